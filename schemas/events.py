@@ -1,0 +1,98 @@
+"""What a reader of a recording must know, as events in the recording itself."""
+
+from enum import StrEnum
+from typing import NamedTuple
+
+from google.protobuf.message import DecodeError
+
+from schemas.proto import driveby_pb2 as pb
+
+SCHEMA_VERSION = 1
+_MAX_TEXT_CHARACTERS = 1000
+
+
+class EventKind(StrEnum):
+    """Why an event was written. The codes are part of the recording format."""
+
+    GAP = "gap"
+    RECOVERED = "recovered"
+    DROPPED = "dropped"
+    REFUSED = "refused"
+    DUPLICATES = "duplicates"
+    CLOCK_STEP = "clock_step"
+    CLOCK_DRIFT = "clock_drift"
+    RECONNECTED = "reconnected"
+    RESTARTED = "restarted"
+    QUEUE_FULL = "queue_full"
+    WRITE_ERROR = "write_error"
+    DISK_LOW = "disk_low"
+
+
+EVENT_TEXTS: dict[EventKind, str] = {
+    EventKind.GAP: "Messages are missing and could not be fetched.",
+    EventKind.RECOVERED: "Missing messages were fetched and stand later in the file.",
+    EventKind.DROPPED: "Messages were dropped.",
+    EventKind.REFUSED: "Messages were refused: malformed, too large or impossible.",
+    EventKind.DUPLICATES: "Messages came more than once; each was written once.",
+    EventKind.CLOCK_STEP: "A wall clock jumped.",
+    EventKind.CLOCK_DRIFT: "The clocks of truck and logger drift apart.",
+    EventKind.RECONNECTED: "A connection was lost and made again.",
+    EventKind.RESTARTED: "A truck began a new boot.",
+    EventKind.QUEUE_FULL: "The writer's queue was full.",
+    EventKind.WRITE_ERROR: "Writing to disk failed.",
+    EventKind.DISK_LOW: "Little room is left on the disk.",
+}
+
+
+class Event(NamedTuple):
+    """One event. Empty or 0 where a field does not apply."""
+
+    kind: EventKind
+    time_ns: int
+    """Wall time, ns since 1970 UTC."""
+    text: str = ""
+    vehicle: str = ""
+    stream: str = ""
+    boot_id: int = 0
+    first_sequence: int = 0
+    last_sequence: int = 0
+    messages: int = 0
+    """How many messages it concerns."""
+
+
+def encode_event(event: Event) -> bytes:
+    """Return the Event message; a text of more than 1000 characters is cut."""
+    return pb.Event(
+        schema_version=SCHEMA_VERSION,
+        time_ns=event.time_ns,
+        kind=str(event.kind),
+        vehicle=event.vehicle,
+        stream=event.stream,
+        boot_id=event.boot_id,
+        first_sequence=event.first_sequence,
+        last_sequence=event.last_sequence,
+        count=event.messages,
+        text=event.text[:_MAX_TEXT_CHARACTERS],
+    ).SerializeToString(deterministic=True)
+
+
+def decode_event(payload: bytes) -> Event:
+    """Return the event; ValueError with one line if it is malformed or of an unknown kind."""
+    try:
+        message = pb.Event.FromString(payload)
+    except DecodeError as error:
+        raise ValueError(f"not a driveby.v1.Event: {error}") from None
+    if message.schema_version != SCHEMA_VERSION:
+        version = message.schema_version
+        raise ValueError(f"schema version {version}; this program reads {SCHEMA_VERSION}")
+    return Event(
+        EventKind(message.kind),
+        message.time_ns,
+        message.text,
+        message.vehicle,
+        message.stream,
+        message.boot_id,
+        message.first_sequence,
+        message.last_sequence,
+        message.count,
+    )

@@ -1,0 +1,95 @@
+"""From a topic's message name to its protobuf class, its descriptors and a checked message.
+
+`foxglove.LocationFix` comes from the package foxglove-schemas-protobuf and is imported only when
+it is needed.
+"""
+
+from collections.abc import Iterator
+from functools import cache
+from typing import Any
+
+from google.protobuf import descriptor_pb2
+from google.protobuf.descriptor import FileDescriptor
+from google.protobuf.message import DecodeError, Message
+
+from schemas import events, signals
+from schemas.proto import driveby_pb2
+from schemas.topics import TOPICS, Topic
+
+LOCATION = "foxglove.LocationFix"
+MESSAGES = tuple(sorted({row.message for row in TOPICS if row.message}))
+
+
+@cache
+def message_class(name: str) -> type[Message]:
+    """Return the class of a full protobuf name of the topic table; ValueError if it is not one."""
+    if name not in MESSAGES:
+        raise ValueError(f"no message {name[:80]!r}; there are {', '.join(MESSAGES)}")
+    if name == LOCATION:
+        return signals.location_class()
+    found: type[Message] = getattr(driveby_pb2, name.removeprefix("driveby.v1."))
+    return found
+
+
+@cache
+def descriptors(name: str) -> bytes:
+    """Return a serialised FileDescriptorSet: the message's file after all that it imports.
+
+    This is the schema data of an MCAP channel; readers such as Rerun decode with it alone.
+    """
+    files = descriptor_pb2.FileDescriptorSet()
+    own: Any = message_class(name).DESCRIPTOR.file  # upb's class, which the stubs keep apart
+    for file in _with_imports(own, set()):
+        file.CopyToProto(files.file.add())
+    return files.SerializeToString(deterministic=True)
+
+
+def _with_imports(file: FileDescriptor, done: set[str]) -> Iterator[FileDescriptor]:
+    if file.name in done:
+        return
+    done.add(file.name)
+    for imported in file.dependencies:
+        yield from _with_imports(imported, done)
+    yield file
+
+
+def decode(name: str, payload: bytes) -> Message:
+    """Parse the payload of a message of the table; ValueError with one line if it is malformed."""
+    try:
+        return message_class(name).FromString(payload)
+    except DecodeError as error:
+        raise ValueError(f"not a {name}: {error}") from None
+
+
+def check_payload(row: Topic, payload: bytes) -> int:
+    """Check a payload as far as its topic allows and return its time in ns since 1970 UTC.
+
+    The time is the wall time of the first sample of `accel`, of the fix of `gnss` and `location`,
+    and when the message was made for all others: the `log_time` of a recording. ValueError names
+    the topic and what is wrong: too large, not that message, another version, impossible values.
+    """
+    where = f"{row.owner}/{row.stream}"
+    if len(payload) > row.max_bytes:
+        raise ValueError(f"{where}: {len(payload)} bytes; at most {row.max_bytes}")
+    try:
+        return _checked_time_ns(row.message, payload)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _checked_time_ns(name: str, payload: bytes) -> int:
+    match name:
+        case "driveby.v1.AccelBatch":
+            return signals.decode_accel(payload).wall_time_ns
+        case "driveby.v1.GnssFix":
+            return signals.decode_gnss(payload).wall_time_ns
+        case "driveby.v1.VehicleInfo":
+            return signals.decode_info(payload).wall_time_ns
+        case "foxglove.LocationFix":
+            return signals.check_location(payload)
+        case "driveby.v1.Event":
+            return events.decode_event(payload).time_ns
+    message = decode(name, payload)
+    signals.check_version(getattr(message, "schema_version", 0))
+    time_field = "created_ns" if name == "driveby.v1.Estimate" else "time_ns"
+    return signals.check_wall_time(getattr(message, time_field, 0))

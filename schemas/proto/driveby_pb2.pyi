@@ -1,0 +1,426 @@
+# mypy: disable-error-code="type-arg"
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class SensorPosition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SENSOR_POSITION_UNSPECIFIED: _ClassVar[SensorPosition]
+    SPRUNG_FRONT: _ClassVar[SensorPosition]
+    SPRUNG_REAR: _ClassVar[SensorPosition]
+    UNSPRUNG_FRONT: _ClassVar[SensorPosition]
+    UNSPRUNG_REAR: _ClassVar[SensorPosition]
+
+class Direction(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DIRECTION_UNSPECIFIED: _ClassVar[Direction]
+    START_TO_END: _ClassVar[Direction]
+    END_TO_START: _ClassVar[Direction]
+
+class CrossingState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CROSSING_STATE_UNSPECIFIED: _ClassVar[CrossingState]
+    DETECTED: _ClassVar[CrossingState]
+    COMPLETE: _ClassVar[CrossingState]
+    WAITING_NOT_VALIDATED: _ClassVar[CrossingState]
+    IDENTIFYING: _ClassVar[CrossingState]
+    DONE: _ClassVar[CrossingState]
+
+class Verdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    VERDICT_UNSPECIFIED: _ClassVar[Verdict]
+    GOOD: _ClassVar[Verdict]
+    SUSPECT: _ClassVar[Verdict]
+    REJECTED: _ClassVar[Verdict]
+SENSOR_POSITION_UNSPECIFIED: SensorPosition
+SPRUNG_FRONT: SensorPosition
+SPRUNG_REAR: SensorPosition
+UNSPRUNG_FRONT: SensorPosition
+UNSPRUNG_REAR: SensorPosition
+DIRECTION_UNSPECIFIED: Direction
+START_TO_END: Direction
+END_TO_START: Direction
+CROSSING_STATE_UNSPECIFIED: CrossingState
+DETECTED: CrossingState
+COMPLETE: CrossingState
+WAITING_NOT_VALIDATED: CrossingState
+IDENTIFYING: CrossingState
+DONE: CrossingState
+VERDICT_UNSPECIFIED: Verdict
+GOOD: Verdict
+SUSPECT: Verdict
+REJECTED: Verdict
+
+class AccelChannel(_message.Message):
+    __slots__ = ("position", "rate_hz", "acceleration_m_per_s2")
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    ACCELERATION_M_PER_S2_FIELD_NUMBER: _ClassVar[int]
+    position: SensorPosition
+    rate_hz: float
+    acceleration_m_per_s2: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, position: _Optional[_Union[SensorPosition, str]] = ..., rate_hz: _Optional[float] = ..., acceleration_m_per_s2: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class AccelBatch(_message.Message):
+    __slots__ = ("schema_version", "boot_id", "sequence", "device_time_ns", "wall_time_ns", "channels")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    WALL_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    boot_id: int
+    sequence: int
+    device_time_ns: int
+    wall_time_ns: int
+    channels: _containers.RepeatedCompositeFieldContainer[AccelChannel]
+    def __init__(self, schema_version: _Optional[int] = ..., boot_id: _Optional[int] = ..., sequence: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., wall_time_ns: _Optional[int] = ..., channels: _Optional[_Iterable[_Union[AccelChannel, _Mapping]]] = ...) -> None: ...
+
+class GnssFix(_message.Message):
+    __slots__ = ("schema_version", "boot_id", "sequence", "device_time_ns", "wall_time_ns", "latitude_deg", "longitude_deg", "altitude_m", "speed_m_per_s", "heading_deg", "horizontal_accuracy_m", "vertical_accuracy_m", "speed_accuracy_m_per_s")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    WALL_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    LATITUDE_DEG_FIELD_NUMBER: _ClassVar[int]
+    LONGITUDE_DEG_FIELD_NUMBER: _ClassVar[int]
+    ALTITUDE_M_FIELD_NUMBER: _ClassVar[int]
+    SPEED_M_PER_S_FIELD_NUMBER: _ClassVar[int]
+    HEADING_DEG_FIELD_NUMBER: _ClassVar[int]
+    HORIZONTAL_ACCURACY_M_FIELD_NUMBER: _ClassVar[int]
+    VERTICAL_ACCURACY_M_FIELD_NUMBER: _ClassVar[int]
+    SPEED_ACCURACY_M_PER_S_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    boot_id: int
+    sequence: int
+    device_time_ns: int
+    wall_time_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    speed_m_per_s: float
+    heading_deg: float
+    horizontal_accuracy_m: float
+    vertical_accuracy_m: float
+    speed_accuracy_m_per_s: float
+    def __init__(self, schema_version: _Optional[int] = ..., boot_id: _Optional[int] = ..., sequence: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., wall_time_ns: _Optional[int] = ..., latitude_deg: _Optional[float] = ..., longitude_deg: _Optional[float] = ..., altitude_m: _Optional[float] = ..., speed_m_per_s: _Optional[float] = ..., heading_deg: _Optional[float] = ..., horizontal_accuracy_m: _Optional[float] = ..., vertical_accuracy_m: _Optional[float] = ..., speed_accuracy_m_per_s: _Optional[float] = ...) -> None: ...
+
+class VehicleInfo(_message.Message):
+    __slots__ = ("schema_version", "boot_id", "sequence", "device_time_ns", "wall_time_ns", "vehicle_id", "site_toml")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    WALL_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    VEHICLE_ID_FIELD_NUMBER: _ClassVar[int]
+    SITE_TOML_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    boot_id: int
+    sequence: int
+    device_time_ns: int
+    wall_time_ns: int
+    vehicle_id: str
+    site_toml: str
+    def __init__(self, schema_version: _Optional[int] = ..., boot_id: _Optional[int] = ..., sequence: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., wall_time_ns: _Optional[int] = ..., vehicle_id: _Optional[str] = ..., site_toml: _Optional[str] = ...) -> None: ...
+
+class Crossing(_message.Message):
+    __slots__ = ("schema_version", "crossing_id", "vehicle", "bridge", "direction", "state", "time_ns", "entry_time_ns", "exit_time_ns")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CROSSING_ID_FIELD_NUMBER: _ClassVar[int]
+    VEHICLE_FIELD_NUMBER: _ClassVar[int]
+    BRIDGE_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    ENTRY_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    EXIT_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    crossing_id: str
+    vehicle: str
+    bridge: str
+    direction: Direction
+    state: CrossingState
+    time_ns: int
+    entry_time_ns: int
+    exit_time_ns: int
+    def __init__(self, schema_version: _Optional[int] = ..., crossing_id: _Optional[str] = ..., vehicle: _Optional[str] = ..., bridge: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., state: _Optional[_Union[CrossingState, str]] = ..., time_ns: _Optional[int] = ..., entry_time_ns: _Optional[int] = ..., exit_time_ns: _Optional[int] = ...) -> None: ...
+
+class Prior(_message.Message):
+    __slots__ = ("distribution", "location", "scale")
+    DISTRIBUTION_FIELD_NUMBER: _ClassVar[int]
+    LOCATION_FIELD_NUMBER: _ClassVar[int]
+    SCALE_FIELD_NUMBER: _ClassVar[int]
+    distribution: str
+    location: float
+    scale: float
+    def __init__(self, distribution: _Optional[str] = ..., location: _Optional[float] = ..., scale: _Optional[float] = ...) -> None: ...
+
+class Parameter(_message.Message):
+    __slots__ = ("unit", "mean", "std", "q025", "q50", "q975", "prior")
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    MEAN_FIELD_NUMBER: _ClassVar[int]
+    STD_FIELD_NUMBER: _ClassVar[int]
+    Q025_FIELD_NUMBER: _ClassVar[int]
+    Q50_FIELD_NUMBER: _ClassVar[int]
+    Q975_FIELD_NUMBER: _ClassVar[int]
+    PRIOR_FIELD_NUMBER: _ClassVar[int]
+    unit: str
+    mean: float
+    std: float
+    q025: float
+    q50: float
+    q975: float
+    prior: Prior
+    def __init__(self, unit: _Optional[str] = ..., mean: _Optional[float] = ..., std: _Optional[float] = ..., q025: _Optional[float] = ..., q50: _Optional[float] = ..., q975: _Optional[float] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ...) -> None: ...
+
+class Covariance(_message.Message):
+    __slots__ = ("names", "matrix")
+    NAMES_FIELD_NUMBER: _ClassVar[int]
+    MATRIX_FIELD_NUMBER: _ClassVar[int]
+    names: _containers.RepeatedScalarFieldContainer[str]
+    matrix: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, names: _Optional[_Iterable[str]] = ..., matrix: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class RoadResult(_message.Message):
+    __slots__ = ("x_m", "front_m", "rear_m", "mean_m", "std_m", "iri_m_per_km", "iso_class")
+    X_M_FIELD_NUMBER: _ClassVar[int]
+    FRONT_M_FIELD_NUMBER: _ClassVar[int]
+    REAR_M_FIELD_NUMBER: _ClassVar[int]
+    MEAN_M_FIELD_NUMBER: _ClassVar[int]
+    STD_M_FIELD_NUMBER: _ClassVar[int]
+    IRI_M_PER_KM_FIELD_NUMBER: _ClassVar[int]
+    ISO_CLASS_FIELD_NUMBER: _ClassVar[int]
+    x_m: _containers.RepeatedScalarFieldContainer[float]
+    front_m: _containers.RepeatedScalarFieldContainer[float]
+    rear_m: _containers.RepeatedScalarFieldContainer[float]
+    mean_m: _containers.RepeatedScalarFieldContainer[float]
+    std_m: _containers.RepeatedScalarFieldContainer[float]
+    iri_m_per_km: float
+    iso_class: str
+    def __init__(self, x_m: _Optional[_Iterable[float]] = ..., front_m: _Optional[_Iterable[float]] = ..., rear_m: _Optional[_Iterable[float]] = ..., mean_m: _Optional[_Iterable[float]] = ..., std_m: _Optional[_Iterable[float]] = ..., iri_m_per_km: _Optional[float] = ..., iso_class: _Optional[str] = ...) -> None: ...
+
+class Derived(_message.Message):
+    __slots__ = ("f1_hz", "max_deflection_m", "probability_below_90_percent_of_baseline")
+    class ProbabilityBelow90PercentOfBaselineEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    F1_HZ_FIELD_NUMBER: _ClassVar[int]
+    MAX_DEFLECTION_M_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_BELOW_90_PERCENT_OF_BASELINE_FIELD_NUMBER: _ClassVar[int]
+    f1_hz: Parameter
+    max_deflection_m: Parameter
+    probability_below_90_percent_of_baseline: _containers.ScalarMap[str, float]
+    def __init__(self, f1_hz: _Optional[_Union[Parameter, _Mapping]] = ..., max_deflection_m: _Optional[_Union[Parameter, _Mapping]] = ..., probability_below_90_percent_of_baseline: _Optional[_Mapping[str, float]] = ...) -> None: ...
+
+class Estimate(_message.Message):
+    __slots__ = ("schema_version", "program", "version", "created_ns", "site_hash", "settings_json", "seed", "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time_ns", "exit_time_ns", "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts", "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road")
+    class DiagnosticsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    class ParametersEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: Parameter
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[_Union[Parameter, _Mapping]] = ...) -> None: ...
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    PROGRAM_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    CREATED_NS_FIELD_NUMBER: _ClassVar[int]
+    SITE_HASH_FIELD_NUMBER: _ClassVar[int]
+    SETTINGS_JSON_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    CROSSING_ID_FIELD_NUMBER: _ClassVar[int]
+    REALM_FIELD_NUMBER: _ClassVar[int]
+    VEHICLE_FIELD_NUMBER: _ClassVar[int]
+    BRIDGE_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    ENTRY_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    EXIT_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    SPEED_M_PER_S_FIELD_NUMBER: _ClassVar[int]
+    METHOD_FIELD_NUMBER: _ClassVar[int]
+    CERTIFICATE_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
+    REASONS_FIELD_NUMBER: _ClassVar[int]
+    REASON_TEXTS_FIELD_NUMBER: _ClassVar[int]
+    CHI2_PER_DOF_FIELD_NUMBER: _ClassVar[int]
+    DIAGNOSTICS_FIELD_NUMBER: _ClassVar[int]
+    PARAMETERS_FIELD_NUMBER: _ClassVar[int]
+    SCALE_ERROR_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    DERIVED_FIELD_NUMBER: _ClassVar[int]
+    ROAD_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    program: str
+    version: str
+    created_ns: int
+    site_hash: str
+    settings_json: str
+    seed: int
+    crossing_id: str
+    realm: str
+    vehicle: str
+    bridge: str
+    direction: Direction
+    entry_time_ns: int
+    exit_time_ns: int
+    speed_m_per_s: float
+    method: str
+    certificate: str
+    verdict: Verdict
+    reasons: _containers.RepeatedScalarFieldContainer[str]
+    reason_texts: _containers.RepeatedScalarFieldContainer[str]
+    chi2_per_dof: float
+    diagnostics: _containers.ScalarMap[str, float]
+    parameters: _containers.MessageMap[str, Parameter]
+    scale_error: float
+    covariance: Covariance
+    derived: Derived
+    road: RoadResult
+    def __init__(self, schema_version: _Optional[int] = ..., program: _Optional[str] = ..., version: _Optional[str] = ..., created_ns: _Optional[int] = ..., site_hash: _Optional[str] = ..., settings_json: _Optional[str] = ..., seed: _Optional[int] = ..., crossing_id: _Optional[str] = ..., realm: _Optional[str] = ..., vehicle: _Optional[str] = ..., bridge: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., entry_time_ns: _Optional[int] = ..., exit_time_ns: _Optional[int] = ..., speed_m_per_s: _Optional[float] = ..., method: _Optional[str] = ..., certificate: _Optional[str] = ..., verdict: _Optional[_Union[Verdict, str]] = ..., reasons: _Optional[_Iterable[str]] = ..., reason_texts: _Optional[_Iterable[str]] = ..., chi2_per_dof: _Optional[float] = ..., diagnostics: _Optional[_Mapping[str, float]] = ..., parameters: _Optional[_Mapping[str, Parameter]] = ..., scale_error: _Optional[float] = ..., covariance: _Optional[_Union[Covariance, _Mapping]] = ..., derived: _Optional[_Union[Derived, _Mapping]] = ..., road: _Optional[_Union[RoadResult, _Mapping]] = ...) -> None: ...
+
+class ElementState(_message.Message):
+    __slots__ = ("mean", "std", "q025", "q975")
+    MEAN_FIELD_NUMBER: _ClassVar[int]
+    STD_FIELD_NUMBER: _ClassVar[int]
+    Q025_FIELD_NUMBER: _ClassVar[int]
+    Q975_FIELD_NUMBER: _ClassVar[int]
+    mean: float
+    std: float
+    q025: float
+    q975: float
+    def __init__(self, mean: _Optional[float] = ..., std: _Optional[float] = ..., q025: _Optional[float] = ..., q975: _Optional[float] = ...) -> None: ...
+
+class LeftOut(_message.Message):
+    __slots__ = ("crossing_id", "reason")
+    CROSSING_ID_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    crossing_id: str
+    reason: str
+    def __init__(self, crossing_id: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
+
+class BridgeState(_message.Message):
+    __slots__ = ("schema_version", "bridge", "time_ns", "flexural_rigidity_nm2", "between_crossing_std", "crossings_used", "crossings_left_out")
+    class FlexuralRigidityNm2Entry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: ElementState
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[_Union[ElementState, _Mapping]] = ...) -> None: ...
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    BRIDGE_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    FLEXURAL_RIGIDITY_NM2_FIELD_NUMBER: _ClassVar[int]
+    BETWEEN_CROSSING_STD_FIELD_NUMBER: _ClassVar[int]
+    CROSSINGS_USED_FIELD_NUMBER: _ClassVar[int]
+    CROSSINGS_LEFT_OUT_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    bridge: str
+    time_ns: int
+    flexural_rigidity_nm2: _containers.MessageMap[str, ElementState]
+    between_crossing_std: float
+    crossings_used: _containers.RepeatedScalarFieldContainer[str]
+    crossings_left_out: _containers.RepeatedCompositeFieldContainer[LeftOut]
+    def __init__(self, schema_version: _Optional[int] = ..., bridge: _Optional[str] = ..., time_ns: _Optional[int] = ..., flexural_rigidity_nm2: _Optional[_Mapping[str, ElementState]] = ..., between_crossing_std: _Optional[float] = ..., crossings_used: _Optional[_Iterable[str]] = ..., crossings_left_out: _Optional[_Iterable[_Union[LeftOut, _Mapping]]] = ...) -> None: ...
+
+class Health(_message.Message):
+    __slots__ = ("schema_version", "time_ns", "service", "ok", "figures", "note")
+    class FiguresEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    SERVICE_FIELD_NUMBER: _ClassVar[int]
+    OK_FIELD_NUMBER: _ClassVar[int]
+    FIGURES_FIELD_NUMBER: _ClassVar[int]
+    NOTE_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    time_ns: int
+    service: str
+    ok: bool
+    figures: _containers.ScalarMap[str, float]
+    note: str
+    def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., service: _Optional[str] = ..., ok: _Optional[bool] = ..., figures: _Optional[_Mapping[str, float]] = ..., note: _Optional[str] = ...) -> None: ...
+
+class Progress(_message.Message):
+    __slots__ = ("schema_version", "time_ns", "crossing_id", "stage", "fraction")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    CROSSING_ID_FIELD_NUMBER: _ClassVar[int]
+    STAGE_FIELD_NUMBER: _ClassVar[int]
+    FRACTION_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    time_ns: int
+    crossing_id: str
+    stage: str
+    fraction: float
+    def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., crossing_id: _Optional[str] = ..., stage: _Optional[str] = ..., fraction: _Optional[float] = ...) -> None: ...
+
+class Event(_message.Message):
+    __slots__ = ("schema_version", "time_ns", "kind", "vehicle", "stream", "boot_id", "first_sequence", "last_sequence", "count", "text")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    VEHICLE_FIELD_NUMBER: _ClassVar[int]
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    FIRST_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    LAST_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    time_ns: int
+    kind: str
+    vehicle: str
+    stream: str
+    boot_id: int
+    first_sequence: int
+    last_sequence: int
+    count: int
+    text: str
+    def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., kind: _Optional[str] = ..., vehicle: _Optional[str] = ..., stream: _Optional[str] = ..., boot_id: _Optional[int] = ..., first_sequence: _Optional[int] = ..., last_sequence: _Optional[int] = ..., count: _Optional[int] = ..., text: _Optional[str] = ...) -> None: ...
+
+class DurableStream(_message.Message):
+    __slots__ = ("vehicle", "stream", "boot_id", "sequence", "count")
+    VEHICLE_FIELD_NUMBER: _ClassVar[int]
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    vehicle: str
+    stream: str
+    boot_id: int
+    sequence: int
+    count: int
+    def __init__(self, vehicle: _Optional[str] = ..., stream: _Optional[str] = ..., boot_id: _Optional[int] = ..., sequence: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...
+
+class Durable(_message.Message):
+    __slots__ = ("schema_version", "time_ns", "streams")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    STREAMS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    time_ns: int
+    streams: _containers.RepeatedCompositeFieldContainer[DurableStream]
+    def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., streams: _Optional[_Iterable[_Union[DurableStream, _Mapping]]] = ...) -> None: ...

@@ -1,0 +1,358 @@
+"""Sensor messages between numpy and Protocol Buffers. No I/O.
+
+Every `decode_*` raises ValueError with one line, and nothing else, whatever bytes it is given:
+malformed, another schema version, not finite, or impossible. Every `encode_*` refuses with
+ValueError what `decode_*` would refuse.
+"""
+
+import math
+import struct
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from google.protobuf.message import DecodeError, Message
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.topics import check_identifier
+
+SCHEMA_VERSION = 1
+CHANNELS = ("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear")
+
+MAX_RATE_HZ = 50_000.0
+MAX_BATCH_S = 1.0
+"""A batch is 50-100 ms; ten times that still bounds the memory that one message can ask for."""
+MAX_ACCELERATION_M_PER_S2 = 1e4
+"""About 1000 g: more is another unit or a broken sensor."""
+MAX_SEQUENCE = 2**32 - 1
+"""MCAP stores 32 bits: six years of batches without a restart."""
+EARLIEST_WALL_TIME_NS = 946_684_800_000_000_000  # 2000-01-01
+LATEST_WALL_TIME_NS = 7_258_118_400_000_000_000  # 2200-01-01
+MAX_SITE_BYTES = 1 << 16
+
+_MAX_BOOT_ID = 2**64 - 1
+_POSITIONS = {
+    "sprung_front": pb.SPRUNG_FRONT,
+    "sprung_rear": pb.SPRUNG_REAR,
+    "unsprung_front": pb.UNSPRUNG_FRONT,
+    "unsprung_rear": pb.UNSPRUNG_REAR,
+}
+_NAMES = {position: name for name, position in _POSITIONS.items()}
+_IDENTITY = struct.Struct("!QQ")
+_NS_PER_S = 1_000_000_000
+
+
+class Identity(NamedTuple):
+    """What, with realm, vehicle and stream, makes a message unique."""
+
+    boot_id: int
+    sequence: int
+
+
+class Channel(NamedTuple):
+    """Evenly spaced samples of one accelerometer, m/s², up positive, gravity removed."""
+
+    rate_hz: float
+    samples: npt.NDArray[np.float64]
+
+
+class AccelBatch(NamedTuple):
+    """50-100 ms of all accelerometers of one truck; both times are of every first sample."""
+
+    boot_id: int
+    sequence: int
+    device_time_ns: int
+    wall_time_ns: int
+    channels: dict[str, Channel]
+
+
+class GnssFix(NamedTuple):
+    """One fix. Accuracies are one standard deviation; None where unknown."""
+
+    boot_id: int
+    sequence: int
+    device_time_ns: int
+    wall_time_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    speed_m_per_s: float
+    heading_deg: float | None = None
+    horizontal_accuracy_m: float | None = None
+    vertical_accuracy_m: float | None = None
+    speed_accuracy_m_per_s: float | None = None
+
+
+class VehicleInfo(NamedTuple):
+    """What the truck says of itself: its parts of the site file, as TOML."""
+
+    boot_id: int
+    sequence: int
+    device_time_ns: int
+    wall_time_ns: int
+    vehicle_id: str
+    site_toml: str
+
+
+def encode_accel(batch: AccelBatch) -> bytes:
+    """Return the AccelBatch message."""
+    _check_accel(batch)
+    message = pb.AccelBatch(schema_version=SCHEMA_VERSION, **_header(batch))
+    for name in CHANNELS:
+        if name in batch.channels:
+            rate_hz, samples = batch.channels[name]
+            message.channels.add(
+                position=_POSITIONS[name], rate_hz=rate_hz, acceleration_m_per_s2=samples.tolist()
+            )
+    return message.SerializeToString(deterministic=True)
+
+
+def decode_accel(payload: bytes) -> AccelBatch:
+    """Return the batch in an AccelBatch message; ValueError if it is malformed or impossible."""
+    message = pb.AccelBatch()
+    _parse(message, payload)
+    channels: dict[str, Channel] = {}
+    for channel in message.channels:
+        name = _NAMES.get(channel.position)
+        if name is None:
+            raise ValueError(f"channel at unknown position {int(channel.position)}")
+        if name in channels:
+            raise ValueError(f"channel {name} is there twice")
+        values = channel.acceleration_m_per_s2
+        channels[name] = Channel(channel.rate_hz, np.fromiter(values, np.float64, len(values)))
+    batch = AccelBatch(
+        message.boot_id, message.sequence, message.device_time_ns, message.wall_time_ns, channels
+    )
+    _check_accel(batch)
+    return batch
+
+
+def encode_gnss(fix: GnssFix) -> bytes:
+    """Return the GnssFix message."""
+    _check_gnss(fix)
+    message = pb.GnssFix(
+        schema_version=SCHEMA_VERSION,
+        **_header(fix),
+        latitude_deg=fix.latitude_deg,
+        longitude_deg=fix.longitude_deg,
+        altitude_m=fix.altitude_m,
+        speed_m_per_s=fix.speed_m_per_s,
+        heading_deg=fix.heading_deg,
+        horizontal_accuracy_m=fix.horizontal_accuracy_m,
+        vertical_accuracy_m=fix.vertical_accuracy_m,
+        speed_accuracy_m_per_s=fix.speed_accuracy_m_per_s,
+    )
+    return message.SerializeToString(deterministic=True)
+
+
+def decode_gnss(payload: bytes) -> GnssFix:
+    """Return the fix in a GnssFix message; ValueError if it is malformed or impossible."""
+    message = pb.GnssFix()
+    _parse(message, payload)
+    optional = {
+        name: getattr(message, name) if message.HasField(name) else None for name in _GNSS_OPTIONAL
+    }
+    fix = GnssFix(
+        message.boot_id,
+        message.sequence,
+        message.device_time_ns,
+        message.wall_time_ns,
+        message.latitude_deg,
+        message.longitude_deg,
+        message.altitude_m,
+        message.speed_m_per_s,
+        **optional,
+    )
+    _check_gnss(fix)
+    return fix
+
+
+def encode_info(info: VehicleInfo) -> bytes:
+    """Return the VehicleInfo message."""
+    _check_info(info)
+    message = pb.VehicleInfo(
+        schema_version=SCHEMA_VERSION,
+        **_header(info),
+        vehicle_id=info.vehicle_id,
+        site_toml=info.site_toml,
+    )
+    return message.SerializeToString(deterministic=True)
+
+
+def decode_info(payload: bytes) -> VehicleInfo:
+    """Return what a VehicleInfo message says; ValueError if it is malformed.
+
+    That `site_toml` is a valid site file is for the reader of site files to say.
+    """
+    message = pb.VehicleInfo()
+    _parse(message, payload)
+    info = VehicleInfo(
+        message.boot_id,
+        message.sequence,
+        message.device_time_ns,
+        message.wall_time_ns,
+        message.vehicle_id,
+        message.site_toml,
+    )
+    _check_info(info)
+    return info
+
+
+def location_class() -> type[Message]:
+    """Return the class foxglove.LocationFix; imported here because few need it."""
+    from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+
+    return LocationFix
+
+
+def encode_location(fix: GnssFix) -> bytes:
+    """Return the fix as foxglove.LocationFix, which Rerun and Foxglove draw on a map."""
+    from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+
+    _check_gnss(fix)
+    message = LocationFix(
+        frame_id="gnss",
+        latitude=fix.latitude_deg,
+        longitude=fix.longitude_deg,
+        altitude=fix.altitude_m,
+    )
+    message.timestamp.seconds, message.timestamp.nanos = divmod(fix.wall_time_ns, _NS_PER_S)
+    if fix.heading_deg is not None:
+        message.heading = math.radians(fix.heading_deg)
+    if fix.horizontal_accuracy_m is not None and fix.vertical_accuracy_m is not None:
+        east = fix.horizontal_accuracy_m**2
+        up = fix.vertical_accuracy_m**2
+        message.position_covariance.extend([east, 0, 0, 0, east, 0, 0, 0, up])
+        message.position_covariance_type = LocationFix.DIAGONAL_KNOWN
+    return message.SerializeToString(deterministic=True)
+
+
+def check_location(payload: bytes) -> int:
+    """Return the wall time in ns of a foxglove.LocationFix; ValueError if it is impossible."""
+    message: Any = location_class()()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError as error:
+        raise ValueError(f"not a foxglove.LocationFix: {error}") from None
+    _check_position(message.latitude, message.longitude, message.altitude)
+    return check_wall_time(message.timestamp.seconds * _NS_PER_S + message.timestamp.nanos)
+
+
+def encode_identity(boot_id: int, sequence: int) -> bytes:
+    """Return the 16 bytes of a put's Zenoh attachment: two unsigned 64-bit big-endian integers."""
+    _check_identity(boot_id, sequence)
+    return _IDENTITY.pack(boot_id, sequence)
+
+
+def decode_identity(attachment: bytes | None) -> Identity:
+    """Return what `encode_identity` put in; ValueError if missing or malformed."""
+    if attachment is None:
+        raise ValueError("no attachment; 16 bytes with boot_id and sequence are expected")
+    if len(attachment) != _IDENTITY.size:
+        raise ValueError(f"attachment of {len(attachment)} bytes; {_IDENTITY.size} are expected")
+    identity = Identity(*_IDENTITY.unpack(attachment))
+    _check_identity(*identity)
+    return identity
+
+
+def check_version(version: int) -> None:
+    """ValueError if this program cannot read messages of that schema version."""
+    if version != SCHEMA_VERSION:
+        raise ValueError(f"schema version {version}; this program reads {SCHEMA_VERSION}")
+
+
+def check_wall_time(time_ns: int) -> int:
+    """Return the time in ns since 1970 UTC if it lies between 2000 and 2200, else ValueError."""
+    if not EARLIEST_WALL_TIME_NS <= time_ns < LATEST_WALL_TIME_NS:
+        raise ValueError(f"time {time_ns} ns is not between the years 2000 and 2200")
+    return time_ns
+
+
+_GNSS_OPTIONAL = (
+    "heading_deg",
+    "horizontal_accuracy_m",
+    "vertical_accuracy_m",
+    "speed_accuracy_m_per_s",
+)
+
+
+def _header(message: AccelBatch | GnssFix | VehicleInfo) -> dict[str, Any]:
+    return {
+        "boot_id": message.boot_id,
+        "sequence": message.sequence,
+        "device_time_ns": message.device_time_ns,
+        "wall_time_ns": message.wall_time_ns,
+    }
+
+
+def _parse(message: pb.AccelBatch | pb.GnssFix | pb.VehicleInfo, payload: bytes) -> None:
+    try:
+        message.ParseFromString(payload)
+    except DecodeError as error:
+        raise ValueError(f"not a {message.DESCRIPTOR.full_name}: {error}") from None
+    check_version(message.schema_version)
+
+
+def _check_identity(boot_id: int, sequence: int) -> None:
+    if not 0 <= boot_id <= _MAX_BOOT_ID:
+        raise ValueError(f"boot_id {boot_id} does not fit 64 bits without sign")
+    if not 0 <= sequence <= MAX_SEQUENCE:
+        raise ValueError(f"sequence {sequence} is not between 0 and {MAX_SEQUENCE}")
+
+
+def _check_header(message: AccelBatch | GnssFix | VehicleInfo) -> None:
+    _check_identity(message.boot_id, message.sequence)
+    if not 0 <= message.device_time_ns < 2**63:
+        raise ValueError(f"device time {message.device_time_ns} ns is negative or too large")
+    check_wall_time(message.wall_time_ns)
+
+
+def _check_accel(batch: AccelBatch) -> None:
+    _check_header(batch)
+    if not batch.channels:
+        raise ValueError("no channel")
+    for name, (rate_hz, samples) in batch.channels.items():
+        if name not in _POSITIONS:
+            raise ValueError(f"no channel {name!r}; there are {', '.join(CHANNELS)}")
+        if not 0.0 < rate_hz <= MAX_RATE_HZ:
+            raise ValueError(f"{name}: rate {rate_hz} Hz is not between 0 and {MAX_RATE_HZ:.0f}")
+        if samples.ndim != 1 or samples.size == 0:
+            raise ValueError(f"{name}: samples of shape {samples.shape}; (n,) is expected")
+        # The rounding of n/rate must not refuse a batch of exactly one second.
+        if samples.size > MAX_BATCH_S * rate_hz * (1 + 1e-9) and samples.size > 1:
+            raise ValueError(f"{name}: {samples.size} samples at {rate_hz} Hz exceed one second")
+        if not bool(np.all(np.abs(samples) <= MAX_ACCELERATION_M_PER_S2)):  # false for NaN too
+            raise ValueError(
+                f"{name}: a sample is not finite or exceeds {MAX_ACCELERATION_M_PER_S2:.0f} m/s²"
+            )
+
+
+def _check_position(latitude_deg: float, longitude_deg: float, altitude_m: float) -> None:
+    _check_range("latitude_deg", latitude_deg, -90.0, 90.0)
+    _check_range("longitude_deg", longitude_deg, -180.0, 180.0)
+    _check_range("altitude_m", altitude_m, -1000.0, 20_000.0)
+
+
+def _check_gnss(fix: GnssFix) -> None:
+    _check_header(fix)
+    _check_position(fix.latitude_deg, fix.longitude_deg, fix.altitude_m)
+    _check_range("speed_m_per_s", fix.speed_m_per_s, -200.0, 200.0)
+    if fix.heading_deg is not None:
+        _check_range("heading_deg", fix.heading_deg, -360.0, 360.0)
+    for name in _GNSS_OPTIONAL[1:]:
+        value = getattr(fix, name)
+        if value is not None:
+            _check_range(name, value, 0.0, 1e6)
+
+
+def _check_info(info: VehicleInfo) -> None:
+    _check_header(info)
+    check_identifier(info.vehicle_id)
+    size = len(info.site_toml.encode())
+    if size > MAX_SITE_BYTES:
+        raise ValueError(f"site_toml of {size} bytes; at most {MAX_SITE_BYTES}")
+
+
+def _check_range(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:  # false for NaN too
+        raise ValueError(f"{name} {value} is not between {low:g} and {high:g}")

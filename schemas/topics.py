@@ -1,0 +1,161 @@
+"""The one table of topics: logger, replay, liveness, viewer and docs/topics.md derive from it.
+
+A key is `driveby/v1/{realm}/{owner}/{identifier}/{stream}`, e.g.
+`driveby/v1/live/vehicle/truck-1/accel`. Nothing here needs anything but the standard library.
+"""
+
+import re
+from typing import Literal, NamedTuple
+
+PREFIX = "driveby/v1"
+IDENTIFIER = r"[a-z0-9][a-z0-9_-]{0,62}"
+REALM = rf"live|(?:replay|sim|import)-{IDENTIFIER}"
+
+_IDENTIFIER = re.compile(IDENTIFIER)
+_REALM = re.compile(REALM)
+_MAX_KEY_CHARACTERS = 255  # far above the longest valid key; bounds the work on hostile ones
+
+Owner = Literal["vehicle", "bridge", "service"]
+Delivery = Literal["reliable", "latest"]
+
+
+class Topic(NamedTuple):
+    """One row of the table: what travels under a stream's name and how it is treated."""
+
+    owner: Owner
+    stream: str
+    message: str
+    """Full protobuf name; empty if presence alone is the message (a Zenoh liveliness token)."""
+    logged: bool
+    """The logger writes it, replay publishes it again."""
+    latched: bool
+    """A late subscriber gets the last message at once."""
+    nominal_rate_hz: float | None
+    """Messages per second while the owner works; None: on occasion."""
+    delivery: Delivery
+    """`reliable`: blocks rather than drops, cached, fetched again. `latest`: may be dropped."""
+    cache: int
+    """Messages the publisher keeps for subscribers that were away."""
+    queue: int
+    """Messages a subscriber keeps waiting before the publisher feels it."""
+    max_bytes: int
+    """A larger payload is refused."""
+    description: str
+
+
+class Key(NamedTuple):
+    """A key taken apart. `str()` does not give it back: use `key(*k)`."""
+
+    realm: str
+    owner: Owner
+    identifier: str
+    stream: str
+
+
+TOPICS: tuple[Topic, ...] = (
+    Topic(
+        "vehicle", "accel", "driveby.v1.AccelBatch", True, False, 20.0, "reliable",
+        6000, 100_000, 1 << 18, "50-100 ms of every accelerometer, at each one's own rate",
+    ),
+    Topic(
+        "vehicle", "gnss", "driveby.v1.GnssFix", True, False, 10.0, "reliable",
+        3000, 100_000, 1 << 12, "one fix of the satellite receiver, with its accuracies",
+    ),
+    Topic(
+        "vehicle", "location", "foxglove.LocationFix", True, False, 10.0, "reliable",
+        3000, 100_000, 1 << 14, "the same fix in the form that map views draw unaided",
+    ),
+    Topic(
+        "vehicle", "info", "driveby.v1.VehicleInfo", True, True, None, "reliable",
+        1, 1_000, 1 << 17, "the truck's parts of the site file",
+    ),
+    Topic(
+        "vehicle", "alive", "", False, False, None, "reliable",
+        0, 1_000, 0, "liveliness token: there while the truck's gateway runs",
+    ),
+    Topic(
+        "bridge", "crossing", "driveby.v1.Crossing", True, False, None, "reliable",
+        1000, 1_000, 1 << 14, "a change of state of one crossing",
+    ),
+    Topic(
+        "bridge", "estimate", "driveby.v1.Estimate", True, False, None, "reliable",
+        100, 1_000, 1 << 24, "the result of one crossing",
+    ),
+    Topic(
+        "bridge", "state", "driveby.v1.BridgeState", True, True, None, "reliable",
+        1, 1_000, 1 << 20, "the bridge's latest fused estimate; also answers queries",
+    ),
+    Topic(
+        "service", "health", "driveby.v1.Health", False, False, 1 / 60, "latest",
+        1, 1_000, 1 << 16, "how a service is: rate, lag, queue, lost, recovered, disk left",
+    ),
+    Topic(
+        "service", "progress", "driveby.v1.Progress", False, False, None, "latest",
+        1, 1_000, 1 << 12, "how far a service is with a long piece of work",
+    ),
+    Topic(
+        "service", "event", "driveby.v1.Event", True, False, None, "reliable",
+        1000, 10_000, 1 << 14, "every gap, drop, recovery, clock step and write error, counted",
+    ),
+    Topic(
+        "service", "durable", "driveby.v1.Durable", False, True, 1.0, "reliable",
+        1, 1_000, 1 << 20, "what a logger has safely on disk, per vehicle, stream and boot",
+    ),
+)  # fmt: skip
+
+_BY_NAME = {(row.owner, row.stream): row for row in TOPICS}
+
+
+def topic(owner: str, stream: str) -> Topic:
+    """Return the row of the table; ValueError if there is none."""
+    try:
+        return _BY_NAME[(owner, stream)]  # type: ignore[index]
+    except KeyError:
+        known = ", ".join(f"{row.owner}/{row.stream}" for row in TOPICS)
+        name = f"{owner}/{stream}"[:80]
+        raise ValueError(f"no topic {name!r}; there are {known}") from None
+
+
+def check_identifier(text: str) -> str:
+    """Return `text` if it may name a vehicle, bridge or service; ValueError if not."""
+    if not _IDENTIFIER.fullmatch(text):
+        raise ValueError(
+            f"identifier {text[:80]!r} must be 1 to 63 of a-z, 0-9, '_' and '-', "
+            "beginning with a letter or digit"
+        )
+    return text
+
+
+def check_realm(text: str) -> str:
+    """Return `text` if it is a realm; ValueError if not."""
+    if not _REALM.fullmatch(text):
+        raise ValueError(
+            f"realm {text[:80]!r} must be live, replay-NAME, sim-NAME or import-NAME, "
+            "NAME of a-z, 0-9, '_' and '-'"
+        )
+    return text
+
+
+def key(realm: str, owner: str, identifier: str, stream: str) -> str:
+    """Return the Zenoh key; ValueError if a part is malformed or the topic does not exist."""
+    topic(owner, stream)
+    check_realm(realm)
+    check_identifier(identifier)
+    return f"{PREFIX}/{realm}/{owner}/{identifier}/{stream}"
+
+
+def parse_key(text: str) -> Key:
+    """Take a key apart; ValueError if it is not one of ours, whatever the text."""
+    if len(text) > _MAX_KEY_CHARACTERS:
+        raise ValueError(f"key of {len(text)} characters; at most {_MAX_KEY_CHARACTERS}")
+    parts = text.split("/")
+    if len(parts) != 6 or "/".join(parts[:2]) != PREFIX:
+        raise ValueError(f"key {text!r} is not {PREFIX}/REALM/OWNER/ID/STREAM")
+    _, _, realm, owner, identifier, stream = parts
+    row = topic(owner, stream)
+    return Key(check_realm(realm), row.owner, check_identifier(identifier), row.stream)
+
+
+def selector(realm: str | None, owner: str, stream: str = "*") -> str:
+    """Return the key expression of all streams (or one) of every such owner in a realm (or any)."""
+    return f"{PREFIX}/{realm or '*'}/{owner}/*/{stream}"
