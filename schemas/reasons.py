@@ -1,0 +1,77 @@
+"""Why a crossing is not `good`: an enumeration with a sentence each."""
+
+from collections.abc import Iterable
+from enum import StrEnum
+from typing import Final
+
+
+class Reason(StrEnum):
+    """The codes in `reasons` of a result. A code is never given another meaning."""
+
+    # What the recording lacks.
+    CHANNEL_MISSING = "channel_missing"
+    GAP_ON_BRIDGE = "gap_on_bridge"
+    POSITION_OUTAGE = "position_outage"
+    NOT_FINITE = "not_finite"
+    SENSOR_SATURATED = "sensor_saturated"
+    CHANNEL_SWAPPED = "channel_swapped"
+    CHANNEL_INVERTED = "channel_inverted"
+    INCOMPLETE_CROSSING = "incomplete_crossing"
+    # How the truck was driven.
+    SPEED_TOO_LOW = "speed_too_low"
+    STOPPED_ON_BRIDGE = "stopped_on_bridge"
+    LEFT_THE_ROAD = "left_the_road"
+    ACCELERATING_CG_UNKNOWN = "accelerating_cg_unknown"
+    SECOND_VEHICLE = "second_vehicle"
+    AXLES_ALIKE = "axles_alike"
+    # What the fit says.
+    NO_NOISE_MODEL = "no_noise_model"
+    MODEL_MISFIT = "model_misfit"
+    RESIDUALS_COLOURED = "residuals_coloured"
+    NOISE_ABOVE_DECLARED = "noise_above_declared"
+    IMPLAUSIBLE_VEHICLE = "implausible_vehicle"
+    POSITION_INCONSISTENT = "position_inconsistent"
+    SPAN_INCONSISTENT = "span_inconsistent"
+    # How the search ended.
+    NOT_CONVERGED = "not_converged"
+    SAMPLER_DIAGNOSTICS = "sampler_diagnostics"
+    FAILED = "failed"
+    NOT_VALIDATED = "not_validated"
+
+
+REASON_TEXTS: Final[dict[Reason, str]] = {
+    Reason.CHANNEL_MISSING: "The truck lacks one of the four accelerometers that the method needs.",
+    Reason.GAP_ON_BRIDGE: "Samples are missing while the truck was on the bridge.",
+    Reason.POSITION_OUTAGE: "The receiver gave no position while the truck was on the bridge.",
+    Reason.NOT_FINITE: "The recording or the fit contains values that are not finite numbers.",
+    Reason.SENSOR_SATURATED: "An accelerometer reached the end of its range.",
+    Reason.CHANNEL_SWAPPED: "Two channels seem to be exchanged.",
+    Reason.CHANNEL_INVERTED: "A channel seems to have the wrong sign.",
+    Reason.INCOMPLETE_CROSSING: "The recording begins or ends while the truck is on the bridge.",
+    Reason.SPEED_TOO_LOW: "The truck was too slow for its axles to feel the bridge's stiffness.",
+    Reason.STOPPED_ON_BRIDGE: "The truck stopped or turned back on the bridge.",
+    Reason.LEFT_THE_ROAD: "The positions leave the line between the ends of the bridge.",
+    Reason.ACCELERATING_CG_UNKNOWN: (
+        "The truck braked or accelerated and the height of its centre of gravity is unknown."
+    ),
+    Reason.SECOND_VEHICLE: "Another vehicle seems to have been on the bridge.",
+    Reason.AXLES_ALIKE: (
+        "The axle loads are nearly equal, so the difference between the wheels says little."
+    ),
+    Reason.NO_NOISE_MODEL: "The method has no noise model, so its intervals mean nothing.",
+    Reason.MODEL_MISFIT: "The model does not explain the measured accelerations.",
+    Reason.RESIDUALS_COLOURED: "What the fit leaves over is not random noise.",
+    Reason.NOISE_ABOVE_DECLARED: "The accelerometers are noisier than the site file says.",
+    Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
+    Reason.POSITION_INCONSISTENT: "The position that fits disagrees with the receiver.",
+    Reason.SPAN_INCONSISTENT: "The span disagrees with the distance between the bridge's ends.",
+    Reason.NOT_CONVERGED: "The search did not converge.",
+    Reason.SAMPLER_DIAGNOSTICS: "The Markov chain did not pass its own checks.",
+    Reason.FAILED: "The identification failed.",
+    Reason.NOT_VALIDATED: "The method has not been validated on simulated crossings of this site.",
+}
+
+
+def texts(reasons: Iterable[Reason]) -> list[str]:
+    """Return the sentence of each reason, in the same order."""
+    return [REASON_TEXTS[reason] for reason in reasons]

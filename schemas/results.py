@@ -1,0 +1,439 @@
+"""Results of identifications: the JSON file of docs/contract.md, and the same on the wire.
+
+Times are seconds since 1970 UTC here and nanoseconds on the wire. A number that is not finite is
+refused when the model is made, so NaN is never written; where a value may be unknown it is None.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Final, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
+
+from schemas.errors import InputError
+from schemas.proto import driveby_pb2 as pb
+from schemas.reasons import Reason, texts
+
+SCHEMA_VERSION: Final = 1
+
+Method = Literal["pre", "least_squares", "random_walk"]
+Verdict = Literal["good", "suspect", "rejected"]
+Direction = Literal["start_to_end", "end_to_start"]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Fields(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Prior(_Fields):
+    """What was known before the crossing."""
+
+    distribution: Literal["normal", "log_normal", "half_normal", "uniform"]
+    location: Finite
+    """Nominal value."""
+    scale: Finite
+    """Relative standard deviation of log_normal, half width of uniform, else in the unit."""
+
+
+class Parameter(_Fields):
+    """A quantity with its uncertainty, all in `unit`."""
+
+    unit: str
+    mean: Finite
+    std: Finite
+    q025: Finite
+    q50: Finite
+    q975: Finite
+    prior: Prior | None = None
+    """None for what is derived from other parameters."""
+
+
+class Covariance(_Fields):
+    """Covariance of the parameters, in products of their units."""
+
+    names: tuple[str, ...] = ()
+    matrix: tuple[tuple[Finite, ...], ...] = ()
+
+    @model_validator(mode="after")
+    def _is_square(self) -> "Covariance":
+        size = len(self.names)
+        if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
+            raise ValueError(f"matrix must be {size} × {size}, as there are {size} names")
+        return self
+
+
+class Derived(_Fields):
+    """What follows from the parameters."""
+
+    f1_hz: Parameter
+    max_deflection_m: Parameter
+    probability_below_90_percent_of_baseline: dict[str, Finite] | None = None
+    """By element; None without a stored baseline."""
+
+
+class Road(_Fields):
+    """The road profile over chainage, as each axle felt it and both together."""
+
+    x_m: tuple[Finite, ...]
+    front_m: tuple[Finite, ...]
+    rear_m: tuple[Finite, ...]
+    mean_m: tuple[Finite, ...]
+    std_m: tuple[Finite, ...] | None = None
+    iri_m_per_km: Finite | None = None
+    iso_class: str | None = None
+
+    @model_validator(mode="after")
+    def _has_one_length(self) -> "Road":
+        profiles = (self.front_m, self.rear_m, self.mean_m, self.std_m or self.x_m)
+        if any(len(profile) != len(self.x_m) for profile in profiles):
+            raise ValueError("all profiles of a road must be as long as x_m")
+        return self
+
+
+class Crossing(_Fields):
+    """The result of one crossing by one method."""
+
+    crossing_id: str
+    realm: str
+    vehicle: str
+    bridge: str
+    direction: Direction
+    entry_time: Finite
+    exit_time: Finite
+    speed_m_per_s: Finite
+    method: Method
+    certificate: str | None = None
+    verdict: Verdict
+    reasons: tuple[Reason, ...] = ()
+    reason_texts: tuple[str, ...] = ()
+    """Filled in from `reasons` if not given."""
+    chi2_per_dof: Finite | None = None
+    diagnostics: dict[str, Finite] = {}
+    parameters: dict[str, Parameter] | None
+    """None if rejected."""
+    scale_error: Finite | None = None
+    covariance: Covariance | None = None
+    derived: Derived | None = None
+    road: Road | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _sentences(cls, values: object) -> object:
+        if isinstance(values, Mapping) and values.get("reasons") and "reason_texts" not in values:
+            return {**values, "reason_texts": texts(Reason(code) for code in values["reasons"])}
+        return values
+
+    @model_validator(mode="after")
+    def _verdict_fits(self) -> "Crossing":
+        if (self.verdict == "rejected") != (self.parameters is None):
+            raise ValueError("a rejected crossing has no parameters, every other one has")
+        if self.verdict == "rejected" and not self.reasons:
+            raise ValueError("a rejected crossing has at least one reason")
+        if len(self.reason_texts) != len(self.reasons):
+            raise ValueError("reason_texts must have one sentence for each reason")
+        return self
+
+
+class ElementState(_Fields):
+    """Flexural rigidity of one element in N·m²."""
+
+    mean: Finite
+    std: Finite
+    q025: Finite
+    q975: Finite
+
+
+class LeftOut(_Fields):
+    """A crossing that is not in the fused estimate."""
+
+    crossing_id: str
+    reason: str
+
+
+class BridgeResult(BaseModel):
+    """The fused estimate of one bridge; its elements are fields EI_1 … EI_n."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+    __pydantic_extra__: dict[Annotated[str, Field(pattern=r"^EI_[1-9]\d?$")], ElementState]
+
+    between_crossing_std: Finite | None = None
+    crossings_used: tuple[str, ...] = ()
+    crossings_left_out: tuple[LeftOut, ...] = ()
+
+    @property
+    def elements(self) -> dict[str, ElementState]:
+        """EI_1 … EI_n in the order of their numbers."""
+        extra = self.__pydantic_extra__
+        return {name: extra[name] for name in sorted(extra, key=lambda n: int(n[3:]))}
+
+
+class Results(_Fields):
+    """A results file."""
+
+    program: str = "driveby"
+    version: str
+    created: Finite
+    site_hash: str
+    settings: dict[str, JsonValue]
+    seed: Annotated[int, Field(ge=0, lt=1 << 64)]
+    crossings: tuple[Crossing, ...] = ()
+    bridges: dict[str, BridgeResult] = {}
+
+
+class Header(NamedTuple):
+    """What a results file says once and a message on the wire says each time."""
+
+    version: str
+    created: float
+    site_hash: str
+    settings: dict[str, JsonValue]
+    seed: int
+    program: str = "driveby"
+
+
+def results(header: Header, crossings: list[Crossing], bridges: dict[str, BridgeResult]) -> Results:
+    """Put a results file together."""
+    return Results(**header._asdict(), crossings=tuple(crossings), bridges=bridges)
+
+
+def results_json(content: Results) -> str:
+    """Return the text of a results file."""
+    return content.model_dump_json(indent=1) + "\n"
+
+
+def load_results(path: Path) -> Results:
+    """Read a results file; raise InputError with one line if it is none."""
+    try:
+        return Results.model_validate_json(path.read_bytes())
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file, a results file (JSON) is expected") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in problem["loc"])
+        message = problem["msg"].removeprefix("Value error, ")
+        raise InputError(f"{path}: {place or 'not a results file'}: {message}") from error
+
+
+def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:
+    """Return the message on the wire for one crossing."""
+    message = pb.Estimate(
+        schema_version=SCHEMA_VERSION,
+        program=header.program,
+        version=header.version,
+        created_ns=_nanoseconds(header.created),
+        site_hash=header.site_hash,
+        settings_json=json.dumps(header.settings, sort_keys=True, separators=(",", ":")),
+        seed=header.seed,
+        crossing_id=crossing.crossing_id,
+        realm=crossing.realm,
+        vehicle=crossing.vehicle,
+        bridge=crossing.bridge,
+        direction=direction_to_protobuf(crossing.direction),
+        entry_time_ns=_nanoseconds(crossing.entry_time),
+        exit_time_ns=_nanoseconds(crossing.exit_time),
+        speed_m_per_s=crossing.speed_m_per_s,
+        method=crossing.method,
+        certificate=crossing.certificate or "",
+        verdict=crossing.verdict.upper(),
+        reasons=crossing.reasons,
+        reason_texts=crossing.reason_texts,
+        chi2_per_dof=crossing.chi2_per_dof,
+        diagnostics=crossing.diagnostics,
+        scale_error=crossing.scale_error,
+    )
+    for name, parameter in (crossing.parameters or {}).items():
+        message.parameters[name].CopyFrom(_parameter_to_protobuf(parameter))
+    if crossing.covariance is not None:
+        message.covariance.names.extend(crossing.covariance.names)
+        message.covariance.matrix.extend(v for row in crossing.covariance.matrix for v in row)
+    if crossing.derived is not None:
+        message.derived.f1_hz.CopyFrom(_parameter_to_protobuf(crossing.derived.f1_hz))
+        message.derived.max_deflection_m.CopyFrom(
+            _parameter_to_protobuf(crossing.derived.max_deflection_m)
+        )
+        message.derived.probability_below_90_percent_of_baseline.update(
+            crossing.derived.probability_below_90_percent_of_baseline or {}
+        )
+    if crossing.road is not None:
+        road = crossing.road
+        message.road.CopyFrom(
+            pb.RoadResult(
+                x_m=road.x_m,
+                front_m=road.front_m,
+                rear_m=road.rear_m,
+                mean_m=road.mean_m,
+                std_m=road.std_m or (),
+                iri_m_per_km=road.iri_m_per_km,
+                iso_class=road.iso_class or "",
+            )
+        )
+    return message
+
+
+def estimate_to_crossing(message: pb.Estimate) -> tuple[Crossing, Header]:
+    """Return the crossing and header of a message; ValueError with one line if it is malformed."""
+    if message.schema_version != SCHEMA_VERSION:
+        raise ValueError(f"Estimate has schema version {message.schema_version}, not 1")
+    try:
+        settings = json.loads(message.settings_json)
+        header = Header(
+            version=message.version,
+            created=message.created_ns / 1e9,
+            site_hash=message.site_hash,
+            settings=settings,
+            seed=message.seed,
+            program=message.program,
+        )
+        return _crossing(message), header
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in problem["loc"])
+        raise ValueError(f"Estimate: {place}: {problem['msg']}") from error
+
+
+def bridge_to_protobuf(name: str, time_ns: int, bridge: BridgeResult) -> pb.BridgeState:
+    """Return the message on the wire for a fused estimate."""
+    message = pb.BridgeState(
+        schema_version=SCHEMA_VERSION,
+        bridge=name,
+        time_ns=time_ns,
+        between_crossing_std=bridge.between_crossing_std,
+        crossings_used=bridge.crossings_used,
+        crossings_left_out=[pb.LeftOut(**out.model_dump()) for out in bridge.crossings_left_out],
+    )
+    for element, state in bridge.elements.items():
+        message.flexural_rigidity_nm2[element].CopyFrom(pb.ElementState(**state.model_dump()))
+    return message
+
+
+def state_to_bridge(message: pb.BridgeState) -> tuple[str, int, BridgeResult]:
+    """Return bridge, time in ns and fused estimate of a message; ValueError if it is malformed."""
+    if message.schema_version != SCHEMA_VERSION:
+        raise ValueError(f"BridgeState has schema version {message.schema_version}, not 1")
+    elements = {
+        name: {"mean": s.mean, "std": s.std, "q025": s.q025, "q975": s.q975}
+        for name, s in message.flexural_rigidity_nm2.items()
+    }
+    values = {
+        **elements,
+        "between_crossing_std": (
+            message.between_crossing_std if message.HasField("between_crossing_std") else None
+        ),
+        "crossings_used": message.crossings_used,
+        "crossings_left_out": [
+            {"crossing_id": out.crossing_id, "reason": out.reason}
+            for out in message.crossings_left_out
+        ],
+    }
+    return message.bridge, message.time_ns, BridgeResult.model_validate(values)
+
+
+def direction_to_protobuf(direction: Direction) -> pb.Direction:
+    """Return the direction of travel as on the wire."""
+    return pb.START_TO_END if direction == "start_to_end" else pb.END_TO_START
+
+
+def direction_from_protobuf(direction: pb.Direction) -> Direction:
+    """Return the direction of travel; ValueError if the message does not say it."""
+    if direction == pb.START_TO_END:
+        return "start_to_end"
+    if direction == pb.END_TO_START:
+        return "end_to_start"
+    raise ValueError("the direction of travel is not given")
+
+
+def _crossing(message: pb.Estimate) -> Crossing:
+    rejected = message.verdict == pb.REJECTED
+    values = {
+        "crossing_id": message.crossing_id,
+        "realm": message.realm,
+        "vehicle": message.vehicle,
+        "bridge": message.bridge,
+        "direction": direction_from_protobuf(message.direction),
+        "entry_time": message.entry_time_ns / 1e9,
+        "exit_time": message.exit_time_ns / 1e9,
+        "speed_m_per_s": message.speed_m_per_s,
+        "method": message.method,
+        "certificate": message.certificate or None,
+        "verdict": pb.Verdict.Name(message.verdict).lower(),
+        "reasons": tuple(message.reasons),
+        "reason_texts": tuple(message.reason_texts),
+        "chi2_per_dof": message.chi2_per_dof if message.HasField("chi2_per_dof") else None,
+        "diagnostics": dict(message.diagnostics),
+        "parameters": (
+            None if rejected else {n: _parameter(p) for n, p in message.parameters.items()}
+        ),
+        "scale_error": message.scale_error if message.HasField("scale_error") else None,
+        "covariance": _covariance(message.covariance) if message.HasField("covariance") else None,
+        "derived": _derived(message.derived) if message.HasField("derived") else None,
+        "road": _road(message.road) if message.HasField("road") else None,
+    }
+    return Crossing.model_validate(values)
+
+
+def _parameter_to_protobuf(parameter: Parameter) -> pb.Parameter:
+    prior = parameter.prior
+    return pb.Parameter(
+        unit=parameter.unit,
+        mean=parameter.mean,
+        std=parameter.std,
+        q025=parameter.q025,
+        q50=parameter.q50,
+        q975=parameter.q975,
+        prior=None if prior is None else pb.Prior(**prior.model_dump()),
+    )
+
+
+def _parameter(message: pb.Parameter) -> dict[str, object]:
+    prior = message.prior
+    return {
+        "unit": message.unit,
+        "mean": message.mean,
+        "std": message.std,
+        "q025": message.q025,
+        "q50": message.q50,
+        "q975": message.q975,
+        "prior": (
+            {"distribution": prior.distribution, "location": prior.location, "scale": prior.scale}
+            if message.HasField("prior")
+            else None
+        ),
+    }
+
+
+def _covariance(message: pb.Covariance) -> dict[str, object]:
+    size = max(len(message.names), 1)
+    rows = [message.matrix[i : i + size] for i in range(0, len(message.matrix), size)]
+    return {"names": tuple(message.names), "matrix": rows}
+
+
+def _derived(message: pb.Derived) -> dict[str, object]:
+    return {
+        "f1_hz": _parameter(message.f1_hz),
+        "max_deflection_m": _parameter(message.max_deflection_m),
+        "probability_below_90_percent_of_baseline": (
+            dict(message.probability_below_90_percent_of_baseline) or None
+        ),
+    }
+
+
+def _road(message: pb.RoadResult) -> dict[str, object]:
+    return {
+        "x_m": tuple(message.x_m),
+        "front_m": tuple(message.front_m),
+        "rear_m": tuple(message.rear_m),
+        "mean_m": tuple(message.mean_m),
+        "std_m": tuple(message.std_m) or None,
+        "iri_m_per_km": message.iri_m_per_km if message.HasField("iri_m_per_km") else None,
+        "iso_class": message.iso_class or None,
+    }
+
+
+def _nanoseconds(seconds: float) -> int:
+    # Seconds since 1970 carry a quarter of a microsecond; whole microseconds come back unchanged.
+    return math.floor(seconds * 1e6 + 0.5) * 1000

@@ -1,0 +1,519 @@
+"""The site file: which trucks drive over which bridges, and what is known of them before.
+
+Field names are the keys of the TOML file (docs/contract.md). Pairs are [front, rear]. A `…_spread`
+is a relative standard deviation of a log-normal prior, unless its name carries a unit.
+"""
+
+import difflib
+import hashlib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    StrictBool,
+    StringConstraints,
+    ValidationError,
+    model_validator,
+)
+
+from schemas.errors import InputError
+from schemas.topics import IDENTIFIER
+
+MAX_ELEMENTS: Final = 30
+MAX_SPAN_DISAGREEMENT: Final = 0.2
+"""Beyond this relative difference between `span_m` and the distance of the ends one of them is a
+slip of the pen. Ends read off a hand-held receiver are metres off, so less is not refused."""
+
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0, le=1e15)]
+NotNegative = Annotated[Number, Field(ge=0, le=1e15)]
+PositivePair = tuple[Positive, Positive]
+NotNegativePair = tuple[NotNegative, NotNegative]
+Spread = Annotated[Number, Field(ge=0, le=3)]
+Latitude = Annotated[Number, Field(ge=-89, le=89)]
+Longitude = Annotated[Number, Field(ge=-180, le=180)]
+Identifier = Annotated[str, StringConstraints(pattern=f"^{IDENTIFIER}$")]
+Text = Annotated[str, StringConstraints(min_length=1, max_length=1000)]
+Sign = Annotated[Literal[1, -1], BeforeValidator(lambda v: int(v) if v in (1.0, -1.0) else v)]
+
+
+def _four(value: object) -> object:
+    """Spell one value for all channels out as four."""
+    return [value] * 4 if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+Rate = Annotated[Number, Field(ge=1, le=100_000)]
+Density = Annotated[Number, Field(ge=0, le=1e6)]
+Rates = Annotated[tuple[Rate, Rate, Rate, Rate], BeforeValidator(_four)]
+Densities = Annotated[tuple[Density, Density, Density, Density], BeforeValidator(_four)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class _Spreadable(_Table):
+    id: Identifier
+
+    def spread(self, key: str) -> float:
+        """Return the relative standard deviation of the prior of `key`."""
+        value: float = getattr(self, f"{key}_spread")
+        return value
+
+
+class Vehicle(_Spreadable):
+    """A truck with two axles. Nominal values are those of a data sheet."""
+
+    total_mass_kg: Annotated[Number, Field(gt=0, le=1e6)]
+    wheelbase_m: Annotated[Number, Field(gt=0, le=30)]
+    front_axle_to_cg_m: Annotated[Number, Field(gt=0, le=30)]
+    suspension_damping_ns_per_m: NotNegativePair
+    suspension_stiffness_n_per_m: PositivePair
+    unsprung_mass_kg: PositivePair
+    tyre_stiffness_n_per_m: PositivePair
+    gps_antenna_to_front_axle_m: Annotated[Number, Field(ge=-50, le=50)]
+    """How far the antenna is behind the front axle, positive to the rear."""
+    cg_height_m: Annotated[Number, Field(gt=0, le=5)] | None = None
+    pitch_inertia_ratio: Annotated[Number, Field(gt=0, le=10)] = 1.0
+    """κ: the pitch inertia is κ·m_s·d_1·d_2."""
+    tyre_damping_ns_per_m: NotNegativePair = (0.0, 0.0)
+
+    total_mass_kg_spread: Spread = 0.01
+    wheelbase_m_spread: Spread = 0.002
+    front_axle_to_cg_m_spread: Spread = 0.15
+    suspension_damping_ns_per_m_spread: Spread = 0.15
+    suspension_stiffness_n_per_m_spread: Spread = 0.15
+    unsprung_mass_kg_spread: Spread = 0.15
+    tyre_stiffness_n_per_m_spread: Spread = 0.15
+    cg_height_m_spread: Spread = 0.15
+    pitch_inertia_ratio_spread: Spread = 0.15
+    tyre_damping_ns_per_m_spread: Spread = 0.15
+
+    @property
+    def sprung_mass_kg(self) -> float:
+        """Mass of the body: what is not axles and wheels."""
+        return self.total_mass_kg - sum(self.unsprung_mass_kg)
+
+    @property
+    def cg_to_rear_axle_m(self) -> float:
+        """Distance d_2 of the body's centre of gravity from the rear axle."""
+        return self.wheelbase_m - self.front_axle_to_cg_m
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Vehicle":
+        if self.front_axle_to_cg_m >= self.wheelbase_m:
+            raise _at(
+                "front_axle_to_cg_m",
+                f"is {self.front_axle_to_cg_m}, it must be a length less than wheelbase_m, "
+                f"{self.wheelbase_m} m",
+            )
+        if self.sprung_mass_kg <= 0:
+            raise _at(
+                "unsprung_mass_kg",
+                f"adds up to {sum(self.unsprung_mass_kg)}, it must be a mass less than "
+                f"total_mass_kg, {self.total_mass_kg} kg",
+            )
+        return self
+
+
+class Bridge(_Spreadable):
+    """A single span. Its ends are where the bearings are; elements are numbered from its start.
+
+    `flexural_rigidity_nm2` is the nominal (sound) value of every element;
+    `flexural_rigidity_per_element_nm2` takes its place where elements are not alike. If both are
+    given the values by element are the nominal ones and the single value is not used.
+    """
+
+    span_m: Annotated[Number, Field(gt=0, le=1000)]
+    start_latitude_deg: Latitude
+    start_longitude_deg: Longitude
+    end_latitude_deg: Latitude
+    end_longitude_deg: Longitude
+    elements: Annotated[int, Strict(), Field(ge=1, le=MAX_ELEMENTS)]
+    flexural_rigidity_nm2: Positive | None = None
+    mass_per_length_kg_per_m: Positive
+    rayleigh_alpha_per_s: NotNegative
+    rayleigh_beta_s: NotNegative
+    flexural_rigidity_per_element_nm2: tuple[Positive, ...] | None = None
+    element_lengths_m: tuple[Positive, ...] | None = None
+    support_rotational_stiffness_spread_nm_per_rad: Positive | None = None
+    baseline: Text | None = None
+    """Path of a results file, relative to the site file."""
+
+    flexural_rigidity_nm2_spread: Spread = 0.55
+    """Standard deviation of ln EI: 95 % within a factor of 3."""
+    mass_per_length_kg_per_m_spread: Spread = 0.1
+    rayleigh_alpha_per_s_spread: Spread = 0.5
+    rayleigh_beta_s_spread: Spread = 0.5
+
+    @property
+    def nominal_flexural_rigidity_nm2(self) -> tuple[float, ...]:
+        """EI of each element before the crossing."""
+        if self.flexural_rigidity_per_element_nm2 is not None:
+            return self.flexural_rigidity_per_element_nm2
+        assert self.flexural_rigidity_nm2 is not None  # noqa: S101 - the validator saw to it
+        return (self.flexural_rigidity_nm2,) * self.elements
+
+    @property
+    def lengths_m(self) -> tuple[float, ...]:
+        """Length of each element; they add up to the span."""
+        return self.element_lengths_m or (self.span_m / self.elements,) * self.elements
+
+    @property
+    def support_spread_nm_per_rad(self) -> float:
+        """Scale of the half-normal prior of the supports' rotational stiffness."""
+        if self.support_rotational_stiffness_spread_nm_per_rad is not None:
+            return self.support_rotational_stiffness_spread_nm_per_rad
+        return sum(self.nominal_flexural_rigidity_nm2) / self.elements / self.span_m
+
+    @property
+    def ends_distance_m(self) -> float:
+        """Distance of the ends by their coordinates, to 0.1 %."""
+        return _distance_m(
+            self.start_latitude_deg,
+            self.start_longitude_deg,
+            self.end_latitude_deg,
+            self.end_longitude_deg,
+        )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Bridge":
+        per_element = self.flexural_rigidity_per_element_nm2
+        if per_element is None and self.flexural_rigidity_nm2 is None:
+            raise _at(
+                "flexural_rigidity_nm2",
+                "is missing, give the sound bridge's flexural rigidity in N·m² "
+                "(or flexural_rigidity_per_element_nm2)",
+            )
+        for key, values in (
+            ("flexural_rigidity_per_element_nm2", per_element),
+            ("element_lengths_m", self.element_lengths_m),
+        ):
+            if values is not None and len(values) != self.elements:
+                raise _at(
+                    key,
+                    f"has {len(values)} values, it must have one for each of the "
+                    f"{self.elements} elements",
+                )
+        if self.element_lengths_m is not None:
+            total = math.fsum(self.element_lengths_m)
+            if not math.isclose(total, self.span_m, rel_tol=1e-3):
+                raise _at(
+                    "element_lengths_m",
+                    f"adds up to {total:g} m, it must add up to span_m, {self.span_m:g} m",
+                )
+        distance = self.ends_distance_m
+        if distance < 0.01:
+            raise _at(
+                "end_latitude_deg",
+                "and end_longitude_deg are the start's, the two ends must be different places",
+            )
+        if abs(self.span_m / distance - 1) > MAX_SPAN_DISAGREEMENT:
+            raise _at(
+                "span_m",
+                f"is {self.span_m:g} but the ends are {distance:.1f} m apart, "
+                "the span and the coordinates of the bearings must agree",
+            )
+        return self
+
+
+class Sensor(_Table):
+    """The accelerometers, in the order sprung front, sprung rear, unsprung front, unsprung rear."""
+
+    rate_hz: Rates
+    noise_density_ug_per_rthz: Densities
+    """One-sided; 0 for a simulation without noise."""
+    gravity_included: StrictBool = False
+    up: tuple[Sign, Sign, Sign, Sign] = (1, 1, 1, 1)
+    gain_spread: Spread = 0.01
+    """Between channels."""
+    delay_spread_s: Annotated[Number, Field(ge=0, le=1)] = 0.0005
+    common_gain_spread: Spread = 0.01
+
+
+class Receiver(_Table):
+    """The satellite receiver."""
+
+    position_spread_m: NotNegative = 1.5
+    """Of the slow error, the same during a crossing."""
+    position_noise_m: NotNegative = 0.4
+    speed_noise_m_per_s: NotNegative = 0.07
+    latency_s: Annotated[Number, Field(ge=-10, le=10)] = 0.0
+    latency_spread_s: Annotated[Number, Field(ge=0, le=10)] = 0.1
+
+
+class Site(_Table):
+    """Everything in a site file."""
+
+    vehicles: Annotated[tuple[Vehicle, ...], Field(alias="vehicle", min_length=1)]
+    bridges: Annotated[tuple[Bridge, ...], Field(alias="bridge", min_length=1)]
+    sensor: Sensor
+    receiver: Receiver = Receiver()
+
+    def vehicle(self, identifier: str) -> Vehicle:
+        """Return the vehicle of that id; KeyError if the site has none."""
+        return {v.id: v for v in self.vehicles}[identifier]
+
+    def bridge(self, identifier: str) -> Bridge:
+        """Return the bridge of that id; KeyError if the site has none."""
+        return {b.id: b for b in self.bridges}[identifier]
+
+    @model_validator(mode="after")
+    def _identifiers_are_unique(self) -> "Site":
+        lists: dict[str, tuple[_Spreadable, ...]] = {
+            "vehicle": self.vehicles,
+            "bridge": self.bridges,
+        }
+        for name, tables in lists.items():
+            seen: set[str] = set()
+            for index, table in enumerate(tables):
+                if table.id in seen:
+                    raise _at(f"{name}.{index}.id", f'is "{table.id}" again, ids must be unique')
+                seen.add(table.id)
+        return self
+
+
+def load_site(path: Path) -> Site:
+    """Read a site file; raise InputError with one line if it cannot be read or is wrong."""
+    return parse_site(read_site_text(path), str(path))
+
+
+def read_site_text(path: Path) -> str:
+    """Return the text of a site file; raise InputError if it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file, a site file (TOML) is expected") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8 text, a site file (TOML) is expected") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def parse_site(toml_text: str, source_name: str) -> Site:
+    """Return the site that the text describes; raise InputError that begins with `source_name`."""
+    try:
+        # TOML has no carriage return of its own; files from Windows do.
+        table = tomllib.loads(toml_text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"{source_name}: {_syntax(str(error))}") from error
+    single = {name for name in ("vehicle", "bridge") if isinstance(table.get(name), dict)}
+    for name in single:
+        table[name] = [table[name]]
+    try:
+        return Site.model_validate(table)
+    except ValidationError as error:
+        raise InputError(f"{source_name}: {_first_line(error, single)}") from error
+
+
+def site_hash(site: Site) -> str:
+    """Return 16 hex digits that change when any value changes, however the file is laid out."""
+    canonical = json.dumps(site.model_dump(by_alias=True), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+def site_toml(site: Site) -> str:
+    """Return a site file with every value spelt out; parsing it gives an equal site."""
+    vehicle = "[vehicle]" if len(site.vehicles) == 1 else "[[vehicle]]"
+    bridge = "[bridge]" if len(site.bridges) == 1 else "[[bridge]]"
+    tables: list[tuple[str, BaseModel]] = [(vehicle, table) for table in site.vehicles]
+    tables += [(bridge, table) for table in site.bridges]
+    return _toml([*tables, ("[sensor]", site.sensor), ("[receiver]", site.receiver)])
+
+
+def vehicle_toml(site: Site, vehicle_id: str) -> str:
+    """Return what a truck says of itself: the [vehicle], [sensor] and [receiver] parts."""
+    return _toml(
+        [
+            ("[vehicle]", site.vehicle(vehicle_id)),
+            ("[sensor]", site.sensor),
+            ("[receiver]", site.receiver),
+        ]
+    )
+
+
+def _toml(tables: list[tuple[str, BaseModel]]) -> str:
+    lines: list[str] = []
+    for heading, table in tables:
+        lines.append(heading)
+        for key, value in table.model_dump().items():
+            if value is not None:
+                # JSON's numbers, strings, booleans and lists are TOML's; DEL alone must be escaped.
+                text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+                lines.append(f"{key} = {text}")
+    return "\n".join(lines) + "\n"
+
+
+class _FieldError(ValueError):
+    """A wrong value found by looking at several fields: says which one to mend."""
+
+    def __init__(self, path: str, message: str) -> None:
+        super().__init__(message)
+        self.path = path
+
+
+def _at(path: str, message: str) -> _FieldError:
+    return _FieldError(path, message)
+
+
+def _syntax(message: str) -> str:
+    """Turn tomllib's message into ours: the line first."""
+    match = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|(end of document))\)", message)
+    if match is None:
+        return f"is not TOML: {message}"
+    if match[4]:
+        return f"last line: is not TOML: {match[1]}"
+    return f"line {match[2]}, column {match[3]}: is not TOML: {match[1]}"
+
+
+# The noun and the unit of a field, by the end of its name; longer endings first.
+_QUANTITIES: Final = (
+    ("_nm_per_rad", "a rotational stiffness", "N·m/rad"),
+    ("_ns_per_m", "a damping", "N·s/m"),
+    ("_n_per_m", "a stiffness", "N/m"),
+    ("_kg_per_m", "a mass per length", "kg/m"),
+    ("_ug_per_rthz", "a noise density", "µg/√Hz"),
+    ("_m_per_s", "a speed", "m/s"),
+    ("_per_s", "a coefficient", "1/s"),
+    ("_nm2", "a flexural rigidity", "N·m²"),
+    ("_spread", "a relative standard deviation", ""),
+    ("_kg", "a mass", "kg"),
+    ("_hz", "a rate", "Hz"),
+    ("_deg", "an angle", "degrees"),
+    ("_m", "a length", "m"),
+    ("_s", "a time", "s"),
+    ("elements", "a whole number", ""),
+)
+
+
+def _first_line(error: ValidationError, single: set[str]) -> str:
+    # A misspelt field is also a missing one: the spelling is what the user can see. And a list
+    # whose entry is wrong is counted by Pydantic as too short as well.
+    order = {"extra_forbidden": 0, "too_short": 2}
+    problems = sorted(error.errors(include_url=False), key=lambda p: order.get(p["type"], 1))
+    line = _describe(problems[0], single)
+    others = sum(p["type"] != "too_short" for p in problems) - 1
+    return f"{line} (and {others} more)" if others > 0 else line
+
+
+def _describe(problem: Any, single: set[str]) -> str:
+    location = list(problem["loc"])
+    context = problem.get("ctx", {})
+    cause = context.get("error")
+    if isinstance(cause, _FieldError):
+        location += [int(part) if part.isdigit() else part for part in cause.path.split(".")]
+        return f"{_path(location, single)} {cause}"
+    path = _path(location, single)
+    key = next((str(part) for part in reversed(location) if isinstance(part, str)), "")
+    if problem["type"] == "missing":
+        if len(location) == 1:
+            return f"the table [{path}] is missing"
+        what = _quantity(key)
+        return f"{path} is missing" + (f", it must be {what}" if what else "")
+    if problem["type"] == "extra_forbidden":
+        return f"{path} is not a known field, {_suggestion(key, len(location))}"
+    return f"{path} is {_shown(problem['input'])}, it must be {_expected(problem, key)}"
+
+
+def _suggestion(key: str, depth: int) -> str:
+    tables: tuple[type[BaseModel], ...] = (Vehicle, Bridge, Sensor, Receiver)
+    known = [name for table in tables for name in table.model_fields]
+    if depth == 1:
+        known = ["vehicle", "bridge", "sensor", "receiver"]
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.8)
+    return f"did you mean {close[0]}?" if close else "check its spelling or remove it"
+
+
+def _path(location: list[int | str], single: set[str]) -> str:
+    """Spell a place as the user typed it: no index where there was one table and no list."""
+    parts = list(_path_parts(location, single))
+    return "".join(parts).removeprefix(".") or "the file"
+
+
+def _path_parts(location: list[int | str], single: set[str]) -> Iterator[str]:
+    for position, part in enumerate(location):
+        if isinstance(part, int):
+            if position != 1 or location[0] not in single:
+                yield f"[{part}]"
+        else:
+            yield f".{part}"
+
+
+def _quantity(key: str, condition: str = "") -> str:
+    for ending, noun, unit in _QUANTITIES:
+        if key.endswith(ending):
+            return " ".join(part for part in (noun, condition or ("in" * bool(unit)), unit) if part)
+    return f"a number {condition}".strip() if condition else ""
+
+
+def _expected(problem: Any, key: str) -> str:
+    kind, context = problem["type"], problem.get("ctx", {})
+    conditions = {
+        "greater_than": ("greater than", "gt"),
+        "greater_than_equal": ("of at least", "ge"),
+        "less_than": ("less than", "lt"),
+        "less_than_equal": ("of at most", "le"),
+    }
+    if kind in conditions:
+        words, name = conditions[kind]
+        return _quantity(key, f"{words} {context[name]:g}")
+    if kind == "finite_number":
+        return ", ".join(part for part in (_quantity(key), "a finite number") if part)
+    if key == "id":
+        return (
+            'an identifier of a-z, 0-9, "_" and "-", at most 63, beginning with a letter or digit'
+        )
+    if kind in ("float_type", "int_type", "int_from_float"):
+        return _quantity(key) or "a number"
+    if kind in ("tuple_type", "too_short", "too_long"):
+        return _list_expected(problem, key)
+    messages = {
+        "bool_type": "true or false",
+        "string_type": "a text in quotation marks",
+        "literal_error": "1 or -1",
+        "model_type": "a table",
+        "model_attributes_type": "a table",
+    }
+    message: str = problem["msg"]
+    return messages.get(kind, message[:1].lower() + message[1:])
+
+
+def _list_expected(problem: Any, key: str) -> str:
+    if key in ("vehicle", "bridge"):
+        return f"a table [{key}] or several [[{key}]]"
+    if key in ("flexural_rigidity_per_element_nm2", "element_lengths_m"):
+        return "a list with one number for each element"
+    if key in Sensor.model_fields:
+        return "a list of four, in the order sprung front, sprung rear, unsprung front, rear"
+    return "a pair [front, rear]"
+
+
+def _shown(value: object) -> str:
+    """Show a value as TOML would, cut to fit a line."""
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except (TypeError, ValueError):
+        text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _distance_m(
+    latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float
+) -> float:
+    """Distance on the WGS 84 ellipsoid of places less than a few km apart."""
+    a, e2 = 6378137.0, 0.00669437999014
+    middle = math.radians((latitude_1 + latitude_2) / 2)
+    w = 1 - e2 * math.sin(middle) ** 2
+    north = math.radians(latitude_2 - latitude_1) * a * (1 - e2) / w**1.5
+    east = math.remainder(longitude_2 - longitude_1, 360)
+    return math.hypot(north, math.radians(east) * a * math.cos(middle) / math.sqrt(w))

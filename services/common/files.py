@@ -1,0 +1,85 @@
+"""Files that are whole or absent: written beside the target, synced, renamed."""
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from services.common.errors import FailureError, InputError
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Replace `path` by `content` (text as UTF-8): readers see the old file or the whole new one.
+
+    Raises InputError if nothing can be written there, FailureError if writing fails.
+    """
+    with replaced_atomically(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def replaced_atomically(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path` to write to; rename it when the block ends well.
+
+    The temporary name keeps the suffix, because writers choose the format by it. If the block
+    raises, the temporary file is removed and `path` stays as it was.
+    """
+    check_writable(path)
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    try:
+        try:
+            yield temporary
+            _sync(temporary)
+            temporary.replace(path)
+            _sync(path.parent)
+        except OSError as error:
+            raise FailureError(f"{path}: could not be written: {_reason(error)}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_writable(path: Path) -> None:
+    """Raise InputError if a file cannot be put at `path`. For use before hours of work."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, give the name of a file to write")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} does not exist, make it first")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: no permission to write in the folder {path.parent}")
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a UTF-8 file; raise InputError if that is not possible."""
+    return decode_text(path, read_bytes(path))
+
+
+def decode_text(path: Path, content: bytes) -> str:
+    """Return the text of UTF-8 bytes that came from `path`."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise InputError(f"{path}: line {line}: is not UTF-8 text") from error
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the bytes of a file; raise InputError if it is missing or unreadable."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {_reason(error)}") from error
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or type(error).__name__
