@@ -88,7 +88,7 @@ def _checked_time_ns(name: str, payload: bytes) -> int:
         case "foxglove.LocationFix":
             return signals.check_location(payload)
         case "driveby.v1.Event":
-            return events.decode_event(payload).time_ns
+            return signals.check_wall_time(events.decode_event(payload).time_ns)
     message = decode(name, payload)
     signals.check_version(getattr(message, "schema_version", 0))
     time_field = "created_ns" if name == "driveby.v1.Estimate" else "time_ns"
