@@ -1,0 +1,220 @@
+"""Dynamic response simulation (DRS): the bridge's deflection under wheels whose forces are known.
+
+For one time step Newmark's average acceleration on a mode of unit mass, q'' + c q' + lambda q = p,
+is the bilinear transform of its transfer function,
+
+    b_0 q[n] + b_1 q[n-1] + b_2 q[n-2] = p[n] + 2 p[n-1] + p[n-2],
+    b_0 = a^2 + a c + lambda,  b_1 = 2 (lambda - a^2),  b_2 = a^2 - a c + lambda,  a = 2/step,
+
+so that a mode costs a handful of multiplications a step. The recursion here is the direct form II,
+w[n] = p[n] - (b_1 w[n-1] + b_2 w[n-2])/b_0, q[n] = (w[n] + 2 w[n-1] + w[n-2])/b_0, with 1/b_0 split
+evenly into the mode shapes. It starts from rest before the first wheel arrives.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from pre_core.bridge import (
+    element_cubics,
+    element_mass,
+    mass_matrix,
+    uniform_beam,
+    unit_stiffness_matrices,
+)
+from pre_core.jacobi import diagonalise
+from pre_core.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store
+from pre_core.parameters import EI_1
+
+FloatArray = NDArray[np.float64]
+
+
+class BeamBasis(NamedTuple):
+    """What every evaluation shares: the beam in coordinates in which the sound one is diagonal.
+
+    `stiffness` (n + 2, m, m): dK/dEI_e and dK/dk_rot in coordinates that make the mass matrix of
+    1 kg/m the identity. `cubics` (n, 4, m): deflection in each element for each coordinate.
+    """
+
+    stiffness: FloatArray
+    cubics: FloatArray
+
+
+def beam_basis(element_lengths_m: FloatArray) -> BeamBasis:
+    """Coordinates: the modes of the uniform beam of the same mesh, all 2n of them."""
+    n = element_lengths_m.size
+    unit = uniform_beam(1.0, np.ones(n), 1.0, 0.0, 0.0)._replace(
+        element_lengths_m=element_lengths_m
+    )
+    units = unit_stiffness_matrices(element_lengths_m)
+    _, shapes = eigh(units[:n].sum(axis=0), mass_matrix(unit))
+    return BeamBasis(
+        np.ascontiguousarray(shapes.T @ units @ shapes),
+        np.ascontiguousarray(element_cubics(element_lengths_m, shapes)),
+    )
+
+
+class ModalWorkspace(NamedTuple):
+    """Work arrays of `modal_filters`; allocated once a thread, modified in place."""
+
+    matrix: FloatArray  # (m, m, 4)
+    vectors: FloatArray  # (m, m, 4)
+
+
+@kernel
+def modal_filters(
+    basis_stiffness: FloatArray,
+    basis_cubics: FloatArray,
+    theta: FloatArray,
+    step_s: float,
+    matrix: FloatArray,
+    vectors: FloatArray,
+    cubics: FloatArray,
+    feedback: FloatArray,
+) -> bool:
+    """Modes of four bridges as the coefficients of their recursions; False if not finite.
+
+    `theta` is (4, n + 15). Written: `cubics` (n, m, 4, 4) [element, mode, power, particle], scaled
+    by 1/sqrt(b_0), and `feedback` (m, 2, 4): -b_1/b_0 and -b_2/b_0.
+    """
+    factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
+    elements = factors - 2
+    rho = EI_1 + elements
+    for i in range(m):
+        for j in range(m):
+            for lane in range(LANES):
+                matrix[i, j, lane] = 0.0
+    for e in range(factors):
+        place = EI_1 + e if e < elements else rho + 3 + e - elements
+        for lane in range(LANES):
+            factor = theta[lane, place]
+            if factor != 0.0:
+                for i in range(m):
+                    for j in range(m):
+                        matrix[i, j, lane] += factor * basis_stiffness[e, i, j]
+    if not diagonalise(matrix, vectors):
+        return False
+    a = 2.0 / step_s
+    for k in range(m):
+        for lane in range(LANES):
+            eigenvalue = matrix[k, k, lane] / theta[lane, rho]
+            damping = theta[lane, rho + 1] + theta[lane, rho + 2] * eigenvalue
+            b_0 = a * a + a * damping + eigenvalue
+            feedback[k, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
+            feedback[k, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
+            matrix[k, k, lane] = 1.0 / np.sqrt(theta[lane, rho] * b_0)
+    for e in range(elements):
+        for k in range(m):
+            size = load(matrix[k], k)
+            for power in range(4):
+                total = (0.0, 0.0, 0.0, 0.0)
+                for i in range(m):
+                    total = fma_scalar(load(vectors[i], k), basis_cubics[e, power, i], total)
+                store(cubics[e, k], power, mul(total, size))
+    return True
+
+
+@kernel
+def _one_mode_two_wheels(
+    front: FloatArray,
+    rear: FloatArray,
+    feedback: FloatArray,
+    state: FloatArray,
+    front_place: FloatArray,
+    rear_place: FloatArray,
+    force: FloatArray,
+    deflection: FloatArray,
+) -> None:
+    a0, a1, a2, a3 = load(front, 0), load(front, 1), load(front, 2), load(front, 3)
+    b0, b1, b2, b3 = load(rear, 0), load(rear, 1), load(rear, 2), load(rear, 3)
+    f1, f2 = load(feedback, 0), load(feedback, 1)
+    w1, w2 = load(state, 0), load(state, 1)
+    before = add(w1, w2)
+    force_front, force_rear = force[0], force[1]
+    deflection_front, deflection_rear = deflection[0], deflection[1]
+    for n in range(front_place.size):
+        x = front_place[n]
+        z = rear_place[n]
+        a = fma_scalar(fma_scalar(fma_scalar(a3, x, a2), x, a1), x, a0)
+        b = fma_scalar(fma_scalar(fma_scalar(b3, z, b2), z, b1), z, b0)
+        p = fma(a, load(force_front, n), mul(b, load(force_rear, n)))
+        w = fma(f1, w1, fma(f2, w2, p))
+        after = add(w, w1)
+        q = add(after, before)
+        before = after
+        w2 = w1
+        w1 = w
+        store(deflection_front, n, fma(a, q, load(deflection_front, n)))
+        store(deflection_rear, n, fma(b, q, load(deflection_rear, n)))
+    store(state, 0, w1)
+    store(state, 1, w2)
+
+
+@kernel
+def _one_mode_one_wheel(
+    cubic: FloatArray,
+    feedback: FloatArray,
+    state: FloatArray,
+    wheel_place: FloatArray,
+    force: FloatArray,
+    deflection: FloatArray,
+) -> None:
+    a0, a1, a2, a3 = load(cubic, 0), load(cubic, 1), load(cubic, 2), load(cubic, 3)
+    f1, f2 = load(feedback, 0), load(feedback, 1)
+    w1, w2 = load(state, 0), load(state, 1)
+    before = add(w1, w2)
+    for n in range(wheel_place.size):
+        x = wheel_place[n]
+        a = fma_scalar(fma_scalar(fma_scalar(a3, x, a2), x, a1), x, a0)
+        w = fma(f1, w1, fma(f2, w2, mul(a, load(force, n))))
+        after = add(w, w1)
+        q = add(after, before)
+        before = after
+        w2 = w1
+        w1 = w
+        store(deflection, n, fma(a, q, load(deflection, n)))
+    store(state, 0, w1)
+    store(state, 1, w2)
+
+
+@kernel
+def advance(
+    front_cubics: FloatArray,
+    rear_cubics: FloatArray,
+    front_on: bool,
+    rear_on: bool,
+    feedback: FloatArray,
+    state: FloatArray,
+    front_place: FloatArray,
+    rear_place: FloatArray,
+    force: FloatArray,
+    deflection: FloatArray,
+) -> None:
+    """March all modes over a stretch in which each wheel stays in one element (or off the bridge).
+
+    Cubics are (m, 4, 4) of the element under each wheel, `feedback` and `state` (m, 2, 4), places
+    (steps,), `force` and `deflection` (2, steps, 4). `state` is updated and the deflections are
+    *added* to. What the fourth axis is (particles, or groups of modes) does not matter here.
+    """
+    for k in range(feedback.shape[0]):
+        if front_on and rear_on:
+            _one_mode_two_wheels(
+                front_cubics[k],
+                rear_cubics[k],
+                feedback[k],
+                state[k],
+                front_place,
+                rear_place,
+                force,
+                deflection,
+            )
+        elif front_on:
+            _one_mode_one_wheel(
+                front_cubics[k], feedback[k], state[k], front_place, force[0], deflection[0]
+            )
+        elif rear_on:
+            _one_mode_one_wheel(
+                rear_cubics[k], feedback[k], state[k], rear_place, force[1], deflection[1]
+            )

@@ -1,0 +1,71 @@
+"""Four numbers at once: the vocabulary of the vector kernels.
+
+A `Lanes` is a tuple of four floats, one for each of four particles (or four modes). Written this
+way, numba's compiler keeps each tuple in one 256-bit register, which it does not manage for short
+inner loops over arrays. All functions are inlined; none allocates.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Lanes = tuple[float, float, float, float]
+
+LANES = 4
+
+# Contraction allows fused multiply-add; no other reordering of the arithmetic is allowed, so that
+# results do not depend on how many particles are evaluated together.
+_options = {"fastmath": {"contract", "nsz"}, "error_model": "numpy", "cache": True, "nogil": True}
+kernel = njit(**_options)
+
+
+@kernel
+def load(a: FloatArray, i: int) -> Lanes:
+    """Row i of a (n, 4) array."""
+    return (a[i, 0], a[i, 1], a[i, 2], a[i, 3])
+
+
+@kernel
+def store(a: FloatArray, i: int, v: Lanes) -> None:
+    """Write row i of a (n, 4) array."""
+    a[i, 0] = v[0]
+    a[i, 1] = v[1]
+    a[i, 2] = v[2]
+    a[i, 3] = v[3]
+
+
+@kernel
+def add(a: Lanes, b: Lanes) -> Lanes:
+    """a + b."""
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3])
+
+
+@kernel
+def sub(a: Lanes, b: Lanes) -> Lanes:
+    """a - b."""
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3])
+
+
+@kernel
+def mul(a: Lanes, b: Lanes) -> Lanes:
+    """a b."""
+    return (a[0] * b[0], a[1] * b[1], a[2] * b[2], a[3] * b[3])
+
+
+@kernel
+def scale(a: Lanes, s: float) -> Lanes:
+    """a s, with one s for all lanes."""
+    return (a[0] * s, a[1] * s, a[2] * s, a[3] * s)
+
+
+@kernel
+def fma(a: Lanes, b: Lanes, c: Lanes) -> Lanes:
+    """a b + c."""
+    return (a[0] * b[0] + c[0], a[1] * b[1] + c[1], a[2] * b[2] + c[2], a[3] * b[3] + c[3])
+
+
+@kernel
+def fma_scalar(a: Lanes, s: float, c: Lanes) -> Lanes:
+    """a s + c, with one s for all lanes."""
+    return (a[0] * s + c[0], a[1] * s + c[1], a[2] * s + c[2], a[3] * s + c[3])

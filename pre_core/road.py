@@ -1,0 +1,182 @@
+"""Road profiles: made from an ISO 8608 class and a seed, felt through a tyre, and judged (IRI, class).
+
+ISO 8608 describes a profile by the displacement spectral density G_d(n) = G_d(n_0) (n/n_0)^-w,
+n_0 = 0.1 cycles/m, w = 2; class A has the geometric mean G_d(n_0) = 16e-6 m^3, each next class four
+times that.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.linalg import expm
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import welch
+
+from pre_core.simulate import Motion, WheelRoad, rear_position_m
+
+FloatArray = NDArray[np.float64]
+
+REFERENCE_CYCLES_PER_M = 0.1
+WAVINESS = 2.0
+CLASSES = "ABCDEFGH"
+GEOMETRIC_MEAN_M3 = {name: 16e-6 * 4.0**i for i, name in enumerate(CLASSES)}
+
+GOLDEN_CAR_SPEED_M_PER_S = 80.0 / 3.6
+GOLDEN_CAR_K1_PER_S2 = 653.0
+GOLDEN_CAR_K2_PER_S2 = 63.3
+GOLDEN_CAR_C_PER_S = 6.0
+GOLDEN_CAR_MU = 0.15
+_GOLDEN_CAR_BASE_M = 0.25  # moving average that stands for the tyre's contact patch
+_GOLDEN_CAR_START_M = 11.0  # length whose mean slope starts the filter
+
+
+class Profile(NamedTuple):
+    """Heights (n,) at the increasing chainages x (n,), evenly spaced."""
+
+    x_m: FloatArray
+    height_m: FloatArray
+
+
+def iso_8608_profile(
+    start_m: float,
+    stop_m: float,
+    spacing_m: float,
+    road_class: str,
+    seed: int,
+    *,
+    longest_wave_m: float = 100.0,
+    shortest_wave_m: float = 0.1,
+) -> Profile:
+    """A profile with the spectral density of an ISO 8608 class at its geometric mean.
+
+    A sum of harmonics of random phase whose amplitudes sqrt(2 G_d(n) dn) follow the density between
+    the longest and the shortest wave (shorter ones do not reach the vehicle through a tyre).
+    """
+    rng = np.random.default_rng(seed)
+    x = start_m + spacing_m * np.arange(round((stop_m - start_m) / spacing_m) + 1)
+    lowest = 1.0 / longest_wave_m
+    # Waves fit four times into the longest stretch asked for, so that no period is seen to repeat.
+    step = min(lowest, 1.0 / (4.0 * (x[-1] - x[0])))
+    n = np.arange(lowest, 1.0 / shortest_wave_m, step)
+    density = GEOMETRIC_MEAN_M3[road_class] * (n / REFERENCE_CYCLES_PER_M) ** -WAVINESS
+    amplitude = np.sqrt(2.0 * density * step)
+    phase = rng.uniform(0.0, 2.0 * np.pi, n.size)
+    height = np.zeros_like(x)
+    for block in np.array_split(np.arange(n.size), max(1, n.size // 64)):
+        height += np.sum(
+            amplitude[block] * np.cos(2.0 * np.pi * np.outer(x, n[block]) + phase[block]), axis=1
+        )
+    return Profile(x, height)
+
+
+def contact_patch_average(profile: Profile, length_m: float) -> Profile:
+    """The profile as a tyre feels it that stands on `length_m` of road."""
+    spacing = float(profile.x_m[1] - profile.x_m[0])
+    samples = max(1, round(length_m / spacing))
+    return profile._replace(
+        height_m=uniform_filter1d(profile.height_m, samples | 1, mode="nearest")
+    )
+
+
+def under_wheels(
+    profile: Profile, motion: Motion, wheelbase_m: float, direction: int
+) -> WheelRoad:
+    """Height and rate of change under both wheels, through a cubic spline of the profile.
+
+    Raises ValueError if the profile does not reach under both wheels all the way.
+    """
+    wheels = np.stack(
+        [motion.position_m, rear_position_m(motion.position_m, wheelbase_m, direction)], axis=1
+    )
+    tolerance = 1e-9
+    if wheels.min() < profile.x_m[0] - tolerance or wheels.max() > profile.x_m[-1] + tolerance:
+        raise ValueError(
+            f"the road from {profile.x_m[0]:.2f} m to {profile.x_m[-1]:.2f} m does not reach under "
+            f"the wheels, which drive from {wheels.min():.2f} m to {wheels.max():.2f} m"
+        )
+    spline = CubicSpline(profile.x_m, profile.height_m)
+    return WheelRoad(
+        np.asarray(spline(wheels)),
+        np.asarray(spline(wheels, 1)) * motion.speed_m_per_s[:, None],
+    )
+
+
+def golden_car_matrices(dx_m: float) -> tuple[FloatArray, FloatArray]:
+    """State transition (4, 4) and input (4,) of the quarter car of the IRI over one sample.
+
+    States are the slopes [z_s', z_s'', z_u', z_u''] of Sayers' formulation (World Bank Technical
+    Paper 46; ASTM E1926); the input is the slope of the profile, constant over the sample.
+    """
+    k1, k2, c, mu = (
+        GOLDEN_CAR_K1_PER_S2,
+        GOLDEN_CAR_K2_PER_S2,
+        GOLDEN_CAR_C_PER_S,
+        GOLDEN_CAR_MU,
+    )
+    a = np.array(
+        [
+            [0.0, 1.0, 0.0, 0.0],
+            [-k2, -c, k2, c],
+            [0.0, 0.0, 0.0, 1.0],
+            [k2 / mu, c / mu, -(k1 + k2) / mu, -c / mu],
+        ]
+    )
+    b = np.array([0.0, 0.0, 0.0, k1 / mu])
+    transition = expm(a * dx_m / GOLDEN_CAR_SPEED_M_PER_S)
+    gain = np.linalg.solve(a, (transition - np.eye(4)) @ b)
+    return transition, gain
+
+
+def iri_m_per_km(profile: Profile, segment_m: float | None = None) -> FloatArray:
+    """International Roughness Index of the profile, whole or per segment (m/km): (segments,).
+
+    Mean rectified slope of the golden car at 80 km/h (ASTM E1926). Slopes are taken over 0.25 m.
+    """
+    dx = float(profile.x_m[1] - profile.x_m[0])
+    reach = max(1, round(_GOLDEN_CAR_BASE_M / dx))
+    slope = (profile.height_m[reach:] - profile.height_m[:-reach]) / (reach * dx)
+    transition, gain = golden_car_matrices(dx)
+    start = min(slope.size, max(1, round(_GOLDEN_CAR_START_M / dx)))
+    first = (profile.height_m[start] if start < profile.height_m.size else profile.height_m[-1])
+    mean_slope = (first - profile.height_m[0]) / (start * dx)
+    state = np.array([mean_slope, 0.0, mean_slope, 0.0])
+    rectified = np.empty(slope.size)
+    for i in range(slope.size):
+        state = transition @ state + gain * slope[i]
+        rectified[i] = abs(state[0] - state[2])
+    if segment_m is None:
+        return np.array([1000.0 * rectified.mean()])
+    per_segment = max(1, round(segment_m / dx))
+    count = (slope.size + reach) // per_segment
+    return np.array(
+        [
+            1000.0 * rectified[i * per_segment : (i + 1) * per_segment].mean()
+            for i in range(max(1, count))
+        ]
+    )
+
+
+def roughness_coefficient_m3(
+    profile: Profile, band_cycles_per_m: tuple[float, float] = (0.05, 1.0)
+) -> float:
+    """G_d(n_0) of a profile: the level of a line of slope -2 fitted to its spectrum in the band."""
+    spacing = float(profile.x_m[1] - profile.x_m[0])
+    n, density = welch(
+        profile.height_m,
+        fs=1.0 / spacing,
+        nperseg=min(profile.height_m.size, round(100.0 / spacing)),
+        detrend="linear",
+    )
+    lowest = max(band_cycles_per_m[0], 2.0 / (profile.x_m[-1] - profile.x_m[0]))
+    band = (n >= lowest) & (n <= band_cycles_per_m[1])
+    levels = np.log(density[band]) + WAVINESS * np.log(n[band] / REFERENCE_CYCLES_PER_M)
+    # Lines of a periodogram crowd at short waves; weights 1/n give every octave the same say.
+    return float(np.exp(np.average(levels, weights=1.0 / n[band])))
+
+
+def iso_8608_class(coefficient_m3: float) -> str:
+    """Class of a roughness coefficient: limits lie a factor of 2 to both sides of the means."""
+    index = round(np.log(coefficient_m3 / GEOMETRIC_MEAN_M3["A"]) / np.log(4.0))
+    return CLASSES[int(np.clip(index, 0, len(CLASSES) - 1))]

@@ -1,0 +1,94 @@
+"""The half-car: a rigid body on two axles (paper section 2.1, Table 1), with free pitch inertia.
+
+Coordinates are the vertical displacements of the body above the axles and of the axles themselves,
+from the equilibrium on a flat road, up positive: z = [z_s1, z_s2, z_u1, z_u2].
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+FloatArray = NDArray[np.float64]
+Pair = tuple[float, float]
+
+
+class HalfCar(NamedTuple):
+    """Mechanical parameters; pairs are (front, rear)."""
+
+    body_mass_kg: float
+    front_axle_to_cg_m: float
+    wheelbase_m: float
+    suspension_damping_ns_per_m: Pair
+    suspension_stiffness_n_per_m: Pair
+    unsprung_mass_kg: Pair
+    tyre_stiffness_n_per_m: Pair
+    pitch_inertia_ratio: float = 1.0
+    """kappa in I = kappa m_s d_1 d_2; 1 makes front and rear independent, as the paper assumes."""
+    tyre_damping_ns_per_m: Pair = (0.0, 0.0)
+    bilinear_damping: float = 0.0
+    """b: dampers act with c (1 + b) in rebound and c (1 - b) in compression."""
+    cg_height_m: float = 0.0
+
+
+def total_mass_kg(car: HalfCar) -> float:
+    """M = m_s + m_u1 + m_u2."""
+    return car.body_mass_kg + car.unsprung_mass_kg[0] + car.unsprung_mass_kg[1]
+
+
+def body_masses_kg(car: HalfCar) -> tuple[float, float, float]:
+    """(m_11, m_22, m_12) of the body in the coordinates above the axles.
+
+    m_11 = (m_s d_2^2 + I)/D^2, m_22 = (m_s d_1^2 + I)/D^2, m_12 = (m_s d_1 d_2 - I)/D^2.
+    """
+    d_1 = car.front_axle_to_cg_m
+    d_2 = car.wheelbase_m - d_1
+    m_s = car.body_mass_kg
+    inertia = car.pitch_inertia_ratio * m_s * d_1 * d_2
+    square = car.wheelbase_m**2
+    return (
+        (m_s * d_2**2 + inertia) / square,
+        (m_s * d_1**2 + inertia) / square,
+        (m_s * d_1 * d_2 - inertia) / square,
+    )
+
+
+def static_axle_loads_n(car: HalfCar, gravity_m_per_s2: float) -> Pair:
+    """Weight on the front and on the rear axle of the standing truck."""
+    d_1 = car.front_axle_to_cg_m
+    d_2 = car.wheelbase_m - d_1
+    front = car.body_mass_kg * d_2 / car.wheelbase_m + car.unsprung_mass_kg[0]
+    rear = car.body_mass_kg * d_1 / car.wheelbase_m + car.unsprung_mass_kg[1]
+    return front * gravity_m_per_s2, rear * gravity_m_per_s2
+
+
+def matrices(car: HalfCar) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mass, damping and stiffness matrices (4, 4) in z = [z_s1, z_s2, z_u1, z_u2].
+
+    The bilinear part of the damping is not linear and is left out; it enters the simulation as a
+    force.
+    """
+    m_11, m_22, m_12 = body_masses_kg(car)
+    mass = np.diag([m_11, m_22, *car.unsprung_mass_kg])
+    mass[0, 1] = mass[1, 0] = m_12
+
+    def assemble(suspension: Pair, tyre: Pair) -> FloatArray:
+        return np.array(
+            [
+                [suspension[0], 0.0, -suspension[0], 0.0],
+                [0.0, suspension[1], 0.0, -suspension[1]],
+                [-suspension[0], 0.0, suspension[0] + tyre[0], 0.0],
+                [0.0, -suspension[1], 0.0, suspension[1] + tyre[1]],
+            ]
+        )
+
+    damping = assemble(car.suspension_damping_ns_per_m, car.tyre_damping_ns_per_m)
+    stiffness = assemble(car.suspension_stiffness_n_per_m, car.tyre_stiffness_n_per_m)
+    return mass, damping, stiffness
+
+
+def natural_frequencies_hz(car: HalfCar) -> FloatArray:
+    """The four undamped natural frequencies, ascending."""
+    mass, _, stiffness = matrices(car)
+    return np.asarray(np.sqrt(eigh(stiffness, mass, eigvals_only=True)) / (2.0 * np.pi))
