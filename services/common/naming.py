@@ -1,0 +1,19 @@
+"""Names that people and files give, as identifiers of keys."""
+
+import re
+
+from schemas.topics import check_identifier
+from services.common.errors import InputError
+
+
+def identifier_from(text: str) -> str:
+    """Return an identifier made of any text, e.g. of a file's name: `Run 3.mcap` → `run-3-mcap`."""
+    return re.sub(r"[^a-z0-9_-]+", "-", text.lower()).strip("-_")[:63] or "unnamed"
+
+
+def checked_identifier(text: str, option: str) -> str:
+    """Return the text if it is an identifier; else InputError that names the option."""
+    try:
+        return check_identifier(text)
+    except ValueError as error:
+        raise InputError(f"{option}: {error}") from error
