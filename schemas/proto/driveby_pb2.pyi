@@ -402,18 +402,20 @@ class Event(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., kind: _Optional[str] = ..., vehicle: _Optional[str] = ..., stream: _Optional[str] = ..., boot_id: _Optional[int] = ..., first_sequence: _Optional[int] = ..., last_sequence: _Optional[int] = ..., count: _Optional[int] = ..., text: _Optional[str] = ...) -> None: ...
 
 class DurableStream(_message.Message):
-    __slots__ = ("vehicle", "stream", "boot_id", "sequence", "count")
-    VEHICLE_FIELD_NUMBER: _ClassVar[int]
+    __slots__ = ("owner", "identifier", "stream", "boot_id", "sequence", "count")
+    OWNER_FIELD_NUMBER: _ClassVar[int]
+    IDENTIFIER_FIELD_NUMBER: _ClassVar[int]
     STREAM_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
-    vehicle: str
+    owner: str
+    identifier: str
     stream: str
     boot_id: int
     sequence: int
     count: int
-    def __init__(self, vehicle: _Optional[str] = ..., stream: _Optional[str] = ..., boot_id: _Optional[int] = ..., sequence: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...
+    def __init__(self, owner: _Optional[str] = ..., identifier: _Optional[str] = ..., stream: _Optional[str] = ..., boot_id: _Optional[int] = ..., sequence: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...
 
 class Durable(_message.Message):
     __slots__ = ("schema_version", "time_ns", "streams")

@@ -1,0 +1,251 @@
+"""Hosts the router and records everything that the topic table says is logged."""
+
+import logging
+import os
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import zenoh
+
+from schemas.events import Event, EventKind, encode_event
+from schemas.proto import driveby_pb2 as pb
+from schemas.signals import Identity
+from schemas.topics import PREFIX, Key, check_identifier, check_realm
+from services.common.bus import Publisher, Received, Subscription, open_session
+from services.common.errors import FailureError, InputError
+from services.common.files import read_text
+from services.common.playback import stopped_by_signals
+from services.common.recording import Message
+from services.logger.intake import Intake
+from services.logger.writer import FileWriter, Place, count_all
+
+__all__ = ["run"]
+
+_log = logging.getLogger(__name__)
+_ANNOUNCE_PERIOD_S = 0.1
+_REPORT_PERIOD_S = 1.0
+_HEALTH_PERIOD_S = 60.0
+_DRAIN_S = 3.0
+_GOODBYE_S = 0.2
+_EXIT_AT_ONCE = 130
+
+
+def run(
+    *,
+    listen: str,
+    folder: Path,
+    file: Path | None,
+    realm: str | None,
+    site: Path | None,
+    service_id: str = "logger",
+    ready: Callable[[], None] | None = None,
+) -> int:
+    """Record until SIGINT or SIGTERM, then finish the files; return 0, or 1 if anything was lost.
+
+    `listen` is where the Zenoh router that lives in this process listens, e.g.
+    `tcp/127.0.0.1:7447`. With `file` everything goes into that one file, else into
+    `folder/REALM/DATE/VEHICLE-TIME.mcap`; no file is ever overwritten. `realm` limits the
+    recording to one realm. The text of the site file `site` is put into every recording.
+    `ready` is called once, when messages can be received. A second signal ends the process at
+    once; the files stay readable.
+
+    InputError: a file that exists or cannot be made, a malformed endpoint, realm or site file.
+    FailureError: the address is in use, or writing failed (disk full).
+    """
+    place = Place(folder, file, _check_realm(realm), _read_site(site))
+    _check_service(service_id)
+    with stopped_by_signals(on_second=_leave_at_once) as stop, open_session(listen=listen) as bus:
+        writer = FileWriter(place)
+        try:
+            logger = _Logger(place, service_id, writer, Intake(realm, service_id, time.time_ns()))
+            _record(logger, bus, stop, ready)
+        except BaseException:
+            writer.finish("logger failed", {})
+            raise
+    if writer.failure is not None:
+        raise FailureError(writer.failure)
+    return 1 if writer.dropped else 0
+
+
+class _Logger(NamedTuple):
+    place: Place
+    service_id: str
+    writer: FileWriter
+    intake: Intake
+
+
+def _record(
+    logger: _Logger, bus: zenoh.Session, stop: threading.Event, ready: Callable[[], None] | None
+) -> None:
+    announcements = _Announcements(bus, logger)
+    subscription = Subscription(bus, f"{PREFIX}/{logger.place.realm or '*'}/**")
+    try:
+        if ready is not None:
+            ready()
+        next_report_s = time.monotonic()
+        while not stop.is_set() and logger.writer.failure is None:
+            received = subscription.receive(_ANNOUNCE_PERIOD_S)
+            if received is not None:
+                _take(logger, received)
+            if time.monotonic() >= next_report_s:
+                next_report_s = time.monotonic() + _REPORT_PERIOD_S
+                _report(logger, announcements, closing=False)
+        subscription.close()
+        deadline = time.monotonic() + _DRAIN_S
+        while time.monotonic() < deadline and (received := subscription.receive()) is not None:
+            _take(logger, received)
+        _report(logger, announcements, closing=True)
+        if logger.writer.failure is not None:
+            event = Event(EventKind.WRITE_ERROR, time.time_ns(), logger.writer.failure)
+            announcements.event(logger.place.realm or "live", event)
+        reason = "stopped by a signal"  # after a write error nothing is written any more
+        logger.writer.finish(reason, count_all(logger.intake.counts, logger.writer))
+    finally:
+        subscription.close()
+        announcements.close()
+
+
+def _take(logger: _Logger, received: Received) -> None:
+    message = logger.intake.take(received, time.time_ns())
+    if message is not None:
+        logger.writer.put(message)
+
+
+def _report(logger: _Logger, announcements: "_Announcements", *, closing: bool) -> None:
+    now_ns = time.time_ns()
+    for where, event in logger.intake.report(now_ns, time.monotonic(), closing=closing):
+        announcements.event(where.realm, event)
+    announcements.report_drops(now_ns)
+
+
+class _Announcements:
+    """What the logger itself says: `durable`, `event` and `health`, from a thread of its own.
+
+    A put to a congested connection blocks, which must hold up neither receiving nor writing.
+    """
+
+    def __init__(self, bus: zenoh.Session, logger: _Logger) -> None:
+        self._bus = bus
+        self._logger = logger
+        self._publishers: dict[str, Publisher] = {}
+        self._event_numbers: Counter[str] = Counter()
+        self._boot_id = logger.intake.own_boot_id
+        self._pending: list[tuple[str, bytes, Identity]] = []
+        self._lock = threading.Lock()
+        self._drops_told = 0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="announce", daemon=True)
+        self._thread.start()
+
+    def event(self, realm: str, event: Event) -> None:
+        """Write an event to the recording of the vehicle concerned, and publish it."""
+        _log.warning("%s: %s %s", event.kind, event.vehicle, event.text)
+        payload = encode_event(event)
+        identity = Identity(self._boot_id, self._event_numbers[realm])
+        self._event_numbers[realm] += 1
+        where = Key(realm, "service", self._logger.service_id, "event")
+        self._logger.writer.put(Message(where, payload, *identity, event.time_ns, event.time_ns))
+        with self._lock:
+            self._pending.append((realm, payload, identity))
+
+    def report_drops(self, now_ns: int) -> None:
+        """Write down how many messages found the queue full since the last call."""
+        dropped = self._logger.writer.dropped
+        if dropped > self._drops_told:
+            number = dropped - self._drops_told
+            text = f"{number} messages found the writer's queue full"
+            realm = self._logger.place.realm or "live"
+            self.event(realm, Event(EventKind.QUEUE_FULL, now_ns, text, messages=number))
+            self._drops_told = dropped
+
+    def close(self) -> None:
+        """Say the last words and stop."""
+        self._closing.set()
+        self._thread.join(timeout=_GOODBYE_S * 5)
+        time.sleep(_GOODBYE_S)  # a put only hands over; leave the connection time to send
+        for publisher in self._publishers.values():
+            publisher.close()
+
+    def _run(self) -> None:
+        version = -1
+        next_health_s = time.monotonic() + _HEALTH_PERIOD_S
+        while True:
+            closing = self._closing.wait(_ANNOUNCE_PERIOD_S)
+            self._publish_events()
+            if self._logger.writer.durable_version() != version:
+                version = self._publish_durable()
+            if closing or time.monotonic() >= next_health_s:
+                next_health_s = time.monotonic() + _HEALTH_PERIOD_S
+                self._publish_health()
+            if closing:
+                return
+
+    def _publisher(self, realm: str) -> Publisher:
+        publisher = self._publishers.get(realm)
+        if publisher is None:
+            publisher = self._publishers[realm] = Publisher(self._bus, realm, self._boot_id)
+        return publisher
+
+    def _publish_events(self) -> None:
+        with self._lock:
+            pending, self._pending = self._pending, []
+        for realm, payload, identity in pending:
+            name = self._logger.service_id
+            self._publisher(realm).put("service", name, "event", payload, identity)
+
+    def _publish_durable(self) -> int:
+        version, by_realm = self._logger.writer.durable()
+        for realm, message in by_realm.items():
+            message.time_ns = time.time_ns()
+            payload = message.SerializeToString(deterministic=True)
+            self._publisher(realm).put("service", self._logger.service_id, "durable", payload)
+        return version
+
+    def _publish_health(self) -> None:
+        writer = self._logger.writer
+        figures = count_all(self._logger.intake.counts, writer)
+        figures |= {"queue": writer.waiting(), "written": writer.written}
+        message = pb.Health(
+            schema_version=1,
+            time_ns=time.time_ns(),
+            service=self._logger.service_id,
+            ok=writer.failure is None and not writer.dropped,
+            figures={name: float(value) for name, value in figures.items()},
+            note=writer.failure or "",
+        )
+        realm = self._logger.place.realm or "live"
+        payload = message.SerializeToString(deterministic=True)
+        self._publisher(realm).put("service", self._logger.service_id, "health", payload)
+        _log.info("%s", ", ".join(f"{name} {value}" for name, value in figures.items()))
+
+
+def _check_realm(realm: str | None) -> str | None:
+    try:
+        return None if realm is None else check_realm(realm)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def _check_service(service_id: str) -> None:
+    try:
+        check_identifier(service_id)
+    except ValueError as error:
+        raise InputError(f"service: {error}") from None
+
+
+def _read_site(site: Path | None) -> str | None:
+    if site is None:
+        return None
+    from schemas.site import parse_site
+
+    text = read_text(site)
+    parse_site(text, str(site))
+    return text
+
+
+def _leave_at_once() -> None:
+    os._exit(_EXIT_AT_ONCE)

@@ -1,0 +1,247 @@
+"""The truck's gateway: puts what its sensors say on the bus. A recording can play the sensors.
+
+A driver of your own sensors does what `run` does, with its own batches:
+
+    with open_session(connect="tcp/127.0.0.1:7447", timeout_s=None) as session:
+        gateway = Gateway(session, "live", "truck-1")
+        gateway.info(Path("site.toml").read_text())
+        for samples in my_driver():                      # every 50 ms
+            channels = {"sprung_front": Channel(1000.0, samples)}
+            gateway.accel(channels, device_time_ns=..., wall_time_ns=...)
+        gateway.close()
+"""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from heapq import merge
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from schemas.signals import (
+    AccelBatch,
+    Channel,
+    GnssFix,
+    Identity,
+    VehicleInfo,
+    decode_accel,
+    decode_gnss,
+    decode_info,
+    encode_accel,
+    encode_gnss,
+    encode_info,
+    encode_location,
+    location_class,
+)
+from schemas.topics import Key, check_identifier, check_realm, key
+from services.common.bus import Delivery, Publisher, open_session
+from services.common.errors import InputError
+from services.common.playback import (
+    check_speed,
+    confirm,
+    play,
+    settle,
+    stopped_by_signals,
+)
+from services.common.recording import Message, read_messages
+
+__all__ = ["Gateway", "run"]
+
+_log = logging.getLogger(__name__)
+CONNECT_TIMEOUT_S = 10.0
+_NS_PER_S = 1_000_000_000
+
+
+class Gateway:
+    """Publishes one truck's messages with identities of this boot. May not be shared by threads."""
+
+    def __init__(self, session: zenoh.Session, realm: str, vehicle: str) -> None:
+        self.vehicle = check_identifier(vehicle)
+        self.publisher = Publisher(session, check_realm(realm))
+        self.delivery = Delivery(session, realm)
+        self._numbers: Counter[str] = Counter()
+        # There while this process runs: services see trucks come and go by it.
+        self._alive = session.liveliness().declare_token(key(realm, "vehicle", vehicle, "alive"))
+
+    def info(self, site_toml: str, *, device_time_ns: int, wall_time_ns: int) -> None:
+        """Say what the truck is: its parts of the site file. Late subscribers get it too."""
+        identity = self._next("info")
+        info = VehicleInfo(*identity, device_time_ns, wall_time_ns, self.vehicle, site_toml)
+        self._put("info", encode_info(info), identity)
+
+    def accel(
+        self, channels: dict[str, Channel], *, device_time_ns: int, wall_time_ns: int
+    ) -> None:
+        """Publish 50-100 ms of accelerations, m/s², up, without gravity; times of their first."""
+        identity = self._next("accel")
+        batch = AccelBatch(*identity, device_time_ns, wall_time_ns, channels)
+        self._put("accel", encode_accel(batch), identity)
+
+    def gnss(self, fix: GnssFix) -> None:
+        """Publish a fix, as `gnss` and as `location`; its boot_id and sequence are replaced."""
+        identity = self._next("gnss")
+        own = fix._replace(boot_id=identity.boot_id, sequence=identity.sequence)
+        self._put("gnss", encode_gnss(own), identity)
+        self._put("location", encode_location(own), self._next("location"))
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._alive.undeclare()  # type: ignore[no-untyped-call]
+        self.delivery.close()
+        self.publisher.close()
+
+    def _next(self, stream: str) -> Identity:
+        identity = Identity(self.publisher.boot_id, self._numbers[stream])
+        self._numbers[stream] += 1
+        return identity
+
+    def _put(self, stream: str, payload: bytes, identity: Identity) -> None:
+        self.publisher.put("vehicle", self.vehicle, stream, payload, identity)
+        self.delivery.sent(Key(self.publisher.realm, "vehicle", self.vehicle, stream), identity)
+
+
+def run(
+    *,
+    recording: Path,
+    endpoint: str,
+    realm: str,
+    speed: float,
+    vehicle: str | None,
+    connect_timeout_s: float | None = CONNECT_TIMEOUT_S,
+) -> int:
+    """Play one vehicle of a recording as a truck that drives now; return 0.
+
+    It is a new boot of that truck: new boot_id, sequences from 0, and times shifted as a whole
+    so that the recording ends now (at `speed` 1 or less: begins now). **Only the publication is
+    faster than real, not the data**: rates and the time between samples stay those of the
+    recording, because they are physics. Shifted to the end, no stamp lies in the future.
+
+    `vehicle` chooses one of several. Returns when a logger has everything on disk (see
+    `services.common.bus`). InputError: the recording is missing, is none, or holds no such
+    vehicle. FailureError: nobody answers at the endpoint within `connect_timeout_s` (None: wait
+    for ever), or the logger did not confirm everything.
+    """
+    check_speed(speed)
+    try:
+        check_realm(realm)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    streams = _read_vehicle(recording, vehicle)
+    with (
+        stopped_by_signals() as stop,
+        open_session(connect=endpoint, timeout_s=connect_timeout_s) as session,
+    ):
+        gateway = Gateway(session, realm, next(iter(streams.values()))[0].key.identifier)
+        try:
+            messages = _driven_now(streams, realm, gateway.publisher.boot_id, speed)
+            if not settle(gateway.publisher, [queue[0].key for queue in streams.values()]):
+                # A real truck drives on as well; its cache serves those who come late.
+                _log.warning("nobody subscribes to %s in realm %s yet", gateway.vehicle, realm)
+            sent = play(messages, gateway.publisher, gateway.delivery, speed=speed, stop=stop)
+            confirm(gateway.delivery, sent)
+            _log.info("%d messages of %s published in realm %s", sent, gateway.vehicle, realm)
+        finally:
+            gateway.close()
+    return 0
+
+
+def _read_vehicle(recording: Path, vehicle: str | None) -> dict[str, list[Message]]:
+    """Return the messages of one vehicle by stream, each stream in the order it was made."""
+    streams: dict[str, list[Message]] = {}
+    vehicles: set[str] = set()
+    for message in read_messages(recording):
+        if message.key.owner != "vehicle":
+            continue
+        vehicles.add(message.key.identifier)
+        if vehicle in (None, message.key.identifier):
+            streams.setdefault(message.key.stream, []).append(message)
+    names = ", ".join(sorted(vehicles)) or "no vehicle at all"
+    if not streams:
+        raise InputError(f"{recording}: no vehicle {vehicle!r}; it holds {names}")
+    if vehicle is None and len(vehicles) > 1:
+        raise InputError(f"{recording}: several vehicles; say which: {names}")
+    for messages in streams.values():
+        messages.sort(key=lambda message: (message.boot_id, message.sequence))
+    return streams
+
+
+def _driven_now(
+    streams: dict[str, list[Message]], realm: str, boot_id: int, speed: float
+) -> Iterator[Message]:
+    """Yield all streams merged by time, with the times and identities of a drive that is now."""
+    first_ns = min(message.log_time_ns for queue in streams.values() for message in queue)
+    last_ns = max(message.log_time_ns for queue in streams.values() for message in queue)
+    duration_ns = last_ns - first_ns
+    ahead_ns = 0  # by how much the last sample would run ahead of the clock
+    if speed == 0.0 or speed > 1.0:
+        ahead_ns = duration_ns - (round(duration_ns / speed) if speed else 0)
+    wall_shift_ns = time.time_ns() - first_ns - ahead_ns
+    device_start_ns = max(0, time.monotonic_ns() - ahead_ns)
+    device_shifts: dict[int, int] = {}
+    for index, message in _merged(streams.values()):
+        yield _restamped(
+            message,
+            Identity(boot_id, index),
+            realm,
+            wall_shift_ns,
+            device_start_ns + message.log_time_ns - first_ns,
+            device_shifts,
+        )
+
+
+def _merged(streams: Iterable[list[Message]]) -> Iterator[tuple[int, Message]]:
+    return merge(*(enumerate(queue) for queue in streams), key=lambda item: item[1].log_time_ns)
+
+
+def _restamped(
+    message: Message,
+    identity: Identity,
+    realm: str,
+    wall_shift_ns: int,
+    device_time_ns: int,
+    device_shifts: dict[int, int],
+) -> Message:
+    """Return the message as of another boot and time; samples, rates and positions untouched.
+
+    The device clock keeps its own intervals within a recorded boot: `device_shifts` holds what
+    to add to it, by recorded boot, decided by the first message of that boot.
+    """
+    wall_time_ns = message.log_time_ns + wall_shift_ns
+    times: dict[str, Any] = {
+        "boot_id": identity.boot_id,
+        "sequence": identity.sequence,
+        "wall_time_ns": wall_time_ns,
+    }
+
+    def device(recorded_ns: int) -> int:
+        shift_ns = device_shifts.setdefault(message.boot_id, device_time_ns - recorded_ns)
+        return max(0, recorded_ns + shift_ns)
+
+    match message.key.stream:
+        case "accel":
+            batch = decode_accel(message.payload)
+            times["device_time_ns"] = device(batch.device_time_ns)
+            payload = encode_accel(batch._replace(**times))
+        case "gnss":
+            fix = decode_gnss(message.payload)
+            times["device_time_ns"] = device(fix.device_time_ns)
+            payload = encode_gnss(fix._replace(**times))
+        case "info":
+            info = decode_info(message.payload)
+            times["device_time_ns"] = device(info.device_time_ns)
+            payload = encode_info(info._replace(**times))
+        case _:
+            location: Any = location_class().FromString(message.payload)
+            seconds, nanoseconds = divmod(wall_time_ns, _NS_PER_S)
+            location.timestamp.seconds, location.timestamp.nanos = seconds, nanoseconds
+            payload = location.SerializeToString(deterministic=True)
+    return Message(
+        message.key._replace(realm=realm),
+        payload,
+        *identity,
+        wall_time_ns,
+        message.publish_time_ns,
+    )

@@ -1,0 +1,520 @@
+"""The bus: Zenoh sessions, publishers that keep what they sent, subscribers that fetch again.
+
+For a service it comes down to
+
+    with open_session(connect=endpoint, timeout_s=10) as session:
+        with Subscription(session, selector("live", "vehicle")) as vehicles:
+            publisher = Publisher(session, "live")
+            while not stop:
+                received = vehicles.receive(0.2)      # None after 0.2 s of silence
+                if received is not None:
+                    ...
+                    publisher.put("bridge", bridge, "estimate", estimate.SerializeToString())
+            publisher.close()
+
+How nothing is lost. Publishers block instead of dropping, keep their last messages (the topic
+table says how many) and announce the number of the last one twice a second. A subscriber asks for
+the history of every publisher that it meets and for every number that it misses. That alone loses
+a gap now and then when router and subscriber die together, so a thread asks once more for every
+gap that has lasted (`facts.md`). What comes twice that way is told by its identity; a subscriber
+that must not see anything twice uses `Seen`.
+
+How a publisher knows that its messages arrived. A put returns when Zenoh has it, no more. Loggers
+publish on `durable` how many messages of each stream and boot are on their disk, after fsync:
+`Delivery` waits for that. Where no logger answers, `LINGER_S` leaves subscribers the time for two
+announcements and the queries that follow from them.
+"""
+
+import json
+import logging
+import queue
+import re
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import zenoh
+from zenoh import ext, handlers
+
+from schemas.messages import decode
+from schemas.proto import driveby_pb2 as pb
+from schemas.signals import Identity, decode_identity, encode_identity
+from schemas.topics import TOPICS, Key, key, parse_key, selector, topic
+from services.common.errors import FailureError, InputError
+from services.common.intervals import Intervals
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+LINGER_S = 1.5
+"""Two heartbeats and the time to answer the queries that they cause."""
+
+_log = logging.getLogger(__name__)
+_ENDPOINT = re.compile(r"(tcp|tls|quic|ws|unixsock-stream)/\S+")
+_HEARTBEAT_S = 0.5
+_IDLE_POLL_S = 0.005
+_GAP_PATIENCE_S = 0.5
+_GAP_TRIES = 3
+_GAP_QUERY_TIMEOUT_S = 5.0
+_MAX_HOLES_PER_ROUND = 100
+
+
+class Received(NamedTuple):
+    """A message as it came from the bus; nothing of it has been checked yet.
+
+    `key_text` may be any key, `attachment` may be missing: see `checked`.
+    """
+
+    key_text: str
+    payload: bytes
+    attachment: bytes | None
+    recovered: bool
+    """It was missing and has been asked for."""
+
+    def identity(self) -> Identity:
+        """Return (boot_id, sequence); ValueError if the attachment is missing or malformed."""
+        return decode_identity(self.attachment)
+
+    def key(self) -> Key:
+        """Return the key taken apart; ValueError if it is not in the topic table."""
+        return parse_key(self.key_text)
+
+
+def open_session(
+    *, connect: str | None = None, listen: str | None = None, timeout_s: float | None = None
+) -> zenoh.Session:
+    """Open a session: a client of the router at `connect`, or a router that listens at `listen`.
+
+    A client waits `timeout_s` (None: for ever) for the router and connects again by itself
+    whenever the connection is lost. It must be closed, or the process does not end; it is a
+    context manager. InputError for a malformed endpoint, FailureError if nobody answers in time
+    or the address cannot be listened at.
+    """
+    if (connect is None) == (listen is None):
+        raise ValueError("either connect or listen")
+    endpoint = _check_endpoint(connect or listen or "")
+    config = zenoh.Config()
+    settings: dict[str, Any] = {
+        "mode": "client" if connect else "router",
+        "connect/endpoints": [endpoint] if connect else [],
+        "listen/endpoints": [endpoint] if listen else [],
+        "connect/timeout_ms": -1 if timeout_s is None else round(timeout_s * 1000),
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 500,
+            "period_increase_factor": 2,
+        },
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "timestamping/enabled": True,
+    }
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        _log.debug("zenoh: %s", error)
+        if connect:
+            raise FailureError(
+                f"no router answers at {endpoint} within {timeout_s:g} s; "
+                "start `driveby logger` first or give another endpoint"
+            ) from None
+        raise FailureError(f"cannot listen at {endpoint}: {_first_sentence(error)}") from None
+
+
+class Publisher:
+    """Publishes messages of the topic table in one realm, each with its identity.
+
+    A publisher of Zenoh is declared at the first put to a key and kept until `close()`. May be
+    used from several threads.
+    """
+
+    def __init__(self, session: zenoh.Session, realm: str, boot_id: int | None = None) -> None:
+        self.realm = realm
+        self.boot_id = time.time_ns() if boot_id is None else boot_id
+        """The start of this process unless given: higher after every restart."""
+        self._session = session
+        self._publishers: dict[str, ext.AdvancedPublisher] = {}
+        self._next_sequence: Counter[str] = Counter()
+        self._latest: dict[str, tuple[bytes, bytes]] = {}
+        self._queryables: list[zenoh.Queryable[None]] = []
+        self._lock = threading.Lock()
+
+    def put(
+        self,
+        owner: str,
+        identifier: str,
+        stream: str,
+        payload: bytes,
+        identity: Identity | None = None,
+    ) -> Identity:
+        """Publish one message and return its identity.
+
+        Without `identity` it gets this publisher's boot_id and the next sequence of its key,
+        beginning at 0. Blocks while the connection is congested. Of a latched topic the last
+        message is kept for late subscribers and answers `session.get(key)`.
+        ValueError if the key is not in the table or the payload larger than it allows.
+        """
+        where = key(self.realm, owner, identifier, stream)
+        row = topic(owner, stream)
+        if not row.message or len(payload) > row.max_bytes:
+            raise ValueError(f"{where}: {len(payload)} bytes; at most {row.max_bytes}")
+        with self._lock:
+            if identity is None:
+                identity = Identity(self.boot_id, self._next_sequence[where])
+                self._next_sequence[where] += 1
+            attachment = encode_identity(*identity)
+            publisher = self._declare(where)
+            if row.latched:
+                self._latest[where] = (payload, attachment)
+            # Within the lock, or two threads could send two messages in the wrong order.
+            publisher.put(payload, attachment=attachment)
+        return identity
+
+    def declare(self, owner: str, identifier: str, stream: str) -> None:
+        """Declare the publisher of a key before its first message.
+
+        Subscribers ask a new publisher for its history; doing so before the data flow keeps the
+        streams of one truck in step with each other from the first message on.
+        """
+        with self._lock:
+            self._declare(key(self.realm, owner, identifier, stream))
+
+    def wait_for_subscriber(
+        self, owner: str, identifier: str, stream: str, timeout_s: float
+    ) -> bool:
+        """Wait until somebody subscribes to a key; False if nobody did in time."""
+        probe = self._session.declare_publisher(key(self.realm, owner, identifier, stream))
+        try:
+            deadline = time.monotonic() + timeout_s
+            while not _matches(probe):
+                if time.monotonic() >= deadline:
+                    return False
+                time.sleep(_IDLE_POLL_S)
+            return True
+        finally:
+            probe.undeclare()  # type: ignore[no-untyped-call]
+
+    def close(self) -> None:
+        """Undeclare all; what was put and not yet fetched is lost (see `Delivery`)."""
+        with self._lock:
+            for queryable in self._queryables:
+                queryable.undeclare()  # type: ignore[no-untyped-call]
+            for publisher in self._publishers.values():
+                publisher.undeclare()  # type: ignore[no-untyped-call]
+            self._queryables.clear()
+            self._publishers.clear()
+
+    def _declare(self, where: str) -> ext.AdvancedPublisher:
+        publisher = self._publishers.get(where)
+        if publisher is None:
+            parsed = parse_key(where)
+            row = topic(parsed.owner, parsed.stream)
+            publisher = self._publishers[where] = _declare_publisher(self._session, where)
+            if row.latched:
+                self._queryables.append(
+                    self._session.declare_queryable(where, self._answer, complete=True)
+                )
+        return publisher
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            where = str(query.key_expr)
+            for name, (payload, attachment) in list(self._latest.items()):
+                if name == where or zenoh.KeyExpr(where).includes(name):
+                    query.reply(name, payload, attachment=attachment)
+
+
+class Subscription:
+    """Receives all messages under a key expression, old ones of living publishers first.
+
+    A message may come twice (after a reconnection) and recovered ones come late: `Seen` tells
+    duplicates, and the sequence orders a stream. One thread receives.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key_expression: str,
+        *,
+        capacity: int | None = None,
+    ) -> None:
+        """Subscribe; `capacity` messages may wait (default: the largest of the topic table).
+
+        More would make the publishers wait, and after 5 s Zenoh cuts the connection: receive
+        quickly and do long work in another thread.
+        """
+        self._session = session
+        self._fetched: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        self._sources: dict[tuple[str, str, str], _Source] = {}
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self.fetched = 0
+        """Messages that the gap query brought."""
+        self._subscriber = ext.declare_advanced_subscriber(
+            session,
+            key_expression,
+            handlers.FifoChannel(capacity or max(row.queue for row in TOPICS)),
+            history=ext.HistoryConfig(detect_late_publishers=True),
+            recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )
+        self._handler = self._subscriber.handler
+        self._filler = threading.Thread(target=self._fill_gaps, name="gap-fill", daemon=True)
+        self._filler.start()
+
+    def receive(self, timeout_s: float = 0.0) -> Received | None:
+        """Return the next message, or None if none came within `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            received = self._next()
+            if received is not None:
+                return received
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                return None
+            time.sleep(min(_IDLE_POLL_S, left_s))
+
+    def close(self) -> None:
+        """Stop receiving; what has already come can still be had from `receive`."""
+        if not self._closing.is_set():
+            self._closing.set()
+            self._filler.join()
+            self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _next(self) -> Received | None:
+        try:
+            sample = self._handler.try_recv()
+        except zenoh.ZError:  # closed and empty
+            sample = None
+        recovered = False
+        if sample is None:
+            if self._fetched.empty():
+                return None
+            sample, recovered = self._fetched.get(), True
+            self.fetched += 1
+        self._note(sample)
+        attachment = sample.attachment
+        return Received(
+            str(sample.key_expr),
+            sample.payload.to_bytes(),
+            None if attachment is None else attachment.to_bytes(),
+            recovered,
+        )
+
+    def _note(self, sample: zenoh.Sample) -> None:
+        """Remember the publisher's own numbering of the sample, which shows what is missing."""
+        source = sample.source_info
+        if source is None:
+            return
+        name = (str(sample.key_expr), str(source.source_id.zid), str(source.source_id.eid))
+        with self._lock:
+            self._sources.setdefault(name, _Source()).numbers.add(source.source_sn)
+
+    def _fill_gaps(self) -> None:
+        while not self._closing.wait(_GAP_PATIENCE_S):
+            for name, hole in self._due_holes():
+                if self._closing.is_set():
+                    return
+                try:
+                    self._fetch(name, hole)
+                except zenoh.ZError as error:  # the session is closing or the router away
+                    _log.debug("gap query for %s: %s", name[0], error)
+
+    def _due_holes(self) -> list[tuple[tuple[str, str, str], tuple[int, int]]]:
+        """Return holes that have lasted a round and were not asked for too often."""
+        due = []
+        with self._lock:
+            for name, source in self._sources.items():
+                holes = source.numbers.holes_from_zero()
+                tries = {hole: source.tries.get(hole, -1) + 1 for hole in holes}
+                source.tries = tries
+                due += [(name, hole) for hole, n in tries.items() if 0 < n <= _GAP_TRIES]
+        return due[:_MAX_HOLES_PER_ROUND]
+
+    def _fetch(self, name: tuple[str, str, str], hole: tuple[int, int]) -> None:
+        where, zid, eid = name
+        replies = self._session.get(
+            f"{where}/@adv/pub/{zid}/{eid}/**?_sn={hole[0]}..{hole[1]}",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=_GAP_QUERY_TIMEOUT_S,
+        )
+        for reply in replies:
+            sample = reply.ok
+            if sample is not None:
+                self._fetched.put(sample)
+
+
+class Seen:
+    """Which messages have been seen, by identity; its memory grows with gaps, not with time."""
+
+    def __init__(self) -> None:
+        self.streams: dict[tuple[Key, int], Intervals] = {}
+        """By (key, boot_id)."""
+
+    def add(self, where: Key, identity: Identity) -> bool:
+        """Note a message; False if it had been seen before."""
+        name = (where, identity.boot_id)
+        numbers = self.streams.get(name)
+        if numbers is None:
+            numbers = self.streams[name] = Intervals()
+        return numbers.add(identity.sequence)
+
+
+class Delivery:
+    """Follows what loggers of a realm have on disk, so that a publisher knows when it may leave."""
+
+    def __init__(self, session: zenoh.Session, realm: str) -> None:
+        self.realm = realm
+        self._sent: Counter[tuple[str, str, str, int]] = Counter()
+        self._durable: dict[str, dict[tuple[str, str, str, int], int]] = {}
+        self._subscription = Subscription(session, selector(realm, "service", "durable"))
+
+    def sent(self, where: Key, identity: Identity) -> None:
+        """Count a message that was published; every identity once."""
+        self._sent[(where.owner, where.identifier, where.stream, identity.boot_id)] += 1
+
+    @property
+    def has_logger(self) -> bool:
+        """Whether any logger has spoken yet."""
+        return bool(self._durable)
+
+    def missing(self) -> int:
+        """Return how many sent messages the logger that has most of them does not have yet."""
+        self._read()
+        by_logger = [
+            sum(max(0, number - durable.get(name, 0)) for name, number in self._sent.items())
+            for durable in self._durable.values()
+        ]
+        return min(by_logger, default=self._sent.total())
+
+    def wait(self, timeout_s: float, most_missing: int = 0) -> int:
+        """Wait until at most so many messages are not on disk; return how many are not.
+
+        Where no logger has spoken within `LINGER_S`, it waits no longer: subscribers have had
+        the time to ask for what they missed.
+        """
+        began = time.monotonic()
+        while (missing := self.missing()) > most_missing:
+            waited_s = time.monotonic() - began
+            if waited_s >= timeout_s or (waited_s >= LINGER_S and not self.has_logger):
+                break
+            time.sleep(_IDLE_POLL_S)
+        return missing
+
+    def close(self) -> None:
+        """Stop following."""
+        self._subscription.close()
+
+    def _read(self) -> None:
+        while (received := self._subscription.receive()) is not None:
+            try:
+                message = decode("driveby.v1.Durable", received.payload)
+                service = received.key().identifier
+            except ValueError as error:
+                _log.warning("durable: %s", error)
+                continue
+            if isinstance(message, pb.Durable):
+                self._durable[service] = {
+                    (s.owner, s.identifier, s.stream, s.boot_id): s.count for s in message.streams
+                }
+
+
+def subscribe_latest(
+    session: zenoh.Session, key_expression: str, capacity: int = 100
+) -> Iterator[Received | None]:
+    """Yield the newest messages for a live display, and None whenever there is none at the time.
+
+    It never holds anybody up: of more than `capacity` waiting messages the oldest are dropped.
+    The consumer decides how long to sleep on None; closing the generator ends the subscription.
+    """
+    subscriber = ext.declare_advanced_subscriber(
+        session,
+        key_expression,
+        handlers.RingChannel(capacity),
+        history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+    )
+    try:
+        while True:
+            sample = subscriber.try_recv()
+            if sample is None:
+                yield None
+                continue
+            attachment = sample.attachment
+            yield Received(
+                str(sample.key_expr),
+                sample.payload.to_bytes(),
+                None if attachment is None else attachment.to_bytes(),
+                False,
+            )
+    finally:
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def get_latest(session: zenoh.Session, key_expression: str, timeout_s: float = 5.0) -> list[bytes]:
+    """Ask for the last message of every latched topic under a key expression; their payloads."""
+    replies = session.get(key_expression, target=zenoh.QueryTarget.ALL, timeout=timeout_s)
+    samples = [reply.ok for reply in replies]
+    return [sample.payload.to_bytes() for sample in samples if sample is not None]
+
+
+class _Source:
+    """One publisher of Zenoh: its own numbers that came, and how often holes were asked for."""
+
+    def __init__(self) -> None:
+        self.numbers = Intervals()
+        self.tries: dict[tuple[int, int], int] = {}
+
+
+def _declare_publisher(session: zenoh.Session, where: str) -> ext.AdvancedPublisher:
+    parsed = parse_key(where)
+    row = topic(parsed.owner, parsed.stream)
+    reliable = row.delivery == "reliable"
+    block, drop = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
+    return ext.declare_advanced_publisher(
+        session,
+        where,
+        encoding=zenoh.Encoding("application/protobuf").with_schema(row.message),
+        congestion_control=block if reliable else drop,
+        reliability=zenoh.Reliability.RELIABLE,
+        cache=ext.CacheConfig(
+            row.cache, replies_config=ext.RepliesConfig(congestion_control=block)
+        ),
+        sample_miss_detection=ext.MissDetectionConfig(
+            heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
+        ),
+        publisher_detection=True,
+    )
+
+
+def _matches(publisher: zenoh.Publisher) -> bool:
+    # An object with a flag, which is always true itself; the type stubs call it a bool.
+    status: Any = publisher.matching_status
+    return bool(getattr(status, "matching", status))
+
+
+def _check_endpoint(endpoint: str) -> str:
+    if not _ENDPOINT.fullmatch(endpoint):
+        raise InputError(
+            f"endpoint {endpoint!r}: PROTOCOL/HOST:PORT is expected, e.g. {DEFAULT_ENDPOINT}"
+        )
+    return endpoint
+
+
+def _first_sentence(error: Exception) -> str:
+    """Return what a user can read of an error of Zenoh: without the places in its source."""
+    return re.split(r" at /|\[", str(error), maxsplit=1)[0].strip()
