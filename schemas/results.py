@@ -280,12 +280,11 @@ def estimate_to_crossing(message: pb.Estimate) -> tuple[Crossing, Header]:
     if message.schema_version != SCHEMA_VERSION:
         raise ValueError(f"Estimate has schema version {message.schema_version}, not 1")
     try:
-        settings = json.loads(message.settings_json)
         header = Header(
             version=message.version,
-            created=message.created_ns / 1e9,
+            created=_seconds(message.created_ns),
             site_hash=message.site_hash,
-            settings=settings,
+            settings=_settings(message.settings_json),
             seed=message.seed,
             program=message.program,
         )
@@ -355,8 +354,8 @@ def _crossing(message: pb.Estimate) -> Crossing:
         "vehicle": message.vehicle,
         "bridge": message.bridge,
         "direction": direction_from_protobuf(message.direction),
-        "entry_time": message.entry_time_ns / 1e9,
-        "exit_time": message.exit_time_ns / 1e9,
+        "entry_time": _seconds(message.entry_time_ns),
+        "exit_time": _seconds(message.exit_time_ns),
         "speed_m_per_s": message.speed_m_per_s,
         "method": message.method,
         "certificate": message.certificate or None,
@@ -374,6 +373,16 @@ def _crossing(message: pb.Estimate) -> Crossing:
         "road": _road(message.road) if message.HasField("road") else None,
     }
     return Crossing.model_validate(values)
+
+
+def _settings(text: str) -> dict[str, JsonValue]:
+    try:
+        settings = json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"Estimate: settings_json: {error}") from error
+    if not isinstance(settings, dict):
+        raise ValueError("Estimate: settings_json: an object is expected")
+    return settings
 
 
 def _parameter_to_protobuf(parameter: Parameter) -> pb.Parameter:
@@ -432,6 +441,10 @@ def _road(message: pb.RoadResult) -> dict[str, object]:
         "iri_m_per_km": message.iri_m_per_km if message.HasField("iri_m_per_km") else None,
         "iso_class": message.iso_class or None,
     }
+
+
+def _seconds(nanoseconds: int) -> float:
+    return nanoseconds / 1_000_000_000  # of two integers: rounded once, where / 1e9 rounds twice
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -306,7 +306,7 @@ def parse_site(toml_text: str, source_name: str) -> Site:
         # TOML has no carriage return of its own; files from Windows do.
         table = tomllib.loads(toml_text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"{source_name}: {_syntax(str(error))}") from error
+        raise InputError(f"{source_name}: {_syntax(str(error), toml_text)}") from error
     single = {name for name in ("vehicle", "bridge") if isinstance(table.get(name), dict)}
     for name in single:
         table[name] = [table[name]]
@@ -366,13 +366,13 @@ def _at(path: str, message: str) -> _FieldError:
     return _FieldError(path, message)
 
 
-def _syntax(message: str) -> str:
+def _syntax(message: str, text: str) -> str:
     """Turn tomllib's message into ours: the line first."""
     match = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|(end of document))\)", message)
     if match is None:
         return f"is not TOML: {message}"
     if match[4]:
-        return f"last line: is not TOML: {match[1]}"
+        return f"line {len(text.splitlines())}: is not TOML: {match[1]} before the end of the file"
     return f"line {match[2]}, column {match[3]}: is not TOML: {match[1]}"
 
 
@@ -426,10 +426,19 @@ def _describe(problem: Any, single: set[str]) -> str:
 
 
 def _suggestion(key: str, depth: int) -> str:
-    tables: tuple[type[BaseModel], ...] = (Vehicle, Bridge, Sensor, Receiver)
-    known = [name for table in tables for name in table.model_fields]
+    tables: dict[str, type[BaseModel]] = {
+        "vehicle": Vehicle,
+        "bridge": Bridge,
+        "sensor": Sensor,
+        "receiver": Receiver,
+    }
     if depth == 1:
-        known = ["vehicle", "bridge", "sensor", "receiver"]
+        known = list(tables)
+    else:
+        for name, table in tables.items():
+            if key in table.model_fields:
+                return f"it belongs into [{name}]"
+        known = [field for table in tables.values() for field in table.model_fields]
     close = difflib.get_close_matches(key, known, n=1, cutoff=0.8)
     return f"did you mean {close[0]}?" if close else "check its spelling or remove it"
 

@@ -1,0 +1,28 @@
+"""What several tests need."""
+
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def project() -> Path:
+    """The root of the repository."""
+    return PROJECT
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder with data that is not in the repository; skips where it is absent."""
+    folder = PROJECT.parent / "shared"
+    if not folder.is_dir():
+        pytest.skip("the folder ../shared with reference data and recordings is not there")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def csv_example() -> Path:
+    """A small folder with accel_00.csv, gps_00.csv and site.toml (tests/data)."""
+    return PROJECT / "tests" / "data" / "csv_example"

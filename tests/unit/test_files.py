@@ -1,0 +1,98 @@
+"""Files are whole or absent."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from services.common.errors import FailureError, InputError
+from services.common.files import (
+    check_writable,
+    read_bytes,
+    read_text,
+    replaced_atomically,
+    write_atomically,
+)
+
+
+def _half(path: Path, error: Exception) -> None:
+    """Write half a file, then fail."""
+    with replaced_atomically(path) as temporary:
+        assert temporary.parent == path.parent
+        assert temporary.suffix == path.suffix
+        temporary.write_text("half")
+        raise error
+
+
+def test_text_and_bytes_replace_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "out.json"
+    write_atomically(path, "Brücke")
+    assert path.read_text(encoding="utf-8") == "Brücke"
+    write_atomically(path, b"\x00\xff")
+    assert path.read_bytes() == b"\x00\xff"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_block_that_raises_leaves_everything_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "out.npz"
+    path.write_text("before")
+    with pytest.raises(ZeroDivisionError):
+        _half(path, ZeroDivisionError())
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_a_failure_with_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "out.bin"
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with pytest.raises(FailureError, match="could not be written: No space left on device"):
+        _half(path, full)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_file_is_synced_before_the_rename_and_the_folder_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "out.txt"
+    synced: list[tuple[str, bool]] = []
+    sync = os.fsync
+
+    def fsync(descriptor: int) -> None:
+        name = Path(f"/proc/self/fd/{descriptor}").readlink()
+        synced.append(("folder" if name == tmp_path else "file", path.exists()))
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_atomically(path, "text")
+    assert synced == [("file", False), ("folder", True)]
+
+
+def test_places_that_cannot_be_written_are_named_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is a folder"):
+        check_writable(tmp_path)
+    with pytest.raises(InputError, match="does not exist"):
+        write_atomically(tmp_path / "none" / "out.json", "text")
+    check_writable(tmp_path / "out.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(InputError, match="no permission"):
+            check_writable(tmp_path / "out.json")
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_unreadable_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="none: no such file"):
+        read_bytes(tmp_path / "none")
+    with pytest.raises(InputError, match="cannot be read: Is a directory"):
+        read_text(tmp_path)
+    path = tmp_path / "latin.csv"
+    path.write_bytes(b"a\nb\n\xfc\n")
+    with pytest.raises(InputError, match=r"latin\.csv: line 3: is not UTF-8"):
+        read_text(path)

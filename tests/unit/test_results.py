@@ -1,0 +1,265 @@
+"""Results: the JSON of the contract, and the same through Protocol Buffers."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from schemas.errors import InputError
+from schemas.proto import driveby_pb2 as pb
+from schemas.reasons import REASON_TEXTS, Reason, texts
+from schemas.results import (
+    BridgeResult,
+    Covariance,
+    Crossing,
+    Derived,
+    Header,
+    Parameter,
+    Prior,
+    Results,
+    Road,
+    bridge_to_protobuf,
+    crossing_to_protobuf,
+    direction_from_protobuf,
+    estimate_to_crossing,
+    load_results,
+    results,
+    results_json,
+    state_to_bridge,
+)
+
+HEADER = Header("0.1.0", 1790010003.25, "0123456789abcdef", {"method": "pre", "draws": 10}, 7)
+
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+names = st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), min_size=1, max_size=12)
+# What a float holds of a time since 1970 is a quarter of a microsecond; microseconds come back.
+times = st.integers(10**15, 4 * 10**15).map(lambda us: us / 1e6)
+priors = st.builds(
+    Prior, distribution=st.sampled_from(["normal", "log_normal"]), location=numbers, scale=numbers
+)
+parameters = st.builds(
+    Parameter,
+    unit=names,
+    mean=numbers,
+    std=numbers,
+    q025=numbers,
+    q50=numbers,
+    q975=numbers,
+    prior=st.none() | priors,
+)
+
+
+@st.composite
+def roads(draw: st.DrawFn) -> Road:
+    size = draw(st.integers(1, 4))
+    profile = st.lists(numbers, min_size=size, max_size=size).map(tuple)
+    return Road(
+        x_m=draw(profile),
+        front_m=draw(profile),
+        rear_m=draw(profile),
+        mean_m=draw(profile),
+        std_m=draw(st.none() | profile),
+        iri_m_per_km=draw(st.none() | numbers),
+        iso_class=draw(st.none() | st.sampled_from("ABCDE")),
+    )
+
+
+@st.composite
+def covariances(draw: st.DrawFn) -> Covariance:
+    size = draw(st.integers(1, 4))
+    row = st.lists(numbers, min_size=size, max_size=size).map(tuple)
+    rows = draw(st.lists(row, min_size=size, max_size=size))
+    return Covariance(names=tuple(f"p{i}" for i in range(size)), matrix=tuple(rows))
+
+
+@st.composite
+def crossings(draw: st.DrawFn) -> Crossing:
+    verdict = draw(st.sampled_from(["good", "suspect", "rejected"]))
+    reasons = draw(st.lists(st.sampled_from(Reason), min_size=verdict != "good", unique=True))
+    estimated = draw(st.dictionaries(names, parameters, min_size=1, max_size=3))
+    values: dict[str, Any] = {
+        "crossing_id": draw(names),
+        "realm": "live",
+        "vehicle": "truck-1",
+        "bridge": "bridge-1",
+        "direction": draw(st.sampled_from(["start_to_end", "end_to_start"])),
+        "entry_time": draw(times),
+        "exit_time": draw(times),
+        "speed_m_per_s": draw(numbers),
+        "method": draw(st.sampled_from(["pre", "least_squares", "random_walk"])),
+        "certificate": draw(st.none() | names),
+        "verdict": verdict,
+        "reasons": tuple(reasons),
+        "chi2_per_dof": draw(st.none() | numbers),
+        "diagnostics": draw(st.dictionaries(names, numbers, max_size=3)),
+        "parameters": None if verdict == "rejected" else estimated,
+        "scale_error": draw(st.none() | numbers),
+        "covariance": draw(st.none() | covariances()),
+        "derived": draw(
+            st.none()
+            | st.builds(
+                Derived,
+                f1_hz=parameters,
+                max_deflection_m=parameters,
+                probability_below_90_percent_of_baseline=st.none()
+                | st.dictionaries(names, numbers, min_size=1, max_size=2),
+            )
+        ),
+        "road": draw(st.none() | roads()),
+    }
+    return Crossing(**values)
+
+
+def a_crossing(**changes: object) -> Crossing:
+    value = Parameter(unit="N·m²", mean=1.5e10, std=1e8, q025=1.3e10, q50=1.5e10, q975=1.7e10)
+    values: dict[str, Any] = {
+        "crossing_id": "truck-1_bridge-1_1790010003",
+        "realm": "live",
+        "vehicle": "truck-1",
+        "bridge": "bridge-1",
+        "direction": "start_to_end",
+        "entry_time": 1790010003.0,
+        "exit_time": 1790010006.44,
+        "speed_m_per_s": 10.0,
+        "method": "least_squares",
+        "verdict": "suspect",
+        "reasons": ("no_noise_model",),
+        "parameters": {"EI_1": value},
+    }
+    return Crossing(**{**values, **changes})
+
+
+def a_bridge() -> BridgeResult:
+    element = {"mean": 1.5e10, "std": 1e8, "q025": 1.3e10, "q975": 1.7e10}
+    return BridgeResult.model_validate(
+        {
+            **{f"EI_{n}": element for n in (10, 9, 2, 1)},
+            "between_crossing_std": 0.02,
+            "crossings_used": ["a"],
+            "crossings_left_out": [{"crossing_id": "b", "reason": "rejected"}],
+        }
+    )
+
+
+@given(crossings())
+def test_a_crossing_survives_the_wire(crossing: Crossing) -> None:
+    payload = crossing_to_protobuf(crossing, HEADER).SerializeToString(deterministic=True)
+    assert estimate_to_crossing(pb.Estimate.FromString(payload)) == (crossing, HEADER)
+
+
+@given(st.lists(crossings(), max_size=2))
+def test_results_survive_the_file(found: list[Crossing]) -> None:
+    content = results(HEADER, found, {"bridge-1": a_bridge()})
+    text = results_json(content)
+    assert Results.model_validate_json(text) == content
+    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} was written"))
+
+
+def test_the_file_has_the_fields_of_the_contract() -> None:
+    content = json.loads(results_json(results(HEADER, [a_crossing()], {"bridge-1": a_bridge()})))
+    assert list(content) == [
+        "program", "version", "created", "site_hash", "settings", "seed", "crossings", "bridges",
+    ]  # fmt: skip
+    assert content["program"] == "driveby"
+    assert list(content["crossings"][0]) == [
+        "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time", "exit_time",
+        "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts",
+        "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road",
+    ]  # fmt: skip
+    assert list(content["crossings"][0]["parameters"]["EI_1"]) == [
+        "unit", "mean", "std", "q025", "q50", "q975", "prior",
+    ]  # fmt: skip
+    assert content["crossings"][0]["reason_texts"] == [REASON_TEXTS[Reason.NO_NOISE_MODEL]]
+    assert set(content["bridges"]["bridge-1"]) == {
+        "EI_1", "EI_2", "EI_9", "EI_10",
+        "between_crossing_std", "crossings_used", "crossings_left_out",
+    }  # fmt: skip
+
+
+def test_elements_of_a_bridge_are_in_their_order_and_survive_the_wire() -> None:
+    bridge = a_bridge()
+    assert list(bridge.elements) == ["EI_1", "EI_2", "EI_9", "EI_10"]
+    payload = bridge_to_protobuf("bridge-1", 5, bridge).SerializeToString()
+    assert state_to_bridge(pb.BridgeState.FromString(payload)) == ("bridge-1", 5, bridge)
+    with pytest.raises(ValidationError):
+        BridgeResult.model_validate({"EI_0": {"mean": 1, "std": 1, "q025": 1, "q975": 1}})
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_refused(value: float) -> None:
+    with pytest.raises(ValidationError):
+        a_crossing(chi2_per_dof=value)
+    with pytest.raises(ValidationError):
+        a_crossing(diagnostics={"r_hat": value})
+    message = crossing_to_protobuf(a_crossing(), HEADER)
+    message.parameters["EI_1"].std = value
+    with pytest.raises(ValueError, match="EI_1"):
+        estimate_to_crossing(message)
+
+
+def test_a_rejected_crossing_has_reasons_and_no_numbers() -> None:
+    rejected = a_crossing(verdict="rejected", reasons=("channel_missing",), parameters=None)
+    assert rejected.reason_texts == (REASON_TEXTS[Reason.CHANNEL_MISSING],)
+    with pytest.raises(ValidationError, match="no parameters"):
+        a_crossing(verdict="rejected")
+    with pytest.raises(ValidationError, match="no parameters"):
+        a_crossing(parameters=None)
+    with pytest.raises(ValidationError, match="at least one reason"):
+        a_crossing(verdict="rejected", reasons=(), parameters=None)
+    with pytest.raises(ValidationError):
+        a_crossing(reasons=("bad_weather",), reason_texts=("It rained.",))
+
+
+def test_malformed_messages_are_refused_with_one_line() -> None:
+    message = crossing_to_protobuf(a_crossing(), HEADER)
+    for change, words in (
+        ({"schema_version": 99}, "schema version 99"),
+        ({"direction": pb.DIRECTION_UNSPECIFIED}, "direction"),
+        ({"verdict": pb.VERDICT_UNSPECIFIED}, "verdict"),
+        ({"settings_json": "{"}, "settings"),
+        ({"method": "guess"}, "method"),
+    ):
+        wrong = pb.Estimate()
+        wrong.CopyFrom(message)
+        for name, value in change.items():
+            setattr(wrong, name, value)
+        with pytest.raises(ValueError, match=words) as caught:
+            estimate_to_crossing(wrong)
+        assert len(str(caught.value).splitlines()) == 1
+    with pytest.raises(ValueError, match="direction"):
+        direction_from_protobuf(pb.DIRECTION_UNSPECIFIED)
+
+
+def test_matrix_and_profiles_must_have_the_right_size() -> None:
+    with pytest.raises(ValidationError, match="2 × 2"):
+        Covariance(names=("a", "b"), matrix=((1.0, 2.0),))
+    with pytest.raises(ValidationError, match="as long as x_m"):
+        Road(x_m=(0, 1), front_m=(0, 1), rear_m=(0,), mean_m=(0, 1))
+
+
+def test_reading_a_file_that_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "out.json"
+    with pytest.raises(InputError, match=r"out\.json: no such file"):
+        load_results(path)
+    path.write_text("{")
+    with pytest.raises(InputError, match=r"out\.json: not a results file"):
+        load_results(path)
+    path.write_text(results_json(results(HEADER, [], {})).replace("seed", "sed"))
+    with pytest.raises(InputError, match=r"out\.json: "):
+        load_results(path)
+    path.write_text(results_json(results(HEADER, [a_crossing()], {})))
+    assert load_results(path).crossings == (a_crossing(),)
+
+
+def test_every_reason_has_a_sentence_of_its_own() -> None:
+    assert set(REASON_TEXTS) == set(Reason)
+    assert len(set(REASON_TEXTS.values())) == len(Reason)
+    for reason in Reason:
+        assert reason.value == reason.name.lower()
+        assert REASON_TEXTS[reason].endswith(".")
+    assert texts([Reason.FAILED]) == [REASON_TEXTS[Reason.FAILED]]
