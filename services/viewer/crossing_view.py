@@ -1,0 +1,114 @@
+"""What a picture of one crossing shows: bare arrays, whatever file or message they came from."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.results import Crossing
+from schemas.site import Bridge
+
+FloatArray = NDArray[np.float64]
+
+VEHICLE_COLOURS = {"front": "#0072B2", "rear": "#D55E00"}  # Okabe and Ito: told apart by all eyes
+TRUTH_COLOUR = "#000000"
+VERDICT_COLOURS = {"good": "#009E73", "suspect": "#B57A00", "rejected": "#C0392B"}
+
+
+class RoadView(NamedTuple):
+    """Road profiles over chainage, all of one length; metres."""
+
+    x_m: FloatArray
+    front_m: FloatArray
+    rear_m: FloatArray
+
+
+class ParameterRow(NamedTuple):
+    """One line of the table of parameters."""
+
+    name: str
+    unit: str
+    mean: float
+    low: float
+    high: float
+
+
+class CrossingView(NamedTuple):
+    """One crossing as it is drawn.
+
+    The bridge has n elements: `element_edges_m` has n + 1 values, the others n. A rejected crossing
+    has no `rigidity_nm2` and no interval; a crossing without an interval has `interval_nm2` None.
+    """
+
+    crossing_id: str
+    vehicle: str
+    bridge: str
+    forward: bool  # driven from the bridge's start to its end
+    entry_time_s: float  # UTC since 1970: first axle on
+    exit_time_s: float  # last axle off
+    speed_m_per_s: float
+    method: str
+    verdict: str
+    reasons: tuple[str, ...]
+    reason_texts: tuple[str, ...]
+    chi2_per_dof: float | None
+    element_edges_m: FloatArray
+    nominal_nm2: FloatArray
+    rigidity_nm2: FloatArray | None
+    interval_nm2: FloatArray | None  # (n, 2): 2.5 % and 97.5 % points
+    road: RoadView | None
+    parameters: tuple[ParameterRow, ...]
+
+    @property
+    def span_m(self) -> float:
+        """Length of the bridge between its bearings."""
+        return float(self.element_edges_m[-1])
+
+    @property
+    def interval_has_meaning(self) -> bool:
+        """Whether the method knows the noise, without which an interval says nothing."""
+        return "no_noise_model" not in self.reasons
+
+
+def summary_line(view: CrossingView) -> str:
+    """Vehicle, bridge, speed and method in one line."""
+    method = view.method.replace("_", " ")
+    return f"{view.vehicle} over {view.bridge} · {view.speed_m_per_s:.1f} m/s · {method}"
+
+
+def view_of_crossing(crossing: Crossing, bridge: Bridge) -> CrossingView:
+    """Gather what is drawn of a result; the bridge gives the lengths and nominal rigidities."""
+    parameters = crossing.parameters
+    rigidity = interval = None
+    if parameters is not None:
+        elements = [parameters[f"EI_{number}"] for number in range(1, bridge.elements + 1)]
+        rigidity = np.array([element.mean for element in elements])
+        interval = np.array([(element.q025, element.q975) for element in elements])
+    road = crossing.road
+    return CrossingView(
+        crossing_id=crossing.crossing_id,
+        vehicle=crossing.vehicle,
+        bridge=crossing.bridge,
+        forward=crossing.direction == "start_to_end",
+        entry_time_s=crossing.entry_time,
+        exit_time_s=crossing.exit_time,
+        speed_m_per_s=crossing.speed_m_per_s,
+        method=crossing.method,
+        verdict=crossing.verdict,
+        reasons=tuple(reason.value for reason in crossing.reasons),
+        reason_texts=crossing.reason_texts,
+        chi2_per_dof=crossing.chi2_per_dof,
+        element_edges_m=np.concatenate(([0.0], np.cumsum(bridge.lengths_m))),
+        nominal_nm2=np.array(bridge.nominal_flexural_rigidity_nm2),
+        rigidity_nm2=rigidity,
+        interval_nm2=interval,
+        road=None
+        if road is None or not road.x_m
+        else RoadView(np.array(road.x_m), np.array(road.front_m), np.array(road.rear_m)),
+        parameters=tuple(
+            ParameterRow(name, value.unit, value.mean, value.q025, value.q975)
+            for name, value in (parameters or {}).items()
+        ),
+    )

@@ -1,0 +1,151 @@
+"""Opening a recording, a result or a Rerun file in the Rerun viewer.
+
+The viewer listens on 127.0.0.1 only and its analytics are switched off. Background tiles of the map
+come from the internet when there is one; tracks and bridges are drawn without.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Iterable
+from importlib import resources
+from pathlib import Path
+
+from google.protobuf.message import DecodeError
+from rich.console import Console
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.results import Crossing, estimate_to_crossing, load_results
+from schemas.site import Site, load_site, parse_site
+from services.common.errors import FailureError, InputError
+from services.common.recording import Message, read_messages, read_site
+from services.viewer.crossing_view import CrossingView, view_of_crossing
+from services.viewer.rerun_file import (
+    VehicleSignals,
+    bridges_of_site,
+    signals_of_messages,
+    write_rrd,
+)
+
+SUFFIXES = (".rrd", ".mcap", ".json")
+
+
+def view_command(
+    *, target: str | Path, web: bool, endpoint: str, realm: str, console: Console
+) -> int:
+    """Open a Rerun file (.rrd), a recording (.mcap) or results (.json); wait until it is closed.
+
+    `web` serves the viewer for a browser instead of opening a window. Returns the exit code.
+    Raises InputError for a missing or unknown file, FailureError if the viewer does not start.
+    """
+    if str(target) == "live":
+        raise FailureError("the live view is not there yet; name a recording to look at")
+    path = Path(target)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, one of {', '.join(SUFFIXES)} is expected")
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: is none of {', '.join(SUFFIXES)}")
+    with tempfile.TemporaryDirectory(prefix="driveby-view-") as folder:
+        shown = path
+        if path.suffix != ".rrd":
+            shown = Path(folder) / f"{path.stem}.rrd"
+            with console.status(f"preparing {path.name}"):
+                convert(path, shown)
+        return _run_viewer(shown, web=web)
+
+
+def convert(target: Path, rrd: Path, *, site: Path | None = None) -> None:
+    """Write the Rerun file of a recording (.mcap) or of results (.json).
+
+    Results do not say where their bridge is: `site` does, or a recording in the same folder.
+    """
+    if target.suffix == ".json":
+        results = load_results(target)
+        bridges = load_site(site) if site is not None else _site_beside(target)
+        write_views(rrd, vehicles={}, crossings=results.crossings, site=bridges)
+        return
+    messages = list(read_messages(target))
+    write_views(
+        rrd,
+        vehicles=signals_of_messages(messages),
+        crossings=crossings_of_messages(messages),
+        site=load_site(site) if site is not None else _site_within(target),
+    )
+
+
+def write_views(
+    rrd: Path,
+    *,
+    vehicles: dict[str, VehicleSignals],
+    crossings: Iterable[Crossing],
+    site: Site | None,
+) -> None:
+    """Write a Rerun file of results and signals; without a site only the signals are drawn."""
+    bridges = {} if site is None else {bridge.id: bridge for bridge in site.bridges}
+    views: list[CrossingView] = [
+        view_of_crossing(crossing, bridges[crossing.bridge])
+        for crossing in crossings
+        if crossing.bridge in bridges
+    ]
+    on_map = [] if site is None else bridges_of_site(site)
+    write_rrd(rrd, vehicles=vehicles, bridges=on_map, crossings=views)
+
+
+def crossings_of_messages(messages: Iterable[Message]) -> list[Crossing]:
+    """The results in a recording; those that cannot be decoded are left out."""
+    crossings = []
+    for message in messages:
+        if message.key.stream != "estimate":
+            continue
+        try:
+            crossing, _ = estimate_to_crossing(pb.Estimate.FromString(message.payload))
+        except (DecodeError, ValueError):
+            continue
+        crossings.append(crossing)
+    return crossings
+
+
+def viewer_program() -> Path:
+    """The viewer itself: the `rerun` command is a wrapper that leaves it running when killed."""
+    return Path(str(resources.files("rerun_cli") / "rerun"))
+
+
+def viewer_arguments(shown: Path, *, web: bool) -> list[str]:
+    """Command line of the viewer. Without `--bind` it would listen on every interface."""
+    arguments = [str(viewer_program()), "--bind", "127.0.0.1", "--port", "auto"]
+    if web:
+        arguments += ["--web-viewer", "--web-viewer-port", "0"]
+    return [*arguments, str(shown)]
+
+
+def _site_within(recording: Path) -> Site | None:
+    toml = read_site(recording)
+    return None if toml is None else parse_site(toml, str(recording))
+
+
+def _site_beside(target: Path) -> Site:
+    for recording in sorted(target.absolute().parent.glob("*.mcap")):
+        site = _site_within(recording)
+        if site is not None:
+            return site
+    raise InputError(
+        f"{target}: results do not say where their bridge is, "
+        "put the recording (.mcap) that they come from into the same folder"
+    )
+
+
+def _run_viewer(shown: Path, *, web: bool) -> int:
+    program = viewer_program()
+    if not program.is_file():
+        raise FailureError(f"{program}: the Rerun viewer is not installed for this platform")
+    subprocess.run([program, "analytics", "disable"], check=False, capture_output=True)
+    with subprocess.Popen(viewer_arguments(shown, web=web)) as viewer:
+        try:
+            code = viewer.wait()
+        except KeyboardInterrupt:
+            viewer.terminate()
+            return 0
+    if code != 0:
+        raise FailureError(f"the Rerun viewer ended with code {code}; without a screen, try --web")
+    return 0

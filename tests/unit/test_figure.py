@@ -1,0 +1,229 @@
+"""The PNG of a crossing: what is drawn is what was found, and nothing is cut off or overlaps."""
+
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.patches import Rectangle
+from matplotlib.text import Text
+
+from services.common.errors import InputError
+from services.viewer.crossing_view import CrossingView, RoadView
+from services.viewer.figure import STYLE, crossing_figure, draw_crossing
+
+RATIOS = np.array([1.0, 0.98, 1.01, 0.4, 1.02, 1.0, 0.99])
+NOMINAL_NM2 = 15.6e9
+X_M = np.linspace(-4.0, 34.0, 400)
+PROFILE_M = 3e-3 * np.sin(X_M)
+
+
+def view(**changes: object) -> CrossingView:
+    rigidity = RATIOS * NOMINAL_NM2
+    crossing = CrossingView(
+        crossing_id="truck-1-bridge-1-1790010001",
+        vehicle="truck-1",
+        bridge="bridge-1",
+        forward=True,
+        entry_time_s=1_790_010_001.0,
+        exit_time_s=1_790_010_004.44,
+        speed_m_per_s=10.0,
+        method="least_squares",
+        verdict="good",
+        reasons=(),
+        reason_texts=(),
+        chi2_per_dof=1.0,
+        element_edges_m=np.linspace(0.0, 30.0, 8),
+        nominal_nm2=np.full(7, NOMINAL_NM2),
+        rigidity_nm2=rigidity,
+        interval_nm2=np.column_stack((0.9 * rigidity, 1.2 * rigidity)),
+        road=RoadView(X_M, PROFILE_M + 2e-6, PROFILE_M),
+        parameters=(),
+    )
+    return crossing._replace(**changes)
+
+
+def draw(crossing: CrossingView, truth: bool = True) -> Figure:
+    return draw_crossing(
+        crossing,
+        element_truth=[1, 1, 1, 0.4, 1, 1, 1] if truth else None,
+        road_truth=(np.array([-10.0, 0.0, 30.0]), np.zeros(3)) if truth else None,
+    )
+
+
+@pytest.fixture(autouse=True)
+def style():
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):
+        yield
+
+
+def bars(axes: Axes) -> list[Rectangle]:
+    return [patch for container in axes.containers for patch in container.patches]
+
+
+def labels(axes: Axes) -> set[str]:
+    legend = axes.get_legend()
+    return set() if legend is None else {text.get_text() for text in legend.get_texts()}
+
+
+def texts(figure: Figure) -> list[Text]:
+    """All words on the page; Matplotlib keeps tick labels beyond the ends that it does not draw."""
+    beyond = {
+        id(label)
+        for axes in figure.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        for tick in axis.get_major_ticks()
+        if not min(axis.get_view_interval()) <= tick.get_loc() <= max(axis.get_view_interval())
+        for label in (tick.label1, tick.label2)
+    }
+    return [
+        text
+        for text in figure.findobj(Text)
+        if text.get_text().strip() and text.get_visible() and id(text) not in beyond
+    ]
+
+
+def test_bars_stand_on_their_elements_with_their_rigidity():
+    edges = np.array([0.0, 3.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0])
+    rigidity = draw(view(element_edges_m=edges)).axes[0]
+    drawn = bars(rigidity)
+    assert [bar.get_height() for bar in drawn] == pytest.approx(RATIOS * 15.6)
+    middles = [bar.get_x() + bar.get_width() / 2 for bar in drawn]
+    assert middles == pytest.approx((edges[:-1] + edges[1:]) / 2)
+    for bar, left, right in zip(drawn, edges, edges[1:], strict=False):
+        assert left < bar.get_x() < bar.get_x() + bar.get_width() < right
+
+
+def test_interval_truth_and_nominal_are_drawn_where_they_are():
+    rigidity = draw(view()).axes[0]
+    whiskers = next(c for c in rigidity.collections if c.get_label() == "95 % interval")
+    ends = np.array([path.vertices[:, 1] for path in whiskers.get_paths()])
+    assert ends == pytest.approx(np.column_stack((0.9 * RATIOS, 1.2 * RATIOS)) * 15.6)
+    truth = next(line for line in rigidity.lines if line.get_label() == "truth")
+    assert truth.get_ydata() == pytest.approx(np.array([1, 1, 1, 0.4, 1, 1, 1]) * 15.6)
+    assert rigidity.get_ylim()[1] > 1.2 * 1.02 * 15.6  # nothing is cut off at the top
+    assert rigidity.get_ylim()[0] == 0.0
+
+
+def test_ratio_axis_agrees_with_the_axis_of_rigidity():
+    figure = draw(view())
+    rigidity, ratio = figure.axes[0], figure.axes[-1]
+    assert ratio.get_ylabel() == "ratio to nominal"
+    assert np.array(rigidity.get_ylim()) == pytest.approx(np.array(ratio.get_ylim()) * 15.6)
+
+
+def test_no_ratio_axis_where_the_elements_have_different_nominal_values():
+    figure = draw(view(nominal_nm2=np.linspace(10e9, 20e9, 7)))
+    assert not any(axes.get_ylabel() == "ratio to nominal" for axes in figure.axes)
+
+
+def test_truth_is_neither_drawn_nor_named_where_there_is_none():
+    figure = draw(view(), truth=False)
+    assert all("truth" not in label for axes in figure.axes for label in labels(axes))
+
+
+def test_interval_without_a_noise_model_is_named_as_such():
+    with_model, without = (
+        labels(draw(view(reasons=reasons)).axes[0]) for reasons in ((), ("no_noise_model",))
+    )
+    assert "95 % interval" in with_model
+    assert "95 % interval" not in without
+    assert "interval (without meaning)" in without
+
+
+def test_rejected_crossing_shows_its_reason_and_no_number():
+    reason = "The truck lacks one of the four accelerometers that the method needs."
+    figure = draw(
+        view(
+            verdict="rejected",
+            reasons=("channel_missing",),
+            reason_texts=(reason,),
+            rigidity_nm2=None,
+            interval_nm2=None,
+            road=None,
+        ),
+        truth=False,
+    )
+    assert bars(figure.axes[0]) == []
+    written = [text.get_text() for text in texts(figure)]
+    assert any(reason in text for text in written)
+    assert "verdict: rejected" in written
+    assert not any(text.startswith("$EI") for text in written)
+
+
+def test_differences_are_between_wheels_and_from_the_truth_where_it_is_known():
+    figure = draw(view())
+    lines = {line.get_label(): line for line in figure.axes[2].lines}
+    assert figure.axes[2].get_ylabel() == "mm"
+    assert lines["front − rear"].get_ydata() == pytest.approx(np.full(400, 2e-3))
+    error = np.asarray(lines["mean − truth"].get_ydata())
+    known = X_M <= 30.0  # the truth of this test ends there
+    assert error[known] == pytest.approx((PROFILE_M[known] + 1e-6) * 1e3)
+    assert np.isnan(error[~known]).all()
+
+
+@pytest.mark.parametrize(
+    ("difference_m", "unit"), [(3e-3, "mm"), (3e-6, "µm"), (3e-9, "nm"), (0.0, "nm")]
+)
+def test_differences_have_a_unit_that_gives_readable_ticks(difference_m: float, unit: str):
+    road = RoadView(X_M, PROFILE_M + difference_m, PROFILE_M)
+    assert draw(view(road=road), truth=False).axes[2].get_ylabel() == unit
+
+
+LONG = {
+    "vehicle": "v" * 40,
+    "bridge": "b" * 40,
+    "verdict": "suspect",
+    "reason_texts": ("A sentence that says at some length why this crossing is suspect.",) * 4,
+}
+
+
+@pytest.mark.parametrize("changes", [{}, {"reasons": ("no_noise_model",)}, LONG])
+def test_all_words_stand_on_the_page_and_apart(changes: dict[str, object]):
+    figure = draw(view(**changes))
+    assert isinstance(figure.canvas, FigureCanvasAgg)
+    figure.canvas.draw()
+    page = figure.bbox
+    boxes = [(text.get_text(), text.get_window_extent()) for text in texts(figure)]
+    for words, box in boxes:
+        assert page.x0 <= box.x0, words
+        assert box.x1 <= page.x1, words
+        assert page.y0 <= box.y0, words
+        assert box.y1 <= page.y1, words
+    for index, (words, box) in enumerate(boxes):
+        for other_words, other in boxes[index + 1 :]:
+            assert not (
+                box.x0 < other.x1 and other.x0 < box.x1 and box.y0 < other.y1 and other.y0 < box.y1
+            ), f"{words!r} lies on {other_words!r}"
+
+
+def test_png_is_wide_enough_for_a_page_and_the_same_each_time(tmp_path: Path):
+    pictures = [tmp_path / "one.png", tmp_path / "two.png"]
+    for picture in pictures:
+        crossing_figure(picture, crossing=view(), element_truth=None, road_truth=None)
+    first, second = (picture.read_bytes() for picture in pictures)
+    assert first == second
+    height, width, _ = imread(io.BytesIO(first)).shape
+    assert width == 1800
+    assert 1000 < height < width
+
+
+def test_nothing_is_left_behind_where_it_cannot_be_written(tmp_path: Path):
+    with pytest.raises(InputError, match="does not exist"):
+        crossing_figure(
+            tmp_path / "no" / "a.png", crossing=view(), element_truth=None, road_truth=None
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_pyplot_and_its_global_state_are_not_touched():
+    code = "import sys, services.viewer.figure; sys.exit('matplotlib.pyplot' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,454 @@
+"""The Rerun recording, read back: every series with all its samples, on the right timelines."""
+
+import io
+import os
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from matplotlib.image import imread
+from rerun.chunk import Chunk, RrdReader
+from rerun.experimental import View, ViewerClient
+
+from schemas.results import Crossing, Header, crossing_to_protobuf, results, results_json
+from schemas.signals import (
+    CHANNELS,
+    AccelBatch,
+    Channel,
+    GnssFix,
+    encode_accel,
+    encode_gnss,
+    encode_location,
+)
+from schemas.site import Site, parse_site
+from schemas.topics import Key
+from services.common.errors import InputError
+from services.common.recording import Message, write_recording
+from services.viewer.crossing_view import CrossingView, view_of_crossing
+from services.viewer.rerun_file import (
+    STRIP_HEIGHT,
+    STRIP_WIDTH,
+    VehicleSignals,
+    acceleration_series,
+    crossing_root,
+    front_axle_chainage,
+    rigidity_strip,
+    signals_of_messages,
+    verdict_markdown,
+)
+from services.viewer.view import (
+    convert,
+    view_command,
+    viewer_arguments,
+    viewer_program,
+    write_views,
+)
+
+START_NS = 1_790_010_000_000_000_000
+RATE_HZ, BATCH = 1000.0, 50
+NOMINAL_NM2 = 15.6e9
+RATIOS = (1.0, 0.4, 1.1)
+SITE_TOML = """
+[vehicle]
+id = "truck-1"
+total_mass_kg = 9530.0
+wheelbase_m = 4.4
+front_axle_to_cg_m = 1.215
+suspension_damping_ns_per_m = [24200, 29000]
+suspension_stiffness_n_per_m = [456000, 410000]
+unsprung_mass_kg = [469, 751]
+tyre_stiffness_n_per_m = [4790000, 4310000]
+gps_antenna_to_front_axle_m = 0.0
+[bridge]
+id = "bridge-1"
+span_m = 30.0
+start_latitude_deg = 36.11060000
+start_longitude_deg = 140.10100000
+end_latitude_deg = 36.11072274
+end_longitude_deg = 140.10129688
+elements = 3
+element_lengths_m = [10.0, 5.0, 15.0]
+flexural_rigidity_nm2 = 15.6e9
+mass_per_length_kg_per_m = 4400.0
+rayleigh_alpha_per_s = 0.7024
+rayleigh_beta_s = 0.0052
+[sensor]
+rate_hz = 1000.0
+noise_density_ug_per_rthz = 25.0
+"""
+
+
+@pytest.fixture
+def site() -> Site:
+    return parse_site(SITE_TOML, "site.toml")
+
+
+def accel(count: int = 40, channels: tuple[str, ...] = CHANNELS) -> list[AccelBatch]:
+    batches = []
+    for sequence in range(count):
+        first_ns = START_NS + sequence * 50_000_000
+        phase = sequence * BATCH + np.arange(BATCH)
+        batches.append(
+            AccelBatch(
+                7,
+                sequence,
+                first_ns - START_NS,
+                first_ns,
+                {name: Channel(RATE_HZ, np.sin(phase / 30.0)) for name in channels},
+            )
+        )
+    return batches
+
+
+def gnss(count: int = 20) -> list[GnssFix]:
+    return [
+        GnssFix(
+            7,
+            sequence,
+            sequence * 100_000_000,
+            START_NS + sequence * 100_000_000,
+            36.1105 + sequence * 2e-5,
+            140.1008 + sequence * 4e-5,
+            24.0,
+            10.0,
+        )
+        for sequence in range(count)
+    ]
+
+
+def crossing(**changes: object) -> Crossing:
+    def parameter(value: float, unit: str) -> dict[str, object]:
+        return {
+            "unit": unit,
+            "mean": value,
+            "std": 0.02 * value,
+            "q025": 0.96 * value,
+            "q50": value,
+            "q975": 1.04 * value,
+        }
+
+    x_m = np.linspace(-2.0, 32.0, 69)
+    fields: dict[str, object] = {
+        "crossing_id": "truck-1_bridge-1_20260921T170000500",
+        "realm": "sim-test",
+        "vehicle": "truck-1",
+        "bridge": "bridge-1",
+        "direction": "start_to_end",
+        "entry_time": START_NS / 1e9 + 0.5,
+        "exit_time": START_NS / 1e9 + 1.2,
+        "speed_m_per_s": 10.0,
+        "method": "least_squares",
+        "verdict": "good",
+        "parameters": {
+            **{
+                f"EI_{number}": parameter(ratio * NOMINAL_NM2, "N·m²")
+                for number, ratio in enumerate(RATIOS, start=1)
+            },
+            "k_s1": parameter(456_000.0, "N/m"),
+        },
+        "road": {
+            "x_m": x_m.tolist(),
+            "front_m": (1e-3 * np.sin(x_m) + 1e-5).tolist(),
+            "rear_m": (1e-3 * np.sin(x_m)).tolist(),
+            "mean_m": (1e-3 * np.sin(x_m)).tolist(),
+        },
+    }
+    return Crossing.model_validate({**fields, **changes})
+
+
+def rejected() -> Crossing:
+    return crossing(verdict="rejected", reasons=["channel_missing"], parameters=None, road=None)
+
+
+def rows(chunks: list[Chunk], entity: str) -> pa.RecordBatch:
+    """The rows over time of an entity."""
+    batches = [
+        chunk.to_record_batch()
+        for chunk in chunks
+        if chunk.entity_path == f"/{entity}" and not chunk.is_static
+    ]
+    assert batches, f"{entity} is not in the file, there are {sorted(paths(chunks))}"
+    return pa.Table.from_batches(batches).combine_chunks().to_batches()[0]
+
+
+def paths(chunks: list[Chunk]) -> set[str]:
+    return {chunk.entity_path.removeprefix("/") for chunk in chunks}
+
+
+def scalars(batch: pa.RecordBatch) -> np.ndarray:
+    column = next(name for name in batch.schema.names if name.endswith("Scalars:scalars"))
+    return np.array([values[0] for values in batch.column(column).to_pylist()])
+
+
+def times_ns(batch: pa.RecordBatch) -> np.ndarray:
+    return batch.column("time").cast(pa.int64()).to_numpy()
+
+
+@pytest.fixture
+def drive(tmp_path: Path, site: Site) -> tuple[list[Chunk], CrossingView]:
+    path = tmp_path / "drive.rrd"
+    vehicles = {"truck-1": VehicleSignals(accel(), gnss())}
+    write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
+    view = view_of_crossing(crossing(), site.bridges[0])
+    return RrdReader(path).stream().to_chunks(), view
+
+
+def test_every_sample_of_every_channel_is_there_at_its_time(drive):
+    chunks, _ = drive
+    expected = np.sin(np.arange(40 * BATCH) / 30.0)
+    for channel in CHANNELS:
+        batch = rows(chunks, f"vehicle/truck-1/acceleration/{channel}")
+        assert scalars(batch) == pytest.approx(expected)
+        assert (times_ns(batch) == START_NS + np.arange(40 * BATCH) * 1_000_000).all()
+
+
+def test_track_has_every_fix(drive):
+    chunks, _ = drive
+    position = rows(chunks, "map/position/truck-1")
+    assert position.num_rows == 20
+    column = next(name for name in position.schema.names if name.endswith(":positions"))
+    assert np.array(position.column(column).to_pylist())[:, 0] == pytest.approx(
+        np.array([(fix.latitude_deg, fix.longitude_deg) for fix in gnss()])
+    )
+    assert {"map/track/truck-1", "map/fixes/truck-1", "map/bridge/bridge-1"} <= paths(chunks)
+
+
+def test_crossing_is_on_both_timelines(drive):
+    chunks, view = drive
+    batch = rows(chunks, f"{crossing_root(view)}/acceleration/sprung_front")
+    entry_ns = START_NS + 500_000_000
+    chainage_mm = batch.column("chainage_mm").to_numpy()
+    assert chainage_mm == pytest.approx((times_ns(batch) - entry_ns) / 1e9 * 10.0 * 1e3, abs=1.0)
+    assert 0 < batch.num_rows < 40 * BATCH + 1
+    road = rows(chunks, f"{crossing_root(view)}/road/front")
+    assert road.column("chainage_mm").to_numpy() == pytest.approx(np.linspace(-2000, 32000, 69))
+    assert scalars(road) == pytest.approx(1e3 * view.road.front_m)
+    difference = rows(chunks, f"{crossing_root(view)}/road_difference/front_minus_rear")
+    assert scalars(difference) == pytest.approx(np.full(69, 1e-2))
+
+
+def test_bars_begin_and_end_on_their_elements(drive):
+    chunks, view = drive
+    chart = next(c for c in chunks if c.entity_path == f"/{crossing_root(view)}/rigidity")
+    columns = {name.split(":")[-1]: name for name in chart.to_record_batch().schema.names}
+    batch = chart.to_record_batch()
+    values, begins = (
+        np.array(batch.column(columns[name]).to_pylist()[0][0]["buffer"])
+        for name in ("values", "abscissa")
+    )
+    widths = np.array(batch.column(columns["widths"]).to_pylist()[0])
+    assert values == pytest.approx(np.array(RATIOS) * 15.6)
+    edges = np.array([0.0, 10.0, 15.0, 30.0])
+    assert (begins > edges[:-1]).all()
+    assert (begins + widths < edges[1:]).all()
+    assert widths / np.diff(edges) == pytest.approx(np.full(3, 0.9))
+
+
+def test_rejected_crossing_shows_its_reason_and_no_number(tmp_path: Path, site: Site):
+    path = tmp_path / "rejected.rrd"
+    vehicles = {"truck-1": VehicleSignals(accel(channels=("sprung_front",)), gnss())}
+    write_views(path, vehicles=vehicles, crossings=[rejected()], site=site)
+    chunks = RrdReader(path).stream().to_chunks()
+    root = crossing_root(view_of_crossing(rejected(), site.bridges[0]))
+    assert f"{root}/verdict" in paths(chunks)
+    assert not any(path.startswith((f"{root}/rigidity", f"{root}/strip")) for path in paths(chunks))
+    text = verdict_markdown(view_of_crossing(rejected(), site.bridges[0]))
+    assert text.startswith("# Rejected")
+    assert "lacks one of the four accelerometers" in text
+    assert "EI_" not in text
+
+
+def test_table_withholds_intervals_that_mean_nothing(site: Site):
+    known = view_of_crossing(crossing(), site.bridges[0])
+    unknown = view_of_crossing(
+        crossing(verdict="suspect", reasons=["no_noise_model"]), site.bridges[0]
+    )
+    assert "| EI_2 | 6.24 GN·m² | 5.99 … 6.49 | 0.400 |" in verdict_markdown(known)
+    assert "| EI_2 | 6.24 GN·m² | – | 0.400 |" in verdict_markdown(unknown)
+    assert "| k_s1 | 4.56e+05 N/m |" in verdict_markdown(known)
+
+
+def test_gap_breaks_the_line():
+    batches = accel(10)
+    del batches[4:6]
+    time_ns, samples = acceleration_series(batches)["sprung_rear"]
+    assert len(samples) == 8 * BATCH + 1
+    (hole,) = np.flatnonzero(np.isnan(samples))
+    assert hole == 4 * BATCH
+    assert (np.diff(time_ns) > 0).all()
+    whole, _ = acceleration_series(accel(10))["sprung_rear"]
+    assert len(whole) == 10 * BATCH
+
+
+def test_absent_channels_stay_absent():
+    assert set(acceleration_series(accel(3, ("sprung_front",)))) == {"sprung_front"}
+
+
+def test_chainage_falls_when_the_truck_comes_from_the_other_end(site: Site):
+    view = view_of_crossing(crossing(direction="end_to_start"), site.bridges[0])
+    times = view.entry_time_s + np.array([0.0, 1.0, 3.0])
+    assert front_axle_chainage(view, times) == pytest.approx([30.0, 20.0, 0.0], abs=1e-5)
+
+
+def test_strip_is_brightest_at_the_estimate(site: Site):
+    view = view_of_crossing(crossing(), site.bridges[0])
+    strip = rigidity_strip(view).astype(int).sum(axis=2)
+    assert strip.shape == (STRIP_HEIGHT, STRIP_WIDTH)
+    for chainage, ratio in zip((5.0, 12.5, 22.5), RATIOS, strict=True):
+        column = strip[:, int(chainage / 30.0 * STRIP_WIDTH)]
+        assert column.argmax() == pytest.approx(STRIP_HEIGHT * (1 - ratio / 1.5), abs=1.5)
+    wide = view._replace(interval_nm2=view.rigidity_nm2[:, None] * np.array([0.6, 1.4]))
+    assert rigidity_strip(wide).astype(int).sum() > strip.sum()
+
+
+def messages() -> list[Message]:
+    def message(stream: str, payload: bytes, sequence: int, time_ns: int) -> Message:
+        key = Key("sim-test", "vehicle", "truck-1", stream)
+        return Message(key, payload, 7, sequence, time_ns, time_ns)
+
+    found = [message("accel", encode_accel(b), b.sequence, b.wall_time_ns) for b in accel()]
+    for fix in gnss():
+        found.append(message("gnss", encode_gnss(fix), fix.sequence, fix.wall_time_ns))
+        found.append(message("location", encode_location(fix), fix.sequence, fix.wall_time_ns))
+    return sorted(found, key=lambda one: one.log_time_ns)
+
+
+def estimate() -> Message:
+    header = Header("0", START_NS / 1e9, "0" * 16, {}, 0)
+    payload = crossing_to_protobuf(crossing(), header).SerializeToString()
+    time_ns = START_NS + 2_000_000_000
+    return Message(
+        Key("sim-test", "bridge", "bridge-1", "estimate"), payload, 1, 0, time_ns, time_ns
+    )
+
+
+def test_repeated_and_late_messages_are_drawn_once_and_in_order():
+    mixed = [*messages()[::-1], *messages()[:10]]
+    broken = messages()[0]._replace(payload=b"\xff\xff", sequence=999)
+    signals = signals_of_messages([broken, *mixed])["truck-1"]
+    assert [batch.sequence for batch in signals.accel] == list(range(40))
+    assert [fix.sequence for fix in signals.gnss] == list(range(20))
+
+
+def test_recording_with_its_results_becomes_a_rerun_file(tmp_path: Path, site: Site):
+    recording, rrd = tmp_path / "run.mcap", tmp_path / "run.rrd"
+    write_recording(recording, [*messages(), estimate()], site_toml=SITE_TOML, reason="test")
+    convert(recording, rrd)
+    found = paths(RrdReader(rrd).stream().to_chunks())
+    root = crossing_root(view_of_crossing(crossing(), site.bridges[0]))
+    assert {f"{root}/rigidity", f"{root}/verdict", "map/position/truck-1"} <= found
+
+
+def test_results_are_drawn_with_the_site_of_the_recording_beside_them(tmp_path: Path):
+    file = tmp_path / "run.json"
+    header = Header("0", START_NS / 1e9, "0" * 16, {}, 0)
+    file.write_text(results_json(results(header, [crossing()], {})))
+    rrd = tmp_path / "out.rrd"
+    with pytest.raises(InputError, match="same folder"):
+        convert(file, rrd)
+    assert not rrd.exists()
+    write_recording(tmp_path / "run.mcap", messages(), site_toml=SITE_TOML, reason="test")
+    convert(file, rrd)
+    assert any(path.endswith("/rigidity") for path in paths(RrdReader(rrd).stream().to_chunks()))
+
+
+@pytest.mark.parametrize("name", ["missing.rrd", "missing.mcap", "notes.txt"])
+def test_what_cannot_be_opened_is_bad_input(tmp_path: Path, name: str):
+    from rich.console import Console
+
+    (tmp_path / "notes.txt").write_text("no recording")
+    with pytest.raises(InputError, match=name):
+        view_command(
+            target=tmp_path / name, web=False, endpoint="", realm="", console=Console(quiet=True)
+        )
+
+
+@pytest.mark.parametrize("web", [False, True])
+def test_viewer_is_told_to_listen_on_loopback_only(web: bool):
+    arguments = viewer_arguments(Path("a.rrd"), web=web)
+    assert arguments[arguments.index("--bind") + 1] == "127.0.0.1"
+    assert ("--web-viewer" in arguments) == web
+
+
+def see(file: Path, folder: Path) -> tuple[list[View], np.ndarray]:
+    """Open a file in the viewer without a screen; what views it chose, and a picture (0 to 1)."""
+    drivers = [Path(root, "vulkan/icd.d") for root in ("/usr/share", "/etc", "/usr/local/share")]
+    if not any(any(found.glob("*.json")) for found in drivers if found.is_dir()):
+        pytest.skip("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    arguments = viewer_arguments(file, web=False)
+    arguments[arguments.index("--port") + 1] = str(port)
+    arguments += ["--headless", "--renderer=vulkan", "--window-size=1000x700"]
+    own = {**os.environ, "HOME": str(folder), "XDG_CONFIG_HOME": str(folder / "config")}
+    subprocess.run([viewer_program(), "analytics", "disable"], env=own, check=True)
+    with subprocess.Popen(arguments, env=own, stderr=subprocess.DEVNULL) as viewer:
+        try:
+            client = _connected(port)
+            views = _views(client)
+            time.sleep(1.0)  # the map centres on its points over a few frames
+            only = views[0].view_id if len(views) == 1 else None
+            return views, imread(io.BytesIO(client.take_screenshot(only)))
+        finally:
+            viewer.terminate()
+
+
+def _connected(port: int) -> ViewerClient:
+    deadline = time.monotonic() + 20.0
+    while True:
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.get_state()
+        except Exception:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.2)
+        else:
+            return client
+
+
+def _views(client: ViewerClient) -> list[View]:
+    deadline = time.monotonic() + 20.0
+    while time.monotonic() < deadline:
+        views = client.get_state().views
+        if any(view.view_class == "Map" for view in views):
+            return views
+        time.sleep(0.2)
+    pytest.fail(f"the viewer shows no map, only {[view.view_class for view in views]}")
+
+
+def coloured(picture: np.ndarray) -> int:
+    """Number of pixels that are neither black nor grey."""
+    rgb = picture[:, :, :3]
+    return int((np.ptp(rgb, axis=2) > 0.2).sum())
+
+
+@pytest.mark.process
+def test_recording_opened_directly_is_drawn_on_a_map(tmp_path: Path):
+    recording = tmp_path / "run.mcap"
+    write_recording(recording, messages(), site_toml=None, reason="test")
+    views, picture = see(recording, tmp_path)
+    assert [(view.view_class, view.reports) for view in views] == [("Map", [])]
+    assert coloured(picture) > 20
+
+
+@pytest.mark.process
+def test_rerun_file_has_its_layout_and_draws_without_complaint(tmp_path: Path, site: Site):
+    path = tmp_path / "drive.rrd"
+    vehicles = {"truck-1": VehicleSignals(accel(), gnss())}
+    write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
+    views, picture = see(path, tmp_path)
+    assert {view.view_class for view in views} == {
+        "BarChart",
+        "2D",
+        "Map",
+        "TextDocument",
+        "TimeSeries",
+    }
+    assert [report for view in views for report in view.reports] == []
+    assert coloured(picture) > 20_000  # the bars
