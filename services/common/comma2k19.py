@@ -94,9 +94,10 @@ def _array(folder: Path, name: str, columns: int) -> Floats:
         raise InputError(f"{path}: no such file, an array of comma2k19 expected") from error
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{path}: is not an array that numpy can read") from error
-    shape = (len(values),) if columns == 1 else (len(values), columns)
-    if values.dtype.kind != "f" or values.shape != shape:
-        raise InputError(f"{path}: has shape {values.shape}, numbers of shape {shape} expected")
+    shape = values.shape[:1] if columns == 1 else (*values.shape[:1], columns)
+    if values.dtype.kind != "f" or values.ndim == 0 or values.shape != shape:
+        expected = "(n,)" if columns == 1 else f"(n, {columns})"
+        raise InputError(f"{path}: has shape {values.shape}, numbers of shape {expected} expected")
     if not np.all(np.isfinite(values)):
         row = int(np.argwhere(~np.isfinite(values))[0][0])
         raise InputError(f"{path}: row {row}: is not finite, a finite number expected")
