@@ -58,6 +58,7 @@ _GAP_PATIENCE_S = 0.5
 _GAP_TRIES = 3
 _GAP_QUERY_TIMEOUT_S = 5.0
 _MAX_HOLES_PER_ROUND = 100
+_QUERIES_WAITING = 100
 
 
 class Received(NamedTuple):
@@ -139,7 +140,8 @@ class Publisher:
         self._publishers: dict[str, ext.AdvancedPublisher] = {}
         self._next_sequence: Counter[str] = Counter()
         self._latest: dict[str, tuple[bytes, bytes]] = {}
-        self._queryables: list[zenoh.Queryable[None]] = []
+        self._queryables: list[zenoh.Queryable[Any]] = []
+        self._answering: list[threading.Thread] = []
         self._lock = threading.Lock()
 
     def put(
@@ -202,6 +204,8 @@ class Publisher:
         with self._lock:
             for queryable in self._queryables:
                 queryable.undeclare()  # type: ignore[no-untyped-call]
+            for thread in self._answering:
+                thread.join()
             for publisher in self._publishers.values():
                 publisher.undeclare()  # type: ignore[no-untyped-call]
             self._queryables.clear()
@@ -214,17 +218,32 @@ class Publisher:
             row = topic(parsed.owner, parsed.stream)
             publisher = self._publishers[where] = _declare_publisher(self._session, where)
             if row.latched:
-                self._queryables.append(
-                    self._session.declare_queryable(where, self._answer, complete=True)
-                )
+                self._answer_queries(where)
         return publisher
 
-    def _answer(self, query: zenoh.Query) -> None:
-        with query:
-            where = str(query.key_expr)
-            for name, (payload, attachment) in list(self._latest.items()):
-                if name == where or zenoh.KeyExpr(where).includes(name):
-                    query.reply(name, payload, attachment=attachment)
+    def _answer_queries(self, where: str) -> None:
+        # A thread of our own: one of Zenoh's that still calls Python while the interpreter ends
+        # takes the process down with it.
+        queryable = self._session.declare_queryable(
+            where, handlers.FifoChannel(_QUERIES_WAITING), complete=True
+        )
+        thread = threading.Thread(
+            target=self._answer, args=(where, queryable.handler), name="answer", daemon=True
+        )
+        thread.start()
+        self._queryables.append(queryable)
+        self._answering.append(thread)
+
+    def _answer(self, where: str, queries: handlers.Handler[zenoh.Query]) -> None:
+        while True:
+            try:
+                query = queries.recv()
+            except zenoh.ZError:  # undeclared
+                return
+            latest = self._latest.get(where)
+            with query:
+                if latest is not None:
+                    query.reply(where, latest[0], attachment=latest[1])
 
 
 class Subscription:

@@ -19,7 +19,6 @@ _MAX_IN_FLIGHT = 20_000
 """Far fewer than a logger's queue holds, so that even `--speed 0` cannot overrun it."""
 _CHECK_EVERY = 1000
 DELIVERY_TIMEOUT_S = 30.0
-SUBSCRIBER_TIMEOUT_S = 10.0
 SETTLE_S = 0.3
 """For the queries that every subscriber sends to a new publisher."""
 
@@ -66,8 +65,8 @@ def play(
     return number
 
 
-def settle(publisher: Publisher, keys: Iterable[Key]) -> bool:
-    """Declare the publishers of all keys and wait for a subscriber; False if there is none.
+def settle(publisher: Publisher, keys: Iterable[Key], timeout_s: float) -> bool:
+    """Declare the publishers of all keys and wait for a subscriber; False if none came in time.
 
     Only then do the streams begin, so that no subscriber gets the beginning of one stream as
     history and of another one live, in another order.
@@ -78,9 +77,7 @@ def settle(publisher: Publisher, keys: Iterable[Key]) -> bool:
         first = first or name
     if first is None:
         return True
-    found = publisher.wait_for_subscriber(
-        first.owner, first.identifier, first.stream, SUBSCRIBER_TIMEOUT_S
-    )
+    found = publisher.wait_for_subscriber(first.owner, first.identifier, first.stream, timeout_s)
     time.sleep(SETTLE_S)
     return found
 

@@ -14,6 +14,7 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
+SUBSCRIBER_TIMEOUT_S = 10.0
 
 
 def run(
@@ -49,7 +50,7 @@ def run(
         publisher = Publisher(session, realm)
         delivery = Delivery(session, realm)
         try:
-            if not settle(publisher, keys):
+            if not settle(publisher, keys, SUBSCRIBER_TIMEOUT_S):
                 raise FailureError(
                     f"nobody subscribes to realm {realm} at {endpoint}; start `driveby logger` "
                     f"or another subscriber of driveby/v1/{realm}/** first"

@@ -52,6 +52,7 @@ __all__ = ["Gateway", "run"]
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
+SUBSCRIBER_TIMEOUT_S = 1.0
 _NS_PER_S = 1_000_000_000
 
 
@@ -137,7 +138,8 @@ def run(
         gateway = Gateway(session, realm, next(iter(streams.values()))[0].key.identifier)
         try:
             messages = _driven_now(streams, realm, gateway.publisher.boot_id, speed)
-            if not settle(gateway.publisher, [queue[0].key for queue in streams.values()]):
+            keys = [queue[0].key for queue in streams.values()]
+            if not settle(gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S):
                 # A real truck drives on as well; its cache serves those who come late.
                 _log.warning("nobody subscribes to %s in realm %s yet", gateway.vehicle, realm)
             sent = play(messages, gateway.publisher, gateway.delivery, speed=speed, stop=stop)

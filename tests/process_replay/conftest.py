@@ -1,0 +1,150 @@
+"""Real processes with real Zenoh sessions on loopback."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from schemas.signals import (
+    CHANNELS,
+    AccelBatch,
+    Channel,
+    GnssFix,
+    VehicleInfo,
+    encode_accel,
+    encode_gnss,
+    encode_info,
+    encode_location,
+)
+from schemas.topics import Key
+from services.common.recording import Message, write_recording
+
+# Runs one entry function as the command line would: exit code 2 for bad input, 1 for a failure.
+_RUNNER = """
+import importlib, json, logging, sys
+from pathlib import Path
+from services.common.errors import FailureError, InputError
+logging.basicConfig(level=logging.INFO, stream=sys.stderr)
+module, arguments = sys.argv[1], json.loads(sys.argv[2])
+for name in ("folder", "file", "site", "recording"):
+    if arguments.get(name) is not None:
+        arguments[name] = Path(arguments[name])
+if "recordings" in arguments:
+    arguments["recordings"] = [Path(path) for path in arguments["recordings"]]
+if module == "services.logger":
+    arguments["ready"] = lambda: print("ready", flush=True)
+try:
+    sys.exit(importlib.import_module(module).run(**arguments))
+except InputError as error:
+    sys.exit(print(error, file=sys.stderr) or 2)
+except FailureError as error:
+    sys.exit(print(error, file=sys.stderr) or 1)
+"""
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Start a service in a process of its own; all are ended with the test."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start_one(module: str, **arguments: Any) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-c", _RUNNER, module, json.dumps(arguments, default=str)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        if module == "services.logger":
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            if line != "ready\n":
+                pytest.fail(f"logger did not start: {process.communicate()[1]}")
+        return process
+
+    yield start_one
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def finish() -> Callable[[subprocess.Popen[str]], None]:
+    """Wait for a process that ends by itself; fail with its log if it did not end well."""
+
+    def wait(process: subprocess.Popen[str]) -> None:
+        _, log = process.communicate(timeout=60)
+        assert process.returncode == 0, log
+
+    return wait
+
+
+@pytest.fixture
+def terminate() -> Callable[[subprocess.Popen[str]], None]:
+    """End a service as an operator would; it must be done within 5 s."""
+
+    def end(process: subprocess.Popen[str]) -> None:
+        began = time.monotonic()
+        os.kill(process.pid, signal.SIGTERM)
+        _, log = process.communicate(timeout=20)
+        assert process.returncode == 0, log
+        assert time.monotonic() - began < 5.0, log
+
+    return end
+
+
+def drive(batches: int = 200, vehicle: str = "truck-1", boot_id: int = 77) -> Iterator[Message]:
+    """A truck with every vehicle stream: 50 ms batches of four channels, a fix every 100 ms."""
+    rng = np.random.default_rng(1)
+    start_ns = 1_700_000_000_000_000_000
+
+    def message(stream: str, payload: bytes, sequence: int, time_ns: int) -> Message:
+        where = Key("sim-test", "vehicle", vehicle, stream)
+        return Message(where, payload, boot_id, sequence, time_ns, time_ns)
+
+    info = VehicleInfo(boot_id, 0, 5, start_ns, vehicle, '[vehicle]\nid = "truck-1"\n')
+    yield message("info", encode_info(info), 0, start_ns)
+    for number in range(batches):
+        device_ns = 5 + number * 50_000_000
+        time_ns = start_ns + number * 50_000_000
+        channels = {name: Channel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+        batch = AccelBatch(boot_id, number, device_ns, time_ns, channels)
+        yield message("accel", encode_accel(batch), number, time_ns)
+        if number % 2 == 0:
+            fix = GnssFix(
+                boot_id, number // 2, device_ns, time_ns, 50 + number * 5e-6, 8.0, 100.0, 10.0
+            )
+            yield message("gnss", encode_gnss(fix), number // 2, time_ns)
+            yield message("location", encode_location(fix), number // 2, time_ns)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """10 s of one truck: 1 info, 200 accel, 100 gnss, 100 location."""
+    path = tmp_path / "drive.mcap"
+    write_recording(path, drive(), site_toml=None, reason="test")
+    return path
+
+
+@pytest.fixture
+def drive_messages() -> Callable[..., Iterator[Message]]:
+    return drive
