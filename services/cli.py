@@ -38,7 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
     except InputError as error:
         return _say(str(error), EXIT_BAD_INPUT)
-    _log(options.log_format, verbose=options.verbose)
+    # A service has nothing else to show for itself than what it says.
+    _log(options.log_format, verbose=options.verbose or options.handler in _SERVICES)
     handler: Handler = options.handler
     try:
         code = handler(options)
@@ -145,6 +146,7 @@ def _logger(options: argparse.Namespace) -> int:
         realm=options.realm,
         site=options.site,
         service_id=options.id,
+        ready=lambda: print(f"ready, listening at {options.listen}", flush=True),
     )
 
 
@@ -191,15 +193,14 @@ def _replay(options: argparse.Namespace) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
-    from services.viewer import view_command
+    from services.viewer.view import view_command
 
     return view_command(
-        target=options.target,
-        web=options.web,
-        endpoint=options.endpoint,
-        realm=options.realm,
-        console=_console(),
+        target=options.target, web=options.web, endpoint=ENDPOINT, realm="live", console=_console()
     )
+
+
+_SERVICES: Final = (_logger, _worker, _truck, _replay)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -236,7 +237,9 @@ def _add_offline(commands: Any) -> None:
         help="flexural rigidity of each element as a ratio to the sound value",
     )
     _add_site(p, "truck and bridge (default: those of the paper)")
-    p.add_argument("--road", choices=tuple("ABCDE"), default="A", help="ISO 8608 class (default: A)")
+    p.add_argument(
+        "--road", choices=tuple("ABCDE"), default="A", help="ISO 8608 class (default: A)"
+    )
     _add_seed(p)
     _add_noise(p, "accelerometers' noise density in µg/√Hz (default: 0)")
     p.add_argument(
@@ -331,19 +334,11 @@ def _add_offline(commands: Any) -> None:
         commands,
         "view",
         _view,
-        "look at a recording, a result, or what is happening now",
+        "look at a recording or a result",
         "driveby view run.mcap --web",
     )
-    p.add_argument(
-        "target",
-        nargs="?",
-        default="live",
-        metavar="REC|RESULT|RRD|live",
-        help="a .mcap, .json or .rrd file, or live (default)",
-    )
+    p.add_argument("target", metavar="REC|RESULT|RRD", help="a .mcap, .json or .rrd file")
     p.add_argument("--web", action="store_true", help="in the browser")
-    _add_endpoint(p)
-    _add_realm(p)
 
 
 def _add_live(commands: Any) -> None:

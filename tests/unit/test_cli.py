@@ -1,0 +1,392 @@
+"""The command line: exit codes, one line for every mistake, nothing half-written, a quick start."""
+
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from schemas.signals import GnssFix, encode_gnss
+from schemas.topics import Key
+from services import cli, importing
+from services.common.errors import FailureError, InputError
+from services.common.recording import Message, read_info, read_site, write_recording
+
+EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
+COMMANDS = (
+    "simulate", "import", "identify", "validate", "view",
+    "demo", "logger", "worker", "truck", "replay",
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_before() -> Iterator[None]:
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:], root.level = handlers, level
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    code = cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run a command that must end with exit code 2 and one line; return the line."""
+    code, out, err = run(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith("driveby: ")
+    assert err.endswith("\n")
+    assert err.count("\n") == 1
+    return err.removeprefix("driveby: ").rstrip("\n")
+
+
+def listing(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """A copy of the example that a test may spoil."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for path in EXAMPLE.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder
+
+
+def spoil(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_import_writes_a_recording_with_its_site(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    output = drive.parent / "drive.mcap"
+    code, out, err = run(capsys, "import", drive, "--site", drive / "site.toml", "-o", output)
+    assert (code, err) == (0, "")
+    assert out == (f"{output}: 1 run of truck-x, 6.0 s, 241 messages, realm import-drive\n")
+    assert read_site(output) == (drive / "site.toml").read_text()
+    assert sum(read_info(output).messages.values()) == 241
+    before = output.read_bytes()
+    pair = (drive / "accel_00.csv", drive / "gps_00.csv")
+    code, _, _ = run(capsys, "import", *pair, "--site", drive / "site.toml", "-o", output)
+    assert code == 0
+    assert output.read_bytes() == before  # an existing file is replaced, by the same
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "words"),
+    [
+        (
+            "site.toml",
+            "9000.0",
+            "-9000.0",
+            "site.toml: vehicle.total_mass_kg is -9000.0, it must be",
+        ),
+        ("site.toml", "span_m = 20.0", "span_m = 0", "site.toml: bridge.span_m is 0, it must be"),
+        (
+            "site.toml",
+            "8.00026296",
+            "8.0",
+            "site.toml: bridge.end_latitude_deg and end_longitude_d",
+        ),
+        (
+            "site.toml",
+            "wheelbase_m",
+            "wheel_base_m",
+            "site.toml: vehicle.wheel_base_m is not a kno",
+        ),
+        ("site.toml", "[sensor]", "[sensor", "site.toml: line 26, column 8: is not TOML"),
+        (
+            "site.toml",
+            "rate_hz = 100",
+            "rate_hz = 1000",
+            "accel_00.csv: time_s gives a rate of 100 ",
+        ),
+        ("accel_00.csv", "sprung_rear", "sprung_back", "accel_00.csv: line 1: unknown column"),
+        (
+            "accel_00.csv",
+            "0.110527",
+            "nan",
+            "accel_00.csv: line 4: sprung_front is nan, it must be",
+        ),
+        ("accel_00.csv", "00.030000", "00.020000", "accel_00.csv: line 5: time_s is 1790000000.02"),
+        ("gps_00.csv", "time_s", "time", 'gps_00.csv: line 1: unknown column "time"'),
+        (
+            "gps_00.csv",
+            "47.0",
+            "147.0",
+            "gps_00.csv: line 2: latitude_deg is 147.00000000, it must ",
+        ),
+    ],
+)
+def test_bad_files_give_one_line_and_leave_nothing(
+    capsys: pytest.CaptureFixture[str], drive: Path, name: str, old: str, new: str, words: str
+) -> None:
+    spoil(drive / name, old, new)
+    before = listing(drive.parent)
+    arguments = ("import", drive, "--site", drive / "site.toml", "-o", drive.parent / "out.mcap")
+    line = refused(capsys, *arguments)
+    assert line.startswith(f"{drive}/{words}")
+    assert listing(drive.parent) == before
+
+
+def test_positions_of_another_day_give_one_line_and_leave_nothing(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    path = drive / "gps_00.csv"
+    path.write_text(path.read_text().replace("\n1790", "\n1791"))
+    before = listing(drive.parent)
+    output = drive.parent / "out.mcap"
+    output.write_text("kept")
+    line = refused(capsys, "import", drive, "--site", drive / "site.toml", "-o", output)
+    assert line.startswith(f"{path}: time_s goes from 1791000000.000 to ")
+    assert listing(drive.parent) == {**before, "out.mcap": b"kept"}
+
+
+def test_missing_files_and_places_are_named(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    before = listing(drive.parent)
+    none, site, output = drive / "none", drive / "site.toml", drive.parent / "out.mcap"
+    assert f"{none}: no such file" in refused(capsys, "import", drive, "--site", none, "-o", output)
+    assert f"{none}: no such" in refused(capsys, "import", none, "--site", site, "-o", output)
+    assert f"{none}: no such" in refused(
+        capsys, "import", drive / "accel_00.csv", none, "--site", site, "-o", output
+    )
+    assert "is a folder" in refused(capsys, "import", drive, "--site", site, "-o", drive)
+    assert "does not exist" in refused(
+        capsys, "import", drive, "--site", site, "-o", none / "out.mcap"
+    )
+    three = [drive / "accel_00.csv"] * 3
+    assert "3 files given" in refused(capsys, "import", *three, "--site", site, "-o", output)
+    assert listing(drive.parent) == before
+
+
+def test_the_vehicle_must_be_chosen_where_there_are_several(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    site, output = drive / "site.toml", drive.parent / "out.mcap"
+    text = site.read_text()
+    table = text[text.index("[vehicle]") : text.index("[bridge]")].replace(
+        "[vehicle]", "[[vehicle]]"
+    )
+    site.write_text(table + table.replace("truck-x", "truck-y") + text[text.index("[bridge]") :])
+    arguments = ("import", drive, "--site", site, "-o", output)
+    assert refused(capsys, *arguments).endswith("choose with --vehicle one of truck-x, truck-y")
+    assert "holds no vehicle z" in refused(capsys, *arguments, "--vehicle", "z")
+    code, _, _ = run(capsys, *arguments, "--vehicle", "truck-y", "--name", "second")
+    assert code == 0
+    assert "driveby/v1/import-second/vehicle/truck-y/accel" in read_info(output).messages
+    assert "--name" in refused(capsys, *arguments, "--vehicle", "truck-y", "--name", "A B")
+
+
+def gnss_only(path: Path) -> None:
+    """A recording of a truck whose accelerometers never came."""
+    messages = [
+        Message(
+            Key("import-test", "vehicle", "truck-x", "gnss"),
+            encode_gnss(GnssFix(1, i, i, 1_790_000_000_000_000_000 + i, 47.0, 8.0, 400.0, 10.0)),
+            1,
+            i,
+            1_790_000_000_000_000_000 + i,
+            1_790_000_000_000_000_000 + i,
+        )
+        for i in range(20)
+    ]
+    site = (EXAMPLE / "site.toml").read_text()
+    write_recording(path, messages, site_toml=site, reason="test")
+
+
+def test_recordings_that_cannot_be_identified(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    pytest.importorskip("services.identify")
+    output = drive.parent / "out.json"
+    recording = drive.parent / "gnss.mcap"
+    gnss_only(recording)
+    before = listing(drive.parent)
+    for path, words in (
+        (drive / "none.mcap", "none.mcap: no such file"),
+        (drive / "site.toml", "site.toml: "),
+        (recording, "gnss.mcap: "),
+    ):
+        assert words in refused(capsys, "identify", path, "--json", output)
+    assert "accel" in refused(capsys, "identify", recording)
+    assert listing(drive.parent) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "the following arguments are required: COMMAND"),
+        (["fly"], "invalid choice: 'fly'"),
+        (["simulate", "-o", "x"], "one of the arguments --scenario --ei is required"),
+        (["simulate", "--scenario", "13", "-o", "x"], '--scenario: is "13", it must be 1 to 12'),
+        (["simulate", "--scenario", "6"], "required: -o/--output"),
+        (["simulate", "--scenario", "6", "--ei", "1,1", "-o", "x"], "not allowed with argument"),
+        (["simulate", "--ei", "1,,1", "-o", "x"], '--ei: is "", it must be ratios from 0.001'),
+        (["simulate", "--ei", "1,-1", "-o", "x"], '--ei: is "-1", it must be ratios'),
+        (["simulate", "--scenario", "6", "--road", "AB", "-o", "x"], "--road: invalid choice"),
+        (["simulate", "--scenario", "6", "--noise", "-1", "-o", "x"], "must be a noise density"),
+        (["simulate", "--scenario", "6", "--noise", "nan", "-o", "x"], "must be a noise density"),
+        (["simulate", "--scenario", "6", "--speed", "8:", "-o", "x"], "must be a speed in m/s"),
+        (["simulate", "--scenario", "6", "--seed", "1.5", "-o", "x"], "a seed, a whole number"),
+        (["simulate", "--scen", "6", "-o", "x"], "one of the arguments --scenario --ei"),
+        (["validate", "--scenarios", "1,0"], '--scenarios: is "0", it must be 1 to 12'),
+        (["replay"], "required: REC.mcap"),
+        (["replay", "x", "--speed", "-2"], '--speed: is "-2", it must be a factor from 0'),
+        (["truck", "x", "--speed", "0"], '--speed: is "0", it must be a factor from 0.001'),
+    ],
+)
+def test_wrong_options_give_one_line(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    line = refused(capsys, *arguments)
+    assert words in line
+    assert re.search(r"\(see driveby ?\w* --help\)$", line)
+
+
+def test_lists_and_ranges_are_read() -> None:
+    parser = cli._parser()
+    options = parser.parse_args(
+        ["simulate", "--ei", "1,.4,1", "--speed", "8:12", "--gps-noise", "-o", "x.mcap"]
+    )
+    assert (options.ei, options.speed, options.gps_noise) == ((1, 0.4, 1), (8, 12), True)
+    options = parser.parse_args(["simulate", "--scenario", "6", "--speed", "9", "-o", "x.mcap"])
+    assert (options.scenario, options.speed, options.gps_noise) == (6, (9, 9), False)
+    assert parser.parse_args(["validate"]).scenarios == tuple(range(1, 13))
+    assert parser.parse_args(["validate", "--scenarios", "1, 6,1"]).scenarios == (1, 6)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(
+    capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main([command, "--help"])
+    assert left.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    example = text.split(f"example: driveby {command}")
+    assert len(example) == 2
+    # The example itself must be understood.
+    arguments = [command, *example[1].split("&&")[0].split()]
+    assert callable(cli._parser().parse_args(arguments).handler)
+
+
+def test_the_commands_offered_are_those_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    assert all(command in refused(capsys, "none") for command in COMMANDS)
+    for later in ("survey", "watch", "report", "recover", "certs"):
+        assert f"'{later}'" in refused(capsys, later).split("(choose from")[0]
+        assert later not in refused(capsys, "none")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (InputError("x.csv: line 3:\n is bad"), 2, "driveby: x.csv: line 3: is bad\n"),
+        (FailureError("nobody answers"), 1, "driveby: nobody answers\n"),
+        (KeyboardInterrupt(), 130, "driveby: interrupted\n"),
+        (
+            RuntimeError("a\nb"),
+            1,
+            "driveby: internal error, please report: RuntimeError: a b"
+            + "; run with --debug for the traceback\n",
+        ),
+    ],
+)
+def test_errors_become_a_line_and_an_exit_code(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException,
+    code: int,
+    line: str,
+) -> None:
+    def fail(**_: object) -> str:
+        raise error
+
+    monkeypatch.setattr(importing, "import_command", fail)
+    arguments = ("import", "x", "--site", "s", "-o", "o")
+    assert run(capsys, *arguments) == (code, "", line)
+    _, _, err = run(capsys, "--debug", *arguments)
+    assert ("Traceback" in err) == isinstance(error, RuntimeError)
+
+
+@pytest.mark.parametrize("place", ["before", "after"])
+def test_log_format_may_stand_before_or_after_the_command(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    def talk(**_: object) -> str:
+        logging.getLogger("services.x").info("hello")
+        return "done"
+
+    monkeypatch.setattr(importing, "import_command", talk)
+    options = ["--log-format", "json", "--verbose"]
+    arguments = ["import", "x", "--site", "s", "-o", "o"]
+    code, out, err = run(
+        capsys, *(options + arguments if place == "before" else arguments + options)
+    )
+    assert (code, out) == (0, "done\n")
+    record = json.loads(err)
+    assert (record["level"], record["logger"], record["message"]) == ("info", "services.x", "hello")
+    _, _, err = run(capsys, *arguments)
+    assert err == ""
+
+
+def driveby(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "services.cli", *arguments]
+
+
+def test_a_reader_that_leaves_early_is_no_error(project: Path) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        driveby("import", str(EXAMPLE), "--site", f"{EXAMPLE}/site.toml", "-o", "/dev/null/x"),
+        cwd=project, stdout=write, stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2  # nothing was printed, so nothing broke
+    code = """
+from services import cli, importing
+importing.import_command = lambda **_: "x" * 100_000
+raise SystemExit(cli.main(["import", "x", "--site", "s", "-o", "o"]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=project, stdout=write, stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_help_and_version_are_quick(project: Path) -> None:
+    """At most 0.5 s, the best of three: other work on the machine is not what is measured."""
+    for arguments, words in ((["--help"], "identify"), (["--version"], "driveby 0.")):
+        seconds = []
+        for _ in range(3):
+            start = time.perf_counter()
+            done = subprocess.run(
+                driveby(*arguments), cwd=project, capture_output=True, text=True, check=True
+            )
+            seconds.append(time.perf_counter() - start)
+            assert words in done.stdout
+        assert min(seconds) <= 0.5
+
+
+def test_nothing_heavy_is_imported_at_the_start(project: Path) -> None:
+    heavy = ("numpy", "numba", "zenoh", "rerun", "matplotlib", "pydantic", "scipy", "rich")
+    code = f"import services.cli, sys; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=project, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[]\n"
