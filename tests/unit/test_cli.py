@@ -25,6 +25,12 @@ COMMANDS = (
 )  # fmt: skip
 
 
+INTERNAL = (
+    "driveby: internal error, please report: RuntimeError: a b; "
+    "run with --debug for the traceback\n"
+)
+
+
 @pytest.fixture(autouse=True)
 def _logging_as_before() -> Iterator[None]:
     root = logging.getLogger()
@@ -117,9 +123,9 @@ def test_import_writes_a_recording_with_its_site(
         ("accel_00.csv", "sprung_rear", "sprung_back", "accel_00.csv: line 1: unknown column"),
         (
             "accel_00.csv",
-            "0.110527",
+            "0.564480",
             "nan",
-            "accel_00.csv: line 4: sprung_front is nan, it must be",
+            "accel_00.csv: line 2: unsprung_rear is nan, it must be",
         ),
         ("accel_00.csv", "00.030000", "00.020000", "accel_00.csv: line 5: time_s is 1790000000.02"),
         ("gps_00.csv", "time_s", "time", 'gps_00.csv: line 1: unknown column "time"'),
@@ -301,8 +307,7 @@ def test_the_commands_offered_are_those_that_exist(capsys: pytest.CaptureFixture
         (
             RuntimeError("a\nb"),
             1,
-            "driveby: internal error, please report: RuntimeError: a b"
-            + "; run with --debug for the traceback\n",
+            INTERNAL,
         ),
     ],
 )
