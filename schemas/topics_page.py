@@ -1,0 +1,98 @@
+"""Writes docs/topics.md from the table of topics: `python -m schemas.topics_page`.
+
+A test compares the page with the table and runs the subscriber that the page shows.
+"""
+
+from pathlib import Path
+
+from schemas.topics import IDENTIFIER, PREFIX, TOPICS, Topic
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "topics.md"
+
+SUBSCRIBER = """\
+import json, sys
+import zenoh
+from schemas.messages import decode
+from schemas.topics import parse_key, topic
+
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))  # tcp/127.0.0.1:7447
+history = zenoh.ext.HistoryConfig(detect_late_publishers=True)  # what was said before, too
+with zenoh.open(config) as session:
+    received = zenoh.ext.declare_advanced_subscriber(session, "driveby/v1/**", history=history)
+    for sample in received:
+        key = parse_key(str(sample.key_expr))
+        message = decode(topic(key.owner, key.stream).message, sample.payload.to_bytes())
+        print(key.realm, key.identifier, key.stream, message.ByteSize(), "bytes", flush=True)
+"""
+
+_HEAD = f"""\
+<!-- Written by `python -m schemas.topics_page` from schemas/topics.py. Do not edit. -->
+# Topics
+
+What travels over Zenoh, one row for each stream. Logger, replay, liveness and viewer go by the
+same table (`schemas/topics.py`); messages are Protocol Buffers (`schemas/proto/driveby.proto`).
+
+A key is `{PREFIX}/{{realm}}/{{owner}}/{{id}}/{{stream}}`, for example
+`{PREFIX}/live/vehicle/truck-1/accel`. The realm is `live`, `replay-NAME`, `sim-NAME` or
+`import-NAME`: a replay never mixes with the real thing. Identifiers and NAME match
+`{IDENTIFIER}`.
+"""
+
+_TAIL = f"""
+- **reliable** publishers block instead of dropping, keep their last messages (*kept*) and are
+  asked again for what was missed. **latest** may be dropped. A **latched** topic gives its last
+  message to a late subscriber; it also answers `session.get(key)`. The logger writes what is
+  **logged**, byte for byte.
+- A message's identity is (realm, owner and id, stream, boot_id, sequence). `boot_id` rises with
+  every start of the publisher, `sequence` counts the messages of one key from 0. Both are in the
+  Zenoh attachment of every put: two unsigned 64-bit integers, big-endian. A message may arrive
+  twice or late; tell it by its identity, and order a stream by (boot_id, sequence).
+- `durable` says, for every stream and boot, up to where a logger has all messages safely on disk
+  (`sequence`, from 0) and how many different ones it has (`count`). A publisher that is about to
+  leave waits until `count` has reached what it sent.
+- A payload larger than *at most*, of another message, of another schema version or with
+  impossible values is refused by the logger, counted, and reported in an `event`.
+
+## A subscriber
+
+Run it with the endpoint of the logger, e.g. `python subscriber.py tcp/127.0.0.1:7447`.
+
+```python
+{SUBSCRIBER}```
+"""
+
+
+def page() -> str:
+    """Return the text of docs/topics.md."""
+    columns = (
+        "stream", "message", "logged", "latched", "per second", "delivery", "kept", "at most", "",
+    )  # fmt: skip
+    lines = [_row(columns), _row(("---",) * len(columns))]
+    lines += [_row(_cells(row)) for row in TOPICS]
+    return _HEAD + "\n" + "\n".join(lines) + "\n" + _TAIL
+
+
+def _cells(row: Topic) -> tuple[str, ...]:
+    rate = row.nominal_rate_hz
+    per_second = "on occasion" if rate is None else f"{rate:g}" if rate >= 1 else "1 a minute"
+    return (
+        f"`{row.owner}/…/{row.stream}`",
+        f"`{row.message}`" if row.message else "(a liveliness token)",
+        "yes" if row.logged else "no",
+        "yes" if row.latched else "no",
+        per_second,
+        row.delivery,
+        f"{row.cache}" if row.message else "",
+        f"{row.max_bytes // 1024} KiB" if row.message else "",
+        row.description,
+    )
+
+
+def _row(cells: tuple[str, ...]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())

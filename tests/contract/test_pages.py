@@ -1,0 +1,85 @@
+"""The repository's pages: links lead somewhere, every command named is there."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from schemas.site import load_site
+from services import cli
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").glob("**/*.md"), ROOT / "recordings/README.md"]
+)
+
+
+def slug(heading: str) -> str:
+    """The anchor that a heading gets on a repository page."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if target.startswith(("http://", "https://")):
+            continue
+        name, _, anchor = target.partition("#")
+        file = page if not name else page.parent / name
+        assert file.exists(), f"{page.name} links to {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", file.read_text(), re.MULTILINE)
+            assert anchor in {slug(heading) for heading in headings}, f"no heading for {target}"
+
+
+def commands(text: str) -> set[str]:
+    return set(re.findall(r"`driveby ([a-z]+)`", text))
+
+
+def test_readme_lists_exactly_the_commands_that_there_are(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    overview = capsys.readouterr().out.split("COMMAND", 2)[-1]
+    offered = set(re.findall(r"^    ([a-z]+)\b", overview, re.MULTILINE))
+    assert offered, overview
+    assert commands((ROOT / "README.md").read_text()) == offered
+
+
+def test_example_site_file_is_accepted():
+    site = load_site(ROOT / "docs/site.example.toml")
+    assert site.bridges[0].elements == 7
+
+
+def test_ci_runs_the_commands_of_the_readme():
+    script = ROOT / ".ci/run"
+    assert script.stat().st_mode & 0o111
+    assert "make test" in script.read_text()
+    assert "make test" in (ROOT / "README.md").read_text()
+
+
+def test_version_is_the_same_everywhere():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {project['version']}\n" in citation
+    assert f"\nlicense: {project['license']}\n" in citation
+
+
+def test_compose_publishes_ports_on_loopback_only():
+    text = (ROOT / "compose.yaml").read_text()
+    published = re.findall(r'^\s*- "([\d.:]+)"$', text, re.MULTILINE)
+    assert published
+    assert all(port.startswith("127.0.0.1:") for port in published)
+
+
+def test_help_does_not_import_the_heavy_libraries():
+    heavy = {"numba", "zenoh", "rerun", "matplotlib", "scipy", "pydantic"}
+    code = (
+        "import sys\nfrom services import cli\n"
+        "try:\n    cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
+        f"print('LOADED', sorted({heavy!r} & sys.modules.keys()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "LOADED []"
