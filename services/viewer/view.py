@@ -6,6 +6,7 @@ come from the internet when there is one; tracks and bridges are drawn without.
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import tempfile
 from collections.abc import Iterable
@@ -31,16 +32,12 @@ from services.viewer.rerun_file import (
 SUFFIXES = (".rrd", ".mcap", ".json")
 
 
-def view_command(
-    *, target: str | Path, web: bool, endpoint: str, realm: str, console: Console
-) -> int:
+def view_command(*, target: str | Path, web: bool, console: Console) -> int:
     """Open a Rerun file (.rrd), a recording (.mcap) or results (.json); wait until it is closed.
 
     `web` serves the viewer for a browser instead of opening a window. Returns the exit code.
     Raises InputError for a missing or unknown file, FailureError if the viewer does not start.
     """
-    if str(target) == "live":
-        raise FailureError("the live view is not there yet; name a recording to look at")
     path = Path(target)
     if not path.is_file():
         raise InputError(f"{path}: no such file, one of {', '.join(SUFFIXES)} is expected")
@@ -141,11 +138,15 @@ def _run_viewer(shown: Path, *, web: bool) -> int:
         raise FailureError(f"{program}: the Rerun viewer is not installed for this platform")
     subprocess.run([program, "analytics", "disable"], check=False, capture_output=True)
     with subprocess.Popen(viewer_arguments(shown, web=web)) as viewer:
+        # Without this the viewer would go on alone when this program is told to stop.
+        previous = signal.signal(signal.SIGTERM, lambda *_: viewer.terminate())
         try:
             code = viewer.wait()
         except KeyboardInterrupt:
             viewer.terminate()
-            return 0
-    if code != 0:
+            code = 0
+        finally:
+            signal.signal(signal.SIGTERM, previous)
+    if code not in (0, -signal.SIGTERM):
         raise FailureError(f"the Rerun viewer ended with code {code}; without a screen, try --web")
     return 0

@@ -4,7 +4,9 @@ import io
 import os
 import socket
 import subprocess
+import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -362,9 +364,7 @@ def test_what_cannot_be_opened_is_bad_input(tmp_path: Path, name: str):
 
     (tmp_path / "notes.txt").write_text("no recording")
     with pytest.raises(InputError, match=name):
-        view_command(
-            target=tmp_path / name, web=False, endpoint="", realm="", console=Console(quiet=True)
-        )
+        view_command(target=tmp_path / name, web=False, console=Console(quiet=True))
 
 
 @pytest.mark.parametrize("web", [False, True])
@@ -372,6 +372,41 @@ def test_viewer_is_told_to_listen_on_loopback_only(web: bool):
     arguments = viewer_arguments(Path("a.rrd"), web=web)
     assert arguments[arguments.index("--bind") + 1] == "127.0.0.1"
     assert ("--web-viewer" in arguments) == web
+
+
+@pytest.mark.process
+def test_viewer_ends_with_the_command_that_started_it(tmp_path: Path, monkeypatch):
+    """A stand-in for the viewer: the real one needs a screen."""
+    started = tmp_path / "started"
+    program = tmp_path / "viewer"
+    program.write_text(
+        f"#!/bin/sh\n[ $1 = analytics ] && exit\necho $$ > {started}\nexec sleep 60\n"
+    )
+    program.chmod(0o755)
+    recording = tmp_path / "run.rrd"
+    recording.touch()
+    code = (
+        "import sys; from pathlib import Path; from rich.console import Console\n"
+        "from services.viewer import view\n"
+        f"view.viewer_program = lambda: Path({str(program)!r})\n"
+        f"sys.exit(view.view_command(target={str(recording)!r}, web=False, console=Console()))"
+    )
+    with subprocess.Popen([sys.executable, "-c", code]) as command:
+        try:
+            wait_until(lambda: started.exists() and started.read_text().endswith("\n"))
+            command.terminate()
+            assert command.wait(timeout=10) == 0
+        finally:
+            command.kill()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(started.read_text()), 0)
+
+
+def wait_until(true: Callable[[], bool], seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
 
 
 def see(file: Path, folder: Path) -> tuple[list[View], np.ndarray]:
