@@ -34,25 +34,37 @@ FloatArray = NDArray[np.float64]
 class BeamBasis(NamedTuple):
     """What every evaluation shares: the beam in coordinates in which the sound one is diagonal.
 
-    `stiffness` (n + 2, m, m): dK/dEI_e and dK/dk_rot in coordinates that make the mass matrix of
-    1 kg/m the identity. `cubics` (n, 4, m): deflection in each element for each coordinate.
+    `stiffness` (n + 2, m, m): dK/dEI_e and dK/dk_rot of the n elements and two supports, in
+    coordinates that make the mass matrix of 1 kg/m the identity. `cubics` (n parts, 4, m):
+    deflection in each part of an element for each coordinate. `lengths_m` (n parts,).
     """
 
     stiffness: FloatArray
     cubics: FloatArray
+    lengths_m: FloatArray
 
 
-def beam_basis(element_lengths_m: FloatArray) -> BeamBasis:
-    """Coordinates: the modes of the uniform beam of the same mesh, all 2n of them."""
+def beam_basis(
+    element_lengths_m: FloatArray, parts: int = 1, coordinates: int | None = None
+) -> BeamBasis:
+    """Coordinates: the lowest modes of the uniform beam whose elements are cut into `parts`.
+
+    All 2 n parts of them by default, which is the finite-element model itself. With finer parts
+    and fewer coordinates the model is nearer to the true beam at the same cost.
+    """
     n = element_lengths_m.size
-    unit = uniform_beam(1.0, np.ones(n), 1.0, 0.0, 0.0)._replace(
-        element_lengths_m=element_lengths_m
+    lengths = np.repeat(element_lengths_m / parts, parts)
+    unit = uniform_beam(1.0, np.ones(n * parts), 1.0, 0.0, 0.0)._replace(element_lengths_m=lengths)
+    fine = unit_stiffness_matrices(lengths)
+    count = fine.shape[1] if coordinates is None else min(coordinates, fine.shape[1])
+    units = np.concatenate(
+        [fine[: n * parts].reshape(n, parts, *fine.shape[1:]).sum(axis=1), fine[n * parts :]]
     )
-    units = unit_stiffness_matrices(element_lengths_m)
-    _, shapes = eigh(units[:n].sum(axis=0), mass_matrix(unit))
+    _, shapes = eigh(units[:n].sum(axis=0), mass_matrix(unit), subset_by_index=(0, count - 1))
     return BeamBasis(
         np.ascontiguousarray(shapes.T @ units @ shapes),
-        np.ascontiguousarray(element_cubics(element_lengths_m, shapes)),
+        np.ascontiguousarray(element_cubics(lengths, shapes)),
+        lengths,
     )
 
 
@@ -76,7 +88,7 @@ def modal_filters(
 ) -> bool:
     """Modes of four bridges as the coefficients of their recursions; False if not finite.
 
-    `theta` is (4, n + 15). Written: `cubics` (n, m, 4, 4) [element, mode, power, particle], scaled
+    `theta` is (4, n + 15). Written: `cubics` (parts, m, 4, 4) [part, mode, power, particle], scaled
     by 1/sqrt(b_0), and `feedback` (m, 2, 4): -b_1/b_0 and -b_2/b_0.
     """
     factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
@@ -105,7 +117,7 @@ def modal_filters(
             feedback[k, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
             feedback[k, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
             matrix[k, k, lane] = 1.0 / np.sqrt(theta[lane, rho] * b_0)
-    for e in range(elements):
+    for e in range(basis_cubics.shape[0]):
         for k in range(m):
             size = load(matrix[k], k)
             for power in range(4):

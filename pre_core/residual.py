@@ -40,8 +40,8 @@ class Window(NamedTuple):
     acceleration: FloatArray  # (4, n)
     load_transfer_n: FloatArray  # (n,): taken off the front axle's load, put on the rear's
     signals: FloatArray  # (2, 4, n): see iep.py
-    stretches: IntArray  # (s, 4): first sample, last + 1, element under front, under rear (-1 none)
-    place: FloatArray  # (2, n): place 0..1 within the element
+    stretches: IntArray  # (s, 4): first sample, last + 1, part under front, under rear (-1 none)
+    place: FloatArray  # (2, n): place 0..1 within the part
     first_row: int  # sample of row 0
     front_sample: IntArray  # (m,): first of the four samples at which the front passed the same x
     front_weight: FloatArray  # (m, 4)
@@ -109,6 +109,8 @@ def build_window(
     speed_change_m_per_s2: FloatArray | None = None,
     cg_height_m: float = 0.0,
     gravity_m_per_s2: float = STANDARD_GRAVITY_M_PER_S2,
+    parts: int = 1,
+    coordinates: int | None = None,
 ) -> Window:
     """Prepare one crossing.
 
@@ -116,6 +118,7 @@ def build_window(
     `direction` is 1 driving from start to end, else -1. With `initial_state_known` the truck was at
     rest at the first sample, as in the paper; otherwise whatever initial displacement and velocity
     (and, unless `bias_known`, constant bias) the channels had is projected out of the residual.
+    `parts` and `coordinates` refine the beam (see `beam_basis`); the defaults are the paper's mesh.
 
     Raises WindowError if the samples do not reach from the entry to the exit.
     """
@@ -138,7 +141,8 @@ def build_window(
     else:
         signals = iep_signals(acceleration_m_per_s2[:, begin : leave + 1], step_s, integrate)
     part = slice(begin, leave + 1)
-    element, place = locate(element_lengths_m, np.stack([front[part], rear[part]]))
+    basis = beam_basis(element_lengths_m, parts, coordinates)
+    element, place = locate(basis.lengths_m, np.stack([front[part], rear[part]]))
 
     first_row = int(np.searchsorted(travel_rear, 0.0)) - begin
     rows = slice(first_row + begin, leave)
@@ -174,7 +178,7 @@ def build_window(
         row_weight,
         _orthonormal(columns, row_weight),
         np.ascontiguousarray(rear[rows]),
-        beam_basis(element_lengths_m),
+        basis,
     )
 
 
