@@ -195,9 +195,7 @@ def _replay(options: argparse.Namespace) -> int:
 def _view(options: argparse.Namespace) -> int:
     from services.viewer.view import view_command
 
-    return view_command(
-        target=options.target, web=options.web, endpoint=ENDPOINT, realm="live", console=_console()
-    )
+    return view_command(target=options.target, web=options.web, console=_console())
 
 
 _SERVICES: Final = (_logger, _worker, _truck, _replay)
