@@ -107,6 +107,7 @@ class FileWriter:
         except Exception as error:  # whatever it was, it must be told and nobody left waiting
             reason = getattr(error, "strerror", None) or str(error)
             self.failure = f"recording stopped: {reason}"
+            self.dropped += len(self._unsynced)
             _log.error("%s", self.failure)
             for file in self._files.values():
                 file.abandon()
@@ -127,8 +128,8 @@ class FileWriter:
                 if file is None:
                     self.dropped += 1
                 else:
-                    file.write(message)
                     self._unsynced.append(message)
+                    file.write(message)
             if self._unsynced and time.monotonic() - synced >= SYNC_PERIOD_S:
                 self._sync()
                 synced = time.monotonic()

@@ -1,0 +1,236 @@
+"""What the logger lets in, what it reports, and how it writes."""
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from schemas.events import EventKind
+from schemas.signals import GnssFix, encode_gnss, encode_identity
+from schemas.topics import Key
+from services.common.bus import Received
+from services.common.errors import InputError
+from services.common.recording import Message, RecordingWriter, read_info, read_messages
+from services.logger.intake import GAP_PATIENCE_S, Intake
+from services.logger.writer import FileWriter, Place
+
+NOW_NS = 1_700_000_000_000_000_000
+KEY = "driveby/v1/live/vehicle/truck-1/gnss"
+
+
+def fix(sequence: int, boot_id: int = 1, **fields: float) -> bytes:
+    good = GnssFix(boot_id, sequence, 0, NOW_NS + sequence, 50.0, 8.0, 100.0, 10.0)
+    return encode_gnss(good._replace(**fields))
+
+
+def received(
+    sequence: int, *, key: str = KEY, payload: bytes | None = None, boot_id: int = 1
+) -> Received:
+    attachment = encode_identity(boot_id, sequence)
+    return Received(key, payload or fix(sequence, boot_id), attachment, False)
+
+
+def make_intake() -> Intake:
+    return Intake("live", "logger", 99)
+
+
+def test_a_good_message_is_written_as_it_came() -> None:
+    intake = make_intake()
+    payload = fix(7)
+    message = intake.take(received(7, payload=payload), NOW_NS + 5)
+    where = Key("live", "vehicle", "truck-1", "gnss")
+    assert message == Message(where, payload, 1, 7, NOW_NS + 7, NOW_NS + 5)
+    assert intake.report(NOW_NS, 0.0) == []
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        (received(0, key="driveby/v1/live/vehicle/truck-1/speed"), "no topic"),
+        (received(0, key="driveby/v1/live/vehicle/../../etc/gnss"), "is not driveby/v1"),
+        (received(0, key="driveby/v1/live/vehicle/" + "a" * 10_000 + "/gnss"), "characters"),
+        (received(0)._replace(attachment=None), "no attachment"),
+        (received(0)._replace(attachment=b"short"), "attachment of 5 bytes"),
+        (received(0, payload=b"\xff"), "not a driveby.v1.GnssFix"),
+        (received(0, payload=b"\x00" * 5000), "at most 4096"),
+        (received(0, key=KEY.replace("gnss", "accel")), "accel"),
+    ],
+)
+def test_bad_messages_are_refused_counted_and_reported(bad: Received, reason: str) -> None:
+    intake = make_intake()
+    assert intake.take(bad, NOW_NS) is None
+    assert intake.take(bad, NOW_NS) is None
+    assert intake.counts["refused"] == 2
+    [(where, event)] = intake.report(NOW_NS, 0.0)
+    assert where.realm == "live"
+    assert (event.kind, event.messages) == (EventKind.REFUSED, 2)
+    assert reason in event.text
+    assert intake.report(NOW_NS, 1.0) == []
+
+
+def test_identity_tells_duplicates() -> None:
+    intake = make_intake()
+    other_realm = KEY.replace("live", "sim-a")
+    same = [received(0), received(0)._replace(recovered=True), received(0)]
+    assert [intake.take(one, NOW_NS) is not None for one in same] == [True, False, False]
+    assert intake.counts["duplicates"] == 2
+    for different in (
+        received(1),
+        received(0, boot_id=2),
+        received(0, key=other_realm),
+        received(0, key=KEY.replace("truck-1", "truck-2")),
+    ):
+        assert intake.take(different, NOW_NS) is not None
+
+
+def test_a_gap_is_reported_when_it_lasts_and_its_end_too() -> None:
+    intake = make_intake()
+    for sequence in (10, 11, 15, 16):
+        intake.take(received(sequence), NOW_NS)
+    assert intake.report(NOW_NS, 0.0) == []
+    assert intake.report(NOW_NS, GAP_PATIENCE_S - 0.1) == []
+    [(where, gap)] = intake.report(NOW_NS, GAP_PATIENCE_S)
+    assert where == Key("live", "vehicle", "truck-1", "gnss")
+    assert gap.kind == EventKind.GAP
+    assert (gap.first_sequence, gap.last_sequence, gap.messages) == (12, 14, 3)
+    assert (gap.vehicle, gap.stream, gap.boot_id) == ("truck-1", "gnss", 1)
+    assert intake.report(NOW_NS, 100.0) == []
+    for sequence in (12, 13, 14):
+        assert intake.take(received(sequence), NOW_NS) is not None
+    [(_, recovered)] = intake.report(NOW_NS, 101.0)
+    assert (recovered.kind, recovered.messages) == (EventKind.RECOVERED, 3)
+
+
+def test_a_gap_at_the_end_is_reported_before_the_file_is_closed() -> None:
+    intake = make_intake()
+    intake.take(received(0), NOW_NS)
+    intake.take(received(2), NOW_NS)
+    [(_, gap)] = intake.report(NOW_NS, 0.0, closing=True)
+    assert gap.kind == EventKind.GAP
+
+
+def test_what_the_logger_says_itself_is_not_taken_twice() -> None:
+    intake = make_intake()
+    own = received(0, key="driveby/v1/live/service/logger/event", boot_id=99)
+    assert intake.take(own, NOW_NS) is None
+    assert sum(intake.counts.values()) == 0
+
+
+def place(folder: Path, file: Path | None = None) -> Place:
+    return Place(folder, file, None, "site = 1\n")
+
+
+def messages(number: int, vehicle: str = "truck-1") -> list[Message]:
+    where = Key("live", "vehicle", vehicle, "gnss")
+    return [Message(where, fix(n), 1, n, NOW_NS + n, NOW_NS) for n in range(number)]
+
+
+def wait_for(condition: object) -> None:
+    deadline = time.monotonic() + 5.0
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_durable_speaks_only_of_what_was_synced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    syncing, go = threading.Event(), threading.Event()
+    real = RecordingWriter.sync
+
+    def slow(self: RecordingWriter) -> None:
+        syncing.set()
+        go.wait(5)
+        real(self)
+
+    writer = FileWriter(place(tmp_path, tmp_path / "a.mcap"))
+    monkeypatch.setattr(RecordingWriter, "sync", slow)
+    sent = messages(5)
+    for message in (sent[0], sent[1], sent[3]):
+        assert writer.put(message)
+    assert syncing.wait(5)
+    assert writer.durable() == (0, {})
+    go.set()
+    wait_for(lambda: writer.durable_version() == 1)
+    [stream] = writer.durable()[1]["live"].streams
+    assert (stream.owner, stream.identifier, stream.stream) == ("vehicle", "truck-1", "gnss")
+    assert (stream.boot_id, stream.sequence, stream.count) == (1, 1, 3)
+    writer.finish("done", {"lost": 1})
+    info = read_info(tmp_path / "a.mcap")
+    assert info.end is not None
+    assert (info.end["reason"], info.end["lost"]) == ("done", "1")
+
+
+def test_durable_without_the_first_message_has_no_sequence(tmp_path: Path) -> None:
+    writer = FileWriter(place(tmp_path, tmp_path / "a.mcap"))
+    writer.put(messages(5)[4])
+    writer.finish("done", {})
+    [stream] = writer.durable()[1]["live"].streams
+    assert not stream.HasField("sequence")
+    assert stream.count == 1
+
+
+def test_files_by_realm_date_and_vehicle(tmp_path: Path) -> None:
+    writer = FileWriter(place(tmp_path))
+    for message in messages(3) + messages(2, "truck-2"):
+        writer.put(message)
+    writer.finish("done", {})
+    files = sorted(tmp_path.glob("live/*/*.mcap"))
+    assert [file.name.rsplit("-", 1)[0] for file in files] == ["truck-1", "truck-2"]
+    assert [len(list(read_messages(file))) for file in files] == [3, 2]
+    assert all(read_info(file).site_toml == "site = 1\n" for file in files)
+
+
+def test_a_full_queue_is_counted_and_holds_nobody_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = threading.Event()
+    real = RecordingWriter.write
+
+    def slow(self: RecordingWriter, message: Message) -> None:
+        go.wait(5)
+        real(self, message)
+
+    monkeypatch.setattr("services.logger.writer.QUEUE_MESSAGES", 10)
+    monkeypatch.setattr(RecordingWriter, "write", slow)
+    writer = FileWriter(place(tmp_path, tmp_path / "a.mcap"))
+    began = time.monotonic()
+    taken = [writer.put(message) for message in messages(20)]
+    assert time.monotonic() - began < 1.0
+    assert 10 <= sum(taken) <= 11
+    assert writer.dropped == 20 - sum(taken)
+    go.set()
+    writer.finish("done", {})
+    assert len(list(read_messages(tmp_path / "a.mcap"))) == sum(taken)
+
+
+def test_a_write_error_is_told_and_what_was_synced_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = FileWriter(place(tmp_path, tmp_path / "a.mcap"))
+    sent = messages(6)
+    for message in sent[:3]:
+        writer.put(message)
+    wait_for(lambda: writer.durable_version() == 1)
+
+    def full(self: RecordingWriter, message: Message) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(RecordingWriter, "write", full)
+    writer.put(sent[3])
+    wait_for(lambda: writer.failure is not None)
+    assert writer.failure == "recording stopped: No space left on device"
+    assert not writer.put(sent[4])
+    assert writer.dropped == 2
+    writer.finish("done", {})
+    assert list(read_messages(tmp_path / "a.mcap")) == sent[:3]
+    [stream] = writer.durable()[1]["live"].streams
+    assert stream.count == 3
+
+
+def test_an_existing_file_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"precious")
+    with pytest.raises(InputError, match="never overwritten"):
+        FileWriter(place(tmp_path, tmp_path / "a.mcap"))
+    assert not [thread for thread in threading.enumerate() if thread.name == "writer"]
