@@ -29,10 +29,10 @@ STANDARD_GRAVITY_M_PER_S2 = 9.80665
 BATCH_S = 0.05
 
 _NS = 1_000_000_000
-_LARGEST_JITTER = (
-    0.1  # of a sampling interval: below it a time stamp's jitter is taken for rounding
-)
-_GAP = 1.5  # sampling intervals without a sample are a gap
+# In sampling intervals: below it the jitter of time stamps is taken for rounding.
+_LARGEST_JITTER = 0.1
+# In sampling intervals: samples further apart have a gap between them.
+_GAP = 1.5
 
 
 class GnssTrack(NamedTuple):

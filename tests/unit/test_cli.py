@@ -91,6 +91,19 @@ def test_import_writes_a_recording_with_its_site(
     assert output.read_bytes() == before  # an existing file is replaced, by the same
 
 
+def test_import_of_a_real_drive(
+    capsys: pytest.CaptureFixture[str], shared: Path, tmp_path: Path
+) -> None:
+    drive, output = shared / "real" / "comma2k19", tmp_path / "drive.mcap"
+    code, out, err = run(capsys, "import", drive, "--site", EXAMPLE / "site.toml", "-o", output)
+    assert (code, err) == (0, "")
+    assert "1 run of truck-x, 60.0 s, " in out
+    prefix = "driveby/v1/import-comma2k19/vehicle/truck-x"
+    counts = read_info(output).messages
+    assert counts[f"{prefix}/gnss"] == counts[f"{prefix}/location"] == 579
+    assert counts[f"{prefix}/accel"] == 1251
+
+
 @pytest.mark.parametrize(
     ("name", "old", "new", "words"),
     [

@@ -290,6 +290,12 @@ def sites(draw: st.DrawFn) -> Site:
     return Site.model_validate({"vehicle": [vehicle], "bridge": [bridge], "sensor": sensor})
 
 
+def test_writing_escapes_what_toml_forbids() -> None:
+    site = parse_site(with_line("elements", '5\nbaseline = "a\\u007f\\u0000\\n\\"ü𝕏"'), "a")
+    assert site.bridges[0].baseline == 'a\x7f\0\n"ü𝕏'
+    assert parse_site(site_toml(site), "b") == site
+
+
 @given(sites())
 def test_writing_and_reading_gives_the_same_site(site: Site) -> None:
     again = parse_site(site_toml(site), "again")
