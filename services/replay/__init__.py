@@ -24,6 +24,7 @@ def run(
     speed: float,
     name: str,
     connect_timeout_s: float | None = CONNECT_TIMEOUT_S,
+    subscriber_timeout_s: float = SUBSCRIBER_TIMEOUT_S,
 ) -> int:
     """Publish what recordings hold in the realm `replay-{name}`, one after the other; return 0.
 
@@ -34,8 +35,8 @@ def run(
     recording replayed twice under one name is taken for duplicates by a logger that saw both.
 
     InputError: no such file, not a recording, a name that is no identifier. FailureError: nobody
-    answers at the endpoint within `connect_timeout_s` (None: wait for ever), nobody subscribes,
-    or the logger did not confirm everything.
+    answers at the endpoint within `connect_timeout_s` (None: wait for ever), nobody subscribes
+    within `subscriber_timeout_s`, or the logger did not confirm everything.
     """
     check_speed(speed)
     try:
@@ -50,7 +51,7 @@ def run(
         publisher = Publisher(session, realm)
         delivery = Delivery(session, realm)
         try:
-            if not settle(publisher, keys, SUBSCRIBER_TIMEOUT_S):
+            if not settle(publisher, keys, subscriber_timeout_s):
                 raise FailureError(
                     f"nobody subscribes to realm {realm} at {endpoint}; start `driveby logger` "
                     f"or another subscriber of driveby/v1/{realm}/** first"

@@ -2,6 +2,8 @@
 
 import io
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -212,3 +214,20 @@ def test_topics_of_others_are_left_out(tmp_path: Path) -> None:
     assert list(read_messages(path)) == [
         Message(Key("live", "vehicle", "t", "gnss"), b"x", 0, 3, START_NS, START_NS)
     ]
+
+
+def test_rerun_draws_the_track_of_a_recording_opened_directly(tmp_path: Path) -> None:
+    """Rerun's own importer must find positions for a map; in a process, for it keeps threads."""
+    recording, drawn = tmp_path / "a.mcap", tmp_path / "a.rrd"
+    write_recording(recording, fixes(20), site_toml=SITE, reason="simulated")
+    code = (
+        "import sys, rerun\n"
+        "rerun.init('test')\n"
+        "rerun.save(sys.argv[2])\n"
+        "rerun.log_file_from_path(sys.argv[1])\n"
+        "rerun.disconnect()\n"
+    )
+    subprocess.run([sys.executable, "-c", code, recording, drawn], check=True, timeout=60)
+    content = drawn.read_bytes()
+    assert b"GeoPoints:positions" in content
+    assert b"driveby.v1.GnssFix:message" in content

@@ -1,0 +1,182 @@
+"""The logger as a process: bad messages, signals, disks that are full, files that exist."""
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from schemas.events import EventKind, decode_event
+from schemas.proto import driveby_pb2 as pb
+from schemas.signals import encode_identity
+from schemas.topics import selector
+from services.common.bus import Subscription, get_latest, open_session
+from services.common.recording import read_info, read_messages
+
+pytestmark = pytest.mark.process
+
+Start = Callable[..., subprocess.Popen[str]]
+End = Callable[[subprocess.Popen[str]], None]
+PREFIX = "driveby/v1"
+
+
+def start_logger(
+    start: Start, endpoint: str, file: Path, **arguments: object
+) -> subprocess.Popen[str]:
+    settings = {"realm": None, "site": None} | arguments
+    return start("services.logger", listen=endpoint, folder=file.parent, file=file, **settings)
+
+
+def test_bad_messages_are_refused_reported_and_never_written(
+    start: Start, finish: End, terminate: End, endpoint: str, recording: Path, tmp_path: Path
+) -> None:
+    logger = start_logger(start, endpoint, tmp_path / "live.mcap")
+    good = next(m for m in read_messages(recording) if m.key.stream == "gnss").payload
+    identity = encode_identity(1, 0)
+    bad: list[tuple[str, bytes, bytes | None]] = [
+        (f"{PREFIX}/live/vehicle/truck-1/nonsense", good, identity),
+        (f"{PREFIX}/live/vehicle/truck-1/gnss", good, None),
+        (f"{PREFIX}/live/vehicle/truck-1/gnss", good, b"12"),
+        (f"{PREFIX}/live/vehicle/truck-1/gnss", good[:10], identity),
+        (f"{PREFIX}/live/vehicle/truck-1/gnss", b"\x00" * 1_000_000, identity),
+        (f"{PREFIX}/live/vehicle/truck-1/accel", good, identity),
+        (f"{PREFIX}/live/vehicle/../gnss", good, identity),
+        (f"{PREFIX}/live/vehicle/TRUCK/gnss", good, identity),
+        (f"{PREFIX}/life/vehicle/truck-1/gnss", good, identity),
+        (f"{PREFIX}/live/vehicle/{'a' * 10_000}/gnss", good, identity),
+        (f"{PREFIX}/live/vehicle/a\nb/gnss", good, identity),
+        (f"{PREFIX}/live", good, identity),
+    ]
+    with open_session(connect=endpoint, timeout_s=5) as stranger:
+        for where, payload, attachment in bad:
+            stranger.put(where, payload, attachment=attachment)
+        replay = {"endpoint": endpoint, "speed": 0.0, "name": "x"}
+        finish(start("services.replay", recordings=[str(recording)], **replay))
+        # Refusals are reported once a second.
+        time.sleep(1.2)
+    terminate(logger)
+    found = list(read_messages(tmp_path / "live.mcap"))
+    data = [m for m in found if m.key.owner == "vehicle"]
+    assert len(data) == 401
+    assert {m.key.realm for m in data} == {"replay-x"}
+    events = [decode_event(m.payload) for m in found if m.key.stream == "event"]
+    refused = [event for event in events if event.kind == EventKind.REFUSED]
+    assert sum(event.messages for event in refused) == len(bad)
+    info = read_info(tmp_path / "live.mcap")
+    assert info.end is not None
+    assert info.end["refused"] == str(len(bad))
+
+
+def test_a_realm_keeps_out_the_others(
+    start: Start, finish: End, terminate: End, endpoint: str, recording: Path, tmp_path: Path
+) -> None:
+    logger = start_logger(start, endpoint, tmp_path / "live.mcap", realm="replay-y")
+    for name in ("x", "y"):
+        arguments = {"endpoint": endpoint, "speed": 0.0, "name": name, "subscriber_timeout_s": 1}
+        process = start("services.replay", recordings=[str(recording)], **arguments)
+        if name == "x":
+            _, log = process.communicate(timeout=30)
+            assert process.returncode == 1
+            assert "nobody subscribes to realm replay-x" in log.splitlines()[-1]
+        else:
+            finish(process)
+    terminate(logger)
+    messages = list(read_messages(tmp_path / "live.mcap"))
+    assert {m.key.realm for m in messages} == {"replay-y"}
+    assert len(messages) == 401
+    assert read_info(tmp_path / "live.mcap").about["realm"] == "replay-y"
+
+
+def test_the_site_file_goes_into_the_recording(
+    start: Start, terminate: End, endpoint: str, csv_example: Path, tmp_path: Path
+) -> None:
+    site = csv_example / "site.toml"
+    terminate(start_logger(start, endpoint, tmp_path / "live.mcap", site=site))
+    assert read_info(tmp_path / "live.mcap").site_toml == site.read_text()
+
+
+def test_interrupt_finishes_the_file(start: Start, endpoint: str, tmp_path: Path) -> None:
+    logger = start_logger(start, endpoint, tmp_path / "live.mcap")
+    logger.send_signal(signal.SIGINT)
+    _, log = logger.communicate(timeout=10)
+    assert logger.returncode == 0, log
+    info = read_info(tmp_path / "live.mcap")
+    assert info.end is not None
+    assert not info.truncated
+
+
+def test_an_existing_file_is_left_alone(
+    endpoint: str, tmp_path: Path, project: Path, start: Start
+) -> None:
+    file = tmp_path / "live.mcap"
+    file.write_bytes(b"precious")
+    with pytest.raises(pytest.fail.Exception, match="exists, and a recording is never overwritten"):
+        start_logger(start, endpoint, file)
+    assert file.read_bytes() == b"precious"
+
+
+def test_a_full_disk_is_told_and_ends_the_logger(
+    start: Start, endpoint: str, recording: Path, tmp_path: Path
+) -> None:
+    """A limit on the size of files stands for the full disk: writing fails in the same way."""
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limit[1]))  # the child inherits it
+    try:
+        logger = start_logger(start, endpoint, tmp_path / "live.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    with (
+        open_session(connect=endpoint, timeout_s=5) as session,
+        Subscription(session, selector("live", "service")) as services,
+    ):
+        arguments = {"endpoint": endpoint, "realm": "live", "speed": 50.0, "vehicle": None}
+        start("services.truck", recording=recording, **arguments)
+        _, log = logger.communicate(timeout=20)
+        assert logger.returncode == 1
+        assert log.splitlines()[-1] == "recording stopped: File too large"
+        assert "Traceback" not in log
+        said = []
+        while (received := services.receive(0.5)) is not None:
+            said.append(received)
+    health = [pb.Health.FromString(r.payload) for r in said if r.key_text.endswith("health")]
+    assert not health[-1].ok
+    events = [decode_event(r.payload) for r in said if r.key_text.endswith("event")]
+    assert EventKind.WRITE_ERROR in [event.kind for event in events]
+    info = read_info(tmp_path / "live.mcap")
+    assert info.truncated or info.end is None
+    assert (tmp_path / "live.mcap").stat().st_size <= 100_000
+
+
+def test_durable_is_there_for_those_who_come_late(
+    start: Start, finish: End, terminate: End, endpoint: str, recording: Path, tmp_path: Path
+) -> None:
+    logger = start_logger(start, endpoint, tmp_path / "live.mcap")
+    arguments = {"endpoint": endpoint, "speed": 0.0, "name": "x"}
+    finish(start("services.replay", recordings=[str(recording)], **arguments))
+    with open_session(connect=endpoint, timeout_s=5) as session:
+        [payload] = get_latest(session, selector("replay-x", "service", "durable"))
+    streams = {s.stream: s for s in pb.Durable.FromString(payload).streams}
+    assert {name: (s.sequence, s.count) for name, s in streams.items()} == {
+        "info": (0, 1),
+        "accel": (199, 200),
+        "gnss": (99, 100),
+        "location": (99, 100),
+    }
+    assert {s.boot_id for s in streams.values()} == {77}
+    terminate(logger)
+
+
+def test_a_second_signal_ends_it_at_once(start: Start, endpoint: str, tmp_path: Path) -> None:
+    logger = start_logger(start, endpoint, tmp_path / "live.mcap")
+    os.kill(logger.pid, signal.SIGTERM)
+    time.sleep(0.05)
+    os.kill(logger.pid, signal.SIGTERM)
+    began = time.monotonic()
+    logger.wait(timeout=5)
+    assert time.monotonic() - began < 1.0
+    assert logger.returncode in (0, 130)  # 0: it was faster than the second signal
