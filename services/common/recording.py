@@ -5,7 +5,7 @@ message's `sequence` is MCAP's own, `log_time` the wall time of the first sample
 when the message came in. Schemas carry all that they import, so that Rerun and Foxglove decode
 them. Besides the messages a file has
 
-- metadata `driveby`: program, version, format, realm;
+- metadata `driveby`: program, version, format, and realm and vehicle where there is only one;
 - metadata `driveby.start` and `driveby.end`: reason, time, and at the end the counts. A file
   without `driveby.end` was cut off: everything up to its last whole chunk can still be read;
 - attachment `site.toml`, if the site was known to the writer.
@@ -102,6 +102,7 @@ class RecordingWriter:
         *,
         reason: str,
         realm: str | None = None,
+        vehicle: str | None = None,
         site_toml: str | None = None,
         time_ns: int | None = None,
     ) -> None:
@@ -118,7 +119,7 @@ class RecordingWriter:
         self.path = path
         self.messages = 0
         """Number of messages written."""
-        self._mcap = _begin(self._file, reason, realm, site_toml, time_ns)
+        self._mcap = _begin(self._file, reason, realm, vehicle, site_toml, time_ns)
         self.sync()
         _sync_folder(path.parent)
 
@@ -168,7 +169,7 @@ def write_recording(
 ) -> int:
     """Write a whole recording beside `path`, sync it and rename it; return how many messages.
 
-    The realm is that of the first message. The file depends on nothing but the arguments and this
+    Realm and vehicle are those of the first message. The file depends on nothing but the arguments and this
     program's version: no clock is read. InputError if `path` cannot be written or there is no
     message, FailureError if writing fails; then `path` is as it was before.
     """
@@ -178,8 +179,10 @@ def write_recording(
         raise InputError(f"{path}: there is no message to write")
     written = 0
     last_time_ns = first.log_time_ns
+    realm = first.key.realm
+    vehicle = first.key.identifier if first.key.owner == "vehicle" else None
     with replaced_atomically(path) as temporary, temporary.open("wb") as file:
-        mcap = _begin(file, reason, first.key.realm, site_toml, first.log_time_ns)
+        mcap = _begin(file, reason, realm, vehicle, site_toml, first.log_time_ns)
         for message in chain([first], source):
             _add(mcap, message)
             written += 1
@@ -267,13 +270,16 @@ def _begin(
     file: BinaryIO,
     reason: str,
     realm: str | None,
+    vehicle: str | None,
     site_toml: str | None,
     time_ns: int | None,
 ) -> _Mcap:
     writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
     writer.start(library=f"driveby {program_version()}")
     about = {"program": "driveby", "version": program_version(), "format": FORMAT}
-    writer.add_metadata(ABOUT, about | ({"realm": realm} if realm else {}))
+    about |= {"realm": realm} if realm else {}
+    about |= {"vehicle": vehicle} if vehicle else {}
+    writer.add_metadata(ABOUT, about)
     if site_toml is not None:
         writer.add_attachment(0, 0, SITE, "application/toml", site_toml.encode())
     now_ns = time.time_ns() if time_ns is None else time_ns

@@ -47,7 +47,7 @@ class FileWriter:
         self._place = place
         self._files: dict[tuple[str, str], RecordingWriter] = {}
         if place.file is not None:
-            self._files[("", "")] = self._open(place.file)
+            self._files[("", "")] = self._open(place.file, place.realm, None)
         self._queue: queue.Queue[Message | None] = queue.Queue(QUEUE_MESSAGES)
         self._unsynced: list[Message] = []
         self._durable = Seen()
@@ -156,13 +156,20 @@ class FileWriter:
             if len(self._files) >= MAX_OPEN_FILES:
                 _log.error("%s: more than %d vehicles, not recorded", name, MAX_OPEN_FILES)
                 return None
-            file = self._files[(realm, name)] = self._open(_free_path(self._place, realm, name))
+            file = self._files[(realm, name)] = self._open(
+                _free_path(self._place, realm, name),
+                realm,
+                None if name == _SERVICE_FILE else name,
+            )
         return file
 
-    def _open(self, path: Path) -> RecordingWriter:
-        realm = self._place.realm
+    def _open(self, path: Path, realm: str | None, vehicle: str | None) -> RecordingWriter:
         writer = RecordingWriter(
-            path, reason="logger started", realm=realm, site_toml=self._place.site_toml
+            path,
+            reason="logger started",
+            realm=realm,
+            vehicle=vehicle,
+            site_toml=self._place.site_toml,
         )
         _log.info("recording to %s", path)
         return writer

@@ -180,6 +180,8 @@ def test_files_by_realm_date_and_vehicle(tmp_path: Path) -> None:
     assert [file.name.rsplit("-", 1)[0] for file in files] == ["truck-1", "truck-2"]
     assert [len(list(read_messages(file))) for file in files] == [3, 2]
     assert all(read_info(file).site_toml == "site = 1\n" for file in files)
+    assert [read_info(file).about["vehicle"] for file in files] == ["truck-1", "truck-2"]
+    assert read_info(files[0]).about["realm"] == "live"
 
 
 def test_a_full_queue_is_counted_and_holds_nobody_up(

@@ -44,7 +44,7 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert read_site(path) == SITE
     info = read_info(path)
     assert info.about["program"] == "driveby"
-    assert info.about["realm"] == "sim-test"
+    assert (info.about["realm"], info.about["vehicle"]) == ("sim-test", "truck-1")
     assert info.start["reason"] == "simulated"
     assert info.end is not None
     assert info.end["messages"] == "1006"
