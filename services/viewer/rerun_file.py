@@ -42,6 +42,7 @@ STRIP_WIDTH, STRIP_HEIGHT = 1200, 600  # pixels of the strip of rigidity along t
 STRIP_TOP_RATIO = 1.5  # of the nominal rigidity, at the strip's upper edge
 STRIP_PAPER, STRIP_INK = (17, 21, 26), (86, 180, 233)  # red, green, blue
 MUTED = "#9AA5B1"
+NEAR_M, M_PER_DEGREE = 20_000.0, 111_000.0  # a bridge and a track that one map can show
 WINDOW_S = 1.0  # of accelerations before the entry and after the exit that a crossing shows
 
 
@@ -78,7 +79,7 @@ def write_rrd(
         rr.RecordingStream(APPLICATION, recording_id=_recording_id(crossings)) as recording,
     ):
         recording.save(temporary, default_blueprint=blueprint)
-        for bridge in bridges:
+        for bridge in bridges_near_tracks(bridges, vehicles.values()):
             _log_bridge(recording, bridge)
         for vehicle, signals in vehicles.items():
             _log_track(recording, vehicle, signals.gnss)
@@ -126,6 +127,26 @@ def signals_of_messages(messages: Iterable[Message]) -> dict[str, VehicleSignals
         )
         for vehicle in sorted(accel.keys() | gnss.keys())
     }
+
+
+def bridges_near_tracks(
+    bridges: Sequence[BridgeOnMap], vehicles: Iterable[VehicleSignals]
+) -> list[BridgeOnMap]:
+    """The bridges within about 20 km of where a truck was; all of them if no truck was anywhere.
+
+    The map shows all that is on it: one bridge at the other end of a country, and a track is a dot.
+    """
+    fixes = [fix for signals in vehicles for fix in signals.gnss]
+    if not fixes:
+        return list(bridges)
+    track = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes])
+    near = []
+    for bridge in bridges:
+        north, east = ((track - bridge.start) * M_PER_DEGREE).T
+        east = east * np.cos(np.radians(bridge.start[0]))
+        if np.hypot(north, east).min() < NEAR_M:
+            near.append(bridge)
+    return near
 
 
 def acceleration_series(batches: Sequence[AccelBatch]) -> dict[str, tuple[IntArray, FloatArray]]:
@@ -453,7 +474,7 @@ def _blueprint(
     vehicles: Mapping[str, VehicleSignals], crossings: Sequence[CrossingView]
 ) -> rrb.Blueprint:
     drive = _drive_layout(vehicles)
-    layouts = [_crossing_layout(crossing) for crossing in crossings]
+    layouts = [_crossing_layout(crossing, vehicles.get(crossing.vehicle)) for crossing in crossings]
     content = rrb.Tabs(*layouts, drive, active_tab=0) if layouts else drive
     return rrb.Blueprint(
         content,
@@ -464,9 +485,35 @@ def _blueprint(
     )
 
 
-def _crossing_layout(crossing: CrossingView) -> rrb.Container:
+def _crossing_layout(crossing: CrossingView, signals: VehicleSignals | None) -> rrb.Container:
+    """What was found at the left, what it was found from in the middle; only what there is."""
     root = crossing_root(crossing)
-    rigidity = rrb.Vertical(
+    plots = _acceleration_plots(f"{root}/acceleration", signals)
+    if crossing.road is not None:
+        plots = [
+            _plot(f"{root}/road", "Road profile (mm)"),
+            _plot(f"{root}/road_difference", "Front minus rear (mm)"),
+            *plots,
+        ]
+    side = rrb.Vertical(
+        _map(more=f"{root}/position", zoom=18.0),
+        rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict"),
+        row_shares=[2, 5],
+    )
+    columns = [(side, 4)]
+    if plots:
+        columns.insert(0, (rrb.Vertical(*plots), 6))
+    if crossing.rigidity_nm2 is not None:
+        columns.insert(0, (_rigidity_layout(root), 5))
+    return rrb.Horizontal(
+        *(column for column, _ in columns),
+        column_shares=[share for _, share in columns],
+        name=f"Crossing of {crossing.bridge}",
+    )
+
+
+def _rigidity_layout(root: str) -> rrb.Vertical:
+    return rrb.Vertical(
         rrb.BarChartView(
             origin=f"{root}/rigidity",
             name="EI of each element (GN·m²) over chainage (m)",
@@ -482,34 +529,25 @@ def _crossing_layout(crossing: CrossingView) -> rrb.Container:
         ),
         row_shares=[5, 6],
     )
-    signals = rrb.Vertical(
-        _plot(f"{root}/road", "Road profile (mm)"),
-        _plot(f"{root}/road_difference", "Front minus rear (mm)"),
-        *_acceleration_plots(f"{root}/acceleration"),
-        row_shares=[4, 3, 3, 3],
-    )
-    side = rrb.Vertical(
-        _map(more=f"{root}/position", zoom=18.0),
-        rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict"),
-        row_shares=[2, 5],
-    )
-    name = f"Crossing of {crossing.bridge}"
-    return rrb.Horizontal(rigidity, signals, side, column_shares=[5, 6, 4], name=name)
 
 
 def _drive_layout(vehicles: Mapping[str, VehicleSignals]) -> rrb.Container:
     plots: list[rrb.View] = []
-    for vehicle in vehicles:
-        plots += _acceleration_plots(f"vehicle/{vehicle}/acceleration", f"{vehicle}:")
+    for vehicle, signals in vehicles.items():
+        plots += _acceleration_plots(f"vehicle/{vehicle}/acceleration", signals, f"{vehicle}:")
         plots.append(_plot(f"vehicle/{vehicle}/speed", f"{vehicle}: Speed (m/s)"))
     return rrb.Horizontal(_map(), rrb.Vertical(*plots), column_shares=[2, 3], name="Whole drive")
 
 
-def _acceleration_plots(origin: str, vehicle: str = "") -> list[rrb.View]:
-    """Body and axles apart: those of the axles are ten times larger."""
+def _acceleration_plots(
+    origin: str, signals: VehicleSignals | None, vehicle: str = ""
+) -> list[rrb.View]:
+    """Body and axles apart: those of the axles are ten times larger. Only what the truck has."""
+    channels = {channel for batch in signals.accel for channel in batch.channels} if signals else ()
     return [
-        _plot(origin, f"{vehicle} Body accelerations (m/s²)".strip(), "sprung"),
-        _plot(origin, f"{vehicle} Axle accelerations (m/s²)".strip(), "unsprung"),
+        _plot(origin, f"{vehicle} {name} accelerations (m/s²)".strip(), part)
+        for part, name in (("sprung", "Body"), ("unsprung", "Axle"))
+        if f"{part}_front" in channels or f"{part}_rear" in channels
     ]
 
 

@@ -36,6 +36,8 @@ from services.viewer.rerun_file import (
     STRIP_WIDTH,
     VehicleSignals,
     acceleration_series,
+    bridges_near_tracks,
+    bridges_of_site,
     crossing_root,
     front_axle_chainage,
     rigidity_strip,
@@ -288,6 +290,14 @@ def test_gap_breaks_the_line():
 
 def test_absent_channels_stay_absent():
     assert set(acceleration_series(accel(3, ("sprung_front",)))) == {"sprung_front"}
+
+
+def test_only_bridges_that_fit_on_the_map_of_the_track_are_on_it(site: Site):
+    (near,) = bridges_of_site(site)
+    far = near._replace(identifier="far", start=(37.9, -122.3), end=(37.9, -122.299))
+    signals = VehicleSignals([], gnss())
+    assert bridges_near_tracks([far, near], [signals]) == [near]
+    assert bridges_near_tracks([far, near], [VehicleSignals([], [])]) == [far, near]
 
 
 def test_chainage_falls_when_the_truck_comes_from_the_other_end(site: Site):
