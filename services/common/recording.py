@@ -169,9 +169,9 @@ def write_recording(
 ) -> int:
     """Write a whole recording beside `path`, sync it and rename it; return how many messages.
 
-    Realm and vehicle are those of the first message. The file depends on nothing but the arguments and this
-    program's version: no clock is read. InputError if `path` cannot be written or there is no
-    message, FailureError if writing fails; then `path` is as it was before.
+    Realm and vehicle are those of the first message. The file depends on nothing but the arguments
+    and this program's version: no clock is read. InputError if `path` cannot be written or there
+    is no message, FailureError if writing fails; then `path` is as it was before.
     """
     source = iter(messages)
     first = next(source, None)

@@ -1,6 +1,7 @@
 """The bus over real sessions in this process: identity, latching, fetching again, delivery."""
 
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -163,17 +164,20 @@ def test_a_live_display_sees_the_newest_and_holds_nobody_up(
 
 def test_two_threads_may_publish(router: zenoh.Session, client: zenoh.Session) -> None:
     publisher = Publisher(client, "live")
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # threads take turns as often as they can
     with Subscription(router, selector("live", "vehicle")) as subscription:
         threads = [
-            threading.Thread(target=put_all, args=(publisher, [b"x"] * 200)) for _ in range(2)
+            threading.Thread(target=put_all, args=(publisher, [b"x"] * 3000)) for _ in range(2)
         ]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-        found = receive(subscription, 400)
+        sys.setswitchinterval(before)
+        found = receive(subscription, 6000)
         # Numbers follow each other on the wire, too: a reader may rely on the order.
-        assert [received.identity().sequence for received in found] == list(range(400))
+        assert [received.identity().sequence for received in found] == list(range(6000))
     publisher.close()
 
 
