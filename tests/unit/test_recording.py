@@ -93,6 +93,7 @@ def test_a_file_cut_off_anywhere_keeps_its_whole_chunks(tmp_path: Path) -> None:
         cut.write_bytes(content[:size])
         info = read_info(cut)
         assert info.truncated
+        assert info.damaged_chunks == 0
         number = sum(info.messages.values())
         assert number >= before
         before = number
@@ -118,6 +119,15 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
     read = list(read_messages(path))
     assert len(messages) * 0.5 < len(read) < len(messages)
     assert set(read) < set(messages)
+
+
+def test_a_damaged_length_does_not_ask_for_memory(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_recording(path, fixes(3), site_toml=None, reason="simulated")
+    content = bytearray(path.read_bytes())
+    content[9:17] = (2**62).to_bytes(8, "little")  # of the header, the first record
+    path.write_bytes(content)
+    assert read_info(path).truncated
 
 
 def test_what_was_synced_is_readable_without_an_end(tmp_path: Path) -> None:
