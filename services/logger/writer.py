@@ -54,7 +54,7 @@ class FileWriter:
         self._durable_lock = threading.Lock()
         self._durable_version = 0
         self._end: tuple[str, Mapping[str, int]] = ("", {})
-        self._thread = threading.Thread(target=self._run, name="writer")
+        self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
 
     def put(self, message: Message) -> bool:
