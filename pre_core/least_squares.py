@@ -24,7 +24,7 @@ _FIRST_DAMPING = 1e-3
 _SMALLEST_DAMPING = 1e-14
 _GIVE_UP_DAMPING = 1e8
 _CONVERGED_STEP = 1e-9  # in logarithms
-_CONVERGED_GAIN = 1e-12  # relative decrease of J that the linear model still promises
+_CONVERGED_GAIN = 1e-7  # relative decrease of J that the linear model still promises
 _LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
 
 

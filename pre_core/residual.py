@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pre_core.bridge import locate
 from pre_core.drs import BeamBasis, advance, beam_basis, modal_filters
-from pre_core.iep import iep_signals
+from pre_core.iep import iep_signals, input_profiles
 from pre_core.integrate import Integrated
 from pre_core.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
 from pre_core.parameters import C_S1, D_1, K_S1, K_U1, KAPPA, M_U1
@@ -521,3 +521,12 @@ def road_profiles(window: Window, work: Workspace, theta: FloatArray) -> Roads:
     return Roads(
         window.x_m.copy(), np.einsum("mj,mj->m", window.front_weight, gathered), rear.copy()
     )
+
+
+def largest_deflection_m(window: Window, theta: FloatArray) -> float:
+    """Largest deflection of the bridge under a wheel during the crossing, positive downwards."""
+    work = workspace(window)
+    four = np.repeat(theta[None, :], LANES, axis=0)
+    march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
+    deflection = input_profiles(window.signals, theta) - work.road[:, :, 0]  # y = u - r
+    return float(-deflection.min())

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ENDPOINT: Final = "tcp/127.0.0.1:7447"
 RECORDINGS: Final = Path("recordings")
-METHODS: Final = ("least-squares",)
+METHODS: Final = ("least-squares", "random-walk")
 SCENARIOS: Final = range(1, 13)
 
 EXIT_FAILED: Final = 1
@@ -158,6 +158,7 @@ def _worker(options: argparse.Namespace) -> int:
         realm=options.realm,
         site=options.site,
         folder=options.folder,
+        file=options.file,
         method=options.method.replace("-", "_"),
         service_id=options.id,
     )
@@ -376,6 +377,7 @@ def _add_live(commands: Any) -> None:
     _add_realm(p)
     _add_site(p, "trucks and bridges", required=True)
     _add_folder(p, "folder of the results")
+    _add_file(p, "--file", "RESULTS.mcap", "put the results into this one new file (and .json)")
     _add_method(p)
     _add_id(p, "worker")
 

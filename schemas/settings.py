@@ -1,0 +1,23 @@
+"""How an identification is done: what a user may choose, and what goes into every result."""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from schemas.results import Method
+
+
+class IdentificationSettings(BaseModel):
+    """Settings of one identification."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    method: Method = "least_squares"
+    seed: Annotated[int, Field(ge=0, lt=1 << 64)] = 0
+    parts: Annotated[int, Field(ge=1, le=8)] = 2
+    """Finite elements in each element of the site file: with 1, its own mesh biases EI at the ends
+    by several per cent (docs/reproduction.md)."""
+    starts: Annotated[int, Field(ge=1, le=20)] = 3
+    """Least squares begins at the nominal values and, where it does not converge, elsewhere."""
+    particles: Annotated[int, Field(ge=4, le=100_000)] = 500
+    steps: Annotated[int, Field(ge=1, le=100_000)] = 600

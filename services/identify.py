@@ -1,0 +1,159 @@
+"""`driveby identify`: recordings become results, offline, through the worker's own engine."""
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from schemas.results import Crossing, Header, Results, results, results_json
+from schemas.settings import IdentificationSettings
+from schemas.site import Site, load_site, parse_site, site_hash
+from services.common.errors import InputError
+from services.common.files import check_writable, replaced_atomically, write_atomically
+from services.common.recording import Message, program_version, read_messages, read_site
+from services.worker.engine import Engine
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def identify_command(
+    *,
+    recordings: list[Path],
+    site: Path | None,
+    method: str,
+    json_path: Path | None,
+    rrd_path: Path | None,
+    draws_path: Path | None,
+    seed: int,
+    console: "Console",
+) -> int:
+    """Identify every crossing in the recordings, print a table and write what was asked for.
+
+    InputError: a file that cannot be read or written, or has no accelerations or positions.
+    """
+    if draws_path is not None:
+        raise InputError(f"--draws: the method {method.replace('_', '-')} has no chain to store")
+    for path in (json_path, rrd_path):
+        if path is not None:
+            check_writable(path)
+    known = site_of(recordings, site)
+    settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
+    with console.status("reading", spinner="dots") as status:
+        found = identify_recordings(recordings, known, settings, status.update)
+    _print(console, found, known)
+    if json_path is not None:
+        write_atomically(json_path, results_json(found))
+    if rrd_path is not None:
+        from services.viewer.crossing_view import view_of_crossing
+        from services.viewer.rerun_file import bridges_of_site, signals_of_messages, write_rrd
+
+        with replaced_atomically(rrd_path) as temporary:
+            write_rrd(
+                temporary,
+                vehicles=signals_of_messages(_all_messages(recordings)),
+                bridges=bridges_of_site(known),
+                crossings=[view_of_crossing(c, known.bridge(c.bridge)) for c in found.crossings],
+            )
+    return 0
+
+
+def site_of(recordings: list[Path], site: Path | None) -> Site:
+    """The site file given, or else the one stored in the first recording that has one."""
+    if site is not None:
+        return load_site(site)
+    for path in recordings:
+        text = read_site(path)
+        if text is not None:
+            return parse_site(text, f"{path}: site.toml")
+    raise InputError(f"{recordings[0]}: no site file is stored in it, give one with --site")
+
+
+def identify_recordings(
+    recordings: list[Path],
+    site: Site,
+    settings: IdentificationSettings,
+    say: Callable[[str], None] = lambda text: None,
+) -> Results:
+    """Results of all crossings in the recordings, in order of time."""
+    header = Header(
+        version=program_version(),
+        created=time.time(),
+        site_hash=site_hash(site),
+        settings=settings.model_dump(mode="json"),
+        seed=settings.seed,
+    )
+    engine = Engine(
+        site,
+        settings,
+        header,
+        stopwatch=time.perf_counter,
+        report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"),
+    )
+    found: list[Crossing] = []
+    streams: set[str] = set()
+    for message in _all_messages(recordings):
+        if message.key.owner == "vehicle":
+            streams.add(message.key.stream)
+        try:
+            outputs = list(engine.feed(message.key, message.payload))
+        except ValueError as error:
+            raise InputError(
+                f"{_names(recordings)}: {message.key.stream} {message.sequence}: {error}"
+            ) from error
+        found += [output.result for output in outputs if output.result is not None]
+    found += [output.result for output in engine.finish() if output.result is not None]
+    for stream, what in (("accel", "accelerations (accel)"), ("gnss", "positions (gnss)")):
+        if stream not in streams:
+            raise InputError(f"{_names(recordings)}: no {what}, a recording of a truck is expected")
+    for vehicle in sorted(engine.unknown_vehicles):
+        raise InputError(f"{_names(recordings)}: {vehicle} drove, but the site has no such vehicle")
+    found.sort(key=lambda crossing: crossing.entry_time)
+    return results(header, found, engine.bridges())
+
+
+def _all_messages(recordings: list[Path]) -> Iterator[Message]:
+    for path in recordings:
+        yield from read_messages(path)
+
+
+def _names(recordings: list[Path]) -> str:
+    return ", ".join(str(path) for path in recordings)
+
+
+def _print(console: "Console", found: Results, site: Site) -> None:
+    from rich.table import Table
+
+    if not found.crossings:
+        bridges = ", ".join(bridge.id for bridge in site.bridges)
+        console.print(f"no crossing of a known bridge ({bridges})")
+        return
+    for crossing in found.crossings:
+        console.print(
+            f"[bold]{crossing.crossing_id}[/]  {crossing.direction.replace('_', ' ')}, "
+            f"{crossing.speed_m_per_s:.2f} m/s, {crossing.method.replace('_', ' ')}: "
+            f"[bold]{crossing.verdict}[/]"
+        )
+        for code, text in zip(crossing.reasons, crossing.reason_texts, strict=True):
+            console.print(f"  {code}: {text}")
+        if crossing.parameters is None:
+            continue
+        nominal = site.bridge(crossing.bridge).nominal_flexural_rigidity_nm2
+        has_meaning = "no_noise_model" not in crossing.reasons
+        table = Table("element", "EI (GN·m²)", "of nominal", box=None, pad_edge=False)
+        for column in table.columns:
+            column.justify = "right"
+        if has_meaning:
+            table.add_column("95 % interval", justify="right")
+        for number, sound in enumerate(nominal, start=1):
+            p = crossing.parameters[f"EI_{number}"]
+            interval = [f"{p.q025 / 1e9:.3f} … {p.q975 / 1e9:.3f}"] if has_meaning else []
+            table.add_row(f"EI_{number}", f"{p.mean / 1e9:.3f}", f"{p.mean / sound:.3f}", *interval)
+        console.print(table)
+        diagnostics = crossing.diagnostics
+        if "relative_misfit" in diagnostics:
+            console.print(
+                f"  the two roads differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm rms, "
+                f"{diagnostics['relative_misfit']:.2%} of the road; "
+                f"{diagnostics['seconds']:.1f} s"
+            )

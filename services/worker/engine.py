@@ -1,0 +1,325 @@
+"""The part of the worker that decides: messages in, messages out.
+
+It finds crossings in the positions, waits for the samples that belong to them, has them identified
+and says so. It opens nothing, reads no clock and asks nobody, so that a recording that is replayed
+through it gives the same bytes every time.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+import numpy as np
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.results import (
+    BridgeResult,
+    Crossing,
+    Direction,
+    ElementState,
+    Header,
+    LeftOut,
+    bridge_to_protobuf,
+    crossing_to_protobuf,
+    direction_to_protobuf,
+)
+from schemas.settings import IdentificationSettings
+from schemas.signals import decode_accel, decode_gnss
+from schemas.site import Bridge, Site, Vehicle
+from schemas.topics import Key
+from services.common.crossing import Passage, Stay, find_stays
+from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
+from services.common.streams import Boot
+from services.worker.identification import MARGIN_S, CrossingData, Report, Stopwatch, identify
+
+_KEEP_S = 300.0
+"""Samples older than this are forgotten: no crossing of a short bridge lasts longer."""
+_SETTLE_S = 1.0
+"""Fixes after the exit that the trajectory should have."""
+_PATIENCE_S = 10.0
+"""How much newer data may come before a crossing is given up on that still lacks samples."""
+
+
+class Output(NamedTuple):
+    """A message to publish, and the result itself where it is one."""
+
+    key: Key
+    payload: bytes
+    result: Crossing | None = None
+
+
+class _Pending(NamedTuple):
+    crossing_id: str
+    bridge: Bridge
+    stay: Stay
+
+
+class _Truck:
+    """One boot of one truck: its messages, and what has been said of its crossings."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self.boot = Boot()
+        self.latest_s = -np.inf
+        self.forgotten_s = -np.inf
+        self.detected: dict[tuple[str, float], str] = {}
+        """Crossing ids by bridge and about the time of entry."""
+        self.done: set[str] = set()
+
+
+class Engine:
+    """Takes the messages of a realm's trucks and returns what is to be published.
+
+    `header` says what goes into every estimate; `stopwatch` measures the seconds of an
+    identification and is the only thing that may differ between two runs; `report` is told how far
+    an identification is.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        settings: IdentificationSettings,
+        header: Header,
+        *,
+        stopwatch: Stopwatch = lambda: 0.0,
+        report: Callable[[str, str, float], None] = lambda crossing, stage, fraction: None,
+    ) -> None:
+        self._site = site
+        self._settings = settings
+        self._header = header
+        self._stopwatch = stopwatch
+        self._report = report
+        self._frames: list[tuple[Bridge, BridgeFrame]] = [
+            (bridge, bridge_frame(bridge)) for bridge in site.bridges
+        ]
+        self._vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
+        self._trucks: dict[tuple[str, str, int], _Truck] = {}
+        self._usable: dict[tuple[str, str], list[Crossing]] = {}
+        self.unknown_vehicles: set[str] = set()
+        """Trucks that the site file does not know; nothing of theirs can be identified."""
+
+    def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
+        """Take one message of a vehicle; other streams are ignored. ValueError: malformed.
+
+        Yields as things happen, so that a state can be published before the long work begins.
+        """
+        if key.owner != "vehicle" or key.stream not in ("accel", "gnss"):
+            return
+        vehicle = self._vehicles.get(key.identifier)
+        if vehicle is None:
+            self.unknown_vehicles.add(key.identifier)
+            return
+        if key.stream == "accel":
+            batch = decode_accel(payload)
+            truck = self._truck(key, batch.boot_id, vehicle)
+            truck.boot.add_accel(batch)
+            return
+        fix = decode_gnss(payload)
+        yield from self._finish_older_boots(key, fix.boot_id)
+        truck = self._truck(key, fix.boot_id, vehicle)
+        truck.boot.add_fix(fix)
+        now_s = (fix.device_time_ns - (truck.boot.epoch_ns or 0)) * 1e-9
+        if now_s > truck.latest_s:
+            truck.latest_s = now_s
+            yield from self._look(key.realm, truck, now_s)
+            if now_s - _KEEP_S > truck.forgotten_s + 10.0:
+                truck.forgotten_s = now_s - _KEEP_S
+                truck.boot.forget_before(truck.forgotten_s)
+
+    def finish(self) -> Iterator[Output]:
+        """No more messages will come: decide all crossings with what there is."""
+        for (realm, _, _), truck in list(self._trucks.items()):
+            yield from self._look(realm, truck, np.inf)
+
+    def gone(self, realm: str, vehicle: str) -> Iterator[Output]:
+        """A truck has gone silent: decide the crossings that it has finished.
+
+        One that it is still in waits: the truck may only have lost its connection.
+        """
+        for name, truck in list(self._trucks.items()):
+            if name[:2] == (realm, vehicle) and np.isfinite(truck.latest_s):
+                yield from self._look(realm, truck, truck.latest_s, complete=True)
+
+    def _truck(self, key: Key, boot_id: int, vehicle: Vehicle) -> _Truck:
+        name = (key.realm, key.identifier, boot_id)
+        truck = self._trucks.get(name)
+        if truck is None:
+            truck = self._trucks[name] = _Truck(vehicle)
+        return truck
+
+    def _finish_older_boots(self, key: Key, boot_id: int) -> Iterator[Output]:
+        """A truck that has started anew says nothing more of its boots before."""
+        for name in [n for n in self._trucks if n[:2] == (key.realm, key.identifier)]:
+            if name[2] < boot_id:
+                yield from self._look(key.realm, self._trucks[name], np.inf)
+                del self._trucks[name]
+
+    def _look(
+        self, realm: str, truck: _Truck, now_s: float, *, complete: bool = False
+    ) -> Iterator[Output]:
+        """Find crossings in the fixes that have come, and identify those that are complete."""
+        fixes = truck.boot.fixes()
+        if fixes.time_s.size < 2:
+            return
+        for bridge, frame in self._frames:
+            chainage, lateral = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
+            stays = find_stays(
+                fixes.time_s,
+                chainage,
+                lateral,
+                span_m=bridge.span_m,
+                wheelbase_m=truck.vehicle.wheelbase_m,
+                antenna_to_front_axle_m=truck.vehicle.gps_antenna_to_front_axle_m,
+            )
+            for stay in stays:
+                yield from self._advance(realm, truck, bridge, stay, now_s, complete=complete)
+
+    def _advance(
+        self,
+        realm: str,
+        truck: _Truck,
+        bridge: Bridge,
+        stay: Stay,
+        now_s: float,
+        *,
+        complete: bool,
+    ) -> Iterator[Output]:
+        crossing_id, is_new = self._identity(truck, bridge, stay)
+        if crossing_id in truck.done:
+            return
+        state = _StateMessages(realm, bridge, truck, stay, crossing_id)
+        if is_new:
+            yield state.message(pb.DETECTED, stay.entry_s)
+        if stay.passage is Passage.ENDS_ON_BRIDGE and np.isfinite(now_s):
+            return  # still on it
+        needed_s = stay.exit_s + MARGIN_S
+        samples_there = truck.boot.latest_accel_s() >= needed_s
+        settled = now_s >= stay.exit_s + _SETTLE_S
+        given_up = now_s >= needed_s + _PATIENCE_S
+        if not (settled and samples_there) and not given_up and not complete:
+            return
+        truck.done.add(crossing_id)
+        yield state.message(pb.COMPLETE, stay.exit_s)
+        yield state.message(pb.IDENTIFYING, stay.exit_s)
+        result = self._identified(realm, truck, bridge, stay, crossing_id)
+        # A result is dated by the data that made it: the engine has no clock.
+        header = self._header._replace(created=result.exit_time)
+        estimate = crossing_to_protobuf(result, header)
+        yield Output(
+            Key(realm, "bridge", bridge.id, "estimate"),
+            estimate.SerializeToString(deterministic=True),
+            result,
+        )
+        yield state.message(pb.DONE, stay.exit_s)
+        latest = self._bridge_state(realm, bridge, result)
+        if latest is not None:
+            message = bridge_to_protobuf(bridge.id, round(result.exit_time * 1e9), latest)
+            yield Output(
+                Key(realm, "bridge", bridge.id, "state"),
+                message.SerializeToString(deterministic=True),
+            )
+
+    def _identity(self, truck: _Truck, bridge: Bridge, stay: Stay) -> tuple[str, bool]:
+        """The id of a stay: the same although its entry moves a little with every new fix."""
+        for (known_bridge, entry_s), crossing_id in truck.detected.items():
+            if known_bridge == bridge.id and abs(entry_s - stay.entry_s) < 5.0:
+                return crossing_id, False
+        wall_ns = truck.boot.wall_time_ns(stay.entry_s)
+        moment = datetime.fromtimestamp(wall_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]
+        crossing_id = f"{truck.vehicle.id}.{bridge.id}.{moment}Z"
+        truck.detected[bridge.id, stay.entry_s] = crossing_id
+        return crossing_id, True
+
+    def _identified(
+        self, realm: str, truck: _Truck, bridge: Bridge, stay: Stay, crossing_id: str
+    ) -> Crossing:
+        frame = dict((b.id, f) for b, f in self._frames)[bridge.id]
+        fixes = truck.boot.fixes()
+        chainage, _ = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
+        data = CrossingData(
+            crossing_id,
+            realm,
+            truck.vehicle,
+            bridge,
+            self._site.receiver,
+            stay,
+            fixes,
+            chainage,
+            truck.boot.samples(stay.entry_s - MARGIN_S, stay.exit_s + MARGIN_S),
+            truck.boot.wall_time_ns(0.0) / 1e9,
+        )
+        report: Report = lambda stage, fraction: self._report(crossing_id, stage, fraction)  # noqa: E731
+        return identify(data, self._settings, stopwatch=self._stopwatch, report=report)
+
+    def _bridge_state(self, realm: str, bridge: Bridge, result: Crossing) -> BridgeResult | None:
+        """The bridge as the latest usable crossing sees it; crossings are not fused yet."""
+        usable = self._usable.setdefault((realm, bridge.id), [])
+        if result.parameters is None:
+            return None
+        usable.append(result)
+        return latest_state(usable)
+
+    def bridges(self) -> dict[str, BridgeResult]:
+        """The latest state of every bridge that has one, for the results file."""
+        return {
+            bridge: latest_state(crossings)
+            for (_, bridge), crossings in self._usable.items()
+            if crossings
+        }
+
+
+def latest_state(usable: list[Crossing]) -> BridgeResult:
+    """The latest of a bridge's usable crossings; the others are named as left out."""
+    last = usable[-1]
+    parameters = last.parameters or {}
+    elements = {
+        name: ElementState(mean=p.mean, std=p.std, q025=p.q025, q975=p.q975)
+        for name, p in parameters.items()
+        if name.startswith("EI_")
+    }
+    return BridgeResult(
+        between_crossing_std=None,
+        crossings_used=(last.crossing_id,),
+        crossings_left_out=tuple(
+            LeftOut(crossing_id=crossing.crossing_id, reason="not_fused")
+            for crossing in usable[:-1]
+        ),
+        **elements,
+    )
+
+
+class _StateMessages(NamedTuple):
+    """Makes the messages that tell the states of one crossing."""
+
+    realm: str
+    bridge: Bridge
+    truck: _Truck
+    stay: Stay
+    crossing_id: str
+
+    def message(self, state: pb.CrossingState, time_s: float) -> Output:
+        direction: Direction = "start_to_end" if self.stay.direction > 0 else "end_to_start"
+        wall_time_ns = self.truck.boot.wall_time_ns
+        left = self.stay.passage is not Passage.ENDS_ON_BRIDGE
+        crossing = pb.Crossing(
+            schema_version=1,
+            crossing_id=self.crossing_id,
+            vehicle=self.truck.vehicle.id,
+            bridge=self.bridge.id,
+            direction=direction_to_protobuf(direction),
+            state=state,
+            time_ns=wall_time_ns(time_s),
+            entry_time_ns=wall_time_ns(self.stay.entry_s),
+            exit_time_ns=wall_time_ns(self.stay.exit_s) if left else 0,
+        )
+        return Output(
+            Key(self.realm, "bridge", self.bridge.id, "crossing"),
+            crossing.SerializeToString(deterministic=True),
+        )
+
+
+def feed_all(engine: Engine, messages: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
+    """Feed a whole recording and finish."""
+    for key, payload in messages:
+        yield from engine.feed(key, payload)
+    yield from engine.finish()

@@ -1,0 +1,536 @@
+"""One crossing: from samples and fixes to a result with a verdict. No I/O, no clock.
+
+`identify` checks what can be checked before any fitting (a missing channel, a gap, no position, too
+slow), fits, and says what the answer is worth. Every way to fail is a verdict, not an exception.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core import least_squares, parameters, random_walk, residual, search
+from pre_core.bridge import Beam, natural_frequencies_hz, uniform_beam
+from pre_core.integrate import spline_integrate
+from pre_core.residual import Window, Workspace
+from pre_core.road import Profile, iri_m_per_km, iso_8608_class, roughness_coefficient_m3
+from pre_core.simulate import Motion
+from pre_core.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
+from schemas import results
+from schemas.reasons import Reason
+from schemas.settings import IdentificationSettings
+from schemas.signals import CHANNELS
+from schemas.site import Bridge, Receiver, Site, Vehicle
+from services.common.crossing import Passage, Stay
+from services.common.streams import Fixes, Samples
+
+Floats = NDArray[np.float64]
+Stopwatch = Callable[[], float]
+Report = Callable[[str, float], None]
+
+MARGIN_S = 1.0
+"""Samples are needed this long before the entry and after the exit."""
+_SLOWEST_M_PER_S = 3.0
+"""Below this the wheels feel next to nothing of the bridge's stiffness (design: axles must differ)."""
+_STANDING_M_PER_S = 0.5
+_LONGEST_OUTAGE_S = 1.5
+_LARGEST_MISFIT = 0.02
+"""Root mean square of R_1 - R_2 relative to the road itself; beyond it nothing was explained."""
+_LARGEST_ACCELERATION_M_PER_S2 = 0.3
+_ROAD_SPACING_M = 0.05
+_NORMAL_975 = 1.959963984540054
+
+
+class CrossingData(NamedTuple):
+    """What is known of one crossing before it is identified. Times are on the truck's clock."""
+
+    crossing_id: str
+    realm: str
+    vehicle: Vehicle
+    bridge: Bridge
+    receiver: Receiver
+    stay: Stay
+    fixes: Fixes
+    chainage_m: Floats  # (m,) of the antenna at the fixes
+    samples: Samples | None  # from MARGIN_S before the entry to MARGIN_S after the exit
+    wall_offset_s: float
+    """What to add to a time on the truck's clock to get seconds since 1970 UTC."""
+
+
+class _Fit(NamedTuple):
+    """What a method found: all parameters, their formal covariance, and how it went."""
+
+    theta: Floats  # (p,)
+    free: NDArray[np.int64]  # (f,)
+    covariance: Floats  # (f, f) in physical units
+    spread: Floats | None  # (f, 3) quantiles where the method has a cloud instead of a curvature
+    ending: search.Ending
+    diagnostics: dict[str, float]
+
+
+def identify(
+    data: CrossingData,
+    settings: IdentificationSettings,
+    *,
+    stopwatch: Stopwatch,
+    report: Report = lambda stage, fraction: None,
+) -> results.Crossing:
+    """The result of one crossing, whatever its data are."""
+    began = stopwatch()
+    direction = data.stay.direction
+    trajectory = _trajectory(data)
+    entry_s, exit_s = _entry_and_exit(data, trajectory)
+    if trajectory is None or exit_s <= entry_s:
+        speed = 0.0
+    else:
+        speed = (data.bridge.span_m + data.vehicle.wheelbase_m) / (exit_s - entry_s)
+    reject = partial(_rejected, data, settings, entry_s, exit_s, speed)
+    reasons = _unusable(data, trajectory, entry_s, exit_s)
+    if reasons or trajectory is None or data.samples is None:
+        return reject(reasons or [Reason.FAILED])
+    time_s = data.samples.start_s + np.arange(_size(data.samples)) / data.samples.rate_hz
+    part = _covered(data.samples, time_s, entry_s, exit_s)
+    if part is None:
+        return reject([Reason.GAP_ON_BRIDGE])
+    motion = motion_at(trajectory, time_s[part], direction)
+    acceleration = np.stack([data.samples.channels[name][part] for name in CHANNELS])
+    try:
+        window = _window(data, settings, acceleration, motion)
+    except residual.WindowError:
+        return reject([Reason.STOPPED_ON_BRIDGE])
+    fit = _METHODS[settings.method](data, settings, window, report)
+    if fit.ending is search.Ending.NOT_FINITE:
+        return reject([Reason.NOT_FINITE])
+    return _result(data, settings, window, fit, motion, entry_s, exit_s, speed, stopwatch() - began)
+
+
+def _trajectory(data: CrossingData) -> Trajectory | None:
+    near = (data.fixes.time_s > data.stay.entry_s - 10.0) & (
+        data.fixes.time_s < data.stay.exit_s + 10.0
+    )
+    if near.sum() < 2:
+        return None
+    antenna = data.vehicle.gps_antenna_to_front_axle_m
+    latency = data.receiver.latency_s
+    # Perfect receivers exist only in simulations; a floor keeps the fit well posed there.
+    return fit_trajectory(
+        data.fixes.time_s[near] - latency,
+        data.chainage_m[near] + data.stay.direction * antenna,
+        data.stay.direction * np.abs(data.fixes.speed_m_per_s[near]),
+        position_noise_m=max(data.receiver.position_noise_m, 1e-3),
+        speed_noise_m_per_s=max(data.receiver.speed_noise_m_per_s, 1e-3),
+        start_s=data.stay.entry_s - MARGIN_S,
+        stop_s=data.stay.exit_s + MARGIN_S,
+    )
+
+
+def _entry_and_exit(data: CrossingData, trajectory: Trajectory | None) -> tuple[float, float]:
+    """When the front axle enters and the rear axle leaves, by the smooth curve if it says so."""
+    stay = data.stay
+    if trajectory is None or stay.passage is not Passage.THROUGH:
+        return stay.entry_s, stay.exit_s
+    direction, span = stay.direction, data.bridge.span_m
+    near, far = (0.0, span) if direction > 0 else (span, 0.0)
+    begin, end = stay.entry_s - MARGIN_S, stay.exit_s + MARGIN_S
+    entry = passing_time_s(trajectory, near, direction, begin, end)
+    beyond = far + direction * data.vehicle.wheelbase_m
+    leave = passing_time_s(trajectory, beyond, direction, begin, end)
+    if not (np.isfinite(entry) and np.isfinite(leave)):
+        return stay.entry_s, stay.exit_s
+    return entry, leave
+
+
+def _unusable(
+    data: CrossingData, trajectory: Trajectory | None, entry_s: float, exit_s: float
+) -> list[Reason]:
+    """Everything that forbids a fit, whatever the method."""
+    reasons: list[Reason] = []
+    match data.stay.passage:
+        case Passage.TURNED_BACK:
+            reasons.append(Reason.STOPPED_ON_BRIDGE)
+        case Passage.BEGINS_ON_BRIDGE | Passage.ENDS_ON_BRIDGE:
+            reasons.append(Reason.INCOMPLETE_CROSSING)
+        case Passage.THROUGH:
+            pass
+    channels = data.samples.channels if data.samples is not None else {}
+    if any(name not in channels for name in CHANNELS):
+        reasons.append(Reason.CHANNEL_MISSING)
+    if trajectory is None or _longest_outage_s(data.fixes.time_s, entry_s, exit_s) > (
+        _LONGEST_OUTAGE_S
+    ):
+        reasons.append(Reason.POSITION_OUTAGE)
+    if trajectory is not None and data.stay.passage is Passage.THROUGH:
+        times = np.linspace(entry_s, exit_s, 200)
+        speed = data.stay.direction * trajectory.spline.derivative()(times)
+        if speed.min() < _STANDING_M_PER_S:
+            reasons.append(Reason.STOPPED_ON_BRIDGE)
+        elif np.median(speed) < _SLOWEST_M_PER_S:
+            reasons.append(Reason.SPEED_TOO_LOW)
+    return reasons
+
+
+def _longest_outage_s(times_s: Floats, entry_s: float, exit_s: float) -> float:
+    inside = times_s[(times_s > entry_s) & (times_s < exit_s)]
+    before = times_s[times_s <= entry_s][-1:]
+    after = times_s[times_s >= exit_s][:1]
+    around = np.concatenate([before, inside, after])
+    return float(np.diff(around).max()) if around.size > 1 else np.inf
+
+
+def _size(samples: Samples) -> int:
+    return next(iter(samples.channels.values())).size
+
+
+def _covered(samples: Samples, time_s: Floats, entry_s: float, exit_s: float) -> slice | None:
+    """The unbroken stretch of samples around the crossing; None if some are missing in it."""
+    first = int(np.searchsorted(time_s, entry_s))
+    last = int(np.searchsorted(time_s, exit_s, side="right"))
+    spare = 4  # for the interpolation at the ends
+    if first < spare or last + spare > time_s.size:
+        return None
+    complete = np.all([np.isfinite(values) for values in samples.channels.values()], axis=0)
+    if not np.all(complete[first - spare : last + spare]):
+        return None
+    holes = np.flatnonzero(~complete)
+    begin = int(holes[holes < first].max(initial=-1)) + 1
+    stop = int(holes[holes >= last].min(initial=time_s.size))
+    return slice(begin, stop)
+
+
+def _window(
+    data: CrossingData, settings: IdentificationSettings, acceleration: Floats, motion: Motion
+) -> Window:
+    vehicle = data.vehicle
+    assert data.samples is not None  # noqa: S101 - `_unusable` saw to it
+    return residual.build_window(
+        acceleration,
+        1.0 / data.samples.rate_hz,
+        motion.position_m,
+        data.stay.direction,
+        element_lengths_m=np.array(data.bridge.lengths_m),
+        total_mass_kg=vehicle.total_mass_kg,
+        wheelbase_m=vehicle.wheelbase_m,
+        integrate=spline_integrate,
+        initial_state_known=False,
+        bias_known=False,
+        speed_change_m_per_s2=motion.acceleration_m_per_s2,
+        cg_height_m=vehicle.cg_height_m or 0.0,
+        parts=settings.parts,
+    )
+
+
+def nominal_parameters(vehicle: Vehicle, bridge: Bridge) -> Floats:
+    """The values of the site file in the order of `pre_core.parameters`."""
+    return np.array(
+        [
+            vehicle.front_axle_to_cg_m,
+            *vehicle.suspension_damping_ns_per_m,
+            *vehicle.suspension_stiffness_n_per_m,
+            *vehicle.unsprung_mass_kg,
+            *vehicle.tyre_stiffness_n_per_m,
+            vehicle.pitch_inertia_ratio,
+            *bridge.nominal_flexural_rigidity_nm2,
+            bridge.mass_per_length_kg_per_m,
+            bridge.rayleigh_alpha_per_s,
+            bridge.rayleigh_beta_s,
+            0.0,
+            0.0,
+        ]
+    )
+
+
+def _least_squares(
+    data: CrossingData, settings: IdentificationSettings, window: Window, report: Report
+) -> _Fit:
+    nominal = nominal_parameters(data.vehicle, data.bridge)
+    free = parameters.paper_subset(data.bridge.elements)
+    free = free[nominal[free] > 0.0]  # a site may say that a damping is exactly zero
+    problem = least_squares.Problem(window, nominal, free)
+    work = residual.workspace(window)
+    rng = np.random.default_rng(settings.seed)
+    best: tuple[least_squares.State, search.Ending] | None = None
+    steps = evaluations = 0
+
+    def progress(count: int, info: least_squares.Info) -> None:
+        report(f"least squares, step {count}", min(0.95, count / least_squares.MAX_STEPS))
+
+    for attempt in range(settings.starts):
+        start = nominal[free]
+        if attempt > 0:
+            start = start * rng.uniform(random_walk.PRIOR_LOW, random_walk.PRIOR_HIGH, free.size)
+        state, infos, ending = search.run(
+            partial(least_squares.init, problem, work, start),
+            partial(least_squares.step, problem, work),
+            least_squares.MAX_STEPS,
+            progress=progress,
+        )
+        steps += len(infos)
+        evaluations += sum(info.evaluations for info in infos)
+        if best is None or state.objective < best[0].objective:
+            best = state, ending
+        if ending is search.Ending.CONVERGED:
+            break
+    assert best is not None  # noqa: S101 - `starts` is at least 1
+    state, ending = best
+    slope = least_squares.derivative_of_values(problem, state.y)
+    return _Fit(
+        least_squares.full_vector(problem, state.y),
+        free,
+        least_squares.covariance(state) * np.outer(slope, slope),
+        None,
+        ending,
+        {"iterations": float(steps), "evaluations": float(evaluations)},
+    )
+
+
+def _random_walk(
+    data: CrossingData, settings: IdentificationSettings, window: Window, report: Report
+) -> _Fit:
+    nominal = nominal_parameters(data.vehicle, data.bridge)
+    free = parameters.paper_subset(data.bridge.elements)
+    free = free[nominal[free] > 0.0]
+    problem = random_walk.problem(window, nominal, free, settings.seed)
+
+    def progress(count: int, info: random_walk.Info) -> None:
+        report(f"random walk, step {count}", count / settings.steps)
+
+    state, infos, ending = search.run(
+        partial(random_walk.init, problem, settings.particles),
+        partial(random_walk.step, problem),
+        settings.steps,
+        at_the_end=search.Ending.STEPS_DONE,
+        progress=progress,
+    )
+    values = state.ratios * nominal[free]
+    theta = nominal.copy()
+    theta[free] = values.mean(axis=0)
+    return _Fit(
+        theta,
+        free,
+        np.atleast_2d(np.cov(values.T)),
+        np.quantile(values, [0.025, 0.5, 0.975], axis=0).T,
+        ending,
+        {
+            "iterations": float(len(infos)),
+            "evaluations": float(settings.particles * (len(infos) + 1)),
+            "acceptance": float(np.mean([info.acceptance for info in infos])),
+        },
+    )
+
+
+_METHODS: dict[
+    str, Callable[[CrossingData, IdentificationSettings, Window, Report], _Fit]
+] = {"least_squares": _least_squares, "random_walk": _random_walk}
+METHODS = tuple(_METHODS)
+
+
+def _result(
+    data: CrossingData,
+    settings: IdentificationSettings,
+    window: Window,
+    fit: _Fit,
+    motion: Motion,
+    entry_s: float,
+    exit_s: float,
+    speed: float,
+    seconds: float,
+) -> results.Crossing:
+    work = residual.workspace(window)
+    roads = residual.road_profiles(window, work, fit.theta)
+    objective = residual.objective(window, work, fit.theta)
+    length = abs(roads.x_m[-1] - roads.x_m[0])
+    misfit_m = float(np.sqrt(objective / length))
+    road_m = float(np.std(_detrended(roads.x_m, 0.5 * (roads.front_m + roads.rear_m))))
+    diagnostics = fit.diagnostics | {
+        "seconds": seconds,
+        "residual_rms_m": misfit_m,
+        "road_rms_m": road_m,
+        "relative_misfit": misfit_m / max(road_m, 1e-12),
+    }
+    reasons = [Reason.NO_NOISE_MODEL]
+    if diagnostics["relative_misfit"] > _LARGEST_MISFIT:
+        reasons.append(Reason.MODEL_MISFIT)
+    if fit.ending in (search.Ending.STEPS_EXHAUSTED, search.Ending.STUCK):
+        reasons.append(Reason.NOT_CONVERGED)
+    changing = np.abs(motion.acceleration_m_per_s2).max() > _LARGEST_ACCELERATION_M_PER_S2
+    if changing and data.vehicle.cg_height_m is None:
+        reasons.append(Reason.ACCELERATING_CG_UNKNOWN)
+    values = _parameters(data, fit, settings)
+    names = tuple(parameters.names(data.bridge.elements)[i] for i in fit.free)
+    return results.Crossing(
+        **_header(data, settings, entry_s, exit_s, speed),
+        verdict="suspect",  # without a noise model nothing can be shown to be good
+        reasons=tuple(reasons),
+        diagnostics=diagnostics,
+        parameters=values,
+        covariance=results.Covariance(
+            names=names, matrix=tuple(tuple(row) for row in fit.covariance.tolist())
+        ),
+        derived=_derived(data, window, fit, values),
+        road=_road(data, roads),
+    )
+
+
+def _header(
+    data: CrossingData,
+    settings: IdentificationSettings,
+    entry_s: float,
+    exit_s: float,
+    speed: float,
+) -> dict[str, object]:
+    return {
+        "crossing_id": data.crossing_id,
+        "realm": data.realm,
+        "vehicle": data.vehicle.id,
+        "bridge": data.bridge.id,
+        "direction": "start_to_end" if data.stay.direction > 0 else "end_to_start",
+        "entry_time": data.wall_offset_s + entry_s,
+        "exit_time": data.wall_offset_s + exit_s,
+        "speed_m_per_s": speed,
+        "method": settings.method,
+    }
+
+
+def _rejected(
+    data: CrossingData,
+    settings: IdentificationSettings,
+    entry_s: float,
+    exit_s: float,
+    speed: float,
+    reasons: list[Reason],
+) -> results.Crossing:
+    return results.Crossing(
+        **_header(data, settings, entry_s, exit_s, speed),
+        verdict="rejected",
+        reasons=tuple(dict.fromkeys(reasons)),
+        parameters=None,
+    )
+
+
+def _parameters(
+    data: CrossingData, fit: _Fit, settings: IdentificationSettings
+) -> dict[str, results.Parameter]:
+    nominal = nominal_parameters(data.vehicle, data.bridge)
+    names = parameters.names(data.bridge.elements)
+    std = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    values: dict[str, results.Parameter] = {}
+    for k, i in enumerate(fit.free):
+        mean = float(fit.theta[i])
+        low, middle, high = (
+            fit.spread[k]
+            if fit.spread is not None
+            else (mean - _NORMAL_975 * std[k], mean, mean + _NORMAL_975 * std[k])
+        )
+        values[names[i]] = results.Parameter(
+            unit=parameters.unit(names[i]),
+            mean=mean,
+            std=float(std[k]),
+            q025=float(low),
+            q50=float(middle),
+            q975=float(high),
+            prior=_start_of_search(float(nominal[i]), settings),
+        )
+    return values | _derived_masses(data, fit)
+
+
+def _start_of_search(nominal: float, settings: IdentificationSettings) -> results.Prior | None:
+    """The random walk starts uniformly around the nominal value; least squares has no prior."""
+    if settings.method != "random_walk":
+        return None
+    half_width = 0.5 * (random_walk.PRIOR_HIGH - random_walk.PRIOR_LOW) * abs(nominal)
+    return results.Prior(distribution="uniform", location=nominal, scale=half_width)
+
+
+def _derived_masses(data: CrossingData, fit: _Fit) -> dict[str, results.Parameter]:
+    """m_s, m_s1, m_s2 and their formal spread to first order."""
+    vehicle = data.vehicle
+    masses = partial(
+        parameters.body_masses,
+        total_mass_kg=vehicle.total_mass_kg,
+        wheelbase_m=vehicle.wheelbase_m,
+    )
+    means, spread = _propagated(fit, lambda theta: masses(theta))
+    return {
+        name: _gaussian("kg", float(mean), float(std))
+        for name, mean, std in zip(("m_s", "m_s1", "m_s2"), means, spread, strict=True)
+    }
+
+
+def _propagated(fit: _Fit, quantity: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
+    """A quantity (q,) of the parameters and its standard deviation to first order."""
+    centre = np.atleast_1d(quantity(fit.theta))
+    slopes = np.empty((centre.size, fit.free.size))
+    for k, i in enumerate(fit.free):
+        moved = fit.theta.copy()
+        step = 1e-5 * moved[i]
+        moved[i] += step
+        slopes[:, k] = (np.atleast_1d(quantity(moved)) - centre) / step
+    variance = np.einsum("qi,ij,qj->q", slopes, fit.covariance, slopes)
+    return centre, np.sqrt(np.maximum(variance, 0.0))
+
+
+def _gaussian(unit: str, mean: float, std: float) -> results.Parameter:
+    return results.Parameter(
+        unit=unit,
+        mean=mean,
+        std=std,
+        q025=mean - _NORMAL_975 * std,
+        q50=mean,
+        q975=mean + _NORMAL_975 * std,
+    )
+
+
+def _beam(data: CrossingData, theta: Floats) -> Beam:
+    n = data.bridge.elements
+    first = parameters.EI_1
+    rho, alpha, beta, k_start, k_end = theta[first + n : first + n + 5]
+    return uniform_beam(
+        data.bridge.span_m, theta[first : first + n], rho, alpha, beta, (k_start, k_end)
+    )._replace(element_lengths_m=np.array(data.bridge.lengths_m))
+
+
+def _derived(
+    data: CrossingData, window: Window, fit: _Fit, values: dict[str, results.Parameter]
+) -> results.Derived:
+    frequency, frequency_std = _propagated(
+        fit, lambda theta: natural_frequencies_hz(_beam(data, theta), 1)
+    )
+    deflection, deflection_std = _propagated(
+        fit, lambda theta: np.array([residual.largest_deflection_m(window, theta)])
+    )
+    return results.Derived(
+        f1_hz=_gaussian("Hz", float(frequency[0]), float(frequency_std[0])),
+        max_deflection_m=_gaussian("m", float(deflection[0]), float(deflection_std[0])),
+    )
+
+
+def _detrended(x_m: Floats, height_m: Floats) -> Floats:
+    line = np.polynomial.Polynomial.fit(x_m, height_m, 1)
+    return np.asarray(height_m - line(x_m))
+
+
+def _road(data: CrossingData, roads: residual.Roads) -> results.Road:
+    """Profiles on an even grid of chainage, each without its own straight line.
+
+    Integrated accelerations leave level and slope of a road unknown.
+    """
+    order = np.argsort(roads.x_m)
+    x = np.arange(0.0, data.bridge.span_m + 0.5 * _ROAD_SPACING_M, _ROAD_SPACING_M)
+    x = x[(x >= roads.x_m.min()) & (x <= roads.x_m.max())]
+    mean = 0.5 * (roads.front_m + roads.rear_m)
+    front, rear, both = (
+        _detrended(x, np.interp(x, roads.x_m[order], profile[order]))
+        for profile in (roads.front_m, roads.rear_m, mean)
+    )
+    profile = Profile(x, both)
+    return results.Road(
+        x_m=tuple(x.tolist()),
+        front_m=tuple(front.tolist()),
+        rear_m=tuple(rear.tolist()),
+        mean_m=tuple(both.tolist()),
+        std_m=None,
+        iri_m_per_km=float(iri_m_per_km(profile)[0]),
+        iso_class=iso_8608_class(roughness_coefficient_m3(profile)),
+    )
