@@ -1,5 +1,7 @@
 """What the logger lets in, what it reports, and how it writes."""
 
+import contextlib
+import socket
 import threading
 import time
 from pathlib import Path
@@ -9,6 +11,7 @@ import pytest
 from schemas.events import EventKind
 from schemas.signals import GnssFix, encode_gnss, encode_identity
 from schemas.topics import Key
+from services import logger
 from services.common.bus import Received
 from services.common.errors import InputError
 from services.common.recording import Message, RecordingWriter, read_info, read_messages
@@ -236,3 +239,35 @@ def test_an_existing_file_is_refused_before_anything_starts(tmp_path: Path) -> N
     with pytest.raises(InputError, match="never overwritten"):
         FileWriter(place(tmp_path, tmp_path / "a.mcap"))
     assert not [thread for thread in threading.enumerate() if thread.name == "writer"]
+
+
+def test_what_has_come_is_written_before_the_file_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A backlog that only shows once the subscription is closed: the end of a busy day."""
+
+    class Backlog:
+        def __init__(self, *arguments: object) -> None:
+            self.waiting: list[Received] = []
+
+        def receive(self, timeout_s: float = 0.0) -> Received | None:
+            return self.waiting.pop(0) if self.waiting else None
+
+        def close(self) -> None:
+            if first_close.is_set():
+                return
+            first_close.set()
+            self.waiting += [received(number) for number in range(50)]
+
+    first_close, stop = threading.Event(), threading.Event()
+    stop.set()
+    monkeypatch.setattr("services.logger.Subscription", Backlog)
+    monkeypatch.setattr(
+        "services.logger.stopped_by_signals", lambda on_second: contextlib.nullcontext(stop)
+    )
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        listen = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    file = tmp_path / "a.mcap"
+    assert logger.run(listen=listen, folder=tmp_path, file=file, realm=None, site=None) == 0
+    assert [message.sequence for message in read_messages(file)] == list(range(50))
