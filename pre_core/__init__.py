@@ -7,5 +7,5 @@ imports. Units are SI throughout; `x` is the chainage of `docs/contract.md`.
 import numba
 
 # The particle kernels hold four particles in tuples of four floats (lanes.py); LLVM packs them into
-# vector registers only with its superword pass, which numba leaves off. It changes speed, not values.
-numba.config.SLP_VECTORIZE = 1
+# vector registers only with its superword pass, which numba leaves off. It changes speed alone.
+setattr(numba.config, "SLP_VECTORIZE", 1)  # noqa: B010 - the type stubs do not know it

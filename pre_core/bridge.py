@@ -100,7 +100,7 @@ def element_stiffness(length_m: float) -> FloatArray:
 
 
 def element_dofs(elements: int) -> NDArray[np.int64]:
-    """Degrees of freedom (n, 4) of each element: deflection, rotation at its two nodes; -1 is held."""
+    """Degrees of freedom (n, 4) of each element, node by node: deflection, rotation; -1 is held."""
     free = np.full(2 * (elements + 1), -1, dtype=np.int64)
     held = {0, 2 * elements}
     count = 0
@@ -170,9 +170,7 @@ def natural_frequencies_hz(
     beam: Beam, count: int | None = None, coupling_sign: float = 1.0
 ) -> FloatArray:
     """Undamped natural frequencies, ascending."""
-    return np.asarray(
-        np.sqrt(modes(beam, count, coupling_sign).eigenvalues_per_s2) / (2.0 * np.pi)
-    )
+    return np.asarray(np.sqrt(modes(beam, count, coupling_sign).eigenvalues_per_s2) / (2.0 * np.pi))
 
 
 def locate(element_lengths_m: FloatArray, x_m: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
@@ -185,7 +183,7 @@ def locate(element_lengths_m: FloatArray, x_m: FloatArray) -> tuple[NDArray[np.i
 
 
 def cubic_from_nodes(length_m: float) -> FloatArray:
-    """Coefficients (4, 4): rows 1, xi, xi^2, xi^3 of the deflection from (w_1, theta_1, w_2, theta_2)."""
+    """Coefficients (4, 4) of 1, xi, xi^2, xi^3 (rows) from w_1, theta_1, w_2, theta_2."""
     s = length_m
     return np.array(
         [
@@ -224,4 +222,6 @@ def static_deflection_m(
 ) -> FloatArray:
     """Deflection at `x_m` under standing point loads, up positive for loads up positive."""
     force = interpolation_matrix(beam, load_x_m).T @ np.asarray(load_n, dtype=np.float64)
-    return np.asarray(interpolation_matrix(beam, x_m) @ np.linalg.solve(stiffness_matrix(beam), force))
+    return np.asarray(
+        interpolation_matrix(beam, x_m) @ np.linalg.solve(stiffness_matrix(beam), force)
+    )

@@ -19,7 +19,6 @@ from scipy.linalg import eigh
 
 from pre_core.bridge import (
     element_cubics,
-    element_mass,
     mass_matrix,
     uniform_beam,
     unit_stiffness_matrices,

@@ -46,7 +46,12 @@ def input_profiles(signals: FloatArray, theta: FloatArray) -> FloatArray:
     wheel = np.arange(2)
     k_u = theta[K_U1 + wheel]
     factors = np.stack(
-        [np.ones(2), theta[M_U1 + wheel] / k_u, theta[C_S1 + wheel] / k_u, theta[K_S1 + wheel] / k_u],
+        [
+            np.ones(2),
+            theta[M_U1 + wheel] / k_u,
+            theta[C_S1 + wheel] / k_u,
+            theta[K_S1 + wheel] / k_u,
+        ],
         axis=1,
     )
     return np.asarray(np.einsum("wj,wjn->wn", factors, signals))

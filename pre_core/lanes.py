@@ -16,8 +16,7 @@ LANES = 4
 
 # Contraction allows fused multiply-add; no other reordering of the arithmetic is allowed, so that
 # results do not depend on how many particles are evaluated together.
-_options = {"fastmath": {"contract", "nsz"}, "error_model": "numpy", "cache": True, "nogil": True}
-kernel = njit(**_options)
+kernel = njit(fastmath={"contract", "nsz"}, error_model="numpy", cache=True, nogil=True)
 
 
 @kernel

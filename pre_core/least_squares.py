@@ -1,8 +1,8 @@
 """Least squares on the paper's residual: Levenberg-Marquardt in logarithms of the unknowns.
 
 Without noise the surface is benign (docs/reproduction.md): from anywhere in the paper's prior about
-ten steps lead to the one minimum. All unknowns are positive, so the search moves in their logarithms
-and needs no bounds, except that d_1 must lie between the axles: there it moves in the logit.
+ten steps lead to the one minimum. All unknowns are positive, so the search moves in logarithms and
+needs no bounds, except that d_1 must lie between the axles: there it moves in the logit.
 """
 
 from typing import NamedTuple
@@ -137,9 +137,7 @@ def step(problem: Problem, work: Workspace, state: State) -> tuple[State, Info]:
             ending = Ending.CONVERGED if size < _CONVERGED_STEP else None
             return new, Info(objective, size, damping, True, evaluations, ending)
         if size < _CONVERGED_STEP:
-            return state, Info(
-                state.objective, size, damping, False, evaluations, Ending.CONVERGED
-            )
+            return state, Info(state.objective, size, damping, False, evaluations, Ending.CONVERGED)
         damping *= 10.0
     return state, Info(state.objective, 0.0, damping, False, evaluations, Ending.STUCK)
 

@@ -65,7 +65,8 @@ def newmark(
         v[0] = velocity
     a[0] = np.linalg.solve(mass, force[0] - damping @ v[0] - stiffness @ u[0])
     effective = mass + 0.5 * step_s * damping + 0.25 * step_s**2 * stiffness
-    _march(mass, damping, stiffness, np.linalg.inv(effective), force, step_s, u, v, a)
+    inverse = np.asarray(np.linalg.inv(effective), dtype=np.float64)
+    _march(mass, damping, stiffness, inverse, force, step_s, u, v, a)
     return Response(u, v, a)
 
 

@@ -1,11 +1,12 @@
 """The paper's search (section 3.1): a cloud of particles, each walking downhill at random.
 
 A particle moves by a random step if its J does not grow, and stays otherwise (paper eq. 23). The
-paper calls it MCMC; it is not a sampler of a posterior, since no probability decides, and the spread
-of its particles is no uncertainty: it shrinks with every further step. It is here for comparison.
+paper calls it MCMC; it is not a sampler of a posterior, since no probability decides, and the
+spread of its particles is no uncertainty: it shrinks with every further step. It is here for
+comparison.
 
 The paper does not print the distribution of the step. Here it is Gaussian with a standard deviation
-of 7 % of the sound value, in all coordinates at once (docs/reproduction.md tells how that was found).
+of 7 % of the sound value, in all coordinates at once (docs/reproduction.md tells how it was found).
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -29,7 +30,7 @@ STEP_RATIO = 0.07
 
 
 class Problem(NamedTuple):
-    """What stays the same: the data, the sound values, which are free, and one workspace a thread."""
+    """What stays the same: data, sound values, which of them are free, a workspace per thread."""
 
     window: Window
     nominal: FloatArray  # (p,)
@@ -44,7 +45,7 @@ class State(NamedTuple):
 
     ratios: FloatArray
     objective: FloatArray
-    count: int
+    steps: int
 
 
 class Info(NamedTuple):
@@ -109,7 +110,7 @@ def init(bound: Problem, particles: int = PARTICLES) -> State:
 
 def step(bound: Problem, state: State) -> tuple[State, Info]:
     """Propose one random step for every particle and keep those that do not make J larger."""
-    rng = _random(bound.seed, state.count + 1)
+    rng = _random(bound.seed, state.steps + 1)
     proposal = state.ratios + bound.step_ratio * rng.standard_normal(state.ratios.shape)
     objective = _evaluate(bound, proposal, state.objective)
     accepted = objective <= state.objective
@@ -117,4 +118,4 @@ def step(bound: Problem, state: State) -> tuple[State, Info]:
     kept = np.where(accepted, objective, state.objective)
     best = float(kept.min())
     ending = None if np.isfinite(best) else Ending.NOT_FINITE
-    return State(ratios, kept, state.count + 1), Info(best, float(accepted.mean()), ending)
+    return State(ratios, kept, state.steps + 1), Info(best, float(accepted.mean()), ending)

@@ -5,6 +5,7 @@ J = integral of (R_1 - R_2)^2 dx (paper eq. 21). Everything that does not depend
 is computed once, in a `Window`.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -60,7 +61,7 @@ def _stretches(element: IntArray) -> IntArray:
     bounds = np.concatenate([[0], changes, [element.shape[1]]])
     rows = [
         (begin, min(begin + _LONGEST_STRETCH, stop), element[0, begin], element[1, begin])
-        for start, stop in zip(bounds[:-1], bounds[1:], strict=True)
+        for start, stop in itertools.pairwise(bounds)
         for begin in range(start, stop, _LONGEST_STRETCH)
     ]
     return np.array(rows, dtype=np.int64)
@@ -153,7 +154,7 @@ def build_window(
     row_weight = np.sqrt(dx)
     columns: list[FloatArray] = []
     if not initial_state_known:
-        t = step_s * np.arange(leave + 1 - begin)
+        t = step_s * np.arange(leave + 1 - begin, dtype=np.float64)
         t_rear = t[rows.start - begin : rows.stop - begin]
         t_front = np.einsum("mj,mj->m", weight, t[base[:, None] + np.arange(4)])
         columns = [np.ones_like(t_rear), t_front, t_rear]
@@ -392,7 +393,7 @@ def _rows(window: Window, road: FloatArray, lane: int, out: FloatArray) -> None:
 def objective_batch(
     window: Window, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
 ) -> None:
-    """J of many particles, four at a time: `theta` (k, p), `limit` (k,) and `total` (k,) (output)."""
+    """J of many particles, four at a time: `theta` (k, p), `limit` (k,), output `total` (k,)."""
     count = theta.shape[0]
     four = np.empty((LANES, theta.shape[1]))
     four_limit = np.empty(LANES)
@@ -428,7 +429,7 @@ def _residual_batch(
 
 
 def residual_batch(window: Window, work: Workspace, theta: FloatArray) -> FloatArray:
-    """Weighted residual rows (k, m) of k vectors (k, p); their squares sum to J. NaN: not finite."""
+    """Weighted residual rows (k, m) of vectors (k, p); their squares sum to J. NaN: not finite."""
     theta = np.ascontiguousarray(theta)
     out = np.empty((theta.shape[0], window.front_sample.size))
     _residual_batch(window, work, theta, out, np.empty(theta.shape[0]))

@@ -1,4 +1,4 @@
-"""Road profiles: made from an ISO 8608 class and a seed, felt through a tyre, and judged (IRI, class).
+"""Road profiles: made from an ISO 8608 class and a seed, felt through a tyre, judged (IRI, class).
 
 ISO 8608 describes a profile by the displacement spectral density G_d(n) = G_d(n_0) (n/n_0)^-w,
 n_0 = 0.1 cycles/m, w = 2; class A has the geometric mean G_d(n_0) = 16e-6 m^3, each next class four
@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
-from scipy.ndimage import uniform_filter1d
 from scipy.signal import welch
 
 from pre_core.simulate import Motion, WheelRoad, rear_position_m
@@ -29,7 +28,7 @@ GOLDEN_CAR_K2_PER_S2 = 63.3
 GOLDEN_CAR_C_PER_S = 6.0
 GOLDEN_CAR_MU = 0.15
 _GOLDEN_CAR_BASE_M = 0.25  # moving average that stands for the tyre's contact patch
-_GOLDEN_CAR_START_M = 11.0  # length whose mean slope starts the filter
+_GOLDEN_CAR_START_M = 0.5 * GOLDEN_CAR_SPEED_M_PER_S  # length whose mean slope starts the filter
 
 
 class Profile(NamedTuple):
@@ -52,14 +51,16 @@ def iso_8608_profile(
     """A profile with the spectral density of an ISO 8608 class at its geometric mean.
 
     A sum of harmonics of random phase whose amplitudes sqrt(2 G_d(n) dn) follow the density between
-    the longest and the shortest wave (shorter ones do not reach the vehicle through a tyre).
+    the longest and the shortest wave (shorter ones do not reach the vehicle through a tyre, and none
+    is shorter than two spacings).
     """
     rng = np.random.default_rng(seed)
-    x = start_m + spacing_m * np.arange(round((stop_m - start_m) / spacing_m) + 1)
+    count = round((stop_m - start_m) / spacing_m) + 1
+    x = start_m + spacing_m * np.arange(count, dtype=np.float64)
     lowest = 1.0 / longest_wave_m
     # Waves fit four times into the longest stretch asked for, so that no period is seen to repeat.
     step = min(lowest, 1.0 / (4.0 * (x[-1] - x[0])))
-    n = np.arange(lowest, 1.0 / shortest_wave_m, step)
+    n = np.arange(lowest, min(1.0 / shortest_wave_m, 0.5 / spacing_m), step)
     density = GEOMETRIC_MEAN_M3[road_class] * (n / REFERENCE_CYCLES_PER_M) ** -WAVINESS
     amplitude = np.sqrt(2.0 * density * step)
     phase = rng.uniform(0.0, 2.0 * np.pi, n.size)
@@ -72,17 +73,28 @@ def iso_8608_profile(
 
 
 def contact_patch_average(profile: Profile, length_m: float) -> Profile:
-    """The profile as a tyre feels it that stands on `length_m` of road."""
-    spacing = float(profile.x_m[1] - profile.x_m[0])
-    samples = max(1, round(length_m / spacing))
-    return profile._replace(
-        height_m=uniform_filter1d(profile.height_m, samples | 1, mode="nearest")
-    )
+    """The profile as a tyre feels it that stands on `length_m` of road: its moving average.
+
+    The average of the cubic spline through the heights, exact for any length; a wave of n cycles/m
+    is multiplied by sin(pi n L)/(pi n L). Beyond its ends the road goes on level.
+    """
+    if length_m <= 0.0:
+        return profile
+    x, height = profile.x_m, profile.height_m
+    first, last = float(x[0]), float(x[-1])
+    area = CubicSpline(x, height).antiderivative()
+
+    def area_to(position: FloatArray) -> FloatArray:
+        within = np.clip(position, first, last)
+        beyond = height[0] * (position - within) * (position < first)
+        beyond += height[-1] * (position - within) * (position > last)
+        return np.asarray(area(within) + beyond)
+
+    half = 0.5 * length_m
+    return profile._replace(height_m=(area_to(x + half) - area_to(x - half)) / length_m)
 
 
-def under_wheels(
-    profile: Profile, motion: Motion, wheelbase_m: float, direction: int
-) -> WheelRoad:
+def under_wheels(profile: Profile, motion: Motion, wheelbase_m: float, direction: int) -> WheelRoad:
     """Height and rate of change under both wheels, through a cubic spline of the profile.
 
     Raises ValueError if the profile does not reach under both wheels all the way.
@@ -132,15 +144,17 @@ def golden_car_matrices(dx_m: float) -> tuple[FloatArray, FloatArray]:
 def iri_m_per_km(profile: Profile, segment_m: float | None = None) -> FloatArray:
     """International Roughness Index of the profile, whole or per segment (m/km): (segments,).
 
-    Mean rectified slope of the golden car at 80 km/h (ASTM E1926). Slopes are taken over 0.25 m.
+    Mean rectified slope of the golden car at 80 km/h (ASTM E1926), which starts on the mean slope of
+    the first 0.5 s. Slopes are taken over 0.25 m. A last segment that is not whole is left out,
+    unless it is the only one.
     """
-    dx = float(profile.x_m[1] - profile.x_m[0])
+    x, height = profile.x_m, profile.height_m
+    dx = float(x[1] - x[0])
     reach = max(1, round(_GOLDEN_CAR_BASE_M / dx))
-    slope = (profile.height_m[reach:] - profile.height_m[:-reach]) / (reach * dx)
+    slope = (height[reach:] - height[:-reach]) / (reach * dx)
     transition, gain = golden_car_matrices(dx)
-    start = min(slope.size, max(1, round(_GOLDEN_CAR_START_M / dx)))
-    first = (profile.height_m[start] if start < profile.height_m.size else profile.height_m[-1])
-    mean_slope = (first - profile.height_m[0]) / (start * dx)
+    start_m = min(_GOLDEN_CAR_START_M, float(x[-1] - x[0]))
+    mean_slope = (np.interp(x[0] + start_m, x, height) - height[0]) / start_m
     state = np.array([mean_slope, 0.0, mean_slope, 0.0])
     rectified = np.empty(slope.size)
     for i in range(slope.size):
@@ -149,12 +163,9 @@ def iri_m_per_km(profile: Profile, segment_m: float | None = None) -> FloatArray
     if segment_m is None:
         return np.array([1000.0 * rectified.mean()])
     per_segment = max(1, round(segment_m / dx))
-    count = (slope.size + reach) // per_segment
+    count = max(1, (slope.size + reach - 1) // per_segment)
     return np.array(
-        [
-            1000.0 * rectified[i * per_segment : (i + 1) * per_segment].mean()
-            for i in range(max(1, count))
-        ]
+        [1000.0 * rectified[i * per_segment : (i + 1) * per_segment].mean() for i in range(count)]
     )
 
 
@@ -170,10 +181,14 @@ def roughness_coefficient_m3(
         detrend="linear",
     )
     lowest = max(band_cycles_per_m[0], 2.0 / (profile.x_m[-1] - profile.x_m[0]))
-    band = (n >= lowest) & (n <= band_cycles_per_m[1])
-    levels = np.log(density[band]) + WAVINESS * np.log(n[band] / REFERENCE_CYCLES_PER_M)
-    # Lines of a periodogram crowd at short waves; weights 1/n give every octave the same say.
-    return float(np.exp(np.average(levels, weights=1.0 / n[band])))
+    level = density[1:] * (n[1:] / REFERENCE_CYCLES_PER_M) ** WAVINESS
+    octave = np.floor(np.log2(n[1:] / lowest))
+    within = (n[1:] >= lowest) & (n[1:] <= band_cycles_per_m[1])
+    # Averaged within an octave before the logarithm (as ISO 8608 smooths): the mean logarithm of the
+    # single lines of a periodogram lies far below the logarithm of their mean. Then every octave has
+    # the same say.
+    octaves = [level[within & (octave == k)].mean() for k in np.unique(octave[within])]
+    return float(np.exp(np.mean(np.log(octaves))))
 
 
 def iso_8608_class(coefficient_m3: float) -> str:

@@ -1,8 +1,8 @@
 """The one loop that runs every search method, and how it ends.
 
-A method is a State, an Info, `init` and `step`: `step(state) -> (state, info)` is a pure function of
-the state, which holds all that the next step needs, its random numbers included. How a search ended
-is a value, never an exception.
+A method is a State, an Info, `init` and `step`: `step(state) -> (state, info)` is a pure function
+of the state, which holds all that the next step needs, its random numbers included. How a search
+ended is a value, never an exception.
 """
 
 from collections.abc import Callable
@@ -24,10 +24,12 @@ class StepInfo(Protocol):
     """What every method's Info says; `ending` is None while the search goes on."""
 
     @property
-    def ending(self) -> Ending | None: ...
+    def ending(self) -> Ending | None:
+        """Why the search is over, None while it is not."""
 
     @property
-    def objective(self) -> float: ...
+    def objective(self) -> float:
+        """The smallest objective so far."""
 
 
 StateT = TypeVar("StateT")

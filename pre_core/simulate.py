@@ -53,11 +53,9 @@ class Simulation(NamedTuple):
     iterations: int
 
 
-def constant_speed(
-    start_m: float, speed_m_per_s: float, steps: int, step_s: float
-) -> Motion:
+def constant_speed(start_m: float, speed_m_per_s: float, steps: int, step_s: float) -> Motion:
     """Motion from x_1 = start at a constant (signed) speed."""
-    position = start_m + speed_m_per_s * step_s * np.arange(steps)
+    position = start_m + speed_m_per_s * step_s * np.arange(steps, dtype=np.float64)
     return Motion(position, np.full(steps, speed_m_per_s), np.zeros(steps))
 
 
@@ -203,9 +201,7 @@ def _march(
                     qd_new[k] = qd_guess[k] + half * acceleration
                     for w in range(2):
                         y[w] += shape[w, k] * q_new[k]
-                        yd[w] += (
-                            shape[w, k] * qd_new[k] + slope[w, k] * wheel_speed[n] * q_new[k]
-                        )
+                        yd[w] += shape[w, k] * qd_new[k] + slope[w, k] * wheel_speed[n] * q_new[k]
             else:
                 for k in range(count):
                     acceleration = (
@@ -302,6 +298,7 @@ def simulate(
         * car.cg_height_m
         / car.wheelbase_m
     )
+    effective = mass + 0.5 * step_s * damping + 0.25 * step_s**2 * stiffness
     steps = motion.position_m.size
     count = basis.eigenvalues_per_s2.size
     z, zd, zdd = (np.zeros((steps, 4)) for _ in range(3))
@@ -309,8 +306,8 @@ def simulate(
     q, qd = np.zeros((steps, count)), np.zeros((steps, count))
     iterations = _march(
         step_s,
-        np.linalg.inv(mass),
-        np.linalg.inv(mass + 0.5 * step_s * damping + 0.25 * step_s**2 * stiffness),
+        np.asarray(np.linalg.inv(mass), dtype=np.float64),
+        np.asarray(np.linalg.inv(effective), dtype=np.float64),
         damping,
         stiffness,
         car.bilinear_damping * np.array(car.suspension_damping_ns_per_m),

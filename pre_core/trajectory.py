@@ -66,9 +66,7 @@ def fit_trajectory(
     )
     # A fit about the straight line through the fixes: the small numbers keep their digits.
     line = np.polynomial.Polynomial.fit(time_s, position_m, 1)
-    measured = np.concatenate(
-        [position_m - line(time_s), velocity_m_per_s - line.deriv()(time_s)]
-    )
+    measured = np.concatenate([position_m - line(time_s), velocity_m_per_s - line.deriv()(time_s)])
     system = np.vstack([fixes * weight[:, None], jerk / _JERK_M_PER_S3])
     right = np.concatenate([measured * weight, np.zeros(jerk.shape[0])])
     coefficients = lstsq(system, right)[0]

@@ -1,0 +1,1 @@
+"""What runs: the command line, the services on the bus, and what they share."""

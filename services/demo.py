@@ -102,9 +102,7 @@ def _free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def _live(
-    services: _Services, source: Path, speed: float, say: Callable[[str], None]
-) -> Crossing:
+def _live(services: _Services, source: Path, speed: float, say: Callable[[str], None]) -> Crossing:
     """Run the three processes until the result has come over the bus; return it."""
     endpoint, site, folder = services
     common = ["--realm", REALM, "--site", str(site)]

@@ -110,9 +110,7 @@ def declared(site: Site, noise_ug_per_rthz: float, rate_hz: float) -> Site:
 def write_drive(path: Path, drive: Drive, site: Site, realm: str = "sim-drive") -> int:
     """Write the recording that the truck would have made, with the site in it."""
     messages = run_to_messages([drive.run], site, realm, site.vehicles[0].id)
-    return write_recording(
-        path, messages, site_toml=site_toml(site), reason="simulation complete"
-    )
+    return write_recording(path, messages, site_toml=site_toml(site), reason="simulation complete")
 
 
 def simulate_drive(
@@ -152,9 +150,7 @@ def simulate_drive(
     motion = constant_acceleration(start, sign * first_speed, acceleration, steps, step_s)
     reach = vehicle.wheelbase_m + 1.0
     low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
-    raw = iso_8608_profile(
-        np.floor(low), np.ceil(high), _ROAD_SPACING_M, road_class, seed
-    )
+    raw = iso_8608_profile(np.floor(low), np.ceil(high), _ROAD_SPACING_M, road_class, seed)
     road = contact_patch_average(raw, _CONTACT_PATCH_M)
     felt = under_wheels(road, motion, car.wheelbase_m, sign)
     fine = simulate(car, refine(beam, _PARTS), motion, felt, step_s, modes=_modes(bridge))
@@ -220,7 +216,9 @@ def _modes(bridge: Bridge) -> int:
     return min(_MODES, 2 * bridge.elements * _PARTS)
 
 
-def _fixes(site: Site, time_s: Floats, position: Floats, speed: Floats, *, forward: bool) -> GnssTrack:
+def _fixes(
+    site: Site, time_s: Floats, position: Floats, speed: Floats, *, forward: bool
+) -> GnssTrack:
     """An errorless receiver: the antenna behind the front axle, ten times a second."""
     vehicle, bridge = site.vehicles[0], site.bridges[0]
     frame = bridge_frame(bridge)

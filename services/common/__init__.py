@@ -1,0 +1,1 @@
+"""What several services need. Imports none of them."""

@@ -128,7 +128,9 @@ def _stay(
     if before >= 0 and start < time_s.size:
         entry = _passing(time_s, front, before, start if start < stop else after, near)
     if after < time_s.size and passage is Passage.THROUGH:
-        leave = _passing(time_s, rear, max(before, stop - 1) if start < stop else before, after, far)
+        leave = _passing(
+            time_s, rear, max(before, stop - 1) if start < stop else before, after, far
+        )
     return [Stay(passage, direction, entry, leave)]
 
 
@@ -140,7 +142,7 @@ def _passing(time_s: Floats, position: Floats, n: int, m: int, where: float) -> 
 
 
 def _merged(stays: list[Stay]) -> list[Stay]:
-    """Stays whose entries are less than 5 s apart are one (a truck that halts at the bridge's end)."""
+    """Stays whose entries are less than 5 s apart are one: a truck that halts at an end."""
     merged: list[Stay] = []
     for stay in stays:
         if merged and stay.entry_s - merged[-1].entry_s < MERGE_S:

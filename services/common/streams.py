@@ -5,6 +5,7 @@ placed by the truck's monotonic clock, which no step of the wall clock can distu
 difference of the two clocks gives the wall time.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ Floats = NDArray[np.float64]
 
 _NS_PER_S = 1_000_000_000
 _LARGEST_RATE_ERROR = 0.02
-"""A crystal is good to 1e-4; beyond this, batches and their declared rate do not belong together."""
+"""A crystal is good to 1e-4; beyond this the declared rate is another sensor's."""
 
 
 class Fixes(NamedTuple):
@@ -146,7 +147,7 @@ class Boot:
         # jitter its time has; a jump of at least half a sample is missing samples.
         first_s = parts[0][0]
         numbers = [0]
-        for (before_s, channel), (time_s, _) in zip(parts[:-1], parts[1:], strict=True):
+        for (before_s, channel), (time_s, _) in itertools.pairwise(parts):
             jump = (time_s - before_s) * declared - channel.samples.size
             missing = round(jump) if abs(jump) >= 0.5 else 0
             numbers.append(numbers[-1] + max(channel.samples.size + missing, 0))

@@ -7,7 +7,7 @@ through it gives the same bytes every time.
 
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -233,7 +233,7 @@ class Engine:
     def _identified(
         self, realm: str, truck: _Truck, bridge: Bridge, stay: Stay, crossing_id: str
     ) -> Crossing:
-        frame = dict((b.id, f) for b, f in self._frames)[bridge.id]
+        frame = {b.id: f for b, f in self._frames}[bridge.id]
         fixes = truck.boot.fixes()
         chainage, _ = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
         data = CrossingData(
@@ -272,7 +272,7 @@ def latest_state(usable: list[Crossing]) -> BridgeResult:
     """The latest of a bridge's usable crossings; the others are named as left out."""
     last = usable[-1]
     parameters = last.parameters or {}
-    elements = {
+    elements: dict[str, Any] = {
         name: ElementState(mean=p.mean, std=p.std, q025=p.q025, q975=p.q975)
         for name, p in parameters.items()
         if name.startswith("EI_")

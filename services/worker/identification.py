@@ -6,7 +6,7 @@ slow), fits, and says what the answer is worth. Every way to fail is a verdict, 
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pre_core import least_squares, parameters, random_walk, residual, search
 from pre_core.bridge import Beam, natural_frequencies_hz, uniform_beam
 from pre_core.integrate import spline_integrate
-from pre_core.residual import Window, Workspace
+from pre_core.residual import Window
 from pre_core.road import Profile, iri_m_per_km, iso_8608_class, roughness_coefficient_m3
 from pre_core.simulate import Motion
 from pre_core.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
@@ -22,7 +22,7 @@ from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
-from schemas.site import Bridge, Receiver, Site, Vehicle
+from schemas.site import Bridge, Receiver, Vehicle
 from services.common.crossing import Passage, Stay
 from services.common.streams import Fixes, Samples
 
@@ -33,7 +33,7 @@ Report = Callable[[str, float], None]
 MARGIN_S = 1.0
 """Samples are needed this long before the entry and after the exit."""
 _SLOWEST_M_PER_S = 3.0
-"""Below this the wheels feel next to nothing of the bridge's stiffness (design: axles must differ)."""
+"""Below this the wheels feel next to nothing of the bridge's stiffness."""
 _STANDING_M_PER_S = 0.5
 _LONGEST_OUTAGE_S = 1.5
 _LARGEST_MISFIT = 0.02
@@ -320,9 +320,10 @@ def _random_walk(
     )
 
 
-_METHODS: dict[
-    str, Callable[[CrossingData, IdentificationSettings, Window, Report], _Fit]
-] = {"least_squares": _least_squares, "random_walk": _random_walk}
+_METHODS: dict[str, Callable[[CrossingData, IdentificationSettings, Window, Report], _Fit]] = {
+    "least_squares": _least_squares,
+    "random_walk": _random_walk,
+}
 METHODS = tuple(_METHODS)
 
 
@@ -379,7 +380,7 @@ def _header(
     entry_s: float,
     exit_s: float,
     speed: float,
-) -> dict[str, object]:
+) -> dict[str, Any]:
     return {
         "crossing_id": data.crossing_id,
         "realm": data.realm,
