@@ -55,7 +55,7 @@ class Drive(NamedTuple):
 
 def paper_site() -> Site:
     """The site of the paper: Tables 1 and 2."""
-    text = resources.files("services").joinpath("paper.toml").read_text(encoding="utf-8")
+    text = resources.files("services").joinpath("data/paper.toml").read_text(encoding="utf-8")
     return parse_site(text, "paper.toml")
 
 
