@@ -51,8 +51,8 @@ def iso_8608_profile(
     """A profile with the spectral density of an ISO 8608 class at its geometric mean.
 
     A sum of harmonics of random phase whose amplitudes sqrt(2 G_d(n) dn) follow the density between
-    the longest and the shortest wave (shorter ones do not reach the vehicle through a tyre, and none
-    is shorter than two spacings).
+    the longest and the shortest wave. Shorter ones do not reach the vehicle through a tyre; none is
+    shorter than two spacings.
     """
     rng = np.random.default_rng(seed)
     count = round((stop_m - start_m) / spacing_m) + 1
@@ -144,8 +144,8 @@ def golden_car_matrices(dx_m: float) -> tuple[FloatArray, FloatArray]:
 def iri_m_per_km(profile: Profile, segment_m: float | None = None) -> FloatArray:
     """International Roughness Index of the profile, whole or per segment (m/km): (segments,).
 
-    Mean rectified slope of the golden car at 80 km/h (ASTM E1926), which starts on the mean slope of
-    the first 0.5 s. Slopes are taken over 0.25 m. A last segment that is not whole is left out,
+    Mean rectified slope of the golden car at 80 km/h (ASTM E1926), which starts on the mean slope
+    of the first 0.5 s. Slopes are taken over 0.25 m. A last segment that is not whole is left out,
     unless it is the only one.
     """
     x, height = profile.x_m, profile.height_m
@@ -184,9 +184,9 @@ def roughness_coefficient_m3(
     level = density[1:] * (n[1:] / REFERENCE_CYCLES_PER_M) ** WAVINESS
     octave = np.floor(np.log2(n[1:] / lowest))
     within = (n[1:] >= lowest) & (n[1:] <= band_cycles_per_m[1])
-    # Averaged within an octave before the logarithm (as ISO 8608 smooths): the mean logarithm of the
-    # single lines of a periodogram lies far below the logarithm of their mean. Then every octave has
-    # the same say.
+    # Averaged within an octave before the logarithm (as ISO 8608 smooths): the mean logarithm of
+    # single lines of a periodogram lies far below the logarithm of their mean. Then every octave
+    # has the same say.
     octaves = [level[within & (octave == k)].mean() for k in np.unique(octave[within])]
     return float(np.exp(np.mean(np.log(octaves))))
 
