@@ -94,17 +94,13 @@ def modal_filters(
     elements = factors - 2
     rho = EI_1 + elements
     for i in range(m):
-        for j in range(m):
-            for lane in range(LANES):
-                matrix[i, j, lane] = 0.0
-    for e in range(factors):
-        place = EI_1 + e if e < elements else rho + 3 + e - elements
-        for lane in range(LANES):
-            factor = theta[lane, place]
-            if factor != 0.0:
-                for i in range(m):
-                    for j in range(m):
-                        matrix[i, j, lane] += factor * basis_stiffness[e, i, j]
+        for j in range(i, m):  # the upper triangle is all that is read
+            total = (0.0, 0.0, 0.0, 0.0)
+            for e in range(factors):
+                place = EI_1 + e if e < elements else rho + 3 + e - elements
+                factor = (theta[0, place], theta[1, place], theta[2, place], theta[3, place])
+                total = fma_scalar(factor, basis_stiffness[e, i, j], total)
+            store(matrix[i], j, total)
     if not diagonalise(matrix, vectors):
         return False
     a = 2.0 / step_s
@@ -122,7 +118,7 @@ def modal_filters(
             for power in range(4):
                 total = (0.0, 0.0, 0.0, 0.0)
                 for i in range(m):
-                    total = fma_scalar(load(vectors[i], k), basis_cubics[e, power, i], total)
+                    total = fma_scalar(load(vectors[k], i), basis_cubics[e, power, i], total)
                 store(cubics[e, k], power, mul(total, size))
     return True
 
@@ -136,7 +132,8 @@ def _one_mode_two_wheels(
     front_place: FloatArray,
     rear_place: FloatArray,
     force: FloatArray,
-    deflection: FloatArray,
+    deflection_front: FloatArray,
+    deflection_rear: FloatArray,
 ) -> None:
     a0, a1, a2, a3 = load(front, 0), load(front, 1), load(front, 2), load(front, 3)
     b0, b1, b2, b3 = load(rear, 0), load(rear, 1), load(rear, 2), load(rear, 3)
@@ -144,7 +141,6 @@ def _one_mode_two_wheels(
     w1, w2 = load(state, 0), load(state, 1)
     before = add(w1, w2)
     force_front, force_rear = force[0], force[1]
-    deflection_front, deflection_rear = deflection[0], deflection[1]
     for n in range(front_place.size):
         x = front_place[n]
         z = rear_place[n]
@@ -201,13 +197,14 @@ def advance(
     front_place: FloatArray,
     rear_place: FloatArray,
     force: FloatArray,
-    deflection: FloatArray,
+    deflection_front: FloatArray,
+    deflection_rear: FloatArray,
 ) -> None:
     """March all modes over a stretch in which each wheel stays in one element (or off the bridge).
 
     Cubics are (m, 4, 4) of the element under each wheel, `feedback` and `state` (m, 2, 4), places
-    (steps,), `force` and `deflection` (2, steps, 4). `state` is updated and the deflections are
-    *added* to. What the fourth axis is (particles, or groups of modes) does not matter here.
+    (steps,), `force` (2, steps, 4), deflections (steps, 4). `state` is updated and the deflections
+    are *added* to. What the fourth axis is (particles, or groups of modes) does not matter here.
     """
     for k in range(feedback.shape[0]):
         if front_on and rear_on:
@@ -219,13 +216,14 @@ def advance(
                 front_place,
                 rear_place,
                 force,
-                deflection,
+                deflection_front,
+                deflection_rear,
             )
         elif front_on:
             _one_mode_one_wheel(
-                front_cubics[k], feedback[k], state[k], front_place, force[0], deflection[0]
+                front_cubics[k], feedback[k], state[k], front_place, force[0], deflection_front
             )
         elif rear_on:
             _one_mode_one_wheel(
-                rear_cubics[k], feedback[k], state[k], rear_place, force[1], deflection[1]
+                rear_cubics[k], feedback[k], state[k], rear_place, force[1], deflection_rear
             )

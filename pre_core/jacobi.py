@@ -9,64 +9,83 @@ that are already nearly diagonal.
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.lanes import LANES, fma, kernel, load, mul, store
+from pre_core.lanes import LANES, Lanes, fma, kernel, load, mul, store
 
 FloatArray = NDArray[np.float64]
 
 MAX_SWEEPS = 30
+_NEGLIGIBLE = 1e-16
+"""Of a_pq^2/(a_pp a_qq) before a sweep: convergence is quadratic, so that after it what is left is
+far below rounding."""
+
+
+@kernel
+def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArray) -> float:
+    """Cosine and sine (4,) that annul a_pq, and how far a_pq was from negligible (> 0: not)."""
+    left = -1.0
+    for lane in range(LANES):
+        off = a[p, q, lane]
+        app = a[p, p, lane]
+        aqq = a[q, q, lane]
+        half = 0.5 * (aqq - app)
+        root = np.sqrt(half * half + off * off) + 1e-300  # no 0/0 where nothing is to be done
+        t = off / (half + (root if half >= 0.0 else -root))
+        c = 1.0 / np.sqrt(1.0 + t * t)
+        cosine[lane] = c
+        sine[lane] = t * c
+        left = max(left, off * off - _NEGLIGIBLE * np.abs(app * aqq))
+    return left
+
+
+@kernel
+def _rotate(x: FloatArray, i: int, y: FloatArray, j: int, c: Lanes, s: Lanes, n: Lanes) -> None:
+    """Rows i of x and j of y become c x - s y and s x + c y; n is -s."""
+    xi = load(x, i)
+    yj = load(y, j)
+    store(x, i, fma(c, xi, mul(n, yj)))
+    store(y, j, fma(s, xi, mul(c, yj)))
 
 
 @kernel
 def diagonalise(a: FloatArray, v: FloatArray) -> bool:
     """Rotate `a` (m, m, 4) to diagonal form, four matrices at once; both are modified in place.
 
-    On return the diagonal of `a` holds the eigenvalues, unsorted, and the columns of `v` (m, m, 4)
-    the orthonormal eigenvectors. False if some matrix is not diagonal to rounding after MAX_SWEEPS
-    (which happens only where it holds a value that is not finite).
+    Only the upper triangle of `a` is read and kept. On return its diagonal holds the eigenvalues,
+    unsorted, and the *rows* of `v` (m, m, 4) the orthonormal eigenvectors. False if some matrix
+    does not get there in MAX_SWEEPS (which happens only where it holds a value that is not finite).
     """
     m = a.shape[0]
     v[:] = 0.0
     for k in range(m):
         for lane in range(LANES):
             v[k, k, lane] = 1.0
-    cosine = np.empty((1, LANES))
-    sine = np.empty((1, LANES))
+    cosine = np.empty(LANES)
+    sine = np.empty(LANES)
     for _ in range(MAX_SWEEPS):
-        largest = 0.0  # of a_pq^2/(a_pp a_qq), which also bounds the error of small eigenvalues
+        left = -1.0
         for p in range(m - 1):
+            row_p = a[p]
             for q in range(p + 1, m):
-                for lane in range(LANES):
-                    off = a[p, q, lane]
-                    ratio = off * off / np.abs(a[p, p, lane] * a[q, q, lane])
-                    if not ratio <= largest:
-                        largest = ratio
-                    difference = 0.5 * (a[q, q, lane] - a[p, p, lane])
-                    root = np.sqrt(difference * difference + off * off)
-                    divisor = difference + (root if difference >= 0.0 else -root)
-                    t = off / divisor if off != 0.0 else 0.0
-                    c = 1.0 / np.sqrt(1.0 + t * t)
-                    cosine[0, lane] = c
-                    sine[0, lane] = t * c
-                c4 = load(cosine, 0)
-                s4 = load(sine, 0)
-                n4 = (-s4[0], -s4[1], -s4[2], -s4[3])
-                for k in range(m):
-                    kp = load(a[k], p)
-                    kq = load(a[k], q)
-                    store(a[k], p, fma(c4, kp, mul(n4, kq)))
-                    store(a[k], q, fma(s4, kp, mul(c4, kq)))
-                row_p = a[p]
                 row_q = a[q]
+                left = max(left, _rotation(a, p, q, cosine, sine))
+                c = (cosine[0], cosine[1], cosine[2], cosine[3])
+                s = (sine[0], sine[1], sine[2], sine[3])
+                n = (-s[0], -s[1], -s[2], -s[3])
+                # The 2 x 2 block itself: a_pp - t a_pq, a_qq + t a_pq, 0.
+                for lane in range(LANES):
+                    change = sine[lane] / cosine[lane] * row_p[q, lane]
+                    row_p[p, lane] -= change
+                    row_q[q, lane] += change
+                    row_p[q, lane] = 0.0
+                for k in range(p):
+                    _rotate(a[k], p, a[k], q, c, s, n)
+                for k in range(p + 1, q):
+                    _rotate(row_p, k, a[k], q, c, s, n)
+                for k in range(q + 1, m):
+                    _rotate(row_p, k, row_q, k, c, s, n)
+                v_p, v_q = v[p], v[q]
                 for k in range(m):
-                    pk = load(row_p, k)
-                    qk = load(row_q, k)
-                    store(row_p, k, fma(c4, pk, mul(n4, qk)))
-                    store(row_q, k, fma(s4, pk, mul(c4, qk)))
-                for k in range(m):
-                    kp = load(v[k], p)
-                    kq = load(v[k], q)
-                    store(v[k], p, fma(c4, kp, mul(n4, kq)))
-                    store(v[k], q, fma(s4, kp, mul(c4, kq)))
-        if largest < 1e-28:
+                    _rotate(v_p, k, v_q, k, c, s, n)
+        if left <= 0.0:
             return True
     return False

@@ -202,8 +202,7 @@ class Workspace(NamedTuple):
     feedback: FloatArray  # (m, 2, 4)
     state: FloatArray  # (m, 2, 4)
     force: FloatArray  # (2, stretch, 4)
-    deflection: FloatArray  # (2, stretch, 4)
-    road: FloatArray  # (2, n, 4): the two road profiles
+    road: FloatArray  # (2, n, 4): minus the two road profiles
     seen: FloatArray  # (q, 4): sums of the rows with the nuisance columns
 
 
@@ -217,7 +216,6 @@ def workspace(window: Window) -> Workspace:
         np.zeros((m, 2, LANES)),
         np.zeros((m, 2, LANES)),
         np.zeros((2, _LONGEST_STRETCH, LANES)),
-        np.zeros((2, _LONGEST_STRETCH, LANES)),
         np.zeros((2, window.signals.shape[2], LANES)),
         np.zeros((window.nuisance.shape[1], LANES)),
     )
@@ -227,8 +225,8 @@ def workspace(window: Window) -> Workspace:
 def _vehicle_factors(
     theta: FloatArray, total_mass: float, wheelbase: float, gravity: float, out: FloatArray
 ) -> None:
-    """Rows of `out` (12, 4): IEP factors of front (3) and rear (3), static loads (2), m_11, m_22,
-    m_12, and a spare; m_u follows from theta."""
+    """Rows of `out` (13, 4): minus the IEP factors of front (3) and rear (3), static loads (2),
+    m_11, m_22, m_12, m_u1, m_u2."""
     for lane in range(LANES):
         p = theta[lane]
         d_1 = p[D_1]
@@ -237,14 +235,16 @@ def _vehicle_factors(
         inertia = p[KAPPA] * m_s * d_1 * d_2
         for w in range(2):
             k_u = p[K_U1 + w]
-            out[3 * w, lane] = p[M_U1 + w] / k_u
-            out[3 * w + 1, lane] = p[C_S1 + w] / k_u
-            out[3 * w + 2, lane] = p[K_S1 + w] / k_u
+            out[3 * w, lane] = -p[M_U1 + w] / k_u
+            out[3 * w + 1, lane] = -p[C_S1 + w] / k_u
+            out[3 * w + 2, lane] = -p[K_S1 + w] / k_u
         out[6, lane] = gravity * (m_s * d_2 / wheelbase + p[M_U1])
         out[7, lane] = gravity * (m_s * d_1 / wheelbase + p[M_U1 + 1])
         out[8, lane] = (m_s * d_2 * d_2 + inertia) / (wheelbase * wheelbase)
         out[9, lane] = (m_s * d_1 * d_1 + inertia) / (wheelbase * wheelbase)
         out[10, lane] = (m_s * d_1 * d_2 - inertia) / (wheelbase * wheelbase)
+        out[11, lane] = p[M_U1]
+        out[12, lane] = p[M_U1 + 1]
 
 
 @kernel
@@ -252,7 +252,6 @@ def _march_stretch(
     window: Window,
     work: Workspace,
     factors: FloatArray,
-    unsprung: FloatArray,
     begin: int,
     stop: int,
     element_front: int,
@@ -260,32 +259,27 @@ def _march_stretch(
     cubics: FloatArray,
     feedback: FloatArray,
 ) -> None:
-    """IEP and contact forces of one stretch into `work.road` and `work.force`, then the DRS into
-    `work.deflection`."""
+    """Minus the road under both wheels, y - u, of one stretch into `work.road`: IEP, then DRS."""
     a = window.acceleration
     s = window.signals
     u1, c1, k1 = load(factors, 0), load(factors, 1), load(factors, 2)
     u2, c2, k2 = load(factors, 3), load(factors, 4), load(factors, 5)
     w1, w2 = load(factors, 6), load(factors, 7)
     m11, m22, m12 = load(factors, 8), load(factors, 9), load(factors, 10)
-    mu1, mu2 = load(unsprung, 0), load(unsprung, 1)
+    mu1, mu2 = load(factors, 11), load(factors, 12)
     front, rear = work.road[0], work.road[1]
     p1, p2 = work.force[0], work.force[1]
-    zero = (0.0, 0.0, 0.0, 0.0)
+    one = (1.0, 1.0, 1.0, 1.0)
     for n in range(begin, stop):
-        z = s[0, 0, n]
         r = fma_scalar(u1, s[0, 1, n], fma_scalar(c1, s[0, 2, n], scale(k1, s[0, 3, n])))
-        store(front, n, (r[0] + z, r[1] + z, r[2] + z, r[3] + z))
-        z = s[1, 0, n]
+        store(front, n, fma_scalar(one, -s[0, 0, n], r))
         r = fma_scalar(u2, s[1, 1, n], fma_scalar(c2, s[1, 2, n], scale(k2, s[1, 3, n])))
-        store(rear, n, (r[0] + z, r[1] + z, r[2] + z, r[3] + z))
+        store(rear, n, fma_scalar(one, -s[1, 0, n], r))
         t = window.load_transfer_n[n]
         f = fma_scalar(m11, a[0, n], fma_scalar(m12, a[1, n], fma_scalar(mu1, a[2, n], w1)))
         store(p1, n - begin, (t - f[0], t - f[1], t - f[2], t - f[3]))
         f = fma_scalar(m22, a[1, n], fma_scalar(m12, a[0, n], fma_scalar(mu2, a[3, n], w2)))
         store(p2, n - begin, (-t - f[0], -t - f[1], -t - f[2], -t - f[3]))
-        store(work.deflection[0], n - begin, zero)
-        store(work.deflection[1], n - begin, zero)
     advance(
         cubics[max(element_front, 0)],
         cubics[max(element_rear, 0)],
@@ -296,7 +290,8 @@ def _march_stretch(
         window.place[0, begin:stop],
         window.place[1, begin:stop],
         work.force,
-        work.deflection,
+        front[begin:stop],
+        rear[begin:stop],
     )
 
 
@@ -327,36 +322,26 @@ def march_particles(
         work.feedback,
     ):
         return
-    factors = np.empty((11, LANES))
+    factors = np.empty((13, LANES))
     _vehicle_factors(
         theta, window.total_mass_kg, window.wheelbase_m, window.gravity_m_per_s2, factors
     )
-    unsprung = np.empty((2, LANES))
-    for lane in range(LANES):
-        unsprung[0, lane] = theta[lane, M_U1]
-        unsprung[1, lane] = theta[lane, M_U1 + 1]
     work.state[:] = 0.0
     work.seen[:] = 0.0
     columns = window.nuisance.shape[1]
     front, rear = work.road[0], work.road[1]
-    y1, y2 = work.deflection[0], work.deflection[1]
     rows = window.front_sample.size
     squares = (0.0, 0.0, 0.0, 0.0)
     for part in range(window.stretches.shape[0]):
         begin, stop, e1, e2 = window.stretches[part]
-        _march_stretch(
-            window, work, factors, unsprung, begin, stop, e1, e2, work.cubics, work.feedback
-        )
-        for n in range(begin, stop):
-            store(front, n, sub(load(front, n), load(y1, n - begin)))
-            store(rear, n, sub(load(rear, n), load(y2, n - begin)))
+        _march_stretch(window, work, factors, begin, stop, e1, e2, work.cubics, work.feedback)
         for row in range(max(0, begin - window.first_row), min(rows, stop - window.first_row)):
             n = window.front_sample[row]
             w = window.front_weight[row]
-            r = fma_scalar(load(front, n), w[0], scale(load(rear, row + window.first_row), -1.0))
-            r = fma_scalar(load(front, n + 1), w[1], r)
-            r = fma_scalar(load(front, n + 2), w[2], r)
-            r = scale(fma_scalar(load(front, n + 3), w[3], r), window.row_weight[row])
+            r = fma_scalar(load(front, n), -w[0], load(rear, row + window.first_row))
+            r = fma_scalar(load(front, n + 1), -w[1], r)
+            r = fma_scalar(load(front, n + 2), -w[2], r)
+            r = scale(fma_scalar(load(front, n + 3), -w[3], r), window.row_weight[row])
             squares = fma(r, r, squares)
             for q in range(columns):
                 seen = fma_scalar(r, window.nuisance[row, q], load(work.seen, q))
@@ -383,9 +368,9 @@ def _rows(window: Window, road: FloatArray, lane: int, out: FloatArray) -> None:
     front, rear = road[0], road[1]
     for row in range(out.size):
         n = window.front_sample[row]
-        r = -rear[row + window.first_row, lane]
+        r = rear[row + window.first_row, lane]
         for j in range(4):
-            r += window.front_weight[row, j] * front[n + j, lane]
+            r -= window.front_weight[row, j] * front[n + j, lane]
         out[row] = r * window.row_weight[row]
 
 
@@ -458,13 +443,10 @@ def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
         work.feedback,
     ):
         return np.inf
-    factors = np.empty((11, LANES))
+    factors = np.empty((13, LANES))
     _vehicle_factors(
         four, window.total_mass_kg, window.wheelbase_m, window.gravity_m_per_s2, factors
     )
-    unsprung = np.empty((2, LANES))
-    unsprung[0] = theta[M_U1]
-    unsprung[1] = theta[M_U1 + 1]
     elements, modes = work.cubics.shape[0], work.cubics.shape[1]
     groups = (modes + LANES - 1) // LANES
     cubics = np.zeros((elements, groups, 4, LANES))
@@ -482,14 +464,25 @@ def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
     rows = window.front_sample.size
     total = 0.0
     front, rear = work.road[0], work.road[1]
-    y1, y2 = work.deflection[0], work.deflection[1]
     for part in range(window.stretches.shape[0]):
         begin, stop, e1, e2 = window.stretches[part]
-        _march_stretch(window, work, factors, unsprung, begin, stop, e1, e2, cubics, feedback)
+        _one_particle_stretch(window, work, factors, begin, stop)
+        advance(
+            cubics[max(e1, 0)],
+            cubics[max(e2, 0)],
+            e1 >= 0,
+            e2 >= 0,
+            feedback,
+            work.state,
+            window.place[0, begin:stop],
+            window.place[1, begin:stop],
+            work.force,
+            front[begin:stop],
+            rear[begin:stop],
+        )
         for n in range(begin, stop):
-            i = n - begin
-            front[n, 0] -= (y1[i, 0] + y1[i, 1]) + (y1[i, 2] + y1[i, 3])
-            rear[n, 0] -= (y2[i, 0] + y2[i, 1]) + (y2[i, 2] + y2[i, 3])
+            front[n, 0] = (front[n, 0] + front[n, 1]) + (front[n, 2] + front[n, 3])
+            rear[n, 0] = (rear[n, 0] + rear[n, 1]) + (rear[n, 2] + rear[n, 3])
         for row in range(max(0, begin - window.first_row), min(rows, stop - window.first_row)):
             n = window.front_sample[row]
             w = window.front_weight[row]
@@ -504,6 +497,32 @@ def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
     return total if np.isfinite(total) else np.inf
 
 
+@kernel
+def _one_particle_stretch(
+    window: Window, work: Workspace, factors: FloatArray, begin: int, stop: int
+) -> None:
+    """Minus the input profiles into lane 0 of `work.road` (the modes of the other lanes begin at
+    zero), and the contact forces into all lanes of `work.force`."""
+    a = window.acceleration
+    s = window.signals
+    for w in range(2):
+        own, other = a[w], a[1 - w]
+        unsprung = a[2 + w]
+        z, acceleration, rate, stroke = s[w, 0], s[w, 1], s[w, 2], s[w, 3]
+        inertia, damping = factors[3 * w, 0], factors[3 * w + 1, 0]
+        stiffness = factors[3 * w + 2, 0]
+        load_n, m_own, m_other = factors[6 + w, 0], factors[8 + w, 0], factors[10, 0]
+        m_u = factors[11 + w, 0]
+        sign = 1.0 - 2.0 * w
+        road, force = work.road[w], work.force[w]
+        for n in range(begin, stop):
+            u = inertia * acceleration[n] + damping * rate[n] + stiffness * stroke[n] - z[n]
+            store(road, n, (u, 0.0, 0.0, 0.0))
+            p = load_n + m_own * own[n] + m_other * other[n] + m_u * unsprung[n]
+            p = sign * window.load_transfer_n[n] - p
+            store(force, n - begin, (p, p, p, p))
+
+
 class Roads(NamedTuple):
     """The two road profiles that a vector of parameters implies, over the compared stretch."""
 
@@ -516,12 +535,10 @@ def road_profiles(window: Window, work: Workspace, theta: FloatArray) -> Roads:
     """Road under the front and under the rear wheel at the rows' chainages, in order of travel."""
     four = np.repeat(theta[None, :], LANES, axis=0)
     march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
-    front = work.road[0, :, 0]
+    front = -work.road[0, :, 0]
     gathered = front[window.front_sample[:, None] + np.arange(4)]
-    rear = work.road[1, window.first_row : window.first_row + window.x_m.size, 0]
-    return Roads(
-        window.x_m.copy(), np.einsum("mj,mj->m", window.front_weight, gathered), rear.copy()
-    )
+    rear = -work.road[1, window.first_row : window.first_row + window.x_m.size, 0]
+    return Roads(window.x_m.copy(), np.einsum("mj,mj->m", window.front_weight, gathered), rear)
 
 
 def largest_deflection_m(window: Window, theta: FloatArray) -> float:
@@ -529,5 +546,5 @@ def largest_deflection_m(window: Window, theta: FloatArray) -> float:
     work = workspace(window)
     four = np.repeat(theta[None, :], LANES, axis=0)
     march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
-    deflection = input_profiles(window.signals, theta) - work.road[:, :, 0]  # y = u - r
+    deflection = input_profiles(window.signals, theta) + work.road[:, :, 0]  # y = u - r
     return float(-deflection.min())
