@@ -15,6 +15,12 @@ from numpy.typing import NDArray
 from pre_core import paper
 from pre_core.bridge import Beam, refine, uniform_beam
 from pre_core.road import Profile, contact_patch_average, iso_8608_profile, under_wheels
+from pre_core.sensors import (
+    Accelerometer,
+    Receiver,
+    measure_acceleration,
+    measure_position,
+)
 from pre_core.simulate import constant_acceleration, simulate
 from pre_core.vehicle import HalfCar
 from schemas.signals import CHANNELS
@@ -41,6 +47,9 @@ _BEFORE_S, _AFTER_S = 3.0, 2.5
 _ROAD_SPACING_M = 0.01
 _CONTACT_PATCH_M = 0.2
 _FIX_RATE_HZ = 10.0
+_SLOW_ERROR_S = 300.0
+"""A receiver's slow error is forgotten within minutes: a crossing sees it as almost constant."""
+_ALTITUDE_M = 25.0
 
 
 class Drive(NamedTuple):
@@ -156,16 +165,18 @@ def simulate_drive(
     fine = simulate(car, refine(beam, _PARTS), motion, felt, step_s, modes=_modes(bridge))
     if not fine.converged:
         raise FailureError("the simulation did not converge: are the site's values possible?")
-    kept = slice(settle, None, every)
-    position = motion.position_m[kept]
-    signals = np.ascontiguousarray(fine.acceleration_m_per_s2[kept].T)
-    if noise_ug_per_rthz > 0.0:
-        signals = _with_noise(signals, rate, noise_ug_per_rthz, seed)
-    time_s = START_TIME_S + np.arange(position.size) / rate
-    gnss = _fixes(site, time_s, position, np.abs(motion.speed_m_per_s[kept]), forward=forward)
-    if receiver_errors:
-        gnss = _with_receiver_errors(gnss, site, seed, forward=forward)
-    channels = {name: signals[i] for i, name in enumerate(CHANNELS)}
+    recorded = fine.acceleration_m_per_s2[settle:]
+    accel_rng, gnss_rng = np.random.default_rng(seed).spawn(2)
+    sensor = Accelerometer(rate, noise_density_ug_per_rthz=noise_ug_per_rthz)
+    channels = {
+        name: measure_acceleration(recorded[:, i], 1.0 / step_s, sensor, accel_rng)
+        for i, name in enumerate(CHANNELS)
+    }
+    time_s = START_TIME_S + np.arange(channels[CHANNELS[0]].size) / rate
+    receiver = _receiver(site, perfect=not receiver_errors)
+    position = motion.position_m[settle:]
+    speed = np.abs(motion.speed_m_per_s[settle:])
+    gnss = _fixes(site, step_s, position, speed, receiver, gnss_rng, forward=forward)
     run = Run("simulation", time_s, rate, channels, gnss)
     return Drive(run, road, np.asarray(rigidity_ratios, dtype=np.float64))
 
@@ -216,31 +227,43 @@ def _modes(bridge: Bridge) -> int:
     return min(_MODES, 2 * bridge.elements * _PARTS)
 
 
-def _fixes(
-    site: Site, time_s: Floats, position: Floats, speed: Floats, *, forward: bool
-) -> GnssTrack:
-    """An errorless receiver: the antenna behind the front axle, ten times a second."""
-    vehicle, bridge = site.vehicles[0], site.bridges[0]
-    frame = bridge_frame(bridge)
-    every = max(1, round((1.0 / _FIX_RATE_HZ) * (time_s.size - 1) / (time_s[-1] - time_s[0])))
-    chosen = slice(0, None, every)
-    sign = 1 if forward else -1
-    antenna = position[chosen] - sign * vehicle.gps_antenna_to_front_axle_m
-    latitude, longitude = to_lat_lon(frame, antenna)
-    heading = heading_deg(frame, start_to_end=forward)
-    return GnssTrack(
-        time_s[chosen],
-        latitude,
-        longitude,
-        np.full(antenna.size, 25.0),
-        speed[chosen],
-        np.full(antenna.size, heading),
+def _receiver(site: Site, *, perfect: bool) -> Receiver:
+    """The receiver of the site file, or one without error."""
+    if perfect:
+        return Receiver(_FIX_RATE_HZ)
+    declared_errors = site.receiver
+    return Receiver(
+        _FIX_RATE_HZ,
+        position_noise_m=declared_errors.position_noise_m,
+        position_spread_m=declared_errors.position_spread_m,
+        correlation_s=_SLOW_ERROR_S,
+        speed_noise_m_per_s=declared_errors.speed_noise_m_per_s,
+        latency_s=declared_errors.latency_s,
     )
 
 
-def _with_noise(signals: Floats, rate_hz: float, density_ug_per_rthz: float, seed: int) -> Floats:
-    raise NotImplementedError
-
-
-def _with_receiver_errors(gnss: GnssTrack, site: Site, seed: int, *, forward: bool) -> GnssTrack:
-    raise NotImplementedError
+def _fixes(
+    site: Site,
+    step_s: float,
+    position: Floats,
+    speed: Floats,
+    receiver: Receiver,
+    rng: np.random.Generator,
+    *,
+    forward: bool,
+) -> GnssTrack:
+    """What the receiver, whose antenna is behind the front axle, reports of the drive."""
+    sign = 1 if forward else -1
+    antenna = position - sign * site.vehicles[0].gps_antenna_to_front_axle_m
+    time_s = step_s * np.arange(position.size, dtype=np.float64)
+    fixes = measure_position(time_s, antenna, np.zeros_like(antenna), speed, receiver, rng)
+    frame = bridge_frame(site.bridges[0])
+    latitude, longitude = to_lat_lon(frame, fixes.chainage_m, fixes.lateral_m)
+    return GnssTrack(
+        START_TIME_S + fixes.time_s,
+        latitude,
+        longitude,
+        np.full(latitude.size, _ALTITUDE_M),
+        fixes.speed_m_per_s,
+        np.full(latitude.size, heading_deg(frame, start_to_end=forward)),
+    )
