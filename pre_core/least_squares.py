@@ -5,6 +5,7 @@ ten steps lead to the one minimum. All unknowns are positive, so the search move
 needs no bounds, except that d_1 must lie between the axles: there it moves in the logit.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -90,21 +91,18 @@ def derivative_of_values(problem: Problem, y: FloatArray) -> FloatArray:
     return slope
 
 
-def _linearise(problem: Problem, work: Workspace, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    points = np.vstack([y, y + _DIFFERENCE * np.eye(y.size)])
-    rows = residual_batch(problem.window, work, full_vector(problem, points))
-    return rows[0], np.asarray(((rows[1:] - rows[0]) / _DIFFERENCE).T)
+Rows = Callable[[FloatArray], FloatArray]
+"""Residual rows (k, m) at points (k, f); a row that is not finite marks an impossible point."""
 
 
-def init(problem: Problem, work: Workspace, start: FloatArray) -> State:
-    """Begin at the free parameters `start` (f,) in physical units."""
-    y = transform(problem, start)
-    residual, jacobian = _linearise(problem, work, y)
-    return State(y, residual, jacobian, float(residual @ residual), _FIRST_DAMPING)
+def begin(rows: Rows, y: FloatArray) -> State:
+    """The state at search coordinates `y` (f,) of any least-squares problem."""
+    residual = rows(y[None, :])[0]
+    return State(y, residual, _jacobian(rows, y, residual), _square(residual), _FIRST_DAMPING)
 
 
-def step(problem: Problem, work: Workspace, state: State) -> tuple[State, Info]:
-    """One Levenberg-Marquardt step: damping grows until the objective falls."""
+def descend(rows: Rows, state: State) -> tuple[State, Info]:
+    """One Levenberg-Marquardt step of any problem: damping grows until the objective falls."""
     if not (np.isfinite(state.objective) and np.all(np.isfinite(state.jacobian))):
         return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.NOT_FINITE)
     scale = np.linalg.norm(state.jacobian, axis=0)
@@ -113,33 +111,63 @@ def step(problem: Problem, work: Workspace, state: State) -> tuple[State, Info]:
     f = state.y.size
     triangle, projected = r[:f, :f], r[:f, f]
     # Where even the full linear step promises next to nothing, the search is at the bottom.
-    promised = float(projected @ projected)
-    if promised <= _CONVERGED_GAIN * state.objective:
+    if _square(projected) <= _CONVERGED_GAIN * state.objective:
         return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.CONVERGED)
     damping = state.damping
     evaluations = 0
     while damping < _GIVE_UP_DAMPING:
-        stacked = np.vstack([triangle, np.sqrt(damping) * np.eye(f)])
-        right = np.concatenate([-projected, np.zeros(f)])
-        q, small = qr(stacked, mode="economic")
-        change = solve_triangular(small, q.T @ right) / scale
+        change = _damped(triangle, projected, damping) / scale
         size = float(np.abs(change).max())
         if size > _LARGEST_STEP:
             change *= _LARGEST_STEP / size
             size = _LARGEST_STEP
         trial = state.y + change
-        residual, jacobian = _linearise(problem, work, trial)
-        evaluations += f + 1
-        objective = float(residual @ residual)
-        if np.isfinite(objective) and objective < state.objective:
+        residual = rows(trial[None, :])[0]
+        objective = _square(residual)
+        evaluations += 1
+        if objective < state.objective:  # false for NaN too
             eased = max(damping * 0.1, _SMALLEST_DAMPING)
-            new = State(trial, residual, jacobian, objective, eased)
+            jacobian = _jacobian(rows, trial, residual)
             ending = Ending.CONVERGED if size < _CONVERGED_STEP else None
-            return new, Info(objective, size, damping, True, evaluations, ending)
+            return (
+                State(trial, residual, jacobian, objective, eased),
+                Info(objective, size, damping, True, evaluations + f, ending),
+            )
         if size < _CONVERGED_STEP:
             return state, Info(state.objective, size, damping, False, evaluations, Ending.CONVERGED)
         damping *= 10.0
     return state, Info(state.objective, 0.0, damping, False, evaluations, Ending.STUCK)
+
+
+def _square(residual: FloatArray) -> float:
+    return float(residual @ residual)
+
+
+def _jacobian(rows: Rows, y: FloatArray, residual: FloatArray) -> FloatArray:
+    moved = rows(y + _DIFFERENCE * np.eye(y.size))
+    return np.asarray(((moved - residual) / _DIFFERENCE).T)
+
+
+def _damped(triangle: FloatArray, projected: FloatArray, damping: float) -> FloatArray:
+    """Minimiser of |R x + p|^2 + damping |x|^2."""
+    f = projected.size
+    stacked = np.vstack([triangle, np.sqrt(damping) * np.eye(f)])
+    q, small = qr(stacked, mode="economic")
+    return np.asarray(solve_triangular(small, q.T @ np.concatenate([-projected, np.zeros(f)])))
+
+
+def _rows_of(problem: Problem, work: Workspace) -> Rows:
+    return lambda y: residual_batch(problem.window, work, full_vector(problem, y))
+
+
+def init(problem: Problem, work: Workspace, start: FloatArray) -> State:
+    """Begin at the free parameters `start` (f,) in physical units."""
+    return begin(_rows_of(problem, work), transform(problem, start))
+
+
+def step(problem: Problem, work: Workspace, state: State) -> tuple[State, Info]:
+    """One step on the paper's residual."""
+    return descend(_rows_of(problem, work), state)
 
 
 def covariance(state: State) -> FloatArray:

@@ -58,17 +58,15 @@ def iso_8608_profile(
     count = round((stop_m - start_m) / spacing_m) + 1
     x = start_m + spacing_m * np.arange(count, dtype=np.float64)
     lowest = 1.0 / longest_wave_m
-    # Waves fit four times into the longest stretch asked for, so that no period is seen to repeat.
-    step = min(lowest, 1.0 / (4.0 * (x[-1] - x[0])))
+    # Waves fit four times into the stretch asked for, so that no period is seen to repeat.
+    period = max(4 * (count - 1), int(np.ceil(longest_wave_m / spacing_m)))  # samples
+    step = 1.0 / (period * spacing_m)
     n = np.arange(lowest, min(1.0 / shortest_wave_m, 0.5 / spacing_m), step)
     density = GEOMETRIC_MEAN_M3[road_class] * (n / REFERENCE_CYCLES_PER_M) ** -WAVINESS
     amplitude = np.sqrt(2.0 * density * step)
-    phase = rng.uniform(0.0, 2.0 * np.pi, n.size)
-    height = np.zeros_like(x)
-    for block in np.array_split(np.arange(n.size), max(1, n.size // 64)):
-        height += np.sum(
-            amplitude[block] * np.cos(2.0 * np.pi * np.outer(x, n[block]) + phase[block]), axis=1
-        )
+    phase = rng.uniform(0.0, 2.0 * np.pi, n.size) + 2.0 * np.pi * n * start_m
+    waves = period * np.fft.ifft(amplitude * np.exp(1j * phase), period)[:count]
+    height = np.real(waves * np.exp(2j * np.pi * lowest * (x - start_m)))
     return Profile(x, height)
 
 
