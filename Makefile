@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: help install demo test test-all lint bench lock clean
 

@@ -34,6 +34,9 @@ Handler = Callable[[argparse.Namespace], int]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    # Our matrices are small: threads that wait for each other at every column cost up to fifty
+    # times the work itself when other processes want the cores too.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         options = _parser().parse_args(arguments)
     except InputError as error:
