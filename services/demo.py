@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -60,7 +61,10 @@ def demo_command(*, out: Path | None, speed: float, noise: float, console: "Cons
     """
     folder = _new_folder(out)
     began = time.monotonic()
-    with console.status("simulating a crossing of the paper's bridge", spinner="dots") as status:
+    with (
+        _terminated_as_interrupted(),
+        console.status("simulating a crossing of the paper's bridge", spinner="dots") as status,
+    ):
         site = declared(paper_site(), noise, 1000.0)
         drive = simulate_drive(
             site,
@@ -82,6 +86,19 @@ def demo_command(*, out: Path | None, speed: float, noise: float, console: "Cons
     _print(console, crossing, drive, site)
     _say_where(console, folder, time.monotonic() - began)
     return 0
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM ends the processes too, as Ctrl-C does, instead of leaving them behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _new_folder(out: Path | None) -> Path:
@@ -158,6 +175,8 @@ def _live(services: _Services, source: Path, speed: float, say: Callable[[str], 
         bus.close()  # type: ignore[no-untyped-call]
         _finish(logger, signal.SIGTERM)
     crossing, _ = estimate_to_crossing(pb.Estimate.FromString(estimate.payload))
+    if crossing.parameters is None:
+        raise FailureError(f"the crossing was rejected: {' '.join(crossing.reason_texts)}")
     return crossing
 
 
@@ -201,7 +220,8 @@ def _wait(
         if received is not None and wanted(received):
             return received
         for one in running:
-            if one.process.poll() not in (None, 0):
+            # A truck that has driven may leave; a service may not, however well it ended.
+            if one.process.poll() not in (None, 0 if one.name == "truck" else None):
                 raise FailureError(f"the {one.name} ended early: {_last_line(one.log)}")
     raise FailureError(f"{otherwise} after {timeout_s:.0f} s; see the logs beside {running[0].log}")
 

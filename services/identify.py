@@ -11,7 +11,8 @@ from schemas.site import Site, load_site, parse_site, site_hash
 from services.common.errors import InputError
 from services.common.files import check_writable, replaced_atomically, write_atomically
 from services.common.recording import Message, program_version, read_messages, read_site
-from services.worker.engine import Engine
+from services.common.streams import device_time_ns
+from services.worker.engine import Engine, Output
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -91,25 +92,49 @@ def identify_recordings(
         report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"),
     )
     found: list[Crossing] = []
-    streams: set[str] = set()
+    messages: dict[str, list[Message]] = {"accel": [], "gnss": []}
     for message in _all_messages(recordings):
-        if message.key.owner == "vehicle":
-            streams.add(message.key.stream)
-        try:
-            outputs = list(engine.feed(message.key, message.payload))
-        except ValueError as error:
-            raise InputError(
-                f"{_names(recordings)}: {message.key.stream} {message.sequence}: {error}"
-            ) from error
-        found += [output.result for output in outputs if output.result is not None]
-    found += [output.result for output in engine.finish() if output.result is not None]
+        if message.key.owner == "vehicle" and message.key.stream in messages:
+            messages[message.key.stream].append(message)
     for stream, what in (("accel", "accelerations (accel)"), ("gnss", "positions (gnss)")):
-        if stream not in streams:
+        if not messages[stream]:
             raise InputError(f"{_names(recordings)}: no {what}, a recording of a truck is expected")
+    for message in _as_it_happened(recordings, [*messages["accel"], *messages["gnss"]]):
+        found += [
+            output.result
+            for output in _fed(recordings, engine, message)
+            if output.result is not None
+        ]
+    found += [output.result for output in engine.finish() if output.result is not None]
     for vehicle in sorted(engine.unknown_vehicles):
         raise InputError(f"{_names(recordings)}: {vehicle} drove, but the site has no such vehicle")
     found.sort(key=lambda crossing: crossing.entry_time)
     return results(header, found, engine.bridges())
+
+
+def _as_it_happened(recordings: list[Path], messages: list[Message]) -> list[Message]:
+    """Boot by boot, by the truck's clock: a recording keeps the order in which messages came."""
+
+    def moment(message: Message) -> tuple[int, str, str, int]:
+        try:
+            time_ns = device_time_ns(message.key.stream, message.payload)
+        except ValueError as error:
+            raise _malformed(recordings, message, error) from error
+        return message.boot_id, message.key.realm, message.key.identifier, time_ns
+
+    return sorted(messages, key=moment)
+
+
+def _fed(recordings: list[Path], engine: Engine, message: Message) -> list[Output]:
+    try:
+        return list(engine.feed(message.key, message.payload))
+    except ValueError as error:
+        raise _malformed(recordings, message, error) from error
+
+
+def _malformed(recordings: list[Path], message: Message, error: ValueError) -> InputError:
+    where = f"{_names(recordings)}: {message.key.stream} {message.sequence}"
+    return InputError(f"{where}: {error}")
 
 
 def _all_messages(recordings: list[Path]) -> Iterator[Message]:

@@ -3,6 +3,9 @@
 Driving along the bridge's line, a truck is before the bridge, on it (with at least one axle) or
 behind it. A crossing is a passage from one side to the other; one that ends on the side where it
 began, or that the positions only begin or end in, is a crossing that cannot be identified.
+
+A receiver's noise moves a truck to and fro over the ends of the bridge: a stay begins when an axle
+is on the bridge, and is over only when the truck is a margin away from it.
 """
 
 from enum import Enum
@@ -12,11 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 CORRIDOR_M = 30.0
 """How far a fix may lie beside the bridge's line: a carriageway's width and a poor receiver."""
 MERGE_S = 5.0
 """Two entries less than this apart are one crossing (docs/contract.md)."""
+MARGIN_M = 3.0
+"""More than a usable receiver's noise between two fixes."""
+_STANDING_M_PER_S = 0.5
+"""Below it the positions move by their noise, not by driving."""
 
 
 class Passage(Enum):
@@ -35,110 +43,157 @@ class Stay(NamedTuple):
     direction: int  # 1: start to end, -1: end to start
     entry_s: float
     exit_s: float
+    is_over: bool = True
+    """False: the truck is on the bridge in the last fix."""
+
+
+class _Places(NamedTuple):
+    """Where the truck was at each fix (m,)."""
+
+    front: Floats
+    rear: Floats
+    depth: Floats  # how far the truck must drive to leave the bridge; negative: how far away it is
+    side: Ints  # -1 before the start, 1 behind the end, 0 on the bridge
+    sense: Floats  # 1: towards the end, -1: towards the start
 
 
 def find_stays(
     time_s: Floats,
     antenna_m: Floats,
     lateral_m: Floats,
+    speed_m_per_s: Floats,
     *,
     span_m: float,
     wheelbase_m: float,
     antenna_to_front_axle_m: float,
+    margin_m: float = MARGIN_M,
 ) -> list[Stay]:
-    """All stays on the bridge, in order of time; the last may still be going on (ENDS_ON_BRIDGE).
+    """All stays on the bridge, in order of time; the last may still be going on.
 
-    Arrays are (m,): chainage and lateral offset of the antenna. Entry and exit are interpolated
-    between fixes, good enough to find the samples; the trajectory says them better.
+    Arrays are (m,): chainage and lateral offset of the antenna, and the receiver's speed. Entry and
+    exit are interpolated between fixes, good enough to find the samples; the trajectory says them
+    better. Who comes less than `margin_m` onto the bridge and goes back was not on it.
     """
     if time_s.size < 2:
         return []
-    forward = _directions(antenna_m)
-    front = antenna_m + forward * antenna_to_front_axle_m
-    rear = front - forward * wheelbase_m
+    sense = _senses(antenna_m, speed_m_per_s, margin_m)
+    front = antenna_m + sense * antenna_to_front_axle_m
+    rear = front - sense * wheelbase_m
     low, high = np.minimum(front, rear), np.maximum(front, rear)
-    side = np.where(high < 0.0, -1, np.where(low > span_m, 1, 0))
+    depth = np.minimum(high, span_m - low)
+    side = np.where(depth > 0.0, 0, np.where(low > 0.5 * span_m, 1, -1))
+    places = _Places(front, rear, depth, side, sense)
     stays: list[Stay] = []
     n = 0
     while n < time_s.size:
-        if side[n] == 0:
-            stop = n
-            while stop < time_s.size and side[stop] == 0:
+        stop = n
+        if depth[n] > 0.0:
+            while stop < time_s.size and depth[stop] > -margin_m:
                 stop += 1
-            stays += _stay(time_s, front, rear, lateral_m, side, n, stop, span_m)
-            n = stop
-        elif n > 0 and side[n - 1] * side[n] == -1:
-            # Jumped over the bridge between two fixes: the receiver was out.
-            stays += _stay(time_s, front, rear, lateral_m, side, n, n, span_m)
-            n += 1
-        else:
-            n += 1
+        jumped = n > 0 and stop == n and side[n - 1] * side[n] == -1  # the receiver was out
+        if stop > n or jumped:
+            stay = _stay(time_s, places, n, stop, span_m, margin_m)
+            deep_m = np.inf
+            if stay.passage is not Passage.THROUGH:
+                # Who backs away has not turned, whatever his positions say: one sense for all.
+                axle = antenna_m[n:stop] + stay.direction * antenna_to_front_axle_m
+                other = axle - stay.direction * wheelbase_m
+                deep = np.minimum(np.maximum(axle, other), span_m - np.minimum(axle, other))
+                deep_m = float(deep.max())
+            was_on_it = deep_m >= min(margin_m, 0.25 * (span_m + wheelbase_m))
+            if was_on_it and _is_near(lateral_m, places, n, stop, stay):
+                stays.append(stay)
+        n = max(stop, n + 1)
     return _merged(stays)
 
 
-def _directions(antenna_m: Floats) -> Floats:
-    """Sense of travel at each fix: of the movement over the last metres, not of the noise."""
-    sense = np.ones(antenna_m.size)
-    anchor = antenna_m[0]
+def _senses(antenna_m: Floats, speed_m_per_s: Floats, margin_m: float) -> Floats:
+    """Sense of travel at each fix, 1 or -1: it turns where the truck turns, not with the noise."""
+    sense = np.zeros(antenna_m.size)
     current = 0.0
-    for n in range(antenna_m.size):
-        moved = antenna_m[n] - anchor
-        if abs(moved) > 2.0:
-            current = float(np.sign(moved))
-            anchor = antenna_m[n]
-        sense[n] = current
-    known = np.flatnonzero(sense)
-    if known.size == 0:
-        return np.ones(antenna_m.size)
-    sense[: known[0]] = sense[known[0]]
-    return sense
+    lowest = highest = farthest = 0
+    for n in np.flatnonzero(np.abs(speed_m_per_s) >= _STANDING_M_PER_S).tolist():
+        here = antenna_m[n]
+        if current == 0.0:
+            lowest = n if here < antenna_m[lowest] else lowest
+            highest = n if here > antenna_m[highest] else highest
+            if max(here - antenna_m[lowest], antenna_m[highest] - here) > margin_m:
+                current = 1.0 if here - antenna_m[lowest] > margin_m else -1.0
+                sense[0] = current
+                farthest = n
+        elif (here - antenna_m[farthest]) * current > 0.0:
+            farthest = n
+        elif (antenna_m[farthest] - here) * current > margin_m:
+            sense[farthest + 1] = -2.0 * current
+            current = -current
+            farthest = n
+    # Only the turns are noted: first the sense, then its changes.
+    return np.cumsum(sense) if current != 0.0 else np.ones(antenna_m.size)
 
 
 def _stay(
-    time_s: Floats,
-    front: Floats,
-    rear: Floats,
-    lateral_m: Floats,
-    side: NDArray[np.int64],
-    start: int,
-    stop: int,
-    span_m: float,
-) -> list[Stay]:
-    """The stay over the fixes start … stop - 1 (none where the receiver jumped), if it is near."""
-    before, after = start - 1, stop
-    first, last = max(before, 0), min(after, time_s.size - 1)
-    lateral = np.abs(lateral_m[first : last + 1] if start < stop else lateral_m[[first, last]])
-    inside = lateral_m[start:stop] if start < stop else 0.5 * lateral_m[[first, last]].sum()
-    if np.min(lateral) > CORRIDOR_M or np.median(np.abs(inside)) > CORRIDOR_M:
-        return []
-    if before < 0:
-        direction = 1 if front[last] >= front[first] else -1
+    time_s: Floats, places: _Places, start: int, stop: int, span_m: float, margin_m: float
+) -> Stay:
+    """The stay over the fixes start … stop - 1 (none where the receiver jumped)."""
+    last = min(stop, time_s.size - 1)
+    side_before = int(places.side[start - 1]) if start > 0 else 0
+    side_after = int(places.side[last])
+    is_over = side_after != 0
+    if start == 0:
         passage = Passage.BEGINS_ON_BRIDGE
+        direction = int(places.sense[last])
     else:
-        direction = int(-side[before])
-        if after >= time_s.size:
+        direction = -side_before
+        if not is_over:
             passage = Passage.ENDS_ON_BRIDGE
-        elif side[after] == -side[before]:
+        elif side_after == -side_before:
             passage = Passage.THROUGH
         else:
             passage = Passage.TURNED_BACK
     near, far = (0.0, span_m) if direction > 0 else (span_m, 0.0)
-    entry = float(time_s[first])
-    leave = float(time_s[last])
-    if before >= 0 and start < time_s.size:
-        entry = _passing(time_s, front, before, start if start < stop else after, near)
-    if after < time_s.size and passage is Passage.THROUGH:
-        leave = _passing(
-            time_s, rear, max(before, stop - 1) if start < stop else before, after, far
-        )
-    return [Stay(passage, direction, entry, leave)]
+    around = slice(max(start - 1, 0), last + 1)
+    times = time_s[around]
+    entry_s, exit_s = float(times[0]), float(times[-1])
+    deep = min(margin_m, 0.5 * span_m)
+    if start > 0:
+        entry_s = _last_passing(times, direction * (places.front[around] - near), deep)
+    if passage is Passage.THROUGH:
+        # Backwards in time the truck comes onto the bridge over its far end.
+        left = direction * (far - places.rear[around])
+        exit_s = -_last_passing(-times[::-1], left[::-1], deep)
+    return Stay(passage, direction, entry_s, exit_s, is_over)
 
 
-def _passing(time_s: Floats, position: Floats, n: int, m: int, where: float) -> float:
-    """Time at which the position passes `where` between two fixes, by linear interpolation."""
-    moved = position[m] - position[n]
-    share = (where - position[n]) / moved if moved != 0.0 else 0.5
-    return float(time_s[n] + np.clip(share, 0.0, 1.0) * (time_s[m] - time_s[n]))
+def _last_passing(time_s: Floats, beyond_m: Floats, deep_m: float) -> float:
+    """When `beyond` last passes zero upwards before it first reaches `deep`; linear between fixes.
+
+    The first value is negative. Noise makes a truck that waits at the end of the bridge pass it
+    often: it enters when it drives on.
+    """
+    reached = np.flatnonzero(beyond_m >= deep_m)
+    stop = int(reached[0]) if reached.size else beyond_m.size - 1
+    outside = np.flatnonzero(beyond_m[: stop + 1] < 0.0)
+    n = int(outside[-1]) if outside.size else 0
+    if n + 1 >= beyond_m.size:
+        return float(time_s[n])
+    share = beyond_m[n] / (beyond_m[n] - beyond_m[n + 1]) if beyond_m[n] < 0.0 else 0.0
+    return float(time_s[n] + np.clip(share, 0.0, 1.0) * (time_s[n + 1] - time_s[n]))
+
+
+def _is_near(lateral_m: Floats, places: _Places, start: int, stop: int, stay: Stay) -> bool:
+    """Whether the truck was on this bridge's road and not on one beside, below or across it."""
+    before = max(start - 1, 0)
+    if start == stop:
+        moved = places.front[start] - places.front[before]
+        share = np.clip((0.0 - places.front[before]) / moved, 0.0, 1.0) if moved != 0.0 else 0.5
+        between = lateral_m[before] + share * (lateral_m[start] - lateral_m[before])
+        nearest = np.abs(lateral_m[[before, start]]).min()
+        return bool(max(abs(between), nearest) <= CORRIDOR_M)
+    beside = np.abs(lateral_m[start:stop])
+    if stay.passage is Passage.BEGINS_ON_BRIDGE:
+        return bool(beside.max() <= CORRIDOR_M)
+    came_in = np.abs(lateral_m[[before, start]]).min()
+    return bool(max(came_in, np.median(beside)) <= CORRIDOR_M)
 
 
 def _merged(stays: list[Stay]) -> list[Stay]:
@@ -148,7 +203,11 @@ def _merged(stays: list[Stay]) -> list[Stay]:
         if merged and stay.entry_s - merged[-1].entry_s < MERGE_S:
             earlier = merged[-1]
             through = [s for s in (earlier, stay) if s.passage is Passage.THROUGH]
-            merged[-1] = through[0] if through else earlier._replace(exit_s=stay.exit_s)
+            merged[-1] = (
+                through[0]
+                if through
+                else earlier._replace(exit_s=stay.exit_s, is_over=stay.is_over)
+            )
         else:
             merged.append(stay)
     return merged

@@ -1,23 +1,35 @@
 """From single messages to arrays: one boot of one truck, ordered, without duplicates, on one clock.
 
 Batches and fixes may come late, twice or not at all. Within a boot they are ordered by sequence and
-placed by the truck's monotonic clock, which no step of the wall clock can disturb; the median
-difference of the two clocks gives the wall time.
+placed by the truck's monotonic clock, which no step of the wall clock can disturb. What is asked
+about a stretch of time depends on the messages of that stretch alone, not on the order in which
+they came nor on what came later.
 """
 
-import itertools
+from bisect import insort
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from schemas.signals import CHANNELS, AccelBatch, GnssFix
+from schemas.proto import driveby_pb2 as pb
+from schemas.signals import CHANNELS, MAX_BATCH_S, AccelBatch, GnssFix
 
 Floats = NDArray[np.float64]
 
+PATIENCE_S = 10.0
+"""How much newer data may come before a message that is missing is taken to be lost."""
 _NS_PER_S = 1_000_000_000
 _LARGEST_RATE_ERROR = 0.02
 """A crystal is good to 1e-4; beyond this the declared rate is another sensor's."""
+_CLOCK_ERROR = 1e-3
+"""How far the declared rate may be off before it says that other samples are missing."""
+_WALL_CLOCK_S = 10.0
+"""The wall clock is read off the fixes of this long before a moment."""
+_JITTER = 8.0
+"""Times of batches that are off by this many times the usual are off for another reason."""
 
 
 class Fixes(NamedTuple):
@@ -44,136 +56,201 @@ class Samples(NamedTuple):
 class Boot:
     """All messages of one boot of a truck that are still of interest.
 
-    Times are seconds on the truck's own clock since `epoch_ns`, the device time of the first
-    message that came.
+    Times are seconds on the truck's own clock. Not relative to the first message: which one came
+    first is chance, and would change the last digits of all that follows.
     """
 
     def __init__(self) -> None:
         self._batches: dict[int, AccelBatch] = {}
-        self._fixes: dict[int, GnssFix] = {}
-        self.epoch_ns: int | None = None
+        self._fixes: list[tuple[int, GnssFix]] = []
+        """By sequence; up to the first one that is missing, and the stragglers."""
+        self._waiting: dict[int, GnssFix] = {}
+        """Those that came before one that is missing."""
+        self._next_fix = 0
+        self._forgotten_ns = -1
+        self._channels: set[str] = set()
 
     def add_accel(self, batch: AccelBatch) -> None:
         """Take a batch in; one that is here already is ignored."""
-        self._batches.setdefault(batch.sequence, batch)
-        self._note(batch)
+        if batch.device_time_ns >= self._forgotten_ns:
+            self._batches.setdefault(batch.sequence, batch)
+            self._channels.update(batch.channels)
 
     def add_fix(self, fix: GnssFix) -> None:
-        """Take a fix in; one that is here already is ignored."""
-        self._fixes.setdefault(fix.sequence, fix)
-        self._note(fix)
+        """Take a fix in; one that is here already is ignored. `settle` makes it known."""
+        if fix.sequence >= self._next_fix:
+            self._waiting.setdefault(fix.sequence, fix)
+        elif fix.device_time_ns >= self._forgotten_ns and fix.sequence not in dict(self._fixes):
+            insort(self._fixes, (fix.sequence, fix))
+
+    def settle(self, *, all_there_is: bool = False) -> Iterator[GnssFix]:
+        """Make fixes known to `fixes` one by one, in their order, and yield them.
+
+        A fix waits for those before it, until they are taken to be lost or `all_there_is` has come.
+        """
+        while self._waiting:
+            sequence = min(self._waiting)
+            if sequence != self._next_fix and not all_there_is:
+                latest_ns = max(fix.device_time_ns for fix in self._waiting.values())
+                waited_ns = latest_ns - self._waiting[sequence].device_time_ns
+                if waited_ns < PATIENCE_S * _NS_PER_S:
+                    return
+            fix = self._waiting.pop(sequence)
+            self._next_fix = sequence + 1
+            self._fixes.append((sequence, fix))
+            yield fix
 
     def forget_before(self, time_s: float) -> None:
         """Drop what is older, so that the memory stays bounded on a long drive."""
-        epoch_ns = self.epoch_ns or 0
-        limit_ns = epoch_ns + round(time_s * _NS_PER_S)
+        limit_ns = max(self._forgotten_ns, round(time_s * _NS_PER_S))
+        self._forgotten_ns = limit_ns
         for sequence in [s for s, b in self._batches.items() if b.device_time_ns < limit_ns]:
             del self._batches[sequence]
-        for sequence in [s for s, f in self._fixes.items() if f.device_time_ns < limit_ns]:
-            del self._fixes[sequence]
+        self._fixes = [(s, f) for s, f in self._fixes if f.device_time_ns >= limit_ns]
 
     def latest_accel_s(self) -> float:
-        """Time of the last sample that has come; -inf without any."""
-        if not self._batches:
-            return -np.inf
-        last = max(self._batches.values(), key=lambda batch: batch.device_time_ns)
-        longest = max(channel.samples.size / channel.rate_hz for channel in last.channels.values())
-        return self._seconds(last.device_time_ns) + longest
+        """Time after the last sample that has come; -inf without any."""
+        return max(
+            (_end_ns(batch) / _NS_PER_S for batch in self._batches.values()), default=-np.inf
+        )
+
+    def lacks_accel(self, start_s: float, stop_s: float) -> bool:
+        """Whether batches between two times have not come, but may still."""
+        start_ns, stop_ns = round(start_s * _NS_PER_S), round(stop_s * _NS_PER_S)
+        ordered = sorted(self._batches)
+        begin = stop = -1
+        for sequence in ordered:
+            batch = self._batches[sequence]
+            if batch.device_time_ns <= start_ns:
+                begin = sequence
+            if _end_ns(batch) >= stop_ns:
+                stop = sequence
+                break
+        if stop < 0:
+            return True
+        begin = max(begin, 0)
+        return sum(begin <= sequence <= stop for sequence in ordered) != stop - begin + 1
 
     def wall_time_ns(self, time_s: float) -> int:
-        """Wall time (ns since 1970 UTC) of a time on this clock."""
-        offsets = [
-            message.wall_time_ns - message.device_time_ns
-            for group in (self._batches, self._fixes)
-            for message in group.values()
+        """Wall time (ns since 1970 UTC) of a time on this clock, by the fixes up to then.
+
+        Their median: single stamps jitter. There must be a fix.
+        """
+        time_ns = round(time_s * _NS_PER_S)
+        before = [
+            fix.wall_time_ns - fix.device_time_ns
+            for _, fix in self._fixes
+            if time_ns - _WALL_CLOCK_S * _NS_PER_S < fix.device_time_ns <= time_ns
         ]
-        middle = sorted(offsets)[len(offsets) // 2]
-        return (self.epoch_ns or 0) + round(time_s * _NS_PER_S) + middle
+        if not before:
+            nearest = min(self._fixes, key=lambda item: abs(item[1].device_time_ns - time_ns))[1]
+            before = [nearest.wall_time_ns - nearest.device_time_ns]
+        return time_ns + sorted(before)[len(before) // 2]
 
     def fixes(self) -> Fixes:
-        """All fixes in order of time."""
-        ordered = sorted(self._fixes.values(), key=lambda fix: fix.device_time_ns)
-        rows = [
+        """All settled fixes in order of time."""
+        rows = sorted(
             (
-                self._seconds(fix.device_time_ns),
+                fix.device_time_ns / _NS_PER_S,
                 fix.latitude_deg,
                 fix.longitude_deg,
                 fix.speed_m_per_s,
             )
-            for fix in ordered
-        ]
+            for _, fix in self._fixes
+        )
         columns = np.array(rows, dtype=np.float64).reshape(-1, 4).T
         kept = np.concatenate([[True], np.diff(columns[0]) > 0.0])[: columns.shape[1]]
         return Fixes(*(np.ascontiguousarray(column[kept]) for column in columns))
 
     def samples(self, start_s: float, stop_s: float) -> Samples | None:
-        """Samples from `start` to `stop`, on the grid of the fastest channel; None without any.
+        """Samples from `start` to `stop`, on the grid of the fastest channel.
 
-        A slower channel is interpolated by cubic splines.
+        A slower channel is interpolated by cubic splines. A channel that this truck has but that
+        has no sample in this stretch is NaN throughout. None: the truck has no channel at all.
         """
         chosen = [
             batch
             for _, batch in sorted(self._batches.items())
-            if self._seconds(batch.device_time_ns) < stop_s
-            and self._seconds(batch.device_time_ns) + 1.0 > start_s
+            if start_s - MAX_BATCH_S < _seconds(batch.device_time_ns) <= stop_s
         ]
         grids = {
             name: grid
             for name in CHANNELS
-            if (grid := self._grid(name, chosen, start_s, stop_s)) is not None
+            if (grid := _grid(name, chosen, start_s, stop_s)) is not None
         }
         if not grids:
-            return None
+            if not self._channels:
+                return None
+            return Samples(start_s, 1.0, {name: np.empty(0) for name in sorted(self._channels)})
         fastest = max(grids.values(), key=lambda grid: grid.rate_hz)
         time = fastest.start_s + np.arange(fastest.values.size) / fastest.rate_hz
         channels = {
-            name: grid.values if grid is fastest else _resampled(grid, time)
-            for name, grid in grids.items()
+            name: _resampled(grids[name], time)
+            if name in grids
+            else np.full(fastest.values.size, np.nan)
+            for name in CHANNELS
+            if name in self._channels
         }
         return Samples(fastest.start_s, fastest.rate_hz, channels)
 
-    def _grid(
-        self, name: str, batches: list[AccelBatch], start_s: float, stop_s: float
-    ) -> "_Grid | None":
-        parts = [
-            (self._seconds(batch.device_time_ns), batch.channels[name])
-            for batch in batches
-            if name in batch.channels
-        ]
-        if not parts:
-            return None
-        declared = float(np.median([channel.rate_hz for _, channel in parts]))
-        # Number the samples: a batch that follows on the one before has the next numbers, whatever
-        # jitter its time has; a jump of at least half a sample is missing samples.
-        first_s = parts[0][0]
-        numbers = [0]
-        for (before_s, channel), (time_s, _) in itertools.pairwise(parts):
-            jump = (time_s - before_s) * declared - channel.samples.size
-            missing = round(jump) if abs(jump) >= 0.5 else 0
-            numbers.append(numbers[-1] + max(channel.samples.size + missing, 0))
-        rate, offset_s = _fit_clock(np.array(numbers), np.array([t for t, _ in parts]), declared)
-        size = numbers[-1] + parts[-1][1].samples.size
-        values = np.full(size, np.nan)
-        for number, (_, channel) in zip(numbers, parts, strict=True):
-            values[number : number + channel.samples.size] = channel.samples
-        begin = max(0, int(np.ceil((start_s - first_s - offset_s) * rate)))
-        stop = min(size, int(np.floor((stop_s - first_s - offset_s) * rate)) + 1)
-        if stop <= begin:
-            return None
-        return _Grid(first_s + offset_s + begin / rate, rate, values[begin:stop])
 
-    def _note(self, message: AccelBatch | GnssFix) -> None:
-        if self.epoch_ns is None:
-            self.epoch_ns = message.device_time_ns
-
-    def _seconds(self, device_time_ns: int) -> float:
-        return (device_time_ns - (self.epoch_ns or 0)) / _NS_PER_S
+def device_time_ns(stream: str, payload: bytes) -> int:
+    """The time on the truck's clock of a message of `accel` or `gnss`; ValueError: malformed."""
+    message = pb.AccelBatch() if stream == "accel" else pb.GnssFix()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError as error:
+        raise ValueError(f"not a {message.DESCRIPTOR.full_name}: {error}") from None
+    return message.device_time_ns
 
 
 class _Grid(NamedTuple):
     start_s: float
     rate_hz: float
     values: Floats
+
+
+def _grid(name: str, batches: list[AccelBatch], start_s: float, stop_s: float) -> _Grid | None:
+    parts = [batch for batch in batches if name in batch.channels]
+    if not parts:
+        return None
+    declared = float(np.median([batch.channels[name].rate_hz for batch in parts]))
+    first_ns = parts[0].device_time_ns
+    times = np.array([batch.device_time_ns - first_ns for batch in parts]) / _NS_PER_S
+    sizes = [batch.channels[name].samples.size for batch in parts]
+    numbers = _numbers(times * declared, sizes, [batch.sequence for batch in parts])
+    rate, offset_s = _fit_clock(numbers, times, declared)
+    values = np.full(int(numbers[-1]) + sizes[-1], np.nan)
+    for number, batch in zip(numbers.tolist(), parts, strict=True):
+        samples = batch.channels[name].samples
+        values[number : number + samples.size] = samples
+    # The times of the ends relative to the first sample: exact to far less than a sample.
+    zero_s = first_ns / _NS_PER_S + offset_s
+    begin = max(0, int(np.ceil((start_s - zero_s) * rate - 1e-6)))
+    stop = min(values.size, int(np.floor((stop_s - zero_s) * rate + 1e-6)) + 1)
+    if stop <= begin:
+        return None
+    return _Grid(zero_s + begin / rate, rate, values[begin:stop])
+
+
+def _numbers(at: Floats, sizes: list[int], sequences: list[int]) -> NDArray[np.int64]:
+    """Numbers (b,) of the first samples of batches, from the times `at` in sampling intervals.
+
+    A batch that follows on the one before has the next numbers, whatever jitter its time has. Where
+    batches are missing, as many samples are missing as those would have had, unless the time says
+    otherwise; so also where a batch starts later than its predecessor ends.
+    """
+    usual = int(np.median(sizes))
+    before = np.array(sizes[:-1], dtype=np.int64)
+    jumps = np.diff(at) - before
+    skipped = np.diff(sequences) - 1
+    # What is off by more than half a batch is no jitter, however usual.
+    followed = np.abs(jumps[skipped == 0])
+    jitter = np.quantile(followed, 0.5, method="lower") if followed.size else 0.0
+    lost = skipped * usual
+    tolerance = max(0.5, min(_JITTER * jitter, 0.5 * usual)) + _CLOCK_ERROR * lost
+    missing = np.where(np.abs(jumps - lost) < tolerance, lost, np.rint(jumps)).astype(np.int64)
+    return np.concatenate([[0], np.cumsum(np.maximum(before + missing, 0))])
 
 
 def _fit_clock(
@@ -183,25 +260,40 @@ def _fit_clock(
 
     The times of an honest sampler lie on a line to rounding; then the declared rate stands.
     """
-    relative = times_s - times_s[0]
-    if numbers.size < 3 or np.all(np.abs(relative - numbers / declared_hz) < 1e-3 / declared_hz):
+    if numbers.size < 3 or np.all(np.abs(times_s - numbers / declared_hz) < 1e-3 / declared_hz):
         return declared_hz, 0.0
-    slope, offset = np.polyfit(numbers.astype(np.float64), relative, 1)
+    centred = numbers - numbers.mean()
+    slope = float(centred @ times_s / max(centred @ centred, 1.0))
     if not abs(slope * declared_hz - 1.0) < _LARGEST_RATE_ERROR:
         return declared_hz, 0.0
-    return float(1.0 / slope), float(offset)
+    return 1.0 / slope, float(times_s.mean() - slope * numbers.mean())
 
 
 def _resampled(grid: _Grid, time_s: Floats) -> Floats:
-    from scipy.interpolate import CubicSpline  # slow to import, seldom needed
-
-    own = grid.start_s + np.arange(grid.values.size) / grid.rate_hz
+    """The values of a grid at other times; NaN in its gaps and beyond its ends."""
+    place = (time_s - grid.start_s) * grid.rate_hz
+    nearest = np.rint(place).astype(np.int64)
+    inside = (nearest >= 0) & (nearest < grid.values.size)
+    values = np.full(time_s.size, np.nan)
+    # At times of its own samples (of most channels all are) a value is itself.
+    own = inside & (np.abs(place - nearest) < 1e-3)
+    values[own] = grid.values[nearest[own]]
     known = np.isfinite(grid.values)
-    if known.sum() < 4:
-        return np.full(time_s.size, np.nan)
-    values = np.asarray(CubicSpline(own[known], grid.values[known])(time_s))
-    # No value may be made up in a gap or beyond the ends.
-    nearest = np.clip(np.searchsorted(own, time_s), 1, own.size - 1)
-    missing = ~(known[nearest] & known[nearest - 1])
-    missing |= (time_s < own[0] - 1e-9) | (time_s > own[-1] + 1e-9)
-    return np.where(missing, np.nan, values)
+    below = np.floor(place).astype(np.int64)
+    between = ~own & (below >= 0) & (below + 1 < grid.values.size)
+    between[between] = known[below[between]] & known[below[between] + 1]
+    if np.any(between) and known.sum() >= 4:
+        from scipy.interpolate import CubicSpline  # slow to import, seldom needed
+
+        at = np.flatnonzero(known)
+        values[between] = CubicSpline(at, grid.values[at])(place[between])
+    return values
+
+
+def _end_ns(batch: AccelBatch) -> int:
+    longest = max(channel.samples.size / channel.rate_hz for channel in batch.channels.values())
+    return batch.device_time_ns + round(longest * _NS_PER_S)
+
+
+def _seconds(device_time_ns: int) -> float:
+    return device_time_ns / _NS_PER_S

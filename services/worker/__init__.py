@@ -1,5 +1,6 @@
 """Identifies crossings as they happen: from the bus to the bus, and into a results file."""
 
+import contextlib
 import logging
 import queue
 import threading
@@ -21,6 +22,7 @@ from services.common.errors import FailureError, InputError
 from services.common.files import read_text, write_atomically
 from services.common.playback import stopped_by_signals
 from services.common.recording import Message, RecordingWriter, program_version
+from services.common.streams import device_time_ns
 from services.worker.engine import Engine, Output
 from services.worker.warm_up import warm_up
 
@@ -31,18 +33,91 @@ _POLL_S = 0.1
 _HEALTH_PERIOD_S = 60.0
 _GONE_AFTER_S = 3.0
 """A truck whose token has gone is given this long for what is still on its way."""
+_SILENT_S = 10.0
+"""So long must a truck be silent that has no token, such as a replayed one, to have gone."""
 _LONGEST_QUEUE = 200_000
+_HISTORY_S = 1.0
+"""A truck that is new here sends its history stream by stream: what comes in the first second is
+put in order of time before it is looked at."""
+_CONNECT_S = 1.0
 
 
 class _Arrived(NamedTuple):
     key: Key
+    boot_id: int
     payload: bytes
 
 
-class _Gone(NamedTuple):
+class _Token(NamedTuple):
+    """A truck has come to the bus or left it."""
+
     realm: str
     vehicle: str
-    due_s: float
+    is_alive: bool
+
+
+_Name = tuple[str, str, int]
+"""Realm, vehicle and boot."""
+
+
+class _Arrivals:
+    """Puts what comes in the order in which it is to be looked at.
+
+    Takes the moments (s, any steady clock) at which things come; no I/O.
+    """
+
+    def __init__(self) -> None:
+        self._known: set[_Name] = set()
+        self._new: dict[_Name, list[_Arrived]] = {}
+        self._since: dict[_Name, float] = {}
+        self._alive: set[tuple[str, str]] = set()
+        self._leaves: dict[tuple[str, str], float] = {}
+        """When a truck is taken to have gone, unless it says something."""
+
+    def add(self, arrived: _Arrived, now_s: float) -> list[_Arrived]:
+        """Take a message in; return it if it can be looked at now."""
+        truck = (arrived.key.realm, arrived.key.identifier)
+        if truck not in self._alive:
+            self._leaves[truck] = now_s + _SILENT_S
+        name = (arrived.key.realm, arrived.key.identifier, arrived.boot_id)
+        if name in self._known:
+            return [arrived]
+        self._new.setdefault(name, []).append(arrived)
+        self._since.setdefault(name, now_s)
+        return []
+
+    def note(self, token: _Token, now_s: float) -> None:
+        """Note that a truck has come or gone."""
+        truck = (token.realm, token.vehicle)
+        if token.is_alive:
+            self._alive.add(truck)
+            self._leaves.pop(truck, None)
+        else:
+            self._alive.discard(truck)
+            self._leaves[truck] = now_s + _GONE_AFTER_S
+
+    def due(self, now_s: float) -> list[_Arrived]:
+        """What trucks that are new have sent in their first second, in order of time."""
+        due: list[_Arrived] = []
+        for name in [n for n, since_s in self._since.items() if since_s + _HISTORY_S <= now_s]:
+            self._known.add(name)
+            del self._since[name]
+            due += sorted(self._new.pop(name), key=_device_time_ns)
+        return due
+
+    def gone(self, now_s: float) -> list[tuple[str, str]]:
+        """Realm and vehicle of the trucks that left and did not come back."""
+        gone = [truck for truck, leaves_s in self._leaves.items() if leaves_s <= now_s]
+        for truck in gone:
+            del self._leaves[truck]
+        return gone
+
+
+def _device_time_ns(arrived: _Arrived) -> int:
+    try:
+        return device_time_ns(arrived.key.stream, arrived.payload)
+    except ValueError:
+        return 0  # the engine will say what is wrong
 
 
 class _ResultFiles:
@@ -54,8 +129,17 @@ class _ResultFiles:
         self._header = header
         self._writer: RecordingWriter | None = None
         self._crossings: list[Crossing] = []
+        self._failed = False
 
     def write(self, message: Message, result: Crossing | None, engine: Engine) -> None:
+        """Add a message, and a result to the JSON file; FailureError if that is not possible."""
+        try:
+            self._write(message, result, engine)
+        except OSError as error:
+            self._failed = True
+            raise FailureError(f"{self.path}: cannot be written: {error.strerror}") from error
+
+    def _write(self, message: Message, result: Crossing | None, engine: Engine) -> None:
         if self._writer is None:
             self._writer = RecordingWriter(
                 self.path,
@@ -71,8 +155,11 @@ class _ResultFiles:
             write_atomically(self.path.with_suffix(".json"), results_json(content))
 
     def finish(self) -> None:
-        if self._writer is not None:
+        """Close the recording; after a failed write it stays as it is on the disk."""
+        if self._writer is not None and not self._failed:
             self._writer.finish("stopped by a signal", {"crossings": len(self._crossings)})
+        elif self._writer is not None:
+            self._writer.abandon()
 
 
 def run(
@@ -106,16 +193,22 @@ def run(
     if file is None:
         moment = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         file = folder / realm / f"results-{moment}.mcap"
+    if file.exists():
+        raise InputError(f"{file}: exists, and results are never overwritten; give another name")
     files = _ResultFiles(file, text, header)
     warm_up()
-    with stopped_by_signals() as stop, open_session(connect=endpoint) as bus:
+    with stopped_by_signals() as stop, contextlib.ExitStack() as stack:
+        bus = _connected(endpoint, stop)
+        if bus is None:
+            return 0
+        stack.enter_context(bus)
         publisher = Publisher(bus, realm)
 
         def report(crossing_id: str, stage: str, fraction: float) -> None:
             _say_progress(publisher, service_id, crossing_id, stage, fraction)
 
         engine = Engine(known, settings, header, stopwatch=time.perf_counter, report=report)
-        arrivals: queue.Queue[_Arrived | _Gone] = queue.Queue(_LONGEST_QUEUE)
+        arrivals: queue.Queue[_Arrived | _Token] = queue.Queue(_LONGEST_QUEUE)
         receiver = threading.Thread(
             target=_receive, args=(bus, realm, arrivals, stop), name="receive", daemon=True
         )
@@ -138,46 +231,56 @@ def _check_names(realm: str, service_id: str) -> None:
         raise InputError(str(error)) from None
 
 
+def _connected(endpoint: str, stop: threading.Event) -> zenoh.Session | None:
+    """A session as soon as a router answers; None if a signal came first."""
+    while not stop.is_set():
+        # Zenoh itself would wait for ever, and no signal would be heard meanwhile.
+        with contextlib.suppress(FailureError):
+            return open_session(connect=endpoint, timeout_s=_CONNECT_S)
+    return None
+
+
 def _receive(
     bus: zenoh.Session,
     realm: str,
-    arrivals: "queue.Queue[_Arrived | _Gone]",
+    arrivals: "queue.Queue[_Arrived | _Token]",
     stop: threading.Event,
 ) -> None:
     """Take everything off the bus quickly: an identification must not hold up a publisher."""
     seen = Seen()
     alive = bus.liveliness().declare_subscriber(
-        selector(realm, "vehicle", "alive"), zenoh.handlers.FifoChannel(1000)
+        selector(realm, "vehicle", "alive"), zenoh.handlers.FifoChannel(1000), history=True
     )
     with Subscription(bus, selector(realm, "vehicle")) as vehicles:
         while not stop.is_set():
             received = vehicles.receive(_POLL_S)
             token = alive.handler.try_recv()
-            if token is not None and token.kind == zenoh.SampleKind.DELETE:
-                key = parse_key(str(token.key_expr))
-                arrivals.put(_Gone(key.realm, key.identifier, time.monotonic() + _GONE_AFTER_S))
-            if received is None:
-                continue
             try:
+                if token is not None:
+                    key = parse_key(str(token.key_expr))
+                    is_alive = token.kind == zenoh.SampleKind.PUT
+                    arrivals.put(_Token(key.realm, key.identifier, is_alive))
+                if received is None:
+                    continue
                 key, identity = received.key(), received.identity()
             except ValueError as error:
-                _log.warning("refused a message on %.80s: %s", received.key_text, error)
+                _log.warning("refused: %.200s", error)
                 continue
-            if seen.add(key, identity):
-                arrivals.put(_Arrived(key, received.payload))
+            if key.stream in ("accel", "gnss") and seen.add(key, identity):
+                arrivals.put(_Arrived(key, identity.boot_id, received.payload))
     alive.undeclare()  # type: ignore[no-untyped-call]
 
 
 def _serve(
     engine: Engine,
-    arrivals: "queue.Queue[_Arrived | _Gone]",
+    queued: "queue.Queue[_Arrived | _Token]",
     publisher: Publisher,
     service_id: str,
     files: _ResultFiles,
     stop: threading.Event,
     ready: Callable[[], None] | None,
 ) -> None:
-    gone: list[_Gone] = []
+    arrivals = _Arrivals()
     told: set[str] = set()
     next_health_s = 0.0
     if ready is not None:
@@ -185,22 +288,23 @@ def _serve(
     while not stop.is_set():
         if time.monotonic() >= next_health_s:
             next_health_s = time.monotonic() + _HEALTH_PERIOD_S
-            _say_health(publisher, service_id, arrivals.qsize())
-        try:
-            arrived = arrivals.get(timeout=_POLL_S)
-        except queue.Empty:
-            due = [one for one in gone if one.due_s <= time.monotonic()]
-            gone = [one for one in gone if one.due_s > time.monotonic()]
-            for one in due:
-                _publish(engine.gone(one.realm, one.vehicle), engine, publisher, files)
-            continue
-        if isinstance(arrived, _Gone):
-            gone.append(arrived)
-            continue
-        try:
-            _publish(engine.feed(arrived.key, arrived.payload), engine, publisher, files)
-        except ValueError as error:
-            _log.warning("refused %s of %s: %s", arrived.key.stream, arrived.key.identifier, error)
+            _say_health(publisher, service_id, queued.qsize())
+        batch: list[_Arrived] = []
+        with contextlib.suppress(queue.Empty):
+            one = queued.get(timeout=_POLL_S)
+            if isinstance(one, _Token):
+                arrivals.note(one, time.monotonic())
+            else:
+                batch += arrivals.add(one, time.monotonic())
+        # In this order: what has come in the queue is newer than a history that is due.
+        for arrived in arrivals.due(time.monotonic()) + batch:
+            try:
+                _publish(engine.feed(arrived.key, arrived.payload), engine, publisher, files)
+            except ValueError as error:
+                name = f"{arrived.key.stream} of {arrived.key.identifier}"
+                _log.warning("refused %s: %s", name, error)
+        for realm, vehicle in arrivals.gone(time.monotonic()):
+            _publish(engine.gone(realm, vehicle), engine, publisher, files)
         for vehicle in engine.unknown_vehicles - told:
             told.add(vehicle)
             _log.warning("%s drives, but the site file has no such vehicle", vehicle)
@@ -214,10 +318,7 @@ def _publish(
         identity = publisher.put(owner, identifier, stream, output.payload)
         now_ns = time.time_ns()
         message = Message(output.key, output.payload, *identity, now_ns, now_ns)
-        try:
-            files.write(message, output.result, engine)
-        except OSError as error:
-            raise FailureError(f"{files.path}: cannot be written: {error.strerror}") from error
+        files.write(message, output.result, engine)
         if output.result is not None:
             result = output.result
             _log.info("%s: %s %s", result.crossing_id, result.verdict, ", ".join(result.reasons))

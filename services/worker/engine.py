@@ -24,20 +24,23 @@ from schemas.results import (
     direction_to_protobuf,
 )
 from schemas.settings import IdentificationSettings
-from schemas.signals import decode_accel, decode_gnss
+from schemas.signals import MAX_BATCH_S, GnssFix, decode_accel, decode_gnss
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
-from services.common.crossing import Passage, Stay, find_stays
+from services.common.crossing import MARGIN_M, Passage, Stay, find_stays
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
-from services.common.streams import Boot
+from services.common.streams import PATIENCE_S, Boot
 from services.worker.identification import MARGIN_S, CrossingData, Report, Stopwatch, identify
 
 _KEEP_S = 300.0
-"""Samples older than this are forgotten: no crossing of a short bridge lasts longer."""
-_SETTLE_S = 1.0
-"""Fixes after the exit that the trajectory should have."""
-_PATIENCE_S = 10.0
-"""How much newer data may come before a crossing is given up on that still lacks samples."""
+"""Samples older than this are forgotten."""
+_LONGEST_STAY_S = 270.0
+"""Who is on a short bridge for so long does not cross it."""
+_SILENCE_S = 120.0
+"""So long may positions come without accelerations, as when both are fetched after an outage."""
+_FORGET_EVERY_S = 10.0
+_REACH_M = 50.0
+"""Further away than this from the ends of a bridge no fix changes what happened on it."""
 
 
 class Output(NamedTuple):
@@ -61,10 +64,20 @@ class _Truck:
         self.vehicle = vehicle
         self.boot = Boot()
         self.latest_s = -np.inf
+        self.began_s = np.inf
         self.forgotten_s = -np.inf
         self.detected: dict[tuple[str, float], str] = {}
         """Crossing ids by bridge and about the time of entry."""
         self.done: set[str] = set()
+        self.side: dict[str, int] = {}
+        """By bridge: far before its start (-1), far behind its end (1), or near (0)."""
+
+    def is_busy_at(self, bridge: Bridge) -> bool:
+        """Whether a crossing of this bridge has begun and is not decided yet."""
+        return any(
+            known_bridge == bridge.id and crossing_id not in self.done
+            for (known_bridge, _), crossing_id in self.detected.items()
+        )
 
 
 class Engine:
@@ -92,8 +105,10 @@ class Engine:
         self._frames: list[tuple[Bridge, BridgeFrame]] = [
             (bridge, bridge_frame(bridge)) for bridge in site.bridges
         ]
+        self._margin_m = max(MARGIN_M, 5.0 * site.receiver.position_noise_m)
         self._vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
         self._trucks: dict[tuple[str, str, int], _Truck] = {}
+        self._newest_boot: dict[tuple[str, str], int] = {}
         self._usable: dict[tuple[str, str], list[Crossing]] = {}
         self.unknown_vehicles: set[str] = set()
         """Trucks that the site file does not know; nothing of theirs can be identified."""
@@ -109,27 +124,24 @@ class Engine:
         if vehicle is None:
             self.unknown_vehicles.add(key.identifier)
             return
-        if key.stream == "accel":
-            batch = decode_accel(payload)
-            truck = self._truck(key, batch.boot_id, vehicle)
+        batch = decode_accel(payload) if key.stream == "accel" else None
+        fix = decode_gnss(payload) if batch is None else None
+        boot_id = batch.boot_id if batch is not None else fix.boot_id if fix is not None else 0
+        if boot_id < self._newest_boot.get((key.realm, key.identifier), 0):
+            return  # its crossings have been decided
+        truck = self._truck(key, boot_id, vehicle)
+        if batch is not None:
             truck.boot.add_accel(batch)
-            return
-        fix = decode_gnss(payload)
-        yield from self._finish_older_boots(key, fix.boot_id)
-        truck = self._truck(key, fix.boot_id, vehicle)
-        truck.boot.add_fix(fix)
-        now_s = (fix.device_time_ns - (truck.boot.epoch_ns or 0)) * 1e-9
-        if now_s > truck.latest_s:
-            truck.latest_s = now_s
-            yield from self._look(key.realm, truck, now_s)
-            if now_s - _KEEP_S > truck.forgotten_s + 10.0:
-                truck.forgotten_s = now_s - _KEEP_S
-                truck.boot.forget_before(truck.forgotten_s)
+            self._forget(truck, batch.device_time_ns * 1e-9)
+        if fix is not None:
+            yield from self._finish_older_boots(key, boot_id)
+            truck.boot.add_fix(fix)
+            yield from self._settle(key.realm, truck)
 
     def finish(self) -> Iterator[Output]:
         """No more messages will come: decide all crossings with what there is."""
         for (realm, _, _), truck in list(self._trucks.items()):
-            yield from self._look(realm, truck, np.inf)
+            yield from self._finish(realm, truck)
 
     def gone(self, realm: str, vehicle: str) -> Iterator[Output]:
         """A truck has gone silent: decide the crossings that it has finished.
@@ -137,8 +149,29 @@ class Engine:
         One that it is still in waits: the truck may only have lost its connection.
         """
         for name, truck in list(self._trucks.items()):
-            if name[:2] == (realm, vehicle) and np.isfinite(truck.latest_s):
-                yield from self._look(realm, truck, truck.latest_s, complete=True)
+            if name[:2] == (realm, vehicle):
+                yield from self._settle(realm, truck, all_there_is=True)
+                if np.isfinite(truck.latest_s):
+                    now_s = truck.latest_s
+                    yield from self._look(realm, truck, self._frames, now_s, complete=True)
+
+    def _settle(self, realm: str, truck: _Truck, *, all_there_is: bool = False) -> Iterator[Output]:
+        """Look once at every fix: what is found does not depend on which came together."""
+        for fix in truck.boot.settle(all_there_is=all_there_is):
+            truck.latest_s = max(truck.latest_s, fix.device_time_ns * 1e-9)
+            bridges = [b for b in self._frames if self._may_change(truck, *b, fix)]
+            yield from self._look(realm, truck, bridges, truck.latest_s)
+            self._forget(truck, truck.latest_s)
+
+    def _finish(self, realm: str, truck: _Truck) -> Iterator[Output]:
+        yield from self._settle(realm, truck, all_there_is=True)
+        yield from self._look(realm, truck, self._frames, np.inf)
+
+    def _forget(self, truck: _Truck, now_s: float) -> None:
+        truck.began_s = min(truck.began_s, now_s)
+        if now_s - _KEEP_S > max(truck.began_s, truck.forgotten_s) + _FORGET_EVERY_S:
+            truck.forgotten_s = now_s - _KEEP_S
+            truck.boot.forget_before(truck.forgotten_s)
 
     def _truck(self, key: Key, boot_id: int, vehicle: Vehicle) -> _Truck:
         name = (key.realm, key.identifier, boot_id)
@@ -151,25 +184,42 @@ class Engine:
         """A truck that has started anew says nothing more of its boots before."""
         for name in [n for n in self._trucks if n[:2] == (key.realm, key.identifier)]:
             if name[2] < boot_id:
-                yield from self._look(key.realm, self._trucks[name], np.inf)
-                del self._trucks[name]
+                yield from self._finish(key.realm, self._trucks.pop(name))
+        self._newest_boot[key.realm, key.identifier] = boot_id
+
+    def _may_change(self, truck: _Truck, bridge: Bridge, frame: BridgeFrame, fix: GnssFix) -> bool:
+        """Whether a fix can begin, change or end a stay on a bridge: most are far from it."""
+        here_m, _ = to_chainage(frame, fix.latitude_deg, fix.longitude_deg)
+        reach_m = _REACH_M + 2.0 * self._margin_m
+        side = -1 if here_m < -reach_m else 1 if here_m > bridge.span_m + reach_m else 0
+        before = truck.side.get(bridge.id, side)
+        truck.side[bridge.id] = side
+        return side == 0 or side != before or truck.is_busy_at(bridge)
 
     def _look(
-        self, realm: str, truck: _Truck, now_s: float, *, complete: bool = False
+        self,
+        realm: str,
+        truck: _Truck,
+        bridges: list[tuple[Bridge, BridgeFrame]],
+        now_s: float,
+        *,
+        complete: bool = False,
     ) -> Iterator[Output]:
-        """Find crossings in the fixes that have come, and identify those that are complete."""
-        fixes = truck.boot.fixes()
-        if fixes.time_s.size < 2:
+        """Find crossings in the fixes that are known, and identify those that are complete."""
+        if not bridges:
             return
-        for bridge, frame in self._frames:
+        fixes = truck.boot.fixes()
+        for bridge, frame in bridges:
             chainage, lateral = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
             stays = find_stays(
                 fixes.time_s,
                 chainage,
                 lateral,
+                fixes.speed_m_per_s,
                 span_m=bridge.span_m,
                 wheelbase_m=truck.vehicle.wheelbase_m,
                 antenna_to_front_axle_m=truck.vehicle.gps_antenna_to_front_axle_m,
+                margin_m=self._margin_m,
             )
             for stay in stays:
                 yield from self._advance(realm, truck, bridge, stay, now_s, complete=complete)
@@ -184,20 +234,22 @@ class Engine:
         *,
         complete: bool,
     ) -> Iterator[Output]:
+        begins = stay.passage is Passage.BEGINS_ON_BRIDGE
+        if begins and stay.entry_s < truck.forgotten_s + _FORGET_EVERY_S:
+            return  # what was before has been forgotten; this had been decided before that
         crossing_id, is_new = self._identity(truck, bridge, stay)
         if crossing_id in truck.done:
             return
         state = _StateMessages(realm, bridge, truck, stay, crossing_id)
         if is_new:
             yield state.message(pb.DETECTED, stay.entry_s)
-        if stay.passage is Passage.ENDS_ON_BRIDGE and np.isfinite(now_s):
-            return  # still on it
-        needed_s = stay.exit_s + MARGIN_S
-        samples_there = truck.boot.latest_accel_s() >= needed_s
-        settled = now_s >= stay.exit_s + _SETTLE_S
-        given_up = now_s >= needed_s + _PATIENCE_S
-        if not (settled and samples_there) and not given_up and not complete:
-            return
+        if np.isfinite(now_s):
+            if not stay.is_over and now_s - stay.entry_s < _LONGEST_STAY_S:
+                return
+            if not stay.is_over:
+                stay = stay._replace(passage=Passage.TURNED_BACK)
+            elif not complete and self._may_still_come(truck, stay, now_s):
+                return
         truck.done.add(crossing_id)
         yield state.message(pb.COMPLETE, stay.exit_s)
         yield state.message(pb.IDENTIFYING, stay.exit_s)
@@ -219,6 +271,17 @@ class Engine:
                 message.SerializeToString(deterministic=True),
             )
 
+    def _may_still_come(self, truck: _Truck, stay: Stay, now_s: float) -> bool:
+        """Whether something of a crossing is missing that a little patience may bring."""
+        begin_s, end_s = stay.entry_s - MARGIN_S, stay.exit_s + MARGIN_S
+        if now_s < end_s:
+            return True
+        if not truck.boot.lacks_accel(begin_s - MAX_BATCH_S, end_s):
+            return False
+        if truck.boot.latest_accel_s() >= end_s + PATIENCE_S:
+            return False  # newer ones have come long ago: it is lost
+        return now_s < end_s + _SILENCE_S
+
     def _identity(self, truck: _Truck, bridge: Bridge, stay: Stay) -> tuple[str, bool]:
         """The id of a stay: the same although its entry moves a little with every new fix."""
         for (known_bridge, entry_s), crossing_id in truck.detected.items():
@@ -236,6 +299,8 @@ class Engine:
         frame = {b.id: f for b, f in self._frames}[bridge.id]
         fixes = truck.boot.fixes()
         chainage, _ = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
+        entry_ns = round(stay.entry_s * 1e9)
+        wall_offset_s = (truck.boot.wall_time_ns(stay.entry_s) - entry_ns) / 1e9
         data = CrossingData(
             crossing_id,
             realm,
@@ -246,7 +311,7 @@ class Engine:
             fixes,
             chainage,
             truck.boot.samples(stay.entry_s - MARGIN_S, stay.exit_s + MARGIN_S),
-            truck.boot.wall_time_ns(0.0) / 1e9,
+            wall_offset_s,
         )
         report: Report = lambda stage, fraction: self._report(crossing_id, stage, fraction)  # noqa: E731
         return identify(data, self._settings, stopwatch=self._stopwatch, report=report)
@@ -257,6 +322,7 @@ class Engine:
         if result.parameters is None:
             return None
         usable.append(result)
+        usable.sort(key=lambda crossing: crossing.entry_time)
         return latest_state(usable)
 
     def bridges(self) -> dict[str, BridgeResult]:

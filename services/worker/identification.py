@@ -79,38 +79,54 @@ def identify(
 ) -> results.Crossing:
     """The result of one crossing, whatever its data are."""
     began = stopwatch()
-    direction = data.stay.direction
     trajectory = _trajectory(data)
     entry_s, exit_s = _entry_and_exit(data, trajectory)
-    if trajectory is None or exit_s <= entry_s:
-        speed = 0.0
-    else:
-        speed = (data.bridge.span_m + data.vehicle.wheelbase_m) / (exit_s - entry_s)
+    speed = _speed_m_per_s(data, entry_s, exit_s)
     reject = partial(_rejected, data, settings, entry_s, exit_s, speed)
     reasons = _unusable(data, trajectory, entry_s, exit_s)
     if reasons or trajectory is None or data.samples is None:
         return reject(reasons or [Reason.FAILED])
-    time_s = data.samples.start_s + np.arange(_size(data.samples)) / data.samples.rate_hz
-    part = _covered(data.samples, time_s, entry_s, exit_s)
+    try:
+        found = _fitted(data, settings, trajectory, data.samples, entry_s, exit_s, report)
+        if isinstance(found, Reason):
+            return reject([found])
+        seconds = stopwatch() - began
+        return _result(data, settings, *found, entry_s, exit_s, speed, seconds)
+    except (ValueError, ArithmeticError):  # numpy's LinAlgError is a ValueError
+        return reject([Reason.FAILED])
+
+
+def _fitted(
+    data: CrossingData,
+    settings: IdentificationSettings,
+    trajectory: Trajectory,
+    samples: Samples,
+    entry_s: float,
+    exit_s: float,
+    report: Report,
+) -> tuple[Window, _Fit, Motion] | Reason:
+    time_s = samples.start_s + np.arange(_size(samples)) / samples.rate_hz
+    part = _covered(samples, time_s, entry_s, exit_s)
     if part is None:
-        return reject([Reason.GAP_ON_BRIDGE])
-    motion = motion_at(trajectory, time_s[part], direction)
-    acceleration = np.stack([data.samples.channels[name][part] for name in CHANNELS])
+        return Reason.GAP_ON_BRIDGE
+    motion = motion_at(trajectory, time_s[part], data.stay.direction)
+    acceleration = np.stack([samples.channels[name][part] for name in CHANNELS])
     try:
         window = _window(data, settings, acceleration, motion)
     except residual.WindowError:
-        return reject([Reason.STOPPED_ON_BRIDGE])
+        return Reason.STOPPED_ON_BRIDGE
     fit = _METHODS[settings.method](data, settings, window, report)
     if fit.ending is search.Ending.NOT_FINITE:
-        return reject([Reason.NOT_FINITE])
-    return _result(data, settings, window, fit, motion, entry_s, exit_s, speed, stopwatch() - began)
+        return Reason.NOT_FINITE
+    return window, fit, motion
 
 
 def _trajectory(data: CrossingData) -> Trajectory | None:
+    # No fixes later than those that are waited for: what came by chance must not matter.
     near = (data.fixes.time_s > data.stay.entry_s - 10.0) & (
-        data.fixes.time_s < data.stay.exit_s + 10.0
+        data.fixes.time_s <= data.stay.exit_s + MARGIN_S
     )
-    if near.sum() < 2:
+    if near.sum() < 2 or data.stay.passage is not Passage.THROUGH:
         return None
     antenna = data.vehicle.gps_antenna_to_front_axle_m
     latency = data.receiver.latency_s
@@ -129,7 +145,7 @@ def _trajectory(data: CrossingData) -> Trajectory | None:
 def _entry_and_exit(data: CrossingData, trajectory: Trajectory | None) -> tuple[float, float]:
     """When the front axle enters and the rear axle leaves, by the smooth curve if it says so."""
     stay = data.stay
-    if trajectory is None or stay.passage is not Passage.THROUGH:
+    if trajectory is None:
         return stay.entry_s, stay.exit_s
     direction, span = stay.direction, data.bridge.span_m
     near, far = (0.0, span) if direction > 0 else (span, 0.0)
@@ -140,6 +156,14 @@ def _entry_and_exit(data: CrossingData, trajectory: Trajectory | None) -> tuple[
     if not (np.isfinite(entry) and np.isfinite(leave)):
         return stay.entry_s, stay.exit_s
     return entry, leave
+
+
+def _speed_m_per_s(data: CrossingData, entry_s: float, exit_s: float) -> float:
+    """Mean speed of a crossing; of what is none, the middle one of the receiver's speeds."""
+    if data.stay.passage is Passage.THROUGH and exit_s > entry_s:
+        return (data.bridge.span_m + data.vehicle.wheelbase_m) / (exit_s - entry_s)
+    near = (data.fixes.time_s >= data.stay.entry_s) & (data.fixes.time_s <= data.stay.exit_s)
+    return float(np.median(np.abs(data.fixes.speed_m_per_s[near]))) if near.any() else 0.0
 
 
 def _unusable(
@@ -157,17 +181,17 @@ def _unusable(
     channels = data.samples.channels if data.samples is not None else {}
     if any(name not in channels for name in CHANNELS):
         reasons.append(Reason.CHANNEL_MISSING)
-    if trajectory is None or _longest_outage_s(data.fixes.time_s, entry_s, exit_s) > (
-        _LONGEST_OUTAGE_S
-    ):
-        reasons.append(Reason.POSITION_OUTAGE)
-    if trajectory is not None and data.stay.passage is Passage.THROUGH:
-        times = np.linspace(entry_s, exit_s, 200)
-        speed = data.stay.direction * trajectory.spline.derivative()(times)
-        if speed.min() < _STANDING_M_PER_S:
-            reasons.append(Reason.STOPPED_ON_BRIDGE)
-        elif np.median(speed) < _SLOWEST_M_PER_S:
-            reasons.append(Reason.SPEED_TOO_LOW)
+    if data.stay.passage is not Passage.THROUGH:
+        return reasons
+    outage_s = _longest_outage_s(data.fixes.time_s, entry_s, exit_s)
+    if trajectory is None or outage_s > _LONGEST_OUTAGE_S:
+        return [*reasons, Reason.POSITION_OUTAGE]
+    times = np.linspace(entry_s, exit_s, 200)
+    speed = data.stay.direction * trajectory.spline.derivative()(times)
+    if speed.min() < _STANDING_M_PER_S:
+        reasons.append(Reason.STOPPED_ON_BRIDGE)
+    elif np.median(speed) < _SLOWEST_M_PER_S:
+        reasons.append(Reason.SPEED_TOO_LOW)
     return reasons
 
 
