@@ -47,16 +47,20 @@ class Cloud(NamedTuple):
     std: dict[str, float]
     accuracy: dict[str, float]
     """S_A = 1 - |mean - true ratio| (paper eq. 24)."""
-    samples: Floats | None  # (particles, 20), for the figure
+    samples: Floats  # (particles, names); one row if the search has one answer
 
 
 class Scenario(NamedTuple):
-    """Both searches on one scenario."""
+    """Both searches on one scenario; how each ended and how long it took."""
 
     number: int
+    names: tuple[str, ...]
     truth: dict[str, float]
+    prior: Floats
+    """Where the random walk began: (particles, names)."""
     random_walk: Cloud
     least_squares: Cloud
+    endings: dict[str, search.Ending]
     seconds: dict[str, float]
 
 
@@ -72,31 +76,37 @@ def validate_command(
     steps: int,
     console: "Console",
 ) -> int:
-    """Run the scenarios, print the table and write what was asked for; 0 also if aims are missed."""
+    """Run scenarios, print the table, write what was asked for; 0 also where an aim is missed."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     if json_path is not None:
         check_writable(json_path)
+    if figures is not None:
+        _make_folder(figures)
     car, sound = _models(site)
     bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), console=console
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
     )
-    found = []
     with bar as progress:
         task = progress.add_task("starting", total=len(scenarios) * (steps + 1))
-        for number in scenarios:
-            found.append(
-                run_scenario(
-                    number,
-                    car,
-                    sound,
-                    noise_ug_per_rthz=noise,
-                    seed=seed,
-                    particles=particles,
-                    steps=steps,
-                    progress=(progress, task),
-                )
+        found = [
+            run_scenario(
+                number,
+                car,
+                sound,
+                noise_ug_per_rthz=noise,
+                seed=seed,
+                particles=particles,
+                steps=steps,
+                progress=(progress, task),
             )
+            for number in scenarios
+        ]
     published = site is None
     _print(console, found, published=published)
     _print_summary(console, found, published=published, noise=noise)
@@ -105,22 +115,28 @@ def validate_command(
     if figures is not None:
         from services.viewer.validation_figure import overview_figure, posterior_figure
 
-        figures.mkdir(parents=True, exist_ok=True)
         for scenario in found:
-            posterior_figure(figures / f"scenario-{scenario.number:02d}.png", scenario, NAMES)
-        overview_figure(figures / "scenarios.png", found, _published() if published else None)
+            path = figures / f"scenario-{scenario.number:02d}.png"
+            posterior_figure(path, scenario, scenario.names)
+        overview_figure(figures / "scenarios.png", found, tables_of_paper() if published else None)
         console.print(f"figures in {figures}/", highlight=False)
     return 0
 
 
-NAMES = (
-    *DERIVED,
-    *(
-        parameters.names(paper.ELEMENTS)[i]
-        for i in parameters.paper_subset(paper.ELEMENTS)
-        if parameters.names(paper.ELEMENTS)[i] != "d_1"
-    ),
-)
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be made a folder: {error.strerror}") from error
+    check_writable(path / "scenarios.png")
+
+
+def _names(free: NDArray[np.int64]) -> tuple[str, ...]:
+    """Names of the columns of `table_columns`: d_1 shows as the two body masses it implies."""
+    return (*DERIVED, *(parameters.names(paper.ELEMENTS)[i] for i in free if i != parameters.D_1))
+
+
+NAMES = _names(parameters.paper_subset(paper.ELEMENTS))
 """The twenty rows of the paper's Tables 7 and 8."""
 
 
@@ -147,13 +163,16 @@ def run_scenario(
     window = paper_window(car, damaged, noise_ug_per_rthz, seed)
     nominal = parameters.from_models(car, sound)
     free = parameters.paper_subset(paper.ELEMENTS)
-    true_ratio = dict.fromkeys(NAMES, 1.0)
+    free = free[nominal[free] > 0.0]  # a site may say that a damping is exactly zero
+    names = _names(free)
+    true_ratio = dict.fromkeys(names, 1.0)
     true_ratio |= {f"EI_{e + 1}": float(ratio) for e, ratio in enumerate(ratios)}
 
     began = time.perf_counter()
     walk = random_walk.problem(window, nominal, free, seed)
-    state, _, _ = search.run(
-        partial(random_walk.init, walk, particles),
+    first = random_walk.init(walk, particles)
+    last, _, walk_ending = search.run(
+        lambda: first,
         partial(random_walk.step, walk),
         steps,
         at_the_end=search.Ending.STEPS_DONE,
@@ -166,42 +185,51 @@ def run_scenario(
         random_walk.PRIOR_LOW, random_walk.PRIOR_HIGH, free.size
     )
     work = residual.workspace(window)
-    best, _, _ = search.run(
+    best, _, fit_ending = search.run(
         partial(least_squares.init, problem, work, nominal[free] * start),
         partial(least_squares.step, problem, work),
         least_squares.MAX_STEPS,
     )
     fitted = time.perf_counter()
     advance("least squares", 1)
-    estimate = least_squares.untransform(problem, best.y) / nominal[free]
-    slope = least_squares.derivative_of_values(problem, best.y) / nominal[free]
-    formal = np.sqrt(np.diag(least_squares.covariance(best))) * slope
-    ours = _cloud(estimate[None, :], nominal, free, window, true_ratio)
-    spread = {
-        name: float(formal[k])
-        for k, i in enumerate(free)
-        if (name := parameters.names(paper.ELEMENTS)[i]) in ours.std
-    }
+    columns = partial(table_columns, nominal=nominal, free=free, window=window)
     return Scenario(
         number,
+        names,
         true_ratio,
-        _cloud(state.ratios, nominal, free, window, true_ratio),
-        ours._replace(std=spread, samples=None),
+        columns(first.ratios),
+        cloud_of(columns(last.ratios), names, true_ratio),
+        cloud_of(
+            columns(least_squares.untransform(problem, best.y)[None, :] / nominal[free]),
+            names,
+            true_ratio,
+        ),
+        {"random_walk": walk_ending, "least_squares": fit_ending},
         {"random_walk": walked - began, "least_squares": fitted - walked},
     )
 
 
-def paper_window(car: HalfCar, beam: Beam, noise_ug_per_rthz: float, seed: int) -> Window:
-    """One crossing of the paper's experiment (Table 4), with white sensor noise if asked for."""
+def paper_window(
+    car: HalfCar,
+    beam: Beam,
+    noise_ug_per_rthz: float,
+    seed: int,
+    *,
+    road: tuple[str, int] = (ROAD_CLASS, ROAD_SEED),
+) -> Window:
+    """One crossing of the paper's experiment (Table 4), with white sensor noise if asked for.
+
+    `road` is an ISO 8608 class and the seed of its phases.
+    """
     span = float(beam.element_lengths_m.sum())
     travel = span + car.wheelbase_m - paper.FRONT_AXLE_START_M
     steps = round(travel / paper.SPEED_M_PER_S / paper.STEP_S) + 10
     motion = constant_speed(paper.FRONT_AXLE_START_M, paper.SPEED_M_PER_S, steps, paper.STEP_S)
     reach = np.ceil(car.wheelbase_m) + 1.0
-    road = iso_8608_profile(
-        paper.FRONT_AXLE_START_M - reach, np.ceil(span + reach), 0.01, ROAD_CLASS, ROAD_SEED
-    )
-    run = simulate(car, beam, motion, under_wheels(road, motion, car.wheelbase_m, 1), paper.STEP_S)
+    begin, end = paper.FRONT_AXLE_START_M - reach, np.ceil(span + reach)
+    profile = iso_8608_profile(begin, end, 0.01, *road)
+    felt = under_wheels(profile, motion, car.wheelbase_m, 1)
+    run = simulate(car, beam, motion, felt, paper.STEP_S)
     if not run.converged:
         raise FailureError("the simulation did not converge: are the site's values possible?")
     acceleration = np.ascontiguousarray(run.acceleration_m_per_s2.T)
@@ -235,9 +263,10 @@ def _models(site: Path | None) -> tuple[HalfCar, Beam]:
     return truck_of(known.vehicles[0]), beam_of(bridge, np.ones(bridge.elements))
 
 
-def _cloud(
-    ratios: Floats, nominal: Floats, free: NDArray[np.int64], window: Window, truth: dict[str, float]
-) -> Cloud:
+def table_columns(
+    ratios: Floats, *, nominal: Floats, free: NDArray[np.int64], window: Window
+) -> Floats:
+    """Ratios (k, f) of the unknowns as ratios (k, names) of the paper's tables, see `_names`."""
     theta = np.repeat(nominal[None, :], ratios.shape[0], axis=0)
     theta[:, free] *= ratios
     masses = partial(
@@ -245,105 +274,107 @@ def _cloud(
         total_mass_kg=window.total_mass_kg,
         wheelbase_m=window.wheelbase_m,
     )
-    columns = dict(zip(DERIVED, (masses(theta) / masses(nominal))[:, 1:].T, strict=True))
-    names = parameters.names(paper.ELEMENTS)
-    columns |= {names[i]: ratios[:, k] for k, i in enumerate(free)}
-    mean = {name: float(columns[name].mean()) for name in NAMES}
-    return Cloud(
-        mean,
-        {name: float(columns[name].std()) for name in NAMES},
-        {name: 1.0 - abs(mean[name] - truth[name]) for name in NAMES},
-        np.stack([columns[name] for name in NAMES], axis=1),
-    )
+    derived = (masses(theta) / masses(nominal))[:, 1:]
+    return np.column_stack([derived, ratios[:, free != parameters.D_1]])
+
+
+def cloud_of(columns: Floats, names: tuple[str, ...], truth: dict[str, float]) -> Cloud:
+    """Mean, standard deviation and S_A of columns (k, names)."""
+    mean = dict(zip(names, columns.mean(axis=0).tolist(), strict=True))
+    std = dict(zip(names, columns.std(axis=0).tolist(), strict=True))
+    return Cloud(mean, std, {name: 1.0 - abs(mean[name] - truth[name]) for name in names}, columns)
 
 
 @cache
-def _published() -> dict[str, Any]:
+def tables_of_paper() -> dict[str, Any]:
     """The paper's tables as data; CC BY 4.0, see services/data/README.md."""
     text = resources.files("services").joinpath("data/paper_tables.json").read_text("utf-8")
     tables: dict[str, Any] = json.loads(text)
     return tables
 
 
-def _of_paper(scenario: int, name: str) -> tuple[float, float]:
+def of_paper(scenario: int, name: str) -> tuple[float, float]:
     """Mean and standard deviation of Table 7."""
-    row = _published()["table7_normalised_estimates"][name]
+    row = tables_of_paper()["table7_normalised_estimates"][name]
     return row["mean"][scenario - 1], row["std"][scenario - 1]
+
+
+def _accuracy_of_paper(scenario: int, name: str) -> float:
+    """S_A of Table 8."""
+    return float(tables_of_paper()["table8_accuracy_S_A"][name][scenario - 1])
 
 
 def _print(console: "Console", found: list[Scenario], *, published: bool) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
-    columns = ["scenario", "parameter", "truth", "paper", "random walk", "ours", "S_A of ours"]
-    if not published:
-        columns.remove("paper")
-    for column in columns:
-        table.add_column(column, justify="left" if column == "parameter" else "right")
+    columns = ["truth", *(["paper", "S_A"] if published else []), "random walk", "S_A"]
+    for column in ("scenario", "parameter", *columns, "ours", "S_A"):
+        left = column == "parameter"
+        table.add_column(column, justify="left" if left else "right", no_wrap=True)
     for scenario in found:
-        for row, name in enumerate(NAMES):
-            walk, ours = scenario.random_walk, scenario.least_squares
-            paper_value = ["{:.2f} ± {:.2f}".format(*_of_paper(scenario.number, name))]
-            table.add_row(
-                str(scenario.number) if row == 0 else "",
-                name,
-                f"{scenario.truth[name]:.2f}",
-                *(paper_value if published else []),
-                f"{walk.mean[name]:.2f} ± {walk.std[name]:.2f}",
-                f"{ours.mean[name]:.4f}",
-                f"{ours.accuracy[name]:.4f}",
-                end_section=row == len(NAMES) - 1,
-            )
+        if scenario is not found[0]:
+            table.add_row()
+        walk, ours = scenario.random_walk, scenario.least_squares
+        for name in scenario.names:
+            row = [str(scenario.number), name, f"{scenario.truth[name]:.2f}"]
+            if published:
+                row.append("{:.2f} ± {:.2f}".format(*of_paper(scenario.number, name)))
+                row.append(f"{_accuracy_of_paper(scenario.number, name):.2f}")
+            row.append(f"{walk.mean[name]:.2f} ± {walk.std[name]:.2f}")
+            row.append(f"{walk.accuracy[name]:.2f}")
+            row.append(_ratio(ours.mean[name]))
+            row.append(_ratio(ours.accuracy[name]))
+            table.add_row(*row, style="bold" if scenario.truth[name] != 1.0 else None)
     console.print(table)
+
+
+def _ratio(value: float) -> str:
+    """At most six characters: four decimals of what is near one, less of what went astray."""
+    if 0.0 <= value < 10.0:
+        return f"{value:.4f}"
+    return f"{value:.2f}" if abs(value) < 100.0 else f"{value:.0e}"
 
 
 def _print_summary(
     console: "Console", found: list[Scenario], *, published: bool, noise: float
 ) -> None:
-    worst = min(
-        (accuracy, name, scenario.number)
-        for scenario in found
-        for name, accuracy in scenario.least_squares.accuracy.items()
+    error, name, number = max(
+        (abs(s.least_squares.mean[name] - s.truth[name]), name, s.number)
+        for s in found
+        for name in s.names
     )
-    count = len(found) * len(NAMES)
-    exact = sum(
-        accuracy >= 0.999
+    accuracies = [a for s in found for a in s.least_squares.accuracy.values()]
+    exact = sum(accuracy >= 0.999 for accuracy in accuracies)
+    least = f"largest error {error:.1e} ({name}, scenario {number})"
+    lines = [f"ours: S_A ≥ 0.999 in {exact} of {len(accuracies)}; {least}"]
+    lines += [
+        f"scenario {scenario.number}, {method.replace('_', ' ')}: {ending.value}"
         for scenario in found
-        for accuracy in scenario.least_squares.accuracy.values()
-    )
-    lines = [
-        f"least squares: S_A ≥ 0.999 in {exact} of {count}; the least is {worst[0]:.6f} "
-        f"({worst[1]}, scenario {worst[2]})"
+        for method, ending in scenario.endings.items()
+        if ending not in (search.Ending.CONVERGED, search.Ending.STEPS_DONE)
     ]
     if published:
-        close = compare_with_paper(found)
-        lines.append(
-            f"random walk: of {close['cells']} cells (m_s1 and m_s2 follow the road and are left "
-            f"out) {close['std']} standard deviations within 0.06 of Table 7 and {close['mean']} "
-            "means within 0.08"
-        )
-    seconds = {
-        method: [scenario.seconds[method] for scenario in found] for method in found[0].seconds
-    }
-    lines.append(
-        f"median seconds a scenario: random walk {np.median(seconds['random_walk']):.1f}, "
-        f"least squares {np.median(seconds['least_squares']):.2f}"
+        close = compare_with_paper({s.number: s.random_walk for s in found})
+        of, without = f"of {close['cells']}", "m_s1 and m_s2 left out"
+        lines.append(f"random walk: {close['std']} {of} stds within 0.06 of Table 7's,")
+        lines.append(f"             {close['mean']} {of} means within 0.08; {without}")
+    walk, fit = (
+        float(np.median([scenario.seconds[method] for scenario in found]))
+        for method in ("random_walk", "least_squares")
     )
+    lines.append(f"median time of a scenario: random walk {walk:.1f} s, ours {fit:.2f} s")
     if noise > 0.0:
         lines.append(f"accelerometer noise {noise:g} µg/√Hz")
     for line in lines:
         console.print(line, highlight=False)
 
 
-def compare_with_paper(found: list[Scenario]) -> dict[str, int]:
-    """How many cells of Table 7 the random walk meets, m_s1 and m_s2 left out."""
-    cells = [(s, name) for s in found for name in NAMES if name not in DERIVED]
-    means = sum(
-        abs(s.random_walk.mean[name] - _of_paper(s.number, name)[0]) <= 0.08 for s, name in cells
-    )
-    stds = sum(
-        abs(s.random_walk.std[name] - _of_paper(s.number, name)[1]) <= 0.06 for s, name in cells
-    )
+def compare_with_paper(clouds: dict[int, Cloud]) -> dict[str, int]:
+    """How many cells of Table 7 the clouds of these scenarios meet, m_s1 and m_s2 left out."""
+    cells = [(n, c, name) for n, c in clouds.items() for name in NAMES if name not in DERIVED]
+    means = sum(abs(c.mean[name] - of_paper(n, name)[0]) <= 0.08 for n, c, name in cells)
+    stds = sum(abs(c.std[name] - of_paper(n, name)[1]) <= 0.06 for n, c, name in cells)
     return {"cells": len(cells), "mean": means, "std": stds}
 
 
@@ -355,12 +386,14 @@ def _as_json(found: list[Scenario]) -> dict[str, Any]:
                 "least_squares": {
                     "S_A": scenario.least_squares.accuracy,
                     "mean": scenario.least_squares.mean,
+                    "ending": scenario.endings["least_squares"].name.lower(),
                     "seconds": scenario.seconds["least_squares"],
                 },
                 "random_walk": {
                     "S_A": scenario.random_walk.accuracy,
                     "mean": scenario.random_walk.mean,
                     "std": scenario.random_walk.std,
+                    "ending": scenario.endings["random_walk"].name.lower(),
                     "seconds": scenario.seconds["random_walk"],
                 },
             }

@@ -1,0 +1,356 @@
+"""The measurements behind docs/reproduction.md that `driveby validate` does not print.
+
+    .venv/bin/python docs/scripts/reproduction.py step|road|length|starts|mesh|frequencies
+
+`--scenarios 1,6,12` chooses scenarios where that makes sense. Minutes each on two cores.
+"""
+
+import argparse
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from pre_core import least_squares, paper, parameters, random_walk, residual, search
+from pre_core.bridge import natural_frequencies_hz
+from pre_core.integrate import newmark_integrate, spline_integrate
+from pre_core.residual import Window
+from pre_core.vehicle import natural_frequencies_hz as vehicle_frequencies_hz
+from services.simulation import paper_site, simulate_drive
+from services.validation import (
+    NAMES,
+    ROAD_CLASS,
+    ROAD_SEED,
+    Cloud,
+    cloud_of,
+    compare_with_paper,
+    paper_window,
+    table_columns,
+    tables_of_paper,
+)
+
+Floats = NDArray[np.float64]
+Proposal = Callable[[np.random.Generator, Floats], Floats]
+
+CONSOLE = Console(highlight=False, width=130)
+NOMINAL = parameters.from_models(paper.TRUCK, paper.beam(np.ones(paper.ELEMENTS)))
+FREE = parameters.paper_subset(paper.ELEMENTS)
+
+
+class Walk(NamedTuple):
+    """One random walk: where it is looked at, and how it steps."""
+
+    label: str
+    scenario: int
+    propose: Proposal
+    stops: tuple[int, ...]
+    road: tuple[str, int]
+    seed: int
+
+
+def gaussian(std: float) -> Proposal:
+    """All coordinates at once, normally distributed."""
+    return lambda rng, x: x + std * rng.standard_normal(x.shape)
+
+
+def uniform(half_width: float) -> Proposal:
+    """All coordinates at once, uniformly distributed."""
+    return lambda rng, x: x + rng.uniform(-half_width, half_width, x.shape)
+
+
+def one_at_a_time(std: float) -> Proposal:
+    """One coordinate, chosen at random for each particle, normally distributed."""
+
+    def propose(rng: np.random.Generator, x: Floats) -> Floats:
+        chosen = rng.integers(0, x.shape[1], x.shape[0])
+        moved = x.copy()
+        moved[np.arange(x.shape[0]), chosen] += std * rng.standard_normal(x.shape[0])
+        return moved
+
+    return propose
+
+
+def window_of(scenario: int, road: tuple[str, int] = (ROAD_CLASS, ROAD_SEED)) -> Window:
+    """The paper's experiment without noise."""
+    beam = paper.beam(paper.scenario_ratios(scenario))
+    return paper_window(paper.TRUCK, beam, 0.0, 0, road=road)
+
+
+def truth_of(scenario: int) -> dict[str, float]:
+    """True ratios by name."""
+    ratios = paper.scenario_ratios(scenario)
+    return dict.fromkeys(NAMES, 1.0) | {f"EI_{e + 1}": float(r) for e, r in enumerate(ratios)}
+
+
+def objective(window: Window, work: residual.Workspace, ratios: Floats, limit: Floats) -> Floats:
+    """J of particles, infinite where a parameter is not positive or d_1 not between the axles."""
+    theta = np.repeat(NOMINAL[None, :], ratios.shape[0], axis=0)
+    theta[:, FREE] *= ratios
+    total = np.full(ratios.shape[0], np.inf)
+    physical = np.all(ratios > 0.0, axis=1) & (theta[:, parameters.D_1] < window.wheelbase_m)
+    out = np.empty(int(physical.sum()))
+    residual.objective_batch(window, work, theta[physical], limit[physical], out)
+    total[physical] = out
+    return total
+
+
+def walk(task: Walk) -> list[Cloud]:
+    """The paper's search with any step: the cloud at each stop."""
+    window = window_of(task.scenario, task.road)
+    work = residual.workspace(window)
+    rng = np.random.default_rng(task.seed)
+    x = rng.uniform(
+        random_walk.PRIOR_LOW, random_walk.PRIOR_HIGH, (random_walk.PARTICLES, FREE.size)
+    )
+    kept = objective(window, work, x, np.full(x.shape[0], np.inf))
+    clouds = []
+    for count in range(1, max(task.stops) + 1):
+        trial = task.propose(rng, x)
+        value = objective(window, work, trial, kept)
+        better = value <= kept
+        x = np.where(better[:, None], trial, x)
+        kept = np.where(better, value, kept)
+        if count in task.stops:
+            columns = table_columns(x, nominal=NOMINAL, free=FREE, window=window)
+            clouds.append(cloud_of(columns, NAMES, truth_of(task.scenario)))
+    return clouds
+
+
+def compare(tasks: list[Walk], title: str) -> None:
+    """Run the walks, two at a time, and print one line for each label and stop."""
+    with ThreadPoolExecutor(2) as pool, CONSOLE.status("") as status:
+        found = []
+        for task, clouds in zip(tasks, pool.map(walk, tasks), strict=True):
+            found.append((task, clouds))
+            status.update(f"{len(found)} of {len(tasks)} walks done")
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in (
+        title,
+        "steps",
+        "stds within 0.06",
+        "means within 0.08",
+        "std of EI",
+        "std of k_s1",
+        "EI_4 of 6",
+        "EI_3, EI_5 of 6",
+        "EI_7 of 12",
+    ):
+        table.add_column(column, justify="left" if column == title else "right")
+    for label in dict.fromkeys(task.label for task in tasks):
+        chosen = [(task, clouds) for task, clouds in found if task.label == label]
+        for place, stop in enumerate(chosen[0][0].stops):
+            by_scenario = {task.scenario: clouds[place] for task, clouds in chosen}
+            table.add_row(label, str(stop), *_figures(by_scenario))
+    CONSOLE.print(table)
+
+
+def _figures(clouds: dict[int, Cloud]) -> list[str]:
+    close = compare_with_paper(clouds)
+    rigidities = [f"EI_{e + 1}" for e in range(paper.ELEMENTS)]
+
+    def mean(scenario: int, *names: str) -> str:
+        if scenario not in clouds:
+            return "-"
+        return ", ".join(f"{clouds[scenario].mean[name]:.2f}" for name in names)
+
+    return [
+        f"{close['std']} of {close['cells']}",
+        f"{close['mean']} of {close['cells']}",
+        f"{np.mean([cloud.std[name] for cloud in clouds.values() for name in rigidities]):.2f}",
+        f"{np.mean([cloud.std['k_s1'] for cloud in clouds.values()]):.2f}",
+        mean(6, "EI_4"),
+        mean(6, "EI_3", "EI_5"),
+        mean(12, "EI_7"),
+    ]
+
+
+def step(scenarios: tuple[int, ...]) -> None:
+    """How the distribution of the step was chosen."""
+    kinds = {f"Gaussian {100 * std:g} %": gaussian(std) for std in (0.03, 0.05, 0.07, 0.10, 0.15)}
+    kinds |= {f"uniform ±{100 * w:g} %": uniform(w) for w in (0.07, 0.12, 0.20)}
+    kinds |= {
+        f"Gaussian {100 * std:g} %, one at a time": one_at_a_time(std) for std in (0.07, 0.20)
+    }
+    stops = (random_walk.STEPS,)
+    compare(
+        [
+            Walk(label, scenario, propose, stops, (ROAD_CLASS, ROAD_SEED), 0)
+            for label, propose in kinds.items()
+            for scenario in scenarios
+        ],
+        "step",
+    )
+
+
+def road(scenarios: tuple[int, ...]) -> None:
+    """What another road changes, and another seed of the search."""
+    roads = [(name, seed, 0) for name in "ABC" for seed in (1, 2, 3)] + [("B", 1, 1), ("B", 1, 2)]
+    compare(
+        [
+            Walk(
+                f"class {name}, road {number}, search seed {seed}",
+                scenario,
+                gaussian(random_walk.STEP_RATIO),
+                (random_walk.STEPS,),
+                (name, number),
+                seed,
+            )
+            for name, number, seed in roads
+            for scenario in scenarios
+        ],
+        "road",
+    )
+
+
+def length(scenarios: tuple[int, ...]) -> None:
+    """The spread of the particles against the number of steps."""
+    compare(
+        [
+            Walk(
+                "Gaussian 7 %",
+                scenario,
+                gaussian(random_walk.STEP_RATIO),
+                (150, 300, 600, 1200, 2400),
+                (ROAD_CLASS, ROAD_SEED),
+                0,
+            )
+            for scenario in scenarios
+        ],
+        "step",
+    )
+
+
+def fit(window: Window, start: Floats) -> tuple[Floats, int, search.Ending]:
+    """Least squares from `start` (ratios): the ratios found, steps, ending."""
+    problem = least_squares.Problem(window, NOMINAL, FREE)
+    work = residual.workspace(window)
+    state, infos, ending = search.run(
+        partial(least_squares.init, problem, work, NOMINAL[FREE] * start),
+        partial(least_squares.step, problem, work),
+        least_squares.MAX_STEPS,
+    )
+    return least_squares.untransform(problem, state.y) / NOMINAL[FREE], len(infos), ending
+
+
+def starts(scenarios: tuple[int, ...], count: int = 20) -> None:
+    """Least squares from many random starts in the paper's prior."""
+    for scenario in scenarios:
+        window = window_of(scenario)
+        rng = np.random.default_rng(scenario)
+        accuracy, steps = [], []
+        for _ in range(count):
+            start = rng.uniform(random_walk.PRIOR_LOW, random_walk.PRIOR_HIGH, FREE.size)
+            found, taken, ending = fit(window, start)
+            columns = table_columns(found[None, :], nominal=NOMINAL, free=FREE, window=window)
+            cloud = cloud_of(columns, NAMES, truth_of(scenario))
+            accuracy.append(min(cloud.accuracy.values()))
+            steps.append(taken)
+            if ending is not search.Ending.CONVERGED:
+                CONSOLE.print(f"scenario {scenario}: {ending.value}")
+        CONSOLE.print(
+            f"scenario {scenario:2d}: {count} starts, 1 - S_A at worst {1 - min(accuracy):.1e}, "
+            f"{np.mean(steps):.1f} steps on average, {max(steps)} at most"
+        )
+
+
+def mesh(scenarios: tuple[int, ...]) -> None:
+    """What a shared mesh and a shared integrator hide: data of a finer model, without noise."""
+    site = paper_site()
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("scenario", "rate", "integration", "parts"):
+        table.add_column(column, justify="right")
+    for e in range(paper.ELEMENTS):
+        table.add_column(f"EI_{e + 1}", justify="right")
+    table.add_column("worst of the truck", justify="right")
+    for scenario in scenarios:
+        for rate in (1000.0, 200.0):
+            ratios = paper.scenario_ratios(scenario)
+            drive = simulate_drive(site, ratios, road_class="B", seed=1, rate_hz=rate).run
+            time_s = drive.accel_time_s - drive.accel_time_s[0]
+            position = paper.SPEED_M_PER_S * (time_s - 3.0)
+            # The span and a second on either side: integration over more only adds drift.
+            part = np.flatnonzero((position > -10.0) & (position < paper.SPAN_M + 15.0))
+            for integrate, name in (
+                (newmark_integrate, "trapezoid"),
+                (spline_integrate, "spline"),
+            ):
+                for parts in (1, 2, 4):
+                    window = residual.build_window(
+                        np.stack([channel[part] for channel in drive.channels.values()]),
+                        1.0 / rate,
+                        position[part],
+                        1,
+                        element_lengths_m=np.full(paper.ELEMENTS, paper.SPAN_M / paper.ELEMENTS),
+                        total_mass_kg=site.vehicles[0].total_mass_kg,
+                        wheelbase_m=paper.TRUCK.wheelbase_m,
+                        integrate=integrate,
+                        initial_state_known=False,
+                        parts=parts,
+                    )
+                    found, _, _ = fit(window, np.ones(FREE.size))
+                    errors = found / np.concatenate([np.ones(9), ratios, np.ones(3)]) - 1.0
+                    table.add_row(
+                        str(scenario),
+                        f"{rate:g} Hz",
+                        name,
+                        str(parts),
+                        *(f"{100 * error:+.2f} %" for error in errors[9:16]),
+                        f"{100 * np.abs(errors[:9]).max():.2f} %",
+                    )
+    CONSOLE.print(table)
+
+
+def frequencies(scenarios: tuple[int, ...]) -> None:
+    """The paper's Table 5 beside the consistent mass matrix, right and with a sign flipped."""
+    printed = tables_of_paper()["table5_natural_frequencies_hz"]
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("scenario", "Table 5", "right matrix", "13l/420 flipped", "difference"):
+        table.add_column(column, justify="right")
+
+    def add(label: str, theirs: Floats, ratios: Floats) -> None:
+        right = natural_frequencies_hz(paper.beam(ratios), 4)
+        flipped = natural_frequencies_hz(paper.beam(ratios), 4, coupling_sign=-1.0)
+        table.add_row(
+            label,
+            *(" ".join(f"{f:.2f}" for f in row) for row in (theirs, right, flipped)),
+            " ".join(f"{f:+.2f}" for f in theirs - flipped),
+        )
+
+    for scenario in scenarios:
+        theirs = np.array(printed["bridge_by_scenario"][str(scenario)])
+        add(str(scenario), theirs, paper.scenario_ratios(scenario))
+        if scenario == 12:
+            add("12 with 0.2", theirs, np.array([1, 1, 1, 1, 1, 1, 0.2]))
+    CONSOLE.print(table)
+    truck = " ".join(f"{f:.2f}" for f in vehicle_frequencies_hz(paper.TRUCK))
+    listed = " ".join(f"{f:.2f}" for f in printed["vehicle"])
+    CONSOLE.print(f"vehicle: {listed} in Table 5, {truck} of Table 1's truck")
+
+
+COMMANDS = {
+    "step": (step, "1,6,12"),
+    "road": (road, "1,6,12"),
+    "length": (length, "1,6,12"),
+    "starts": (starts, "1,2,3,4,5,6,7,8,9,10,11,12"),
+    "mesh": (mesh, "1,6"),
+    "frequencies": (frequencies, "1,2,3,4,5,6,7,8,9,10,11,12"),
+}
+
+
+def main() -> None:
+    """Parse the arguments and run one measurement."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=COMMANDS)
+    parser.add_argument("--scenarios", default=None)
+    options = parser.parse_args()
+    command, usual = COMMANDS[options.what]
+    command(tuple(int(part) for part in (options.scenarios or usual).split(",")))
+
+
+if __name__ == "__main__":
+    main()
