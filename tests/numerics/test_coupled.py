@@ -77,7 +77,7 @@ def test_coupled_system_is_of_second_order_in_time(measured: Agree) -> None:
     errors = np.array([np.abs(final(float(h)) - exact) for h in steps])
     for i, name in enumerate(("z_s1", "z_s2", "z_u1", "z_u2", "midspan")):
         order = float(np.polyfit(np.log(steps), np.log(errors[:, i]), 1)[0])
-        measured(f"order in time of the coupled system, {name}", 2.0, order, 0.2)
+        measured(f"order in time of the coupled system: {name}", 2.0, order, 0.2)
 
 
 def energy_error(step_s: float, car: HalfCar) -> float:
@@ -160,8 +160,8 @@ def test_energy_balance(kind: str, measured: Agree) -> None:
     steps = np.array([0.002, 0.001, 0.0005, 0.00025])
     errors = [energy_error(float(h), car) for h in steps]
     order = float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
-    measured(f"energy imbalance relative to the work at 0.25 ms, {kind}", 0.0, errors[-1], 2e-4)
-    measured(f"order of the energy imbalance, {kind}", 2.0, order, 0.25)
+    measured(f"energy imbalance at 0.25 ms, relative to the work: {kind}", 0.0, errors[-1], 2e-4)
+    measured(f"order of the energy imbalance: {kind}", 2.0, order, 0.25)
 
 
 def test_driving_back_over_the_mirrored_bridge_feels_the_same() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 
 from pre_core.bridge import Beam, interpolation_matrix, modes, natural_frequencies_hz, uniform_beam
 from pre_core.newmark import newmark_modal
@@ -56,7 +57,7 @@ def test_moving_sprung_mass(sprung_by: str, known_answers: dict[str, Any], agree
     """20 elements, 0.5 ms, all 40 modes; g of the file.
 
     The half-car becomes the single sprung mass twice: as the body on its suspension (axle of a
-    millionth of the mass, tyre 1000 times as stiff: 0.1 % softer springs at most) and, exactly but
+    millionth of the mass, tyre 1000 times as stiff: a 0.1 % softer spring) and, exactly but
     for a millionth of the mass, as the axle on its tyre.
     """
     case = known_answers["moving_sprung_mass"]
@@ -80,12 +81,73 @@ def test_moving_sprung_mass(sprung_by: str, known_answers: dict[str, Any], agree
         car, beam, case["vehicle"]["speed_m_per_s"], case["vehicle"]["g"], step_s
     )
     expect, tolerance = case["expect"], case["tolerance_relative"]
-    agree("sprung mass: f_1, Hz", expect["f1_hz"], float(natural_frequencies_hz(beam)[0]), 2e-5)
+    agree(
+        "sprung mass, beam: f_1, Hz", expect["f1_hz"], float(natural_frequencies_hz(beam)[0]), 2e-5
+    )
     agree(f"sprung mass on its {sprung_by}: peak, m", expect["midspan_min_m"], y.min(), tolerance)
     assert step_s * y.argmin() == pytest.approx(expect["at_s"], abs=0.002)
     for at, value in expect["midspan_m_at_s"].items():
         ours = float(y[round(float(at) / step_s)])
         agree(f"sprung mass on its {sprung_by}: at {at} s, m", value, ours, tolerance)
+
+
+def sprung_mass_in_sine_modes(case: dict[str, Any], times: FloatArray) -> FloatArray:
+    """Midspan deflection of the same problem by analytic modes and an adaptive Runge-Kutta method
+    of order 8: no finite elements, no Newmark, no iteration between two systems. 8 modes move, the
+    next 52 (from 332 Hz on) follow the force without inertia."""
+    span, speed, g = case["beam"]["span_m"], case["vehicle"]["speed_m_per_s"], case["vehicle"]["g"]
+    rho = case["beam"]["mass_per_length_kg_per_m"]
+    mass, spring = case["vehicle"]["sprung_mass_kg"], case["vehicle"]["stiffness_n_per_m"]
+    i = np.arange(1, 61)
+    eigenvalues = (i * np.pi / span) ** 4 * case["beam"]["E_pa"] * case["beam"]["I_m4"] / rho
+    stiff = 2.0 / (rho * span * eigenvalues[8:])
+
+    def tyre(t: float, state: FloatArray) -> tuple[float, FloatArray]:
+        """Force beyond the weight, from y = S - f (m g + F) and F = k (y - z); mode shapes."""
+        shape = np.sin(i * np.pi * speed * t / span)
+        flexibility = stiff @ shape[8:] ** 2
+        free = shape[:8] @ state[:8] - flexibility * mass * g
+        return spring * (free - state[16]) / (1.0 + flexibility * spring), shape
+
+    def rates(t: float, state: FloatArray) -> FloatArray:
+        force, shape = tyre(t, state)
+        bridge = -2.0 / (rho * span) * shape[:8] * (mass * g + force) - eigenvalues[:8] * state[:8]
+        return np.concatenate([state[8:16], bridge, [state[17], force / mass]])
+
+    run = solve_ivp(
+        rates, (0.0, span / speed), np.zeros(18), "DOP853", t_eval=times, rtol=1e-8, atol=1e-13
+    )
+    middle = np.sin(0.5 * np.pi * i)
+    result = []
+    for t, state in zip(times, run.y.T, strict=True):
+        force, shape = tyre(t, state)
+        followed = -(stiff * middle[8:]) @ shape[8:] * (mass * g + force)
+        result.append(float(middle[:8] @ state[:8] + followed))
+    return np.array(result)
+
+
+def test_moving_sprung_mass_against_an_independent_solution(
+    known_answers: dict[str, Any], agree: Agree
+) -> None:
+    """20 elements, 0.1 ms. Ten times tighter than the published numbers allow: that at 0.90 s lies
+    0.11 % beside the converged solution, on which ours and this one agree."""
+    case = known_answers["moving_sprung_mass"]
+    rigidity = case["beam"]["E_pa"] * case["beam"]["I_m4"]
+    beam = uniform_beam(
+        case["beam"]["span_m"], [rigidity] * 20, case["beam"]["mass_per_length_kg_per_m"], 0.0, 0.0
+    )
+    mass, spring = case["vehicle"]["sprung_mass_kg"], case["vehicle"]["stiffness_n_per_m"]
+    car = one_axle(1e-6 * mass, mass, 1e-3 * spring, spring)
+    step_s = 0.0001
+    y = midspan_of_sprung_mass(
+        car, beam, case["vehicle"]["speed_m_per_s"], case["vehicle"]["g"], step_s
+    )
+    times = [*(float(at) for at in case["expect"]["midspan_m_at_s"]), case["expect"]["at_s"]]
+    times.sort()
+    series = sprung_mass_in_sine_modes(case, np.array(times))
+    for at, known in zip(times, series, strict=True):
+        ours = float(y[round(at / step_s)])
+        agree(f"sprung mass against sine modes: at {at:g} s, m", float(known), ours, 1e-4)
 
 
 def force_on_beam(beam: Beam, force_n: float, speed: float, steps: int) -> FloatArray:
@@ -135,16 +197,21 @@ def test_moving_force(speed: str, known_answers: dict[str, Any], agree: Agree) -
     expect, tolerance = case["expect"], case["tolerance_relative"]
     if v == case["speed_m_per_s"]:
         agree(
-            "moving force: f_1, Hz", expect["f1_hz"], float(natural_frequencies_hz(beam)[0]), 2e-5
+            "moving force, beam: f_1, Hz",
+            expect["f1_hz"],
+            float(natural_frequencies_hz(beam)[0]),
+            2e-5,
         )
         agree("moving force: peak, m", expect["midspan_peak_m"], y.max(), tolerance)
         assert t[y.argmax()] == pytest.approx(expect["at_s"], abs=0.002)
         amplification = expect["dynamic_amplification"]
     else:
         amplification = expect["dynamic_amplification_by_speed"][speed]
-    agree(f"moving force at {speed} m/s: amplification", amplification, y.max() / static, tolerance)
     agree(
-        f"moving force at {speed} m/s: amplification, against the series",
+        f"moving force, amplification: at {speed} m/s", amplification, y.max() / static, tolerance
+    )
+    agree(
+        f"moving force, amplification against the series: at {speed} m/s",
         series.max() / static,
         y.max() / static,
         2e-4,

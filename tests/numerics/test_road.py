@@ -126,7 +126,7 @@ def test_classes_match_the_standard(known_answers: dict[str, Any], agree: Agree)
     table = known_answers["iso_8608"]
     for name, known in table["geometric_mean_Gd_n0_m3"].items():
         assert iso_8608_class(known) == name
-        agree(f"ISO 8608 class {name}: G_d(n_0), m^3", known, GEOMETRIC_MEAN_M3[name], 1e-12)
+        agree(f"ISO 8608, G_d(n_0): class {name}, m^3", known, GEOMETRIC_MEAN_M3[name], 1e-12)
     limit = table["upper_limit_of_A_m3"]
     assert iso_8608_class(0.999 * limit) == "A"
     assert iso_8608_class(1.001 * limit) == "B"
