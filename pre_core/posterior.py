@@ -1,0 +1,202 @@
+"""Method `pre`: the whitened likelihood of one crossing with its priors, and its optimum.
+
+All unknowns are put into coordinates y in which their prior is a standard normal (docs/method.md):
+logarithms of positive quantities, multiples of the prior's spread for the others. The trajectory's
+spline coefficients have no prior of their own; the receiver's fixes take its place. The sum of
+squares of all rows is then -2 log posterior up to a constant, and its Gauss-Newton curvature the
+precision of the Gaussian that the Markov chain starts from.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import qr, solve_triangular
+
+from pre_core.pre_model import Crossing, Points, Work, evaluate
+from pre_core.whitening import RowFilter, Whitener, filtered, whiten
+
+FloatArray = NDArray[np.float64]
+
+CHANNELS = 4
+# Three directions in which four gains differ; what is common to all is a scale error that no
+# residual shows.
+_CONTRASTS = np.array(
+    [[0.5, 0.5, -0.5, -0.5], [0.5, -0.5, 0.5, -0.5], [0.5, -0.5, -0.5, 0.5]], dtype=np.float64
+)
+_INITIAL_SPREAD = np.array([0.1, 0.1, 0.1])  # m, m/s, m/s²: wide; they are nuisances
+_JERK_M_PER_S3 = 1.0
+
+
+class Priors(NamedTuple):
+    """What is known before the crossing; relative spreads are those of a log-normal."""
+
+    theta: FloatArray  # (p,) nominal values
+    spread: FloatArray  # (p,) relative; of the two support springs absolute (half-normal at zero)
+    wheelbase_m: float
+    wheelbase_spread: float
+    gain_spread: float
+    delay_spread_s: float
+
+
+class Fixes(NamedTuple):
+    """The receiver's fixes near the crossing, of the front axle's chainage; (m,) each."""
+
+    time_s: FloatArray
+    position_m: FloatArray
+    velocity_m_per_s: FloatArray
+    position_noise_m: float
+    speed_noise_m_per_s: float
+    offset_spread_m: float
+    """Slow error and latency together: common to all fixes."""
+
+
+class Problem(NamedTuple):
+    """Everything that stays the same during a search."""
+
+    crossing: Crossing
+    priors: Priors
+    rows: RowFilter
+    noise: Whitener
+    basis_position: FloatArray  # (n, b): trajectory = basis @ coefficients
+    basis_acceleration: FloatArray  # (n, b), positive when speeding up
+    receiver_rows: FloatArray  # (r, b + 1): rows of (coefficients, offset)
+    receiver_values: FloatArray  # (r,)
+    estimated: NDArray[np.bool_]  # (p,) which of theta are unknown
+    works: tuple[Work, ...]
+
+
+class Layout(NamedTuple):
+    """Places of the groups of unknowns in y."""
+
+    theta: slice
+    wheelbase: int
+    gains: slice
+    delays: slice
+    initial: slice
+    trajectory: slice
+    offset: int
+    size: int
+
+
+def layout(problem: Problem) -> Layout:
+    """Order: theta (only what is estimated), wheelbase, gains, delays, initial states, trajectory."""
+    t = int(problem.estimated.sum())
+    gains = slice(t + 1, t + 4)
+    delays = slice(gains.stop, gains.stop + CHANNELS)
+    initial = slice(delays.stop, delays.stop + 3 * CHANNELS)
+    trajectory = slice(initial.stop, initial.stop + problem.basis_position.shape[1])
+    return Layout(
+        slice(0, t), t, gains, delays, initial, trajectory, trajectory.stop, trajectory.stop + 1
+    )
+
+
+def trajectory_basis(
+    fixes: Fixes, start_s: float, step_s: float, count: int, direction: int, knot_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Spline basis at the samples, the receiver's rows, and the coefficients that fit them best.
+
+    Returns (n, b) positions, (n, b) accelerations, (r, b + 1), (r,) and (b + 1,).
+    """
+    degree = 3
+    time = start_s + step_s * np.arange(count, dtype=np.float64)
+    first = min(float(time[0]), float(fixes.time_s[0]))
+    last = max(float(time[-1]), float(fixes.time_s[-1]))
+    spans = max(2, round((last - first) / knot_s))
+    inner = np.linspace(first, last, spans + 1)
+    knots = np.concatenate([np.full(degree, first), inner, np.full(degree, last)])
+    b = knots.size - degree - 1
+    spline = BSpline(knots, np.eye(b), degree)
+    middles = 0.5 * (inner[1:] + inner[:-1])
+    jerk = spline.derivative(3)(middles) * np.sqrt(np.diff(inner))[:, None] / _JERK_M_PER_S3
+    position = spline(fixes.time_s) / fixes.position_noise_m
+    velocity = spline.derivative()(fixes.time_s) / fixes.speed_noise_m_per_s
+    rows = np.zeros((position.shape[0] + velocity.shape[0] + jerk.shape[0] + 1, b + 1))
+    m = fixes.time_s.size
+    rows[:m, :b] = position
+    rows[:m, b] = 1.0 / fixes.position_noise_m
+    rows[m : 2 * m, :b] = velocity
+    rows[2 * m : -1, :b] = jerk
+    rows[-1, b] = 1.0 / fixes.offset_spread_m
+    values = np.concatenate(
+        [
+            fixes.position_m / fixes.position_noise_m,
+            fixes.velocity_m_per_s / fixes.speed_noise_m_per_s,
+            np.zeros(jerk.shape[0] + 1),
+        ]
+    )
+    best = np.linalg.lstsq(rows, values, rcond=None)[0]
+    acceleration = direction * spline.derivative(2)(time)
+    return np.asarray(spline(time)), np.asarray(acceleration), rows, values, best
+
+
+def points(problem: Problem, y: FloatArray) -> Points:
+    """What the points y (k, size) mean."""
+    where = layout(problem)
+    priors = problem.priors
+    k = y.shape[0]
+    p = priors.theta.size
+    theta = np.repeat(priors.theta[None, :], k, axis=0)
+    springs = np.zeros(p, dtype=bool)
+    springs[-2:] = True
+    logs = np.flatnonzero(problem.estimated & ~springs)
+    values = np.zeros((k, p))
+    values[:, problem.estimated] = y[:, where.theta]
+    theta[:, logs] = priors.theta[logs] * np.exp(priors.spread[logs] * values[:, logs])
+    spring = np.flatnonzero(problem.estimated & springs)
+    theta[:, spring] = priors.spread[spring] * values[:, spring]
+    coefficients = y[:, where.trajectory]
+    return Points(
+        theta,
+        priors.wheelbase_m * np.exp(priors.wheelbase_spread * y[:, where.wheelbase]),
+        coefficients @ problem.basis_position.T,
+        coefficients @ problem.basis_acceleration.T,
+        priors.gain_spread * (y[:, where.gains] @ _CONTRASTS),
+        priors.delay_spread_s * y[:, where.delays],
+        (y[:, where.initial].reshape(k, CHANNELS, 3) * _INITIAL_SPREAD),
+    )
+
+
+def data_rows(problem: Problem, y: FloatArray) -> FloatArray:
+    """White rows (k, 3 m) of the data alone."""
+    residuals = evaluate(problem.crossing, problem.works, points(problem, y))
+    return whiten(problem.noise, filtered(problem.rows, residuals))
+
+
+def all_rows(problem: Problem, y: FloatArray) -> FloatArray:
+    """Rows of data, receiver and priors: their squares sum to -2 log posterior + constant."""
+    where = layout(problem)
+    receiver = y[:, where.trajectory.start : where.offset + 1] @ problem.receiver_rows.T
+    return np.concatenate(
+        [
+            data_rows(problem, y),
+            receiver - problem.receiver_values,
+            y[:, : where.trajectory.start],
+        ],
+        axis=1,
+    )
+
+
+def start(problem: Problem, trajectory: FloatArray) -> FloatArray:
+    """Coordinates of the nominal values and of a trajectory (b + 1,)."""
+    where = layout(problem)
+    y = np.zeros(where.size)
+    y[where.trajectory.start :] = trajectory
+    if problem.estimated[-1]:
+        y[where.theta.stop - 2 : where.theta.stop] = 0.0
+    return y
+
+
+def precision_root(jacobian: FloatArray) -> FloatArray:
+    """Upper triangle R (f, f) with R'R the Gauss-Newton precision of y."""
+    (r,) = qr(jacobian, mode="r")
+    f = jacobian.shape[1]
+    signs = np.sign(np.diag(r[:f]))
+    return np.asarray(signs[:, None] * r[:f])
+
+
+def covariance(root: FloatArray) -> FloatArray:
+    """(R'R)^-1."""
+    inverse = solve_triangular(root, np.eye(root.shape[0]))
+    return np.asarray(inverse @ inverse.T)
