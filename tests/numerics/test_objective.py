@@ -71,6 +71,16 @@ def make_case(name: str, scenario: int = 6) -> Case:
         height = 1.2
         car = car._replace(cg_height_m=height)
         motion = constant_acceleration(start, direction * 9.0, 0.4, 4000, STEP_S)
+    elif "pulsing" in name:  # only here is every nuisance column independent of the others
+        t = STEP_S * np.arange(4200)
+        omega = 2.0 * np.pi / 1.7
+        car = car._replace(cg_height_m=1.2)
+        height = 1.2
+        motion = Motion(
+            start + direction * (9.5 * t + 0.1 * (1.0 - np.cos(omega * t))),
+            direction * (9.5 + 0.1 * omega * np.sin(omega * t)),
+            0.1 * omega**2 * np.cos(omega * t),
+        )
     elif "odd" in name:  # a speed at which no sample of the front falls on one of the rear
         motion = constant_speed(start, direction * 9.731, 4000, STEP_S)
     else:
@@ -260,6 +270,7 @@ CASES = [
     "back kappa springs unknown state",
     "accelerating",
     "accelerating back kappa springs unknown state and bias",
+    "pulsing unknown state and bias",
     "spline odd speed unknown state and bias",
     "spline accelerating kappa springs",
 ]
