@@ -1,0 +1,305 @@
+"""Every way to search keeps one contract, and least squares finds the truth of the paper's data.
+
+The data are the paper's own set-up: simulated with the mesh and the step that the search uses.
+"""
+
+import pickle
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from pre_core import least_squares, paper, parameters, random_walk, residual, search
+from pre_core.residual import Window
+from pre_core.search import Ending
+from services.validation import DERIVED, NAMES, paper_window, table_columns
+
+NOMINAL = parameters.from_models(paper.TRUCK, paper.beam(np.ones(paper.ELEMENTS)))
+FREE = parameters.paper_subset(paper.ELEMENTS)
+PARTICLES = 12
+
+State = Any
+Step = Callable[[State], tuple[State, Any]]
+
+
+class Method(NamedTuple):
+    """A search bound to data: `bind(window, seed, threads)` gives its init and step."""
+
+    bind: Callable[[Window, int, int], tuple[Callable[[], State], Step]]
+    steps: int  # enough to see it move
+    endings: frozenset[Ending]  # how it may end on sound data
+
+
+def bind_random_walk(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
+    bound = random_walk.problem(window, NOMINAL, FREE, seed, threads=threads)
+    return partial(random_walk.init, bound, PARTICLES), partial(random_walk.step, bound)
+
+
+def bind_least_squares(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
+    bound = least_squares.Problem(window, NOMINAL, FREE)
+    work = residual.workspace(window)
+    start = NOMINAL[FREE] * np.random.default_rng(seed).uniform(0.8, 1.2, FREE.size)
+    return (
+        partial(least_squares.init, bound, work, start),
+        partial(least_squares.step, bound, work),
+    )
+
+
+METHODS = {
+    "random_walk": Method(bind_random_walk, 30, frozenset({Ending.STEPS_EXHAUSTED})),
+    "least_squares": Method(bind_least_squares, 30, frozenset({Ending.CONVERGED})),
+}
+
+
+@pytest.fixture(params=METHODS)
+def method(request: pytest.FixtureRequest) -> Method:
+    return METHODS[request.param]
+
+
+def data_of(scenario: int) -> Window:
+    return paper_window(paper.TRUCK, paper.beam(paper.scenario_ratios(scenario)), 0.0, 0)
+
+
+@pytest.fixture(scope="module")
+def window() -> Window:
+    return data_of(6)
+
+
+def frozen(state: State) -> tuple[object, ...]:
+    """Bit for bit what a state holds."""
+    return tuple(
+        (part.shape, part.tobytes()) if isinstance(part, np.ndarray) else part for part in state
+    )
+
+
+def stored(state: State) -> State:
+    """A state as it comes back from a file."""
+    return pickle.loads(pickle.dumps(state))  # noqa: S301 - written a moment ago
+
+
+def check_pure(init: Callable[[], State], step: Step) -> None:
+    """The same state gives the same next state and the same info, and is itself left alone."""
+    first = init()
+    assert frozen(init()) == frozen(first)
+    for _ in range(3):
+        before = frozen(first)
+        following, info = step(first)
+        assert frozen(first) == before
+        again, info_again = step(stored(first))
+        assert frozen(again) == frozen(following)
+        assert info_again == info
+        first = following
+
+
+def test_a_step_follows_from_the_state_alone(method: Method, window: Window):
+    check_pure(*method.bind(window, 3, 2))
+
+
+def test_a_step_with_a_memory_is_caught(window: Window):
+    init, step = bind_random_walk(window, 3, 2)
+    generator = np.random.default_rng(0)
+
+    def remembers(state: random_walk.State) -> tuple[random_walk.State, random_walk.Info]:
+        following, info = step(state)
+        return following._replace(ratios=following.ratios * generator.uniform()), info
+
+    with pytest.raises(AssertionError):
+        check_pure(init, remembers)
+
+
+def test_a_step_that_changes_its_argument_is_caught(window: Window):
+    init, step = bind_random_walk(window, 3, 2)
+
+    def scribbles(state: random_walk.State) -> tuple[random_walk.State, random_walk.Info]:
+        state.ratios[0] = 1.0
+        return step(state)
+
+    with pytest.raises(AssertionError):
+        check_pure(init, scribbles)
+
+
+def test_the_seed_decides(method: Method, window: Window):
+    ends = [
+        frozen(search.run(*method.bind(window, seed, 2), method.steps)[0]) for seed in (5, 5, 6)
+    ]
+    assert ends[0] == ends[1]
+    assert ends[0] != ends[2]
+
+
+def test_the_number_of_threads_changes_nothing(method: Method, window: Window):
+    ends = {
+        frozen(search.run(*method.bind(window, 5, threads), method.steps)[0])
+        for threads in (1, 2, 3)
+    }
+    assert len(ends) == 1
+
+
+def test_a_stopped_and_resumed_search_is_the_uninterrupted_one(method: Method, window: Window):
+    init, step = method.bind(window, 2, 2)
+    whole, infos, _ = search.run(init, step, 6)
+    half, first_infos, _ = search.run(init, step, 2)
+    _, other_step = method.bind(window, 2, 2)  # as a new process would
+    resumed, last_infos, _ = search.run(lambda: stored(half), other_step, 4)
+    assert frozen(resumed) == frozen(whole)
+    assert first_infos + last_infos == infos
+
+
+def test_the_objective_never_grows(method: Method, window: Window):
+    init, step = method.bind(window, 7, 2)
+    state = init()
+    objective = [float(np.min(state.objective))]
+    for _ in range(method.steps):
+        state, info = step(state)
+        objective.append(info.objective)
+        if info.ending is not None:
+            break
+    assert np.all(np.diff(objective) <= 0.0)
+    assert objective[-1] < objective[0]
+
+
+def test_sound_data_end_as_announced(method: Method, window: Window):
+    _, infos, ending = search.run(*method.bind(window, 1, 2), method.steps)
+    assert ending in method.endings
+    assert len(infos) <= method.steps
+    assert all(info.ending is None for info in infos[:-1])
+
+
+def test_too_few_steps_are_an_ending_of_their_own(method: Method, window: Window):
+    init, step = method.bind(window, 1, 2)
+    assert search.run(init, step, 1)[2] is Ending.STEPS_EXHAUSTED
+    assert search.run(init, step, 1, at_the_end=Ending.STEPS_DONE)[2] is Ending.STEPS_DONE
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+def test_an_objective_that_is_not_finite_is_an_ending_not_an_exception(
+    method: Method, window: Window, poison: float
+):
+    broken = window._replace(acceleration=np.full_like(window.acceleration, poison))
+    _, infos, ending = search.run(*method.bind(broken, 1, 2), method.steps)
+    assert ending is Ending.NOT_FINITE
+    assert len(infos) == 1
+
+
+def test_progress_is_told_once_a_step(method: Method, window: Window):
+    told = []
+    _, infos, _ = search.run(
+        *method.bind(window, 1, 2), 3, progress=lambda count, info: told.append((count, info))
+    )
+    assert told == list(enumerate(infos, start=1))
+
+
+def test_every_ending_is_a_sentence():
+    assert all(ending.value.endswith(".") and ending.value[0].isupper() for ending in Ending)
+    assert len({ending.value for ending in Ending}) == len(Ending)
+
+
+def test_a_kink_leaves_least_squares_stuck():
+    state = least_squares.begin(lambda y: 1.0 + np.abs(y), np.zeros(1))
+    assert least_squares.descend(lambda y: 1.0 + np.abs(y), state)[1].ending is Ending.STUCK
+
+
+# The random walk
+
+
+def test_no_particle_of_the_random_walk_ever_climbs(window: Window):
+    init, step = bind_random_walk(window, 9, 2)
+    state = init()
+    moved = np.zeros(PARTICLES, dtype=bool)
+    for count in range(1, 41):
+        following, info = step(state)
+        assert np.all(following.objective <= state.objective)
+        stayed = np.all(following.ratios == state.ratios, axis=1)
+        assert info.acceptance == pytest.approx(np.mean(~stayed))
+        assert np.all(following.objective[stayed] == state.objective[stayed])
+        moved |= ~stayed
+        assert following.steps == count
+        state = following
+    assert moved.all()
+
+
+def test_the_random_walk_begins_in_the_papers_prior(window: Window):
+    bound = random_walk.problem(window, NOMINAL, FREE, 0)
+    ratios = random_walk.init(bound, 2000).ratios
+    assert ratios.shape == (2000, 19)
+    assert 0.8 <= ratios.min() < 0.801
+    assert 1.199 < ratios.max() <= 1.2
+    # The mean of 2000 uniform numbers of this width spreads by 0.0026.
+    assert np.abs(ratios.mean(axis=0) - 1.0).max() < 5 * 0.4 / np.sqrt(12 * 2000)
+
+
+def test_the_particles_objective_is_their_own(window: Window):
+    """Early stopping of an evaluation must not leave a wrong J with an accepted particle."""
+    init, step = bind_random_walk(window, 4, 2)
+    state, _, _ = search.run(init, step, 25)
+    theta = np.repeat(NOMINAL[None, :], PARTICLES, axis=0)
+    theta[:, FREE] *= state.ratios
+    rows = residual.residual_batch(window, residual.workspace(window), theta)
+    assert np.sum(rows**2, axis=1) == pytest.approx(state.objective, rel=1e-9)
+
+
+def test_impossible_particles_are_never_kept(window: Window):
+    """A step as large as the values themselves proposes negative masses all the time."""
+    bound = random_walk.problem(window, NOMINAL, FREE, 0, step_ratio=2.0)
+    state, _, ending = search.run(
+        partial(random_walk.init, bound, 60), partial(random_walk.step, bound), 20
+    )
+    assert ending is Ending.STEPS_EXHAUSTED
+    assert np.all(state.ratios > 0.0)
+    assert np.all(state.ratios[:, 0] * NOMINAL[parameters.D_1] < window.wheelbase_m)
+
+
+# Least squares
+
+
+def worst_accuracy(window: Window, truth: np.ndarray, seed: int) -> float:
+    """The smallest S_A of all twenty parameters from a random start in the paper's prior."""
+    init, step = bind_least_squares(window, seed, 1)
+    state, _, ending = search.run(init, step, least_squares.MAX_STEPS)
+    if ending is not Ending.CONVERGED:
+        return -np.inf
+    bound = least_squares.Problem(window, NOMINAL, FREE)
+    ratios = least_squares.untransform(bound, state.y)[None, :] / NOMINAL[FREE]
+    found = table_columns(ratios, nominal=NOMINAL, free=FREE, window=window)[0]
+    return float(1.0 - np.abs(found - truth).max())
+
+
+def truth_of(scenario: int) -> np.ndarray:
+    truth = np.ones(len(NAMES))
+    first = NAMES.index("EI_1")
+    truth[first : first + paper.ELEMENTS] = paper.scenario_ratios(scenario)
+    return truth
+
+
+@pytest.mark.parametrize(("scenario", "starts"), [(9, 20), (12, 5)])
+def test_least_squares_finds_everything_from_anywhere_in_the_prior(scenario: int, starts: int):
+    window = data_of(scenario)
+    accuracy = [worst_accuracy(window, truth_of(scenario), seed) for seed in range(starts)]
+    assert min(accuracy) >= 0.999
+
+
+def test_wrong_data_and_wrong_truths_are_not_called_found(window: Window):
+    """The check above must be able to fail."""
+    truth = truth_of(6)
+    assert worst_accuracy(window, truth, 0) >= 0.999
+    wrong = truth.copy()
+    wrong[NAMES.index("EI_4")] = 0.41
+    assert worst_accuracy(window, wrong, 0) < 0.999
+    inverted = window._replace(
+        acceleration=window.acceleration * np.array([[1.0], [1.0], [-1.0], [1.0]])
+    )
+    assert worst_accuracy(inverted, truth, 0) < 0.999
+    heavier = window._replace(total_mass_kg=1.02 * window.total_mass_kg)
+    assert worst_accuracy(heavier, truth, 0) < 0.999
+
+
+def test_derived_masses_follow_from_d_1_and_the_axles(window: Window):
+    ratios = np.ones((1, FREE.size))
+    ratios[0, list(FREE).index(parameters.D_1)] = 1.2
+    columns = table_columns(ratios, nominal=NOMINAL, free=FREE, window=window)[0]
+    found = dict(zip(NAMES, columns, strict=True))
+    d_1, wheelbase = 1.215, 4.4  # Table 1
+    assert found["m_s1"] == pytest.approx((wheelbase - 1.2 * d_1) / (wheelbase - d_1))
+    assert found["m_s2"] == pytest.approx(1.2)
+    assert {found[name] for name in NAMES if name not in DERIVED} == {1.0}
