@@ -1,8 +1,12 @@
 """What several tests need."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from services.simulation import Drive
 
 PROJECT = Path(__file__).parents[1]
 
@@ -26,3 +30,12 @@ def shared() -> Path:
 def csv_example() -> Path:
     """A small folder with accel_00.csv, gps_00.csv and site.toml (tests/data)."""
     return PROJECT / "tests" / "data" / "csv_example"
+
+
+@pytest.fixture(scope="session")
+def scenario_6() -> "Drive":
+    """A crossing of the paper's scenario 6: fine mesh of 70 elements, 0.1 ms, no noise."""
+    from pre_core.paper import scenario_ratios
+    from services.simulation import paper_site, simulate_drive
+
+    return simulate_drive(paper_site(), scenario_ratios(6), road_class="A", seed=1)

@@ -84,14 +84,13 @@ def find_stays(
     side = np.where(depth > 0.0, 0, np.where(low > 0.5 * span_m, 1, -1))
     places = _Places(front, rear, depth, side, sense)
     stays: list[Stay] = []
-    n = 0
-    while n < time_s.size:
-        stop = n
-        if depth[n] > 0.0:
-            while stop < time_s.size and depth[stop] > -margin_m:
-                stop += 1
-        jumped = n > 0 and stop == n and side[n - 1] * side[n] == -1  # the receiver was out
-        if stop > n or jumped:
+    # Where the truck comes onto the bridge, or jumps over it because the receiver was out.
+    begins = np.flatnonzero((depth > 0.0) | (np.diff(side, prepend=side[0]) * side == 2))
+    gone = np.append(np.flatnonzero(depth <= -margin_m), time_s.size)
+    stop = 0
+    for n in begins.tolist():
+        if n >= stop:
+            stop = int(gone[np.searchsorted(gone, n)]) if depth[n] > 0.0 else n
             stay = _stay(time_s, places, n, stop, span_m, margin_m)
             deep_m = np.inf
             if stay.passage is not Passage.THROUGH:
@@ -103,7 +102,6 @@ def find_stays(
             was_on_it = deep_m >= min(margin_m, 0.25 * (span_m + wheelbase_m))
             if was_on_it and _is_near(lateral_m, places, n, stop, stay):
                 stays.append(stay)
-        n = max(stop, n + 1)
     return _merged(stays)
 
 

@@ -67,6 +67,9 @@ class Boot:
         self._waiting: dict[int, GnssFix] = {}
         """Those that came before one that is missing."""
         self._next_fix = 0
+        self._fresh: list[GnssFix] = []
+        self._columns: Floats = np.empty((4, 0))
+        """Known fixes as `fixes` gives them, but for the fresh ones: thousands, asked for often."""
         self._forgotten_ns = -1
         self._channels: set[str] = set()
 
@@ -82,6 +85,7 @@ class Boot:
             self._waiting.setdefault(fix.sequence, fix)
         elif fix.device_time_ns >= self._forgotten_ns and fix.sequence not in dict(self._fixes):
             insort(self._fixes, (fix.sequence, fix))
+            self._fresh.append(fix)
 
     def settle(self, *, all_there_is: bool = False) -> Iterator[GnssFix]:
         """Make fixes known to `fixes` one by one, in their order, and yield them.
@@ -98,6 +102,7 @@ class Boot:
             fix = self._waiting.pop(sequence)
             self._next_fix = sequence + 1
             self._fixes.append((sequence, fix))
+            self._fresh.append(fix)
             yield fix
 
     def forget_before(self, time_s: float) -> None:
@@ -107,6 +112,8 @@ class Boot:
         for sequence in [s for s, b in self._batches.items() if b.device_time_ns < limit_ns]:
             del self._batches[sequence]
         self._fixes = [(s, f) for s, f in self._fixes if f.device_time_ns >= limit_ns]
+        known_s = self.fixes().time_s
+        self._columns = np.ascontiguousarray(self._columns[:, known_s >= limit_ns / _NS_PER_S])
 
     def latest_accel_s(self) -> float:
         """Time after the last sample that has come; -inf without any."""
@@ -149,18 +156,18 @@ class Boot:
 
     def fixes(self) -> Fixes:
         """All settled fixes in order of time."""
-        rows = sorted(
-            (
-                fix.device_time_ns / _NS_PER_S,
-                fix.latitude_deg,
-                fix.longitude_deg,
-                fix.speed_m_per_s,
-            )
-            for _, fix in self._fixes
-        )
-        columns = np.array(rows, dtype=np.float64).reshape(-1, 4).T
-        kept = np.concatenate([[True], np.diff(columns[0]) > 0.0])[: columns.shape[1]]
-        return Fixes(*(np.ascontiguousarray(column[kept]) for column in columns))
+        if self._fresh:
+            rows = [
+                (f.device_time_ns / _NS_PER_S, f.latitude_deg, f.longitude_deg, f.speed_m_per_s)
+                for f in self._fresh
+            ]
+            self._fresh.clear()
+            columns = np.concatenate([self._columns, np.array(rows).T], axis=1)
+            if np.any(np.diff(columns[0]) <= 0.0):
+                columns = columns[:, np.lexsort(columns[::-1])]
+                columns = columns[:, np.concatenate([[True], np.diff(columns[0]) > 0.0])]
+            self._columns = np.ascontiguousarray(columns)
+        return Fixes(*self._columns)
 
     def samples(self, start_s: float, stop_s: float) -> Samples | None:
         """Samples from `start` to `stop`, on the grid of the fastest channel.
