@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
@@ -12,12 +13,17 @@ help: ## list the commands
 
 install: $(STAMP) ## make .venv from pinned, hashed requirements
 
-$(STAMP): requirements/dev.txt pyproject.toml
+$(PACKAGES): requirements/dev.txt pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed; set PYTHON=…")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/dev.txt
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --no-index -e .
-	touch $@
+	@touch $@
+
+# numba inlines kernels of one file into another's and would not see that they have changed.
+$(STAMP): $(PACKAGES) $(wildcard pre_core/*.py)
+	@$(BIN)/python -m services.precompile || true
+	@touch $@
 
 demo: $(STAMP) ## a truck crosses a bridge: simulated, recorded, identified, drawn
 	$(BIN)/driveby demo
@@ -34,8 +40,8 @@ lint: $(STAMP) ## format, lint, types and import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(STAMP) ## timings of the kernels, with their peers
-	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only -o timeout=0
+bench: $(STAMP) ## time everything, with its peers, into docs/benchmarks.md (12 minutes)
+	$(BIN)/python -m tests.benchmarks.report
 
 lock: ## write the pinned requirements anew (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate pyproject.toml -o requirements/runtime.txt

@@ -1,0 +1,159 @@
+"""What a user waits for and pays: starts of the commands, memory, parts of an identification.
+
+Everything is measured in processes of their own, after one run that fills the caches.
+"""
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+PROJECT = Path(__file__).parents[2]
+
+_MEMORY = """
+import json, resource
+from functools import partial
+from pathlib import Path
+
+def peak_bytes():
+    # ru_maxrss of a child begins at its parent's peak on Linux; VmHWM is this program's own.
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM"):
+                return 1024 * int(line.split()[1])
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+bare = peak_bytes()
+from pre_core import random_walk, search
+from tests.benchmarks import cases
+walk = random_walk.problem(cases.paper_window(6), cases.NOMINAL, cases.FREE, seed=1)
+random_walk.step(walk, random_walk.init(walk, 8))
+before = peak_bytes()
+search.run(
+    partial(random_walk.init, walk), partial(random_walk.step, walk), random_walk.STEPS,
+    at_the_end=search.Ending.STEPS_DONE,
+)
+print(json.dumps({"interpreter": bare, "before": before, "whole": peak_bytes()}))
+"""
+
+_IDENTIFY = """
+import cProfile, json, pstats, sys, time
+from pathlib import Path
+began = time.perf_counter()
+from schemas.settings import IdentificationSettings
+from services.identify import identify_recordings, site_of
+imported = time.perf_counter()
+recordings = [Path(sys.argv[1])]
+settings = IdentificationSettings.model_validate({"method": "least_squares", "seed": 0})
+
+def work():
+    begin = time.perf_counter()
+    identify_recordings(recordings, site_of(recordings, None), settings)
+    return time.perf_counter() - begin
+
+first = work()
+again = [work() for _ in range(5)]
+profile = cProfile.Profile()
+profile.enable()
+work()
+profile.disable()
+own = {}
+for (file, _, name), (_, _, seconds, _, _) in pstats.Stats(profile).stats.items():
+    own[f"{file}:{name}"] = own.get(f"{file}:{name}", 0.0) + seconds
+print(json.dumps({"imports": imported - began, "first": first, "again": again, "own": own}))
+"""
+
+
+def _python(*arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=PROJECT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_memory_of_the_search(benchmark: BenchmarkFixture):
+    _python("-c", _MEMORY.replace("random_walk.STEPS", "2"))
+    output = benchmark.pedantic(lambda: _python("-c", _MEMORY), rounds=1)
+    benchmark.extra_info |= json.loads(output)
+
+
+def test_start_of_help(benchmark: BenchmarkFixture):
+    program = Path(sys.executable).with_name("driveby")
+    command = [str(program)] if program.exists() else [sys.executable, "-m", "services"]
+
+    def start() -> None:
+        subprocess.run([*command, "--help"], cwd=PROJECT, capture_output=True, check=True)
+
+    benchmark.pedantic(start, rounds=15, warmup_rounds=2)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("identify") / "drive.mcap"
+    _python("-m", "services", "simulate", "--scenario", "6", "--road", "A", "-o", str(path))
+    return path
+
+
+def test_start_of_identify(benchmark: BenchmarkFixture, recording: Path):
+    """The command as a user runs it; what is beyond the work: that wall time less the work's."""
+    command = ["-m", "services", "identify", str(recording), "--method", "least-squares"]
+    benchmark.pedantic(lambda: _python(*command), rounds=7, warmup_rounds=1)
+    inside: dict[str, Any] = json.loads(_python("-c", _IDENTIFY, str(recording)))
+    seconds = []
+    for _ in range(7):
+        began = time.perf_counter()
+        _python("-c", "pass")
+        seconds.append(time.perf_counter() - began)
+    parts = _by_place(inside["own"])
+    benchmark.extra_info |= {
+        "python": statistics.median(seconds),
+        "imports": inside["imports"],
+        "first": inside["first"],
+        "work": statistics.median(inside["again"]),
+        "profile": parts,
+    }
+
+
+_PLACES = {
+    "the kernels of J (pre_core/residual.py)": ("pre_core/residual.py",),
+    "linear algebra of the steps (least_squares.py, SciPy, NumPy)": (
+        "pre_core/least_squares.py",
+        "scipy",
+        "numpy",
+    ),
+    "reading and decoding (MCAP, protobuf, zstd, schemas)": (
+        "mcap",
+        "google/",
+        "zstandard",
+        "schemas/signals.py",
+        "schemas/topics.py",
+        "services/common/recording.py",
+        "services/common/streams.py",
+        "struct",
+        "decompress",
+    ),
+    "the site file and the results (pydantic, TOML)": ("pydantic", "tomllib", "schemas/"),
+    "the rest of pre_core": ("pre_core/",),
+    "the rest of services": ("services/",),
+}
+
+
+def _by_place(own: dict[str, float]) -> dict[str, float]:
+    """Own seconds of every function, summed by where it is; built-ins count as Python's."""
+    parts = dict.fromkeys([*_PLACES, "Python itself"], 0.0)
+    for function, seconds in own.items():
+        for place, marks in _PLACES.items():
+            if any(mark in function for mark in marks):
+                parts[place] += seconds
+                break
+        else:
+            parts["Python itself"] += seconds
+    return parts
