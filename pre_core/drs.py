@@ -48,8 +48,9 @@ def beam_basis(
 ) -> BeamBasis:
     """Coordinates: the lowest modes of the uniform beam whose elements are cut into `parts`.
 
-    All 2 n parts of them by default, which is the finite-element model itself. With finer parts
-    and fewer coordinates the model is nearer to the true beam at the same cost.
+    All 2 n parts of them by default, which is the finite-element model itself. Fewer are quicker
+    but poor for a beam that is not uniform or has springs at its supports, whose kinked curvature
+    smooth modes do not span: f_1 of the paper's scenario 6 is 1 % off with 14 of 28.
     """
     n = element_lengths_m.size
     lengths = np.repeat(element_lengths_m / parts, parts)

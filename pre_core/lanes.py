@@ -15,7 +15,7 @@ Lanes = tuple[float, float, float, float]
 LANES = 4
 
 # Contraction allows fused multiply-add; no other reordering of the arithmetic is allowed, so that
-# results do not depend on how many particles are evaluated together.
+# results depend only to rounding on which particles are evaluated together.
 kernel = njit(fastmath={"contract", "nsz"}, error_model="numpy", cache=True, nogil=True)
 
 

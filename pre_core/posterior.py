@@ -81,7 +81,7 @@ class Layout(NamedTuple):
 
 
 def layout(problem: Problem) -> Layout:
-    """Order: theta (only what is estimated), wheelbase, gains, delays, initial states, trajectory."""
+    """Order: theta (what is estimated), wheelbase, gains, delays, initial states, trajectory."""
     t = int(problem.estimated.sum())
     gains = slice(t + 1, t + 4)
     delays = slice(gains.stop, gains.stop + CHANNELS)

@@ -128,15 +128,16 @@ def build_window(
     rear = rear_position_m(front, wheelbase_m, direction)
     travel_front = front if direction > 0 else span - front
     travel_rear = travel_front - wheelbase_m
-    if np.any(np.diff(travel_front) <= 0.0):
-        raise WindowError("the truck stops or turns round within the samples of the crossing")
-    entry = int(np.searchsorted(travel_front, 0.0))
-    leave = int(np.searchsorted(travel_rear, span, side="right"))
+    # The first passage only: before and after it the truck may do as it likes.
+    entry = int(np.argmax(travel_front >= 0.0))
+    leave = int(np.argmax(travel_rear > span))
     if entry < _STENCIL:
         raise WindowError("the samples begin after the front axle has entered the bridge")
-    if leave >= front.size:
+    if travel_rear[leave] <= span:
         raise WindowError("the samples end before the rear axle has left the bridge")
     begin = entry - _STENCIL
+    if np.any(np.diff(travel_front[begin : leave + 1]) <= 0.0):
+        raise WindowError("the truck stops or turns round during the crossing")
     if initial_state_known:
         signals = iep_signals(acceleration_m_per_s2, step_s, integrate)[:, :, begin : leave + 1]
     else:
@@ -145,7 +146,7 @@ def build_window(
     basis = beam_basis(element_lengths_m, parts, coordinates)
     element, place = locate(basis.lengths_m, np.stack([front[part], rear[part]]))
 
-    first_row = int(np.searchsorted(travel_rear, 0.0)) - begin
+    first_row = int(np.argmax(travel_rear >= 0.0)) - begin
     rows = slice(first_row + begin, leave)
     base, weight = _cubic_weights(travel_front[part], travel_rear[rows])
     if np.any(base + 3 >= np.arange(rows.start, rows.stop) - begin):
