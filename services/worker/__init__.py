@@ -196,8 +196,8 @@ def run(
     if file.exists():
         raise InputError(f"{file}: exists, and results are never overwritten; give another name")
     files = _ResultFiles(file, text, header)
-    warm_up()
     with stopped_by_signals() as stop, contextlib.ExitStack() as stack:
+        warm_up()
         bus = _connected(endpoint, stop)
         if bus is None:
             return 0

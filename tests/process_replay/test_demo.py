@@ -1,0 +1,205 @@
+"""`driveby demo`, as a newcomer runs it: what it prints, what it leaves, how it fails."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from rerun.chunk import RrdReader
+
+from schemas.results import load_results
+from schemas.signals import CHANNELS, decode_accel
+from services import cli
+from services.common.recording import read_info, read_messages
+from services.common.runs import run_to_messages
+from services.simulation import Drive, paper_site
+
+pytestmark = pytest.mark.process
+
+FILES = ["demo.png", "demo.rrd", "recording.mcap", "results.json", "results.mcap"]
+
+
+class Demo(NamedTuple):
+    folder: Path
+    code: int
+    out: str
+    err: str
+
+
+def command(folder: Path) -> list[str]:
+    return [sys.executable, "-m", "services", "demo", "--out", str(folder), "--speed", "8"]
+
+
+def processes_of(folder: Path) -> dict[int, str]:
+    """Ids and command lines of the processes that were started for a demo."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except OSError:  # it has ended meanwhile
+                continue
+            if str(folder) in line and int(entry.name) != os.getpid():
+                found[int(entry.name)] = line
+    return found
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory, project: Path) -> Demo:
+    folder = tmp_path_factory.mktemp("demo") / "new" / "demo"
+    environment = {**os.environ, "PYTHONPATH": str(project), "COLUMNS": "120"}
+    done = subprocess.run(
+        command(folder),
+        cwd=folder.parents[1],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
+    )
+    return Demo(folder, done.returncode, done.stdout, done.stderr)
+
+
+def test_it_works(demo: Demo) -> None:
+    assert (demo.code, demo.err) == (0, "")
+    rows = re.findall(r"EI_(\d)\D+([\d.]+)\D+([\d.]+)\D+means nothing", demo.out)
+    assert [(number, float(truth)) for number, truth, _ in rows] == [
+        (str(n), 0.4 if n == 4 else 1.0) for n in range(1, 8)
+    ]
+    for _, truth, estimate in rows:
+        assert float(estimate) == pytest.approx(float(truth), rel=0.01)
+    assert all(name in demo.out for name in FILES)
+
+
+def test_the_numbers_are_those_of_the_bridge(demo: Demo) -> None:
+    found = load_results(demo.folder / "results.json")
+    (crossing,) = found.crossings
+    assert crossing.parameters is not None
+    ratios = [crossing.parameters[f"EI_{n}"].mean / 1.56e10 for n in range(1, 8)]
+    assert ratios == pytest.approx([1, 1, 1, 0.4, 1, 1, 1], rel=0.01)
+    assert (crossing.realm, crossing.vehicle, crossing.bridge) == (
+        "sim-demo",
+        "truck-1",
+        "bridge-1",
+    )
+    assert crossing.speed_m_per_s == pytest.approx(10.0, rel=1e-3)
+
+
+def test_nothing_else_is_left(demo: Demo) -> None:
+    assert sorted(path.name for path in demo.folder.iterdir()) == FILES
+    root = demo.folder.parents[1]
+    assert sorted(p.name for p in root.rglob("*") if p.is_file()) == FILES
+    assert processes_of(demo.folder) == {}
+
+
+def test_the_recording_is_what_the_truck_measured(demo: Demo, scenario_6: Drive) -> None:
+    messages = list(read_messages(demo.folder / "recording.mcap"))
+    sent = list(run_to_messages([scenario_6.run], paper_site(), "x", "truck-1"))
+    ours = [m for m in messages if m.key.owner == "vehicle"]
+    assert sorted(m.key.stream for m in ours) == sorted(m.key.stream for m in sent)
+    for one, other in zip(
+        sorted((m for m in ours if m.key.stream == "accel"), key=lambda m: m.sequence),
+        (m for m in sent if m.key.stream == "accel"),
+        strict=True,
+    ):
+        recorded, measured = decode_accel(one.payload), decode_accel(other.payload)
+        for name in CHANNELS:
+            # Another process may sum in another order: the last digit is its own.
+            np.testing.assert_allclose(
+                recorded.channels[name].samples,
+                measured.channels[name].samples,
+                rtol=0,
+                atol=1e-12,
+            )
+    # Results and progress went over the same bus.
+    streams = {m.key.stream for m in messages}
+    assert {"crossing", "estimate", "state", "health"} <= streams
+    info = read_info(demo.folder / "recording.mcap")
+    assert info.end is not None
+    assert (info.truncated, info.damaged_chunks, info.end["lost"]) == (False, 0, "0")
+    estimate = [m.payload for m in messages if m.key.stream == "estimate"]
+    results = list(read_messages(demo.folder / "results.mcap"))
+    assert [m.payload for m in results if m.key.stream == "estimate"] == estimate
+
+
+def test_the_pictures_open(demo: Demo) -> None:
+    picture = imread(demo.folder / "demo.png")
+    assert picture.shape[0] > 400
+    assert picture.shape[1] > 600
+    assert np.std(picture[..., :3]) > 0.05
+    paths = {str(chunk.entity_path) for chunk in RrdReader(demo.folder / "demo.rrd").stream()}
+    for part in ("acceleration/sprung_front", "road/front", "rigidity"):
+        assert any(part in path for path in paths), paths
+
+
+def test_its_recording_is_identified_again_to_the_same(
+    demo: Demo, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    again = tmp_path / "again.json"
+    recording = demo.folder / "recording.mcap"
+    assert cli.main(["identify", str(recording), "--json", str(again), "--seed", "0"]) == 0
+    before, after = load_results(demo.folder / "results.json"), load_results(again)
+    (one,), (other,) = before.crossings, after.crossings
+    assert one.parameters == other.parameters
+    assert (one.crossing_id, one.entry_time) == (other.crossing_id, other.entry_time)
+    assert before.site_hash == after.site_hash
+
+
+def test_a_folder_that_exists_is_left_alone(tmp_path: Path, project: Path) -> None:
+    (tmp_path / "kept").write_text("kept")
+    done = subprocess.run(
+        command(tmp_path), cwd=project, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 2
+    assert done.stderr == f"driveby: {tmp_path}: exists, the demo wants a new folder\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
+
+
+@pytest.fixture
+def running(tmp_path: Path, project: Path) -> Iterator[subprocess.Popen[str]]:
+    """A demo whose worker is about to start or has started."""
+    folder = tmp_path / "demo"
+    process = subprocess.Popen(
+        command(folder), cwd=project, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        for _ in range(600):
+            if any(" services worker " in line for line in processes_of(folder).values()):
+                break
+            time.sleep(0.1)
+            assert process.poll() is None, process.communicate()
+        else:
+            pytest.fail("the demo started no worker within 60 s")
+        yield process
+    finally:
+        for pid in (process.pid, *processes_of(folder)):
+            if pid != process.pid or process.poll() is None:
+                os.kill(pid, signal.SIGKILL)
+        process.communicate()
+
+
+def test_a_worker_that_is_killed(running: subprocess.Popen[str], tmp_path: Path) -> None:
+    folder = tmp_path / "demo"
+    (worker,) = [pid for pid, line in processes_of(folder).items() if " services worker " in line]
+    os.kill(worker, signal.SIGKILL)
+    _, err = running.communicate(timeout=60)
+    assert running.returncode == 1
+    assert re.fullmatch(r"driveby: the worker ended early: [^\n]+\n", err)
+    assert processes_of(folder) == {}
+    # What may explain it is left.
+    assert (folder / "worker.log").is_file()
+
+
+def test_a_demo_that_is_told_to_end(running: subprocess.Popen[str], tmp_path: Path) -> None:
+    running.terminate()
+    _, err = running.communicate(timeout=30)
+    assert (running.returncode, err) == (130, "driveby: interrupted\n")
+    assert processes_of(tmp_path / "demo") == {}

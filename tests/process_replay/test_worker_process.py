@@ -1,0 +1,262 @@
+"""The worker as a process: late, disturbed, stopped."""
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.results import load_results
+from schemas.signals import Identity
+from schemas.site import site_toml
+from schemas.topics import selector
+from services.common.bus import Publisher, Received, Subscription, open_session
+from services.common.geodesy import bridge_frame, to_lat_lon
+from services.common.recording import Message, read_info, read_messages
+from services.common.runs import GnssTrack, run_to_messages
+from services.simulation import Drive, paper_site
+
+pytestmark = pytest.mark.process
+
+Start = Callable[..., subprocess.Popen[str]]
+End = Callable[[subprocess.Popen[str]], None]
+Begin = Callable[[], subprocess.Popen[str]]
+REALM = "sim-worker"
+LONGEST_S = 60.0
+"""For a worker that has to compile its kernels first."""
+
+
+@pytest.fixture(scope="module")
+def drive_on(scenario_6: Drive) -> list[Message]:
+    """Scenario 6, and then half a minute of driving on: longer than the worker is patient."""
+    run, site = scenario_6.run, paper_site()
+    more = 30.0
+    rng = np.random.default_rng(2)
+    extra = run.accel_time_s[-1] + np.arange(1, round(more * run.rate_hz)) / run.rate_hz
+    fixes = run.gnss.time_s[-1] + np.arange(1, round(more * 10)) / 10.0
+    latitude, longitude = to_lat_lon(
+        bridge_frame(site.bridges[0]), 60.0 + 10.0 * (fixes - run.gnss.time_s[-1])
+    )
+    still = np.full(fixes.size, 1.0)
+    gnss = GnssTrack(
+        np.append(run.gnss.time_s, fixes),
+        np.append(run.gnss.latitude_deg, latitude),
+        np.append(run.gnss.longitude_deg, longitude),
+        np.append(run.gnss.altitude_m, 25.0 * still),
+        np.append(run.gnss.speed_m_per_s, 10.0 * still),
+        None,
+    )
+    channels = {
+        name: np.append(values, 0.1 * rng.standard_normal(extra.size))
+        for name, values in run.channels.items()
+    }
+    longer = run._replace(
+        accel_time_s=np.append(run.accel_time_s, extra), channels=channels, gnss=gnss
+    )
+    return list(run_to_messages([longer], site, REALM, "truck-1"))
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    path = tmp_path / "site.toml"
+    path.write_text(site_toml(paper_site()))
+    return path
+
+
+@pytest.fixture
+def bus(start: Start, endpoint: str, tmp_path: Path) -> Iterator[zenoh.Session]:
+    """A session of the test, behind the logger's router."""
+    start(
+        "services.logger",
+        listen=endpoint,
+        folder=tmp_path,
+        file=tmp_path / "recorded.mcap",
+        realm=None,
+        site=None,
+    )
+    with open_session(connect=endpoint, timeout_s=10.0) as session:
+        yield session
+
+
+@pytest.fixture
+def worker(
+    start: Start, endpoint: str, site: Path, tmp_path: Path
+) -> Callable[[], subprocess.Popen[str]]:
+    def begin() -> subprocess.Popen[str]:
+        return start(
+            "services.worker",
+            endpoint=endpoint,
+            realm=REALM,
+            site=site,
+            folder=tmp_path,
+            file=tmp_path / "results.mcap",
+            method="least_squares",
+            service_id="worker",
+        )
+
+    return begin
+
+
+def publish(publisher: Publisher, messages: list[Message]) -> None:
+    for message in messages:
+        identity = Identity(message.boot_id, message.sequence)
+        _, owner, identifier, stream = message.key
+        publisher.put(owner, identifier, stream, message.payload, identity)
+
+
+def until(subscription: Subscription, stream: str, timeout_s: float = LONGEST_S) -> list[Received]:
+    """Everything up to the first message of a stream."""
+    received: list[Received] = []
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        one = subscription.receive(0.2)
+        if one is not None:
+            received.append(one)
+            if one.key().stream == stream:
+                return received
+    pytest.fail(f"no {stream} within {timeout_s} s, only {[r.key_text for r in received]}")
+
+
+def after(subscription: Subscription, seconds: float) -> list[Received]:
+    received = []
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        one = subscription.receive(0.2)
+        if one is not None:
+            received.append(one)
+    return received
+
+
+def ratio_of(estimate: Received) -> float:
+    message = pb.Estimate.FromString(estimate.payload)
+    return message.parameters["EI_4"].mean / 1.56e10
+
+
+def test_a_worker_that_comes_late_gives_the_result_once(
+    bus: zenoh.Session,
+    worker: Begin,
+    terminate: End,
+    drive_on: list[Message],
+    tmp_path: Path,
+) -> None:
+    """The truck has driven and fallen silent; its publisher still has everything."""
+    with Subscription(bus, selector(REALM, "bridge")) as results:
+        publisher = Publisher(bus, REALM)
+        publish(publisher, drive_on)
+        process = worker()
+        told = until(results, "state") + after(results, 3.0)
+        publisher.close()
+        terminate(process)
+    streams = [received.key().stream for received in told]
+    assert streams == ["crossing"] * 3 + ["estimate", "crossing", "state"]
+    assert ratio_of(told[3]) == pytest.approx(0.4, rel=0.01)
+
+    found = load_results(tmp_path / "results.json")
+    (crossing,) = found.crossings
+    estimate = pb.Estimate.FromString(told[3].payload)
+    assert crossing.crossing_id == estimate.crossing_id
+    assert (found.site_hash, found.version) == (estimate.site_hash, estimate.version)
+    info = read_info(tmp_path / "results.mcap")
+    assert info.end is not None
+    assert (info.end["reason"], info.end["crossings"]) == ("stopped by a signal", "1")
+    assert info.site_toml is not None
+    stored = [message.payload for message in read_messages(tmp_path / "results.mcap")]
+    assert stored == [received.payload for received in told]
+
+
+def test_a_worker_outlives_what_strangers_send(
+    bus: zenoh.Session,
+    worker: Begin,
+    terminate: End,
+    drive_on: list[Message],
+) -> None:
+    """Tokens and keys that are none, messages that are none, and a truck nobody knows."""
+    prefix = f"driveby/v1/{REALM}/vehicle"
+    with (
+        Subscription(bus, selector(REALM, "bridge")) as results,
+        Subscription(bus, selector(REALM, "service", "health")) as health,
+    ):
+        process = worker()
+        until(health, "health")
+        token = bus.liveliness().declare_token(f"{prefix}/TRUCK/alive")
+        publisher = Publisher(bus, REALM)
+        half = len(drive_on) // 20
+        publish(publisher, drive_on[:half])
+        bus.put(f"{prefix}/TRUCK/accel", b"x")
+        bus.put(f"{prefix}/truck-1/gnss", b"x")
+        bus.put(f"{prefix}/truck-1/nonsense", b"x", attachment=b"1" * 16)
+        for number, payload in enumerate((b"", b"\xff" * 50, b"\x00" * 10_000)):
+            publisher.put(
+                "vehicle",
+                "truck-1",
+                "accel",
+                payload,
+                Identity(drive_on[0].boot_id, 70_000 + number),
+            )
+        stranger = [m._replace(key=m.key._replace(identifier="stranger")) for m in drive_on[:200]]
+        publish(publisher, stranger)
+        token.undeclare()  # type: ignore[no-untyped-call]
+        publish(publisher, drive_on[half:])
+        told = until(results, "state")
+        publisher.close()
+        terminate(process)
+    estimates = [received for received in told if received.key().stream == "estimate"]
+    assert [ratio_of(one) for one in estimates] == [pytest.approx(0.4, rel=0.01)]
+
+
+def test_a_second_truck_does_not_keep_the_first_from_leaving(
+    bus: zenoh.Session,
+    worker: Begin,
+    terminate: End,
+    drive_on: list[Message],
+) -> None:
+    """The first recording ends right after its exit; a busy stranger drives all the while."""
+    began_ns = drive_on[0].log_time_ns
+    short = [m for m in drive_on if m.log_time_ns - began_ns < 7_200_000_000]
+    with (
+        Subscription(bus, selector(REALM, "bridge")) as results,
+        Subscription(bus, selector(REALM, "service", "health")) as health,
+    ):
+        process = worker()
+        until(health, "health")
+        publisher = Publisher(bus, REALM)
+        token = bus.liveliness().declare_token(f"driveby/v1/{REALM}/vehicle/truck-1/alive")
+        publish(publisher, short)
+        token.undeclare()  # type: ignore[no-untyped-call]
+        estimates: list[Received] = []
+        deadline = time.monotonic() + LONGEST_S
+        stranger = iter(m._replace(key=m.key._replace(identifier="stranger")) for m in drive_on)
+        while not estimates and time.monotonic() < deadline:
+            publish(publisher, [next(stranger)])
+            one = results.receive(0.02)
+            if one is not None and one.key().stream == "estimate":
+                estimates.append(one)
+        publisher.close()
+        terminate(process)
+    assert [ratio_of(one) for one in estimates] == [pytest.approx(0.4, rel=0.01)]
+
+
+def test_a_signal_ends_a_worker_that_waits_for_a_router(
+    worker: Begin,
+) -> None:
+    process = worker()
+    time.sleep(6.0)
+    assert process.poll() is None
+    os.kill(process.pid, signal.SIGTERM)
+    _, log = process.communicate(timeout=10)
+    assert process.returncode == 0, log
+
+
+def test_results_that_exist_are_left_alone(worker: Begin, tmp_path: Path) -> None:
+    (tmp_path / "results.mcap").write_bytes(b"precious")
+    process = worker()
+    _, log = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert log.splitlines()[-1].startswith(f"{tmp_path / 'results.mcap'}: exists")
+    assert (tmp_path / "results.mcap").read_bytes() == b"precious"

@@ -1,0 +1,343 @@
+"""`driveby identify`, from the recording to the numbers and files.
+
+Truth and identification share no discretisation: the simulation has 70 finite elements and steps of
+0.1 ms, the identification 14 elements and samples at 1 ms.
+"""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from pre_core.paper import scenario_ratios
+from schemas.results import Crossing, Results, load_results
+from schemas.settings import IdentificationSettings
+from schemas.signals import CHANNELS
+from schemas.site import Site, parse_site, site_hash, site_toml
+from services import cli
+from services.common.errors import InputError
+from services.common.geodesy import bridge_frame, to_lat_lon
+from services.common.recording import Message, read_messages, read_site, write_recording
+from services.common.runs import GnssTrack, Run, run_to_messages
+from services.identify import identify_command, identify_recordings, site_of
+from services.importing import import_command
+from services.simulation import Drive, paper_site, simulate_drive, write_drive
+
+SOUND_NM2 = 1.56e10
+
+
+def ratios(crossing: Crossing, sound: float = SOUND_NM2) -> list[float]:
+    assert crossing.parameters is not None, crossing.reasons
+    return [crossing.parameters[f"EI_{n}"].mean / sound for n in range(1, 8)]
+
+
+def identified(path: Path) -> Results:
+    return identify_recordings([path], site_of([path], None), IdentificationSettings())
+
+
+def only(found: Results) -> Crossing:
+    assert len(found.crossings) == 1
+    return found.crossings[0]
+
+
+@pytest.fixture(scope="module")
+def recording(scenario_6: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("identify") / "drive.mcap"
+    write_drive(path, scenario_6, paper_site())
+    return path
+
+
+@pytest.fixture
+def empty_recording(tmp_path: Path) -> Callable[..., Path]:
+    """A recording of the truck that goes nowhere near the bridge; streams can be left out."""
+
+    def write(*, without: tuple[str, ...] = (), vehicle: str = "truck-1") -> Path:
+        rng = np.random.default_rng(1)
+        site = paper_site()
+        drive = simulate_free(site, rng)
+        messages = [
+            m._replace(key=m.key._replace(identifier=vehicle))
+            for m in run_to_messages([drive], site, "sim-x", "truck-1")
+            if m.key.stream not in without
+        ]
+        path = tmp_path / "empty.mcap"
+        write_recording(path, messages, site_toml=site_toml(site), reason="test")
+        return path
+
+    return write
+
+
+def simulate_free(site: Site, rng: np.random.Generator) -> Run:
+    time = 1_767_225_600.0 + np.arange(2000) / 200.0
+    fixes = time[::20]
+    latitude, longitude = to_lat_lon(
+        bridge_frame(site.bridges[0]), -900.0 + 10.0 * (fixes - fixes[0])
+    )
+    track = GnssTrack(
+        fixes, latitude, longitude, np.zeros(fixes.size), np.full(fixes.size, 10.0), None
+    )
+    channels = {name: rng.standard_normal(time.size) for name in CHANNELS}
+    return Run("free", time, 200.0, channels, track)
+
+
+def test_scenario_6_within_one_per_cent(recording: Path) -> None:
+    crossing = only(identified(recording))
+    assert ratios(crossing) == pytest.approx([1, 1, 1, 0.4, 1, 1, 1], rel=0.01)
+    assert (crossing.verdict, crossing.reasons) == ("suspect", ("no_noise_model",))
+    assert crossing.diagnostics["relative_misfit"] < 1e-3
+    truck = paper_site().vehicles[0]
+    assert crossing.parameters is not None
+    found = [crossing.parameters[f"k_u{wheel}"].mean for wheel in (1, 2)]
+    assert found == pytest.approx(truck.tyre_stiffness_n_per_m, rel=0.01)
+
+
+def test_the_road_is_the_one_that_was_driven(recording: Path, scenario_6: Drive) -> None:
+    road = only(identified(recording)).road
+    assert road is not None
+    x = np.array(road.x_m)
+    truth = np.interp(x, scenario_6.road.x_m, scenario_6.road.height_m)
+    truth -= np.polynomial.Polynomial.fit(x, truth, 1)(x)
+    # Roads of class A are some millimetres high; their difference is less than a tenth of one.
+    assert np.ptp(truth) > 2e-3
+    for profile in (road.front_m, road.rear_m, road.mean_m):
+        assert np.abs(np.array(profile) - truth).max() < 1e-4
+    assert road.iso_class == "A"
+
+
+def test_scenario_12_within_one_per_cent(tmp_path: Path) -> None:
+    """Damage in the last element, at the edge, where the paper's search fails."""
+    truth = scenario_ratios(12)
+    assert truth.min() < 0.9
+    drive = simulate_drive(paper_site(), truth, road_class="A", seed=2)
+    write_drive(tmp_path / "drive.mcap", drive, paper_site())
+    assert ratios(only(identified(tmp_path / "drive.mcap"))) == pytest.approx(truth, rel=0.01)
+
+
+def test_elements_are_numbered_from_the_bridges_start_also_driving_the_other_way(
+    tmp_path: Path,
+) -> None:
+    truth = np.array([1.0, 0.5, 1.0, 1.0, 0.9, 1.0, 1.0])
+    drive = simulate_drive(paper_site(), truth, road_class="A", seed=3, forward=False)
+    write_drive(tmp_path / "drive.mcap", drive, paper_site())
+    crossing = only(identified(tmp_path / "drive.mcap"))
+    assert crossing.direction == "end_to_start"
+    assert ratios(crossing) == pytest.approx(truth, rel=0.01)
+
+
+def test_an_antenna_far_from_the_front_axle_and_a_changing_speed(tmp_path: Path) -> None:
+    site = paper_site()
+    truck = site.vehicles[0].model_copy(
+        update={"gps_antenna_to_front_axle_m": 2.5, "cg_height_m": 1.2}
+    )
+    site = site.model_copy(update={"vehicles": (truck,)})
+    truth = scenario_ratios(6)
+    drive = simulate_drive(site, truth, road_class="A", seed=4, speed_m_per_s=(8.0, 12.0))
+    write_drive(tmp_path / "drive.mcap", drive, site)
+    crossing = only(identified(tmp_path / "drive.mcap"))
+    assert "accelerating_cg_unknown" not in crossing.reasons
+    assert ratios(crossing) == pytest.approx(truth, rel=0.02)
+
+
+def test_accelerating_with_an_unknown_centre_of_gravity_is_said(tmp_path: Path) -> None:
+    drive = simulate_drive(
+        paper_site(), scenario_ratios(6), road_class="A", seed=4, speed_m_per_s=(8.0, 12.0)
+    )
+    write_drive(tmp_path / "drive.mcap", drive, paper_site())
+    assert "accelerating_cg_unknown" in only(identified(tmp_path / "drive.mcap")).reasons
+
+
+def test_a_strange_truck_is_a_misfit(recording: Path) -> None:
+    """The same recording with a truck of another wheelbase: the roads do not match."""
+    site = paper_site()
+    truck = site.vehicles[0].model_copy(update={"wheelbase_m": 4.9})
+    wrong = site.model_copy(update={"vehicles": (truck,)})
+    found = identify_recordings([recording], wrong, IdentificationSettings(starts=1))
+    assert "model_misfit" in only(found).reasons
+
+
+def test_files_of_another_simulator(shared: Path, tmp_path: Path) -> None:
+    """Nothing but the measured files is there: what is found comes from them."""
+    source = shared / "crossings" / "d1_clean_const_speed"
+    folder = tmp_path / "crossing"
+    folder.mkdir()
+    for name in ("accel_00.csv", "gps_00.csv", "site.toml"):
+        shutil.copy(source / name, folder)
+    recording = tmp_path / "d1.mcap"
+    import_command(
+        sources=[folder], site=folder / "site.toml", output=recording, vehicle=None, name=None
+    )
+    found = identified(recording)
+    crossing = only(found)
+    assert crossing.direction == "start_to_end"
+    assert crossing.verdict == "suspect"
+    assert np.isfinite(crossing.diagnostics["relative_misfit"])
+    assert crossing.diagnostics["relative_misfit"] > 0.0
+    assert found.site_hash == site_hash(parse_site((folder / "site.toml").read_text(), "site"))
+    # The same with the whole folder, truth and all.
+    import_command(
+        sources=[source], site=source / "site.toml", output=recording, vehicle=None, name="crossing"
+    )
+    assert ratios(only(identified(recording))) == ratios(crossing)
+
+
+def test_late_messages_in_a_recording_are_put_in_order(recording: Path, tmp_path: Path) -> None:
+    """What the logger recovered stands at the end of the file, minutes of data later."""
+    messages = list(read_messages(recording))
+    rng = np.random.default_rng(7)
+    late = rng.random(len(messages)) < 0.3
+    moved = [m for m, is_late in zip(messages, late, strict=True) if not is_late]
+    moved += [m for m, is_late in zip(messages, late, strict=True) if is_late]
+    path = tmp_path / "late.mcap"
+    write_recording(path, moved, site_toml=read_site(recording), reason="test")
+    assert unhurried(identified(path)) == unhurried(identified(recording))
+
+
+def test_parts_of_a_drive_in_any_order_and_overlapping(recording: Path, tmp_path: Path) -> None:
+    messages = list(read_messages(recording))
+    half = len(messages) // 2
+    parts = [tmp_path / "b.mcap", tmp_path / "a.mcap"]
+    write_recording(parts[0], messages[half:], site_toml=read_site(recording), reason="test")
+    write_recording(parts[1], messages[: half + 60], site_toml=read_site(recording), reason="test")
+    found = identify_recordings(parts, site_of(parts, None), IdentificationSettings())
+    assert unhurried(found) == unhurried(identified(recording))
+
+
+def unhurried(found: Results) -> list[Crossing]:
+    return [
+        crossing.model_copy(update={"diagnostics": crossing.diagnostics | {"seconds": 0.0}})
+        for crossing in found.crossings
+    ]
+
+
+def test_results_are_written_as_the_contract_says(recording: Path, tmp_path: Path) -> None:
+    out, rrd = tmp_path / "out.json", tmp_path / "out.rrd"
+    for path in (out, rrd):
+        path.write_text("of yesterday")
+    console = Console(record=True, width=120)
+    code = identify_command(
+        recordings=[recording],
+        site=None,
+        method="least_squares",
+        json_path=out,
+        rrd_path=rrd,
+        draws_path=None,
+        seed=5,
+        console=console,
+    )
+    assert code == 0
+    found = load_results(out)
+    assert (found.program, found.seed, found.settings["method"]) == ("driveby", 5, "least_squares")
+    assert found.site_hash == site_hash(site_of([recording], None))
+    crossing = only(found)
+    assert re.fullmatch(r"truck-1\.bridge-1\.20260101T00000\d\.\d{3}Z", crossing.crossing_id)
+    assert crossing.parameters is not None
+    wheels = [f"{name}{wheel}" for name in ("c_s", "k_s", "m_u", "k_u", "m_s") for wheel in (1, 2)]
+    names = ["d_1", "rhoA", "alpha", "beta", "m_s", *wheels]
+    assert set(names) <= set(crossing.parameters)
+    assert {f"EI_{n}" for n in range(1, 8)} <= set(crossing.parameters)
+    assert crossing.parameters["EI_1"].unit == "N·m²"
+    assert found.bridges["bridge-1"].crossings_used == (crossing.crossing_id,)
+    assert list(found.bridges["bridge-1"].elements) == [f"EI_{n}" for n in range(1, 8)]
+    assert rrd.read_bytes()[:4] == b"RRF2"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.json", "out.rrd"]
+    text = console.export_text()
+    assert re.search(r"EI_4\s+6\.2\d\d\s+0\.400", text)
+    assert "no_noise_model" in text
+    assert "95 %" not in text  # an interval that means nothing is not printed
+
+
+def test_a_failing_writer_leaves_the_files_of_yesterday(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out.rrd"
+    out.write_text("of yesterday")
+
+    def fail(path: Path, **_: object) -> None:
+        path.write_bytes(b"half")
+        raise RuntimeError("broken")
+
+    monkeypatch.setattr("services.viewer.rerun_file.write_rrd", fail)
+    arguments = ["identify", str(recording), "--rrd", str(out)]
+    assert cli.main(arguments) == 1
+    assert out.read_text() == "of yesterday"
+    assert [path.name for path in tmp_path.iterdir()] == ["out.rrd"]
+
+
+def test_no_crossing_is_a_valid_answer(
+    empty_recording: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.json"
+    assert cli.main(["identify", str(empty_recording()), "--json", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert printed == "no crossing of a known bridge (bridge-1)\n"
+    found = load_results(out)
+    assert found.crossings == ()
+    assert found.bridges == {}
+
+
+@pytest.mark.parametrize(("stream", "words"), [("accel", "accelerations"), ("gnss", "positions")])
+def test_a_stream_that_is_missing_altogether(
+    empty_recording: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    stream: str,
+    words: str,
+) -> None:
+    path = empty_recording(without=(stream,))
+    assert cli.main(["identify", str(path), "--json", str(tmp_path / "out.json")]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"driveby: {path}: no {words} ({stream}), a recording of a truck")
+    assert err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["empty.mcap"]
+
+
+def test_an_unknown_vehicle(
+    empty_recording: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = empty_recording(vehicle="stranger")
+    assert cli.main(["identify", str(path)]) == 2
+    err = capsys.readouterr().err
+    assert err == f"driveby: {path}: stranger drove, but the site has no such vehicle\n"
+
+
+def test_a_malformed_message_in_a_recording_is_named(recording: Path, tmp_path: Path) -> None:
+    messages: list[Message] = []
+    for message in read_messages(recording):
+        is_it = (message.key.stream, message.sequence) == ("accel", 17)
+        messages.append(message._replace(payload=b"\xff\xff") if is_it else message)
+    path = tmp_path / "bad.mcap"
+    write_recording(path, messages, site_toml=read_site(recording), reason="test")
+    with pytest.raises(InputError, match=rf"{path}: accel 17: not a driveby\.v1\.AccelBatch"):
+        identified(path)
+
+
+def test_a_recording_without_a_site_needs_one(recording: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bare.mcap"
+    write_recording(path, read_messages(recording), site_toml=None, reason="test")
+    with pytest.raises(InputError, match="no site file is stored in it, give one with --site"):
+        site_of([path], None)
+    site = tmp_path / "site.toml"
+    site.write_text(site_toml(paper_site()))
+    assert site_of([path], site) == paper_site()
+
+
+def test_draws_need_a_chain(recording: Path, tmp_path: Path) -> None:
+    arguments = ["identify", str(recording), "--draws", str(tmp_path / "x.npz")]
+    assert cli.main(arguments) == 2
+
+
+def test_method_and_seed_reach_the_search(recording: Path) -> None:
+    """Two seeds of the random walk are two answers, the same seed is the same one."""
+    settings = IdentificationSettings(method="random_walk", particles=8, steps=3)
+    site = site_of([recording], None)
+    answers = [
+        ratios(only(identify_recordings([recording], site, chosen)))
+        for chosen in (settings, settings, settings.model_copy(update={"seed": 9}))
+    ]
+    assert answers[0] == answers[1]
+    assert answers[0] != answers[2]
