@@ -59,6 +59,7 @@ class Problem(NamedTuple):
     priors: Priors
     rows: RowFilter
     noise: Whitener
+    density: FloatArray  # (4,) one-sided, m/s²/√Hz
     basis_position: FloatArray  # (n, b): trajectory = basis @ coefficients
     basis_acceleration: FloatArray  # (n, b), positive when speeding up
     receiver_rows: FloatArray  # (r, b + 1): rows of (coefficients, offset)

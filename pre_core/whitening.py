@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.signal import firwin, kaiserord, upfirdn
+from scipy.signal import firwin, kaiserord
 
 from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
 
@@ -27,6 +27,10 @@ _STOP_BAND_DB = 90.0
 _TRANSITION = 0.5  # of the pass band
 _ROWS_PER_CYCLE = 2.5  # decimated rate over the highest frequency that passes whole
 _TABLE = 2048  # frequencies of the numerical integral over the noise spectrum
+
+
+# Dot products may be summed in any order.
+_blas = njit(fastmath={"contract", "nsz", "reassoc"}, cache=True, nogil=True, error_model="numpy")
 
 
 class RowFilter(NamedTuple):
@@ -63,10 +67,22 @@ def row_filter(step_s: float, highest_hz: float) -> RowFilter:
 
 def filtered(rows: RowFilter, residuals: FloatArray) -> FloatArray:
     """Filter (…, n) residuals to (…, m) rows; only rows that see no end of the record."""
-    size = rows.taps.size
-    kept = (residuals.shape[-1] - size) // rows.every + 1
-    out = upfirdn(rows.taps, residuals[..., : (kept - 1) * rows.every + size], 1, 1, axis=-1)
-    return np.ascontiguousarray(out[..., size - 1 : size + (kept - 1) * rows.every : rows.every])
+    kept = (residuals.shape[-1] - rows.taps.size) // rows.every + 1
+    flat = np.ascontiguousarray(residuals).reshape(-1, residuals.shape[-1])
+    out = np.empty((flat.shape[0], kept))
+    _filter(rows.taps, rows.every, flat, out)
+    return out.reshape(*residuals.shape[:-1], kept)
+
+
+@_blas
+def _filter(taps: FloatArray, every: int, x: FloatArray, out: FloatArray) -> None:
+    for r in range(x.shape[0]):
+        for k in range(out.shape[1]):
+            seen = x[r, k * every : k * every + taps.size]
+            total = 0.0
+            for j in range(taps.size):  # the taps are symmetric
+                total += taps[j] * seen[j]
+            out[r, k] = total
 
 
 def _responses(
@@ -119,10 +135,6 @@ def whitener(
     if not _cholesky(banded):
         raise ValueError("the noise covariance is not positive: are all densities above zero?")
     return Whitener(banded)
-
-
-# The dot products of a factorisation may be summed in any order.
-_blas = njit(fastmath={"contract", "nsz", "reassoc"}, cache=True, nogil=True, error_model="numpy")
 
 
 @_blas
