@@ -30,7 +30,8 @@ from schemas.topics import Key
 from services.common.crossing import MARGIN_M, Passage, Stay, find_stays
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
 from services.common.streams import PATIENCE_S, Boot
-from services.worker.identification import MARGIN_S, CrossingData, Report, Stopwatch, identify
+from services.worker.crossing_data import CrossingData
+from services.worker.identification import MARGIN_S, Report, Stopwatch, identify
 
 _KEEP_S = 300.0
 """Samples older than this are forgotten."""
@@ -306,6 +307,7 @@ class Engine:
             realm,
             truck.vehicle,
             bridge,
+            self._site.sensor,
             self._site.receiver,
             stay,
             fixes,

@@ -6,7 +6,7 @@ slow), fits, and says what the answer is worth. Every way to fail is a verdict, 
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +15,27 @@ from pre_core import least_squares, parameters, random_walk, residual, search
 from pre_core.bridge import Beam, natural_frequencies_hz, uniform_beam
 from pre_core.integrate import spline_integrate
 from pre_core.residual import Window
-from pre_core.road import Profile, iri_m_per_km, iso_8608_class, roughness_coefficient_m3
 from pre_core.simulate import Motion
 from pre_core.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
-from schemas.site import Bridge, Receiver, Vehicle
-from services.common.crossing import Passage, Stay
-from services.common.streams import Fixes, Samples
+from services.common.crossing import Passage
+from services.common.streams import Samples
+from services.worker.crossing_data import (
+    NORMAL_975,
+    CrossingData,
+    Floats,
+    Passing,
+    detrended,
+    gaussian,
+    header,
+    nominal_parameters,
+    rejected,
+    road_result,
+)
 
-Floats = NDArray[np.float64]
 Stopwatch = Callable[[], float]
 Report = Callable[[str, float], None]
 
@@ -39,24 +48,6 @@ _LONGEST_OUTAGE_S = 1.5
 _LARGEST_MISFIT = 0.02
 """Root mean square of R_1 - R_2 relative to the road itself; beyond it nothing was explained."""
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3
-_ROAD_SPACING_M = 0.05
-_NORMAL_975 = 1.959963984540054
-
-
-class CrossingData(NamedTuple):
-    """What is known of one crossing before it is identified. Times are on the truck's clock."""
-
-    crossing_id: str
-    realm: str
-    vehicle: Vehicle
-    bridge: Bridge
-    receiver: Receiver
-    stay: Stay
-    fixes: Fixes
-    chainage_m: Floats  # (m,) of the antenna at the fixes
-    samples: Samples | None  # from MARGIN_S before the entry to MARGIN_S after the exit
-    wall_offset_s: float
-    """What to add to a time on the truck's clock to get seconds since 1970 UTC."""
 
 
 class _Fit(NamedTuple):
@@ -81,8 +72,8 @@ def identify(
     began = stopwatch()
     trajectory = _trajectory(data)
     entry_s, exit_s = _entry_and_exit(data, trajectory)
-    speed = _speed_m_per_s(data, entry_s, exit_s)
-    reject = partial(_rejected, data, settings, entry_s, exit_s, speed)
+    passing = Passing(entry_s, exit_s, _speed_m_per_s(data, entry_s, exit_s))
+    reject = partial(rejected, data, settings, passing)
     reasons = _unusable(data, trajectory, entry_s, exit_s)
     if reasons or trajectory is None or data.samples is None:
         return reject(reasons or [Reason.FAILED])
@@ -90,8 +81,7 @@ def identify(
         found = _fitted(data, settings, trajectory, data.samples, entry_s, exit_s, report)
         if isinstance(found, Reason):
             return reject([found])
-        seconds = stopwatch() - began
-        return _result(data, settings, *found, entry_s, exit_s, speed, seconds)
+        return _result(data, settings, passing, *found, stopwatch() - began)
     except (ValueError, ArithmeticError):  # numpy's LinAlgError is a ValueError
         return reject([Reason.FAILED])
 
@@ -245,26 +235,6 @@ def _window(
     )
 
 
-def nominal_parameters(vehicle: Vehicle, bridge: Bridge) -> Floats:
-    """The values of the site file in the order of `pre_core.parameters`."""
-    return np.array(
-        [
-            vehicle.front_axle_to_cg_m,
-            *vehicle.suspension_damping_ns_per_m,
-            *vehicle.suspension_stiffness_n_per_m,
-            *vehicle.unsprung_mass_kg,
-            *vehicle.tyre_stiffness_n_per_m,
-            vehicle.pitch_inertia_ratio,
-            *bridge.nominal_flexural_rigidity_nm2,
-            bridge.mass_per_length_kg_per_m,
-            bridge.rayleigh_alpha_per_s,
-            bridge.rayleigh_beta_s,
-            0.0,
-            0.0,
-        ]
-    )
-
-
 def _least_squares(
     data: CrossingData, settings: IdentificationSettings, window: Window, report: Report
 ) -> _Fit:
@@ -354,12 +324,10 @@ METHODS = tuple(_METHODS)
 def _result(
     data: CrossingData,
     settings: IdentificationSettings,
+    passing: Passing,
     window: Window,
     fit: _Fit,
     motion: Motion,
-    entry_s: float,
-    exit_s: float,
-    speed: float,
     seconds: float,
 ) -> results.Crossing:
     work = residual.workspace(window)
@@ -367,7 +335,7 @@ def _result(
     objective = residual.objective(window, work, fit.theta)
     length = abs(roads.x_m[-1] - roads.x_m[0])
     misfit_m = float(np.sqrt(objective / length))
-    road_m = float(np.std(_detrended(roads.x_m, 0.5 * (roads.front_m + roads.rear_m))))
+    road_m = float(np.std(detrended(roads.x_m, 0.5 * (roads.front_m + roads.rear_m))))
     diagnostics = fit.diagnostics | {
         "seconds": seconds,
         "residual_rms_m": misfit_m,
@@ -385,7 +353,7 @@ def _result(
     values = _parameters(data, fit, settings)
     names = tuple(parameters.names(data.bridge.elements)[i] for i in fit.free)
     return results.Crossing(
-        **_header(data, settings, entry_s, exit_s, speed),
+        **header(data, settings, passing),
         verdict="suspect",  # without a noise model nothing can be shown to be good
         reasons=tuple(reasons),
         diagnostics=diagnostics,
@@ -394,43 +362,7 @@ def _result(
             names=names, matrix=tuple(tuple(row) for row in fit.covariance.tolist())
         ),
         derived=_derived(data, window, fit, values),
-        road=_road(data, roads),
-    )
-
-
-def _header(
-    data: CrossingData,
-    settings: IdentificationSettings,
-    entry_s: float,
-    exit_s: float,
-    speed: float,
-) -> dict[str, Any]:
-    return {
-        "crossing_id": data.crossing_id,
-        "realm": data.realm,
-        "vehicle": data.vehicle.id,
-        "bridge": data.bridge.id,
-        "direction": "start_to_end" if data.stay.direction > 0 else "end_to_start",
-        "entry_time": data.wall_offset_s + entry_s,
-        "exit_time": data.wall_offset_s + exit_s,
-        "speed_m_per_s": speed,
-        "method": settings.method,
-    }
-
-
-def _rejected(
-    data: CrossingData,
-    settings: IdentificationSettings,
-    entry_s: float,
-    exit_s: float,
-    speed: float,
-    reasons: list[Reason],
-) -> results.Crossing:
-    return results.Crossing(
-        **_header(data, settings, entry_s, exit_s, speed),
-        verdict="rejected",
-        reasons=tuple(dict.fromkeys(reasons)),
-        parameters=None,
+        road=road_result(data, roads.x_m, roads.front_m, roads.rear_m),
     )
 
 
@@ -446,7 +378,7 @@ def _parameters(
         low, middle, high = (
             fit.spread[k]
             if fit.spread is not None
-            else (mean - _NORMAL_975 * std[k], mean, mean + _NORMAL_975 * std[k])
+            else (mean - NORMAL_975 * std[k], mean, mean + NORMAL_975 * std[k])
         )
         values[names[i]] = results.Parameter(
             unit=parameters.unit(names[i]),
@@ -478,7 +410,7 @@ def _derived_masses(data: CrossingData, fit: _Fit) -> dict[str, results.Paramete
     )
     means, spread = _propagated(fit, lambda theta: masses(theta))
     return {
-        name: _gaussian("kg", float(mean), float(std))
+        name: gaussian("kg", float(mean), float(std))
         for name, mean, std in zip(("m_s", "m_s1", "m_s2"), means, spread, strict=True)
     }
 
@@ -494,17 +426,6 @@ def _propagated(fit: _Fit, quantity: Callable[[Floats], Floats]) -> tuple[Floats
         slopes[:, k] = (np.atleast_1d(quantity(moved)) - centre) / step
     variance = np.einsum("qi,ij,qj->q", slopes, fit.covariance, slopes)
     return centre, np.sqrt(np.maximum(variance, 0.0))
-
-
-def _gaussian(unit: str, mean: float, std: float) -> results.Parameter:
-    return results.Parameter(
-        unit=unit,
-        mean=mean,
-        std=std,
-        q025=mean - _NORMAL_975 * std,
-        q50=mean,
-        q975=mean + _NORMAL_975 * std,
-    )
 
 
 def _beam(data: CrossingData, theta: Floats) -> Beam:
@@ -526,36 +447,6 @@ def _derived(
         fit, lambda theta: np.array([residual.largest_deflection_m(window, theta)])
     )
     return results.Derived(
-        f1_hz=_gaussian("Hz", float(frequency[0]), float(frequency_std[0])),
-        max_deflection_m=_gaussian("m", float(deflection[0]), float(deflection_std[0])),
-    )
-
-
-def _detrended(x_m: Floats, height_m: Floats) -> Floats:
-    line = np.polynomial.Polynomial.fit(x_m, height_m, 1)
-    return np.asarray(height_m - line(x_m))
-
-
-def _road(data: CrossingData, roads: residual.Roads) -> results.Road:
-    """Profiles on an even grid of chainage, each without its own straight line.
-
-    Integrated accelerations leave level and slope of a road unknown.
-    """
-    order = np.argsort(roads.x_m)
-    x = np.arange(0.0, data.bridge.span_m + 0.5 * _ROAD_SPACING_M, _ROAD_SPACING_M)
-    x = x[(x >= roads.x_m.min()) & (x <= roads.x_m.max())]
-    mean = 0.5 * (roads.front_m + roads.rear_m)
-    front, rear, both = (
-        _detrended(x, np.interp(x, roads.x_m[order], profile[order]))
-        for profile in (roads.front_m, roads.rear_m, mean)
-    )
-    profile = Profile(x, both)
-    return results.Road(
-        x_m=tuple(x.tolist()),
-        front_m=tuple(front.tolist()),
-        rear_m=tuple(rear.tolist()),
-        mean_m=tuple(both.tolist()),
-        std_m=None,
-        iri_m_per_km=float(iri_m_per_km(profile)[0]),
-        iso_class=iso_8608_class(roughness_coefficient_m3(profile)),
+        f1_hz=gaussian("Hz", float(frequency[0]), float(frequency_std[0])),
+        max_deflection_m=gaussian("m", float(deflection[0]), float(deflection_std[0])),
     )
