@@ -4,8 +4,8 @@ Driving along the bridge's line, a truck is before the bridge, on it (with at le
 behind it. A crossing is a passage from one side to the other; one that ends on the side where it
 began, or that the positions only begin or end in, is a crossing that cannot be identified.
 
-A receiver's noise moves a truck to and fro over the ends of the bridge: a stay begins when an axle
-is on the bridge, and is over only when the truck is a margin away from it.
+A receiver's noise moves a truck that is at an end of the bridge on and off it: only what goes
+through, or further onto the bridge than noise reaches, is a stay.
 """
 
 from enum import Enum
@@ -86,7 +86,7 @@ def find_stays(
     stays: list[Stay] = []
     # Where the truck comes onto the bridge, or jumps over it because the receiver was out.
     begins = np.flatnonzero((depth > 0.0) | (np.diff(side, prepend=side[0]) * side == 2))
-    gone = np.append(np.flatnonzero(depth <= -margin_m), time_s.size)
+    gone = np.append(np.flatnonzero(depth <= 0.0), time_s.size)
     stop = 0
     for n in begins.tolist():
         if n >= stop:

@@ -43,6 +43,8 @@ def stays_of(
     lateral_m: float | Floats = 0.0,
     kept: NDArray[np.bool_] | None = None,
     span_m: float = SPAN_M,
+    reverses: bool = False,
+    wander_m: float | Floats = 0.0,
 ) -> list[Stay]:
     time_s, front = driven
     rng = np.random.default_rng(seed)
@@ -50,7 +52,8 @@ def stays_of(
     heading = np.sign(velocity)
     for n in range(1, heading.size):  # a truck that stands still looks where it came
         heading[n] = heading[n] or heading[n - 1]
-    antenna = front - heading * antenna_m + noise_m * rng.standard_normal(front.size)
+    heading = np.full(front.size, heading[1]) if reverses else heading
+    antenna = front - heading * antenna_m + noise_m * rng.standard_normal(front.size) + wander_m
     speed = np.abs(np.abs(velocity) + (0.07 if noise_m else 0.0) * rng.standard_normal(front.size))
     lateral = np.broadcast_to(np.asarray(lateral_m, float), front.shape)
     lateral = lateral + noise_m * rng.standard_normal(front.size)
@@ -215,6 +218,34 @@ def test_a_truck_that_waits(where: str, antenna_m: float) -> None:
         assert stay.exit_s == pytest.approx(exit_s, abs=0.4)
         # Whoever waits this near may be thought to have entered at his last move before.
         assert stay.entry_s == pytest.approx(entry_s, abs=0.4)
+
+
+def test_wandering_positions_of_a_truck_that_stands_do_not_turn_it() -> None:
+    """A slow error of 4 m, larger than the margin; the truck stands with its tail on the bridge."""
+    driven = legs((0, -60), (9.1, 31), (99.1, 31), (109.1, 131))
+    wander = 2.0 * np.sin(driven.time_s / 7.0)
+    stay = only(stays_of(driven, wander_m=wander))
+    assert stay.passage is Passage.THROUGH
+    assert stay.exit_s == pytest.approx(99.1 + 0.34, abs=0.3)
+
+
+@pytest.mark.parametrize("antenna_m", [-1.5, 0.0, 3.0])
+def test_a_truck_that_backs_away_was_not_on_the_bridge(antenna_m: float) -> None:
+    driven = legs((0, -60), (6, -0.5), (16, -0.5), (30, -90))
+    assert stays_of(driven, reverses=True, antenna_m=antenna_m, noise_m=0.1) == []
+
+
+def test_who_comes_again_within_five_seconds_crosses_once() -> None:
+    stay = only(stays_of(legs((0, -20), (2, 4), (4, -1), (14, 99)), reverses=True))
+    assert stay.passage is Passage.THROUGH
+    stays = stays_of(legs((0, -20), (2, 4), (4, -1), (9, -1), (19, 99)), reverses=True)
+    assert [one.passage for one in stays] == [Passage.TURNED_BACK, Passage.THROUGH]
+
+
+def test_an_oblique_road_below() -> None:
+    """It passes under the bridge's middle, but comes from 45 m beside its end."""
+    driven = drive(lambda t: 15.0 + 3.0 * (t - 20.0), 40.0)
+    assert stays_of(driven, lateral_m=3.0 * (driven.front_m - 15.0)) == []
 
 
 def test_to_and_fro() -> None:
