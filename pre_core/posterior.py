@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import qr, solve_triangular
 
-from pre_core.pre_model import Crossing, Points, Work, evaluate
+from pre_core.pre_model import Crossing, Points, Work, evaluate, roads_and_deflections
 from pre_core.whitening import RowFilter, Whitener, filtered, whiten
 
 FloatArray = NDArray[np.float64]
@@ -201,3 +201,29 @@ def covariance(root: FloatArray) -> FloatArray:
     """(R'R)^-1."""
     inverse = solve_triangular(root, np.eye(root.shape[0]))
     return np.asarray(inverse @ inverse.T)
+
+
+def roads(problem: Problem, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Chainage (m,), road under the front and under the rear wheel there, for one point y.
+
+    On the bridge only, in the order of the rear wheel's samples.
+    """
+    crossing = problem.crossing
+    at = points(problem, y[None, :])
+    height, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
+    front = at.position_m[0]
+    sign = 1.0 if crossing.direction > 0 else -1.0
+    rear = front - sign * at.wheelbase_m[0]
+    on_bridge = np.flatnonzero((rear >= 0.0) & (rear <= crossing.span_m))
+    front_height = np.interp(sign * rear[on_bridge], sign * front, height[0])
+    return rear[on_bridge], front_height, height[1, on_bridge]
+
+
+def largest_deflections_m(problem: Problem, y: FloatArray) -> FloatArray:
+    """Largest deflection under a wheel (k,), positive downwards, of the points y (k, size)."""
+    at = points(problem, y)
+    largest = np.empty(y.shape[0])
+    for k in range(y.shape[0]):
+        _, deflection = roads_and_deflections(problem.crossing, problem.works[0], at, k)
+        largest[k] = -deflection.min()
+    return largest

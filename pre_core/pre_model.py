@@ -350,3 +350,40 @@ def evaluate(crossing: Crossing, works: tuple[Work, ...], points: Points) -> Flo
     with ThreadPoolExecutor(len(works)) as pool:
         list(pool.map(part, range(len(works))))
     return out
+
+
+@kernel
+def _one(crossing: Crossing, work: Work, points: Points, k: int, deflection: FloatArray) -> bool:
+    """Leave point k's roads in `work.road` (minus the road) and the deflections in (2, n)."""
+    front = points.position_m[k]
+    _correct(
+        crossing.signals,
+        crossing.step_s,
+        points.gain[k],
+        points.delay_s[k],
+        points.initial[k],
+        work.corrected,
+    )
+    _wheels(crossing, work, points.theta[k], points.wheelbase_m[k], points.acceleration_m_per_s2[k])
+    _locate(crossing, work, front, points.wheelbase_m[k])
+    if not _bridge(crossing, work, points.theta[k]):
+        return False
+    deflection[:] = work.road
+    _deflect(work)
+    for w in range(2):
+        for i in range(front.size):
+            deflection[w, i] = work.road[w, i] - deflection[w, i]
+    return True
+
+
+def roads_and_deflections(
+    crossing: Crossing, work: Work, points: Points, k: int
+) -> tuple[FloatArray, FloatArray]:
+    """Road heights (2, n) under both wheels at every sample, and the bridge's deflections (2, n).
+
+    Raises ValueError for an impossible point.
+    """
+    deflection = np.empty_like(work.road)
+    if not _one(crossing, work, points, k, deflection):
+        raise ValueError("the bridge of this point has no modes")
+    return -work.road, deflection

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ENDPOINT: Final = "tcp/127.0.0.1:7447"
 RECORDINGS: Final = Path("recordings")
-METHODS: Final = ("least-squares", "random-walk")
+METHODS: Final = ("least-squares", "random-walk", "pre")
 SCENARIOS: Final = range(1, 13)
 
 EXIT_FAILED: Final = 1

@@ -35,6 +35,7 @@ from services.worker.crossing_data import (
     rejected,
     road_result,
 )
+from services.worker.pre_method import identify_pre
 
 Stopwatch = Callable[[], float]
 Report = Callable[[str, float], None]
@@ -78,12 +79,41 @@ def identify(
     if reasons or trajectory is None or data.samples is None:
         return reject(reasons or [Reason.FAILED])
     try:
+        if settings.method == "pre":
+            return _by_posterior(
+                data,
+                settings,
+                passing,
+                trajectory,
+                data.samples,
+                report,
+                lambda: stopwatch() - began,
+            )
         found = _fitted(data, settings, trajectory, data.samples, entry_s, exit_s, report)
         if isinstance(found, Reason):
             return reject([found])
         return _result(data, settings, passing, *found, stopwatch() - began)
     except (ValueError, ArithmeticError):  # numpy's LinAlgError is a ValueError
         return reject([Reason.FAILED])
+
+
+def _by_posterior(
+    data: CrossingData,
+    settings: IdentificationSettings,
+    passing: Passing,
+    trajectory: Trajectory,
+    samples: Samples,
+    report: Report,
+    elapsed: Stopwatch,
+) -> results.Crossing:
+    time_s = samples.start_s + np.arange(_size(samples)) / samples.rate_hz
+    part = _covered(samples, time_s, passing.entry_s, passing.exit_s)
+    if part is None:
+        return rejected(data, settings, passing, [Reason.GAP_ON_BRIDGE])
+    motion = motion_at(trajectory, time_s[part], data.stay.direction)
+    acceleration = np.stack([samples.channels[name][part] for name in CHANNELS])
+    start_s = float(time_s[part][0])
+    return identify_pre(data, settings, passing, acceleration, start_s, motion, report, elapsed)
 
 
 def _fitted(
@@ -318,7 +348,6 @@ _METHODS: dict[str, Callable[[CrossingData, IdentificationSettings, Window, Repo
     "least_squares": _least_squares,
     "random_walk": _random_walk,
 }
-METHODS = tuple(_METHODS)
 
 
 def _result(
