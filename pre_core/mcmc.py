@@ -1,11 +1,15 @@
-"""A Markov chain on the posterior: independence proposals from the curvature at its optimum.
+"""Markov chains on the posterior, steered by the normal approximation at its optimum.
 
-The posterior of one crossing is close to Gaussian, so that draws from a slightly wider Student t
-with the Gauss-Newton covariance are accepted about every second time, in sixty dimensions where a
-random walk would need a hundred times the evaluations (Tierney 1994, section 2.3.1). Proposals do
-not depend on the state: a whole block is evaluated at once. Four chains start from draws of the
-proposal, and tell by their agreement (split R-hat; Gelman et al., BDA 3, section 11.4) whether to
-believe them.
+The posterior of one crossing is close to normal in sixty dimensions. With y = T(w), where T maps a
+standard normal w to the approximation, the chains move by
+
+    w' = rho w + sqrt(1 - rho^2) xi,    xi standard normal,
+
+which leaves the approximation itself invariant, and accept by what the posterior differs from it
+(preconditioned Crank-Nicolson; Cotter et al. 2013). rho = 0 proposes anew and is accepted about
+every third time; rho near one gets a chain away from where the approximation is too thin. Many
+short chains start from draws of the approximation; their agreement (split R-hat; Gelman et al.,
+BDA 3, section 11.4) tells whether to believe them.
 """
 
 from collections.abc import Callable
@@ -13,103 +17,113 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import cholesky
+from scipy.special import log_ndtr, ndtri_exp
 
 from pre_core.search import Ending
 
 FloatArray = NDArray[np.float64]
 
-CHAINS = 4
-BLOCK = 25
-DEGREES_OF_FREEDOM = 60.0
-"""Of the proposal: heavier tails than the target's, yet not so heavy that most draws are lost."""
+CHAINS = 20
+RHO = (0.0, 0.8, 0.6, 0.95)
+"""Taken in turn."""
 
 LogDensity = Callable[[FloatArray], FloatArray]
 """Logarithm of the target at points (k, f), up to a constant; minus infinity where impossible."""
 
 
-class Proposal(NamedTuple):
-    """A Student t about `centre` with precision R'R, restricted to `positive` coordinates >= 0."""
+class Approximation(NamedTuple):
+    """A normal with mean `centre`, cut off where the coordinates `positive` would be negative.
+
+    In the order `order` (the positive ones first), y = centre + L z with standard normal z, those
+    of the positive coordinates cut off one after the other.
+    """
 
     centre: FloatArray  # (f,)
-    root: FloatArray  # (f, f) upper triangle R
-    positive: NDArray[np.int64]
+    factor: FloatArray  # (f, f) lower triangle L
+    order: NDArray[np.int64]  # (f,)
+    positive: int
     seed: int
 
 
 class State(NamedTuple):
-    """Where the chains are: points (c, f), log target less log proposal (c,), and blocks taken."""
+    """Where the chains are: normals and points (c, f), log weights (c,), and steps taken."""
 
+    w: FloatArray
     y: FloatArray
     log_weight: FloatArray
-    blocks: int
+    steps: int
 
 
 class Info(NamedTuple):
-    """One block: the draws (block, c, f), and how many proposals were accepted."""
+    """One step of all chains."""
 
-    draws: FloatArray
     acceptance: float
     objective: float
     ending: Ending | None
 
 
-def _draw(proposal: Proposal, count: int, stream: int) -> tuple[FloatArray, FloatArray]:
-    """`count` draws and the logarithm of their density up to a constant."""
-    rng = np.random.default_rng(np.random.SeedSequence(proposal.seed, spawn_key=(stream,)))
-    f = proposal.centre.size
-    nu = DEGREES_OF_FREEDOM
-    kept: list[FloatArray] = []
-    squares: list[FloatArray] = []
-    missing = count
-    for _ in range(1000):
-        z = rng.standard_normal((2 * missing + 16, f))
-        scale = np.sqrt(nu / rng.chisquare(nu, z.shape[0]))
-        white = z * scale[:, None]
-        y = proposal.centre + solve_triangular(proposal.root, white.T).T
-        allowed = np.all(y[:, proposal.positive] >= 0.0, axis=1)
-        kept.append(y[allowed][:missing])
-        squares.append(np.sum(white[allowed][:missing] ** 2, axis=1))
-        missing -= kept[-1].shape[0]
-        if missing == 0:
-            break
-    y = np.concatenate(kept)
-    r2 = np.concatenate(squares)
-    return y, -0.5 * (nu + f) * np.log1p(r2 / nu)
+def approximation(
+    centre: FloatArray, covariance: FloatArray, positive: NDArray[np.int64], seed: int
+) -> Approximation:
+    """Bind a normal approximation (f,), (f, f) of the target."""
+    others = np.setdiff1d(np.arange(centre.size), positive)
+    order = np.concatenate([positive, others])
+    factor = cholesky(covariance[np.ix_(order, order)], lower=True)
+    return Approximation(centre, np.asarray(factor), order, positive.size, seed)
 
 
-def init(target: LogDensity, proposal: Proposal) -> State:
-    """Four chains at draws of the proposal."""
-    y, log_q = _draw(proposal, CHAINS, 0)
-    return State(y, target(y) - log_q, 0)
+def _map(normal: Approximation, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points T(w) of standard normals (k, f) and their log density, up to a constant."""
+    z = w.copy()
+    log_q = -0.5 * np.sum(w[:, normal.positive :] ** 2, axis=1)
+    for i in range(normal.positive):
+        # The i-th ordered coordinate, centre + sum over j <= i of L_ij z_j, must stay >= 0.
+        before = normal.centre[normal.order[i]] + z[:, :i] @ normal.factor[i, :i]
+        lowest = -before / normal.factor[i, i]
+        log_tail = log_ndtr(-lowest)
+        # The upper tail probability of w_i, shrunk to the part above `lowest`.
+        z[:, i] = np.maximum(-ndtri_exp(log_ndtr(-w[:, i]) + log_tail), lowest)
+        log_q += -0.5 * z[:, i] ** 2 - log_tail
+    y = np.empty_like(w)
+    y[:, normal.order] = normal.centre[normal.order] + z @ normal.factor.T
+    cut = normal.order[: normal.positive]
+    y[:, cut] = np.maximum(y[:, cut], 0.0)
+    return y, log_q
 
 
-def step(target: LogDensity, proposal: Proposal, state: State) -> tuple[State, Info]:
-    """One block of Metropolis-Hastings steps of every chain."""
-    y, log_q = _draw(proposal, BLOCK * CHAINS, 2 * state.blocks + 1)
-    if y.shape[0] < BLOCK * CHAINS:
-        return state, Info(np.empty((0, *state.y.shape)), 0.0, np.inf, Ending.NOT_FINITE)
+def _weigh(target: LogDensity, y: FloatArray, log_q: FloatArray) -> FloatArray:
     log_p = target(y)
-    log_weight = np.where(np.isfinite(log_p), log_p, -np.inf) - log_q
-    rng = np.random.default_rng(
-        np.random.SeedSequence(proposal.seed, spawn_key=(2 * state.blocks + 2,))
+    return np.where(np.isfinite(log_p), log_p, -np.inf) - log_q
+
+
+def init(target: LogDensity, normal: Approximation) -> State:
+    """All chains at draws of the approximation."""
+    rng = np.random.default_rng(np.random.SeedSequence(normal.seed, spawn_key=(0,)))
+    w = rng.standard_normal((CHAINS, normal.centre.size))
+    y, log_q = _map(normal, w)
+    return State(w, y, _weigh(target, y, log_q), 0)
+
+
+def step(target: LogDensity, normal: Approximation, state: State) -> tuple[State, Info]:
+    """One Metropolis-Hastings step of every chain."""
+    rng = np.random.default_rng(np.random.SeedSequence(normal.seed, spawn_key=(state.steps + 1,)))
+    rho = RHO[state.steps % len(RHO)]
+    w = rho * state.w + np.sqrt(1.0 - rho**2) * rng.standard_normal(state.w.shape)
+    y, log_q = _map(normal, w)
+    log_weight = _weigh(target, y, log_q)
+    with np.errstate(invalid="ignore"):  # both impossible: infinity less infinity
+        gain = log_weight - state.log_weight
+    accepted = np.log(rng.uniform(size=CHAINS)) < gain
+    accepted |= ~np.isfinite(state.log_weight) & np.isfinite(log_weight)
+    new = State(
+        np.where(accepted[:, None], w, state.w),
+        np.where(accepted[:, None], y, state.y),
+        np.where(accepted, log_weight, state.log_weight),
+        state.steps + 1,
     )
-    uniform = np.log(rng.uniform(size=(BLOCK, CHAINS)))
-    now, weight = state.y.copy(), state.log_weight.copy()
-    draws = np.empty((BLOCK, CHAINS, now.shape[1]))
-    accepted = 0
-    for n in range(BLOCK):
-        for c in range(CHAINS):
-            candidate = n * CHAINS + c
-            gain = log_weight[candidate] - weight[c]
-            if np.isnan(weight[c]) or uniform[n, c] < gain:
-                now[c], weight[c] = y[candidate], log_weight[candidate]
-                accepted += 1
-        draws[n] = now
-    ending = None if np.any(np.isfinite(weight)) else Ending.NOT_FINITE
-    best = -2.0 * float(np.max(log_p))
-    info = Info(draws, accepted / (BLOCK * CHAINS), best, ending)
-    return State(now, weight, state.blocks + 1), info
+    ending = None if np.any(np.isfinite(new.log_weight)) else Ending.NOT_FINITE
+    return new, Info(float(accepted.mean()), -2.0 * float(np.max(new.log_weight)), ending)
 
 
 def split_r_hat(draws: FloatArray) -> FloatArray:

@@ -22,9 +22,11 @@ from pre_core.posterior import (
     Priors,
     Problem,
     all_rows,
+    covariance,
     data_rows,
     layout,
     points,
+    precision_root,
     start,
     trajectory_basis,
 )
@@ -242,14 +244,33 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
 
 
 def _polished(found: Optimum, evaluations: int, tried: int) -> Optimum:
-    """A last few steps with the noise of the truck that was found."""
-    free = np.eye(found.state.y.size)
-    y, state, ending, used = _descend(found.problem, found.state.y, free, 1.0, 8, 0.01)
+    """Last steps with the noise of the truck that was found, and supports that do not push.
+
+    Least squares may leave a support spring below zero, where no posterior is; it is then held at
+    zero and the rest is brought to the optimum beside it. The slope that is left belongs to the
+    normal approximation (`normal_approximation`).
+    """
+    where = layout(found.problem)
+    y = found.state.y.copy()
+    springs = np.arange(where.theta.stop - 2, where.theta.stop)
+    held = springs[y[springs] < 0.0]
+    y[held] = 0.0
+    directions = np.delete(np.eye(y.size), held, axis=1)
+    y, _, ending, used = _descend(found.problem, y, directions, 1.0, 15, 0.1)
+    y[springs] = np.maximum(y[springs], 0.0)
+    state = least_squares.begin(lambda at: all_rows(found.problem, at), y)
     return Optimum(
         found.problem,
-        state._replace(y=y),
+        state,
         ending,
         chi2_per_dof(found.problem, y),
-        evaluations + used,
+        evaluations + used + y.size + 1,
         tried,
     )
+
+
+def normal_approximation(found: Optimum) -> tuple[FloatArray, FloatArray]:
+    """Mean (f,) and covariance (f, f) of the Gauss-Newton approximation at the optimum."""
+    spread = covariance(precision_root(found.state.jacobian))
+    slope = found.state.jacobian.T @ found.state.residual
+    return found.state.y - spread @ slope, spread

@@ -348,8 +348,9 @@ def _print_summary(
     exact = sum(accuracy >= 0.999 for accuracy in accuracies)
     least = f"largest error {error:.1e} ({name}, scenario {number})"
     lines = [f"ours: S_A ≥ 0.999 in {exact} of {len(accuracies)}; {least}"]
+    labels = {"random_walk": "random walk", "least_squares": "ours"}
     lines += [
-        f"scenario {scenario.number}, {method.replace('_', ' ')}: {ending.value}"
+        f"scenario {scenario.number}, {labels[method]}: {ending.value}"
         for scenario in found
         for method, ending in scenario.endings.items()
         if ending not in (search.Ending.CONVERGED, search.Ending.STEPS_DONE)

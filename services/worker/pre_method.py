@@ -28,7 +28,7 @@ from services.worker.crossing_data import (
 )
 
 _MICRO_G = 9.80665e-6
-_BURN_IN_BLOCKS = 2
+_BURN_IN_SHARE = 4
 _SMALLEST_NOISE_UG = 0.1
 """A declared noise of zero cannot whiten anything; below this, model error dominates."""
 _GOOD_CHI2 = 1.25
@@ -168,7 +168,7 @@ def identify_pre(
             diagnostics=diagnostics,
         )
     inflation = float(np.sqrt(max(1.0, found.chi2_per_dof)))
-    chain = _sample(problem, found.state.jacobian, y, settings, inflation, report)
+    chain = _sample(found, settings, inflation, report)
     diagnostics |= {"r_hat": chain.r_hat, "ess": chain.ess, "acceptance": chain.acceptance}
     reasons = _reasons(data, problem, found, chain, motion)
     values = _values(data, problem, chain, settings)
@@ -190,34 +190,30 @@ def _offset_m(problem: posterior.Problem, y: Floats) -> float:
 
 
 def _sample(
-    problem: posterior.Problem,
-    jacobian: Floats,
-    y: Floats,
-    settings: IdentificationSettings,
-    inflation: float,
-    report: Report,
+    found: pre.Optimum, settings: IdentificationSettings, inflation: float, report: Report
 ) -> _Chain:
     """Markov chains on the posterior; where the fit is imperfect, of noise so much larger."""
+    problem = found.problem
     where = posterior.layout(problem)
     springs = np.arange(where.theta.stop - 2, where.theta.stop)
-    proposal = mcmc.Proposal(
-        y, posterior.precision_root(jacobian) / inflation, springs, settings.seed
-    )
+    centre, covariance = pre.normal_approximation(found)
+    normal = mcmc.approximation(centre, inflation**2 * covariance, springs, settings.seed)
 
     def target(points: Floats) -> Floats:
         rows = posterior.all_rows(problem, points)
         return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
 
-    state = mcmc.init(target, proposal)
+    wanted = max(len(mcmc.RHO), settings.draws // mcmc.CHAINS)
+    steps = wanted + wanted // _BURN_IN_SHARE
+    state = mcmc.init(target, normal)
     draws, acceptance = [], []
-    blocks = max(1, settings.draws // (mcmc.BLOCK * mcmc.CHAINS)) + _BURN_IN_BLOCKS
-    for block in range(blocks):
-        report("sampling the posterior", 0.6 + 0.4 * block / blocks)
-        state, info = mcmc.step(target, proposal, state)
-        if block >= _BURN_IN_BLOCKS:
-            draws.append(info.draws)
+    for count in range(steps):
+        report("sampling the posterior", 0.6 + 0.4 * count / steps)
+        state, info = mcmc.step(target, normal, state)
+        if count >= steps - wanted:
+            draws.append(state.y)
             acceptance.append(info.acceptance)
-    kept = np.concatenate(draws)
+    kept = np.stack(draws)
     of_interest = kept[:, :, where.theta]
     return _Chain(
         kept,
