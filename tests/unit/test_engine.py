@@ -489,6 +489,17 @@ def test_absurd_accelerations_get_a_verdict(scenario_6: Drive, value: float) -> 
     assert {"model_misfit", "not_finite", "failed", "not_converged"} & set(crossing.reasons)
 
 
+def test_what_fails_inside_is_a_verdict(
+    crossing_messages: list[Message], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    monkeypatch.setattr("pre_core.residual.build_window", fail)
+    (crossing,) = results_in(fed(crossing_messages))
+    assert (crossing.verdict, crossing.reasons) == ("rejected", ("failed",))
+
+
 def test_channels_of_different_rates_are_identified(scenario_6: Drive) -> None:
     """Body sensors at half the rate of the axles'; the body moves slowly."""
     messages = []
