@@ -1,32 +1,49 @@
 """How the time of an evaluation grows with the size of the problem; and what it is made of."""
 
 import time
+from typing import NamedTuple
 
 import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pre_core import residual
+from pre_core import paper, residual
 from pre_core.residual import Window
 from tests.benchmarks import cases
 
-_ROUNDS = 9
+_ROUNDS = 15
 
 
-def _seconds(window: Window, elements: int, particles: int = 64) -> float:
-    """The least of several times of one batch, single thread: its own time on the processor."""
-    work = residual.workspace(window)
-    vectors = cases.noise_particles(particles, elements)
-    limit, total = np.full(particles, np.inf), np.empty(particles)
-    seconds = []
-    for _ in range(_ROUNDS):
-        began = time.thread_time()
-        residual.objective_batch(window, work, vectors, limit, total)
-        seconds.append(time.thread_time() - began)
-    assert np.all(np.isfinite(total))
-    return min(seconds[1:])
+class _Size(NamedTuple):
+    window: Window
+    elements: int = paper.ELEMENTS
+    particles: int = 64
 
 
-def _record(benchmark: BenchmarkFixture, sizes: list[int], seconds: list[float]) -> None:
+def _seconds(sizes: list[_Size]) -> list[float]:
+    """Processor time of one batch of each size, single thread: the least of several rounds.
+
+    Every round takes all sizes in turn, so that other work disturbs them alike.
+    """
+    bound = []
+    for window, elements, particles in sizes:
+        limit, total = np.full(particles, np.inf), np.empty(particles)
+        vectors = cases.noise_particles(particles, elements)
+        bound.append((window, residual.workspace(window), vectors, limit, total))
+    rounds = np.empty((_ROUNDS, len(sizes)))
+    for times in rounds:
+        for i, arguments in enumerate(bound):
+            began = time.thread_time()
+            residual.objective_batch(*arguments)
+            times[i] = time.thread_time() - began
+    assert all(np.all(np.isfinite(total)) for *_, total in bound)
+    least: list[float] = rounds[1:].min(axis=0).tolist()
+    return least
+
+
+def _record(
+    benchmark: BenchmarkFixture, sizes: list[int], batches: list[float], evaluations: int = 64
+) -> None:
+    seconds = [batch / evaluations for batch in batches]
     benchmark.extra_info |= {
         "sizes": sizes,
         "seconds": seconds,
@@ -38,7 +55,7 @@ def _record(benchmark: BenchmarkFixture, sizes: list[int], seconds: list[float])
 def test_growth_with_steps(benchmark: BenchmarkFixture):
     """A longer crossing: the same bridge at 40 to 2.5 m/s, each at 1 ms."""
     windows = [cases.noise_window(speed_m_per_s=v) for v in (40.0, 20.0, 10.0, 5.0, 2.5)]
-    seconds = benchmark.pedantic(lambda: [_seconds(w, 7) / 64 for w in windows], rounds=1)
+    seconds = benchmark.pedantic(_seconds, args=([_Size(w) for w in windows],), rounds=1)
     _record(benchmark, [w.signals.shape[2] for w in windows], seconds)
 
 
@@ -46,7 +63,7 @@ def test_growth_with_modes(benchmark: BenchmarkFixture):
     """Seven elements of four parts each, as a basis of 7 to 56 coordinates, at 10 m/s."""
     counts = [7, 14, 28, 56]
     windows = [cases.noise_window(parts=4, coordinates=c) for c in counts]
-    seconds = benchmark.pedantic(lambda: [_seconds(w, 7) / 64 for w in windows], rounds=1)
+    seconds = benchmark.pedantic(_seconds, args=([_Size(w) for w in windows],), rounds=1)
     _record(benchmark, counts, seconds)
 
 
@@ -54,9 +71,8 @@ def test_growth_with_elements(benchmark: BenchmarkFixture):
     """More unknown rigidities in a basis of 14 coordinates, at 10 m/s."""
     counts = [7, 14, 28, 56]
     windows = [cases.noise_window(elements=n, coordinates=14) for n in counts]
-    seconds = benchmark.pedantic(
-        lambda: [_seconds(w, n) / 64 for w, n in zip(windows, counts, strict=True)], rounds=1
-    )
+    sizes = [_Size(w, elements=n) for w, n in zip(windows, counts, strict=True)]
+    seconds = benchmark.pedantic(_seconds, args=(sizes,), rounds=1)
     _record(benchmark, counts, seconds)
 
 
@@ -64,9 +80,8 @@ def test_growth_with_elements_and_all_modes(benchmark: BenchmarkFixture):
     """More elements with all their 2 n degrees of freedom, at 10 m/s."""
     counts = [4, 7, 14, 28]
     windows = [cases.noise_window(elements=n) for n in counts]
-    seconds = benchmark.pedantic(
-        lambda: [_seconds(w, n) / 64 for w, n in zip(windows, counts, strict=True)], rounds=1
-    )
+    sizes = [_Size(w, elements=n) for w, n in zip(windows, counts, strict=True)]
+    seconds = benchmark.pedantic(_seconds, args=(sizes,), rounds=1)
     _record(benchmark, counts, seconds)
 
 
@@ -74,10 +89,9 @@ def test_growth_with_particles(benchmark: BenchmarkFixture):
     """The paper's crossing for 125 to 2000 particles."""
     counts = [125, 250, 500, 1000, 2000]
     window = cases.noise_window()
-    seconds = benchmark.pedantic(
-        lambda: [_seconds(window, 7, particles=n) for n in counts], rounds=1
-    )
-    _record(benchmark, counts, seconds)
+    sizes = [_Size(window, particles=n) for n in counts]
+    seconds = benchmark.pedantic(_seconds, args=(sizes,), rounds=1)
+    _record(benchmark, counts, seconds, evaluations=1)
 
 
 def test_parts_of_an_evaluation(benchmark: BenchmarkFixture):
@@ -86,14 +100,11 @@ def test_parts_of_an_evaluation(benchmark: BenchmarkFixture):
     From four evaluations: at 10 and 5 m/s (twice the steps), with 14 and with 7 coordinates.
     """
 
-    def four() -> list[float]:
-        return [
-            _seconds(cases.noise_window(coordinates=m, speed_m_per_s=v), 7) / 64
-            for m in (14, 7)
-            for v in (10.0, 5.0)
-        ]
-
-    fast, slow, fast_half, slow_half = benchmark.pedantic(four, rounds=1)
+    sizes = [
+        _Size(cases.noise_window(coordinates=m, speed_m_per_s=v)) for m in (14, 7) for v in (10, 5)
+    ]
+    batches = benchmark.pedantic(_seconds, args=(sizes,), rounds=1)
+    fast, slow, fast_half, slow_half = (seconds / sizes[0].particles for seconds in batches)
     march, march_half = slow - fast, slow_half - fast_half
     modes = 2.0 * (march - march_half)
     benchmark.extra_info |= {

@@ -106,9 +106,8 @@ def _page(run: Entry) -> str:
         "## Growth",
         (
             "Time of one evaluation (of all particles in the last row), amortised over a batch on "
-            "one thread, least of eight; processor time of that thread. The exponent k of time ~ "
-            "size^k is fitted to all sizes on log axes; the last exponent is between the two "
-            "largest."
+            "one thread: its processor time, least of fourteen. The exponent k of time ~ size^k is "
+            "fitted to all sizes on log axes; the last exponent is between the two largest."
         ),
         _growth(found),
         "## Where the time goes",
@@ -161,8 +160,8 @@ def _targets(found: dict[str, Entry]) -> str:
             5.0,
             _median(walk),
             _time,
-            f"{_time(_median(walk) / walk['extra_info']['evaluations'])} an evaluation: most "
-            "stop early",
+            f"{_time(_median(walk) / walk['extra_info']['evaluations'])} an evaluation, "
+            "which stops when the comparison is decided",
         ),
         _Row(
             "least squares on one crossing, noise-free, random start",
