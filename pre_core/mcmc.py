@@ -1,9 +1,9 @@
 """Markov chains on the posterior, steered by the normal approximation at its optimum.
 
-The posterior of one crossing is close to normal in sixty dimensions. With y = T(w), where T maps a
-standard normal w to the approximation, the chains move by
+The posterior of one crossing is close to normal in sixty dimensions. With y = T(v), where T maps a
+standard normal v to the approximation, the chains move by
 
-    w' = rho w + sqrt(1 - rho^2) xi,    xi standard normal,
+    v' = rho v + sqrt(1 - rho^2) xi,    xi standard normal,
 
 which leaves the approximation itself invariant, and accept by what the posterior differs from it
 (preconditioned Crank-Nicolson; Cotter et al. 2013). rho = 0 proposes anew and is accepted about
@@ -24,9 +24,11 @@ from pre_core.search import Ending
 
 FloatArray = NDArray[np.float64]
 
-CHAINS = 20
-RHO = (0.0, 0.8, 0.6, 0.95)
+CHAINS = 8
+RHO = (0.0, 0.7)
 """Taken in turn."""
+_SMALLEST_SHIFT = 0.35
+_SMALLEST_STRETCH = 0.2
 
 LogDensity = Callable[[FloatArray], FloatArray]
 """Logarithm of the target at points (k, f), up to a constant; minus infinity where impossible."""
@@ -35,21 +37,23 @@ LogDensity = Callable[[FloatArray], FloatArray]
 class Approximation(NamedTuple):
     """A normal with mean `centre`, cut off where the coordinates `positive` would be negative.
 
-    In the order `order` (the positive ones first), y = centre + L z with standard normal z, those
-    of the positive coordinates cut off one after the other.
+    In the order `order` (the positive ones first), y = centre + L z, where z is w = shift + scale v
+    with standard normal v, those of the positive coordinates cut off one after the other.
     """
 
     centre: FloatArray  # (f,)
     factor: FloatArray  # (f, f) lower triangle L
     order: NDArray[np.int64]  # (f,)
     positive: int
+    shift: FloatArray  # (f,) of w; zero until the approximation has been adapted
+    scale: FloatArray  # (f,)
     seed: int
 
 
 class State(NamedTuple):
     """Where the chains are: normals and points (c, f), log weights (c,), and steps taken."""
 
-    w: FloatArray
+    v: FloatArray
     y: FloatArray
     log_weight: FloatArray
     steps: int
@@ -70,13 +74,38 @@ def approximation(
     others = np.setdiff1d(np.arange(centre.size), positive)
     order = np.concatenate([positive, others])
     factor = cholesky(covariance[np.ix_(order, order)], lower=True)
-    return Approximation(centre, np.asarray(factor), order, positive.size, seed)
+    f = centre.size
+    return Approximation(
+        centre, np.asarray(factor), order, positive.size, np.zeros(f), np.ones(f), seed
+    )
 
 
-def _map(normal: Approximation, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points T(w) of standard normals (k, f) and their log density, up to a constant."""
+def adapted(normal: Approximation, v: FloatArray) -> Approximation:
+    """The approximation moved and stretched, coordinate by coordinate, to fit draws v (n, c, f).
+
+    A posterior that leans to one side has its mean elsewhere than its optimum; draws tell where.
+    Chains must be begun anew with it (`moved`), and the draws it was made of be thrown away.
+    """
+    mean, spread = v.mean(axis=(0, 1)), np.clip(v.std(axis=(0, 1)), 0.7, 1.6)
+    # Few draws in many coordinates: only what stands out of their own scatter is taken over.
+    mean = np.where(np.abs(mean) > _SMALLEST_SHIFT, mean, 0.0)
+    spread = np.where(np.abs(spread - 1.0) > _SMALLEST_STRETCH, spread, 1.0)
+    return normal._replace(shift=normal.shift + normal.scale * mean, scale=normal.scale * spread)
+
+
+def moved(target: LogDensity, before: Approximation, after: Approximation, state: State) -> State:
+    """The same points as a state of another approximation."""
+    v = (before.shift + before.scale * state.v - after.shift) / after.scale
+    y, log_q = _map(after, v)
+    return State(v, y, _weigh(target, y, log_q), state.steps)
+
+
+def _map(normal: Approximation, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points of standard normals v (k, f) and their log density, up to a constant."""
+    w = normal.shift + normal.scale * v
     z = w.copy()
-    log_q = -0.5 * np.sum(w[:, normal.positive :] ** 2, axis=1)
+    # The density of z times that of v over that of w: dy/dz is constant, dw/dv too.
+    log_q = 0.5 * np.sum(w[:, : normal.positive] ** 2, axis=1) - 0.5 * np.sum(v**2, axis=1)
     for i in range(normal.positive):
         # The i-th ordered coordinate, centre + sum over j <= i of L_ij z_j, must stay >= 0.
         before = normal.centre[normal.order[i]] + z[:, :i] @ normal.factor[i, :i]
@@ -100,24 +129,24 @@ def _weigh(target: LogDensity, y: FloatArray, log_q: FloatArray) -> FloatArray:
 def init(target: LogDensity, normal: Approximation) -> State:
     """All chains at draws of the approximation."""
     rng = np.random.default_rng(np.random.SeedSequence(normal.seed, spawn_key=(0,)))
-    w = rng.standard_normal((CHAINS, normal.centre.size))
-    y, log_q = _map(normal, w)
-    return State(w, y, _weigh(target, y, log_q), 0)
+    v = rng.standard_normal((CHAINS, normal.centre.size))
+    y, log_q = _map(normal, v)
+    return State(v, y, _weigh(target, y, log_q), 0)
 
 
 def step(target: LogDensity, normal: Approximation, state: State) -> tuple[State, Info]:
     """One Metropolis-Hastings step of every chain."""
     rng = np.random.default_rng(np.random.SeedSequence(normal.seed, spawn_key=(state.steps + 1,)))
     rho = RHO[state.steps % len(RHO)]
-    w = rho * state.w + np.sqrt(1.0 - rho**2) * rng.standard_normal(state.w.shape)
-    y, log_q = _map(normal, w)
+    v = rho * state.v + np.sqrt(1.0 - rho**2) * rng.standard_normal(state.v.shape)
+    y, log_q = _map(normal, v)
     log_weight = _weigh(target, y, log_q)
     with np.errstate(invalid="ignore"):  # both impossible: infinity less infinity
         gain = log_weight - state.log_weight
     accepted = np.log(rng.uniform(size=CHAINS)) < gain
     accepted |= ~np.isfinite(state.log_weight) & np.isfinite(log_weight)
     new = State(
-        np.where(accepted[:, None], w, state.w),
+        np.where(accepted[:, None], v, state.v),
         np.where(accepted[:, None], y, state.y),
         np.where(accepted, log_weight, state.log_weight),
         state.steps + 1,

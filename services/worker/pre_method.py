@@ -28,7 +28,8 @@ from services.worker.crossing_data import (
 )
 
 _MICRO_G = 9.80665e-6
-_BURN_IN_SHARE = 4
+_LEARNING_SHARE = 3
+_LEARNING_STAGES = 2
 _SMALLEST_NOISE_UG = 0.1
 """A declared noise of zero cannot whiten anything; below this, model error dominates."""
 _GOOD_CHI2 = 1.25
@@ -204,15 +205,23 @@ def _sample(
         return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
 
     wanted = max(len(mcmc.RHO), settings.draws // mcmc.CHAINS)
-    steps = wanted + wanted // _BURN_IN_SHARE
+    learning = max(len(mcmc.RHO), wanted // _LEARNING_SHARE)
     state = mcmc.init(target, normal)
+    for stage in range(_LEARNING_STAGES):
+        seen = []
+        for count in range(learning):
+            report("learning the posterior's shape", 0.6 + 0.1 * (stage + count / learning))
+            state, _ = mcmc.step(target, normal, state)
+            seen.append(state.v)
+        better = mcmc.adapted(normal, np.stack(seen[learning // 3 :]))
+        state = mcmc.moved(target, normal, better, state)
+        normal = better
     draws, acceptance = [], []
-    for count in range(steps):
-        report("sampling the posterior", 0.6 + 0.4 * count / steps)
+    for count in range(wanted):
+        report("sampling the posterior", 0.8 + 0.2 * count / wanted)
         state, info = mcmc.step(target, normal, state)
-        if count >= steps - wanted:
-            draws.append(state.y)
-            acceptance.append(info.acceptance)
+        draws.append(state.y)
+        acceptance.append(info.acceptance)
     kept = np.stack(draws)
     of_interest = kept[:, :, where.theta]
     return _Chain(
