@@ -23,7 +23,7 @@ from pre_core.bridge import (
     uniform_beam,
     unit_stiffness_matrices,
 )
-from pre_core.jacobi import diagonalise
+from pre_core.jacobi import diagonalise, diagonalise_one
 from pre_core.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store
 from pre_core.parameters import EI_1
 
@@ -121,6 +121,63 @@ def modal_filters(
                 for i in range(m):
                     total = fma_scalar(load(vectors[k], i), basis_cubics[e, power, i], total)
                 store(cubics[e, k], power, mul(total, size))
+    return True
+
+
+@kernel
+def modal_filters_one(
+    basis_stiffness: FloatArray,
+    basis_cubics: FloatArray,
+    theta: FloatArray,
+    step_s: float,
+    matrix: FloatArray,
+    vectors: FloatArray,
+    cubics: FloatArray,
+    feedback: FloatArray,
+) -> bool:
+    """The same for one bridge `theta` (n + 15,), its modes in the lanes: g groups of four.
+
+    `matrix` and `vectors` are (m, m). Written: `cubics` (parts, g, 4, 4) [part, group, power, mode]
+    and `feedback` (g, 2, 4); lanes beyond the last mode stay zero.
+    """
+    factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
+    elements = factors - 2
+    rho = EI_1 + elements
+    matrix[:] = 0.0
+    for e in range(factors):
+        factor = theta[EI_1 + e] if e < elements else theta[rho + 3 + e - elements]
+        if factor != 0.0:
+            for i in range(m):
+                to, unit = matrix[i], basis_stiffness[e, i]
+                for j in range(m):
+                    to[j] += factor * unit[j]
+    if not diagonalise_one(matrix, vectors):
+        return False
+    a = 2.0 / step_s
+    cubics[:] = 0.0
+    feedback[:] = 0.0
+    for k in range(m):
+        group, lane = k // LANES, k % LANES
+        eigenvalue = matrix[k, k] / theta[rho]
+        damping = theta[rho + 1] + theta[rho + 2] * eigenvalue
+        b_0 = a * a + a * damping + eigenvalue
+        feedback[group, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
+        feedback[group, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
+        size = 1.0 / np.sqrt(theta[rho] * b_0)
+        vector = vectors[k]
+        for e in range(basis_cubics.shape[0]):
+            for power in range(4):
+                row = basis_cubics[e, power]
+                # Four sums, so that each need not wait for the one before.
+                s0 = s1 = s2 = s3 = 0.0
+                for i in range(0, m - 3, 4):
+                    s0 += vector[i] * row[i]
+                    s1 += vector[i + 1] * row[i + 1]
+                    s2 += vector[i + 2] * row[i + 2]
+                    s3 += vector[i + 3] * row[i + 3]
+                for i in range(m - m % 4, m):
+                    s0 += vector[i] * row[i]
+                cubics[e, group, power, lane] = size * ((s0 + s1) + (s2 + s3))
     return True
 
 

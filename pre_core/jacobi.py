@@ -1,4 +1,4 @@
-"""Eigenvalues and eigenvectors of four small symmetric matrices at once.
+"""Eigenvalues and eigenvectors of small symmetric matrices: one, or four at once.
 
 A LAPACK call on one 14 x 14 matrix costs more than the time integration it serves. Cyclic Jacobi
 rotations (Golub and Van Loan, Matrix Computations, section 8.5) are branch-free, so that four
@@ -87,5 +87,50 @@ def diagonalise(a: FloatArray, v: FloatArray) -> bool:
                 for k in range(m):
                     _rotate(v_p, k, v_q, k, c, s, n)
         if left <= 0.0:
+            return True
+    return False
+
+
+@kernel
+def diagonalise_one(a: FloatArray, v: FloatArray) -> bool:
+    """The same for one matrix `a` (m, m), of which both triangles are read; `v` is (m, m).
+
+    Here a rotation that would change nothing is skipped, which four matrices cannot agree on.
+    """
+    m = a.shape[0]
+    v[:] = 0.0
+    for k in range(m):
+        v[k, k] = 1.0
+    for _ in range(MAX_SWEEPS):
+        left = False
+        for p in range(m - 1):
+            for q in range(p + 1, m):
+                off, app, aqq = a[p, q], a[p, p], a[q, q]
+                size = off * off
+                if size <= _NEGLIGIBLE**2 * np.abs(app * aqq):
+                    continue
+                # Written so that a NaN counts as something left.
+                left = left or not size <= _NEGLIGIBLE * np.abs(app * aqq)
+                half = 0.5 * (aqq - app)
+                root = np.sqrt(half * half + size)
+                t = off / (half + (root if half >= 0.0 else -root))
+                c = 1.0 / np.sqrt(1.0 + t * t)
+                s = t * c
+                row_p, row_q = a[p], a[q]
+                for k in range(m):
+                    x, y = row_p[k], row_q[k]
+                    row_p[k] = c * x - s * y
+                    row_q[k] = s * x + c * y
+                for k in range(m):
+                    a[k, p] = row_p[k]
+                    a[k, q] = row_q[k]
+                a[p, p], a[q, q] = app - t * off, aqq + t * off
+                a[p, q] = a[q, p] = 0.0
+                v_p, v_q = v[p], v[q]
+                for k in range(m):
+                    x, y = v_p[k], v_q[k]
+                    v_p[k] = c * x - s * y
+                    v_q[k] = s * x + c * y
+        if not left:
             return True
     return False

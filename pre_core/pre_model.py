@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.drs import BeamBasis, advance, modal_filters
+from pre_core.drs import BeamBasis, advance, modal_filters_one
 from pre_core.lanes import LANES, kernel
 from pre_core.parameters import C_S1, D_1, K_S1, K_U1, KAPPA, M_U1
 
@@ -54,12 +54,10 @@ class Points(NamedTuple):
 class Work(NamedTuple):
     """Work arrays of one thread; modified in place."""
 
-    matrix: FloatArray
-    vectors: FloatArray
-    cubics: FloatArray  # (parts, m, 4, 4)
-    feedback: FloatArray  # (m, 2, 4)
-    group_cubics: FloatArray  # (parts, groups, 4, 4)
-    group_feedback: FloatArray  # (groups, 2, 4)
+    matrix: FloatArray  # (m, m)
+    vectors: FloatArray  # (m, m)
+    cubics: FloatArray  # (parts, groups, 4, 4)
+    feedback: FloatArray  # (groups, 2, 4)
     state: FloatArray  # (groups, 2, 4)
     force: FloatArray  # (2, stretch, 4)
     lanes: FloatArray  # (2, stretch, 4)
@@ -69,7 +67,7 @@ class Work(NamedTuple):
     load: FloatArray  # (2, n)
     road: FloatArray  # (2, n)
     body: FloatArray  # (2, n)
-    modes_of: FloatArray  # (p,) the bridge whose modes are in group_cubics
+    modes_of: FloatArray  # (p,) the bridge whose modes are in `cubics`
 
 
 def workspace(crossing: Crossing, parameters: int) -> Work:
@@ -78,10 +76,8 @@ def workspace(crossing: Crossing, parameters: int) -> Work:
     groups = (m + LANES - 1) // LANES
     n = crossing.signals.shape[2]
     return Work(
-        np.zeros((m, m, LANES)),
-        np.zeros((m, m, LANES)),
-        np.zeros((parts, m, 4, LANES)),
-        np.zeros((m, 2, LANES)),
+        np.zeros((m, m)),
+        np.zeros((m, m)),
         np.zeros((parts, groups, 4, LANES)),
         np.zeros((groups, 2, LANES)),
         np.zeros((groups, 2, LANES)),
@@ -191,14 +187,11 @@ def _bridge(crossing: Crossing, work: Work, theta: FloatArray) -> bool:
             same = False
     if same:
         return True
-    four = np.empty((LANES, theta.size))
-    for lane in range(LANES):
-        four[lane] = theta
     basis = crossing.basis
-    if not modal_filters(
+    if not modal_filters_one(
         basis.stiffness,
         basis.cubics,
-        four,
+        theta,
         crossing.step_s,
         work.matrix,
         work.vectors,
@@ -207,13 +200,6 @@ def _bridge(crossing: Crossing, work: Work, theta: FloatArray) -> bool:
     ):
         work.modes_of[:] = np.nan
         return False
-    for k in range(work.cubics.shape[1]):
-        group, lane = k // LANES, k % LANES
-        for e in range(work.cubics.shape[0]):
-            for power in range(4):
-                work.group_cubics[e, group, power, lane] = work.cubics[e, k, power, 0]
-        work.group_feedback[group, 0, lane] = work.feedback[k, 0, 0]
-        work.group_feedback[group, 1, lane] = work.feedback[k, 1, 0]
     work.modes_of[:] = theta
     return True
 
@@ -242,11 +228,11 @@ def _deflect(work: Work) -> None:
                         work.force[w, i - begin, lane] = p
                         work.lanes[w, i - begin, lane] = 0.0
             advance(
-                work.group_cubics[max(e1, 0)],
-                work.group_cubics[max(e2, 0)],
+                work.cubics[max(e1, 0)],
+                work.cubics[max(e2, 0)],
                 e1 >= 0,
                 e2 >= 0,
-                work.group_feedback,
+                work.feedback,
                 work.state,
                 work.place[0, begin:stop],
                 work.place[1, begin:stop],

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.bridge import locate
-from pre_core.drs import BeamBasis, advance, beam_basis, modal_filters
+from pre_core.drs import BeamBasis, advance, beam_basis, modal_filters, modal_filters_one
 from pre_core.iep import iep_signals, input_profiles
 from pre_core.integrate import Integrated
 from pre_core.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
@@ -427,38 +427,34 @@ def residual_batch(window: Window, work: Workspace, theta: FloatArray) -> FloatA
 @kernel
 def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
     """J of one vector (p,), quicker than a batch of one: modes, not particles, share the lanes."""
-    four = np.empty((LANES, theta.size))
-    for lane in range(LANES):
-        four[lane] = theta
     if not np.all(np.isfinite(theta)):
         return np.inf
     basis = window.basis
-    if not modal_filters(
+    elements, modes = work.cubics.shape[0], work.cubics.shape[1]
+    groups = (modes + LANES - 1) // LANES
+    cubics = np.empty((elements, groups, 4, LANES))
+    feedback = np.empty((groups, 2, LANES))
+    matrix = np.empty((modes, modes))
+    vectors = np.empty((modes, modes))
+    if not modal_filters_one(
         basis.stiffness,
         basis.cubics,
-        four,
+        theta,
         window.step_s,
-        work.matrix,
-        work.vectors,
-        work.cubics,
-        work.feedback,
+        matrix,
+        vectors,
+        cubics,
+        feedback,
     ):
         return np.inf
+    four = np.empty((LANES, theta.size))
+    for lane in range(LANES):
+        for i in range(theta.size):
+            four[lane, i] = theta[i]
     factors = np.empty((13, LANES))
     _vehicle_factors(
         four, window.total_mass_kg, window.wheelbase_m, window.gravity_m_per_s2, factors
     )
-    elements, modes = work.cubics.shape[0], work.cubics.shape[1]
-    groups = (modes + LANES - 1) // LANES
-    cubics = np.zeros((elements, groups, 4, LANES))
-    feedback = np.zeros((groups, 2, LANES))
-    for k in range(modes):
-        group, lane = k // LANES, k % LANES
-        for e in range(elements):
-            for power in range(4):
-                cubics[e, group, power, lane] = work.cubics[e, k, power, 0]
-        feedback[group, 0, lane] = work.feedback[k, 0, 0]
-        feedback[group, 1, lane] = work.feedback[k, 1, 0]
     work.state[:] = 0.0
     work.seen[:] = 0.0
     columns = window.nuisance.shape[1]

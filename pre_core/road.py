@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
-from scipy.signal import welch
 
 from pre_core.simulate import Motion, WheelRoad, rear_position_m
 
@@ -171,6 +170,8 @@ def roughness_coefficient_m3(
     profile: Profile, band_cycles_per_m: tuple[float, float] = (0.05, 1.0)
 ) -> float:
     """G_d(n_0) of a profile: the level of a line of slope -2 fitted to its spectrum in the band."""
+    from scipy.signal import welch  # slow to import, seldom needed
+
     spacing = float(profile.x_m[1] - profile.x_m[0])
     n, density = welch(
         profile.height_m,

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import kaiser_beta, lfilter
 
 from pre_core.simulate import STANDARD_GRAVITY_M_PER_S2
 
@@ -122,6 +121,8 @@ def resample(samples: FloatArray, rate_hz: float, new_rate_hz: float, delay_s: f
         cutoff = stop - 0.5 * width
         taps = (_STOP_BAND_DB - 7.95) / (2.285 * 2.0 * np.pi * width)  # Kaiser's formula
         half_length = max(_SMALLEST_HALF_LENGTH, int(np.ceil(taps / 2.0)))
+    from scipy.signal import kaiser_beta  # slow to import, seldom needed
+
     beta = kaiser_beta(_STOP_BAND_DB)
     offsets = np.arange(1 - half_length, half_length + 1)
     result = np.empty(count)
@@ -180,6 +181,8 @@ def gauss_markov(
     phi = float(np.exp(-(time_s[1] - time_s[0]) / correlation_s))
     innovations = np.sqrt(1.0 - phi**2) * draws
     innovations[0] = draws[0]
+    from scipy.signal import lfilter  # slow to import, seldom needed
+
     return np.asarray(lfilter([1.0], [1.0, -phi], innovations))
 
 

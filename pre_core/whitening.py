@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.signal import firwin, kaiserord
 
 from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
 
@@ -52,6 +51,8 @@ class Whitener(NamedTuple):
 
 def row_filter(step_s: float, highest_hz: float) -> RowFilter:
     """Pass what is below `highest_hz` whole; decimate to about two and a half times that."""
+    from scipy.signal import firwin, kaiserord  # slow to import, seldom needed
+
     rate = 1.0 / step_s
     every = max(1, int(rate / (_ROWS_PER_CYCLE * highest_hz)))
     width = _TRANSITION * highest_hz
