@@ -108,7 +108,7 @@ def validate_command(
             for number in scenarios
         ]
     published = site is None
-    _print(console, found, published=published)
+    print_table(console, found, published=published)
     _print_summary(console, found, published=published, noise=noise)
     if json_path is not None:
         write_atomically(json_path, json.dumps(_as_json(found), indent=1) + "\n")
@@ -304,7 +304,8 @@ def _accuracy_of_paper(scenario: int, name: str) -> float:
     return float(tables_of_paper()["table8_accuracy_S_A"][name][scenario - 1])
 
 
-def _print(console: "Console", found: list[Scenario], *, published: bool) -> None:
+def print_table(console: "Console", found: list[Scenario], *, published: bool) -> None:
+    """One row for every scenario and parameter, at most 80 characters wide; weak ones in bold."""
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -322,7 +323,8 @@ def _print(console: "Console", found: list[Scenario], *, published: bool) -> Non
                 row.append("{:.2f} ± {:.2f}".format(*of_paper(scenario.number, name)))
                 row.append(f"{_accuracy_of_paper(scenario.number, name):.2f}")
             row.append(f"{walk.mean[name]:.2f} ± {walk.std[name]:.2f}")
-            row.append(f"{walk.accuracy[name]:.2f}")
+            accuracy = walk.accuracy[name]
+            row.append(f"{accuracy:.2f}" if accuracy >= 0.0 else f"{accuracy:.1f}")
             row.append(_ratio(ours.mean[name]))
             row.append(_ratio(ours.accuracy[name]))
             table.add_row(*row, style="bold" if scenario.truth[name] != 1.0 else None)
