@@ -38,7 +38,7 @@ from services.validation import (
 Floats = NDArray[np.float64]
 Proposal = Callable[[np.random.Generator, Floats], Floats]
 
-CONSOLE = Console(highlight=False, width=130)
+CONSOLE = Console(highlight=False, width=150)
 NOMINAL = parameters.from_models(paper.TRUCK, paper.beam(np.ones(paper.ELEMENTS)))
 FREE = parameters.paper_subset(paper.ELEMENTS)
 
@@ -52,6 +52,13 @@ class Walk(NamedTuple):
     stops: tuple[int, ...]
     road: tuple[str, int]
     seed: int
+
+
+class Stop(NamedTuple):
+    """The particles at one stop, and what share of the last 50 steps' proposals was accepted."""
+
+    cloud: Cloud
+    acceptance: float
 
 
 def gaussian(std: float) -> Proposal:
@@ -100,8 +107,8 @@ def objective(window: Window, work: residual.Workspace, ratios: Floats, limit: F
     return total
 
 
-def walk(task: Walk) -> list[Cloud]:
-    """The paper's search with any step: the cloud at each stop."""
+def walk(task: Walk) -> list[Stop]:
+    """The paper's search with any step, looked at at each stop."""
     window = window_of(task.scenario, task.road)
     work = residual.workspace(window)
     rng = np.random.default_rng(task.seed)
@@ -109,25 +116,28 @@ def walk(task: Walk) -> list[Cloud]:
         random_walk.PRIOR_LOW, random_walk.PRIOR_HIGH, (random_walk.PARTICLES, FREE.size)
     )
     kept = objective(window, work, x, np.full(x.shape[0], np.inf))
-    clouds = []
+    found: list[Stop] = []
+    accepted: list[float] = []
     for count in range(1, max(task.stops) + 1):
         trial = task.propose(rng, x)
         value = objective(window, work, trial, kept)
         better = value <= kept
         x = np.where(better[:, None], trial, x)
         kept = np.where(better, value, kept)
+        accepted.append(float(better.mean()))
         if count in task.stops:
             columns = table_columns(x, nominal=NOMINAL, free=FREE, window=window)
-            clouds.append(cloud_of(columns, NAMES, truth_of(task.scenario)))
-    return clouds
+            cloud = cloud_of(columns, NAMES, truth_of(task.scenario))
+            found.append(Stop(cloud, float(np.mean(accepted[-50:]))))
+    return found
 
 
 def compare(tasks: list[Walk], title: str) -> None:
     """Run the walks, two at a time, and print one line for each label and stop."""
     with ThreadPoolExecutor(2) as pool, CONSOLE.status("") as status:
         found = []
-        for task, clouds in zip(tasks, pool.map(walk, tasks), strict=True):
-            found.append((task, clouds))
+        for task, stops in zip(tasks, pool.map(walk, tasks), strict=True):
+            found.append((task, stops))
             status.update(f"{len(found)} of {len(tasks)} walks done")
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in (
@@ -140,13 +150,16 @@ def compare(tasks: list[Walk], title: str) -> None:
         "EI_4 of 6",
         "EI_3, EI_5 of 6",
         "EI_7 of 12",
+        "m_s2 of 6",
+        "accepted",
     ):
         table.add_column(column, justify="left" if column == title else "right")
     for label in dict.fromkeys(task.label for task in tasks):
-        chosen = [(task, clouds) for task, clouds in found if task.label == label]
+        chosen = [(task, stops) for task, stops in found if task.label == label]
         for place, stop in enumerate(chosen[0][0].stops):
-            by_scenario = {task.scenario: clouds[place] for task, clouds in chosen}
-            table.add_row(label, str(stop), *_figures(by_scenario))
+            clouds = {task.scenario: stops[place].cloud for task, stops in chosen}
+            acceptance = float(np.mean([stops[place].acceptance for _, stops in chosen]))
+            table.add_row(label, str(stop), *_figures(clouds), f"{100 * acceptance:.2f} %")
     CONSOLE.print(table)
 
 
@@ -167,6 +180,7 @@ def _figures(clouds: dict[int, Cloud]) -> list[str]:
         mean(6, "EI_4"),
         mean(6, "EI_3", "EI_5"),
         mean(12, "EI_7"),
+        f"{clouds[6].mean['m_s2']:.2f} ± {clouds[6].std['m_s2']:.2f}" if 6 in clouds else "-",
     ]
 
 
