@@ -2,7 +2,7 @@
 
 A particle moves by a random step if its J does not grow, and stays otherwise (paper eq. 23). The
 paper calls it MCMC; it is not a sampler of a posterior, since no probability decides, and the
-spread of its particles is no uncertainty: it shrinks with every further step. It is here for
+spread of its particles is no uncertainty: it follows from the width of the step. It is here for
 comparison.
 
 The paper does not print the distribution of the step. Here it is Gaussian with a standard deviation
@@ -113,7 +113,7 @@ def step(bound: Problem, state: State) -> tuple[State, Info]:
     rng = _random(bound.seed, state.steps + 1)
     proposal = state.ratios + bound.step_ratio * rng.standard_normal(state.ratios.shape)
     objective = _evaluate(bound, proposal, state.objective)
-    accepted = objective <= state.objective
+    accepted = np.isfinite(objective) & (objective <= state.objective)
     ratios = np.where(accepted[:, None], proposal, state.ratios)
     kept = np.where(accepted, objective, state.objective)
     best = float(kept.min())

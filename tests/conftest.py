@@ -1,5 +1,6 @@
 """What several tests need."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -7,6 +8,9 @@ import pytest
 
 if TYPE_CHECKING:
     from services.simulation import Drive
+
+# As the commands do, before anything imports numpy: see services/cli.py.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 PROJECT = Path(__file__).parents[1]
 

@@ -48,6 +48,8 @@ _STANDING_M_PER_S = 0.5
 _LONGEST_OUTAGE_S = 1.5
 _LARGEST_MISFIT = 0.02
 """Root mean square of R_1 - R_2 relative to the road itself; beyond it nothing was explained."""
+_LARGEST_FACTOR = 100.0
+"""Nothing of a truck or a bridge is a hundred times what its owner says."""
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3
 
 
@@ -350,6 +352,15 @@ _METHODS: dict[str, Callable[[CrossingData, IdentificationSettings, Window, Repo
 }
 
 
+def _ran_away(data: CrossingData, fit: _Fit) -> bool:
+    """Whether the search ended anywhere but at a minimum within reason."""
+    if fit.ending in (search.Ending.STEPS_EXHAUSTED, search.Ending.STUCK):
+        return True
+    nominal = nominal_parameters(data.vehicle, data.bridge)[fit.free]
+    factors = np.abs(np.log(fit.theta[fit.free] / nominal))
+    return bool(factors.max() > np.log(_LARGEST_FACTOR))
+
+
 def _result(
     data: CrossingData,
     settings: IdentificationSettings,
@@ -371,11 +382,12 @@ def _result(
         "road_rms_m": road_m,
         "relative_misfit": misfit_m / max(road_m, 1e-12),
     }
+    if _ran_away(data, fit):
+        # Under noise the plain residual has no minimum to speak of: no number is an estimate.
+        return rejected(data, settings, passing, [Reason.NOT_CONVERGED], diagnostics=diagnostics)
     reasons = [Reason.NO_NOISE_MODEL]
     if diagnostics["relative_misfit"] > _LARGEST_MISFIT:
         reasons.append(Reason.MODEL_MISFIT)
-    if fit.ending in (search.Ending.STEPS_EXHAUSTED, search.Ending.STUCK):
-        reasons.append(Reason.NOT_CONVERGED)
     changing = np.abs(motion.acceleration_m_per_s2).max() > _LARGEST_ACCELERATION_M_PER_S2
     if changing and data.vehicle.cg_height_m is None:
         reasons.append(Reason.ACCELERATING_CG_UNKNOWN)
