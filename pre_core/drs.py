@@ -68,13 +68,6 @@ def beam_basis(
     )
 
 
-class ModalWorkspace(NamedTuple):
-    """Work arrays of `modal_filters`; allocated once a thread, modified in place."""
-
-    matrix: FloatArray  # (m, m, 4)
-    vectors: FloatArray  # (m, m, 4)
-
-
 @kernel
 def modal_filters(
     basis_stiffness: FloatArray,

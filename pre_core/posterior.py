@@ -1,10 +1,10 @@
 """Method `pre`: the whitened likelihood of one crossing with its priors, and its optimum.
 
-All unknowns are put into coordinates y in which their prior is a standard normal (docs/method.md):
-logarithms of positive quantities, multiples of the prior's spread for the others. The trajectory's
-spline coefficients have no prior of their own; the receiver's fixes take its place. The sum of
-squares of all rows is then -2 log posterior up to a constant, and its Gauss-Newton curvature the
-precision of the Gaussian that the Markov chain starts from.
+All unknowns are put into coordinates y in which their prior is a standard normal
+(docs/method-pre.md): logarithms of positive quantities, multiples of the prior's spread for the
+others. The trajectory's spline coefficients have no prior of their own; the receiver's fixes take
+its place. The sum of squares of all rows is then -2 log posterior up to a constant, and its
+Gauss-Newton curvature the precision of the normal that the Markov chains are steered by.
 """
 
 from typing import NamedTuple

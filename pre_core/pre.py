@@ -119,8 +119,7 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         speeding,
         rows,
         values,
-        np.ones(theta.size, dtype=bool)
-        & ((theta > 0.0) | (np.arange(theta.size) >= theta.size - 2)),
+        (theta > 0.0) | (np.arange(theta.size) >= theta.size - 2),
         tuple(workspace(crossing, theta.size) for _ in range(inputs.threads)),
     )
     return problem, start(problem, best)

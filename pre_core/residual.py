@@ -395,9 +395,7 @@ def objective_batch(
 
 
 @kernel
-def _residual_batch(
-    window: Window, work: Workspace, theta: FloatArray, out: FloatArray, valid: FloatArray
-) -> None:
+def _residual_batch(window: Window, work: Workspace, theta: FloatArray, out: FloatArray) -> None:
     count = theta.shape[0]
     four = np.empty((LANES, theta.shape[1]))
     no_limit = np.full(LANES, np.inf)
@@ -407,7 +405,6 @@ def _residual_batch(
         totals = np.empty(LANES)
         march_particles(window, work, four, no_limit, totals)
         for lane in range(min(LANES, count - begin)):
-            valid[begin + lane] = totals[lane]
             if np.isfinite(totals[lane]):
                 _rows(window, work.road, lane, out[begin + lane])
             else:
@@ -418,7 +415,7 @@ def residual_batch(window: Window, work: Workspace, theta: FloatArray) -> FloatA
     """Weighted residual rows (k, m) of vectors (k, p); their squares sum to J. NaN: not finite."""
     theta = np.ascontiguousarray(theta)
     out = np.empty((theta.shape[0], window.front_sample.size))
-    _residual_batch(window, work, theta, out, np.empty(theta.shape[0]))
+    _residual_batch(window, work, theta, out)
     if window.nuisance.shape[1]:
         out -= (out @ window.nuisance) @ window.nuisance.T
     return out

@@ -1,5 +1,6 @@
 """`driveby identify`: recordings become results, offline, through the worker's own engine."""
 
+import logging
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+_log = logging.getLogger(__name__)
+
+
 def identify_command(
     *,
     recordings: list[Path],
@@ -34,7 +38,7 @@ def identify_command(
     InputError: a file that cannot be read or written, or has no accelerations or positions.
     """
     if draws_path is not None:
-        raise InputError(f"--draws: the method {method.replace('_', '-')} has no chain to store")
+        raise InputError("--draws: no method stores its chain yet, leave the option out")
     for path in (json_path, rrd_path):
         if path is not None:
             check_writable(path)
@@ -99,6 +103,7 @@ def identify_recordings(
     for stream, what in (("accel", "accelerations (accel)"), ("gnss", "positions (gnss)")):
         if not messages[stream]:
             raise InputError(f"{_names(recordings)}: no {what}, a recording of a truck is expected")
+    _check_vehicles(recordings, site, [*messages["accel"], *messages["gnss"]])
     for message in _as_it_happened(recordings, [*messages["accel"], *messages["gnss"]]):
         found += [
             output.result
@@ -106,10 +111,21 @@ def identify_recordings(
             if output.result is not None
         ]
     found += [output.result for output in engine.finish() if output.result is not None]
-    for vehicle in sorted(engine.unknown_vehicles):
-        raise InputError(f"{_names(recordings)}: {vehicle} drove, but the site has no such vehicle")
     found.sort(key=lambda crossing: crossing.entry_time)
     return results(header, found, engine.bridges())
+
+
+def _check_vehicles(recordings: list[Path], site: Site, messages: list[Message]) -> None:
+    """InputError if the site knows none of the trucks; a warning for each that it does not know."""
+    known = {vehicle.id for vehicle in site.vehicles}
+    drove = {message.key.identifier for message in messages}
+    strangers = ", ".join(sorted(drove - known))
+    if drove and not drove & known:
+        raise InputError(
+            f"{_names(recordings)}: {strangers} drove, but the site has no such vehicle"
+        )
+    if strangers:
+        _log.warning("%s drove too, but the site has no such vehicle", strangers)
 
 
 def _as_it_happened(recordings: list[Path], messages: list[Message]) -> list[Message]:

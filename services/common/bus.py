@@ -16,7 +16,7 @@ How nothing is lost. Publishers block instead of dropping, keep their last messa
 table says how many) and announce the number of the last one twice a second. A subscriber asks for
 the history of every publisher that it meets and for every number that it misses. That alone loses
 a gap now and then when router and subscriber die together, so a thread asks once more for every
-gap that has lasted (`facts.md`). What comes twice that way is told by its identity; a subscriber
+gap that has lasted. What comes twice that way is told by its identity; a subscriber
 that must not see anything twice uses `Seen`.
 
 How a publisher knows that its messages arrived. A put returns when Zenoh has it, no more. Loggers

@@ -209,8 +209,9 @@ def run(
 
         engine = Engine(known, settings, header, stopwatch=time.perf_counter, report=report)
         arrivals: queue.Queue[_Arrived | _Token] = queue.Queue(_LONGEST_QUEUE)
+        failed = threading.Event()
         receiver = threading.Thread(
-            target=_receive, args=(bus, realm, arrivals, stop), name="receive", daemon=True
+            target=_receive, args=(bus, realm, arrivals, stop, failed), name="receive", daemon=True
         )
         receiver.start()
         try:
@@ -220,6 +221,8 @@ def run(
             receiver.join()
             publisher.close()
             files.finish()
+        if failed.is_set():
+            raise FailureError(f"{endpoint}: the connection to the bus failed, see the log")
     return 0
 
 
@@ -245,8 +248,28 @@ def _receive(
     realm: str,
     arrivals: "queue.Queue[_Arrived | _Token]",
     stop: threading.Event,
+    failed: threading.Event,
 ) -> None:
-    """Take everything off the bus quickly: an identification must not hold up a publisher."""
+    """Take everything off the bus quickly: an identification must not hold up a publisher.
+
+    Sets `failed` and `stop` if it cannot go on: a worker that hears nothing must not look alive.
+    """
+    try:
+        _take_all(bus, realm, arrivals, stop)
+    except zenoh.ZError as error:
+        if not stop.is_set():
+            failed.set()
+            _log.error("the connection to the bus failed: %s", error)
+    finally:
+        stop.set()
+
+
+def _take_all(
+    bus: zenoh.Session,
+    realm: str,
+    arrivals: "queue.Queue[_Arrived | _Token]",
+    stop: threading.Event,
+) -> None:
     seen = Seen()
     alive = bus.liveliness().declare_subscriber(
         selector(realm, "vehicle", "alive"), zenoh.handlers.FifoChannel(1000), history=True
@@ -259,7 +282,7 @@ def _receive(
                 if token is not None:
                     key = parse_key(str(token.key_expr))
                     is_alive = token.kind == zenoh.SampleKind.PUT
-                    arrivals.put(_Token(key.realm, key.identifier, is_alive))
+                    _put(arrivals, _Token(key.realm, key.identifier, is_alive), stop)
                 if received is None:
                     continue
                 key, identity = received.key(), received.identity()
@@ -267,8 +290,18 @@ def _receive(
                 _log.warning("refused: %.200s", error)
                 continue
             if key.stream in ("accel", "gnss") and seen.add(key, identity):
-                arrivals.put(_Arrived(key, identity.boot_id, received.payload))
+                _put(arrivals, _Arrived(key, identity.boot_id, received.payload), stop)
     alive.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _put(
+    arrivals: "queue.Queue[_Arrived | _Token]", item: _Arrived | _Token, stop: threading.Event
+) -> None:
+    """Wait for room in the queue, but not beyond the end of the service."""
+    while not stop.is_set():
+        with contextlib.suppress(queue.Full):
+            arrivals.put(item, timeout=_POLL_S)
+            return
 
 
 def _serve(

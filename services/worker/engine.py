@@ -52,12 +52,6 @@ class Output(NamedTuple):
     result: Crossing | None = None
 
 
-class _Pending(NamedTuple):
-    crossing_id: str
-    bridge: Bridge
-    stay: Stay
-
-
 class _Truck:
     """One boot of one truck: its messages, and what has been said of its crossings."""
 

@@ -4,6 +4,7 @@
 slow), fits, and says what the answer is worth. Every way to fail is a verdict, not an exception.
 """
 
+import logging
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -37,6 +38,7 @@ from services.worker.crossing_data import (
 )
 from services.worker.pre_method import identify_pre
 
+_log = logging.getLogger(__name__)
 Stopwatch = Callable[[], float]
 Report = Callable[[str, float], None]
 
@@ -95,7 +97,8 @@ def identify(
         if isinstance(found, Reason):
             return reject([found])
         return _result(data, settings, passing, *found, stopwatch() - began)
-    except (ValueError, ArithmeticError):  # numpy's LinAlgError is a ValueError
+    except Exception:  # whatever the data are, the answer is a verdict
+        _log.exception("identification of %s failed", data.crossing_id)
         return reject([Reason.FAILED])
 
 
@@ -391,6 +394,8 @@ def _result(
     changing = np.abs(motion.acceleration_m_per_s2).max() > _LARGEST_ACCELERATION_M_PER_S2
     if changing and data.vehicle.cg_height_m is None:
         reasons.append(Reason.ACCELERATING_CG_UNKNOWN)
+    if any(data.vehicle.tyre_damping_ns_per_m):
+        reasons.append(Reason.TYRE_DAMPING_IGNORED)
     values = _parameters(data, fit, settings)
     names = tuple(parameters.names(data.bridge.elements)[i] for i in fit.free)
     return results.Crossing(
