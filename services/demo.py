@@ -6,6 +6,7 @@ the live result, and drawn.
 """
 
 import contextlib
+import shutil
 import signal
 import socket
 import subprocess
@@ -60,6 +61,14 @@ def demo_command(*, out: Path | None, speed: float, noise: float, console: "Cons
     FailureError says which of them did not happen. InputError: the folder exists.
     """
     folder = _new_folder(out)
+    try:
+        return _run(folder, speed, noise, console)
+    except KeyboardInterrupt:
+        shutil.rmtree(folder, ignore_errors=True)  # half a demo is of no use to anybody
+        raise
+
+
+def _run(folder: Path, speed: float, noise: float, console: "Console") -> int:
     began = time.monotonic()
     with (
         _terminated_as_interrupted(),

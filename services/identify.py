@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from schemas.results import Crossing, Header, Results, results, results_json
 from schemas.settings import IdentificationSettings
 from schemas.site import Site, load_site, parse_site, site_hash
-from services.common.errors import InputError
+from services.common.errors import FailureError, InputError
 from services.common.files import check_writable, replaced_atomically, write_atomically
 from services.common.recording import Message, program_version, read_messages, read_site
 from services.common.streams import device_time_ns
@@ -53,13 +53,18 @@ def identify_command(
         from services.viewer.crossing_view import view_of_crossing
         from services.viewer.rerun_file import bridges_of_site, signals_of_messages, write_rrd
 
-        with replaced_atomically(rrd_path) as temporary:
-            write_rrd(
-                temporary,
-                vehicles=signals_of_messages(_all_messages(recordings)),
-                bridges=bridges_of_site(known),
-                crossings=[view_of_crossing(c, known.bridge(c.bridge)) for c in found.crossings],
-            )
+        try:
+            with replaced_atomically(rrd_path) as temporary:
+                write_rrd(
+                    temporary,
+                    vehicles=signals_of_messages(_all_messages(recordings)),
+                    bridges=bridges_of_site(known),
+                    crossings=[
+                        view_of_crossing(c, known.bridge(c.bridge)) for c in found.crossings
+                    ],
+                )
+        except RuntimeError as error:  # so Rerun says that its file could not be written
+            raise FailureError(f"{rrd_path}: could not be written: {error}") from error
     return 0
 
 
@@ -172,7 +177,7 @@ def _print(console: "Console", found: Results, site: Site) -> None:
     for crossing in found.crossings:
         console.print(
             f"[bold]{crossing.crossing_id}[/]  {crossing.direction.replace('_', ' ')}, "
-            f"{crossing.speed_m_per_s:.2f} m/s, {crossing.method.replace('_', ' ')}: "
+            f"{crossing.speed_m_per_s:.2f} m/s, {crossing.method.replace('_', ' ')}\n"
             f"[bold]{crossing.verdict}[/]"
         )
         for code, text in zip(crossing.reasons, crossing.reason_texts, strict=True):

@@ -41,6 +41,8 @@ def import_command(
 
 
 def _read(sources: list[Path], site: Site, site_path: Path) -> list[Run]:
+    if len(sources) == 1 and sources[0].suffix == ".csv":
+        raise InputError(f"{sources[0]}: the positions are missing, give accel.csv and gps.csv")
     if len(sources) == 1 and is_comma2k19(sources[0]):
         return [read_comma2k19(sources[0])]  # knows its axes and its rate itself
     if len(sources) == 1:

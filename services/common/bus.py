@@ -25,10 +25,13 @@ publish on `durable` how many messages of each stream and boot are on their disk
 announcements and the queries that follow from them.
 """
 
+import contextlib
 import json
 import logging
+import math
 import queue
 import re
+import socket
 import threading
 import time
 from collections import Counter
@@ -54,6 +57,7 @@ _log = logging.getLogger(__name__)
 _ENDPOINT = re.compile(r"(tcp|tls|quic|ws|unixsock-stream)/\S+")
 _HEARTBEAT_S = 0.5
 _IDLE_POLL_S = 0.005
+_CONNECT_TRY_MS = 500
 _GAP_PATIENCE_S = 0.5
 _GAP_TRIES = 3
 _GAP_QUERY_TIMEOUT_S = 5.0
@@ -95,12 +99,36 @@ def open_session(
     if (connect is None) == (listen is None):
         raise ValueError("either connect or listen")
     endpoint = _check_endpoint(connect or listen or "")
+    deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
+    while True:
+        try:
+            return zenoh.open(_configuration(endpoint, is_client=connect is not None))
+        except zenoh.ZError as error:
+            _log.debug("zenoh: %s", error)
+            if listen is not None:
+                raise FailureError(_why_not_listening(endpoint, error)) from None
+            # Zenoh would wait by itself, but meanwhile Python hears no signal.
+            if time.monotonic() >= deadline:
+                raise FailureError(
+                    f"no router answers at {endpoint} within {timeout_s:g} s; "
+                    "start `driveby logger` first or give another endpoint"
+                ) from None
+
+
+def _why_not_listening(endpoint: str, error: zenoh.ZError) -> str:
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    with contextlib.suppress(OSError, ValueError), socket.create_connection((host, int(port)), 1):
+        return f"cannot listen at {endpoint}: the address is in use, is another logger running?"
+    return f"cannot listen at {endpoint}: {_first_sentence(error).rstrip(':')}"
+
+
+def _configuration(endpoint: str, *, is_client: bool) -> zenoh.Config:
     config = zenoh.Config()
     settings: dict[str, Any] = {
-        "mode": "client" if connect else "router",
-        "connect/endpoints": [endpoint] if connect else [],
-        "listen/endpoints": [endpoint] if listen else [],
-        "connect/timeout_ms": -1 if timeout_s is None else round(timeout_s * 1000),
+        "mode": "client" if is_client else "router",
+        "connect/endpoints": [endpoint] if is_client else [],
+        "listen/endpoints": [] if is_client else [endpoint],
+        "connect/timeout_ms": _CONNECT_TRY_MS,
         "connect/retry": {
             "period_init_ms": 100,
             "period_max_ms": 500,
@@ -113,16 +141,7 @@ def open_session(
     }
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        _log.debug("zenoh: %s", error)
-        if connect:
-            raise FailureError(
-                f"no router answers at {endpoint} within {timeout_s:g} s; "
-                "start `driveby logger` first or give another endpoint"
-            ) from None
-        raise FailureError(f"cannot listen at {endpoint}: {_first_sentence(error)}") from None
+    return config
 
 
 class Publisher:

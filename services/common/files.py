@@ -43,10 +43,24 @@ def check_writable(path: Path) -> None:
     """Raise InputError if a file cannot be put at `path`. For use before hours of work."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder, give the name of a file to write")
+    if path.exists() and not path.is_file():
+        # Renaming a file onto a device or a pipe would replace it.
+        raise InputError(f"{path}: is no ordinary file, give the name of a file to write")
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist, make it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise InputError(f"{path}: no permission to write in the folder {path.parent}")
+
+
+def check_folder_writable(folder: Path) -> None:
+    """Raise InputError if nothing can be put into a folder, or into the first parent there is."""
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise InputError(f"{folder}: cannot be made, {there} is a file")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: no permission to write in the folder {there}")
 
 
 def read_text(path: Path) -> str:

@@ -17,7 +17,7 @@ from schemas.signals import Identity
 from schemas.topics import PREFIX, Key, check_identifier, check_realm
 from services.common.bus import Publisher, Received, Subscription, open_session
 from services.common.errors import FailureError, InputError
-from services.common.files import read_text
+from services.common.files import check_folder_writable, read_text
 from services.common.playback import stopped_by_signals
 from services.common.recording import Message
 from services.logger.intake import Intake
@@ -58,6 +58,7 @@ def run(
     """
     place = Place(folder, file, _check_realm(realm), _read_site(site))
     _check_service(service_id)
+    check_folder_writable(file.parent if file is not None else folder)
     with stopped_by_signals(on_second=_leave_at_once) as stop, open_session(listen=listen) as bus:
         writer = FileWriter(place)
         try:
