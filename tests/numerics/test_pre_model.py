@@ -1,0 +1,362 @@
+"""The residual model at the truth of simulated crossings, and what each of its corrections undoes.
+
+The truth has 70 elements, 40 modes and steps of 0.1 ms; what is left of the residual at the true
+parameters is measured in units of the noise of 5 µg/√Hz, five times better than the sensors.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pre_core import paper
+from pre_core.channels import A, V, Z, channel_signals
+from pre_core.drs import beam_basis
+from pre_core.parameters import EI_1, K_U1, KAPPA, from_models
+from pre_core.pre_model import Crossing, Points, evaluate, roads_and_deflections, workspace
+from pre_core.sensors import MICRO_G_M_PER_S2, resample
+from pre_core.simulate import STANDARD_GRAVITY_M_PER_S2
+from pre_core.vehicle import body_masses_kg
+from pre_core.whitening import filtered, row_filter, whiten, whitener
+from schemas.signals import CHANNELS
+from schemas.site import Site
+from services.simulation import beam_of, paper_site, simulate_drive, truck_of
+
+if TYPE_CHECKING:
+    from services.simulation import Drive
+
+FloatArray = NDArray[np.float64]
+
+NOISE_UG = 5.0
+BEFORE_S = 3.0  # of driving in a simulated recording before the front axle enters
+PARTS = 2
+RHO_A, ALPHA, BETA, START, END = range(-5, 0)
+
+
+class Case(NamedTuple):
+    acceleration: FloatArray
+    step_s: float
+    theta: FloatArray
+    front_m: FloatArray
+    speeding: FloatArray
+    direction: int
+    site: Site
+
+
+def case(
+    drive: "Drive",
+    site: Site,
+    *,
+    forward: bool = True,
+    speeds: tuple[float, float] = (paper.SPEED_M_PER_S, paper.SPEED_M_PER_S),
+) -> Case:
+    vehicle, bridge = site.vehicles[0], site.bridges[0]
+    t = np.arange(drive.run.accel_time_s.size) / drive.run.rate_hz
+    begin, end = speeds
+    driven_s = BEFORE_S + (bridge.span_m + vehicle.wheelbase_m) / (0.5 * (begin + end)) + 2.5
+    rate = (end - begin) / driven_s
+    travel = begin * (t - BEFORE_S) + 0.5 * rate * (t**2 - BEFORE_S**2)
+    kept = (travel > -8.0) & (travel < bridge.span_m + vehicle.wheelbase_m + 6.0)
+    travel = travel[kept]
+    return Case(
+        np.stack([drive.run.channels[name][kept] for name in CHANNELS]),
+        1.0 / drive.run.rate_hz,
+        from_models(truck_of(vehicle), beam_of(bridge, drive.rigidity_ratios)),
+        travel if forward else bridge.span_m - travel,
+        np.full(travel.size, rate),
+        1 if forward else -1,
+        site,
+    )
+
+
+def crossing(case: Case, *, cg_height_m: float | None = None, parts: int = PARTS) -> Crossing:
+    vehicle, bridge = case.site.vehicles[0], case.site.bridges[0]
+    basis = beam_basis(np.array(bridge.lengths_m), parts)
+    travelled = np.abs(case.front_m - case.front_m[0])
+    first = int(np.searchsorted(travelled, vehicle.wheelbase_m + 1.0))
+    return Crossing(
+        case.step_s,
+        channel_signals(case.acceleration, case.step_s),
+        case.direction,
+        bridge.span_m,
+        vehicle.total_mass_kg,
+        (vehicle.cg_height_m or 0.0) if cg_height_m is None else cg_height_m,
+        STANDARD_GRAVITY_M_PER_S2,
+        basis,
+        np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
+        first,
+        case.front_m.size - first,
+    )
+
+
+def point(case: Case, count: int = 1) -> Points:
+    """`count` times the truth, without any correction."""
+    return Points(
+        np.tile(case.theta, (count, 1)),
+        np.full(count, case.site.vehicles[0].wheelbase_m),
+        np.tile(case.front_m, (count, 1)),
+        np.tile(case.speeding, (count, 1)),
+        np.zeros((count, 4)),
+        np.zeros((count, 4)),
+        np.zeros((count, 4, 3)),
+    )
+
+
+def residual(
+    case: Case, at: Points, *, data: Crossing | None = None, threads: int = 1
+) -> FloatArray:
+    data = crossing(case) if data is None else data
+    works = tuple(workspace(data, case.theta.size) for _ in range(threads))
+    return evaluate(data, works, at)
+
+
+def in_noise(case: Case, residuals: FloatArray) -> FloatArray:
+    """Mean square of the three white rows, where 1 is the noise of 5 µg/√Hz: (3,)."""
+    m_11, m_22, _ = body_masses_kg(truck_of(case.site.vehicles[0]))
+    rows = row_filter(case.step_s, 80.0)
+    seen = filtered(rows, residuals)
+    noise = whitener(
+        rows, seen.shape[2], case.theta, (m_11, m_22), np.full(4, NOISE_UG * MICRO_G_M_PER_S2)
+    )
+    return np.asarray(np.mean(whiten(noise, seen).reshape(-1, 3) ** 2, axis=0))
+
+
+@pytest.fixture(scope="module")
+def truth(scenario_6: "Drive") -> Case:
+    return case(scenario_6, paper_site())
+
+
+@pytest.fixture(scope="module")
+def backward() -> Case:
+    site = paper_site()
+    drive = simulate_drive(site, paper.scenario_ratios(6), road_class="A", seed=1, forward=False)
+    return case(drive, site, forward=False)
+
+
+@pytest.mark.parametrize("name", ["truth", "backward"])
+def test_at_the_truth_little_of_the_noise_is_left(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    """Measured: 0.05, 0.0002, 0.001 of the noise power of 5 µg/√Hz, that is 1.1 µg/√Hz at most."""
+    here: Case = request.getfixturevalue(name)
+    left = in_noise(here, residual(here, point(here)))
+    assert left[0] < 0.1, left
+    assert np.all(left[1:] < 0.01), left
+
+
+@pytest.mark.parametrize("name", ["truth", "backward"])
+@pytest.mark.parametrize(
+    ("place", "ratio"), [(EI_1 + 3, 1.05), (EI_1 + 1, 1.05), (KAPPA, 0.99), (K_U1 + 1, 1.02)]
+)
+def test_a_wrong_parameter_stands_out(
+    name: str, place: int, ratio: float, request: pytest.FixtureRequest
+) -> None:
+    here: Case = request.getfixturevalue(name)
+    at = point(here)
+    at.theta[0, place] *= ratio
+    assert in_noise(here, residual(here, at)).sum() > 2.0
+
+
+def test_place_and_wheelbase_stand_out(truth: Case) -> None:
+    at = point(truth)
+    assert in_noise(truth, residual(truth, at._replace(position_m=at.position_m + 0.1))).sum() > 2.0
+    longer = at._replace(wheelbase_m=at.wheelbase_m * 1.001)
+    assert in_noise(truth, residual(truth, longer)).sum() > 2.0
+
+
+def test_load_moves_between_the_axles_while_accelerating() -> None:
+    """At 0.6 m/s² and with a centre of gravity at 1.2 m; left out, it stands out."""
+    site = paper_site()
+    high = site.vehicles[0].model_copy(update={"cg_height_m": 1.2})
+    site = site.model_copy(update={"vehicles": (high,)})
+    speeds = (9.0, 14.0)
+    drive = simulate_drive(
+        site, paper.scenario_ratios(6), road_class="A", seed=3, speed_m_per_s=speeds
+    )
+    here = case(drive, site, speeds=speeds)
+    assert abs(here.speeding[0]) > 0.5
+    left = in_noise(here, residual(here, point(here)))
+    assert left.sum() < 0.3, left
+    low = in_noise(here, residual(here, point(here), data=crossing(here, cg_height_m=0.0)))
+    assert low.sum() > 2.0 * left.sum(), (left, low)
+    wrong_sign = point(here)._replace(acceleration_m_per_s2=-here.speeding[None])
+    assert in_noise(here, residual(here, wrong_sign)).sum() > 1.5 * low.sum()
+
+
+def read_with(
+    case: Case, gain: FloatArray, delay_s: FloatArray, bias: FloatArray
+) -> tuple[Case, Points]:
+    """The truth as imperfect channels read it, and the point that undoes their errors."""
+    rate_hz = 1.0 / case.step_s
+    read = np.stack(
+        [
+            (1.0 + gain[c]) * resample(case.acceleration[c], rate_hz, rate_hz, delay_s[c]) + bias[c]
+            for c in range(4)
+        ]
+    )
+    # Beyond its ends `resample` takes the signal for constant: those ends are left out.
+    kept = slice(100, -100)
+    here = case._replace(
+        acceleration=read[:, kept], front_m=case.front_m[kept], speeding=case.speeding[kept]
+    )
+    undo = 1.0 / (1.0 + gain) - 1.0
+    corrected = point(here)._replace(gain=undo[None], delay_s=delay_s[None])
+    corrected.initial[0, :, 2] = -bias / (1.0 + gain)
+    return here, corrected
+
+
+GAIN = np.array([0.02, -0.01, 0.015, -0.02])
+DELAY_S = np.array([0.2e-3, -0.15e-3, 0.25e-3, -0.1e-3])
+BIAS = np.array([0.05, -0.03, 0.02, 0.04])
+
+
+def test_gains_delays_and_biases_are_undone(truth: Case) -> None:
+    here, corrected = read_with(truth, GAIN, DELAY_S, BIAS)
+    left = in_noise(here, residual(here, corrected))
+    assert left[0] < 0.1, left
+    assert np.all(left[1:] < 0.01), left
+    # Each of them matters: leave out one kind in one channel and the residual stands out.
+    for c in range(4):
+        for wrong in (corrected.gain, corrected.delay_s):
+            right = wrong[0, c]
+            wrong[0, c] = 0.0
+            assert in_noise(here, residual(here, corrected)).sum() > 1.0, c
+            wrong[0, c] = right
+    assert in_noise(here, residual(here, point(here))).sum() > 100.0
+
+
+@pytest.mark.xfail(reason="the acceleration's Taylor series ends before delay^3")
+def test_delays_of_two_standard_deviations_are_undone(truth: Case) -> None:
+    """1 ms is twice the default spread; measured now: 15 times the noise power of 5 µg/√Hz."""
+    here, corrected = read_with(truth, 0.0 * GAIN, 4.0 * DELAY_S, 0.0 * BIAS)
+    left = in_noise(here, residual(here, corrected))
+    assert left[0] < 0.2, left
+
+
+def test_initial_states_and_bias_are_undone_to_rounding(truth: Case) -> None:
+    """What unknown initial values add to the signals is a parabola about the record's middle."""
+    data = crossing(truth)
+    expected = residual(truth, point(truth), data=data)
+    z_0, v_0, b = np.random.default_rng(3).normal(0.0, 0.05, (3, 4, 1))
+    n = truth.front_m.size
+    t = truth.step_s * (np.arange(n) - n // 2)
+    signals = data.signals.copy()
+    signals[:, Z] += z_0 + v_0 * t + 0.5 * b * t**2
+    signals[:, V] += v_0 + b * t
+    signals[:, A] += b
+    at = point(truth)
+    spoilt = residual(truth, at, data=data._replace(signals=signals))
+    assert np.abs(spoilt - expected).max() > 1e-2
+    at = at._replace(initial=-np.concatenate([z_0, v_0, b], axis=1)[None])
+    undone = residual(truth, at, data=data._replace(signals=signals))
+    np.testing.assert_allclose(undone, expected, atol=1e-11)
+
+
+def test_mirrored_crossing_gives_the_same_residuals(truth: Case) -> None:
+    """The same signals on the mirrored bridge in the other direction, elements of unlike length."""
+    lengths = np.array([2.0, 5.0, 4.0, 6.0, 3.0, 7.0, 3.0])
+    theta = truth.theta.copy()
+    theta[EI_1 : EI_1 + 7] *= np.linspace(0.6, 1.3, 7)
+    theta[START], theta[END] = 3e8, 9e8
+
+    def one(direction: int) -> FloatArray:
+        order = slice(None, None, direction)
+        basis = beam_basis(lengths[order], PARTS)
+        at = point(truth)
+        at.theta[0] = theta
+        at.theta[0, EI_1 : EI_1 + 7] = theta[EI_1 : EI_1 + 7][order]
+        if direction < 0:
+            at.theta[0, [START, END]] = theta[[END, START]]
+            at = at._replace(position_m=30.0 - at.position_m)
+        data = crossing(truth)._replace(
+            direction=direction,
+            basis=basis,
+            edges_m=np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
+        )
+        return residual(truth, at, data=data)
+
+    forth, back = one(1), one(-1)
+    np.testing.assert_allclose(back, forth, atol=1e-9 * np.abs(forth).max())
+
+
+def changes(case: Case, count: int) -> Points:
+    """Points that differ in one or another group only, in random order, many of them twice."""
+    rng = np.random.default_rng(11)
+    at = point(case, count)
+    places = [EI_1, EI_1 + 6, *(case.theta.size + i for i in (RHO_A, ALPHA, BETA)), K_U1, KAPPA]
+    for k in range(count):
+        which = int(rng.integers(0, len(places) + 3))
+        if which < len(places):
+            at.theta[k, places[which]] *= rng.choice([0.9, 1.1])
+        elif which == len(places):
+            at.theta[k, [START, END]] = rng.choice([0.0, 1e9], 2)
+        elif which == len(places) + 1:
+            at.position_m[k] += rng.choice([-0.2, 0.2])
+    return at
+
+
+def test_modes_are_never_those_of_another_bridge(truth: Case) -> None:
+    data = crossing(truth)
+    at = changes(truth, 60)
+    together = residual(truth, at, data=data)
+    assert np.isfinite(together).all()
+    for k in range(60):
+        alone = Points(*(part[k : k + 1] for part in at))
+        np.testing.assert_array_equal(residual(truth, alone, data=data)[0], together[k])
+    assert len({together[k].tobytes() for k in range(60)}) > 12
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_threads_change_nothing(truth: Case, threads: int) -> None:
+    at = changes(truth, 20)
+    np.testing.assert_array_equal(
+        residual(truth, at, threads=threads), residual(truth, at, threads=1)
+    )
+
+
+def test_impossible_points_are_not_numbers_and_spoil_no_other(truth: Case) -> None:
+    at = point(truth, 6)
+    at.theta[0, EI_1] = np.nan
+    at.theta[1, 0] = 5.0  # centre of gravity behind the rear axle
+    at.theta[2, EI_1 + 2] = np.inf
+    at.position_m[3] = np.sin(np.linspace(0.0, 6.0, truth.front_m.size))  # turns round
+    out = residual(truth, at)
+    assert np.isnan(out[:4]).all()
+    expected = residual(truth, point(truth))[0]
+    np.testing.assert_array_equal(out[4], expected)
+    np.testing.assert_array_equal(out[5], expected)
+
+
+def test_at_rest_the_bridge_bends_by_its_weight(truth: Case) -> None:
+    """A truck that creeps over with silent sensors: the static deflection of a uniform beam.
+
+    Under the load P at a: P a^2 b^2 / (3 EI L), and between two loads Maxwell's coefficients.
+    """
+    silent = truth._replace(acceleration=np.zeros_like(truth.acceleration))
+    rigidity, span, wheelbase = 1.56e10, 30.0, 4.4
+    data = crossing(silent)
+    at = point(silent)
+    at.theta[0, EI_1 : EI_1 + 7] = rigidity
+    at.theta[0, ALPHA], at.theta[0, BETA] = 20.0, 0.02  # heavily damped
+    # 0.2 of the speed would need a longer record: the mass is made small instead.
+    at.theta[0, RHO_A] = 40.0
+    _, deflection = roads_and_deflections(data, workspace(data, at.theta.shape[1]), at, 0)
+    car = truck_of(silent.site.vehicles[0])
+    d_1 = car.front_axle_to_cg_m
+    g = STANDARD_GRAVITY_M_PER_S2
+    loads = g * (
+        car.body_mass_kg * np.array([wheelbase - d_1, d_1]) / wheelbase
+        + np.array(car.unsprung_mass_kg)
+    )
+
+    def influence(x: float, a: float) -> float:
+        low, high = min(x, a), max(x, a)
+        b = span - high
+        return b * low * (span**2 - b**2 - low**2) / (6.0 * rigidity * span)
+
+    i = int(np.argmin(np.abs(silent.front_m - 17.0)))
+    wheels = (silent.front_m[i], silent.front_m[i] - wheelbase)
+    for w in range(2):
+        static = -sum(p * influence(wheels[w], a) for p, a in zip(loads, wheels, strict=True))
+        assert deflection[w, i] == pytest.approx(static, rel=0.02)

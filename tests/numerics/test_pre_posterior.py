@@ -1,0 +1,299 @@
+"""The posterior of one crossing against the stated Gaussian model, written out densely."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from pre_core import paper
+from pre_core.parameters import D_1, EI_1, K_U1, from_models
+from pre_core.posterior import (
+    Fixes,
+    Priors,
+    Problem,
+    all_rows,
+    covariance,
+    data_rows,
+    layout,
+    points,
+    precision_root,
+    start,
+    trajectory_basis,
+)
+from pre_core.pre import Inputs, prepare
+from pre_core.sensors import MICRO_G_M_PER_S2, white_noise
+from schemas.signals import CHANNELS
+from services.simulation import beam_of, paper_site, truck_of
+
+if TYPE_CHECKING:
+    from services.simulation import Drive
+
+FloatArray = NDArray[np.float64]
+
+POSITION_NOISE_M, SPEED_NOISE_M_PER_S, OFFSET_SPREAD_M = 0.02, 0.03, 1.2
+SPRING_SPREAD = 4e8
+KNOT_S = 0.4
+DEGREE = 3
+JERK_M_PER_S3 = 1.0
+
+
+class Case(NamedTuple):
+    problem: Problem
+    y: FloatArray  # at the truth
+    fixes: Fixes
+    priors: Priors
+    start_s: float
+    step_s: float
+    samples: int
+
+
+def fixes_of(time_s: FloatArray, rng: np.random.Generator) -> Fixes:
+    travel = paper.SPEED_M_PER_S * (time_s - 3.0)
+    return Fixes(
+        time_s,
+        travel + POSITION_NOISE_M * rng.standard_normal(time_s.size),
+        paper.SPEED_M_PER_S + SPEED_NOISE_M_PER_S * rng.standard_normal(time_s.size),
+        POSITION_NOISE_M,
+        SPEED_NOISE_M_PER_S,
+        OFFSET_SPREAD_M,
+    )
+
+
+@pytest.fixture(scope="module")
+def here(scenario_6: "Drive") -> Case:
+    """Scenario 6 with 25 µg/√Hz; y holds the truth (nominal truck, EI_4 = 0.4, true place)."""
+    site = paper_site()
+    vehicle, bridge = site.vehicles[0], site.bridges[0]
+    rng = np.random.default_rng(5)
+    step_s = 1.0 / scenario_6.run.rate_hz
+    t = step_s * np.arange(scenario_6.run.accel_time_s.size)
+    travel = paper.SPEED_M_PER_S * (t - 3.0)
+    kept = (travel > -10.0) & (travel < 42.0)
+    density = 25.0 * MICRO_G_M_PER_S2
+    acceleration = np.stack(
+        [
+            scenario_6.run.channels[name][kept]
+            + white_noise(int(kept.sum()), 1.0 / step_s, density, rng)
+            for name in CHANNELS
+        ]
+    )
+    start_s = float(t[kept][0])
+    fixes = fixes_of(np.arange(1.5, 8.0, 0.1), rng)
+    nominal = from_models(truck_of(vehicle), beam_of(bridge, np.ones(7)))
+    spread = np.full(nominal.size, 0.15)
+    spread[EI_1 : EI_1 + 7] = 0.55
+    spread[-2:] = SPRING_SPREAD
+    priors = Priors(nominal, spread, vehicle.wheelbase_m, 0.002, 0.01, 0.0005)
+    problem, y = prepare(
+        Inputs(
+            acceleration,
+            start_s,
+            step_s,
+            1,
+            bridge.span_m,
+            np.array(bridge.lengths_m),
+            vehicle.total_mass_kg,
+            0.0,
+            np.full(4, density),
+            1.0 / step_s,
+            fixes,
+            priors,
+            2,
+            2,
+        )
+    )
+    where = layout(problem)
+    ratio = paper.scenario_ratios(6)
+    y[EI_1 : EI_1 + 7] = np.log(ratio) / 0.55
+    # A straight line has the coefficients x(g), g the means of each three knots (Greville).
+    first, last = float(fixes.time_s[0]), float(fixes.time_s[-1])
+    spans = np.linspace(first, last, problem.basis_position.shape[1] - DEGREE + 1)
+    knots = np.concatenate([np.full(DEGREE, first), spans, np.full(DEGREE, last)])
+    greville = np.convolve(knots[1:-1], np.full(DEGREE, 1.0 / DEGREE), "valid")
+    y[where.trajectory] = paper.SPEED_M_PER_S * (greville - 3.0)
+    true = paper.SPEED_M_PER_S * (t[kept] - 3.0)
+    np.testing.assert_allclose(problem.basis_position @ y[where.trajectory], true, atol=1e-9)
+    y[where.offset] = 0.0
+    return Case(problem, y, fixes, priors, start_s, step_s, int(kept.sum()))
+
+
+def test_places_of_all_unknowns(here: Case) -> None:
+    where = layout(here.problem)
+    groups = [
+        range(where.theta.start, where.theta.stop),
+        [where.wheelbase],
+        range(where.gains.start, where.gains.stop),
+        range(where.delays.start, where.delays.stop),
+        range(where.initial.start, where.initial.stop),
+        range(where.trajectory.start, where.trajectory.stop),
+        [where.offset],
+    ]
+    assert [len(group) for group in groups[:5]] == [22, 1, 3, 4, 12]
+    assert [i for group in groups for i in group] == list(range(where.size))
+
+
+def test_coordinates_are_standard_normal_under_the_priors(here: Case) -> None:
+    """Draws of y through `points`: logarithms have the stated medians and spreads."""
+    rng = np.random.default_rng(8)
+    draws = 4000
+    y = np.tile(here.y, (draws, 1))
+    where = layout(here.problem)
+    y[:, : where.trajectory.start] = rng.standard_normal((draws, where.trajectory.start))
+    at = points(here.problem, y)
+    # 4.5 standard errors of a mean and of a standard deviation of normal draws.
+    mean_error, spread_error = 4.5 / np.sqrt(draws), 4.5 / np.sqrt(2.0 * draws)
+
+    def standard(values: FloatArray, spread: float) -> None:
+        assert abs(values.mean()) / spread < mean_error
+        assert values.std() / spread == pytest.approx(1.0, abs=spread_error)
+
+    for i in range(at.theta.shape[1] - 2):
+        standard(np.log(at.theta[:, i] / here.priors.theta[i]), here.priors.spread[i])
+    for i in (-2, -1):
+        standard(at.theta[:, i], SPRING_SPREAD)
+    standard(np.log(at.wheelbase_m / here.priors.wheelbase_m), here.priors.wheelbase_spread)
+    for c in range(4):
+        standard(at.delay_s[:, c], here.priors.delay_spread_s)
+        for i in range(3):
+            standard(at.initial[:, c, i], 0.1)
+    # Four independent gains without what is common to them: covariance s^2 (1 - 1/4 everywhere).
+    expected = here.priors.gain_spread**2 * (np.eye(4) - 0.25)
+    np.testing.assert_allclose(
+        np.cov(at.gain.T), expected, atol=6.0 * here.priors.gain_spread**2 / np.sqrt(draws)
+    )
+    np.testing.assert_allclose(at.gain.sum(axis=1), 0.0, atol=1e-15)
+
+
+def test_prior_rows_are_the_coordinates(here: Case) -> None:
+    """A step in one coordinate changes the sum of squares of the prior by its square alone."""
+    where = layout(here.problem)
+    rng = np.random.default_rng(0)
+    y = here.y.copy()
+    y[: where.trajectory.start] += 0.1 * rng.standard_normal(where.trajectory.start)
+    rows = all_rows(here.problem, y[None])[0]
+    data = data_rows(here.problem, y[None])[0]
+    receiver = here.problem.receiver_values.size
+    np.testing.assert_array_equal(rows[: data.size], data)
+    np.testing.assert_array_equal(rows[data.size + receiver :], y[: where.trajectory.start])
+
+
+def test_receiver_rows_are_the_stated_gaussian(here: Case) -> None:
+    """Densely: fixes = spline + offset + noise, speeds = its derivative + noise, white jerk."""
+    position, speeding, rows, values, best = trajectory_basis(
+        here.fixes, here.start_s, here.step_s, here.samples, 1, KNOT_S
+    )
+    b = position.shape[1]
+    rng = np.random.default_rng(4)
+    coefficients = best[:b] + rng.normal(0.0, 0.05, b)
+    offset = 0.7
+    first = min(here.start_s, here.fixes.time_s[0])
+    last = max(here.start_s + here.step_s * (here.samples - 1), here.fixes.time_s[-1])
+    inner = np.linspace(first, last, b - DEGREE + 1)
+    assert np.diff(inner)[0] == pytest.approx(KNOT_S, rel=0.1)
+    knots = np.concatenate([np.full(DEGREE, first), inner, np.full(DEGREE, last)])
+    curve = BSpline(knots, coefficients, DEGREE)
+    # Every fix has the offset: dense covariance of all fixes, the offset integrated over.
+    n = here.fixes.time_s.size
+    dense = POSITION_NOISE_M**2 * np.eye(n) + OFFSET_SPREAD_M**2 * np.ones((n, n))
+    error = here.fixes.position_m - curve(here.fixes.time_s)
+    slower = here.fixes.velocity_m_per_s - curve.derivative()(here.fixes.time_s)
+    fine = np.linspace(first, last, 40_001)
+    middles = 0.5 * (fine[1:] + fine[:-1])
+    jerk = np.sum(curve.derivative(3)(middles) ** 2) * (fine[1] - fine[0]) / JERK_M_PER_S3**2
+    others = np.sum(slower**2) / SPEED_NOISE_M_PER_S**2 + jerk
+    given = np.sum((error - offset) ** 2) / POSITION_NOISE_M**2 + (offset / OFFSET_SPREAD_M) ** 2
+    residual = rows @ np.append(coefficients, offset) - values
+    assert residual @ residual == pytest.approx(given + others, rel=2e-3)
+    # The offset that minimises leaves the quadratic form of the marginal.
+    free = rows @ np.append(coefficients, 0.0) - values
+    column = rows[:, -1]
+    least = free @ free - (column @ free) ** 2 / (column @ column)
+    assert least == pytest.approx(error @ np.linalg.solve(dense, error) + others, rel=2e-3)
+    # And what is read at the samples is that curve.
+    time = here.start_s + here.step_s * np.arange(here.samples)
+    np.testing.assert_allclose(position @ coefficients, curve(time), atol=1e-9)
+    np.testing.assert_allclose(speeding @ coefficients, curve.derivative(2)(time), atol=1e-6)
+    np.testing.assert_allclose(
+        rows.T @ (rows @ best - values), 0.0, atol=1e-6 * np.abs(rows.T @ values).max()
+    )
+
+
+def test_speeding_up_is_positive_in_both_directions() -> None:
+    """x = -t^2/2: towards smaller chainage and ever faster."""
+    time = np.linspace(1.0, 6.0, 51)
+    fixes = Fixes(time, -0.5 * time**2, -time, 0.01, 0.01, 1.0)
+    _, speeding, _, _, best = trajectory_basis(fixes, 1.0, 0.01, 501, -1, KNOT_S)
+    np.testing.assert_allclose(speeding @ best[:-1], 1.0, atol=1e-2)
+
+
+def test_start_is_the_nominal_truck_and_bridge(here: Case) -> None:
+    where = layout(here.problem)
+    trajectory = here.y[where.trajectory.start :]
+    at = points(here.problem, start(here.problem, trajectory)[None])
+    np.testing.assert_array_equal(at.theta[0], here.priors.theta)
+    assert at.wheelbase_m[0] == here.priors.wheelbase_m
+    for correction in (at.gain, at.delay_s, at.initial):
+        assert not correction.any()
+
+
+def test_at_the_truth_the_data_rows_are_noise(here: Case) -> None:
+    """25 µg/√Hz was added and declared: chi-square of the rows within 4 standard deviations."""
+    rows = data_rows(here.problem, here.y[None])[0]
+    assert np.mean(rows**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / rows.size))
+
+
+def test_precision_and_covariance_of_a_known_matrix() -> None:
+    rng = np.random.default_rng(2)
+    jacobian = rng.standard_normal((40, 7)) * np.logspace(-2, 2, 7)
+    root = precision_root(jacobian)
+    assert np.all(np.diag(root) > 0.0)
+    np.testing.assert_allclose(root, np.triu(root))
+    precision = jacobian.T @ jacobian
+    np.testing.assert_allclose(root.T @ root, precision, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(covariance(root) @ precision, np.eye(7), atol=1e-8)
+
+
+def jacobian_of(case: Case, size: float) -> FloatArray:
+    f = case.y.size
+    shifts = np.concatenate([case.y + size * np.eye(f), case.y - size * np.eye(f)])
+    rows = all_rows(case.problem, shifts)
+    return np.asarray((rows[:f] - rows[f:]).T / (2.0 * size))
+
+
+def test_curvature_against_differences_of_the_sum_of_squares(here: Case) -> None:
+    """Gauss-Newton against second differences of -2 log posterior, halved.
+
+    The data are moved so that they fit exactly: what Gauss-Newton leaves out is zero then, and both
+    must agree in every direction. Along the column of its covariance that belongs to an unknown,
+    one standard deviation costs exactly one.
+    """
+    where = layout(here.problem)
+    spread = covariance(precision_root(jacobian_of(here, 1e-4)))
+    np.testing.assert_allclose(spread, spread.T, rtol=1e-6, atol=1e-12)
+    springs = [where.theta.stop - 2, where.theta.stop - 1]
+    rigidities = [EI_1, EI_1 + 1, EI_1 + 3]
+    fitted = all_rows(here.problem, here.y[None])[0]
+    size = 0.1
+    for i in [*rigidities, K_U1, D_1, *springs, where.wheelbase, where.gains.start]:
+        step = spread[:, i] / np.sqrt(spread[i, i])
+        around = all_rows(here.problem, np.stack([here.y - size * step, here.y + size * step]))
+        second = np.sum((around - fitted) ** 2) / (2.0 * size**2)
+        assert second == pytest.approx(1.0, abs=0.02), (i, second)
+
+
+def test_the_data_tell_more_than_the_priors(here: Case) -> None:
+    """Standard deviations of EI of a few per cent (design study: 1.4 % to 4.7 %), EI_4 the best."""
+    root = precision_root(jacobian_of(here, 1e-4))
+    deviation = 0.55 * np.sqrt(np.diag(covariance(root)))[EI_1 : EI_1 + 7]
+    assert np.all(deviation > 0.01)
+    assert np.all(deviation < 0.1)
+
+
+def test_a_far_wrong_curvature_would_be_noticed(here: Case) -> None:
+    """Negative control: with the data's noise declared half, the same second difference is four."""
+    rows = data_rows(here.problem, here.y[None])[0]
+    noise = here.problem.noise._replace(factor=0.5 * here.problem.noise.factor)
+    halved = data_rows(here.problem._replace(noise=noise), here.y[None])[0]
+    np.testing.assert_allclose(halved, 2.0 * rows, rtol=1e-9)
