@@ -220,6 +220,22 @@ def test_receiver_rows_are_the_stated_gaussian(here: Case) -> None:
     )
 
 
+def test_a_trajectory_moved_against_the_offset_costs_the_offset_alone(here: Case) -> None:
+    """Fixes, speeds and jerk stay as they are; what changes is (offset/spread)^2."""
+    _, _, rows, values, best = trajectory_basis(
+        here.fixes, here.start_s, here.step_s, here.samples, 1, KNOT_S
+    )
+    best[-1] = 0.0
+
+    def objective(offset: float) -> float:
+        at = np.append(best[:-1] - offset, offset)  # the basis sums to one
+        return float(np.sum((rows @ at - values) ** 2))
+
+    for offset in (-1.5, 0.4, 3.0):
+        cost = objective(offset) - objective(0.0)
+        assert cost == pytest.approx((offset / OFFSET_SPREAD_M) ** 2, rel=1e-6)
+
+
 def test_speeding_up_is_positive_in_both_directions() -> None:
     """x = -t^2/2: towards smaller chainage and ever faster."""
     time = np.linspace(1.0, 6.0, 51)
