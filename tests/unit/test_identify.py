@@ -150,13 +150,16 @@ def test_accelerating_with_an_unknown_centre_of_gravity_is_said(tmp_path: Path) 
     assert "accelerating_cg_unknown" in only(identified(tmp_path / "drive.mcap")).reasons
 
 
-def test_a_strange_truck_is_a_misfit(recording: Path) -> None:
+def test_a_strange_truck_gets_no_number(recording: Path) -> None:
     """The same recording with a truck of another wheelbase: the roads do not match."""
     site = paper_site()
     truck = site.vehicles[0].model_copy(update={"wheelbase_m": 4.9})
     wrong = site.model_copy(update={"vehicles": (truck,)})
     found = identify_recordings([recording], wrong, IdentificationSettings(starts=1))
-    assert "model_misfit" in only(found).reasons
+    crossing = only(found)
+    assert {"model_misfit", "not_converged"} & set(crossing.reasons)
+    assert crossing.verdict == "rejected"
+    assert crossing.diagnostics["relative_misfit"] > 0.1
 
 
 def test_files_of_another_simulator(shared: Path, tmp_path: Path) -> None:
