@@ -184,6 +184,20 @@ def test_load_moves_between_the_axles_while_accelerating() -> None:
     assert in_noise(here, residual(here, wrong_sign)).sum() > 1.5 * low.sum()
 
 
+def test_axles_coupled_by_the_pitch_inertia() -> None:
+    """At 1, as in the paper, nothing couples them; at 0.8 each feels the other's acceleration."""
+    site = paper_site()
+    stubby = site.vehicles[0].model_copy(update={"pitch_inertia_ratio": 0.8})
+    site = site.model_copy(update={"vehicles": (stubby,)})
+    here = case(simulate_drive(site, paper.scenario_ratios(6), road_class="A", seed=1), site)
+    left = in_noise(here, residual(here, point(here)))
+    assert left[0] < 0.1, left
+    assert np.all(left[1:] < 0.01), left
+    uncoupled = point(here)
+    uncoupled.theta[0, KAPPA] = 1.0
+    assert in_noise(here, residual(here, uncoupled)).sum() > 100.0
+
+
 def read_with(
     case: Case, gain: FloatArray, delay_s: FloatArray, bias: FloatArray
 ) -> tuple[Case, Points]:
