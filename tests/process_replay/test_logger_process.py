@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from schemas.events import EventKind, decode_event
 from schemas.proto import driveby_pb2 as pb
