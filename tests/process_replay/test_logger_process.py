@@ -53,7 +53,12 @@ def test_bad_messages_are_refused_reported_and_never_written(
     ]
     with open_session(connect=endpoint, timeout_s=5) as stranger:
         for where, payload, attachment in bad:
-            stranger.put(where, payload, attachment=attachment)
+            stranger.put(
+                where,
+                payload,
+                attachment=attachment,
+                congestion_control=zenoh.CongestionControl.BLOCK,  # by default it may drop
+            )
         replay = {"endpoint": endpoint, "speed": 0.0, "name": "x"}
         finish(start("services.replay", recordings=[str(recording)], **replay))
         # Refusals are reported once a second.
