@@ -448,6 +448,7 @@ def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
     for lane in range(LANES):
         for i in range(theta.size):
             four[lane, i] = theta[i]
+    scratch = np.empty((2, _LONGEST_STRETCH))
     factors = np.empty((13, LANES))
     _vehicle_factors(
         four, window.total_mass_kg, window.wheelbase_m, window.gravity_m_per_s2, factors
@@ -460,7 +461,7 @@ def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
     front, rear = work.road[0], work.road[1]
     for part in range(window.stretches.shape[0]):
         begin, stop, e1, e2 = window.stretches[part]
-        _one_particle_stretch(window, work, factors, begin, stop)
+        _one_particle_stretch(window, work, factors, begin, stop, scratch)
         advance(
             cubics[max(e1, 0)],
             cubics[max(e2, 0)],
@@ -493,7 +494,12 @@ def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
 
 @kernel
 def _one_particle_stretch(
-    window: Window, work: Workspace, factors: FloatArray, begin: int, stop: int
+    window: Window,
+    work: Workspace,
+    factors: FloatArray,
+    begin: int,
+    stop: int,
+    scratch: FloatArray,
 ) -> None:
     """Minus the input profiles into lane 0 of `work.road` (the modes of the other lanes begin at
     zero), and the contact forces into all lanes of `work.force`."""
@@ -508,13 +514,30 @@ def _one_particle_stretch(
         load_n, m_own, m_other = factors[6 + w, 0], factors[8 + w, 0], factors[10, 0]
         m_u = factors[11 + w, 0]
         sign = 1.0 - 2.0 * w
+        # One store a loop: with more, the compiler gives up proving that the arrays do not overlap
+        # and leaves the vector registers unused.
+        u, p = scratch[0], scratch[1]
+        a_u, rate_w, stroke_w, z_w = (
+            acceleration[begin:stop],
+            rate[begin:stop],
+            stroke[begin:stop],
+            z[begin:stop],
+        )
+        for i in range(a_u.size):
+            u[i] = inertia * a_u[i] + damping * rate_w[i] + stiffness * stroke_w[i] - z_w[i]
+        own_w, other_w, unsprung_w, transfer = (
+            own[begin:stop],
+            other[begin:stop],
+            unsprung[begin:stop],
+            window.load_transfer_n[begin:stop],
+        )
+        for i in range(own_w.size):
+            inertial = m_own * own_w[i] + m_other * other_w[i] + m_u * unsprung_w[i]
+            p[i] = sign * transfer[i] - load_n - inertial
         road, force = work.road[w], work.force[w]
-        for n in range(begin, stop):
-            u = inertia * acceleration[n] + damping * rate[n] + stiffness * stroke[n] - z[n]
-            store(road, n, (u, 0.0, 0.0, 0.0))
-            p = load_n + m_own * own[n] + m_other * other[n] + m_u * unsprung[n]
-            p = sign * window.load_transfer_n[n] - p
-            store(force, n - begin, (p, p, p, p))
+        for i in range(stop - begin):
+            store(road, begin + i, (u[i], 0.0, 0.0, 0.0))
+            store(force, i, (p[i], p[i], p[i], p[i]))
 
 
 class Roads(NamedTuple):
