@@ -5,7 +5,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.bridge import Beam, uniform_beam
+from pre_core.parameters import EI_1
 from pre_core.road import Profile, iri_m_per_km, iso_8608_class, roughness_coefficient_m3
+from pre_core.simulate import Motion
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
@@ -17,6 +20,8 @@ Floats = NDArray[np.float64]
 
 NORMAL_975 = 1.959963984540054
 _ROAD_SPACING_M = 0.05
+_LARGEST_ACCELERATION_M_PER_S2 = 0.3
+"""From here on load transfer matters, which the height of the centre of gravity decides."""
 
 
 class CrossingData(NamedTuple):
@@ -96,6 +101,26 @@ def nominal_parameters(vehicle: Vehicle, bridge: Bridge) -> Floats:
             0.0,
         ]
     )
+
+
+def caveats(data: CrossingData, motion: Motion) -> list[Reason]:
+    """Reasons against any method's answer: what it neglects of this truck and this drive."""
+    reasons: list[Reason] = []
+    changing = np.abs(motion.acceleration_m_per_s2).max() > _LARGEST_ACCELERATION_M_PER_S2
+    if changing and data.vehicle.cg_height_m is None:
+        reasons.append(Reason.ACCELERATING_CG_UNKNOWN)
+    if any(data.vehicle.tyre_damping_ns_per_m):
+        reasons.append(Reason.TYRE_DAMPING_IGNORED)
+    return reasons
+
+
+def beam_of(data: CrossingData, theta: Floats) -> Beam:
+    """The bridge that a vector of parameters (p,) describes."""
+    n = data.bridge.elements
+    rho, alpha, beta, start, end = theta[EI_1 + n : EI_1 + n + 5]
+    return uniform_beam(
+        data.bridge.span_m, theta[EI_1 : EI_1 + n], rho, alpha, beta, (start, end)
+    )._replace(element_lengths_m=np.array(data.bridge.lengths_m))
 
 
 def gaussian(unit: str, mean: float, std: float) -> results.Parameter:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import least_squares, parameters, random_walk, residual, search
-from pre_core.bridge import Beam, natural_frequencies_hz, uniform_beam
+from pre_core.bridge import natural_frequencies_hz
 from pre_core.integrate import spline_integrate
 from pre_core.residual import Window
 from pre_core.simulate import Motion
@@ -29,6 +29,8 @@ from services.worker.crossing_data import (
     CrossingData,
     Floats,
     Passing,
+    beam_of,
+    caveats,
     detrended,
     gaussian,
     header,
@@ -53,7 +55,6 @@ _LARGEST_MISFIT = 0.002
 noise a fit leaves 1e-5; from a few thousandths on the elements are not told apart."""
 _LARGEST_FACTOR = 100.0
 """Nothing of a truck or a bridge is a hundred times what its owner says."""
-_LARGEST_ACCELERATION_M_PER_S2 = 0.3
 
 
 class _Fit(NamedTuple):
@@ -84,67 +85,54 @@ def identify(
     if reasons or trajectory is None or data.samples is None:
         return reject(reasons or [Reason.FAILED])
     try:
+        cut = _cut(data, trajectory, data.samples, passing)
+        if cut is None:
+            return reject([Reason.GAP_ON_BRIDGE])
         if settings.method == "pre":
-            return _by_posterior(
-                data,
-                settings,
-                passing,
-                trajectory,
-                data.samples,
-                report,
-                lambda: stopwatch() - began,
-            )
-        found = _fitted(data, settings, trajectory, data.samples, entry_s, exit_s, report)
+            return identify_pre(data, settings, passing, *cut, report, lambda: stopwatch() - began)
+        found = _fitted(data, settings, cut, report)
         if isinstance(found, Reason):
             return reject([found])
-        return _result(data, settings, passing, *found, stopwatch() - began)
+        return _result(data, settings, passing, *found, cut.motion, stopwatch() - began)
     except Exception:  # whatever the data are, the answer is a verdict
         _log.exception("identification of %s failed", data.crossing_id)
         return reject([Reason.FAILED])
 
 
-def _by_posterior(
-    data: CrossingData,
-    settings: IdentificationSettings,
-    passing: Passing,
-    trajectory: Trajectory,
-    samples: Samples,
-    report: Report,
-    elapsed: Stopwatch,
-) -> results.Crossing:
+class _Cut(NamedTuple):
+    """The samples of a crossing and where the truck was at them."""
+
+    acceleration: Floats  # (4, n)
+    start_s: float
+    motion: Motion
+
+
+def _cut(
+    data: CrossingData, trajectory: Trajectory, samples: Samples, passing: Passing
+) -> _Cut | None:
+    """The unbroken samples around the crossing; None if some are missing in it."""
     time_s = samples.start_s + np.arange(_size(samples)) / samples.rate_hz
     part = _covered(samples, time_s, passing.entry_s, passing.exit_s)
     if part is None:
-        return rejected(data, settings, passing, [Reason.GAP_ON_BRIDGE])
-    motion = motion_at(trajectory, time_s[part], data.stay.direction)
-    acceleration = np.stack([samples.channels[name][part] for name in CHANNELS])
-    start_s = float(time_s[part][0])
-    return identify_pre(data, settings, passing, acceleration, start_s, motion, report, elapsed)
+        return None
+    return _Cut(
+        np.stack([samples.channels[name][part] for name in CHANNELS]),
+        float(time_s[part][0]),
+        motion_at(trajectory, time_s[part], data.stay.direction),
+    )
 
 
 def _fitted(
-    data: CrossingData,
-    settings: IdentificationSettings,
-    trajectory: Trajectory,
-    samples: Samples,
-    entry_s: float,
-    exit_s: float,
-    report: Report,
-) -> tuple[Window, _Fit, Motion] | Reason:
-    time_s = samples.start_s + np.arange(_size(samples)) / samples.rate_hz
-    part = _covered(samples, time_s, entry_s, exit_s)
-    if part is None:
-        return Reason.GAP_ON_BRIDGE
-    motion = motion_at(trajectory, time_s[part], data.stay.direction)
-    acceleration = np.stack([samples.channels[name][part] for name in CHANNELS])
+    data: CrossingData, settings: IdentificationSettings, cut: _Cut, report: Report
+) -> tuple[Window, _Fit] | Reason:
     try:
-        window = _window(data, settings, acceleration, motion)
+        window = _window(data, settings, cut.acceleration, cut.motion)
     except residual.WindowError:
         return Reason.STOPPED_ON_BRIDGE
     fit = _METHODS[settings.method](data, settings, window, report)
     if fit.ending is search.Ending.NOT_FINITE:
         return Reason.NOT_FINITE
-    return window, fit, motion
+    return window, fit
 
 
 def _trajectory(data: CrossingData) -> Trajectory | None:
@@ -394,11 +382,7 @@ def _result(
     diagnostics["misfit_over_deflection"] = misfit_m / max(deflection_m, 1e-12)
     if diagnostics["misfit_over_deflection"] > _LARGEST_MISFIT:
         reasons.append(Reason.MODEL_MISFIT)
-    changing = np.abs(motion.acceleration_m_per_s2).max() > _LARGEST_ACCELERATION_M_PER_S2
-    if changing and data.vehicle.cg_height_m is None:
-        reasons.append(Reason.ACCELERATING_CG_UNKNOWN)
-    if any(data.vehicle.tyre_damping_ns_per_m):
-        reasons.append(Reason.TYRE_DAMPING_IGNORED)
+    reasons += caveats(data, motion)
     values = _parameters(data, fit, settings)
     names = tuple(parameters.names(data.bridge.elements)[i] for i in fit.free)
     return results.Crossing(
@@ -477,20 +461,11 @@ def _propagated(fit: _Fit, quantity: Callable[[Floats], Floats]) -> tuple[Floats
     return centre, np.sqrt(np.maximum(variance, 0.0))
 
 
-def _beam(data: CrossingData, theta: Floats) -> Beam:
-    n = data.bridge.elements
-    first = parameters.EI_1
-    rho, alpha, beta, k_start, k_end = theta[first + n : first + n + 5]
-    return uniform_beam(
-        data.bridge.span_m, theta[first : first + n], rho, alpha, beta, (k_start, k_end)
-    )._replace(element_lengths_m=np.array(data.bridge.lengths_m))
-
-
 def _derived(
     data: CrossingData, window: Window, fit: _Fit, values: dict[str, results.Parameter]
 ) -> results.Derived:
     frequency, frequency_std = _propagated(
-        fit, lambda theta: natural_frequencies_hz(_beam(data, theta), 1)
+        fit, lambda theta: natural_frequencies_hz(beam_of(data, theta), 1)
     )
     deflection, deflection_std = _propagated(
         fit, lambda theta: np.array([residual.largest_deflection_m(window, theta)])

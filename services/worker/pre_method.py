@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import mcmc, parameters, posterior, pre
-from pre_core.bridge import natural_frequencies_hz, uniform_beam
+from pre_core.bridge import natural_frequencies_hz
 from pre_core.search import Ending
 from pre_core.simulate import Motion
 from schemas import results
@@ -21,6 +21,8 @@ from services.worker.crossing_data import (
     CrossingData,
     Floats,
     Passing,
+    beam_of,
+    caveats,
     header,
     nominal_parameters,
     rejected,
@@ -38,7 +40,6 @@ _LARGEST_R_HAT = 1.05
 _SMALLEST_ESS = 100.0
 _LARGEST_VEHICLE_Z = 4.0
 _LARGEST_POSITION_Z = 4.0
-_UNKNOWN_CG_ACCELERATION = 0.3
 _ROAD_DRAWS = 40
 _FREQUENCY_DRAWS = 200
 
@@ -258,12 +259,7 @@ def _reasons(
     offset_z = problem.receiver_rows[-1, -1] * y[where.offset]
     if abs(offset_z) > _LARGEST_POSITION_Z:
         reasons.append(Reason.POSITION_INCONSISTENT)
-    changing = np.abs(motion.acceleration_m_per_s2).max() > _UNKNOWN_CG_ACCELERATION
-    if changing and data.vehicle.cg_height_m is None:
-        reasons.append(Reason.ACCELERATING_CG_UNKNOWN)
-    if any(data.vehicle.tyre_damping_ns_per_m):
-        reasons.append(Reason.TYRE_DAMPING_IGNORED)
-    return reasons
+    return reasons + caveats(data, motion)
 
 
 def _values(
@@ -341,21 +337,10 @@ def _derived(
     flat: Floats,
     rng: np.random.Generator,
 ) -> results.Derived:
-    lengths = np.array(data.bridge.lengths_m)
-    n = data.bridge.elements
     some = _chosen(theta.shape[0], _FREQUENCY_DRAWS, rng)
     frequencies = np.empty(some.size)
     for k, i in enumerate(some):
-        rho, alpha, beta, start, end = theta[i, parameters.EI_1 + n :]
-        beam = uniform_beam(
-            data.bridge.span_m,
-            theta[i, parameters.EI_1 : parameters.EI_1 + n],
-            rho,
-            alpha,
-            beta,
-            (start, end),
-        )._replace(element_lengths_m=lengths)
-        frequencies[k] = natural_frequencies_hz(beam, 1)[0]
+        frequencies[k] = natural_frequencies_hz(beam_of(data, theta[i]), 1)[0]
     few = _chosen(flat.shape[0], _ROAD_DRAWS, rng)
     deflections = posterior.largest_deflections_m(problem, flat[few])
     return results.Derived(
