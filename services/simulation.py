@@ -21,7 +21,7 @@ from pre_core.sensors import (
     measure_acceleration,
     measure_position,
 )
-from pre_core.simulate import constant_acceleration, simulate
+from pre_core.simulate import Motion, Simulation, constant_acceleration, simulate
 from pre_core.vehicle import HalfCar
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle, load_site, parse_site, site_toml
@@ -157,28 +157,65 @@ def simulate_drive(
     sign = 1 if forward else -1
     start = -approach if forward else bridge.span_m + approach
     motion = constant_acceleration(start, sign * first_speed, acceleration, steps, step_s)
-    reach = vehicle.wheelbase_m + 1.0
+    sensor = Accelerometer(rate, noise_density_ug_per_rthz=noise_ug_per_rthz)
+    run, road = measured_run(
+        bridge,
+        car,
+        beam,
+        motion,
+        step_s,
+        settle,
+        (road_class, seed),
+        (sensor,) * len(CHANNELS),
+        _receiver(site, perfect=not receiver_errors),
+        np.random.default_rng(seed),
+        antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
+    )[:2]
+    return Drive(run, road, np.asarray(rigidity_ratios, dtype=np.float64))
+
+
+def measured_run(
+    bridge: Bridge,
+    car: HalfCar,
+    beam: Beam,
+    motion: Motion,
+    step_s: float,
+    settling_steps: int,
+    road: tuple[str, int],
+    sensors: Sequence[Accelerometer],
+    receiver: Receiver,
+    rng: np.random.Generator,
+    *,
+    antenna_to_front_axle_m: float = 0.0,
+) -> tuple[Run, Profile, Simulation]:
+    """Drive `car` over `beam` along `motion` and measure it with one sensor per channel.
+
+    `road` is an ISO 8608 class and the seed of its phases. The recording begins after
+    `settling_steps`; the sensors are of one rate, of which the steps are a whole fraction. Returns
+    the recording, the road as the tyres felt it and all that truck and bridge did. FailureError if
+    the coupled simulation does not settle.
+    """
+    sign = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
+    reach = car.wheelbase_m + 1.0
     low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
-    raw = iso_8608_profile(np.floor(low), np.ceil(high), _ROAD_SPACING_M, road_class, seed)
-    road = contact_patch_average(raw, _CONTACT_PATCH_M)
-    felt = under_wheels(road, motion, car.wheelbase_m, sign)
+    raw = iso_8608_profile(np.floor(low), np.ceil(high), _ROAD_SPACING_M, *road)
+    profile = contact_patch_average(raw, _CONTACT_PATCH_M)
+    felt = under_wheels(profile, motion, car.wheelbase_m, sign)
     fine = simulate(car, refine(beam, _PARTS), motion, felt, step_s, modes=_modes(bridge))
     if not fine.converged:
         raise FailureError("the simulation did not converge: are the site's values possible?")
-    recorded = fine.acceleration_m_per_s2[settle:]
-    accel_rng, gnss_rng = np.random.default_rng(seed).spawn(2)
-    sensor = Accelerometer(rate, noise_density_ug_per_rthz=noise_ug_per_rthz)
+    recorded = fine.acceleration_m_per_s2[settling_steps:]
+    accel_rng, gnss_rng = rng.spawn(2)
+    rate = sensors[0].rate_hz
     channels = {
-        name: measure_acceleration(recorded[:, i], 1.0 / step_s, sensor, accel_rng)
+        name: measure_acceleration(recorded[:, i], 1.0 / step_s, sensors[i], accel_rng)
         for i, name in enumerate(CHANNELS)
     }
     time_s = START_TIME_S + np.arange(channels[CHANNELS[0]].size) / rate
-    receiver = _receiver(site, perfect=not receiver_errors)
-    position = motion.position_m[settle:]
-    speed = np.abs(motion.speed_m_per_s[settle:])
-    gnss = _fixes(site, step_s, position, speed, receiver, gnss_rng, forward=forward)
-    run = Run("simulation", time_s, rate, channels, gnss)
-    return Drive(run, road, np.asarray(rigidity_ratios, dtype=np.float64))
+    antenna = motion.position_m[settling_steps:] - sign * antenna_to_front_axle_m
+    speed = np.abs(motion.speed_m_per_s[settling_steps:])
+    gnss = _fixes(bridge, step_s, antenna, speed, receiver, gnss_rng, forward=sign > 0)
+    return Run("simulation", time_s, rate, channels, gnss), profile, fine
 
 
 def truck_of(vehicle: Vehicle) -> HalfCar:
@@ -243,21 +280,19 @@ def _receiver(site: Site, *, perfect: bool) -> Receiver:
 
 
 def _fixes(
-    site: Site,
+    bridge: Bridge,
     step_s: float,
-    position: Floats,
+    antenna: Floats,
     speed: Floats,
     receiver: Receiver,
     rng: np.random.Generator,
     *,
     forward: bool,
 ) -> GnssTrack:
-    """What the receiver, whose antenna is behind the front axle, reports of the drive."""
-    sign = 1 if forward else -1
-    antenna = position - sign * site.vehicles[0].gps_antenna_to_front_axle_m
-    time_s = step_s * np.arange(position.size, dtype=np.float64)
+    """What the receiver reports of the drive of its antenna."""
+    time_s = step_s * np.arange(antenna.size, dtype=np.float64)
     fixes = measure_position(time_s, antenna, np.zeros_like(antenna), speed, receiver, rng)
-    frame = bridge_frame(site.bridges[0])
+    frame = bridge_frame(bridge)
     latitude, longitude = to_lat_lon(frame, fixes.chainage_m, fixes.lateral_m)
     return GnssTrack(
         START_TIME_S + fixes.time_s,

@@ -31,7 +31,7 @@ from services.common.crossing import MARGIN_M, Passage, Stay, find_stays
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
 from services.common.streams import PATIENCE_S, Boot
 from services.worker.crossing_data import CrossingData
-from services.worker.identification import MARGIN_S, Report, Stopwatch, identify
+from services.worker.identification import MARGIN_S, Identify, Report, Stopwatch, identify
 
 _KEEP_S = 300.0
 """Samples older than this are forgotten."""
@@ -80,7 +80,7 @@ class Engine:
 
     `header` says what goes into every estimate; `stopwatch` measures the seconds of an
     identification and is the only thing that may differ between two runs; `report` is told how far
-    an identification is.
+    an identification is. Who wants more of a crossing than its result wraps `identify`.
     """
 
     def __init__(
@@ -91,8 +91,10 @@ class Engine:
         *,
         stopwatch: Stopwatch = lambda: 0.0,
         report: Callable[[str, str, float], None] = lambda crossing, stage, fraction: None,
+        identify: Identify = identify,
     ) -> None:
         self._site = site
+        self._identify = identify
         self._settings = settings
         self._header = header
         self._stopwatch = stopwatch
@@ -310,7 +312,7 @@ class Engine:
             wall_offset_s,
         )
         report: Report = lambda stage, fraction: self._report(crossing_id, stage, fraction)  # noqa: E731
-        return identify(data, self._settings, stopwatch=self._stopwatch, report=report)
+        return self._identify(data, self._settings, stopwatch=self._stopwatch, report=report)
 
     def _bridge_state(self, realm: str, bridge: Bridge, result: Crossing) -> BridgeResult | None:
         """The bridge as the latest usable crossing sees it; crossings are not fused yet."""

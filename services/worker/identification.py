@@ -7,7 +7,7 @@ slow), fits, and says what the answer is worth. Every way to fail is a verdict, 
 import logging
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,20 @@ from services.worker.pre_method import identify_pre
 _log = logging.getLogger(__name__)
 Stopwatch = Callable[[], float]
 Report = Callable[[str, float], None]
+
+
+class Identify(Protocol):
+    """What `identify` is: from one crossing to its result."""
+
+    def __call__(  # noqa: D102
+        self,
+        data: CrossingData,
+        settings: IdentificationSettings,
+        *,
+        stopwatch: Stopwatch,
+        report: Report = ...,
+    ) -> results.Crossing: ...
+
 
 MARGIN_S = 1.0
 """Samples are needed this long before the entry and after the exit."""
