@@ -1,6 +1,7 @@
 """A growing set of sequence numbers, as few intervals: what came, what is missing."""
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable
 
 
 class Intervals:
@@ -32,6 +33,27 @@ class Intervals:
             self._last.insert(at, number)
         return True
 
+    def add_range(self, first: int, last: int) -> int:
+        """Put all numbers from first to last in; how many of them were new."""
+        if last < first:
+            return 0
+        # Every interval that overlaps or touches the new one becomes part of it.
+        low = bisect_left(self._last, first - 1)
+        high = bisect_right(self._first, last + 1)
+        there = sum(
+            min(b, last) - max(a, first) + 1
+            for a, b in zip(self._first[low:high], self._last[low:high], strict=True)
+            if a <= last and b >= first
+        )
+        if low < high:
+            joined = (min(first, self._first[low]), max(last, self._last[high - 1]))
+        else:
+            joined = (first, last)
+        self._first[low:high], self._last[low:high] = [joined[0]], [joined[1]]
+        new = last - first + 1 - there
+        self.size += new
+        return new
+
     def __contains__(self, number: int) -> bool:
         at = bisect_right(self._first, number)
         return at > 0 and number <= self._last[at - 1]
@@ -45,6 +67,29 @@ class Intervals:
     def highest(self) -> int | None:
         """The highest number; None if the set is empty."""
         return self._last[-1] if self._last else None
+
+    def ranges(self) -> list[tuple[int, int]]:
+        """Return (first, last) of every run of numbers that are there."""
+        return list(zip(self._first, self._last, strict=True))
+
+    def missing_of(self, ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Return the parts of the given (first, last) that are not in the set."""
+        missing = []
+        for first, last in ranges:
+            at = bisect_left(self._last, first)
+            while first <= last and at < len(self._first) and self._first[at] <= last:
+                if first < self._first[at]:
+                    missing.append((first, self._first[at] - 1))
+                first = self._last[at] + 1
+                at += 1
+            if first <= last:
+                missing.append((first, last))
+        return missing
+
+    @property
+    def runs(self) -> int:
+        """How many runs of numbers there are: what the set takes in memory."""
+        return len(self._first)
 
     def holes(self) -> list[tuple[int, int]]:
         """Return (first, last) of every run of missing numbers between numbers that are there."""

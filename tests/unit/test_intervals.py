@@ -1,5 +1,7 @@
 """Intervals against Python's own set."""
 
+from itertools import pairwise
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,6 +23,27 @@ def test_as_a_set(numbers: list[int]) -> None:
     assert inner == [n for n in missing if n > min(reference)]
     contiguous = next(n for n in range(42) if n not in reference) - 1
     assert intervals.contiguous_from_zero == (contiguous if contiguous >= 0 else None)
+
+
+RANGES = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)))
+
+
+@given(st.lists(st.integers(0, 40)), RANGES)
+def test_ranges_as_a_set(numbers: list[int], ranges: list[tuple[int, int]]) -> None:
+    intervals, reference = Intervals(), set[int]()
+    for number in numbers:
+        intervals.add(number)
+        reference.add(number)
+    for first, last in ranges:
+        wanted = set(range(first, last + 1))
+        missing = [n for a, b in intervals.missing_of([(first, last)]) for n in range(a, b + 1)]
+        assert missing == sorted(wanted - reference)
+        assert intervals.add_range(first, last) == len(wanted - reference)
+        reference |= wanted
+        runs = intervals.ranges()
+        assert [n for a, b in runs for n in range(a, b + 1)] == sorted(reference)
+        assert all(b + 1 < a for (_, b), (a, _) in pairwise(runs))
+        assert (intervals.size, intervals.runs) == (len(reference), len(runs))
 
 
 def test_memory_grows_with_holes_only() -> None:
