@@ -26,6 +26,7 @@ announcements and the queries that follow from them.
 """
 
 import contextlib
+import ipaddress
 import json
 import logging
 import math
@@ -36,6 +37,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
@@ -47,9 +49,11 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity, decode_identity, encode_identity
 from schemas.topics import TOPICS, Key, key, parse_key, selector, topic
 from services.common.errors import FailureError, InputError
+from services.common.files import read_bytes
 from services.common.intervals import Intervals
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+DEFAULT_TLS_ENDPOINT = "tls/127.0.0.1:7447"
 LINGER_S = 1.5
 """Two heartbeats and the time to answer the queries that they cause."""
 
@@ -87,32 +91,60 @@ class Received(NamedTuple):
 
 
 def open_session(
-    *, connect: str | None = None, listen: str | None = None, timeout_s: float | None = None
+    *,
+    connect: str | None = None,
+    listen: str | None = None,
+    timeout_s: float | None = None,
+    tls: Path | None = None,
+    insecure: bool = False,
 ) -> zenoh.Session:
     """Open a session: a client of the router at `connect`, or a router that listens at `listen`.
 
     A client waits `timeout_s` (None: for ever) for the router and connects again by itself
     whenever the connection is lost. It must be closed, or the process does not end; it is a
-    context manager. InputError for a malformed endpoint, FailureError if nobody answers in time
-    or the address cannot be listened at.
+    context manager.
+
+    `tls` is a folder of `driveby certs`: both sides prove who they are, nothing but TLS is spoken,
+    and a router lets everybody say and hear only what its access control allows. Without it only
+    this machine can be listened to, unless `insecure` says that whoever reaches the address may
+    say and hear everything.
+
+    InputError for a malformed endpoint, bad credentials, or an address open to strangers;
+    FailureError if nobody answers in time or the address cannot be listened at.
     """
     if (connect is None) == (listen is None):
         raise ValueError("either connect or listen")
-    endpoint = _check_endpoint(connect or listen or "")
+    endpoint = _check_endpoint(connect or listen or "", tls)
+    if listen is not None and tls is None and not insecure and not _is_on_this_machine(listen):
+        raise InputError(
+            f"{listen} can be reached by other machines, and without --tls FOLDER anybody there "
+            "could publish as a truck; say --insecure if that is wanted (see docs/security.md)"
+        )
     deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
+    config = _configuration(endpoint, tls, is_client=connect is not None)
     while True:
         try:
-            return zenoh.open(_configuration(endpoint, is_client=connect is not None))
+            return zenoh.open(config)
         except zenoh.ZError as error:
             _log.debug("zenoh: %s", error)
             if listen is not None:
                 raise FailureError(_why_not_listening(endpoint, error)) from None
             # Zenoh would wait by itself, but meanwhile Python hears no signal.
             if time.monotonic() >= deadline:
-                raise FailureError(
-                    f"no router answers at {endpoint} within {timeout_s:g} s; "
-                    "start `driveby logger` first or give another endpoint"
-                ) from None
+                raise FailureError(_why_not_connected(endpoint, timeout_s, tls)) from None
+
+
+def default_endpoint(tls: Path | None) -> str:
+    """Return where a logger listens and the others connect unless told otherwise."""
+    return DEFAULT_ENDPOINT if tls is None else DEFAULT_TLS_ENDPOINT
+
+
+def _why_not_connected(endpoint: str, timeout_s: float | None, tls: Path | None) -> str:
+    refused = "" if tls is None else ", or the one there refuses or does not prove a certificate"
+    return (
+        f"no router answers at {endpoint} within {timeout_s:g} s{refused}; "
+        "start `driveby logger` first or give another endpoint"
+    )
 
 
 def _why_not_listening(endpoint: str, error: zenoh.ZError) -> str:
@@ -122,7 +154,7 @@ def _why_not_listening(endpoint: str, error: zenoh.ZError) -> str:
     return f"cannot listen at {endpoint}: {_first_sentence(error).rstrip(':')}"
 
 
-def _configuration(endpoint: str, *, is_client: bool) -> zenoh.Config:
+def _configuration(endpoint: str, tls: Path | None, *, is_client: bool) -> zenoh.Config:
     config = zenoh.Config()
     settings: dict[str, Any] = {
         "mode": "client" if is_client else "router",
@@ -141,7 +173,38 @@ def _configuration(endpoint: str, *, is_client: bool) -> zenoh.Config:
     }
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
+    if tls is not None:
+        _add_security(config, tls.absolute(), is_client=is_client)
     return config
+
+
+def _add_security(config: zenoh.Config, tls: Path, *, is_client: bool) -> None:
+    # Imported here: cryptography takes as long to load as the rest, and most sessions are local.
+    from services.common.credentials import LISTENERS, check_credentials, link_settings
+
+    subject = check_credentials(tls)
+    for name, value in link_settings(tls).items():
+        config.insert_json5(f"transport/link/{name}", json.dumps(value))
+    if is_client:
+        return
+    if subject.role not in LISTENERS:
+        raise InputError(f"{tls}: is the certificate of {subject}; only a logger's may listen")
+    config.insert_json5("access_control", json.dumps(_access_control(tls)))
+
+
+def _access_control(tls: Path) -> dict[str, Any]:
+    """The access control in the configuration of a folder; InputError if it would let all pass."""
+    from services.common.credentials import CONFIGURATION
+
+    path = tls / CONFIGURATION
+    read_bytes(path)  # says what is wrong better than Zenoh
+    try:
+        access: Any = json.loads(zenoh.Config.from_file(path).get_json("access_control"))
+    except zenoh.ZError as error:
+        raise InputError(f"{path}: {_first_sentence(error)}") from None
+    if not (access["enabled"] and access["default_permission"] == "deny" and access["subjects"]):
+        raise InputError(f"{path}: lets everybody do everything; make it with `driveby certs`")
+    return dict(access)
 
 
 class Publisher:
@@ -545,12 +608,31 @@ def _matches(publisher: zenoh.Publisher) -> bool:
     return bool(getattr(status, "matching", status))
 
 
-def _check_endpoint(endpoint: str) -> str:
+def _check_endpoint(endpoint: str, tls: Path | None) -> str:
     if not _ENDPOINT.fullmatch(endpoint):
         raise InputError(
-            f"endpoint {endpoint!r}: PROTOCOL/HOST:PORT is expected, e.g. {DEFAULT_ENDPOINT}"
+            f"endpoint {endpoint!r}: PROTOCOL/HOST:PORT is expected, e.g. {default_endpoint(tls)}"
         )
+    is_tls = endpoint.startswith("tls/")
+    if tls is not None and not is_tls:
+        raise InputError(f"endpoint {endpoint!r}: with --tls it must begin with tls/")
+    if tls is None and is_tls:
+        raise InputError(f"endpoint {endpoint!r}: needs --tls FOLDER, see `driveby certs --help`")
     return endpoint
+
+
+def _is_on_this_machine(endpoint: str) -> bool:
+    """Whether only programs on this machine can reach what listens at an endpoint."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol == "unixsock-stream":
+        return True
+    host = re.split(r"[?#]", address)[0].rpartition(":")[0].strip("[]")
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False  # a name may be that of any interface
 
 
 def _first_sentence(error: Exception) -> str:

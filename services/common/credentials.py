@@ -1,0 +1,157 @@
+"""Who a process is on the bus: a folder with a certificate, its private key and the authority.
+
+`driveby certs` makes one such folder for each router, service and truck:
+
+    ca.pem        the authority's certificate: whom to believe
+    cert.pem      this one's certificate; its common name is ROLE/NAME, e.g. truck/truck-1
+    key.pem       its private key, readable by its owner alone
+    zenoh.json5   the same as a configuration for the programs of Zenoh; for those who listen also
+                  the access control
+
+Nothing here ever puts a key into a message or a log.
+"""
+
+import logging
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    PublicFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import NameOID
+
+from schemas.topics import check_identifier
+from services.common.errors import InputError
+from services.common.files import read_bytes
+
+ROLES = ("router", "logger", "worker", "viewer", "replay", "truck")
+LISTENERS = ("router", "logger")
+"""Roles to which others connect: their certificates are valid for servers and name hosts."""
+AUTHORITY, CERTIFICATE, KEY, CONFIGURATION = "ca.pem", "cert.pem", "key.pem", "zenoh.json5"
+
+_log = logging.getLogger(__name__)
+_WARN_BEFORE = timedelta(days=30)
+_CLOCK_TOLERANCE = timedelta(minutes=5)
+
+
+class Subject(NamedTuple):
+    """The one a certificate speaks for."""
+
+    role: str
+    name: str
+
+    def __str__(self) -> str:
+        """Return the common name of its certificate."""
+        return f"{self.role}/{self.name}"
+
+
+def parse_subject(text: str) -> Subject:
+    """Take ROLE/NAME apart; ValueError if it is none."""
+    role, _, name = text.partition("/")
+    if role not in ROLES:
+        raise ValueError(f"{text[:80]!r}: ROLE/NAME is expected, ROLE one of {', '.join(ROLES)}")
+    return Subject(role, check_identifier(name))
+
+
+def subject_of(certificate: x509.Certificate) -> Subject:
+    """Return whom a certificate is for; ValueError if its common name is not ROLE/NAME."""
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    if len(names) != 1:
+        raise ValueError("the certificate has no common name")
+    return parse_subject(str(names[0].value))
+
+
+def check_credentials(folder: Path, now: datetime | None = None) -> Subject:
+    """Return whose credentials lie in a folder, after all that can be checked before connecting.
+
+    A router answers a bad certificate with silence, so whatever can be said is said here: a
+    missing file, a key that others may read or of another certificate, another authority, a
+    certificate that has expired or is not valid yet. InputError names the file.
+    """
+    now = now or datetime.now(UTC)
+    certificate = read_certificate(folder / CERTIFICATE)
+    authority = read_certificate(folder / AUTHORITY)
+    _check_key(folder / KEY, certificate)
+    try:
+        subject = subject_of(certificate)
+    except ValueError as error:
+        raise InputError(f"{folder / CERTIFICATE}: {error}; see `driveby certs --help`") from None
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature):
+        where = folder / CERTIFICATE
+        raise InputError(f"{where}: was not issued by the authority of {AUTHORITY}") from None
+    for path, one in ((folder / CERTIFICATE, certificate), (folder / AUTHORITY, authority)):
+        if now > one.not_valid_after_utc:
+            day = one.not_valid_after_utc.date()
+            raise InputError(f"{path}: expired on {day}; renew it with `driveby certs --renew`")
+        if now < one.not_valid_before_utc - _CLOCK_TOLERANCE:
+            day = one.not_valid_before_utc.date()
+            raise InputError(f"{path}: valid from {day} only; is this machine's clock right?")
+        if now > one.not_valid_after_utc - _WARN_BEFORE:
+            _log.warning("%s expires on %s", path, one.not_valid_after_utc.date())
+    return subject
+
+
+def check_speaks_for(folder: Path | None, role: str, name: str) -> None:
+    """Raise InputError if the credentials are not those of this role and name.
+
+    The access control of a router drops what somebody else says without a word: whoever used the
+    wrong folder would never learn why nothing arrives. None, no credentials, passes.
+    """
+    if folder is None:
+        return
+    subject = check_credentials(folder)
+    if subject != (role, name):
+        raise InputError(
+            f"{folder}: is the certificate of {subject}, but {role}/{name} is to be published"
+        )
+
+
+def read_certificate(path: Path) -> x509.Certificate:
+    """Return the certificate of a PEM file; InputError if there is none."""
+    content = read_bytes(path)
+    try:
+        return x509.load_pem_x509_certificate(content)
+    except ValueError:
+        raise InputError(f"{path}: is no certificate in PEM form") from None
+
+
+def link_settings(folder: Path | str) -> dict[str, Any]:
+    """Return Zenoh's settings for mutual TLS, and nothing but TLS, with a folder's credentials.
+
+    The client proves who it is and checks that the router's certificate names the host that it
+    meant to reach. A link ends when a certificate on it expires.
+    """
+    key, certificate = f"{folder}/{KEY}", f"{folder}/{CERTIFICATE}"
+    return {
+        "protocols": ["tls"],
+        "tls": {
+            "root_ca_certificate": f"{folder}/{AUTHORITY}",
+            "listen_private_key": key,
+            "listen_certificate": certificate,
+            "connect_private_key": key,
+            "connect_certificate": certificate,
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        },
+    }
+
+
+def _check_key(path: Path, certificate: x509.Certificate) -> None:
+    content = read_bytes(path)
+    if path.stat().st_mode & 0o077:
+        raise InputError(f"{path}: others may read this private key; chmod 600 {path}")
+    try:
+        key = load_pem_private_key(content, password=None)
+    except (ValueError, TypeError):
+        raise InputError(f"{path}: is no private key in PEM form without a password") from None
+    form = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+    if key.public_key().public_bytes(*form) != certificate.public_key().public_bytes(*form):
+        raise InputError(f"{path}: is not the key of {CERTIFICATE} beside it")
