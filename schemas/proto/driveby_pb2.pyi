@@ -426,3 +426,49 @@ class Durable(_message.Message):
     time_ns: int
     streams: _containers.RepeatedCompositeFieldContainer[DurableStream]
     def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., streams: _Optional[_Iterable[_Union[DurableStream, _Mapping]]] = ...) -> None: ...
+
+class SequenceRange(_message.Message):
+    __slots__ = ("first", "last")
+    FIRST_FIELD_NUMBER: _ClassVar[int]
+    LAST_FIELD_NUMBER: _ClassVar[int]
+    first: int
+    last: int
+    def __init__(self, first: _Optional[int] = ..., last: _Optional[int] = ...) -> None: ...
+
+class SpoolBoot(_message.Message):
+    __slots__ = ("boot_id", "next_sequence", "held", "durable", "dropped")
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    NEXT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    HELD_FIELD_NUMBER: _ClassVar[int]
+    DURABLE_FIELD_NUMBER: _ClassVar[int]
+    DROPPED_FIELD_NUMBER: _ClassVar[int]
+    boot_id: int
+    next_sequence: int
+    held: _containers.RepeatedCompositeFieldContainer[SequenceRange]
+    durable: int
+    dropped: int
+    def __init__(self, boot_id: _Optional[int] = ..., next_sequence: _Optional[int] = ..., held: _Optional[_Iterable[_Union[SequenceRange, _Mapping]]] = ..., durable: _Optional[int] = ..., dropped: _Optional[int] = ...) -> None: ...
+
+class SpoolContents(_message.Message):
+    __slots__ = ("schema_version", "time_ns", "boots")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    BOOTS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    time_ns: int
+    boots: _containers.RepeatedCompositeFieldContainer[SpoolBoot]
+    def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., boots: _Optional[_Iterable[_Union[SpoolBoot, _Mapping]]] = ...) -> None: ...
+
+class SpoolPage(_message.Message):
+    __slots__ = ("schema_version", "boot_id", "first", "last", "next")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    FIRST_FIELD_NUMBER: _ClassVar[int]
+    LAST_FIELD_NUMBER: _ClassVar[int]
+    NEXT_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    boot_id: int
+    first: int
+    last: int
+    next: int
+    def __init__(self, schema_version: _Optional[int] = ..., boot_id: _Optional[int] = ..., first: _Optional[int] = ..., last: _Optional[int] = ..., next: _Optional[int] = ...) -> None: ...

@@ -1,0 +1,430 @@
+"""The spool: what a truck has sent, on its own disk until a logger has it on another.
+
+A folder of segments, one boot after the other, `{boot_id}-{number}.spool`. A segment is appended
+to and never changed: a header (magic, boot_id, CRC), then records
+
+    CRC-32 of the rest | length of the rest | sequence | length of the name | stream | payload
+
+all big-endian. What `append` was given survives `kill -9` of the process; what stood there when
+`sync` was called survives a power cut. The end that a cut left half-written is removed when the
+folder is opened. `state.json` holds what is known of messages whose segments are gone: up to where
+loggers have confirmed them, and which were given up for room; it is replaced before a segment is
+deleted, so that nothing is ever unaccounted for.
+"""
+
+import fcntl
+import json
+import logging
+import os
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from schemas.spool import Held
+from services.common.errors import FailureError, InputError
+from services.common.files import check_folder_writable, write_atomically
+from services.common.intervals import Intervals
+
+__all__ = ["DEFAULT_BUDGET_BYTES", "Page", "Spool", "SpooledMessage"]
+
+DEFAULT_BUDGET_BYTES = 4 << 30
+"""A day and a half of four channels at 1 kHz."""
+PAGE_MESSAGES = 1000
+PAGE_BYTES = 1 << 20
+
+_log = logging.getLogger(__name__)
+_MAGIC = b"DBSPOOL1"
+_HEADER = struct.Struct("!8sQI")
+_RECORD = struct.Struct("!IIQB")
+_RECORD_PREFIX = 8  # CRC and length, which the length does not count
+_SMALLEST_BUDGET_BYTES = 1 << 20
+_LARGEST_SEGMENT_BYTES = 4 << 20
+_SEGMENTS_IN_BUDGET = 16
+_STATE = "state.json"
+_LOCK = "lock"
+_BOOTS_REMEMBERED = 100
+
+
+class SpooledMessage(NamedTuple):
+    """One message of a stream and boot, as it was or should have been published."""
+
+    sequence: int
+    payload: bytes
+
+
+class Page(NamedTuple):
+    """A part of what was asked for, in ascending order."""
+
+    messages: list[SpooledMessage]
+    next_sequence: int | None
+    """Where to go on; None: there is no more. What lies below it and was not given is not held."""
+
+
+class Spool:
+    """The spool in one folder, of one truck, for one boot that begins with its opening.
+
+    Thread-safe. `append` and `sync` may raise OSError; the spool stays usable.
+    """
+
+    def __init__(self, folder: Path, *, budget_bytes: int = DEFAULT_BUDGET_BYTES) -> None:
+        """Open or make the folder; InputError if it cannot be used or another process has it."""
+        if budget_bytes < _SMALLEST_BUDGET_BYTES:
+            least = _SMALLEST_BUDGET_BYTES >> 20
+            raise InputError(f"spool budget of {budget_bytes} bytes; at least {least} MiB")
+        self.folder = folder
+        self.budget_bytes = budget_bytes
+        self.torn_bytes = 0
+        """Bytes removed at the opening, because they were cut off or damaged."""
+        self._segment_bytes = min(_LARGEST_SEGMENT_BYTES, budget_bytes // _SEGMENTS_IN_BUDGET)
+        self._lock = threading.Lock()
+        self._lock_file = _locked(folder)
+        try:
+            self._past = _read_state(folder / _STATE)
+            self._segments = [
+                segment for path in sorted(folder.glob("*.spool")) if (segment := self._load(path))
+            ]
+        except OSError as error:
+            os.close(self._lock_file)
+            raise FailureError(f"{folder}: cannot be read: {error.strerror}") from None
+        boots = [segment.boot_id for segment in self._segments]
+        boots += [boot_id for _, boot_id in self._past]
+        self.boot_id = max([time.time_ns(), *(boot_id + 1 for boot_id in boots)])
+        """Higher than any before, also where the wall clock went back in between."""
+        self._next: dict[str, int] = {}
+        self._file: int | None = None
+        self._unsynced: list[int] = []
+        self._number = 0
+
+    def append(self, stream: str, sequence: int, payload: bytes) -> None:
+        """Add a message of this boot; of each stream the sequences ascend. May raise OSError."""
+        name = stream.encode("ascii")
+        body = _RECORD.pack(0, _RECORD.size - _RECORD_PREFIX + len(name) + len(payload), sequence,
+                            len(name))[4:] + name + payload  # fmt: skip
+        record = zlib.crc32(body).to_bytes(4, "big") + body
+        with self._lock:
+            self._next[stream] = sequence + 1
+            if self._file is None or self._segments[-1].size >= self._segment_bytes:
+                self._begin_segment()
+            segment = self._segments[-1]
+            self._write(segment, record)
+            segment.streams.setdefault(stream, Intervals()).add(sequence)
+
+    def sync(self) -> None:
+        """Bring everything appended so far to the disk itself, and keep to the budget."""
+        with self._lock:
+            self._enforce_budget()
+            files, self._unsynced = self._unsynced, []
+            if self._file is not None:
+                files.append(os.dup(self._file))
+        for file in files:
+            try:
+                os.fsync(file)
+            finally:
+                os.close(file)
+
+    def read(
+        self,
+        stream: str,
+        boot_id: int,
+        first: int,
+        last: int,
+        *,
+        max_messages: int = PAGE_MESSAGES,
+        max_bytes: int = PAGE_BYTES,
+    ) -> Page:
+        """Return the messages from first to last that are held, as many as a page takes."""
+        with self._lock:
+            segments = [
+                (segment.path, segment.size)
+                for segment in self._segments
+                if segment.boot_id == boot_id and segment.holds_any(stream, first, last)
+            ]
+        found: list[SpooledMessage] = []
+        used = 0
+        for path, size in segments:
+            for record in _records(_read_file(path, size)):
+                if record.stream != stream or not first <= record.sequence <= last:
+                    continue
+                if found and (len(found) >= max_messages or used + len(record.payload) > max_bytes):
+                    return Page(found, record.sequence)
+                found.append(SpooledMessage(record.sequence, record.payload))
+                used += len(record.payload)
+        return Page(found, None)
+
+    def contents(self, stream: str) -> list[Held]:
+        """Return what is held of a stream, boot by boot, oldest first."""
+        with self._lock:
+            return self._contents(stream)
+
+    def streams(self) -> list[str]:
+        """Return the names of all streams of which anything is known."""
+        with self._lock:
+            names = {name for segment in self._segments for name in segment.streams}
+            return sorted(names | set(self._next) | {name for name, _ in self._past})
+
+    def confirm(self, durable: Mapping[tuple[str, int], int]) -> None:
+        """Free what is on a logger's disk: the highest contiguous sequence by (stream, boot_id)."""
+        with self._lock:
+            changed = False
+            for name, sequence in durable.items():
+                past = self._past.get(name)
+                known = past is not None or any(
+                    segment.boot_id == name[1] and name[0] in segment.streams
+                    for segment in self._segments
+                )
+                if known and (past is None or sequence > past.durable):
+                    self._past.setdefault(name, _Past()).durable = sequence
+                    changed = True
+            if not changed:
+                return
+            # A boot that is still going on keeps its open segment.
+            done = [
+                segment
+                for segment in (self._segments if self._file is None else self._segments[:-1])
+                if self._is_durable(segment)
+            ]
+            self._delete(done)
+
+    def dropped(self) -> int:
+        """Return how many messages were given up for room before any logger had them."""
+        with self._lock:
+            return sum(past.dropped.size for past in self._past.values())
+
+    def used_bytes(self) -> int:
+        """Return the size of all segments."""
+        with self._lock:
+            return sum(segment.size for segment in self._segments)
+
+    def close(self) -> None:
+        """Sync, and let another process have the folder. Nothing can be appended any more."""
+        self.sync()
+        with self._lock:
+            if self._file is not None:
+                os.close(self._file)
+                self._file = None
+            os.close(self._lock_file)
+
+    def _contents(self, stream: str) -> list[Held]:
+        by_boot: dict[int, Intervals] = {}
+        for segment in self._segments:
+            if stream in segment.streams:
+                numbers = by_boot.setdefault(segment.boot_id, Intervals())
+                for first, last in segment.streams[stream].ranges():
+                    numbers.add_range(first, last)
+        boots = set(by_boot) | {boot_id for name, boot_id in self._past if name == stream}
+        if stream in self._next:
+            boots.add(self.boot_id)
+        contents = []
+        for boot_id in sorted(boots):
+            numbers = by_boot.get(boot_id, Intervals())
+            past = self._past.get((stream, boot_id), _Past())
+            highest = max(numbers.highest or 0, past.durable, past.dropped.highest or 0)
+            next_sequence = self._next.get(stream, 0) if boot_id == self.boot_id else highest + 1
+            contents.append(
+                Held(boot_id, next_sequence, numbers.ranges(), past.durable, past.dropped.size)
+            )
+        return contents
+
+    def _begin_segment(self) -> None:
+        path = self.folder / f"{self.boot_id:020d}-{self._number:06d}.spool"
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        self._number += 1
+        if self._file is not None:
+            self._unsynced.append(self._file)
+        self._file = file
+        segment = _Segment(path, self.boot_id)
+        self._segments.append(segment)
+        header = _HEADER.pack(_MAGIC, self.boot_id, zlib.crc32(_MAGIC + _boot(self.boot_id)))
+        self._write(segment, header)
+        folder = os.open(self.folder, os.O_RDONLY)
+        self._unsynced.append(folder)
+
+    def _write(self, segment: "_Segment", data: bytes) -> None:
+        assert self._file is not None  # noqa: S101  # narrowed for the type checker
+        try:
+            written = os.write(self._file, data)
+            if written != len(data):
+                raise OSError(28, "No space left on device")
+        except OSError:
+            # A half-written record in the middle would hide those behind it.
+            os.ftruncate(self._file, segment.size)
+            raise
+        segment.size += written
+
+    def _is_durable(self, segment: "_Segment") -> bool:
+        return all(
+            (numbers.highest or 0) <= self._past.get((name, segment.boot_id), _Past()).durable
+            for name, numbers in segment.streams.items()
+        )
+
+    def _enforce_budget(self) -> None:
+        total = sum(segment.size for segment in self._segments)
+        doomed = []
+        for segment in self._segments[:-1]:
+            if total <= self.budget_bytes:
+                break
+            total -= segment.size
+            doomed.append(segment)
+            lost = 0
+            for name, numbers in segment.streams.items():
+                past = self._past.setdefault((name, segment.boot_id), _Past())
+                for first, last in numbers.ranges():
+                    lost += past.dropped.add_range(max(first, past.durable + 1), last)
+            if lost:
+                _log.error("%s: full, %d messages that no logger has are gone", self.folder, lost)
+        self._delete(doomed)
+
+    def _delete(self, doomed: list["_Segment"]) -> None:
+        if not doomed:
+            return
+        gone = {id(segment) for segment in doomed}
+        self._segments = [segment for segment in self._segments if id(segment) not in gone]
+        self._forget_old_boots()
+        _write_state(self.folder / _STATE, self._past)
+        for segment in doomed:
+            segment.path.unlink(missing_ok=True)
+
+    def _forget_old_boots(self) -> None:
+        """Drop what is remembered of boots of which nothing is left and nothing was lost."""
+        held = {(name, segment.boot_id) for segment in self._segments for name in segment.streams}
+        for name, past in list(self._past.items()):
+            settled = not past.dropped.size or (past.dropped.highest or 0) <= past.durable
+            if name not in held and name[1] != self.boot_id and settled:
+                del self._past[name]
+        boots = sorted({boot_id for _, boot_id in self._past})
+        for boot_id in boots[:-_BOOTS_REMEMBERED]:
+            for name in [name for name in self._past if name[1] == boot_id and name not in held]:
+                del self._past[name]
+
+    def _load(self, path: Path) -> "_Segment | None":
+        """Read a segment of an earlier boot and remove its torn end; None if nothing is left."""
+        content = _read_file(path, path.stat().st_size)
+        boot_id = _boot_of(content)
+        if boot_id is None:
+            self.torn_bytes += len(content)
+            _log.warning("%s: no segment of a spool, removed (%d bytes)", path, len(content))
+            path.unlink()
+            return None
+        segment = _Segment(path, boot_id, _HEADER.size)
+        for record in _records(content):
+            segment.streams.setdefault(record.stream, Intervals()).add(record.sequence)
+            segment.size = record.end
+        torn = len(content) - segment.size
+        if torn:
+            self.torn_bytes += torn
+            _log.warning("%s: %d bytes at its end were cut off, removed", path, torn)
+            os.truncate(path, segment.size)
+        if not segment.streams:
+            path.unlink()
+            return None
+        return segment
+
+
+@dataclass
+class _Past:
+    durable: int = -1
+    dropped: Intervals = field(default_factory=Intervals)
+
+
+@dataclass
+class _Segment:
+    path: Path
+    boot_id: int
+    size: int = 0
+    streams: dict[str, Intervals] = field(default_factory=dict)
+
+    def holds_any(self, stream: str, first: int, last: int) -> bool:
+        numbers = self.streams.get(stream)
+        return numbers is not None and any(a <= last and b >= first for a, b in numbers.ranges())
+
+
+class _Record(NamedTuple):
+    stream: str
+    sequence: int
+    payload: bytes
+    end: int
+
+
+def _records(content: bytes) -> Iterator[_Record]:
+    """Yield the intact records; a damaged one is left out if the next one can be found."""
+    at = _HEADER.size
+    while at + _RECORD.size <= len(content):
+        crc, length, sequence, name_length = _RECORD.unpack_from(content, at)
+        end = at + _RECORD_PREFIX + length
+        if end > len(content) or length < _RECORD.size - _RECORD_PREFIX + name_length:
+            return
+        if zlib.crc32(memoryview(content)[at + 4 : end]) == crc:
+            start = at + _RECORD.size
+            name = content[start : start + name_length].decode("ascii", errors="replace")
+            yield _Record(name, sequence, content[start + name_length : end], end)
+        at = end
+
+
+def _boot(boot_id: int) -> bytes:
+    return boot_id.to_bytes(8, "big")
+
+
+def _boot_of(content: bytes) -> int | None:
+    if len(content) < _HEADER.size:
+        return None
+    magic, boot_id, crc = _HEADER.unpack_from(content)
+    if magic != _MAGIC or zlib.crc32(magic + _boot(boot_id)) != crc:
+        return None
+    return int(boot_id)
+
+
+def _read_file(path: Path, size: int) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(size)
+    except FileNotFoundError:  # freed in the meantime
+        return b""
+
+
+def _locked(folder: Path) -> int:
+    check_folder_writable(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    file = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(file)
+        raise InputError(
+            f"{folder}: another truck uses this spool; give every truck a folder of its own"
+        ) from None
+    return file
+
+
+def _read_state(path: Path) -> dict[tuple[str, int], _Past]:
+    if not path.exists():
+        return {}
+    try:
+        entries: list[dict[str, Any]] = json.loads(path.read_text())["streams"]
+        state = {}
+        for entry in entries:
+            past = _Past(int(entry["durable"]))
+            for first, last in entry["dropped"]:
+                past.dropped.add_range(int(first), int(last))
+            state[(str(entry["stream"]), int(entry["boot_id"]))] = past
+        return state
+    except (ValueError, KeyError, TypeError) as error:
+        _log.warning("%s: unreadable (%s), what was confirmed will be offered again", path, error)
+        return {}
+
+
+def _write_state(path: Path, past: Mapping[tuple[str, int], _Past]) -> None:
+    entries = [
+        {
+            "stream": stream,
+            "boot_id": boot_id,
+            "durable": one.durable,
+            "dropped": one.dropped.ranges(),
+        }
+        for (stream, boot_id), one in sorted(past.items())
+    ]
+    write_atomically(path, json.dumps({"streams": entries}))
