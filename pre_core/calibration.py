@@ -1,0 +1,99 @@
+"""What many crossings of known truth say about a method's intervals.
+
+Each function takes errors or ranks and returns how far they are from what true intervals would
+give. Ranks and normal scores of one crossing are not independent of each other (its elements share
+a scale error, neighbours trade rigidity), so standard errors are taken between crossings, and a
+group of parameters is tested parameter by parameter.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, log_ndtr, ndtr
+
+FloatArray = NDArray[np.float64]
+
+NORMAL_975 = 1.959963984540054
+
+
+class Share(NamedTuple):
+    """A share of cases and its standard error between crossings."""
+
+    value: float
+    error: float
+    cases: int
+
+
+def pooled_share(hits: FloatArray) -> Share:
+    """Share of hits (crossings, parameters), each 0 or 1; crossings are independent, hits in one
+    are not."""
+    per_crossing = hits.mean(axis=1)
+    n = per_crossing.size
+    error = float(per_crossing.std(ddof=1) / np.sqrt(n)) if n > 1 else float("nan")
+    return Share(float(per_crossing.mean()), error, hits.size)
+
+
+def root_mean_square(z: FloatArray) -> float:
+    """Root mean square of normal scores of any shape: 1 for true intervals."""
+    return float(np.sqrt(np.mean(z * z)))
+
+
+def rank(draws: FloatArray, truth: FloatArray) -> FloatArray:
+    """Share (p,) of draws (n, p) below the truth (p,): uniform for a true posterior.
+
+    Half of the draws that equal it count as below.
+    """
+    below = np.mean(draws < truth, axis=0)
+    return np.asarray(below + 0.5 * np.mean(draws == truth, axis=0))
+
+
+def rank_from_quantiles(truth: float, low: float, middle: float, high: float) -> float:
+    """The rank of the truth as far as the 2.5, 50 and 97.5 % quantiles tell.
+
+    The normal score is interpolated between them in the logarithm where all is positive (half a
+    logarithm beyond), linearly otherwise: exact for a normal and for a log-normal posterior.
+    """
+    values = np.array([low, middle, high, truth])
+    if np.all(values > 0.0):
+        low, middle, high, truth = np.log(values)
+    width = (middle - low) if truth < middle else (high - middle)
+    score = NORMAL_975 * (truth - middle) / max(width, 1e-300)
+    return float(ndtr(score))
+
+
+class Uniformity(NamedTuple):
+    """Chi-square test of ranks against the uniform distribution."""
+
+    statistic: float
+    p_value: float
+    counts: NDArray[np.int64]
+
+
+def uniformity(ranks: FloatArray, bins: int = 10) -> Uniformity:
+    """Test independent ranks (n,) between 0 and 1; at least five in a bin are expected."""
+    bins = max(2, min(bins, ranks.size // 5))
+    counts, _ = np.histogram(np.clip(ranks, 0.0, 1.0), bins, (0.0, 1.0))
+    expected = ranks.size / bins
+    statistic = float(np.sum((counts - expected) ** 2) / expected) if ranks.size else 0.0
+    return Uniformity(statistic, float(chdtrc(bins - 1, statistic)), counts)
+
+
+def group_p_value(p_values: FloatArray) -> float:
+    """Chance of the worst of k p-values under any dependence (Bonferroni)."""
+    return float(min(1.0, p_values.size * p_values.min()))
+
+
+def without_negative(covariance: FloatArray, i: int, centre: float) -> FloatArray:
+    """Covariance (f, f) when coordinate i, normal about `centre`, cannot be negative.
+
+    Its variance becomes that of the truncated normal; the others keep their regression on it.
+    """
+    variance = float(covariance[i, i])
+    std = np.sqrt(variance)
+    lowest = -centre / std
+    # Inverse Mills ratio of the part above `lowest`.
+    mills = float(np.exp(-0.5 * lowest**2 - 0.5 * np.log(2.0 * np.pi) - log_ndtr(-lowest)))
+    share = 1.0 + lowest * mills - mills**2
+    column = covariance[:, i]
+    return np.asarray(covariance - np.outer(column, column) * ((1.0 - share) / variance))

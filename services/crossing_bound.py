@@ -1,0 +1,208 @@
+"""How well one crossing can be known at all: the Cramér-Rao bound of its data at the truth.
+
+The bound is that of all rows of the posterior - white data, receiver, priors - differentiated at
+the true values of every unknown of truck and bridge, with all nuisances (trajectory, gains, delays,
+initial states) free: the inverse of J'J, of which J is the Jacobian by central differences. A
+support spring cannot be negative, which the inverse does not know: its variance is replaced by
+that of a normal about the true value cut off at zero, and what follows for the others is taken
+along (`without_negative`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core import parameters, posterior, pre
+from pre_core.calibration import without_negative
+from pre_core.parameters import EI_1
+from schemas.signals import CHANNELS
+from schemas.site import Site
+from services.drawn_crossings import Drawn, Seen, Truth, true_values
+from services.worker.pre_method import inputs_of
+
+Floats = NDArray[np.float64]
+
+_STEP = 1e-4
+"""Of a central difference, in the coordinates of the posterior: multiples of a prior's spread, and
+metres of the trajectory. Halving it moves no bound by 1e-4 of itself (tests)."""
+_NUISANCE_STEPS = 12
+
+
+class Bound(NamedTuple):
+    """Relative standard deviations (of supports absolute), by parameter name."""
+
+    std: dict[str, float]
+    """With the scale error, as results give it."""
+    std_without_scale: dict[str, float]
+    chi2_per_dof: float
+    """Of the data at the truth: the model itself, whatever a search finds."""
+
+
+def bound_at_truth(seen: Seen, drawn: Drawn) -> dict[str, dict[str, float]]:
+    """The bounds of a drawn crossing as JSON."""
+    problem, y = _problem(seen)
+    where = posterior.layout(problem)
+    scale, gain = _scale(seen.data.sensor.gain_spread, drawn.truth, drawn.site)
+    theta = equivalent_theta(true_values(drawn.truth), problem.priors.theta.size - 15, scale, gain)
+    _set_theta(problem, y, theta, drawn.truth.car.wheelbase_m)
+    gains = drawn.truth.channels.gain
+    _set_gains(problem, y, gains.mean() - gains)
+    y[where.delays] = drawn.truth.channels.delay_s / problem.priors.delay_spread_s
+    time_s = _sample_times(seen)
+    wall = time_s + seen.data.wall_offset_s
+    true_m = np.interp(
+        wall,
+        drawn.start_s + drawn.step_s * np.arange(drawn.motion.position_m.size),
+        drawn.motion.position_m,
+    )
+    y[where.trajectory] = np.linalg.lstsq(problem.basis_position, true_m, rcond=None)[0]
+    y[where.offset] = _best_offset(problem, y)
+    problem = pre.with_noise_at(problem, y)
+    # Initial states are not known exactly; a delay and a shift along the road are nearly the same.
+    y = settle(problem, y, np.arange(where.gains.start, where.size), 4)
+    return as_json(bound_of(problem, y, common_spread(seen)))
+
+
+def as_json(bound: Bound) -> dict[str, dict[str, float]]:
+    """Plain dictionaries."""
+    return {
+        "std": bound.std,
+        "std_without_scale": bound.std_without_scale,
+        "at_truth": {"chi2_per_dof": bound.chi2_per_dof},
+    }
+
+
+def common_spread(seen: Seen) -> float:
+    """Relative standard deviation of what scales all EI: total mass, common and mean gain."""
+    sensor = seen.data.sensor
+    return float(
+        np.sqrt(
+            seen.data.vehicle.spread("total_mass_kg") ** 2
+            + sensor.common_gain_spread**2
+            + (0.5 * sensor.gain_spread) ** 2
+        )
+    )
+
+
+def bound_of(problem: posterior.Problem, y: Floats, scale_error: float) -> Bound:
+    """The bound at y (size,); `scale_error` is that of `common_spread`."""
+    where = posterior.layout(problem)
+    jacobian = central_jacobian(problem, y, np.arange(where.size))
+    covariance = posterior.covariance(posterior.precision_root(jacobian))
+    springs = np.arange(where.theta.stop - int(problem.estimated[-2:].sum()), where.theta.stop)
+    for spring in springs:
+        covariance = without_negative(covariance, int(spring), float(y[spring]))
+    std = np.sqrt(np.diag(covariance))
+    elements = problem.priors.theta.size - 15
+    names = parameters.names(elements)
+    alone, full = {}, {}
+    for place, i in enumerate(np.flatnonzero(problem.estimated)):
+        alone[names[i]] = float(problem.priors.spread[i] * std[place])
+        is_scaled = names[i].startswith(("c_", "k_s", "k_u", "m_", "EI_")) or names[i] == "rhoA"
+        full[names[i]] = float(np.hypot(alone[names[i]], scale_error if is_scaled else 0.0))
+    return Bound(full, alone, pre.chi2_per_dof(problem, y))
+
+
+def central_jacobian(
+    problem: posterior.Problem, y: Floats, columns: NDArray[np.int64], step: float = _STEP
+) -> Floats:
+    """Derivatives (rows, columns) of all rows at y by central differences."""
+    moved = np.repeat(y[None, :], 2 * columns.size, axis=0)
+    moved[np.arange(columns.size), columns] += step
+    moved[columns.size + np.arange(columns.size), columns] -= step
+    values = posterior.all_rows(problem, moved)
+    return np.asarray((values[: columns.size] - values[columns.size :]).T / (2.0 * step))
+
+
+def settle(
+    problem: posterior.Problem,
+    y: Floats,
+    columns: NDArray[np.int64],
+    steps: int = _NUISANCE_STEPS,
+) -> Floats:
+    """The best y in these columns alone, the others held: Gauss-Newton with halved steps."""
+    rows = posterior.all_rows(problem, y[None, :])[0]
+    for _ in range(steps):
+        jacobian = central_jacobian(problem, y, columns)
+        move = np.linalg.lstsq(jacobian, -rows, rcond=None)[0]
+        for share in (1.0, 0.5, 0.25, 0.1, 0.02):
+            tried = y.copy()
+            tried[columns] += share * move
+            new = posterior.all_rows(problem, tried[None, :])[0]
+            if np.all(np.isfinite(new)) and new @ new < rows @ rows:
+                break
+        else:
+            return y
+        y, rows = tried, new
+    return y
+
+
+def equivalent_theta(
+    values: dict[str, float], elements: int, scale: float, common_gain: float
+) -> Floats:
+    """The parameters (p,) that the method would find without noise.
+
+    The method takes the total mass for the nominal one and the common gain for none. All forces
+    are then off by `scale`, nominal over true mass, and so are masses, springs and dampers. The
+    bridge's deflection is read too large by the gain: its rigidity and mass are divided by it.
+    """
+    theta = np.array([values[name] for name in parameters.names(elements)])
+    theta[1 : EI_1 - 1] *= scale
+    theta[EI_1 : EI_1 + elements + 1] *= scale / (1.0 + common_gain)
+    theta[-2:] *= scale / (1.0 + common_gain)
+    return theta
+
+
+def _scale(gain_spread: float, truth: Truth, site: Site) -> tuple[float, float]:
+    car = truth.car
+    mass = car.body_mass_kg + sum(car.unsprung_mass_kg)
+    mean_gain = float(truth.channels.gain.mean())
+    common = (1.0 + truth.channels.common_gain) * (1.0 + mean_gain) - 1.0
+    return site.vehicles[0].total_mass_kg / mass, common
+
+
+def _sample_times(seen: Seen) -> Floats:
+    samples = seen.data.samples
+    assert samples is not None  # noqa: S101 - the crossing was identified
+    count = samples.channels[CHANNELS[0]].size
+    return np.asarray(samples.start_s + np.arange(count) / samples.rate_hz)
+
+
+def _problem(seen: Seen) -> tuple[posterior.Problem, Floats]:
+    """The posterior as the method sets it up for this crossing, and its nominal start."""
+    samples = seen.data.samples
+    assert samples is not None  # noqa: S101 - the crossing was identified
+    acceleration = np.stack([samples.channels[name] for name in CHANNELS])
+    return pre.prepare(inputs_of(seen.data, seen.settings, acceleration, samples.start_s))
+
+
+def _set_theta(problem: posterior.Problem, y: Floats, theta: Floats, wheelbase_m: float) -> None:
+    """Put physical values (p,) into the coordinates y; modified in place."""
+    priors, where = problem.priors, posterior.layout(problem)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.log(theta / priors.theta) / priors.spread
+        values[-2:] = theta[-2:] / priors.spread[-2:]
+    y[where.theta] = values[problem.estimated]
+    y[where.wheelbase] = np.log(wheelbase_m / priors.wheelbase_m) / priors.wheelbase_spread
+
+
+def _set_gains(problem: posterior.Problem, y: Floats, gain: Floats) -> None:
+    """Put corrections (4,) of the gains into y, of which three directions exist."""
+    where = posterior.layout(problem)
+    places = np.arange(where.gains.start, where.gains.stop)
+    unit = np.repeat(y[None, :], places.size, axis=0)
+    unit[:, places] = np.eye(places.size)
+    directions = posterior.points(problem, unit).gain
+    y[places] = np.linalg.lstsq(directions.T, gain, rcond=None)[0]
+
+
+def _best_offset(problem: posterior.Problem, y: Floats) -> float:
+    """The offset of all fixes from the trajectory in y."""
+    where = posterior.layout(problem)
+    column = problem.receiver_rows[:, -1]
+    on = column != 0.0
+    trajectory = problem.receiver_rows[:, :-1] @ y[where.trajectory]
+    return float(
+        column[on] @ (problem.receiver_values - trajectory)[on] / (column[on] @ column[on])
+    )
