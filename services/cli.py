@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 ENDPOINT: Final = "tcp/127.0.0.1:7447"
+TLS_ENDPOINT: Final = "tls/127.0.0.1:7447"
 RECORDINGS: Final = Path("recordings")
 METHODS: Final = ("least-squares", "random-walk", "pre")
 SCENARIOS: Final = range(1, 13)
@@ -139,17 +140,36 @@ def _demo(options: argparse.Namespace) -> int:
     )
 
 
+def _certs(options: argparse.Namespace) -> int:
+    from services.certs import certs_command
+
+    lines = certs_command(
+        folder=options.folder,
+        trucks=options.trucks,
+        others=options.add,
+        renew=options.renew,
+        revoke=options.revoke,
+        hosts=options.host,
+        days=options.days,
+    )
+    print("\n".join(lines))
+    return 0
+
+
 def _logger(options: argparse.Namespace) -> int:
     from services import logger
 
+    listen = options.listen or _default_endpoint(options)
     return logger.run(
-        listen=options.listen,
+        listen=listen,
         folder=options.folder,
         file=options.file,
         realm=options.realm,
         site=options.site,
         service_id=options.id,
-        ready=lambda: print(f"ready, listening at {options.listen}", flush=True),
+        ready=lambda: print(f"ready, listening at {listen}", flush=True),
+        tls=options.tls,
+        insecure=options.insecure,
     )
 
 
@@ -157,13 +177,14 @@ def _worker(options: argparse.Namespace) -> int:
     from services import worker
 
     return worker.run(
-        endpoint=options.endpoint,
+        endpoint=options.endpoint or _default_endpoint(options),
         realm=options.realm,
         site=options.site,
         folder=options.folder,
         file=options.file,
         method=options.method.replace("-", "_"),
         service_id=options.id,
+        tls=options.tls,
     )
 
 
@@ -172,10 +193,11 @@ def _truck(options: argparse.Namespace) -> int:
 
     return truck.run(
         recording=options.recording,
-        endpoint=options.endpoint,
+        endpoint=options.endpoint or _default_endpoint(options),
         realm=options.realm,
         speed=options.speed,
         vehicle=options.vehicle,
+        tls=options.tls,
     )
 
 
@@ -186,13 +208,14 @@ def _replay(options: argparse.Namespace) -> int:
     name = options.name
     return replay.run(
         recordings=options.recordings,
-        endpoint=options.endpoint,
+        endpoint=options.endpoint or _default_endpoint(options),
         speed=options.speed,
         name=(
             identifier_from(options.recordings[0].stem)
             if name is None
             else checked_identifier(name, "--name")
         ),
+        tls=options.tls,
     )
 
 
@@ -362,7 +385,13 @@ def _add_live(commands: Any) -> None:
         "record all that travels; hosts the router that the others connect to",
         f"driveby logger --listen {ENDPOINT} --folder recordings",
     )
-    p.add_argument("--listen", default=ENDPOINT, help=f"where to listen (default: {ENDPOINT})")
+    p.add_argument("--listen", help=f"where to listen (default: {ENDPOINT})")
+    _add_tls(p)
+    p.add_argument(
+        "--insecure",
+        action="store_true",
+        help="listen to other machines without --tls: whoever reaches the address is believed",
+    )
     _add_folder(p, "folder of the recordings")
     _add_file(p, "--file", "REC.mcap", "put everything into this one new file")
     p.add_argument("--realm", help="record this realm only (default: all)")
@@ -408,6 +437,44 @@ def _add_live(commands: Any) -> None:
     _add_endpoint(p)
     _add_speed(p, 1.0, zero="0 for as fast as possible")
     p.add_argument("--name", help="realm replay-NAME (default: name of the first recording)")
+
+    p = _command(
+        commands,
+        "certs",
+        _certs,
+        "make certificates and access control for a bus between machines",
+        "driveby certs certs --trucks truck-1,truck-2 --host logger.example.org",
+    )
+    p.add_argument(
+        "folder",
+        type=Path,
+        metavar="FOLDER",
+        help="made by the first run, with an authority, router, logger, worker, viewer and replay",
+    )
+    p.add_argument("--trucks", type=_names, default=(), metavar="ID,…", help="add these trucks")
+    p.add_argument(
+        "--add", type=_names, default=(), metavar="ROLE/NAME,…", help="add e.g. viewer/anna"
+    )
+    p.add_argument(
+        "--host",
+        nargs="+",
+        default=(),
+        metavar="NAME",
+        help="names and addresses of the machines of router and logger, besides this machine",
+    )
+    p.add_argument(
+        "--days",
+        type=_whole("days", 1, 3650),
+        default=365,
+        metavar="N",
+        help="how long the new certificates are valid (default: 365)",
+    )
+    p.add_argument(
+        "--renew", type=_names, default=(), metavar="NAME,…", help="new key and certificate"
+    )
+    p.add_argument(
+        "--revoke", type=_names, default=(), metavar="NAME,…", help="these may no longer take part"
+    )
 
 
 def _command(
@@ -494,9 +561,21 @@ def _add_method(p: argparse.ArgumentParser) -> None:
 
 
 def _add_endpoint(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--endpoint", help=f"where the logger listens (default: {ENDPOINT})")
+    _add_tls(p)
+
+
+def _add_tls(p: argparse.ArgumentParser) -> None:
     p.add_argument(
-        "--endpoint", default=ENDPOINT, help=f"where the logger listens (default: {ENDPOINT})"
+        "--tls",
+        type=Path,
+        metavar="FOLDER",
+        help=f"credentials made by `driveby certs`; the default address is {TLS_ENDPOINT} then",
     )
+
+
+def _default_endpoint(options: argparse.Namespace) -> str:
+    return ENDPOINT if options.tls is None else TLS_ENDPOINT
 
 
 def _add_realm(p: argparse.ArgumentParser) -> None:
@@ -522,15 +601,20 @@ def _number(what: str, *, low: float, high: float) -> Callable[[str], float]:
     return parse
 
 
-def _whole(what: str, low: int) -> Callable[[str], int]:
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(","))
+
+
+def _whole(what: str, low: int, high: int = (1 << 63) - 1) -> Callable[[str], int]:
     def parse(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
             value = low - 1
-        if not low <= value < 1 << 63:
+        if not low <= value <= high:
+            limits = f"of at least {low}" if high >= (1 << 63) - 1 else f"from {low} to {high}"
             raise argparse.ArgumentTypeError(
-                f'is "{text}", it must be {what}, a whole number of at least {low}'
+                f'is "{text}", it must be {what}, a whole number {limits}'
             )
         return value
 

@@ -48,6 +48,12 @@ from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity, decode_identity, encode_identity
 from schemas.topics import TOPICS, Key, key, parse_key, selector, topic
+from services.common.credentials import (
+    CONFIGURATION,
+    LISTENERS,
+    check_credentials,
+    link_settings,
+)
 from services.common.errors import FailureError, InputError
 from services.common.files import read_bytes
 from services.common.intervals import Intervals
@@ -179,9 +185,6 @@ def _configuration(endpoint: str, tls: Path | None, *, is_client: bool) -> zenoh
 
 
 def _add_security(config: zenoh.Config, tls: Path, *, is_client: bool) -> None:
-    # Imported here: cryptography takes as long to load as the rest, and most sessions are local.
-    from services.common.credentials import LISTENERS, check_credentials, link_settings
-
     subject = check_credentials(tls)
     for name, value in link_settings(tls).items():
         config.insert_json5(f"transport/link/{name}", json.dumps(value))
@@ -194,8 +197,6 @@ def _add_security(config: zenoh.Config, tls: Path, *, is_client: bool) -> None:
 
 def _access_control(tls: Path) -> dict[str, Any]:
     """The access control in the configuration of a folder; InputError if it would let all pass."""
-    from services.common.credentials import CONFIGURATION
-
     path = tls / CONFIGURATION
     read_bytes(path)  # says what is wrong better than Zenoh
     try:
@@ -482,7 +483,8 @@ class Delivery:
     def __init__(self, session: zenoh.Session, realm: str) -> None:
         self.realm = realm
         self._sent: Counter[tuple[str, str, str, int]] = Counter()
-        self._durable: dict[str, dict[tuple[str, str, str, int], int]] = {}
+        self._durable: dict[str, dict[tuple[str, str, str, int], _OnDisk]] = {}
+        self._lock = threading.Lock()
         self._subscription = Subscription(session, selector(realm, "service", "durable"))
 
     def sent(self, where: Key, identity: Identity) -> None:
@@ -498,7 +500,10 @@ class Delivery:
         """Return how many sent messages the logger that has most of them does not have yet."""
         self._read()
         by_logger = [
-            sum(max(0, number - durable.get(name, 0)) for name, number in self._sent.items())
+            sum(
+                max(0, number - durable.get(name, _OnDisk(0, -1)).count)
+                for name, number in self._sent.items()
+            )
             for durable in self._durable.values()
         ]
         return min(by_logger, default=self._sent.total())
@@ -517,22 +522,46 @@ class Delivery:
             time.sleep(_IDLE_POLL_S)
         return missing
 
+    def confirmed(self, vehicle: str) -> dict[tuple[str, int], int]:
+        """Return up to where at least one logger has everything, by (stream, boot_id)."""
+        self._read()
+        highest: dict[tuple[str, int], int] = {}
+        for durable in self._durable.values():
+            for (owner, identifier, stream, boot_id), on_disk in durable.items():
+                if (owner, identifier) == ("vehicle", vehicle) and on_disk.sequence >= 0:
+                    name = (stream, boot_id)
+                    highest[name] = max(highest.get(name, -1), on_disk.sequence)
+        return highest
+
     def close(self) -> None:
         """Stop following."""
         self._subscription.close()
 
     def _read(self) -> None:
-        while (received := self._subscription.receive()) is not None:
-            try:
-                message = decode("driveby.v1.Durable", received.payload)
-                service = received.key().identifier
-            except ValueError as error:
-                _log.warning("durable: %s", error)
-                continue
-            if isinstance(message, pb.Durable):
-                self._durable[service] = {
-                    (s.owner, s.identifier, s.stream, s.boot_id): s.count for s in message.streams
-                }
+        with self._lock:
+            newest: dict[str, Received] = {}
+            while (received := self._subscription.receive()) is not None:
+                newest[received.key_text] = received  # each tells everything
+            for received in newest.values():
+                try:
+                    message = decode("driveby.v1.Durable", received.payload)
+                    service = received.key().identifier
+                except ValueError as error:
+                    _log.warning("durable: %s", error)
+                    continue
+                if isinstance(message, pb.Durable):
+                    self._durable[service] = {
+                        (s.owner, s.identifier, s.stream, s.boot_id): _OnDisk(
+                            s.count, s.sequence if s.HasField("sequence") else -1
+                        )
+                        for s in message.streams
+                    }
+
+
+class _OnDisk(NamedTuple):
+    count: int
+    sequence: int
+    """The highest with nothing missing below it; -1: none."""
 
 
 def subscribe_latest(

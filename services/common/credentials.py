@@ -98,8 +98,8 @@ def check_credentials(folder: Path, now: datetime | None = None) -> Subject:
     return subject
 
 
-def check_speaks_for(folder: Path | None, role: str, name: str) -> None:
-    """Raise InputError if the credentials are not those of this role and name.
+def check_speaks_for(folder: Path | None, role: str, name: str | None = None) -> None:
+    """Raise InputError if the credentials are not those of this role and name (None: any name).
 
     The access control of a router drops what somebody else says without a word: whoever used the
     wrong folder would never learn why nothing arrives. None, no credentials, passes.
@@ -107,10 +107,8 @@ def check_speaks_for(folder: Path | None, role: str, name: str) -> None:
     if folder is None:
         return
     subject = check_credentials(folder)
-    if subject != (role, name):
-        raise InputError(
-            f"{folder}: is the certificate of {subject}, but {role}/{name} is to be published"
-        )
+    if subject.role != role or name not in (None, subject.name):
+        raise InputError(f"{folder}: is the certificate of {subject}, not of {role}/{name or '…'}")
 
 
 def read_certificate(path: Path) -> x509.Certificate:

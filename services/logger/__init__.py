@@ -16,6 +16,7 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import PREFIX, Key, check_identifier, check_realm
 from services.common.bus import Publisher, Received, Subscription, open_session
+from services.common.credentials import check_speaks_for
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, read_text
 from services.common.playback import stopped_by_signals
@@ -43,6 +44,8 @@ def run(
     site: Path | None,
     service_id: str = "logger",
     ready: Callable[[], None] | None = None,
+    tls: Path | None = None,
+    insecure: bool = False,
 ) -> int:
     """Record until SIGINT or SIGTERM, then finish the files; return 0, or 1 if anything was lost.
 
@@ -50,6 +53,7 @@ def run(
     `tcp/127.0.0.1:7447`. With `file` everything goes into that one file, else into
     `folder/REALM/DATE/VEHICLE-TIME.mcap`; no file is ever overwritten. `realm` limits the
     recording to one realm. The text of the site file `site` is put into every recording.
+    `tls` and `insecure` are those of `open_session`.
     `ready` is called once, when messages can be received. A second signal ends the process at
     once; the files stay readable.
 
@@ -58,8 +62,12 @@ def run(
     """
     place = Place(folder, file, _check_realm(realm), _read_site(site))
     _check_service(service_id)
+    check_speaks_for(tls, "logger", service_id)
     check_folder_writable(file.parent if file is not None else folder)
-    with stopped_by_signals(on_second=_leave_at_once) as stop, open_session(listen=listen) as bus:
+    with (
+        stopped_by_signals(on_second=_leave_at_once) as stop,
+        open_session(listen=listen, tls=tls, insecure=insecure) as bus,
+    ):
         writer = FileWriter(place)
         try:
             logger = _Logger(place, service_id, writer, Intake(realm, service_id, time.time_ns()))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from schemas.topics import Key, check_realm, parse_key, topic
 from services.common.bus import Delivery, Publisher, open_session
+from services.common.credentials import check_speaks_for
 from services.common.errors import FailureError, InputError
 from services.common.playback import check_speed, confirm, play, settle, stopped_by_signals
 from services.common.recording import Message, read_info, read_messages
@@ -25,6 +26,7 @@ def run(
     name: str,
     connect_timeout_s: float | None = CONNECT_TIMEOUT_S,
     subscriber_timeout_s: float = SUBSCRIBER_TIMEOUT_S,
+    tls: Path | None = None,
 ) -> int:
     """Publish what recordings hold in the realm `replay-{name}`, one after the other; return 0.
 
@@ -33,6 +35,8 @@ def run(
     has these published again too. Returns when a logger has everything on disk, or, where there
     is no logger, when subscribers have had the time to fetch what they missed; the same
     recording replayed twice under one name is taken for duplicates by a logger that saw both.
+
+    `tls` is a folder of credentials, see `open_session`.
 
     InputError: no such file, not a recording, a name that is no identifier. FailureError: nobody
     answers at the endpoint within `connect_timeout_s` (None: wait for ever), nobody subscribes
@@ -43,10 +47,11 @@ def run(
         realm = check_realm(f"replay-{name}")
     except ValueError as error:
         raise InputError(f"name {name!r}: {error}") from None
+    check_speaks_for(tls, "replay")
     keys = _keys(recordings)
     with (
         stopped_by_signals() as stop,
-        open_session(connect=endpoint, timeout_s=connect_timeout_s) as session,
+        open_session(connect=endpoint, timeout_s=connect_timeout_s, tls=tls) as session,
     ):
         publisher = Publisher(session, realm)
         delivery = Delivery(session, realm)

@@ -38,6 +38,7 @@ from schemas.signals import (
 )
 from schemas.topics import Key, check_identifier, check_realm, key
 from services.common.bus import Delivery, Publisher, open_session
+from services.common.credentials import check_speaks_for
 from services.common.errors import InputError
 from services.common.playback import (
     check_speed,
@@ -112,6 +113,7 @@ def run(
     speed: float,
     vehicle: str | None,
     connect_timeout_s: float | None = CONNECT_TIMEOUT_S,
+    tls: Path | None = None,
 ) -> int:
     """Play one vehicle of a recording as a truck that drives now; return 0.
 
@@ -120,7 +122,8 @@ def run(
     faster than real, not the data**: rates and the time between samples stay those of the
     recording, because they are physics. Shifted to the end, no stamp lies in the future.
 
-    `vehicle` chooses one of several. Returns when a logger has everything on disk (see
+    `vehicle` chooses one of several; `tls` is a folder of its credentials, see `open_session`.
+    Returns when a logger has everything on disk (see
     `services.common.bus`). InputError: the recording is missing, is none, or holds no such
     vehicle. FailureError: nobody answers at the endpoint within `connect_timeout_s` (None: wait
     for ever), or the logger did not confirm everything.
@@ -131,11 +134,13 @@ def run(
     except ValueError as error:
         raise InputError(str(error)) from None
     streams = _read_vehicle(recording, vehicle)
+    vehicle = next(iter(streams.values()))[0].key.identifier
+    check_speaks_for(tls, "truck", vehicle)
     with (
         stopped_by_signals() as stop,
-        open_session(connect=endpoint, timeout_s=connect_timeout_s) as session,
+        open_session(connect=endpoint, timeout_s=connect_timeout_s, tls=tls) as session,
     ):
-        gateway = Gateway(session, realm, next(iter(streams.values()))[0].key.identifier)
+        gateway = Gateway(session, realm, vehicle)
         try:
             messages = _driven_now(streams, realm, gateway.publisher.boot_id, speed)
             keys = [queue[0].key for queue in streams.values()]

@@ -18,6 +18,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import parse_site, site_hash
 from schemas.topics import Key, check_identifier, check_realm, parse_key, selector
 from services.common.bus import Publisher, Seen, Subscription, open_session
+from services.common.credentials import check_speaks_for
 from services.common.errors import FailureError, InputError
 from services.common.files import read_text, write_atomically
 from services.common.playback import stopped_by_signals
@@ -172,14 +173,17 @@ def run(
     method: str,
     service_id: str,
     ready: Callable[[], None] | None = None,
+    tls: Path | None = None,
 ) -> int:
     """Identify all crossings of a realm until SIGINT or SIGTERM; return 0.
 
     Results are published and written to `folder/REALM/results-TIME.mcap` (or `file`) and `.json`
     beside it. Waits for the router for ever. `ready` is called once, when the worker listens.
+    `tls` is a folder of credentials, see `open_session`.
     InputError: a bad site file, realm or id. FailureError: a result cannot be written.
     """
     _check_names(realm, service_id)
+    check_speaks_for(tls, "worker", service_id)
     text = read_text(site)
     known = parse_site(text, str(site))
     settings = IdentificationSettings.model_validate({"method": method})
@@ -198,7 +202,7 @@ def run(
     files = _ResultFiles(file, text, header)
     with stopped_by_signals() as stop, contextlib.ExitStack() as stack:
         warm_up()
-        bus = _connected(endpoint, stop)
+        bus = _connected(endpoint, tls, stop)
         if bus is None:
             return 0
         stack.enter_context(bus)
@@ -234,12 +238,12 @@ def _check_names(realm: str, service_id: str) -> None:
         raise InputError(str(error)) from None
 
 
-def _connected(endpoint: str, stop: threading.Event) -> zenoh.Session | None:
+def _connected(endpoint: str, tls: Path | None, stop: threading.Event) -> zenoh.Session | None:
     """A session as soon as a router answers; None if a signal came first."""
     while not stop.is_set():
         # Zenoh itself would wait for ever, and no signal would be heard meanwhile.
         with contextlib.suppress(FailureError):
-            return open_session(connect=endpoint, timeout_s=_CONNECT_S)
+            return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
     return None
 
 
