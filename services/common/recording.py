@@ -7,56 +7,57 @@ them. Besides the messages a file has
 
 - metadata `driveby`: program, version, format, and realm and vehicle where there is only one;
 - metadata `driveby.start` and `driveby.end`: reason, time, and at the end the counts. A file
-  without `driveby.end` was cut off: everything up to its last whole chunk can still be read;
+  without `driveby.end` was cut off: everything up to its last whole chunk can still be read. A file
+  that continues another one names it as `previous` in `driveby.start`, and begins with that many
+  latched messages again as `repeated` says;
+- metadata `driveby.identities` before the end: by key and boot, the sequence numbers in the file;
+- metadata `driveby.recovered`, if the file was rewritten by `driveby recover`: what was lost;
 - attachment `site.toml`, if the site was known to the writer.
 """
 
+import contextlib
+import fcntl
 import io
 import logging
 import os
 import struct
 import time
-import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import metadata
 from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import CRCValidationError, breakup_chunk
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.records import Attachment, Channel, Footer, Metadata, MetadataIndex
+from mcap.writer import MCAP0_MAGIC
 
 from schemas.messages import descriptors
 from schemas.topics import Key, key, parse_key, topic
+from services.common.disk import DISK, Disk, write_all
 from services.common.errors import InputError
 from services.common.files import replaced_atomically
+from services.common.intervals import Intervals
+from services.common.mcap_file import McapWriter
+from services.common.mcap_scan import MAX_RECORD_BYTES, Damage, RawMessage, scan
 
 FORMAT = "1"
 ABOUT = "driveby"
 START = "driveby.start"
 END = "driveby.end"
+IDENTITIES = "driveby.identities"
+RECOVERED = "driveby.recovered"
 SITE = "site.toml"
 
 _log = logging.getLogger(__name__)
-_CHUNK_BYTES = 64 * 1024
+CHUNK_BYTES = 64 * 1024
 _RECORD_HEADER = struct.Struct("<BQ")
-_DAMAGE = (
-    McapError,
-    CRCValidationError,
-    zstandard.ZstdError,
-    struct.error,
-    UnicodeDecodeError,
-    ValueError,
-    zlib.error,
-    EOFError,
-)
+
+Identities = dict[tuple[Key, int], Intervals]
+"""By key and boot_id: the sequence numbers of the messages."""
 
 
 class Message(NamedTuple):
@@ -85,6 +86,7 @@ class RecordingInfo(NamedTuple):
     first_time_ns: int
     last_time_ns: int
     damaged_chunks: int
+    """Places in the middle of the file that cannot be read, a chunk each as a rule."""
     truncated: bool
     """The file ends in the middle of a record or without MCAP's footer."""
 
@@ -93,7 +95,9 @@ class RecordingWriter:
     """Writes a recording under its final name, so that a crash leaves a readable file.
 
     `sync()` must be called at least once a second: what was written before it survives `kill -9`
-    and loss of power. Not thread-safe. Every method may raise OSError.
+    and loss of power. Until it is closed the file is locked (flock), which tells a recording that
+    is being written from one whose writer has died. Not thread-safe. Every method may raise
+    OSError; then only `fail` may follow.
     """
 
     def __init__(
@@ -105,11 +109,18 @@ class RecordingWriter:
         vehicle: str | None = None,
         site_toml: str | None = None,
         time_ns: int | None = None,
+        previous: str | None = None,
+        latched: Sequence[Message] = (),
+        disk: Disk = DISK,
     ) -> None:
-        """Create the file; InputError if it exists (recordings are never overwritten)."""
+        """Create the file; InputError if it exists (recordings are never overwritten).
+
+        `previous` is the name of the recording that this one continues, `latched` what a reader
+        must know of it: those messages are written once more.
+        """
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("xb")
+            self._file = disk.create(path)
         except FileExistsError:
             raise InputError(
                 f"{path}: exists, and a recording is never overwritten; give another name"
@@ -119,24 +130,50 @@ class RecordingWriter:
         self.path = path
         self.messages = 0
         """Number of messages written."""
-        self._mcap = _begin(self._file, reason, realm, vehicle, site_toml, time_ns)
-        self.sync()
-        _sync_folder(path.parent)
+        self.identities: Identities = {}
+        self._disk = disk
+        self._is_dirty = True
+        fcntl.flock(self._file, fcntl.LOCK_EX)
+        start = {"previous": previous} if previous else {}
+        start |= {"repeated": str(len(latched))} if latched else {}
+        try:
+            self._mcap = _begin(
+                lambda data: write_all(self._file, data),
+                {"reason": reason} | start,
+                realm=realm,
+                vehicle=vehicle,
+                site_toml=site_toml,
+                time_ns=time_ns,
+            )
+            for message in latched:
+                self.write(message)
+            self.sync()
+            disk.sync_folder(path.parent)
+        except OSError:
+            self._file.close()
+            raise
 
     def write(self, message: Message) -> None:
         """Add one message; it is safe on disk only after `sync()`."""
-        _add(self._mcap, message)
+        name = (message.key, message.boot_id)
+        numbers = self.identities.get(name)
+        if numbers is None:
+            numbers = self.identities[name] = Intervals()
+        numbers.add(message.sequence)
+        self._is_dirty = True
         self.messages += 1
+        _add(self._mcap, message)
 
     def sync(self) -> None:
         """Close the chunk and bring everything written so far to the disk itself."""
-        self._mcap.writer.flush()  # type: ignore[no-untyped-call]
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        if self._is_dirty:
+            self._mcap.writer.flush()
+            self._disk.sync(self._file.fileno())
+            self._is_dirty = False
 
     def tell(self) -> int:
         """Return the bytes in the file so far, without the open chunk."""
-        return self._file.tell()
+        return self._mcap.writer.offset
 
     def finish(
         self,
@@ -145,19 +182,42 @@ class RecordingWriter:
         time_ns: int | None = None,
     ) -> None:
         """Write the END sentinel with its reason and counts, the index, and close the file."""
-        try:
-            _end(self._mcap.writer, reason, self.messages, counts or {}, time_ns)
-            self._file.flush()
-            os.fsync(self._file.fileno())
-        finally:
-            self._file.close()
+        self._mcap.writer.add_metadata(IDENTITIES, _identities_text(self.identities))
+        _end(self._mcap.writer, reason, self.messages, counts or {}, time_ns)
+        self._disk.sync(self._file.fileno())
+        self._file.close()
+
+    def fail(self, reason: str, counts: Mapping[str, int], events: Iterable[Message]) -> None:
+        """Close the file after an OSError, with END and what happened if there is room for that.
+
+        Half a chunk at the end is cut off, and messages not yet in a chunk are given up. Never
+        raises OSError: without END the file is one that crashed, and as readable.
+        """
+        writer = self._mcap.writer
+        self.messages -= writer.discard()
+        whole = writer.offset
+        with contextlib.suppress(OSError):
+            self._cut(whole)
+            try:
+                for event in events:
+                    self.messages += 1
+                    _add(self._mcap, event)
+                _end(writer, reason, self.messages, counts, None)
+                self._disk.sync(self._file.fileno())
+            except OSError:
+                self._cut(whole)
+        self.abandon()
 
     def abandon(self) -> None:
-        """Close the file as it is, after a write error: what was synced stays readable."""
+        """Close the file as it is: what was synced stays readable."""
         try:
             self._file.close()
-        except OSError as error:  # the buffer could not be written; the handle is closed anyway
+        except OSError as error:  # the handle is closed anyway
             _log.error("%s: %s", self.path, error.strerror)
+
+    def _cut(self, size: int) -> None:
+        self._file.truncate(size)
+        self._file.seek(size)
 
 
 def write_recording(
@@ -182,7 +242,14 @@ def write_recording(
     realm = first.key.realm
     vehicle = first.key.identifier if first.key.owner == "vehicle" else None
     with replaced_atomically(path) as temporary, temporary.open("wb") as file:
-        mcap = _begin(file, reason, realm, vehicle, site_toml, first.log_time_ns)
+        mcap = _begin(
+            file.write,
+            {"reason": reason},
+            realm=realm,
+            vehicle=vehicle,
+            site_toml=site_toml,
+            time_ns=first.log_time_ns,
+        )
         for message in chain([first], source):
             _add(mcap, message)
             written += 1
@@ -194,7 +261,7 @@ def write_recording(
 def read_messages(path: Path) -> Iterator[Message]:
     """Yield the messages in the order of the file.
 
-    A file that was cut off is read up to its last whole chunk, a damaged chunk is left out; both
+    A file that was cut off is read up to its last whole chunk, damaged places are left out; both
     are logged (and counted by `read_info`). InputError if the file is missing, is no MCAP file or
     holds no message of ours.
     """
@@ -203,7 +270,7 @@ def read_messages(path: Path) -> Iterator[Message]:
         if isinstance(item, Message):
             found = True
             yield item
-        elif isinstance(item, _Damage):
+        elif isinstance(item, Damage):
             _log.warning("%s: %s", path, item.text)
     if not found:
         raise InputError(f"{path}: holds no driveby message; a recording of a truck is expected")
@@ -239,9 +306,9 @@ def read_info(path: Path) -> RecordingInfo:
                 sentinels[item.name] = dict(item.metadata)
             case Attachment() if item.name == SITE:
                 site_toml = item.data.decode(errors="replace")
-            case _Damage():
-                truncated = truncated or item.truncated
-                damaged_chunks += 0 if item.truncated else 1
+            case Damage():
+                truncated = truncated or item.is_cut_off
+                damaged_chunks += 0 if item.is_cut_off else 1
     return RecordingInfo(
         sentinels.get(ABOUT, {}),
         sentinels.get(START, {}),
@@ -255,35 +322,61 @@ def read_info(path: Path) -> RecordingInfo:
     )
 
 
+def read_identities(path: Path) -> Identities:
+    """Return which messages a recording holds; quick where its writer got to finish it.
+
+    InputError if the file is missing or not MCAP.
+    """
+    known = _stored_identities(path)
+    if known is not None:
+        return known
+    identities: Identities = {}
+    for item in _scan(path):
+        if isinstance(item, Message):
+            numbers = identities.setdefault((item.key, item.boot_id), Intervals())
+            numbers.add(item.sequence)
+    return identities
+
+
+def is_closed(path: Path) -> bool:
+    """Whether a recording has an END sentinel and its index; InputError if it cannot be read."""
+    return _last_metadata(path, END) is not None
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a living process writes to a recording; InputError if it cannot be opened."""
+    with _opened(path) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        return False
+
+
 class _Mcap(NamedTuple):
-    writer: Writer
+    writer: McapWriter
     schemas: dict[str, int]
     channels: dict[tuple[Key, int], int]
 
 
-class _Damage(NamedTuple):
-    text: str
-    truncated: bool
-
-
 def _begin(
-    file: BinaryIO,
-    reason: str,
+    write: Callable[[bytes], object],
+    start: dict[str, str],
+    *,
     realm: str | None,
     vehicle: str | None,
     site_toml: str | None,
     time_ns: int | None,
 ) -> _Mcap:
-    writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-    writer.start(library=f"driveby {program_version()}")
+    writer = McapWriter(write, library=f"driveby {program_version()}", chunk_bytes=CHUNK_BYTES)
     about = {"program": "driveby", "version": program_version(), "format": FORMAT}
     about |= {"realm": realm} if realm else {}
     about |= {"vehicle": vehicle} if vehicle else {}
     writer.add_metadata(ABOUT, about)
     if site_toml is not None:
-        writer.add_attachment(0, 0, SITE, "application/toml", site_toml.encode())
+        writer.add_attachment(SITE, "application/toml", site_toml.encode())
     now_ns = time.time_ns() if time_ns is None else time_ns
-    writer.add_metadata(START, {"reason": reason, "time_ns": str(now_ns)})
+    writer.add_metadata(START, start | {"time_ns": str(now_ns)})
     return _Mcap(writer, {}, {})
 
 
@@ -293,11 +386,11 @@ def _add(mcap: _Mcap, message: Message) -> None:
     if channel is None:
         channel = mcap.channels[name] = _register(mcap, *name)
     mcap.writer.add_message(
-        channel_id=channel,
-        log_time=message.log_time_ns,
-        data=message.payload,
-        publish_time=message.publish_time_ns,
-        sequence=message.sequence,
+        channel,
+        message.sequence,
+        message.log_time_ns,
+        message.publish_time_ns,
+        message.payload,
     )
 
 
@@ -307,117 +400,139 @@ def _register(mcap: _Mcap, where: Key, boot_id: int) -> int:
         raise ValueError(f"{where.owner}/{where.stream} has no message to record")
     schema = mcap.schemas.get(name)
     if schema is None:
-        schema = mcap.writer.register_schema(name, "protobuf", descriptors(name))
+        schema = mcap.writer.add_schema(name, "protobuf", descriptors(name))
         mcap.schemas[name] = schema
-    return mcap.writer.register_channel(
+    return mcap.writer.add_channel(
         key(*where), "protobuf", schema, {"boot_id": str(boot_id), "stream": where.stream}
     )
 
 
 def _end(
-    writer: Writer, reason: str, messages: int, counts: Mapping[str, int], time_ns: int | None
+    writer: McapWriter, reason: str, messages: int, counts: Mapping[str, int], time_ns: int | None
 ) -> None:
-    writer.flush()  # type: ignore[no-untyped-call]  # else the sentinel would stand before the last chunk
     now_ns = time.time_ns() if time_ns is None else time_ns
     figures = {name: str(value) for name, value in counts.items()}
     known = {"reason": reason, "time_ns": str(now_ns), "messages": str(messages)}
     writer.add_metadata(END, figures | known)
-    writer.finish()  # type: ignore[no-untyped-call]
+    writer.finish()
 
 
-def _scan(path: Path) -> Iterator[Message | Metadata | Attachment | _Damage]:
-    """Yield all that is of use in a file, in its order, and what is damaged.
+def _identities_text(identities: Identities) -> dict[str, str]:
+    return {
+        f"{key(*where)} {boot_id}": ",".join(f"{a}-{b}" for a, b in numbers.ranges())
+        for (where, boot_id), numbers in identities.items()
+    }
 
-    mcap's readers need an intact index or raise in the middle of a cut-off record; here every
-    record is measured against what is left of the file before it is read.
-    """
-    channels: dict[int, Channel] = {}
-    keys: dict[int, Key | None] = {}
+
+def _stored_identities(path: Path) -> Identities | None:
+    stored = _last_metadata(path, IDENTITIES)
+    if stored is None or not is_closed(path):
+        return None
+    identities: Identities = {}
+    try:
+        for name, ranges in stored.items():
+            where, _, boot_id = name.partition(" ")
+            numbers = identities[(parse_key(where), int(boot_id))] = Intervals()
+            for text in ranges.split(","):
+                first, _, last = text.partition("-")
+                numbers.add_range(int(first), int(last))
+    except ValueError:
+        return None  # damaged, or of another version of this program
+    return identities
+
+
+def _last_metadata(path: Path, name: str) -> dict[str, str] | None:
+    """Return a metadata record of a whole file through its index, without reading the rest."""
+    tail = _RECORD_HEADER.size + 20 + len(MCAP0_MAGIC)
+    with _opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size < tail:
+            return None
+        file.seek(size - tail)
+        end = file.read(tail)
+        if not end.endswith(MCAP0_MAGIC) or end[0] != Opcode.FOOTER:
+            return None
+        try:
+            footer = Footer.read(ReadDataStream(io.BytesIO(end[_RECORD_HEADER.size :])))
+            if not footer.summary_start <= size - tail <= footer.summary_start + MAX_RECORD_BYTES:
+                return None
+            file.seek(footer.summary_start)
+            summary = file.read(size - tail - footer.summary_start)
+            found: dict[str, str] | None = None
+            at = 0
+            while at + _RECORD_HEADER.size <= len(summary):
+                opcode, length = _RECORD_HEADER.unpack_from(summary, at)
+                body = summary[at + _RECORD_HEADER.size : at + _RECORD_HEADER.size + length]
+                at += _RECORD_HEADER.size + length
+                if opcode != Opcode.METADATA_INDEX:
+                    continue
+                index = MetadataIndex.read(ReadDataStream(io.BytesIO(body)))
+                if index.name == name and _RECORD_HEADER.size < index.length <= MAX_RECORD_BYTES:
+                    file.seek(index.offset + _RECORD_HEADER.size)
+                    stored = file.read(index.length - _RECORD_HEADER.size)
+                    record = Metadata.read(ReadDataStream(io.BytesIO(stored)))
+                    found = dict(record.metadata) if record.name == name else found
+            return found
+        except (McapError, struct.error, ValueError, OverflowError):
+            return None
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if size == 0:
-                raise InputError(f"{path}: is empty; an MCAP recording is expected")
-            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                raise InputError(f"{path}: is not an MCAP file; a recording (.mcap) is expected")
-            for record in _records(file, size):
-                if isinstance(record, Channel):
-                    channels[record.id] = record
-                    keys[record.id] = _our_key(path, record)
-                elif isinstance(record, McapMessage):
-                    message = _message(record, channels, keys)
-                    if message is not None:
-                        yield message
-                else:
-                    yield record
+            yield file
     except OSError as error:
         missing = isinstance(error, FileNotFoundError)
         why = "no such file" if missing else f"cannot be read: {error.strerror}"
         raise InputError(f"{path}: {why}") from None
 
 
-def _message(
-    record: McapMessage, channels: dict[int, Channel], keys: dict[int, Key | None]
-) -> Message | None:
-    where = keys.get(record.channel_id)
-    if where is None:
-        return None
-    boot_id = channels[record.channel_id].metadata.get("boot_id", "0")
-    return Message(
-        where,
-        record.data,
-        int(boot_id) if boot_id.isdecimal() else 0,
-        record.sequence,
-        record.log_time,
-        record.publish_time,
-    )
+def _scan(path: Path) -> Iterator[Message | Metadata | Attachment | Damage]:
+    """Yield all that is of use in a file, in its order, and what is damaged."""
+    with _opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size == 0:
+            raise InputError(f"{path}: is empty; an MCAP recording is expected")
+        if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            raise InputError(f"{path}: is not an MCAP file; a recording (.mcap) is expected")
+        channels: dict[int, tuple[Key, int] | None] = {}
+        for item in scan(file):
+            if isinstance(item, RawMessage):
+                if item.channel_id not in channels:
+                    # The chunk that said it is lost. Ours say it again in every chunk; of older
+                    # files only the summary does.
+                    channels |= {n: _our_channel(path, c) for n, c in find_channels(path).items()}
+                known = channels.setdefault(item.channel_id, None)
+                if known is not None:
+                    where, boot_id = known
+                    _, sequence, log_time_ns, publish_time_ns, data = item
+                    yield Message(where, data, boot_id, sequence, log_time_ns, publish_time_ns)
+            elif isinstance(item, Channel):
+                if item.id not in channels:
+                    channels[item.id] = _our_channel(path, item)
+            elif isinstance(item, (Metadata, Attachment, Damage)):
+                yield item
 
 
-def _our_key(path: Path, channel: Channel) -> Key | None:
+def find_channels(path: Path) -> dict[int, Channel]:
+    """Return all channels that are named anywhere in a file; of several, the first."""
+    channels: dict[int, Channel] = {}
+    with _opened(path) as file:
+        for item in scan(file):
+            if isinstance(item, Channel):
+                channels.setdefault(item.id, item)
+    return channels
+
+
+def _our_channel(path: Path, channel: Channel) -> tuple[Key, int] | None:
+    boot_id = channel.metadata.get("boot_id", "0")
     try:
-        return parse_key(channel.topic)
+        where = parse_key(channel.topic)
     except ValueError:
         _log.warning("%s: topic %.80r is not ours and is left out", path, channel.topic)
         return None
-
-
-def _records(
-    file: BinaryIO, size: int
-) -> Iterator[Channel | McapMessage | Metadata | Attachment | _Damage]:
-    while True:
-        offset = file.tell()
-        header = file.read(_RECORD_HEADER.size)
-        if len(header) < _RECORD_HEADER.size:
-            yield _Damage(f"cut off at byte {offset} of {size}", truncated=True)
-            return
-        opcode, length = _RECORD_HEADER.unpack(header)
-        if length > size - file.tell():
-            yield _Damage(f"cut off at byte {offset} of {size}", truncated=True)
-            return
-        if opcode == Opcode.FOOTER:
-            return
-        body = file.read(length)
-        try:
-            yield from _parse(opcode, body)
-        except _DAMAGE as error:
-            yield _Damage(f"damaged record at byte {offset}: {error}", truncated=False)
-
-
-def _parse(opcode: int, body: bytes) -> Iterator[Channel | McapMessage | Metadata | Attachment]:
-    stream = ReadDataStream(io.BytesIO(body))
-    match opcode:
-        case Opcode.CHUNK:
-            for record in breakup_chunk(Chunk.read(stream), validate_crc=True):
-                if isinstance(record, (Channel, McapMessage)):
-                    yield record
-        case Opcode.CHANNEL:
-            yield Channel.read(stream)
-        case Opcode.MESSAGE:
-            yield McapMessage.read(stream, len(body))
-        case Opcode.METADATA:
-            yield Metadata.read(stream)
-        case Opcode.ATTACHMENT:
-            yield Attachment.read(stream)
+    return where, int(boot_id) if boot_id.isascii() and boot_id.isdecimal() else 0
 
 
 def program_version() -> str:
@@ -426,11 +541,3 @@ def program_version() -> str:
         return metadata.version("driveby")
     except metadata.PackageNotFoundError:  # run from a checkout that was not installed
         return "0"
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -1,0 +1,72 @@
+"""The disk as recordings see it: the few calls that can fail, in one place."""
+
+import errno
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+
+class RawFile(Protocol):
+    """An unbuffered file opened for writing, as `open(path, "xb", buffering=0)` gives it."""
+
+    def write(self, data: memoryview, /) -> int | None:
+        """Write some of the data; return how many bytes."""
+
+    def truncate(self, size: int, /) -> int:
+        """Cut the file."""
+
+    def seek(self, offset: int, /) -> int:
+        """Write from there on."""
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+class Disk(NamedTuple):
+    """What a writer of recordings asks of the disk. Each may raise OSError."""
+
+    create: Callable[[Path], RawFile]
+    """Make a new file; FileExistsError if there is one."""
+    sync: Callable[[int], None]
+    """Bring a file (by its descriptor) to the disk itself."""
+    sync_folder: Callable[[Path], None]
+    """Bring the names in a folder to the disk itself."""
+    free_bytes: Callable[[Path], int]
+    """Room left for this user on the disk that holds a folder."""
+
+
+def write_all(file: RawFile, data: bytes) -> None:
+    """Write all of the data, in as many calls as it takes; OSError if the file takes no more."""
+    view = memoryview(data)
+    while view:
+        taken = file.write(view)
+        if not taken:
+            raise OSError(errno.EIO, "the disk took no more bytes")
+        view = view[taken:]
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _free_bytes(folder: Path) -> int:
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
+
+
+DISK = Disk(
+    create=lambda path: path.open("xb", buffering=0),
+    sync=lambda descriptor: os.fsync(descriptor),
+    sync_folder=_sync_folder,
+    free_bytes=_free_bytes,
+)

@@ -1,0 +1,345 @@
+"""Reading MCAP files that may be damaged anywhere: every record is checked before it is believed.
+
+mcap's own readers need an intact index, or raise in the middle of a record that is cut off or
+changed. Here a record counts only if it holds together: the lengths inside it agree with its own,
+encoding it again gives the same bytes, the checksum of a chunk or attachment is right. Where a
+record does not hold, the search goes on byte by byte for the next one that does. A chunk is also
+found when its opcode, a length or its compression's name is damaged, because its checksum says
+whether the right bytes were taken.
+
+Memory is bounded whatever the lengths in the file say: by `MAX_RECORD_BYTES` for a record, and for
+what a chunk decompresses to.
+"""
+
+import io
+import os
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from typing import BinaryIO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+MAX_RECORD_BYTES = 64 << 20
+"""Of one record, and of what one chunk decompresses to; ours are a thousand times smaller."""
+
+_HEADER = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQI")
+_LENGTH = struct.Struct("<Q")
+_INDEX = struct.Struct("<HI")
+_INDEX_ENTRY_BYTES = 16
+_ZSTD = b"\x04\x00\x00\x00zstd"
+_ZSTD_AT = _HEADER.size + _CHUNK.size
+_FRAME = b"\x28\xb5\x2f\xfd"
+_FRAME_AT = _ZSTD_AT + len(_ZSTD) + _LENGTH.size
+# A record's header with a length below 2**40, or what marks a chunk whose header is damaged.
+_CANDIDATE = re.compile(
+    rb"(?=(?:([\x01-\x0f].{5}\x00{3})|(%b)|(%b)))" % (re.escape(_ZSTD), re.escape(_FRAME)), re.S
+)
+_CANDIDATE_BYTES = 9
+_WINDOW_BYTES = 1 << 20
+_READABLE: dict[int, type[McapRecord]] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.DATA_END: DataEnd,
+    Opcode.FOOTER: Footer,
+    Opcode.STATISTICS: Statistics,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.SUMMARY_OFFSET: SummaryOffset,
+}
+_UNREADABLE = (McapError, struct.error, UnicodeDecodeError, ValueError, EOFError)
+
+
+class RawMessage(NamedTuple):
+    """A message as MCAP stores it."""
+
+    channel_id: int
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+
+
+class Indexed(NamedTuple):
+    """How many messages of a channel the chunk before held, said by the index behind it."""
+
+    channel_id: int
+    messages: int
+
+
+class Damage(NamedTuple):
+    """Bytes of the file that belong to no record that holds."""
+
+    offset: int
+    size: int
+    text: str
+    is_chunk: bool
+    """A chunk is where it should be, but its content is not what was written."""
+    is_cut_off: bool
+    """The file ends here."""
+
+
+Item = Schema | Channel | RawMessage | Indexed | Attachment | Metadata | DataEnd | Footer | Damage
+
+
+def scan(file: BinaryIO) -> Iterator[Item]:
+    """Yield what holds in the file, in its order, and the damage between.
+
+    Of the summary come its schemas and channels, and the footer. A file that ends without a footer
+    ends with a `Damage` that is cut off, of size 0 if not even a record was torn. OSError if
+    reading fails.
+    """
+    size = os.fstat(file.fileno()).st_size
+    at = len(MCAP0_MAGIC)
+    if _read(file, 0, at) != MCAP0_MAGIC:
+        at = 0
+    is_whole = False
+    while at < size:
+        if size - at == len(MCAP0_MAGIC) and _read(file, at, len(MCAP0_MAGIC)) == MCAP0_MAGIC:
+            break
+        record = _record_at(file, at, size)
+        if record is None:
+            begin = _next_record(file, at, size)
+            yield from _torn_messages(file, at, size) if begin == size else ()
+            if begin > at:
+                cut = begin == size
+                text = f"cut off at byte {at} of {size}" if cut else f"damaged at byte {at}"
+                yield Damage(at, begin - at, text, is_chunk=False, is_cut_off=cut)
+            if begin == size:
+                return
+            at = begin
+            record = _record_at(file, at, size, is_after_damage=True)
+            if record is None:  # it was one a moment ago: somebody else writes to the file
+                return
+        for item in record.items():
+            is_whole = is_whole or isinstance(item, Footer)
+            yield item
+        at = record.end
+    if not is_whole:
+        text = f"cut off at byte {at} of {size}"
+        yield Damage(at, 0, text, is_chunk=False, is_cut_off=True)
+
+
+class _Record(NamedTuple):
+    end: int
+    items: Callable[[], Iterator[Item]]
+
+
+def _record_at(
+    file: BinaryIO, at: int, size: int, *, is_after_damage: bool = False
+) -> _Record | None:
+    """Return the record that begins at a byte; None if none does that holds.
+
+    After damage nothing is believed that has no inner consistency to show.
+    """
+    header = _read(file, at, _HEADER.size)
+    if len(header) < _HEADER.size:
+        return None
+    opcode, length = _HEADER.unpack(header)
+    end = at + _HEADER.size + length
+    fits = end <= size and length <= MAX_RECORD_BYTES
+    chunk = _chunk_at(file, at, size, end if fits else None)
+    if chunk is not None:
+        return chunk
+    if not fits:
+        return None
+    if opcode == Opcode.CHUNK:
+        # Nothing but its content can be wrong if the next record is where this one says.
+        if is_after_damage or not _is_followed(file, end, size):
+            return None
+        text = f"damaged chunk at byte {at}"
+        return _found(end, Damage(at, end - at, text, is_chunk=True, is_cut_off=False))
+    if opcode == Opcode.MESSAGE:
+        if is_after_damage or length < _MESSAGE.size or not _is_followed(file, end, size):
+            return None
+        body = _read(file, at + _HEADER.size, length)
+        return _found(end, _raw_message(body, 0, length))
+    return _plain_record_at(file, at, opcode, length)
+
+
+def _plain_record_at(file: BinaryIO, at: int, opcode: int, length: int) -> _Record | None:
+    end = at + _HEADER.size + length
+    if opcode == Opcode.MESSAGE_INDEX:
+        head = _read(file, at + _HEADER.size, _INDEX.size)
+        if len(head) < _INDEX.size:
+            return None
+        channel_id, array_bytes = _INDEX.unpack(head)
+        entries, rest = divmod(array_bytes, _INDEX_ENTRY_BYTES)
+        if rest or array_bytes != length - _INDEX.size:
+            return None
+        return _found(end, Indexed(channel_id, entries))
+    kind = _READABLE.get(opcode)
+    if kind is None:
+        return None
+    body = _read(file, at + _HEADER.size, length)
+    try:
+        record = kind.read(ReadDataStream(io.BytesIO(body)))  # type: ignore[attr-defined]
+        again = RecordBuilder()
+        record.write(again)
+        encoded: bytes = again.end()  # type: ignore[no-untyped-call]
+        if encoded[_HEADER.size :] != body:
+            return None
+    except _UNREADABLE:
+        return None
+    wanted = (Schema, Channel, Attachment, Metadata, DataEnd, Footer)
+    return _found(end, *([record] if isinstance(record, wanted) else []))
+
+
+def _found(end: int, *items: Item) -> _Record:
+    return _Record(end, lambda: iter(items))
+
+
+def _is_followed(file: BinaryIO, at: int, size: int) -> bool:
+    """Whether at a byte there is the end of the file or something like a record."""
+    header = _read(file, at, _HEADER.size)
+    if len(header) < _HEADER.size:
+        return at == size
+    opcode, length = _HEADER.unpack(header)
+    known = opcode in _READABLE or opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
+    return known and length <= size - at - _HEADER.size
+
+
+def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Record | None:
+    """Return the chunk whose record begins at a byte, if its checksum holds.
+
+    Its end is said twice, by the record and by the length of what is compressed, and either may be
+    damaged, as may be its opcode and the name of the compression.
+    """
+    head = _read(file, at, _FRAME_AT + len(_FRAME))
+    if len(head) < _FRAME_AT:
+        return None
+    crc = _CHUNK.unpack_from(head, _HEADER.size)[3]
+    name_bytes = int.from_bytes(head[_ZSTD_AT : _ZSTD_AT + 4], "little")
+    attempts: list[tuple[bool, int, int]] = []
+    if head[0] == Opcode.CHUNK and name_bytes == 0:
+        begin = at + _ZSTD_AT + 4 + _LENGTH.size
+        attempts.append((False, begin, begin + _LENGTH.unpack_from(head, _ZSTD_AT + 4)[0]))
+    elif head[_FRAME_AT:] == _FRAME or head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD:
+        begin = at + _FRAME_AT
+        inner_end = begin + _LENGTH.unpack_from(head, _FRAME_AT - _LENGTH.size)[0]
+        attempts += [(True, begin, end) for end in dict.fromkeys((inner_end, outer_end)) if end]
+    for is_compressed, begin, end in attempts:
+        if not begin <= end <= size or end - begin > MAX_RECORD_BYTES:
+            continue
+        data = _read(file, begin, end - begin)
+        content = _decompressed(data) if is_compressed else data
+        if content is not None and _holds(content, crc, is_certain=end == outer_end):
+            return _Record(end, lambda content=content: _records_of(content))  # type: ignore[misc]
+    return None
+
+
+def _decompressed(data: bytes) -> bytes | None:
+    try:
+        # Reading one byte too many tells a bomb without unpacking it.
+        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+            content: bytes = reader.read(MAX_RECORD_BYTES + 1)
+    except (zstandard.ZstdError, MemoryError):
+        return None
+    return content if len(content) <= MAX_RECORD_BYTES else None
+
+
+def _holds(content: bytes, crc: int, *, is_certain: bool) -> bool:
+    if crc:
+        return zlib.crc32(content) == crc
+    at = 0  # a writer may leave the checksum out
+    while is_certain and at < len(content):
+        if len(content) - at < _HEADER.size:
+            return False
+        at += _HEADER.size + _HEADER.unpack_from(content, at)[1]
+    return is_certain and at == len(content)
+
+
+def _records_of(content: bytes) -> Iterator[Item]:
+    """Yield what a chunk holds, as far as it goes."""
+    at = 0
+    while at + _HEADER.size <= len(content):
+        opcode, length = _HEADER.unpack_from(content, at)
+        begin = at + _HEADER.size
+        at = begin + length
+        if at > len(content):
+            return
+        if opcode == Opcode.MESSAGE:
+            if length >= _MESSAGE.size:
+                yield _raw_message(content, begin, at)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            kind = Schema if opcode == Opcode.SCHEMA else Channel
+            try:
+                yield kind.read(ReadDataStream(io.BytesIO(content[begin:at])))
+            except _UNREADABLE:
+                continue
+
+
+def _raw_message(content: bytes, begin: int, end: int) -> RawMessage:
+    channel_id, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(content, begin)
+    data = content[begin + _MESSAGE.size : end]
+    return RawMessage(channel_id, sequence, log_time_ns, publish_time_ns, data)
+
+
+def _torn_messages(file: BinaryIO, at: int, size: int) -> Iterator[Item]:
+    """Yield what can be had of a chunk that the end of the file cuts off.
+
+    zstd gives back whole blocks only, of 128 KiB before compression: nothing of a chunk of ours.
+    """
+    head = _read(file, at, _FRAME_AT)
+    compressed = head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD
+    if len(head) < _FRAME_AT or head[0] != Opcode.CHUNK or not compressed:
+        return
+    length = _HEADER.unpack_from(head)[1]
+    if at + _HEADER.size + length <= size or length > MAX_RECORD_BYTES:
+        return  # damaged, not torn: what came out could be anything
+    content = bytearray()
+    data = _read(file, at + _FRAME_AT, size - at - _FRAME_AT)
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+            while len(content) < MAX_RECORD_BYTES and (piece := reader.read(1 << 16)):
+                content += piece
+    except zstandard.ZstdError:
+        pass
+    yield from _records_of(bytes(content))
+
+
+def _next_record(file: BinaryIO, at: int, size: int) -> int:
+    """Return where the next record that holds begins, at a byte or after it; `size` if none."""
+    begin = at
+    while begin < size:
+        window = _read(file, begin, _WINDOW_BYTES)
+        for match in _CANDIDATE.finditer(window):
+            behind = (0, _ZSTD_AT, _FRAME_AT)[(match.lastindex or 1) - 1]
+            start = begin + match.start() - behind
+            if start >= at and _record_at(file, start, size, is_after_damage=True) is not None:
+                return start
+        if len(window) <= _CANDIDATE_BYTES:
+            break
+        begin += len(window) - _CANDIDATE_BYTES + 1
+    return size
+
+
+def _read(file: BinaryIO, at: int, length: int) -> bytes:
+    file.seek(at)
+    return file.read(length)
