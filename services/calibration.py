@@ -4,13 +4,16 @@ One crossing becomes one record (`record`), a JSON object that holds all that th
 records can be stored, put together and looked at one by one.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pre_core import calibration, parameters
+from pre_core.calibration import NORMAL_975
 from pre_core.road import Profile
 from schemas.results import Crossing, Parameter
 from schemas.settings import IdentificationSettings
@@ -18,6 +21,12 @@ from schemas.site import Site
 from services.crossing_bound import bound_at_truth
 from services.drawn_crossings import Drawn, Seen, draw_truth, drive, see, true_values
 from services.worker.crossing_data import detrended
+
+Floats = NDArray[np.float64]
+Record = dict[str, Any]
+"""One crossing as JSON, see `record`."""
+
+_FEWEST_RANKS = 20
 
 
 def _estimates(result: Crossing) -> dict[str, Parameter]:
@@ -43,17 +52,24 @@ def _road_z(result: Crossing, road: Profile) -> float | None:
 
 def record(
     seed: int, drawn: Drawn, seen: Seen | None, bound: dict[str, dict[str, float]]
-) -> dict[str, Any]:
+) -> Record:
     """One crossing as JSON: conditions, truth, verdict, estimates and bounds by name."""
     truth = true_values(drawn.truth) | {"max_deflection_m": drawn.largest_deflection_m}
-    line: dict[str, Any] = {
+    line: Record = {
         "seed": seed,
         "conditions": drawn.truth.conditions._asdict(),
         "truth": truth,
     }
     if seen is None:
-        return line | {"verdict": "not_found", "reasons": [], "estimates": {}, "bound": bound}
+        return line | {
+            "verdict": "not_found",
+            "reasons": [],
+            "estimates": {},
+            "ranks": {},
+            "bound": bound,
+        }
     result = seen.result
+    estimates = _estimates(result)
     return line | {
         "verdict": result.verdict,
         "reasons": [str(reason) for reason in result.reasons],
@@ -69,7 +85,12 @@ def record(
                 "q50": p.q50,
                 "q975": p.q975,
             }
-            for name, p in _estimates(result).items()
+            for name, p in estimates.items()
+        },
+        "ranks": {
+            name: calibration.rank_from_quantiles(truth[name], p.q025, p.q50, p.q975)
+            for name, p in estimates.items()
+            if name in truth
         },
         "bound": bound,
     }
@@ -77,7 +98,7 @@ def record(
 
 def one_crossing(
     site: Site, seed: int, settings: IdentificationSettings, declared_noise: float = 1.0
-) -> dict[str, Any]:
+) -> Record:
     """Draw, drive, identify and judge one crossing; see `record`.
 
     `declared_noise` is what the owner declares over what the sensors have: 0.5 is the negative
@@ -90,47 +111,205 @@ def one_crossing(
         update={"sensor": sensor.model_copy(update={"noise_density_ug_per_rthz": density})}
     )
     found = see([drawn.run], told, settings)
-    seen = found[0] if len(found) == 1 else None
-    is_comparable = seen is not None and seen.result.parameters and declared_noise == 1.0
-    bound = bound_at_truth(seen, drawn) if seen is not None and is_comparable else {}
-    return record(seed, drawn, seen, bound)
+    if len(found) != 1:
+        return record(seed, drawn, None, {})
+    is_comparable = found[0].result.parameters is not None and declared_noise == 1.0
+    return record(seed, drawn, found[0], bound_at_truth(found[0], drawn) if is_comparable else {})
 
 
-def many_crossings(
-    site: Site,
-    seeds: range,
-    settings: IdentificationSettings,
-    *,
-    processes: int = 2,
-    declared_noise: float = 1.0,
-    progress: Callable[[dict[str, Any]], None] = lambda line: None,
-) -> list[dict[str, Any]]:
-    """`one_crossing` for every seed, in processes of one thread each; ordered by seed."""
-    alone = settings.model_copy(update={"threads": 1})
-    lines = []
-    for line in _each(site, seeds, alone, processes, declared_noise):
-        progress(line)
-        lines.append(line)
-    return sorted(lines, key=lambda line: int(line["seed"]))
-
-
-def _each(
-    site: Site,
-    seeds: range,
-    settings: IdentificationSettings,
+def in_processes(
+    jobs: Sequence[Callable[[], Record]],
     processes: int,
-    declared_noise: float,
-) -> Iterator[dict[str, Any]]:
+    progress: Callable[[Record], None] = lambda line: None,
+) -> list[Record]:
+    """The records of all jobs, in their order; each process works on one at a time.
+
+    Jobs are pickled: partial applications of functions of modules.
+    """
     if processes == 1:
-        for seed in seeds:
-            yield one_crossing(site, seed, settings, declared_noise)
-        return
+        lines = []
+        for job in jobs:
+            lines.append(job())
+            progress(lines[-1])
+        return lines
     # Not by fork: numba's and OpenBLAS's threads would not survive it.
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        futures = [pool.submit(one_crossing, site, s, settings, declared_noise) for s in seeds]
+        futures = [pool.submit(job) for job in jobs]
         try:
             for future in as_completed(futures):
-                yield future.result()
+                progress(future.result())
         finally:
             for future in futures:
                 future.cancel()
+    return [future.result() for future in futures]
+
+
+# What many records say
+
+
+class Check(NamedTuple):
+    """One aim: what was measured, and within which limits it had to be."""
+
+    name: str
+    measured: float | None
+    low: float
+    high: float
+    note: str = ""
+
+    @property
+    def is_met(self) -> bool:
+        """Not met either where there is nothing to measure."""
+        return self.measured is not None and self.low <= self.measured <= self.high
+
+
+class Scores(NamedTuple):
+    """Errors of the rigidities in all usable crossings, (crossings, elements) each."""
+
+    seeds: NDArray[np.int64]  # (crossings,)
+    is_good: NDArray[np.bool_]  # (crossings,)
+    z: Floats
+    """(mean - truth)/std of EI."""
+    z_log: Floats
+    """The same of ln EI, whose mean and std are read off the quantiles."""
+    is_covered: NDArray[np.bool_]
+    """The truth lies between the 2.5 and 97.5 % quantiles."""
+    std_log: Floats
+    bound: Floats
+    """Cramér-Rao bound of ln EI with the scale error."""
+
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "vehicle": parameters.VEHICLE_NAMES,
+    "bridge": ("rhoA", "alpha", "beta"),
+    "supports": ("k_rot_start", "k_rot_end"),
+    "derived": ("f1_hz", "max_deflection_m"),
+}
+SMALLEST_P = 0.01
+"""Of the ranks of a group, whose parameters are tested one by one."""
+
+
+def elements_of(records: list[Record]) -> int:
+    """How many elements the bridge of these records has."""
+    return sum(name.startswith("EI_") for name in records[0]["truth"])
+
+
+def scores(records: list[Record]) -> Scores:
+    """Errors of all crossings that offer numbers."""
+    usable = [line for line in records if line["estimates"]]
+    names = [f"EI_{e + 1}" for e in range(elements_of(records))]
+    truth = _table(usable, names, lambda line, name: line["truth"][name])
+
+    def estimate(key: str) -> Floats:
+        return _table(usable, names, lambda line, name: line["estimates"][name][key])
+
+    low, middle, high = estimate("q025"), estimate("q50"), estimate("q975")
+    std_log = np.log(high / low) / (2.0 * NORMAL_975)
+    return Scores(
+        np.array([line["seed"] for line in usable], dtype=np.int64),
+        np.array([line["verdict"] == "good" for line in usable], dtype=np.bool_),
+        (estimate("mean") - truth) / estimate("std"),
+        np.log(middle / truth) / std_log,
+        (low <= truth) & (truth <= high),
+        std_log,
+        _table(usable, names, lambda line, name: line["bound"].get("std", {}).get(name, np.nan)),
+    )
+
+
+def _table(
+    records: list[Record], names: Sequence[str], value: Callable[[Record, str], float]
+) -> Floats:
+    table = [[value(line, name) for name in names] for line in records]
+    return np.array(table, dtype=np.float64).reshape(len(records), len(names))
+
+
+def rank_tests(records: list[Record]) -> dict[str, dict[str, calibration.Uniformity]]:
+    """By group and parameter: whether the truth's ranks are uniform over the usable crossings."""
+    usable = [line for line in records if line["estimates"]]
+    groups = {"EI": tuple(f"EI_{e + 1}" for e in range(elements_of(records)))} | GROUPS
+    found: dict[str, dict[str, calibration.Uniformity]] = {}
+    for group, names in groups.items():
+        for name in names:
+            ranks = np.array([line["ranks"][name] for line in usable if name in line["ranks"]])
+            if ranks.size >= _FEWEST_RANKS:
+                found.setdefault(group, {})[name] = calibration.uniformity(ranks)
+    return found
+
+
+def checks(records: list[Record]) -> list[Check]:
+    """The aims that well-specified crossings have to meet (docs/validation.md)."""
+    s = scores(records)
+    if s.seeds.size < 2:
+        return [Check("crossings with numbers", float(s.seeds.size), 2.0, np.inf)]
+    pooled = calibration.pooled_share(s.is_covered.astype(np.float64))
+    each = s.is_covered.mean(axis=0)
+    ratio = float(np.nanmean(s.std_log) / np.nanmean(s.bound))
+    good = np.mean([line["verdict"] == "good" for line in records])
+    worst = np.maximum(np.abs(s.z), np.abs(s.z_log))[s.is_good]
+    tests = rank_tests(records)
+    return [
+        Check("pooled coverage", pooled.value, 0.93, 0.97, f"± {pooled.error:.3f}"),
+        Check("coverage of each element, least", float(each.min()), 0.90, 0.99),
+        Check("coverage of each element, most", float(each.max()), 0.90, 0.99),
+        Check("root mean square of z, ln EI", calibration.root_mean_square(s.z_log), 0.9, 1.15),
+        Check("root mean square of z, EI", calibration.root_mean_square(s.z), 0.9, 1.15),
+        Check("mean standard deviation over bound", ratio, 0.0, 1.25),
+        Check("share good", float(good), 0.95, 1.0),
+        Check("largest |z| among good", float(worst.max()) if worst.size else None, 0.0, 5.0),
+        *(
+            Check(
+                f"ranks of {group}, p",
+                calibration.group_p_value(np.array([test.p_value for test in of_group.values()])),
+                SMALLEST_P,
+                1.0,
+                min(of_group, key=lambda name: of_group[name].p_value),
+            )
+            for group, of_group in tests.items()
+        ),
+    ]
+
+
+def distribution(records: list[Record], key: str) -> dict[str, float] | None:
+    """Quantiles of a diagnostic, or of a number of the records themselves; None if none has it."""
+    values = [line.get("diagnostics", {}).get(key, line.get(key)) for line in records]
+    known = np.array([value for value in values if value is not None], dtype=np.float64)
+    if known.size == 0:
+        return None
+    shares = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
+    return {name: float(np.quantile(known, q)) for name, q in shares.items()}
+
+
+def by_condition(records: list[Record]) -> list[tuple[str, int, float, float | None, float | None]]:
+    """Crossings, share good, coverage and root mean square of z in parts of the conditions."""
+
+    def change(line: Record) -> float:
+        how = line["conditions"]
+        return float(2.0 * np.pi * how["change_m_per_s"] / how["period_s"])
+
+    parts: list[tuple[str, Callable[[Record], bool]]] = [
+        ("at most 200 Hz", lambda line: line["conditions"]["rate_hz"] <= 200.0),
+        ("500 Hz", lambda line: line["conditions"]["rate_hz"] == 500.0),
+        ("1000 Hz and more", lambda line: line["conditions"]["rate_hz"] >= 1000.0),
+        ("below 10 m/s", lambda line: line["conditions"]["speed_m_per_s"] < 10.0),
+        ("10 to 18 m/s", lambda line: 10.0 <= line["conditions"]["speed_m_per_s"] < 18.0),
+        ("18 m/s and more", lambda line: line["conditions"]["speed_m_per_s"] >= 18.0),
+        ("speed changes by more than 0.3 m/s²", lambda line: change(line) > 0.3),
+        ("steadier", lambda line: change(line) <= 0.3),
+        ("road class A", lambda line: line["conditions"]["road_class"] == "A"),
+        ("road class B", lambda line: line["conditions"]["road_class"] == "B"),
+        ("less than 50 µg/√Hz", lambda line: line["conditions"]["noise_ug_per_rthz"] < 50.0),
+        ("50 µg/√Hz and more", lambda line: line["conditions"]["noise_ug_per_rthz"] >= 50.0),
+        ("start to end", lambda line: line["conditions"]["forward"]),
+        ("end to start", lambda line: not line["conditions"]["forward"]),
+        ("1 fix a second", lambda line: line["conditions"]["fix_rate_hz"] < 5.0),
+    ]
+    rows = []
+    for name, belongs in parts:
+        chosen = [line for line in records if belongs(line)]
+        if not chosen:
+            continue
+        s = scores(chosen)
+        good = float(np.mean([line["verdict"] == "good" for line in chosen]))
+        covered = float(s.is_covered.mean()) if s.seeds.size else None
+        rms = calibration.root_mean_square(s.z_log) if s.seeds.size else None
+        rows.append((name, len(chosen), good, covered, rms))
+    return rows

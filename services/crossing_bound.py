@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pre_core import parameters, posterior, pre
 from pre_core.calibration import without_negative
 from pre_core.parameters import EI_1
+from pre_core.vehicle import total_mass_kg
 from schemas.signals import CHANNELS
-from schemas.site import Site
-from services.drawn_crossings import Drawn, Seen, Truth, true_values
+from services.drawn_crossings import Drawn, Seen, true_values
 from services.worker.pre_method import inputs_of
 
 Floats = NDArray[np.float64]
@@ -26,7 +26,9 @@ Floats = NDArray[np.float64]
 _STEP = 1e-4
 """Of a central difference, in the coordinates of the posterior: multiples of a prior's spread, and
 metres of the trajectory. Halving it moves no bound by 1e-4 of itself (tests)."""
-_NUISANCE_STEPS = 12
+_NUISANCE_STEPS = 20
+_ENOUGH = 0.01
+"""Of the sum of squares, whose standard deviation is tens: less is no step."""
 
 
 class Bound(NamedTuple):
@@ -43,25 +45,55 @@ def bound_at_truth(seen: Seen, drawn: Drawn) -> dict[str, dict[str, float]]:
     """The bounds of a drawn crossing as JSON."""
     problem, y = _problem(seen)
     where = posterior.layout(problem)
-    scale, gain = _scale(seen.data.sensor.gain_spread, drawn.truth, drawn.site)
-    theta = equivalent_theta(true_values(drawn.truth), problem.priors.theta.size - 15, scale, gain)
+    scale, gain = _scale(drawn)
+    theta = equivalent_theta(true_values(drawn.truth), _elements(problem), scale, gain)
     _set_theta(problem, y, theta, drawn.truth.car.wheelbase_m)
     gains = drawn.truth.channels.gain
     _set_gains(problem, y, gains.mean() - gains)
     y[where.delays] = drawn.truth.channels.delay_s / problem.priors.delay_spread_s
-    time_s = _sample_times(seen)
-    wall = time_s + seen.data.wall_offset_s
     true_m = np.interp(
-        wall,
+        _sample_times(seen) + seen.data.wall_offset_s,
         drawn.start_s + drawn.step_s * np.arange(drawn.motion.position_m.size),
         drawn.motion.position_m,
     )
     y[where.trajectory] = np.linalg.lstsq(problem.basis_position, true_m, rcond=None)[0]
+    return as_json(_bound_near(seen, problem, y))
+
+
+def bound_at(
+    seen: Seen, values: dict[str, float], wheelbase_m: float, entry_time: float
+) -> dict[str, dict[str, float]]:
+    """The bounds of a crossing of which only truck and bridge are known, as JSON.
+
+    `values` are by the names of docs/contract.md; the trajectory is the receiver's, moved so that
+    the front axle enters the bridge at `entry_time` (s since 1970).
+    """
+    problem, y = _problem(seen)
+    where = posterior.layout(problem)
+    names = parameters.names(_elements(problem))
+    theta = np.array([values[name] for name in names])
+    _set_theta(problem, y, theta, wheelbase_m)
+    entry_m = np.interp(
+        entry_time - seen.data.wall_offset_s,
+        _sample_times(seen),
+        problem.basis_position @ y[where.trajectory],
+    )
+    begin_m = 0.0 if seen.data.stay.direction > 0 else seen.data.bridge.span_m
+    y[where.trajectory] += begin_m - entry_m
+    return as_json(_bound_near(seen, problem, y))
+
+
+def _bound_near(seen: Seen, problem: posterior.Problem, y: Floats) -> Bound:
+    """The bound with truck and bridge as they are in y, and the nuisances that fit best there.
+
+    Initial states are known of no truth, and a common delay of all channels is nearly the same as
+    a shift along the road.
+    """
+    where = posterior.layout(problem)
     y[where.offset] = _best_offset(problem, y)
     problem = pre.with_noise_at(problem, y)
-    # Initial states are not known exactly; a delay and a shift along the road are nearly the same.
-    y = settle(problem, y, np.arange(where.gains.start, where.size), 4)
-    return as_json(bound_of(problem, y, common_spread(seen)))
+    y = settle(problem, y, np.arange(where.gains.start, where.size))
+    return bound_of(problem, y, common_spread(seen))
 
 
 def as_json(bound: Bound) -> dict[str, dict[str, float]]:
@@ -94,8 +126,7 @@ def bound_of(problem: posterior.Problem, y: Floats, scale_error: float) -> Bound
     for spring in springs:
         covariance = without_negative(covariance, int(spring), float(y[spring]))
     std = np.sqrt(np.diag(covariance))
-    elements = problem.priors.theta.size - 15
-    names = parameters.names(elements)
+    names = parameters.names(_elements(problem))
     alone, full = {}, {}
     for place, i in enumerate(np.flatnonzero(problem.estimated)):
         alone[names[i]] = float(problem.priors.spread[i] * std[place])
@@ -134,7 +165,10 @@ def settle(
                 break
         else:
             return y
+        is_there = rows @ rows - new @ new < _ENOUGH
         y, rows = tried, new
+        if is_there:
+            return y
     return y
 
 
@@ -154,12 +188,16 @@ def equivalent_theta(
     return theta
 
 
-def _scale(gain_spread: float, truth: Truth, site: Site) -> tuple[float, float]:
-    car = truth.car
-    mass = car.body_mass_kg + sum(car.unsprung_mass_kg)
-    mean_gain = float(truth.channels.gain.mean())
-    common = (1.0 + truth.channels.common_gain) * (1.0 + mean_gain) - 1.0
-    return site.vehicles[0].total_mass_kg / mass, common
+def _scale(drawn: Drawn) -> tuple[float, float]:
+    """Nominal over true total mass, and the relative error common to all gains."""
+    car, errors = drawn.truth.car, drawn.truth.channels
+    mass = total_mass_kg(car)
+    common = (1.0 + errors.common_gain) * (1.0 + float(errors.gain.mean())) - 1.0
+    return drawn.site.vehicles[0].total_mass_kg / mass, common
+
+
+def _elements(problem: posterior.Problem) -> int:
+    return int(problem.priors.theta.size) - len(parameters.names(0))
 
 
 def _sample_times(seen: Seen) -> Floats:
