@@ -86,6 +86,8 @@ class Received(NamedTuple):
     attachment: bytes | None
     recovered: bool
     """It was missing and has been asked for."""
+    spooled: bool = False
+    """It came from the truck's own disk: there is no better copy of it."""
 
     def identity(self) -> Identity:
         """Return (boot_id, sequence); ValueError if the attachment is missing or malformed."""
@@ -501,7 +503,7 @@ class Delivery:
         self._read()
         by_logger = [
             sum(
-                max(0, number - durable.get(name, _OnDisk(0, -1)).count)
+                max(0, number - durable.get(name, _OnDisk(0, -1)).messages)
                 for name, number in self._sent.items()
             )
             for durable in self._durable.values()
@@ -559,7 +561,7 @@ class Delivery:
 
 
 class _OnDisk(NamedTuple):
-    count: int
+    messages: int
     sequence: int
     """The highest with nothing missing below it; -1: none."""
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from schemas.signals import Identity
 from schemas.topics import Key
 from services.common.bus import Delivery, Publisher
 from services.common.errors import FailureError, InputError
@@ -32,13 +31,13 @@ def check_speed(speed: float) -> float:
 
 def play(
     messages: Iterable[Message],
-    publisher: Publisher,
+    put: Callable[[Message], None],
     delivery: Delivery,
     *,
     speed: float,
     stop: threading.Event,
 ) -> int:
-    """Publish the messages with the spacing of their log times divided by `speed`; how many.
+    """Put the messages with the spacing of their log times divided by `speed`; how many.
 
     A message whose log time is not later than that of the one before follows at once (recovered
     messages stand late in a recording). Ends early when `stop` is set.
@@ -55,10 +54,7 @@ def play(
                 stop.wait(due - now)
         if stop.is_set():
             break
-        identity = Identity(message.boot_id, message.sequence)
-        _, owner, identifier, stream = message.key
-        publisher.put(owner, identifier, stream, message.payload, identity)
-        delivery.sent(Key(publisher.realm, owner, identifier, stream), identity)
+        put(message)
         number += 1
         if number % _CHECK_EVERY == 0 and delivery.missing() and delivery.has_logger:
             delivery.wait(DELIVERY_TIMEOUT_S, most_missing=_MAX_IN_FLIGHT)

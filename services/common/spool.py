@@ -84,16 +84,15 @@ class Spool:
         self._lock = threading.Lock()
         self._lock_file = _locked(folder)
         try:
-            self._past = _read_state(folder / _STATE)
+            highest, self._past = _read_state(folder / _STATE)
             self._segments = [
                 segment for path in sorted(folder.glob("*.spool")) if (segment := self._load(path))
             ]
         except OSError as error:
             os.close(self._lock_file)
             raise FailureError(f"{folder}: cannot be read: {error.strerror}") from None
-        boots = [segment.boot_id for segment in self._segments]
-        boots += [boot_id for _, boot_id in self._past]
-        self.boot_id = max([time.time_ns(), *(boot_id + 1 for boot_id in boots)])
+        boots = [highest, *(segment.boot_id for segment in self._segments)]
+        self.boot_id = max(time.time_ns(), max(boots) + 1)
         """Higher than any before, also where the wall clock went back in between."""
         self._next: dict[str, int] = {}
         self._file: int | None = None
@@ -202,12 +201,15 @@ class Spool:
 
     def close(self) -> None:
         """Sync, and let another process have the folder. Nothing can be appended any more."""
-        self.sync()
-        with self._lock:
-            if self._file is not None:
-                os.close(self._file)
-                self._file = None
-            os.close(self._lock_file)
+        try:
+            self.sync()
+        finally:
+            with self._lock:
+                if self._file is not None:
+                    os.close(self._file)
+                    self._file = None
+                self._delete([segment for segment in self._segments if self._is_durable(segment)])
+                os.close(self._lock_file)
 
     def _contents(self, stream: str) -> list[Held]:
         by_boot: dict[int, Intervals] = {}
@@ -285,7 +287,7 @@ class Spool:
         gone = {id(segment) for segment in doomed}
         self._segments = [segment for segment in self._segments if id(segment) not in gone]
         self._forget_old_boots()
-        _write_state(self.folder / _STATE, self._past)
+        _write_state(self.folder / _STATE, self.boot_id, self._past)
         for segment in doomed:
             segment.path.unlink(missing_ok=True)
 
@@ -294,7 +296,7 @@ class Spool:
         held = {(name, segment.boot_id) for segment in self._segments for name in segment.streams}
         for name, past in list(self._past.items()):
             settled = not past.dropped.size or (past.dropped.highest or 0) <= past.durable
-            if name not in held and name[1] != self.boot_id and settled:
+            if name not in held and (name[1] != self.boot_id or self._file is None) and settled:
                 del self._past[name]
         boots = sorted({boot_id for _, boot_id in self._past})
         for boot_id in boots[:-_BOOTS_REMEMBERED]:
@@ -356,7 +358,7 @@ def _records(content: bytes) -> Iterator[_Record]:
     while at + _RECORD.size <= len(content):
         crc, length, sequence, name_length = _RECORD.unpack_from(content, at)
         end = at + _RECORD_PREFIX + length
-        if end > len(content) or length < _RECORD.size - _RECORD_PREFIX + name_length:
+        if end > len(content) or end < at + _RECORD.size:
             return
         if zlib.crc32(memoryview(content)[at + 4 : end]) == crc:
             start = at + _RECORD.size
@@ -400,24 +402,26 @@ def _locked(folder: Path) -> int:
     return file
 
 
-def _read_state(path: Path) -> dict[tuple[str, int], _Past]:
+def _read_state(path: Path) -> tuple[int, dict[tuple[str, int], _Past]]:
+    """Return the boot that wrote it, and what it knew of messages by (stream, boot_id)."""
     if not path.exists():
-        return {}
+        return 0, {}
     try:
-        entries: list[dict[str, Any]] = json.loads(path.read_text())["streams"]
+        content: dict[str, Any] = json.loads(path.read_text())
+        entries: list[dict[str, Any]] = content["streams"]
         state = {}
         for entry in entries:
             past = _Past(int(entry["durable"]))
             for first, last in entry["dropped"]:
                 past.dropped.add_range(int(first), int(last))
             state[(str(entry["stream"]), int(entry["boot_id"]))] = past
-        return state
+        return int(content["boot_id"]), state
     except (ValueError, KeyError, TypeError) as error:
         _log.warning("%s: unreadable (%s), what was confirmed will be offered again", path, error)
-        return {}
+        return 0, {}
 
 
-def _write_state(path: Path, past: Mapping[tuple[str, int], _Past]) -> None:
+def _write_state(path: Path, boot_id: int, past: Mapping[tuple[str, int], _Past]) -> None:
     entries = [
         {
             "stream": stream,
@@ -427,4 +431,4 @@ def _write_state(path: Path, past: Mapping[tuple[str, int], _Past]) -> None:
         }
         for (stream, boot_id), one in sorted(past.items())
     ]
-    write_atomically(path, json.dumps({"streams": entries}))
+    write_atomically(path, json.dumps({"boot_id": boot_id, "streams": entries}))

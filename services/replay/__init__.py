@@ -4,6 +4,7 @@ import logging
 from collections.abc import Iterator
 from pathlib import Path
 
+from schemas.signals import Identity
 from schemas.topics import Key, check_realm, parse_key, topic
 from services.common.bus import Delivery, Publisher, open_session
 from services.common.credentials import check_speaks_for
@@ -61,7 +62,14 @@ def run(
                     f"nobody subscribes to realm {realm} at {endpoint}; start `driveby logger` "
                     f"or another subscriber of driveby/v1/{realm}/** first"
                 )
-            sent = play(_all(recordings), publisher, delivery, speed=speed, stop=stop)
+
+            def put(message: Message) -> None:
+                _, owner, identifier, stream = message.key
+                identity = Identity(message.boot_id, message.sequence)
+                publisher.put(owner, identifier, stream, message.payload, identity)
+                delivery.sent(Key(realm, owner, identifier, stream), identity)
+
+            sent = play(_all(recordings), put, delivery, speed=speed, stop=stop)
             confirm(delivery, sent)
             _log.info("%d messages published in realm %s", sent, realm)
         finally:

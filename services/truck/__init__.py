@@ -1,43 +1,27 @@
-"""The truck's gateway: puts what its sensors say on the bus. A recording can play the sensors.
+"""The truck: a gateway that puts what sensors say on the bus, and recordings that play sensors.
 
-A driver of your own sensors does what `run` does, with its own batches:
-
-    with open_session(connect="tcp/127.0.0.1:7447", timeout_s=None) as session:
-        gateway = Gateway(session, "live", "truck-1")
-        gateway.info(Path("site.toml").read_text())
-        for samples in my_driver():                      # every 50 ms
-            channels = {"sprung_front": Channel(1000.0, samples)}
-            gateway.accel(channels, device_time_ns=..., wall_time_ns=...)
-        gateway.close()
+`gateway` is what a program with sensors of its own uses; `run` drives a recording again.
 """
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from heapq import merge
 from pathlib import Path
 from typing import Any
 
-import zenoh
-
 from schemas.signals import (
-    AccelBatch,
-    Channel,
-    GnssFix,
     Identity,
-    VehicleInfo,
     decode_accel,
     decode_gnss,
     decode_info,
     encode_accel,
     encode_gnss,
     encode_info,
-    encode_location,
     location_class,
 )
-from schemas.topics import Key, check_identifier, check_realm, key
-from services.common.bus import Delivery, Publisher, open_session
+from schemas.topics import check_realm
+from services.common.bus import open_session
 from services.common.credentials import check_speaks_for
 from services.common.errors import InputError
 from services.common.playback import (
@@ -48,6 +32,8 @@ from services.common.playback import (
     stopped_by_signals,
 )
 from services.common.recording import Message, read_messages
+from services.common.spool import DEFAULT_BUDGET_BYTES, Spool
+from services.truck.gateway import Gateway
 
 __all__ = ["Gateway", "run"]
 
@@ -55,54 +41,6 @@ _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
 SUBSCRIBER_TIMEOUT_S = 1.0
 _NS_PER_S = 1_000_000_000
-
-
-class Gateway:
-    """Publishes one truck's messages with identities of this boot. May not be shared by threads."""
-
-    def __init__(self, session: zenoh.Session, realm: str, vehicle: str) -> None:
-        self.vehicle = check_identifier(vehicle)
-        self.publisher = Publisher(session, check_realm(realm))
-        self.delivery = Delivery(session, realm)
-        self._numbers: Counter[str] = Counter()
-        # There while this process runs: services see trucks come and go by it.
-        self._alive = session.liveliness().declare_token(key(realm, "vehicle", vehicle, "alive"))
-
-    def info(self, site_toml: str, *, device_time_ns: int, wall_time_ns: int) -> None:
-        """Say what the truck is: its parts of the site file. Late subscribers get it too."""
-        identity = self._next("info")
-        info = VehicleInfo(*identity, device_time_ns, wall_time_ns, self.vehicle, site_toml)
-        self._put("info", encode_info(info), identity)
-
-    def accel(
-        self, channels: dict[str, Channel], *, device_time_ns: int, wall_time_ns: int
-    ) -> None:
-        """Publish 50-100 ms of accelerations, m/s², up, without gravity; times of their first."""
-        identity = self._next("accel")
-        batch = AccelBatch(*identity, device_time_ns, wall_time_ns, channels)
-        self._put("accel", encode_accel(batch), identity)
-
-    def gnss(self, fix: GnssFix) -> None:
-        """Publish a fix, as `gnss` and as `location`; its boot_id and sequence are replaced."""
-        identity = self._next("gnss")
-        own = fix._replace(boot_id=identity.boot_id, sequence=identity.sequence)
-        self._put("gnss", encode_gnss(own), identity)
-        self._put("location", encode_location(own), self._next("location"))
-
-    def close(self) -> None:
-        """Leave the bus."""
-        self._alive.undeclare()  # type: ignore[no-untyped-call]
-        self.delivery.close()
-        self.publisher.close()
-
-    def _next(self, stream: str) -> Identity:
-        identity = Identity(self.publisher.boot_id, self._numbers[stream])
-        self._numbers[stream] += 1
-        return identity
-
-    def _put(self, stream: str, payload: bytes, identity: Identity) -> None:
-        self.publisher.put("vehicle", self.vehicle, stream, payload, identity)
-        self.delivery.sent(Key(self.publisher.realm, "vehicle", self.vehicle, stream), identity)
 
 
 def run(
@@ -114,6 +52,8 @@ def run(
     vehicle: str | None,
     connect_timeout_s: float | None = CONNECT_TIMEOUT_S,
     tls: Path | None = None,
+    spool: Path | None = None,
+    spool_budget_bytes: int = DEFAULT_BUDGET_BYTES,
 ) -> int:
     """Play one vehicle of a recording as a truck that drives now; return 0.
 
@@ -123,9 +63,12 @@ def run(
     recording, because they are physics. Shifted to the end, no stamp lies in the future.
 
     `vehicle` chooses one of several; `tls` is a folder of its credentials, see `open_session`.
-    Returns when a logger has everything on disk (see
-    `services.common.bus`). InputError: the recording is missing, is none, or holds no such
-    vehicle. FailureError: nobody answers at the endpoint within `connect_timeout_s` (None: wait
+    With a folder `spool` every message goes to disk there first and stays until a logger has it
+    (see `services.common.spool`); what an earlier drive left there is offered, too. Returns when a
+    logger has everything on disk (see `services.common.bus`).
+
+    InputError: the recording is missing, is none, or holds no such vehicle, or another truck uses
+    the spool. FailureError: nobody answers at the endpoint within `connect_timeout_s` (None: wait
     for ever), or the logger did not confirm everything.
     """
     check_speed(speed)
@@ -140,19 +83,28 @@ def run(
         stopped_by_signals() as stop,
         open_session(connect=endpoint, timeout_s=connect_timeout_s, tls=tls) as session,
     ):
-        gateway = Gateway(session, realm, vehicle)
+        gateway = Gateway(session, realm, vehicle, _open_spool(spool, spool_budget_bytes))
         try:
-            messages = _driven_now(streams, realm, gateway.publisher.boot_id, speed)
+            messages = _driven_now(streams, realm, gateway.boot_id, speed)
             keys = [queue[0].key for queue in streams.values()]
             if not settle(gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S):
                 # A real truck drives on as well; its cache serves those who come late.
                 _log.warning("nobody subscribes to %s in realm %s yet", gateway.vehicle, realm)
-            sent = play(messages, gateway.publisher, gateway.delivery, speed=speed, stop=stop)
+
+            def put(message: Message) -> None:
+                identity = Identity(message.boot_id, message.sequence)
+                gateway.put(message.key.stream, message.payload, identity, patient=True)
+
+            sent = play(messages, put, gateway.delivery, speed=speed, stop=stop)
             confirm(gateway.delivery, sent)
             _log.info("%d messages of %s published in realm %s", sent, gateway.vehicle, realm)
         finally:
             gateway.close()
     return 0
+
+
+def _open_spool(folder: Path | None, budget_bytes: int) -> Spool | None:
+    return None if folder is None else Spool(folder, budget_bytes=budget_bytes)
 
 
 def _read_vehicle(recording: Path, vehicle: str | None) -> dict[str, list[Message]]:

@@ -76,7 +76,15 @@ def test_boots_follow_each_other_also_when_the_clock_went_back(
     assert spool.boot_id == first + 1
     fill(spool, 0, 4)
     assert sequences(spool, first) == list(range(10))
+    spool.close()
+    Spool(tmp_path).close()
+    spool = Spool(tmp_path)
     assert [boot.boot_id for boot in spool.contents("accel")] == [first, first + 1]
+    spool.confirm({("accel", first): 9, ("accel", first + 1): 4})
+    spool.close()
+    spool = Spool(tmp_path)
+    assert spool.streams() == []
+    assert spool.boot_id > first + 1
     spool.close()
 
 

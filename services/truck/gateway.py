@@ -1,0 +1,284 @@
+"""What a truck's computer does with each message: to its own disk first, then to the bus.
+
+    with open_session(connect="tcp/127.0.0.1:7447", timeout_s=None) as session:
+        gateway = Gateway(session, "live", "truck-1", Spool(Path("spool/truck-1")))
+        gateway.info(Path("site.toml").read_text(), device_time_ns=..., wall_time_ns=...)
+        for samples in my_driver():                      # every 50 ms
+            channels = {"sprung_front": Channel(1000.0, samples)}
+            gateway.accel(channels, device_time_ns=..., wall_time_ns=...)
+        gateway.close()
+
+`docs/examples/own_driver.py` is a program that runs. The caller never waits for the network: a
+message is appended to the spool and put into a queue, from which a thread publishes. Where that
+queue is full, because the router does not take anything, the message stays in the spool, and the
+logger asks for it (`schemas.spool`) once it sees that it lacks it. What a logger has confirmed is
+freed. Without a spool, messages are published at once, and the end of this process is the end of
+those that nobody has fetched yet.
+"""
+
+import contextlib
+import logging
+import queue
+import threading
+import time
+from collections import Counter
+from typing import Any
+
+import zenoh
+from zenoh import handlers
+
+from schemas.signals import (
+    AccelBatch,
+    Channel,
+    GnssFix,
+    Identity,
+    VehicleInfo,
+    encode_accel,
+    encode_gnss,
+    encode_identity,
+    encode_info,
+    encode_location,
+)
+from schemas.spool import (
+    encode_contents,
+    encode_page,
+    parse_query,
+    parse_spool_key,
+    spool_key,
+    spool_selector,
+)
+from schemas.topics import Key, check_identifier, check_realm, key, topic
+from services.common.bus import Delivery, Publisher
+from services.common.errors import FailureError
+from services.common.spool import Spool
+
+__all__ = ["Gateway"]
+
+_log = logging.getLogger(__name__)
+_OUTBOX_MESSAGES = 10_000
+_SYNC_PERIOD_S = 0.5
+_FREE_EVERY = 10  # syncs
+_GOODBYE_S = 5.0
+_QUERIES_WAITING = 100
+_COMPLAINT_PERIOD_S = 60.0
+
+
+class Gateway:
+    """Publishes one truck's messages with identities of this boot. May not be shared by threads.
+
+    The spool, if there is one, belongs to the gateway from then on and is closed with it.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, realm: str, vehicle: str, spool: Spool | None = None
+    ) -> None:
+        self.vehicle = check_identifier(vehicle)
+        self.publisher = Publisher(
+            session, check_realm(realm), None if spool is None else spool.boot_id
+        )
+        self.delivery = Delivery(session, realm)
+        self.deferred = 0
+        """Messages that were spooled and not published, because the bus did not take them."""
+        self.unspooled = 0
+        """Messages that the disk did not take; they were published all the same."""
+        self._next: Counter[str] = Counter()
+        self._complained_s = float("-inf")
+        self._spool = None if spool is None else _SpoolService(session, self, spool)
+        # There while this process runs: services see trucks come and go by it.
+        self._alive = session.liveliness().declare_token(key(realm, "vehicle", vehicle, "alive"))
+
+    @property
+    def boot_id(self) -> int:
+        """The boot of all messages of this gateway: higher than any before it."""
+        return self.publisher.boot_id
+
+    def info(self, site_toml: str, *, device_time_ns: int, wall_time_ns: int) -> None:
+        """Say what the truck is: its parts of the site file. Late subscribers get it too."""
+        identity = self._identity("info")
+        info = VehicleInfo(*identity, device_time_ns, wall_time_ns, self.vehicle, site_toml)
+        self.put("info", encode_info(info), identity)
+
+    def accel(
+        self, channels: dict[str, Channel], *, device_time_ns: int, wall_time_ns: int
+    ) -> None:
+        """Publish 50-100 ms of accelerations, m/s², up, without gravity; times of their first."""
+        identity = self._identity("accel")
+        batch = AccelBatch(*identity, device_time_ns, wall_time_ns, channels)
+        self.put("accel", encode_accel(batch), identity)
+
+    def gnss(self, fix: GnssFix) -> None:
+        """Publish a fix, as `gnss` and as `location`; its boot_id and sequence are replaced."""
+        identity = self._identity("gnss")
+        own = fix._replace(boot_id=identity.boot_id, sequence=identity.sequence)
+        self.put("gnss", encode_gnss(own), identity)
+        self.put("location", encode_location(own), self._identity("location"))
+
+    def put(
+        self, stream: str, payload: bytes, identity: Identity, *, patient: bool = False
+    ) -> None:
+        """Publish a message that is encoded already; of each stream the sequences ascend from 0.
+
+        With `patient` it waits for room in the queue, as the reader of a file can, rather than
+        leave the message to the spool. ValueError if the payload is larger than its topic allows.
+        """
+        row = topic("vehicle", stream)
+        if not row.message or len(payload) > row.max_bytes:
+            raise ValueError(f"vehicle/{stream}: {len(payload)} bytes; at most {row.max_bytes}")
+        if self._spool is None:
+            self.publisher.put("vehicle", self.vehicle, stream, payload, identity)
+        else:
+            spooled = self._append(self._spool.spool, stream, payload, identity)
+            # What is on no disk can only be published, however long that takes.
+            if not self._spool.publish(stream, payload, identity, wait=patient or not spooled):
+                self.deferred += 1
+        self._next[stream] = identity.sequence + 1
+        self.delivery.sent(Key(self.publisher.realm, "vehicle", self.vehicle, stream), identity)
+
+    def close(self) -> None:
+        """Leave the bus. What is spooled and on no logger's disk the next boot offers again."""
+        self._alive.undeclare()  # type: ignore[no-untyped-call]
+        if self._spool is not None:
+            self._spool.close()
+        self.delivery.close()
+        self.publisher.close()
+
+    def _identity(self, stream: str) -> Identity:
+        """Return the identity of the next message; used up only by `put`, not by a refused one."""
+        return Identity(self.boot_id, self._next[stream])
+
+    def _append(self, spool: Spool, stream: str, payload: bytes, identity: Identity) -> bool:
+        try:
+            spool.append(stream, identity.sequence, payload)
+            return True
+        except OSError as error:
+            self.unspooled += 1
+            if time.monotonic() >= self._complained_s + _COMPLAINT_PERIOD_S:
+                self._complained_s = time.monotonic()
+                _log.error(
+                    "%s: spool: %s; %d messages so far were published without being on disk",
+                    self.vehicle, error.strerror, self.unspooled,
+                )  # fmt: skip
+            return False
+
+
+class _SpoolService:
+    """Three threads: one publishes, one syncs and frees, one answers queries."""
+
+    def __init__(self, session: zenoh.Session, gateway: Gateway, spool: Spool) -> None:
+        self.spool = spool
+        self._gateway = gateway
+        self._realm = gateway.publisher.realm
+        self._outbox: queue.Queue[tuple[str, bytes, Identity] | None] = queue.Queue(
+            _OUTBOX_MESSAGES
+        )
+        self._closing = threading.Event()
+        self._queryable: zenoh.Queryable[Any] = session.declare_queryable(
+            spool_selector(self._realm, gateway.vehicle),
+            handlers.FifoChannel(_QUERIES_WAITING),
+            complete=True,
+        )
+        self._threads = [
+            threading.Thread(target=target, name=f"spool-{name}", daemon=True)
+            for name, target in (
+                ("publish", self._publish_all),
+                ("sync", self._sync_all),
+                ("answer", self._answer_all),
+            )
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def publish(self, stream: str, payload: bytes, identity: Identity, *, wait: bool) -> bool:
+        """Hand over a message for publication; False if the bus is behind."""
+        try:
+            self._outbox.put((stream, payload, identity), block=wait)
+            return True
+        except queue.Full:
+            return False
+
+    def close(self) -> None:
+        """Publish what waits, as far as the bus takes it within seconds; close the spool."""
+        deadline = time.monotonic() + _GOODBYE_S
+        while not self._outbox.empty() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        self._closing.set()
+        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+        with contextlib.suppress(queue.Full):  # then the thread sees _closing after its message
+            self._outbox.put_nowait(None)
+        for thread in self._threads:
+            thread.join(timeout=_GOODBYE_S)
+        self._free()
+        try:
+            self.spool.close()
+        except (OSError, FailureError) as error:
+            _log.error("%s: spool: %s", self._gateway.vehicle, error)
+
+    def _publish_all(self) -> None:
+        publisher, vehicle = self._gateway.publisher, self._gateway.vehicle
+        while (item := self._outbox.get()) is not None and not self._closing.is_set():
+            stream, payload, identity = item
+            try:
+                publisher.put("vehicle", vehicle, stream, payload, identity)
+            except zenoh.ZError as error:  # it stays in the spool
+                _log.debug("%s: %s", vehicle, error)
+
+    def _sync_all(self) -> None:
+        rounds = 0
+        while not self._closing.wait(_SYNC_PERIOD_S):
+            rounds += 1
+            try:
+                self.spool.sync()
+            except (OSError, FailureError) as error:
+                _log.error("%s: spool: %s", self._gateway.vehicle, error)
+            if rounds % _FREE_EVERY == 0:
+                self._free()
+
+    def _free(self) -> None:
+        try:
+            self.spool.confirm(self._gateway.delivery.confirmed(self._gateway.vehicle))
+        except (OSError, FailureError) as error:  # what is not freed now is freed later
+            _log.error("%s: spool: %s", self._gateway.vehicle, error)
+
+    def _answer_all(self) -> None:
+        # A thread of our own: one of Zenoh's that still calls Python while the interpreter ends
+        # takes the process down with it.
+        while True:
+            try:
+                query = self._queryable.handler.recv()
+            except zenoh.ZError:  # undeclared
+                return
+            with query:
+                try:
+                    self._answer(query)
+                except (ValueError, OSError, zenoh.ZError) as error:
+                    _log.warning("%s: spool query: %s", self._gateway.vehicle, error)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        parameters: Any = query.parameters  # pairs, whatever the type stubs say
+        wanted = parse_query(dict(parameters))
+        if wanted is None:
+            for stream in self.spool.streams():
+                where = self._key(stream)
+                if query.key_expr.intersects(zenoh.KeyExpr(where)):
+                    contents = encode_contents(time.time_ns(), self.spool.contents(stream))
+                    self._reply(query, where, contents)
+            return
+        where = str(query.key_expr)
+        page = self.spool.read(parse_spool_key(where).stream, *wanted)
+        for sequence, payload in page.messages:
+            self._reply(query, where, payload, encode_identity(wanted.boot_id, sequence))
+        self._reply(query, where, encode_page(wanted, page.next_sequence))
+
+    def _reply(
+        self, query: zenoh.Query, where: str, payload: bytes, attachment: bytes | None = None
+    ) -> None:
+        query.reply(
+            where,
+            payload,
+            attachment=attachment,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA_LOW,  # what is live goes first
+        )
+
+    def _key(self, stream: str) -> str:
+        return spool_key(Key(self._realm, "vehicle", self._gateway.vehicle, stream))
