@@ -16,6 +16,10 @@ class Reason(StrEnum):
     SENSOR_SATURATED = "sensor_saturated"
     CHANNEL_SWAPPED = "channel_swapped"
     CHANNEL_INVERTED = "channel_inverted"
+    CHANNEL_STUCK = "channel_stuck"
+    CHANNELS_ALIKE = "channels_alike"
+    CHANNEL_BIASED = "channel_biased"
+    SIGNAL_SPIKES = "signal_spikes"
     INCOMPLETE_CROSSING = "incomplete_crossing"
     # How the truck was driven.
     SPEED_TOO_LOW = "speed_too_low"
@@ -29,6 +33,7 @@ class Reason(StrEnum):
     MODEL_MISFIT = "model_misfit"
     RESIDUALS_COLOURED = "residuals_coloured"
     NOISE_ABOVE_DECLARED = "noise_above_declared"
+    NOISE_BELOW_DECLARED = "noise_below_declared"
     IMPLAUSIBLE_VEHICLE = "implausible_vehicle"
     POSITION_INCONSISTENT = "position_inconsistent"
     SPAN_INCONSISTENT = "span_inconsistent"
@@ -48,6 +53,10 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.SENSOR_SATURATED: "An accelerometer reached the end of its range.",
     Reason.CHANNEL_SWAPPED: "Two channels seem to be exchanged.",
     Reason.CHANNEL_INVERTED: "A channel seems to have the wrong sign.",
+    Reason.CHANNEL_STUCK: "A channel repeats one value.",
+    Reason.CHANNELS_ALIKE: "Two channels show the same.",
+    Reason.CHANNEL_BIASED: "A channel has an offset as large as a part of gravity.",
+    Reason.SIGNAL_SPIKES: "Single samples of a channel stand out of their neighbours.",
     Reason.INCOMPLETE_CROSSING: "The recording begins or ends while the truck is on the bridge.",
     Reason.SPEED_TOO_LOW: "The truck was too slow for its axles to feel the bridge's stiffness.",
     Reason.STOPPED_ON_BRIDGE: "The truck stopped or turned back on the bridge.",
@@ -63,6 +72,9 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.MODEL_MISFIT: "The model does not explain the measured accelerations.",
     Reason.RESIDUALS_COLOURED: "What the fit leaves over is not random noise.",
     Reason.NOISE_ABOVE_DECLARED: "The accelerometers are noisier than the site file says.",
+    Reason.NOISE_BELOW_DECLARED: (
+        "The accelerometers are much quieter than the site file says, which could hide a misfit."
+    ),
     Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
     Reason.POSITION_INCONSISTENT: "The position that fits disagrees with the receiver.",
     Reason.SPAN_INCONSISTENT: "The span disagrees with the distance between the bridge's ends.",

@@ -24,6 +24,7 @@ from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from services.common.crossing import Passage
 from services.common.streams import Samples
+from services.worker.checks import reasons_before_fit
 from services.worker.crossing_data import (
     NORMAL_975,
     CrossingData,
@@ -102,6 +103,15 @@ def identify(
         cut = _cut(data, trajectory, data.samples, passing)
         if cut is None:
             return reject([Reason.GAP_ON_BRIDGE])
+        broken = reasons_before_fit(
+            data.vehicle,
+            cut.acceleration,
+            1.0 / data.samples.rate_hz,
+            cut.motion,
+            data.stay.direction,
+        )
+        if broken:
+            return reject(broken)
         if settings.method == "pre":
             return identify_pre(data, settings, passing, *cut, report, lambda: stopwatch() - began)
         found = _fitted(data, settings, cut, report)

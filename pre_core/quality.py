@@ -1,0 +1,324 @@
+"""What signals and residuals say about whether an answer can be trusted: numbers, no verdicts.
+
+Before the fit, of four accelerations alone: does a channel stand still or stop at an end of its
+range, do the channels obey the body equation (which contains no unknown input), does the front axle
+meet the road before the rear. After it, of the white rows: how large is their mean square, for each
+kind of residual, part of the drive and band of frequencies, and how unlikely is that by chance.
+Thresholds stand where verdicts are made.
+"""
+
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+_BODY_BAND_HZ = (0.7, 10.0)
+_BODY_FACTOR = 4.0
+"""k/m and c/m may be so many times what is known, either way."""
+_LARGEST_COUPLING = 0.6
+_ROAD_BAND_HZ = (1.0, 8.0)
+
+
+# Signals.
+
+
+def longest_hold(values: FloatArray) -> int:
+    """Length of the longest run of equal values (n,), in samples."""
+    changes = np.flatnonzero(np.diff(values) != 0.0)
+    edges = np.concatenate([[-1], changes, [values.size - 1]])
+    return int(np.diff(edges).max())
+
+
+def smallest_difference(signals: FloatArray) -> float:
+    """Least root mean square of the difference of two of the signals (c, n), over their own."""
+    smallest = np.inf
+    for i in range(signals.shape[0]):
+        for j in range(i):
+            power = float(signals[i] @ signals[i] + signals[j] @ signals[j])
+            difference = signals[i] - signals[j]
+            if power > 0.0:
+                smallest = min(smallest, float(np.sqrt(difference @ difference / power)))
+    return smallest
+
+
+def repeated_extremes(values: FloatArray, digits: float = 1e-5) -> int:
+    """How often a signal (n,) has exactly its largest or smallest value.
+
+    Zero where values are so coarse (their least step above `digits` of the largest) that repeats
+    are to be expected.
+    """
+    distinct = np.unique(values)
+    if distinct.size < 3 or np.diff(distinct).min() > digits * np.abs(distinct).max():
+        return 0
+    return max(
+        int(np.count_nonzero(values == distinct[0])), int(np.count_nonzero(values == distinct[-1]))
+    )
+
+
+class Rail(NamedTuple):
+    """Where the values of a signal pile up at an end of its range; see `pile_up`."""
+
+    ratio: float
+    """Samples in the fullest outer bin over the mean of the bins just inside it."""
+    visits: int
+    """How many separate times the signal was there."""
+    level: float
+
+
+def pile_up(values: FloatArray, bins: int = 100) -> Rail:
+    """Look for a level beyond which a signal (n,) should go and does not.
+
+    The density of a signal that is not cut off falls towards its ends: a smooth peak spends most of
+    its time at its top, yet in the uppermost hundredth only 2.4 times as long as in the next. A
+    signal that is cut off spends in the last bin all the time that it should have been beyond.
+    Both ends are looked at; the worse one is returned.
+    """
+    centred = values - np.median(values)
+    worst = Rail(0.0, 0, 0.0)
+    for sign in (1.0, -1.0):
+        side = sign * centred
+        top = float(side.max())
+        if not top > 0.0:
+            continue
+        place = np.floor(side * (bins / top)).astype(np.int64).clip(-1, bins - 1)
+        counts = np.bincount(place[place >= 0], minlength=bins).astype(np.float64)
+        # What a filter after the clipping lets through lies a little beyond the rail.
+        for k in range(bins - 1, int(0.8 * bins), -1):
+            inside = counts[k - 6 : k - 1].mean()
+            ratio = counts[k] / max(inside, 1.0)
+            if ratio > worst.ratio:
+                there = place >= k
+                visits = int(np.count_nonzero(there[1:] & ~there[:-1])) + int(there[0])
+                worst = Rail(float(ratio), visits, sign * top * (k + 0.5) / bins)
+    return worst
+
+
+def spikes(values: FloatArray, height: float = 20.0) -> int:
+    """Number of single samples (n,) that stand out of their neighbours.
+
+    A sample's distance from the cubic through its four neighbours, over the typical such distance
+    within a quarter of a second to either side.
+    """
+    if values.size < 9:
+        return 0
+    distance = np.abs(
+        values[2:-2] - (4.0 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6.0
+    )
+    typical = np.median(distance)
+    if not typical > 0.0:
+        return 0
+    out = np.flatnonzero(distance > height * typical)
+    # One disturbed sample disturbs the distances of its neighbours.
+    return int(np.count_nonzero(np.diff(out, prepend=-10) > 3))
+
+
+class Pairing(NamedTuple):
+    """Which of four channels behave as body and axle, front and rear; see `pairing`."""
+
+    recorded: float
+    """Part of the body's motion that the body equations leave unexplained, channels as recorded."""
+    upright: tuple[float, float]
+    """Of the front and the rear pair apart."""
+    reversed_: tuple[float, float]
+    """The same with the axle's sign turned round."""
+    best: float
+    """The same for the best other way to connect the channels."""
+    best_order: tuple[int, int, int, int]
+    """That way: which channel is sprung front, sprung rear, unsprung front, unsprung rear."""
+
+
+def pairing(
+    acceleration_m_per_s2: FloatArray,
+    step_s: float,
+    stiffness_per_mass: FloatArray,
+    damping_per_mass: FloatArray,
+) -> Pairing:
+    """Test the order and the signs of four accelerations (4, n) by the body equations.
+
+    a_s + (c/m)(v_s - v_u) + (k/m)(z_s - z_u) + (m_12/m) a_s,other = 0 holds for the right channels
+    whatever the road and the bridge, and for hardly any others. c/m and k/m (2,) are free within a
+    factor of 4 of what is known (front, rear), the coupling within 0.6. Between 0.7 and 10 Hz.
+    """
+    spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
+    left: dict[tuple[int, int, int, int, bool], float] = {}
+
+    def unexplained(w: int, s: int, u: int, other: int, *, upright: bool = True) -> float:
+        key = (w, s, u, other, upright)
+        if key not in left:
+            left[key] = _unexplained(
+                spectrum[s],
+                spectrum[u] if upright else -spectrum[u],
+                spectrum[other],
+                omega,
+                float(stiffness_per_mass[w]),
+                float(damping_per_mass[w]),
+            )
+        return left[key]
+
+    upright = (unexplained(0, 0, 2, 1), unexplained(1, 1, 3, 0))
+    best, best_order = np.inf, (0, 1, 2, 3)
+    for order in permutations(range(4)):
+        s_1, s_2, u_1, u_2 = order
+        # To exchange both pairs changes neither equation: that is for `lead`.
+        if order in ((0, 1, 2, 3), (1, 0, 3, 2)):
+            continue
+        value = max(unexplained(0, s_1, u_1, s_2), unexplained(1, s_2, u_2, s_1))
+        if value < best:
+            best, best_order = value, (s_1, s_2, u_1, u_2)
+    return Pairing(
+        max(upright),
+        upright,
+        (unexplained(0, 0, 2, 1, upright=False), unexplained(1, 1, 3, 0, upright=False)),
+        best,
+        best_order,
+    )
+
+
+def _spectrum(
+    signals: FloatArray, step_s: float, band_hz: tuple[float, float]
+) -> tuple[NDArray[np.complex128], FloatArray]:
+    n = signals.shape[1]
+    window = np.hanning(n)
+    centred = signals - (signals @ window / window.sum())[:, None]
+    spectrum = np.fft.rfft(centred * window, axis=1)
+    frequency = np.fft.rfftfreq(n, step_s)
+    inside = (frequency >= band_hz[0]) & (frequency <= band_hz[1])
+    return spectrum[:, inside], np.asarray(2.0 * np.pi * frequency[inside], dtype=np.float64)
+
+
+def _unexplained(
+    body: NDArray[np.complex128],
+    axle: NDArray[np.complex128],
+    other: NDArray[np.complex128],
+    omega: FloatArray,
+    stiffness_per_mass: float,
+    damping_per_mass: float,
+) -> float:
+    """Smallest |residual|^2 of the body equation over |body|^2, constants within their bounds."""
+    from scipy.optimize import lsq_linear  # slow to import, seldom needed
+
+    stroke = body - axle
+    columns = np.stack(
+        [
+            -stiffness_per_mass * stroke / omega**2,
+            damping_per_mass * stroke / (1j * omega),
+            other,
+        ],
+        axis=1,
+    )
+    matrix = np.concatenate([columns.real, columns.imag])
+    right = -np.concatenate([body.real, body.imag])
+    power = float(right @ right)
+    if not power > 0.0:
+        return 1.0
+    low = [1.0 / _BODY_FACTOR, 0.0, -_LARGEST_COUPLING]
+    high = [_BODY_FACTOR, _BODY_FACTOR, _LARGEST_COUPLING]
+    found = lsq_linear(matrix, right, (low, high), method="bvls")
+    return 2.0 * float(found.cost) / power
+
+
+def lead(
+    front_m_per_s2: FloatArray,
+    rear_m_per_s2: FloatArray,
+    step_s: float,
+    travelled_m: FloatArray,
+    wheelbase_m: float,
+) -> tuple[float, float]:
+    """Correlation of what both axles feel at the same place, as recorded and with them exchanged.
+
+    Below 8 Hz an axle follows the road. `travelled_m` (n,) is how far the front axle has come, at
+    every sample, increasing; the rear axle is where the front axle was a wheelbase before. With the
+    axles exchanged the one that is called rear is in front.
+    """
+    smooth = _band_passed(np.stack([front_m_per_s2, rear_m_per_s2]), step_s, _ROAD_BAND_HZ)
+    return (
+        _correlation(smooth[0], smooth[1], travelled_m, -wheelbase_m),
+        _correlation(smooth[0], smooth[1], travelled_m, wheelbase_m),
+    )
+
+
+def _band_passed(signals: FloatArray, step_s: float, band_hz: tuple[float, float]) -> FloatArray:
+    n = signals.shape[1]
+    spectrum = np.fft.rfft((signals - signals.mean(axis=1, keepdims=True)) * np.hanning(n), axis=1)
+    frequency = np.fft.rfftfreq(n, step_s)
+    spectrum[:, (frequency < band_hz[0]) | (frequency > band_hz[1])] = 0.0
+    return np.fft.irfft(spectrum, n, axis=1)
+
+
+def _correlation(
+    front: FloatArray, rear: FloatArray, travelled_m: FloatArray, rear_offset_m: float
+) -> float:
+    """Correlation at the same place of signals whose places differ by an offset."""
+    rear_at = travelled_m + rear_offset_m
+    low, high = max(travelled_m[0], rear_at[0]), min(travelled_m[-1], rear_at[-1])
+    if high - low < 2.0 * abs(rear_offset_m):
+        return 0.0
+    place = np.linspace(low, high, front.size)
+    a = np.interp(place, travelled_m, front)
+    b = np.interp(place, rear_at, rear)
+    scale = np.sqrt((a @ a) * (b @ b))
+    return float(a @ b / scale) if scale > 0.0 else 0.0
+
+
+# White rows.
+
+
+class Cell(NamedTuple):
+    """A part of the white rows: one kind of residual, stretch of the drive and band."""
+
+    mean_square: float
+    size: int
+
+
+def cell_excess(cell: Cell, expected: float = 1.0) -> float:
+    """How many standard deviations a mean square lies above what is expected of `size` normals.
+
+    Wilson and Hilferty: the cube root of chi squared over its degrees of freedom is nearly normal.
+    """
+    if cell.size == 0:
+        return 0.0
+    spread = 2.0 / (9.0 * cell.size)
+    return float((np.cbrt(cell.mean_square / expected) - 1.0 + spread) / np.sqrt(spread))
+
+
+def cells(
+    white: FloatArray, stretches: NDArray[np.int64], step_s: float, edges_hz: FloatArray
+) -> dict[tuple[int, int, int], Cell]:
+    """Mean squares of white rows (m, kinds) by kind, stretch and band.
+
+    `stretches` (m,) numbers contiguous stretches of rows. Within each the rows are turned into
+    their cosine transform, which is orthogonal: of white rows of unit variance every coefficient
+    is a standard normal, and coefficient k of n belongs to the frequency k/(2 n step). Bands lie
+    between consecutive `edges_hz`.
+    """
+    from scipy.fft import dct  # slow to import, seldom needed
+
+    found: dict[tuple[int, int, int], Cell] = {}
+    for stretch in np.unique(stretches).tolist():
+        rows = white[stretches == stretch]
+        power = np.asarray(dct(rows, type=2, axis=0, norm="ortho")) ** 2
+        frequency = np.arange(rows.shape[0]) / (2.0 * rows.shape[0] * step_s)
+        band = np.searchsorted(edges_hz, frequency, side="right") - 1
+        for b in range(edges_hz.size - 1):
+            chosen = power[band == b]
+            for kind in range(white.shape[1]):
+                count = chosen.shape[0]
+                mean = float(chosen[:, kind].mean()) if count else 0.0
+                found[kind, stretch, b] = Cell(mean, count)
+    return found
+
+
+def joined(parts: list[Cell]) -> Cell:
+    """Several cells as one."""
+    count = sum(part.size for part in parts)
+    total = sum(part.mean_square * part.size for part in parts)
+    return Cell(total / count if count else 0.0, count)
+
+
+def excess_kurtosis(values: FloatArray) -> float:
+    """Fourth moment over the squared second of values (n,), less 3: zero for normal ones."""
+    square = values**2
+    return float(np.mean(square**2) / np.mean(square) ** 2 - 3.0)
