@@ -489,7 +489,7 @@ def test_absurd_accelerations_get_a_verdict(
     run = scenario_6.run
     noise = np.random.default_rng(0).uniform(0.5, 1.0, run.accel_time_s.size)
     crossing = rejected(
-        run._replace(channels={name: value * noise for name in CHANNELS})  # all the same
+        run._replace(channels=dict.fromkeys(CHANNELS, value * noise))  # all the same
     )
     assert crossing.reasons == reasons
 
