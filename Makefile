@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo test test-all lint bench lock clean
+.PHONY: help install demo test test-all faults lint bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -34,6 +34,9 @@ test: $(STAMP) ## the default tests (at most 5 minutes on 2 cores)
 
 test-all: $(STAMP) ## the default tests and the slow ones
 	$(BIN)/python -m pytest -m "slow or not slow"
+
+faults: $(STAMP) ## everything that tries to lose or break data (at most 20 minutes)
+	$(BIN)/python -m pytest tests/faults -m "faults or not faults"
 
 lint: $(STAMP) ## format, lint, types and import contracts
 	$(BIN)/ruff format --check .

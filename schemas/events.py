@@ -26,6 +26,8 @@ class EventKind(StrEnum):
     QUEUE_FULL = "queue_full"
     WRITE_ERROR = "write_error"
     DISK_LOW = "disk_low"
+    RECORDING_RECOVERED = "recording_recovered"
+    RECORDING_DELETED = "recording_deleted"
 
 
 EVENT_TEXTS: dict[EventKind, str] = {
@@ -41,6 +43,8 @@ EVENT_TEXTS: dict[EventKind, str] = {
     EventKind.QUEUE_FULL: "The writer's queue was full.",
     EventKind.WRITE_ERROR: "Writing to disk failed.",
     EventKind.DISK_LOW: "Little room is left on the disk.",
+    EventKind.RECORDING_RECOVERED: "A recording that was damaged or cut off was rewritten.",
+    EventKind.RECORDING_DELETED: "A recording was deleted to keep within the budget.",
 }
 
 

@@ -1,7 +1,8 @@
 """The command `driveby`: reads the arguments, calls one function, turns errors into exit codes.
 
-0 it worked, 1 it failed, 2 the input was bad. The functions are imported when they are called, so
-that `driveby --help` does not wait for compilers and viewers.
+0 it worked, 1 it failed, 2 the input was bad; 3 of `recover`: it worked, but something is lost.
+The functions are imported when they are called, so that `driveby --help` does not wait for
+compilers and viewers.
 """
 
 import argparse
@@ -130,6 +131,19 @@ def _validate(options: argparse.Namespace) -> int:
         steps=options.steps,
         console=_console(),
     )
+
+
+def _recover(options: argparse.Namespace) -> int:
+    from services.recover import recover_command
+
+    code, line = recover_command(
+        source=options.recording,
+        output=options.output,
+        set_aside=options.set_aside,
+        as_json=options.json,
+    )
+    print(line)
+    return code
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -354,6 +368,28 @@ def _add_offline(commands: Any) -> None:
     p.add_argument("--particles", type=_whole("particles", 1), default=500, help="(default: 500)")
     p.add_argument("--steps", type=_whole("steps", 1), default=600, help="(default: 600)")
     _add_seed(p)
+
+    p = _command(
+        commands,
+        "recover",
+        _recover,
+        "rewrite a recording that is damaged or was cut off",
+        "driveby recover run.mcap -o whole.mcap",
+    )
+    p.add_argument("recording", type=Path, metavar="REC.mcap", help="recording, stays as it is")
+    p.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="OUT.mcap",
+        help="(default: REC.recovered.mcap beside it)",
+    )
+    p.add_argument(
+        "--set-aside",
+        action="store_true",
+        help="then rename the damaged one to REC.mcap.crashed",
+    )
+    p.add_argument("--json", action="store_true", help="print the counts as JSON")
 
     p = _command(
         commands,

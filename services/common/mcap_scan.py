@@ -17,6 +17,7 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import BinaryIO, NamedTuple
 
 import zstandard
@@ -119,11 +120,11 @@ def scan(file: BinaryIO) -> Iterator[Item]:
     at = len(MCAP0_MAGIC)
     if _read(file, 0, at) != MCAP0_MAGIC:
         at = 0
-    is_whole = False
+    is_whole = is_chunked = False
     while at < size:
         if size - at == len(MCAP0_MAGIC) and _read(file, at, len(MCAP0_MAGIC)) == MCAP0_MAGIC:
             break
-        record = _record_at(file, at, size)
+        record = _record_at(file, at, size, is_chunked=is_chunked)
         if record is None:
             begin = _next_record(file, at, size)
             yield from _torn_messages(file, at, size) if begin == size else ()
@@ -134,9 +135,10 @@ def scan(file: BinaryIO) -> Iterator[Item]:
             if begin == size:
                 return
             at = begin
-            record = _record_at(file, at, size, is_after_damage=True)
+            record = _strong_record_at(file, at, size)
             if record is None:  # it was one a moment ago: somebody else writes to the file
                 return
+        is_chunked = is_chunked or record.is_chunk
         for item in record.items():
             is_whole = is_whole or isinstance(item, Footer)
             yield item
@@ -149,38 +151,48 @@ def scan(file: BinaryIO) -> Iterator[Item]:
 class _Record(NamedTuple):
     end: int
     items: Callable[[], Iterator[Item]]
+    is_chunk: bool = False
 
 
-def _record_at(
-    file: BinaryIO, at: int, size: int, *, is_after_damage: bool = False
-) -> _Record | None:
-    """Return the record that begins at a byte; None if none does that holds.
+def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Record | None:
+    """Return the record that begins where the one before ended; None if it does not hold."""
+    record = _strong_record_at(file, at, size)
+    if record is not None:
+        return record
+    opcode, length = _header_at(file, at, size) or (0, 0)
+    end = at + _HEADER.size + length
+    if opcode not in (Opcode.CHUNK, Opcode.MESSAGE) or not _is_followed(file, end, size):
+        return None
+    if opcode == Opcode.CHUNK:
+        # Its content alone is wrong: the next record is where this one says.
+        text = f"damaged chunk at byte {at}"
+        return _found(end, Damage(at, end - at, text, is_chunk=True, is_cut_off=False))
+    # Nothing shows whether a message outside chunks is one. Where there are chunks it is none:
+    # one bit makes an index a message.
+    if is_chunked or length < _MESSAGE.size:
+        return None
+    return _found(end, _raw_message(_read(file, at + _HEADER.size, length), 0, length))
 
-    After damage nothing is believed that has no inner consistency to show.
-    """
+
+def _strong_record_at(file: BinaryIO, at: int, size: int) -> _Record | None:
+    """Return the record that begins at a byte, if there is one that shows by itself to be one."""
+    opcode, length = _header_at(file, at, size) or (0, 0)
+    outer_end = at + _HEADER.size + length if opcode else None
+    chunk = _chunk_at(file, at, size, outer_end)
+    if chunk is not None or outer_end is None:
+        return chunk
+    return _plain_record_at(file, at, opcode, length)
+
+
+def _header_at(file: BinaryIO, at: int, size: int) -> tuple[int, int] | None:
+    """Return opcode and length at a byte; None if that record would be too long."""
     header = _read(file, at, _HEADER.size)
     if len(header) < _HEADER.size:
         return None
     opcode, length = _HEADER.unpack(header)
-    end = at + _HEADER.size + length
-    fits = end <= size and length <= MAX_RECORD_BYTES
-    chunk = _chunk_at(file, at, size, end if fits else None)
-    if chunk is not None:
-        return chunk
-    if not fits:
+    if length > min(MAX_RECORD_BYTES, size - at - _HEADER.size):
         return None
-    if opcode == Opcode.CHUNK:
-        # Nothing but its content can be wrong if the next record is where this one says.
-        if is_after_damage or not _is_followed(file, end, size):
-            return None
-        text = f"damaged chunk at byte {at}"
-        return _found(end, Damage(at, end - at, text, is_chunk=True, is_cut_off=False))
-    if opcode == Opcode.MESSAGE:
-        if is_after_damage or length < _MESSAGE.size or not _is_followed(file, end, size):
-            return None
-        body = _read(file, at + _HEADER.size, length)
-        return _found(end, _raw_message(body, 0, length))
-    return _plain_record_at(file, at, opcode, length)
+    return opcode, length
 
 
 def _plain_record_at(file: BinaryIO, at: int, opcode: int, length: int) -> _Record | None:
@@ -250,7 +262,7 @@ def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Rec
         data = _read(file, begin, end - begin)
         content = _decompressed(data) if is_compressed else data
         if content is not None and _holds(content, crc, is_certain=end == outer_end):
-            return _Record(end, lambda content=content: _records_of(content))  # type: ignore[misc]
+            return _Record(end, partial(_records_of, content), is_chunk=True)
     return None
 
 
@@ -332,7 +344,7 @@ def _next_record(file: BinaryIO, at: int, size: int) -> int:
         for match in _CANDIDATE.finditer(window):
             behind = (0, _ZSTD_AT, _FRAME_AT)[(match.lastindex or 1) - 1]
             start = begin + match.start() - behind
-            if start >= at and _record_at(file, start, size, is_after_damage=True) is not None:
+            if start >= at and _strong_record_at(file, start, size) is not None:
                 return start
         if len(window) <= _CANDIDATE_BYTES:
             break

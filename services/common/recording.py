@@ -182,7 +182,7 @@ class RecordingWriter:
         time_ns: int | None = None,
     ) -> None:
         """Write the END sentinel with its reason and counts, the index, and close the file."""
-        self._mcap.writer.add_metadata(IDENTITIES, _identities_text(self.identities))
+        self._mcap.writer.add_metadata(IDENTITIES, identities_text(self.identities))
         _end(self._mcap.writer, reason, self.messages, counts or {}, time_ns)
         self._disk.sync(self._file.fileno())
         self._file.close()
@@ -417,7 +417,8 @@ def _end(
     writer.finish()
 
 
-def _identities_text(identities: Identities) -> dict[str, str]:
+def identities_text(identities: Identities) -> dict[str, str]:
+    """Return the content of the metadata `driveby.identities`."""
     return {
         f"{key(*where)} {boot_id}": ",".join(f"{a}-{b}" for a, b in numbers.ranges())
         for (where, boot_id), numbers in identities.items()

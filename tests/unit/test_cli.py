@@ -20,7 +20,7 @@ from services.common.recording import Message, read_info, read_site, write_recor
 
 EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
 COMMANDS = (
-    "simulate", "import", "identify", "validate", "view",
+    "simulate", "import", "identify", "validate", "recover", "view",
     "demo", "logger", "worker", "truck", "replay",
 )  # fmt: skip
 
