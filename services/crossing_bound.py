@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pre_core import parameters, posterior, pre
 from pre_core.calibration import without_negative
-from pre_core.parameters import EI_1
+from pre_core.parameters import C_S1, EI_1, KAPPA
 from pre_core.vehicle import total_mass_kg
 from schemas.signals import CHANNELS
 from services.drawn_crossings import Drawn, Seen, true_values
@@ -45,11 +45,15 @@ def bound_at_truth(seen: Seen, drawn: Drawn) -> dict[str, dict[str, float]]:
     """The bounds of a drawn crossing as JSON."""
     problem, y = _problem(seen)
     where = posterior.layout(problem)
-    scale, gain = _scale(drawn)
-    theta = equivalent_theta(true_values(drawn.truth), _elements(problem), scale, gain)
+    errors = drawn.truth.channels
+    correction = 1.0 / ((1.0 + errors.common_gain) * (1.0 + errors.gain)) - 1.0
+    theta = equivalent_theta(
+        true_values(drawn.truth),
+        _elements(problem),
+        drawn.site.vehicles[0].total_mass_kg / total_mass_kg(drawn.truth.car),
+        _set_gains(problem, y, correction),
+    )
     _set_theta(problem, y, theta, drawn.truth.car.wheelbase_m)
-    gains = drawn.truth.channels.gain
-    _set_gains(problem, y, gains.mean() - gains)
     y[where.delays] = drawn.truth.channels.delay_s / problem.priors.delay_spread_s
     true_m = np.interp(
         _sample_times(seen) + seen.data.wall_offset_s,
@@ -93,7 +97,7 @@ def _bound_near(seen: Seen, problem: posterior.Problem, y: Floats) -> Bound:
     y[where.offset] = _best_offset(problem, y)
     problem = pre.with_noise_at(problem, y)
     y = settle(problem, y, np.arange(where.gains.start, where.size))
-    return bound_of(problem, y, common_spread(seen))
+    return bound_of(problem, y, unseen_spread(seen, problem))
 
 
 def as_json(bound: Bound) -> dict[str, dict[str, float]]:
@@ -105,20 +109,21 @@ def as_json(bound: Bound) -> dict[str, dict[str, float]]:
     }
 
 
-def common_spread(seen: Seen) -> float:
-    """Relative standard deviation of what scales all EI: total mass, common and mean gain."""
+def unseen_spread(seen: Seen, problem: posterior.Problem) -> float:
+    """Relative standard deviation of what scales all EI and is no unknown of the posterior.
+
+    Always the total mass; the common gain, and the mean of the channels' own, where only
+    differences between gains are unknowns.
+    """
     sensor = seen.data.sensor
-    return float(
-        np.sqrt(
-            seen.data.vehicle.spread("total_mass_kg") ** 2
-            + sensor.common_gain_spread**2
-            + (0.5 * sensor.gain_spread) ** 2
-        )
-    )
+    _, directions = _gain_directions(problem)
+    is_seen = float(np.abs(directions.sum(axis=1)).max()) > 1e-9
+    gain = 0.0 if is_seen else np.hypot(sensor.common_gain_spread, 0.5 * sensor.gain_spread)
+    return float(np.hypot(seen.data.vehicle.spread("total_mass_kg"), gain))
 
 
 def bound_of(problem: posterior.Problem, y: Floats, scale_error: float) -> Bound:
-    """The bound at y (size,); `scale_error` is that of `common_spread`."""
+    """The bound at y (size,); `scale_error` is that of `unseen_spread`."""
     where = posterior.layout(problem)
     jacobian = central_jacobian(problem, y, np.arange(where.size))
     covariance = posterior.covariance(posterior.precision_root(jacobian))
@@ -173,27 +178,19 @@ def settle(
 
 
 def equivalent_theta(
-    values: dict[str, float], elements: int, scale: float, common_gain: float
+    values: dict[str, float], elements: int, scale: float, correction: float
 ) -> Floats:
     """The parameters (p,) that the method would find without noise.
 
-    The method takes the total mass for the nominal one and the common gain for none. All forces
-    are then off by `scale`, nominal over true mass, and so are masses, springs and dampers. The
-    bridge's deflection is read too large by the gain: its rigidity and mass are divided by it.
+    The method takes the total mass for the nominal one. All forces are then off by `scale`, nominal
+    over true mass, and so are masses, springs and dampers. A `correction` of all gains that it does
+    not make leaves the bridge's deflection too large by its inverse: rigidities and mass follow.
     """
     theta = np.array([values[name] for name in parameters.names(elements)])
-    theta[1 : EI_1 - 1] *= scale
-    theta[EI_1 : EI_1 + elements + 1] *= scale / (1.0 + common_gain)
-    theta[-2:] *= scale / (1.0 + common_gain)
+    theta[C_S1:KAPPA] *= scale
+    theta[EI_1 : EI_1 + elements + 1] *= scale * (1.0 + correction)
+    theta[-2:] *= scale * (1.0 + correction)
     return theta
-
-
-def _scale(drawn: Drawn) -> tuple[float, float]:
-    """Nominal over true total mass, and the relative error common to all gains."""
-    car, errors = drawn.truth.car, drawn.truth.channels
-    mass = total_mass_kg(car)
-    common = (1.0 + errors.common_gain) * (1.0 + float(errors.gain.mean())) - 1.0
-    return drawn.site.vehicles[0].total_mass_kg / mass, common
 
 
 def _elements(problem: posterior.Problem) -> int:
@@ -225,14 +222,24 @@ def _set_theta(problem: posterior.Problem, y: Floats, theta: Floats, wheelbase_m
     y[where.wheelbase] = np.log(wheelbase_m / priors.wheelbase_m) / priors.wheelbase_spread
 
 
-def _set_gains(problem: posterior.Problem, y: Floats, gain: Floats) -> None:
-    """Put corrections (4,) of the gains into y, of which three directions exist."""
+def _gain_directions(problem: posterior.Problem) -> tuple[NDArray[np.int64], Floats]:
+    """Places of the gains in y, and the corrections (places, 4) that one of each makes."""
     where = posterior.layout(problem)
     places = np.arange(where.gains.start, where.gains.stop)
-    unit = np.repeat(y[None, :], places.size, axis=0)
-    unit[:, places] = np.eye(places.size)
-    directions = posterior.points(problem, unit).gain
-    y[places] = np.linalg.lstsq(directions.T, gain, rcond=None)[0]
+    unit = np.zeros((places.size + 1, where.size))
+    unit[np.arange(places.size), places] = 1.0
+    gains = posterior.points(problem, unit).gain
+    return places, gains[:-1] - gains[-1]
+
+
+def _set_gains(problem: posterior.Problem, y: Floats, correction: Floats) -> float:
+    """Put corrections (4,) of the gains into y as far as it has room for them; what is left.
+
+    What is left is common to all channels: the correction that the rigidities have to take over.
+    """
+    places, directions = _gain_directions(problem)
+    y[places] = np.linalg.lstsq(directions.T, correction, rcond=None)[0]
+    return float((correction - y[places] @ directions).mean())
 
 
 def _best_offset(problem: posterior.Problem, y: Floats) -> float:
