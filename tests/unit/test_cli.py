@@ -306,7 +306,7 @@ def test_every_command_has_help_with_an_example(
 
 def test_the_commands_offered_are_those_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(command in refused(capsys, "none") for command in COMMANDS)
-    for later in ("survey", "watch", "report", "recover"):
+    for later in ("survey", "watch", "report"):
         assert f"'{later}'" in refused(capsys, later).split("(choose from")[0]
         assert later not in refused(capsys, "none")
 
