@@ -272,13 +272,8 @@ class _SpoolService:
     def _reply(
         self, query: zenoh.Query, where: str, payload: bytes, attachment: bytes | None = None
     ) -> None:
-        query.reply(
-            where,
-            payload,
-            attachment=attachment,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.DATA_LOW,  # what is live goes first
-        )
+        # With the priority and the congestion control of the query: Zenoh ignores others.
+        query.reply(where, payload, attachment=attachment)
 
     def _key(self, stream: str) -> str:
         return spool_key(Key(self._realm, "vehicle", self._gateway.vehicle, stream))
