@@ -1,0 +1,213 @@
+"""Logger, truck and replay as processes of the command line, each with its own certificate."""
+
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+
+from schemas.signals import Channel
+from schemas.spool import spool_selector
+from schemas.topics import Key
+from services.certs import certs_command
+from services.common.bus import open_session
+from services.common.errors import InputError
+from services.common.recording import read_messages
+from services.common.spool import Spool
+from services.truck import Gateway
+
+pytestmark = pytest.mark.process
+
+Driveby = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture(scope="module")
+def credentials(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bus") / "certs"
+    certs_command(folder=folder, trucks=["truck-1", "truck-2"])
+    return folder
+
+
+@pytest.fixture
+def tls_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tls/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def driveby() -> Iterator[Driveby]:
+    """Start a sub-command; a logger is waited for."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: object) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "services", *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        if arguments[0] == "logger":
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            if not line.startswith("ready"):
+                pytest.fail(f"the logger did not start: {process.communicate()[1]}")
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def identities(folder: Path) -> list[tuple[Key, int, int]]:
+    """Of every message of a vehicle in all recordings of a folder, duplicates included."""
+    found = []
+    for path in sorted(folder.rglob("*.mcap")):
+        with contextlib.suppress(InputError):  # a logger was killed before its first second
+            found += [
+                (message.key, message.boot_id, message.sequence)
+                for message in read_messages(path)
+                if message.key.owner == "vehicle"
+            ]
+    return found
+
+
+def test_everything_is_recorded_under_access_control(
+    driveby: Driveby, credentials: Path, tls_endpoint: str, recording: Path, tmp_path: Path
+) -> None:
+    bus = ["--endpoint", tls_endpoint, "--tls"]
+    logger = driveby(
+        *("logger", "--listen", tls_endpoint, "--tls", credentials / "logger"),
+        *("--folder", tmp_path / "r"),
+    )
+    truck = driveby("truck", recording, "--speed", 50, *bus, credentials / "truck-1")
+    _, log = truck.communicate(timeout=60)
+    assert truck.returncode == 0, log  # it knows that all is on disk: it could read `durable`
+    assert "401 messages of truck-1 published" in log
+    replay = driveby("replay", recording, "--speed", 0, "--name", "x", *bus, credentials / "replay")
+    _, log = replay.communicate(timeout=60)
+    assert replay.returncode == 0, log
+    logger.send_signal(signal.SIGTERM)
+    _, log = logger.communicate(timeout=20)
+    assert logger.returncode == 0, log
+    found = identities(tmp_path / "r")
+    assert len(found) == len(set(found)) == 802
+    assert {key.realm for key, _, _ in found} == {"live", "replay-x"}
+    for key in credentials.glob("*/key.pem"):
+        assert key.read_text().splitlines()[1] not in log
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            ["truck", "{recording}", "--tls", "{certs}/truck-2"],
+            "{certs}/truck-2: is the certificate of truck/truck-2, not of truck/truck-1",
+        ),
+        (
+            ["replay", "{recording}", "--tls", "{certs}/truck-1"],
+            "{certs}/truck-1: is the certificate of truck/truck-1, not of replay/…",
+        ),
+        (
+            ["worker", "--site", "site.toml", "--tls", "{certs}/worker", "--id", "other"],
+            "{certs}/worker: is the certificate of worker/worker, not of worker/other",
+        ),
+        (
+            ["logger", "--tls", "{certs}/viewer"],
+            "{certs}/viewer: is the certificate of viewer/viewer, not of logger/logger",
+        ),
+        (
+            ["logger", "--listen", "tcp/0.0.0.0:7447"],
+            (
+                "tcp/0.0.0.0:7447 can be reached by other machines, and without --tls FOLDER "
+                "anybody there could publish as a truck; say --insecure if that is wanted "
+                "(see docs/security.md)"
+            ),
+        ),
+        (
+            ["certs", "{certs}", "--trucks", "truck-1"],
+            "{certs}/truck-1: exists and is not overwritten; --renew replaces it",
+        ),
+    ],
+)
+def test_what_would_be_dropped_without_a_word_is_refused_with_one_line(
+    driveby: Driveby, credentials: Path, recording: Path, arguments: list[str], line: str
+) -> None:
+    values = {"recording": recording, "certs": credentials}
+    command = [argument.format(**values) for argument in arguments]
+    ended = subprocess.run(
+        [sys.executable, "-m", "services", *command], capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 2
+    assert ended.stderr == f"driveby: {line.format(**values)}\n"
+
+
+def test_a_logger_killed_and_started_again_misses_nothing_under_access_control(
+    driveby: Driveby, credentials: Path, tls_endpoint: str, tmp_path: Path
+) -> None:
+    """The router dies with it; what the truck said meanwhile comes from its cache."""
+    arguments = [
+        *("logger", "--listen", tls_endpoint, "--tls", credentials / "logger"),
+        *("--folder", tmp_path / "r"),
+    ]
+    logger = driveby(*arguments)
+    with open_session(connect=tls_endpoint, timeout_s=10, tls=credentials / "truck-1") as session:
+        gateway = Gateway(session, "live", "truck-1")
+        for number in range(60):
+            if number == 20:
+                logger.kill()
+                logger.wait()
+            if number == 40:
+                logger = driveby(*arguments)
+            say(gateway)
+            time.sleep(0.02)
+        missing = gateway.delivery.wait(30.0)
+        gateway.close()
+    logger.send_signal(signal.SIGTERM)
+    _, log = logger.communicate(timeout=20)
+    assert logger.returncode == 0, log
+    assert {sequence for _, _, sequence in identities(tmp_path / "r")} == set(range(60))
+    assert missing == 0
+
+
+def say(gateway: Gateway) -> None:
+    channels = {"sprung_front": Channel(1000.0, np.zeros(50))}
+    gateway.accel(channels, device_time_ns=time.monotonic_ns(), wall_time_ns=time.time_ns())
+
+
+def test_a_real_spool_answers_the_logger_and_no_other_truck(
+    credentials: Path, tls_endpoint: str, tmp_path: Path
+) -> None:
+    def answers(session: zenoh.Session) -> int:
+        replies = session.get(
+            spool_selector("live", "truck-1"),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=10.0,
+        )
+        return sum(reply.ok is not None for reply in replies)
+
+    with (
+        open_session(listen=tls_endpoint, tls=credentials / "logger") as logger,
+        open_session(connect=tls_endpoint, timeout_s=10, tls=credentials / "truck-1") as session,
+        open_session(connect=tls_endpoint, timeout_s=10, tls=credentials / "truck-2") as other,
+    ):
+        gateway = Gateway(session, "live", "truck-1", Spool(tmp_path / "spool"))
+        for _ in range(10):
+            say(gateway)
+        deadline = time.monotonic() + 10.0
+        while not answers(logger) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert answers(logger) == 1
+        assert answers(other) == 0
+        gateway.close()
