@@ -193,6 +193,11 @@ def elements_of(records: list[Record]) -> int:
     return sum(name.startswith("EI_") for name in records[0]["truth"])
 
 
+def groups_of(records: list[Record]) -> dict[str, tuple[str, ...]]:
+    """Names of the parameters of each group that is tested together."""
+    return {"EI": tuple(f"EI_{e + 1}" for e in range(elements_of(records)))} | GROUPS
+
+
 def scores(records: list[Record]) -> Scores:
     """Errors of all crossings that offer numbers."""
     usable = [line for line in records if line["estimates"]]
@@ -222,17 +227,24 @@ def _table(
     return np.array(table, dtype=np.float64).reshape(len(records), len(names))
 
 
+def ranks_of(records: list[Record]) -> dict[str, Floats]:
+    """By group of parameters the truth's ranks (crossings, parameters) in the usable crossings."""
+    usable = [line for line in records if line["estimates"]]
+    found: dict[str, Floats] = {}
+    for group, names in groups_of(records).items():
+        if usable and all(name in line["ranks"] for line in usable for name in names):
+            found[group] = _table(usable, names, lambda line, name: line["ranks"][name])
+    return found
+
+
 def rank_tests(records: list[Record]) -> dict[str, dict[str, calibration.Uniformity]]:
     """By group and parameter: whether the truth's ranks are uniform over the usable crossings."""
-    usable = [line for line in records if line["estimates"]]
-    groups = {"EI": tuple(f"EI_{e + 1}" for e in range(elements_of(records)))} | GROUPS
-    found: dict[str, dict[str, calibration.Uniformity]] = {}
-    for group, names in groups.items():
-        for name in names:
-            ranks = np.array([line["ranks"][name] for line in usable if name in line["ranks"]])
-            if ranks.size >= _FEWEST_RANKS:
-                found.setdefault(group, {})[name] = calibration.uniformity(ranks)
-    return found
+    names = groups_of(records)
+    return {
+        group: {name: calibration.uniformity(ranks[:, k]) for k, name in enumerate(names[group])}
+        for group, ranks in ranks_of(records).items()
+        if ranks.shape[0] >= _FEWEST_RANKS
+    }
 
 
 def checks(records: list[Record]) -> list[Check]:

@@ -118,6 +118,21 @@ def _identify(options: argparse.Namespace) -> int:
 
 
 def _validate(options: argparse.Namespace) -> int:
+    if options.method == "pre":
+        from services.validation_pre import validate_pre_command
+
+        return validate_pre_command(
+            crossings=options.crossings,
+            control=options.control,
+            scenarios=options.scenarios,
+            folder=options.truth,
+            site=options.site,
+            processes=options.processes,
+            json_path=options.json,
+            figures=options.figures,
+            page=options.page,
+            console=_console(),
+        )
     from services.validation import validate_command
 
     return validate_command(
@@ -368,6 +383,34 @@ def _add_offline(commands: Any) -> None:
     p.add_argument("--particles", type=_whole("particles", 1), default=500, help="(default: 500)")
     p.add_argument("--steps", type=_whole("steps", 1), default=600, help="(default: 600)")
     _add_seed(p)
+    p.add_argument(
+        "--method",
+        choices=("paper", "pre"),
+        default="paper",
+        help="paper: its search and least squares, without sensors; pre: is its uncertainty true "
+        "(exit code 1 if an aim is missed; the options below) (default: paper)",
+    )
+    p.add_argument(
+        "--crossings",
+        type=_whole("a number of crossings", 0),
+        default=200,
+        help="whose truth is drawn from the priors (default: 200)",
+    )
+    p.add_argument(
+        "--control",
+        type=_whole("a number of crossings", 0),
+        default=20,
+        help="of these again with half the noise declared (default: 20)",
+    )
+    p.add_argument(
+        "--truth",
+        type=Path,
+        default=Path("../shared/crossings"),
+        metavar="DIR",
+        help="folders of crossings with a truth.json (default: ../shared/crossings)",
+    )
+    p.add_argument("--processes", type=_whole("processes", 1, 256), default=2, help="(default: 2)")
+    _add_file(p, "--page", "PAGE.md", "write what was found as a page")
 
     p = _command(
         commands,

@@ -82,7 +82,7 @@ def validate_command(
     if json_path is not None:
         check_writable(json_path)
     if figures is not None:
-        _make_folder(figures)
+        make_folder(figures)
     car, sound = _models(site)
     bar = Progress(
         TextColumn("{task.description}"),
@@ -123,7 +123,8 @@ def validate_command(
     return 0
 
 
-def _make_folder(path: Path) -> None:
+def make_folder(path: Path) -> None:
+    """Make the folder of the figures; InputError if nothing can be written there."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
