@@ -10,7 +10,7 @@ COPY schemas schemas
 COPY services services
 RUN pip install --no-cache-dir --no-deps . \
     && useradd --create-home driveby \
-    && mkdir recordings \
-    && chown driveby recordings
+    && mkdir recordings certs \
+    && chown driveby recordings certs
 USER driveby
 ENTRYPOINT ["driveby"]
