@@ -15,6 +15,7 @@ class EventKind(StrEnum):
     """Why an event was written. The codes are part of the recording format."""
 
     GAP = "gap"
+    LOST = "lost"
     RECOVERED = "recovered"
     DROPPED = "dropped"
     REFUSED = "refused"
@@ -31,7 +32,8 @@ class EventKind(StrEnum):
 
 
 EVENT_TEXTS: dict[EventKind, str] = {
-    EventKind.GAP: "Messages are missing and could not be fetched.",
+    EventKind.GAP: "Messages are missing and have not been fetched yet.",
+    EventKind.LOST: "Messages are lost: the truck no longer has them.",
     EventKind.RECOVERED: "Missing messages were fetched and stand later in the file.",
     EventKind.DROPPED: "Messages were dropped.",
     EventKind.REFUSED: "Messages were refused: malformed, too large or impossible.",

@@ -6,7 +6,7 @@ it is needed.
 
 from collections.abc import Iterator
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from google.protobuf import descriptor_pb2
 from google.protobuf.descriptor import FileDescriptor
@@ -61,8 +61,23 @@ def decode(name: str, payload: bytes) -> Message:
         raise ValueError(f"not a {name}: {error}") from None
 
 
+class Stamp(NamedTuple):
+    """When a message was made, and who it says it is."""
+
+    wall_time_ns: int
+    device_time_ns: int | None = None
+    """Of the sender's monotonic clock; None where the message has none."""
+    identity: signals.Identity | None = None
+    """As in the payload itself; None where it has none."""
+
+
 def check_payload(row: Topic, payload: bytes) -> int:
-    """Check a payload as far as its topic allows and return its time in ns since 1970 UTC.
+    """Return the time in ns since 1970 UTC of a payload that `check_stamp` finds right."""
+    return check_stamp(row, payload).wall_time_ns
+
+
+def check_stamp(row: Topic, payload: bytes) -> Stamp:
+    """Check a payload as far as its topic allows and return its times and identity.
 
     The time is the wall time of the first sample of `accel`, of the fix of `gnss` and `location`,
     and when the message was made for all others: the `log_time` of a recording. ValueError names
@@ -72,24 +87,29 @@ def check_payload(row: Topic, payload: bytes) -> int:
     if len(payload) > row.max_bytes:
         raise ValueError(f"{where}: {len(payload)} bytes; at most {row.max_bytes}")
     try:
-        return _checked_time_ns(row.message, payload)
+        return _checked_stamp(row.message, payload)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
 
-def _checked_time_ns(name: str, payload: bytes) -> int:
+def _checked_stamp(name: str, payload: bytes) -> Stamp:
     match name:
         case "driveby.v1.AccelBatch":
-            return signals.decode_accel(payload).wall_time_ns
+            return _stamp(signals.decode_accel(payload))
         case "driveby.v1.GnssFix":
-            return signals.decode_gnss(payload).wall_time_ns
+            return _stamp(signals.decode_gnss(payload))
         case "driveby.v1.VehicleInfo":
-            return signals.decode_info(payload).wall_time_ns
+            return _stamp(signals.decode_info(payload))
         case "foxglove.LocationFix":
-            return signals.check_location(payload)
+            return Stamp(signals.check_location(payload))
         case "driveby.v1.Event":
-            return signals.check_wall_time(events.decode_event(payload).time_ns)
+            return Stamp(signals.check_wall_time(events.decode_event(payload).time_ns))
     message = decode(name, payload)
     signals.check_version(getattr(message, "schema_version", 0))
     time_field = "created_ns" if name == "driveby.v1.Estimate" else "time_ns"
-    return signals.check_wall_time(getattr(message, time_field, 0))
+    return Stamp(signals.check_wall_time(getattr(message, time_field, 0)))
+
+
+def _stamp(message: signals.AccelBatch | signals.GnssFix | signals.VehicleInfo) -> Stamp:
+    identity = signals.Identity(message.boot_id, message.sequence)
+    return Stamp(message.wall_time_ns, message.device_time_ns, identity)

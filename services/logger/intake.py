@@ -1,22 +1,40 @@
 """What the logger does with a message before it is written: checks, counts, tells duplicates.
 
-No I/O and no clock of its own: messages go in, messages and events come out.
+No I/O and no clock of its own: messages go in, messages and events come out. What strangers send
+takes a bounded amount of memory: so many streams, boots of each, holes, and sources of refusals.
 """
 
+import zlib
+from bisect import bisect_right
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from schemas.events import Event, EventKind
-from schemas.messages import check_payload
+from schemas.messages import Stamp, check_stamp
 from schemas.signals import Identity
-from schemas.topics import Key, topic
+from schemas.topics import Key, Topic, topic
 from services.common.bus import Received, Seen
+from services.common.intervals import Intervals
 from services.common.recording import Message
+from services.logger.clocks import TruckClock, clock_step_ns
 
 GAP_PATIENCE_S = 5.0
 """How long a missing message may take to be fetched before a gap is written down."""
-_MAX_REFUSED_SOURCES = 1000
+MAX_STREAMS = 8000
+MAX_BOOTS = 64
+"""Boots remembered of one stream, and the most new ones in `_BOOTS_PERIOD_NS`."""
+MAX_RUNS = 10_000
+"""Runs of sequences of one stream and boot: holes, one more."""
+RATE_FACTOR = 50
+"""More than so many times the nominal rate, for longer than a cache lasts, is no sensor."""
+_BOOTS_PERIOD_NS = 3_600_000_000_000
+_RATE_ON_OCCASION_HZ = 100.0
+_LEAST_BURST = 1000
+_MAX_REFUSED_SOURCES = 100
+_REFUSALS_PERIOD_S = 60.0
+_RECENT = 256
+_NS_PER_S = 1_000_000_000
 
 
 class Refusals(NamedTuple):
@@ -24,6 +42,19 @@ class Refusals(NamedTuple):
 
     first_reason: str
     number: int
+
+
+@dataclass
+class _Stream:
+    """What is remembered of a key beside the sequences that came."""
+
+    boots: dict[int, int] = field(default_factory=dict)
+    """By boot_id when it was last heard of; the longest silent one first."""
+    recent: dict[tuple[int, int], int] = field(default_factory=dict)
+    """By identity the CRC of the last payloads."""
+    tokens: float = -1.0
+    arrival_ns: int = 0
+    log_time_ns: int = 0
 
 
 @dataclass
@@ -37,15 +68,28 @@ class Intake:
     """What this logger says itself comes back from the bus, and has been written already."""
     seen: Seen = field(default_factory=Seen)
     counts: Counter[str] = field(default_factory=Counter)
-    """received (of logged topics), accepted, refused, duplicates, recovered, lost."""
+    """received (of logged topics), accepted, refused, duplicates, recovered, missing, lost."""
+    forgotten: list[tuple[Key, int]] = field(default_factory=list)
+    """Streams and boots of which nothing is remembered any more; the caller empties it."""
+    settled: list[tuple[Key, int, int, int]] = field(default_factory=list)
+    """Stream, boot, first and last of what will never be written; the caller empties it."""
+    _streams: dict[Key, _Stream] = field(default_factory=dict)
+    _clocks: dict[tuple[str, str], TruckClock] = field(default_factory=dict)
+    _clock_stream: dict[tuple[str, str], tuple[str, int]] = field(default_factory=dict)
+    _own_clock_ns: int | None = None
+    _lag_ns: int = 0
+    _due: list[tuple[Key, Event]] = field(default_factory=list)
     _refused: dict[tuple[str, str], Refusals] = field(default_factory=dict)
+    _refused_told_s: dict[tuple[str, str], float] = field(default_factory=dict)
     _late: Counter[tuple[Key, int]] = field(default_factory=Counter)
+    _lost: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
     _holes: dict[tuple[Key, int], dict[tuple[int, int], float]] = field(default_factory=dict)
-    _reported: dict[tuple[Key, int], set[tuple[int, int]]] = field(default_factory=dict)
+    _reported: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
 
     def take(self, received: Received, now_ns: int) -> Message | None:
         """Return the message to write, or None if it is refused, not logged or a duplicate."""
         where: Key | None = None
+        identity: Identity | None = None
         try:
             where = received.key()
             row = topic(where.owner, where.stream)
@@ -55,15 +99,55 @@ class Intake:
             if where.identifier == self.own_service and identity.boot_id == self.own_boot_id:
                 return None
             self.counts["received"] += 1
-            log_time_ns = check_payload(row, received.payload)
+            stamp = check_stamp(row, received.payload)
+            if stamp.identity not in (None, identity):
+                raise ValueError(
+                    f"{row.owner}/{row.stream}: the payload says {stamp.identity[0]}, "
+                    f"{stamp.identity[1]} where its attachment says {identity[0]}, {identity[1]}"
+                )
+            stream = self._stream(where, identity, now_ns)
+            if not received.recovered:
+                _check_rate(row, stream, stamp.wall_time_ns, now_ns)
+            is_new = self._is_new(where, identity, stream, received.payload)
         except ValueError as error:
             self._refuse(where, str(error))
+            if received.spooled and where is not None and identity is not None:
+                # There is no better copy: to ask for it again would be for ever.
+                self._settle(where, *identity)
             return None
-        if not self._is_new(where, identity):
+        if not is_new:
             self.counts["duplicates"] += 1
             return None
         self.counts["accepted"] += 1
-        return Message(where, received.payload, *identity, log_time_ns, now_ns)
+        if not received.recovered:
+            self._watch_clock(where, identity, stamp, now_ns)
+        return Message(where, received.payload, *identity, stamp.wall_time_ns, now_ns)
+
+    def adopt(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> bool:
+        """Note messages that an earlier run has on disk, so that they are not written again.
+
+        False (and a refusal) if that would be more than can be remembered.
+        """
+        try:
+            self._stream(where, Identity(boot_id, first), now_ns)
+        except ValueError as error:
+            self._refuse(where, str(error))
+            return False
+        self.seen.streams.setdefault((where, boot_id), Intervals()).add_range(first, last)
+        return True
+
+    def lose(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> None:
+        """Give up messages that nobody has any more."""
+        try:
+            self._stream(where, Identity(boot_id, first), now_ns)
+        except ValueError as error:
+            self._refuse(where, str(error))
+            return
+        seen = self.seen.streams.setdefault((where, boot_id), Intervals())
+        for a, b in seen.missing_of([(first, last)]):
+            self.counts["lost"] += seen.add_range(a, b)
+            self._lost.setdefault((where, boot_id), Intervals()).add_range(a, b)
+            self.settled.append((where, boot_id, a, b))
 
     def report(
         self, now_ns: int, now_s: float, *, closing: bool = False
@@ -72,35 +156,93 @@ class Intake:
 
         `now_s` is a monotonic clock. When `closing`, what is missing now is reported at once.
         """
-        events: list[tuple[Key, Event]] = []
-        for (realm, vehicle), refusals in self._refused.items():
-            event = Event(
-                EventKind.REFUSED,
-                now_ns,
-                refusals.first_reason,
-                vehicle=vehicle,
-                messages=refusals.number,
-            )
-            events.append((Key(realm, "vehicle", vehicle, ""), event))
-        self._refused.clear()
+        events = self._own_clock(now_ns, now_s) + self._due
+        self._due = []
+        events += self._refusals(now_ns, now_s, closing=closing)
         for (where, boot_id), number in self._late.items():
             text = "came late and stand later in the file"
             events.append(_event(where, boot_id, EventKind.RECOVERED, now_ns, text, number))
         self._late.clear()
+        for (where, boot_id), numbers in self._lost.items():
+            for first, last in numbers.ranges():
+                text = "are lost, the truck no longer has them"
+                events.append(
+                    _event(where, boot_id, EventKind.LOST, now_ns, text, last - first + 1, first)
+                )
+        self._lost.clear()
         patience_s = 0.0 if closing else GAP_PATIENCE_S
         events += self._gaps(now_ns, now_s, patience_s)
+        events += self._drifts(now_ns, now_s)
         return events
 
-    def _is_new(self, where: Key, identity: Identity) -> bool:
+    def lag_s(self) -> float:
+        """Return how long live messages took at most since the last call.
+
+        The clocks' difference is in it, and the length of a batch: its time is that of its start.
+        """
+        lag_ns, self._lag_ns = self._lag_ns, 0
+        return lag_ns * 1e-9
+
+    def clock_figures(self) -> dict[str, float]:
+        """Return by name how far each truck's clock is behind the logger's, and its drift."""
+        figures = {}
+        for (_, vehicle), clock in self._clocks.items():
+            drift = clock.drift()
+            if drift is not None:
+                figures[f"clock_offset_s/{vehicle}"] = drift.offset_s
+                if drift.drift_ppm is not None:
+                    figures[f"clock_drift_ppm/{vehicle}"] = drift.drift_ppm
+        return figures
+
+    def _stream(self, where: Key, identity: Identity, now_ns: int) -> _Stream:
+        """Return what is remembered of a key; ValueError if it would be one too many."""
+        stream = self._streams.get(where)
+        if stream is None:
+            if len(self._streams) >= MAX_STREAMS:
+                raise ValueError(f"more than {MAX_STREAMS} streams")
+            stream = self._streams[where] = _Stream()
+        boots, boot_id = stream.boots, identity.boot_id
+        if boot_id not in boots and len(boots) >= MAX_BOOTS:
+            oldest, heard_ns = next(iter(boots.items()))
+            if abs(now_ns - heard_ns) < _BOOTS_PERIOD_NS:
+                raise ValueError(f"{where.stream}: more than {MAX_BOOTS} boots within an hour")
+            self._forget(where, oldest)
+        if len(boots) > 1:
+            boots.pop(boot_id, None)  # the one heard of last stands last
+        boots[boot_id] = now_ns
+        return stream
+
+    def _forget(self, where: Key, boot_id: int) -> None:
+        name = (where, boot_id)
+        del self._streams[where].boots[boot_id]
+        for memory in (self.seen.streams, self._holes, self._reported):
+            memory.pop(name, None)
+        self.forgotten.append(name)
+
+    def _is_new(self, where: Key, identity: Identity, stream: _Stream, payload: bytes) -> bool:
         name = (where, identity.boot_id)
         before = self.seen.streams.get(name)
         highest = before.highest if before is not None else None
+        sequence = identity.sequence
+        if before is not None and before.runs >= MAX_RUNS and not _touches(before, sequence):
+            raise ValueError(f"{where.stream}: more than {MAX_RUNS} holes in the sequence")
+        crc = zlib.crc32(payload)
         if not self.seen.add(where, identity):
+            if stream.recent.get(identity, crc) != crc:
+                raise ValueError(f"{where.stream}: sequence {sequence} again, with another content")
             return False
-        if highest is not None and identity.sequence < highest:
+        stream.recent[identity] = crc
+        if len(stream.recent) > _RECENT:
+            del stream.recent[next(iter(stream.recent))]
+        if highest is not None and sequence < highest:
             self._late[name] += 1
             self.counts["recovered"] += 1
         return True
+
+    def _settle(self, where: Key, boot_id: int, sequence: int) -> None:
+        name = (where, boot_id)
+        if name in self.seen.streams and self.seen.add(where, Identity(boot_id, sequence)):
+            self.settled.append((where, boot_id, sequence, sequence))
 
     def _refuse(self, where: Key | None, reason: str) -> None:
         self.counts["refused"] += 1
@@ -112,31 +254,149 @@ class Intake:
         first_reason, number = self._refused.get(name, Refusals(reason, 0))
         self._refused[name] = Refusals(first_reason, number + 1)
 
+    def _refusals(self, now_ns: int, now_s: float, *, closing: bool) -> list[tuple[Key, Event]]:
+        events: list[tuple[Key, Event]] = []
+        told = self._refused_told_s
+        for name in [name for name, at_s in told.items() if now_s - at_s >= _REFUSALS_PERIOD_S]:
+            del told[name]
+        for name, refusals in list(self._refused.items()):
+            if not closing and (name in told or len(told) >= _MAX_REFUSED_SOURCES):
+                continue
+            realm, vehicle = name
+            told[name] = now_s
+            del self._refused[name]
+            event = Event(
+                EventKind.REFUSED,
+                now_ns,
+                refusals.first_reason,
+                vehicle=vehicle,
+                messages=refusals.number,
+            )
+            events.append((Key(realm, "vehicle", vehicle, ""), event))
+        return events
+
     def _gaps(self, now_ns: int, now_s: float, patience_s: float) -> list[tuple[Key, Event]]:
         events = []
+        missing = 0
         for name, numbers in self.seen.streams.items():
-            holes = numbers.holes()
             since = self._holes.pop(name, {})
-            if not holes:
+            if numbers.runs < 2:
                 continue
-            self._holes[name] = {hole: since.get(hole, now_s) for hole in holes}
-            reported = self._reported.setdefault(name, set())
-            for hole, first_s in self._holes[name].items():
-                if hole in reported or now_s - first_s < patience_s:
+            holes = {hole: _since(since, hole, now_s) for hole in numbers.holes()}
+            self._holes[name] = holes
+            reported = self._reported.setdefault(name, Intervals())
+            for hole, first_s in holes.items():
+                if now_s - first_s < patience_s:
                     continue
-                reported.add(hole)
-                first, last = hole
-                self.counts["lost"] += last - first + 1
-                where, boot_id = name
-                key_, event = _event(
-                    where, boot_id, EventKind.GAP, now_ns, "missing", last - first + 1
+                missing += hole[1] - hole[0] + 1
+                for first, last in reported.missing_of([hole]):
+                    reported.add_range(first, last)
+                    where, boot_id = name
+                    number = last - first + 1
+                    events.append(
+                        _event(where, boot_id, EventKind.GAP, now_ns, "missing", number, first)
+                    )
+        self.counts["missing"] = missing
+        return events
+
+    def _watch_clock(self, where: Key, identity: Identity, stamp: Stamp, now_ns: int) -> None:
+        """Compare a live message's times with those before it, and with when it came."""
+        if stamp.device_time_ns is None or where.realm.startswith(("replay-", "import-")):
+            return
+        truck = (where.realm, where.identifier)
+        stream, highest = self._clock_stream.get(truck, (where.stream, -1))
+        if stream != where.stream and where.stream != "accel":
+            return  # one stream is enough, and accelerations come most often
+        clock = self._clocks.get(truck)
+        if clock is None or stream != where.stream or identity.boot_id > clock.boot_id:
+            clock = self._clocks[truck] = TruckClock(identity.boot_id)
+            highest = -1
+        if identity.boot_id < clock.boot_id or identity.sequence <= highest:
+            return
+        self._clock_stream[truck] = (where.stream, identity.sequence)
+        step_ns = clock.wall_against_device(stamp.wall_time_ns, stamp.device_time_ns)
+        if step_ns:
+            text = f"the truck's wall clock jumped by {step_ns * 1e-9:+.3f} s"
+            event = Event(
+                EventKind.CLOCK_STEP,
+                now_ns,
+                text,
+                vehicle=where.identifier,
+                stream=where.stream,
+                boot_id=identity.boot_id,
+                first_sequence=identity.sequence,
+            )
+            self._due.append((where, event))
+        clock.arrived(stamp.wall_time_ns, now_ns)
+        self._lag_ns = max(self._lag_ns, now_ns - stamp.wall_time_ns)
+
+    def _own_clock(self, now_ns: int, now_s: float) -> list[tuple[Key, Event]]:
+        offset_ns = now_ns - round(now_s * _NS_PER_S)
+        step_ns = clock_step_ns(self._own_clock_ns, offset_ns)
+        self._own_clock_ns = offset_ns
+        if not step_ns:
+            return []
+        for clock in self._clocks.values():
+            clock.forget()
+        text = f"the logger's wall clock jumped by {step_ns * 1e-9:+.3f} s"
+        where = Key(self.realm or "live", "vehicle", "", "")
+        return [(where, Event(EventKind.CLOCK_STEP, now_ns, text))]
+
+    def _drifts(self, now_ns: int, now_s: float) -> list[tuple[Key, Event]]:
+        events = []
+        for (realm, vehicle), clock in self._clocks.items():
+            drift = clock.due(now_s)
+            if drift is not None:
+                ppm = "" if drift.drift_ppm is None else f", {drift.drift_ppm:+.1f} ppm"
+                text = f"the truck's clock is {drift.offset_s:.3f} s behind the logger's{ppm}"
+                event = Event(
+                    EventKind.CLOCK_DRIFT, now_ns, text, vehicle=vehicle, boot_id=clock.boot_id
                 )
-                events.append((key_, event._replace(first_sequence=first, last_sequence=last)))
+                events.append((Key(realm, "vehicle", vehicle, ""), event))
         return events
 
 
+def _check_rate(row: Topic, stream: _Stream, log_time_ns: int, now_ns: int) -> None:
+    """ValueError if a stream comes faster than any sensor, by the clock and by its own times.
+
+    By both: a replay is fast by the clock, a truck whose wall clock stands still by its times.
+    """
+    nominal_hz = row.nominal_rate_hz
+    limit_hz = RATE_FACTOR * nominal_hz if nominal_hz is not None else _RATE_ON_OCCASION_HZ
+    burst = float(max(2 * row.cache, _LEAST_BURST))
+    passed_ns = max(now_ns - stream.arrival_ns, log_time_ns - stream.log_time_ns, 0)
+    tokens = burst if stream.tokens < 0.0 else stream.tokens + passed_ns * 1e-9 * limit_hz
+    stream.arrival_ns = now_ns
+    stream.log_time_ns = max(stream.log_time_ns, log_time_ns)
+    stream.tokens = min(burst, tokens)
+    if stream.tokens < 1.0:
+        raise ValueError(f"{row.owner}/{row.stream}: more than {limit_hz:.0f} messages a second")
+    stream.tokens -= 1.0
+
+
+def _touches(numbers: Intervals, sequence: int) -> bool:
+    return any(n in numbers for n in (sequence, sequence - 1, sequence + 1))
+
+
+def _since(before: dict[tuple[int, int], float], hole: tuple[int, int], now_s: float) -> float:
+    """Return since when a hole has been there, also if it was part of a larger one."""
+    if hole in before:
+        return before[hole]
+    larger = list(before)
+    at = bisect_right(larger, hole[0], key=lambda one: one[0]) - 1
+    if at >= 0 and larger[at][1] >= hole[1]:
+        return before[larger[at]]
+    return now_s
+
+
 def _event(
-    where: Key, boot_id: int, kind: EventKind, now_ns: int, text: str, number: int
+    where: Key,
+    boot_id: int,
+    kind: EventKind,
+    now_ns: int,
+    text: str,
+    number: int,
+    first: int | None = None,
 ) -> tuple[Key, Event]:
     vehicle = where.identifier if where.owner == "vehicle" else ""
     event = Event(
@@ -146,6 +406,8 @@ def _event(
         vehicle=vehicle,
         stream=where.stream,
         boot_id=boot_id,
+        first_sequence=first or 0,
+        last_sequence=0 if first is None else first + number - 1,
         messages=number,
     )
     return where, event

@@ -38,13 +38,18 @@ def make_intake() -> Intake:
     return Intake("live", "logger", 99)
 
 
+def at(now_s: float) -> tuple[int, float]:
+    """Wall clock and monotonic clock, in step."""
+    return NOW_NS + round(now_s * 1e9), now_s
+
+
 def test_a_good_message_is_written_as_it_came() -> None:
     intake = make_intake()
     payload = fix(7)
     message = intake.take(received(7, payload=payload), NOW_NS + 5)
     where = Key("live", "vehicle", "truck-1", "gnss")
     assert message == Message(where, payload, 1, 7, NOW_NS + 7, NOW_NS + 5)
-    assert intake.report(NOW_NS, 0.0) == []
+    assert intake.report(*at(0.0)) == []
 
 
 @pytest.mark.parametrize(
@@ -65,11 +70,11 @@ def test_bad_messages_are_refused_counted_and_reported(bad: Received, reason: st
     assert intake.take(bad, NOW_NS) is None
     assert intake.take(bad, NOW_NS) is None
     assert intake.counts["refused"] == 2
-    [(where, event)] = intake.report(NOW_NS, 0.0)
+    [(where, event)] = intake.report(*at(0.0))
     assert where.realm == "live"
     assert (event.kind, event.messages) == (EventKind.REFUSED, 2)
     assert reason in event.text
-    assert intake.report(NOW_NS, 1.0) == []
+    assert intake.report(*at(1.0)) == []
 
 
 def test_identity_tells_duplicates() -> None:
@@ -91,17 +96,17 @@ def test_a_gap_is_reported_when_it_lasts_and_its_end_too() -> None:
     intake = make_intake()
     for sequence in (10, 11, 15, 16):
         intake.take(received(sequence), NOW_NS)
-    assert intake.report(NOW_NS, 0.0) == []
-    assert intake.report(NOW_NS, GAP_PATIENCE_S - 0.1) == []
-    [(where, gap)] = intake.report(NOW_NS, GAP_PATIENCE_S)
+    assert intake.report(*at(0.0)) == []
+    assert intake.report(*at(GAP_PATIENCE_S - 0.1)) == []
+    [(where, gap)] = intake.report(*at(GAP_PATIENCE_S))
     assert where == Key("live", "vehicle", "truck-1", "gnss")
     assert gap.kind == EventKind.GAP
     assert (gap.first_sequence, gap.last_sequence, gap.messages) == (12, 14, 3)
     assert (gap.vehicle, gap.stream, gap.boot_id) == ("truck-1", "gnss", 1)
-    assert intake.report(NOW_NS, 100.0) == []
+    assert intake.report(*at(100.0)) == []
     for sequence in (12, 13, 14):
         assert intake.take(received(sequence), NOW_NS) is not None
-    [(_, recovered)] = intake.report(NOW_NS, 101.0)
+    [(_, recovered)] = intake.report(*at(101.0))
     assert (recovered.kind, recovered.messages) == (EventKind.RECOVERED, 3)
 
 
@@ -109,7 +114,7 @@ def test_a_gap_at_the_end_is_reported_before_the_file_is_closed() -> None:
     intake = make_intake()
     intake.take(received(0), NOW_NS)
     intake.take(received(2), NOW_NS)
-    [(_, gap)] = intake.report(NOW_NS, 0.0, closing=True)
+    [(_, gap)] = intake.report(*at(0.0), closing=True)
     assert gap.kind == EventKind.GAP
 
 

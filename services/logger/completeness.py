@@ -1,0 +1,163 @@
+"""That nothing is missing and nothing written twice: what is on disk, what trucks still have.
+
+The thread that receives calls `step` and `report`; nothing in them waits.
+"""
+
+import logging
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import zenoh
+from zenoh import handlers
+
+from schemas.topics import Key, parse_key, selector
+from services.common.bus import Received
+from services.common.errors import InputError
+from services.common.recording import read_identities
+from services.logger.intake import Intake
+from services.logger.spool_recovery import SpoolRecovery
+
+__all__ = ["Completeness", "Known", "known_on_disk"]
+
+_log = logging.getLogger(__name__)
+KNOWN_AGE_S = 2 * 86_400.0
+"""Older recordings are not read at the start: what they hold trucks have long been told of."""
+_TRUCKS = 1000
+_TOKENS_WAITING = 1000
+_HISTORY = 60
+"""Reports over which rate and lag are taken; there is one a second."""
+_NOT_OURS = ("replay-", "import-")
+"""Who replays a recording twice wants it twice."""
+
+
+class Known(NamedTuple):
+    """Sequences that stand in a recording of an earlier run."""
+
+    where: Key
+    boot_id: int
+    first: int
+    last: int
+
+
+class Durable(Protocol):
+    """What a writer must be told."""
+
+    def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
+        """Note sequences that need not come: already on disk, or lost for ever."""
+
+    def forget(self, names: Iterable[tuple[Key, int]]) -> None:
+        """Speak of these streams and boots no more."""
+
+    def waiting(self) -> int:
+        """Return how many messages wait to be written."""
+
+
+def known_on_disk(folder: Path, realm: str | None, now_s: float) -> Iterator[Known]:
+    """Yield what trucks' streams have in the recordings below a folder, one file after the other.
+
+    Only of the last two days (`now_s` is the wall clock) and of the realms in which trucks drive.
+    """
+    for path in sorted(folder.glob(f"{realm or '*'}/*/*.mcap")):
+        try:
+            if now_s - path.stat().st_mtime > KNOWN_AGE_S or path.stat().st_size == 0:
+                continue
+            identities = read_identities(path)
+        except (InputError, OSError) as error:
+            _log.warning("%s: not read: %s", path, error)
+            continue
+        for (where, boot_id), numbers in identities.items():
+            if where.owner == "vehicle" and not where.realm.startswith(_NOT_OURS):
+                for first, last in numbers.ranges():
+                    yield Known(where, boot_id, first, last)
+
+
+class Completeness:
+    """What is on disk, what trucks have, and which of them are there."""
+
+    def __init__(
+        self,
+        bus: zenoh.Session,
+        folder: Path | None,
+        realm: str | None,
+        intake: Intake,
+        writer: Durable,
+    ) -> None:
+        """Read what earlier runs left in `folder`; None: this run has a file of its own."""
+        self._intake = intake
+        self._writer = writer
+        if folder is not None:
+            for known in known_on_disk(folder, realm, time.time()):
+                self._on_disk(*known)
+        self._recovery = SpoolRecovery(
+            bus, realm, intake.seen, confirmed=self._on_disk, lost=self._lost
+        )
+        self._alive: dict[tuple[str, str], bool] = {}
+        self._tokens: Any = bus.liveliness().declare_subscriber(
+            selector(realm, "vehicle", "alive"), handlers.FifoChannel(_TOKENS_WAITING), history=True
+        )
+        self._figures: dict[str, float] = {}
+        self._history: deque[tuple[float, int, float]] = deque(maxlen=_HISTORY)
+
+    def step(self, now_s: float, *, hold: bool = False) -> list[Received]:
+        """Return messages that trucks gave again. `hold`: ask for no more of them now."""
+        return self._recovery.step(now_s, hold=hold)
+
+    def report(self, now_s: float) -> None:
+        """Tell the writer what need not come any more, and count."""
+        intake = self._intake
+        for where, boot_id, first, last in intake.settled:
+            self._writer.settle(where, boot_id, first, last, on_disk=False)
+        intake.settled.clear()
+        if intake.forgotten:
+            self._writer.forget(intake.forgotten)
+            intake.forgotten.clear()
+        self._read_tokens()
+        self._figures = self._counted(now_s)
+
+    def figures(self) -> dict[str, float]:
+        """Return what `report` counted last; may be called from another thread."""
+        return self._figures
+
+    def close(self) -> None:
+        """Ask nobody any more."""
+        self._tokens.undeclare()
+
+    def _on_disk(self, where: Key, boot_id: int, first: int, last: int) -> None:
+        if self._intake.adopt(where, boot_id, first, last, time.time_ns()):
+            self._writer.settle(where, boot_id, first, last, on_disk=True)
+
+    def _lost(self, where: Key, boot_id: int, first: int, last: int) -> None:
+        self._intake.lose(where, boot_id, first, last, time.time_ns())
+
+    def _read_tokens(self) -> None:
+        while (sample := self._tokens.try_recv()) is not None:
+            try:
+                where = parse_key(str(sample.key_expr))
+            except ValueError as error:
+                _log.warning("liveliness: %s", error)
+                continue
+            name = (where.realm, where.identifier)
+            if name not in self._alive and len(self._alive) >= _TRUCKS:
+                continue
+            is_here = sample.kind == zenoh.SampleKind.PUT
+            if self._alive.get(name, False) != is_here:
+                _log.info("%s in realm %s %s", name[1], name[0], "came" if is_here else "left")
+            self._alive[name] = is_here
+
+    def _counted(self, now_s: float) -> dict[str, float]:
+        self._history.append((now_s, self._intake.counts["received"], self._intake.lag_s()))
+        (first_s, before, _), (last_s, received, _) = self._history[0], self._history[-1]
+        alive = {f"alive/{vehicle}": float(here) for (_, vehicle), here in self._alive.items()}
+        return (
+            {
+                "rate_per_s": (received - before) / max(1.0, last_s - first_s),
+                "lag_s": max(lag_s for _, _, lag_s in self._history),
+                "to_fetch": float(self._recovery.waiting()),
+                "trucks_alive": sum(alive.values()),
+            }
+            | alive
+            | self._intake.clock_figures()
+        )

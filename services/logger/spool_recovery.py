@@ -1,0 +1,316 @@
+"""Fetches from the trucks' own disks what the bus did not bring.
+
+Every few seconds all trucks are asked what their spools hold (`schemas.spool`). What a logger lacks
+for longer than one such round is asked for, a page at a time, one query per truck and few in all,
+again and again with growing pauses until the truck answers. Only when a truck says that it has no
+more of it, is it lost.
+
+Everything runs in the thread that calls `step`; nothing in it waits.
+"""
+
+import logging
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import zenoh
+from zenoh import handlers
+
+from schemas.signals import decode_identity
+from schemas.spool import (
+    MAX_RANGES,
+    Held,
+    Query,
+    Range,
+    decode_contents,
+    decode_page,
+    parse_spool_key,
+    spool_key,
+    spool_selector,
+)
+from schemas.topics import Key, key
+from services.common.bus import Received, Seen
+from services.common.intervals import Intervals
+
+__all__ = ["Shortfall", "SpoolRecovery", "shortfall"]
+
+_log = logging.getLogger(__name__)
+LIST_PERIOD_S = 5.0
+_LIST_TIMEOUT_S = 4.0
+_PAGE_TIMEOUT_S = 10.0
+_QUERIES_AT_ONCE = 8
+_REPLIES_WAITING = 20_000
+_REPLIES_PER_STEP = 500
+_FIRST_PAUSE_S = 1.0
+_LONGEST_PAUSE_S = 60.0
+_TRUCKS = 1000
+_NEAR = 200
+"""Holes closer to each other than that are asked for at once: few queries rather than few bytes."""
+
+
+class Shortfall(NamedTuple):
+    """What a logger lacks of one stream and boot, by what can be done about it."""
+
+    fetch: list[Range]
+    """The truck has it."""
+    confirmed: list[Range]
+    """It was on a logger's disk before; the truck was told so."""
+    lost: list[Range]
+    """Nobody has it."""
+
+
+def shortfall(boot: Held, seen: Intervals, ripe: int) -> Shortfall:
+    """Compare what came of a stream and boot with what its truck has, below sequence `ripe`."""
+    missing = seen.missing_of([(0, min(ripe, boot.next_sequence) - 1)])
+    durable = Intervals()
+    durable.add_range(0, boot.durable)
+    open_ = durable.missing_of(missing)
+    held = Intervals()
+    for first, last in boot.held:
+        held.add_range(first, last)
+    lost = held.missing_of(open_)
+    return Shortfall(_without(open_, lost), _without(missing, open_), lost)
+
+
+class _Task(NamedTuple):
+    """A query under way."""
+
+    where: Key
+    query: Query
+    handler: Any
+    deadline_s: float
+    got: Intervals
+
+
+@dataclass
+class _Truck:
+    ripe: dict[tuple[str, int], int] = field(default_factory=dict)
+    """Of each stream and boot: below which sequence all is at least one round old."""
+    unlisted: set[tuple[Key, int]] = field(default_factory=set)
+    todo: deque[tuple[Key, Query]] = field(default_factory=deque)
+    task: _Task | None = None
+    failures: int = 0
+    not_before_s: float = 0.0
+
+
+class SpoolRecovery:
+    """What is asked of every truck, and how far that is."""
+
+    def __init__(
+        self,
+        bus: zenoh.Session,
+        realm: str | None,
+        seen: Seen,
+        *,
+        confirmed: Callable[[Key, int, int, int], None],
+        lost: Callable[[Key, int, int, int], None],
+    ) -> None:
+        """`seen` is read only. The callbacks get (stream's key, boot_id, first, last)."""
+        self._bus = bus
+        self._realm = realm
+        self._seen = seen
+        self._confirmed = confirmed
+        self._lost = lost
+        self._trucks: dict[tuple[str, str], _Truck] = {}
+        self._listing: Any = None
+        self._next_list_s = 0.0
+        self._busy = False
+
+    def step(self, now_s: float, *, hold: bool = False) -> list[Received]:
+        """Do what can be done without waiting; return what was fetched. `hold`: no new queries."""
+        if now_s >= self._next_list_s:
+            self._next_list_s = now_s + LIST_PERIOD_S
+            self._ask_all()
+        if self._listing is not None:
+            self._read_listing()
+        if not self._busy:
+            return []
+        received: list[Received] = []
+        running = 0
+        for truck in self._trucks.values():
+            if truck.task is not None:
+                self._read(truck, truck.task, now_s, received)
+            running += truck.task is not None
+        self._busy = running > 0
+        for truck in self._trucks.values():
+            if truck.task is None and truck.todo:
+                self._busy = True
+                if running < _QUERIES_AT_ONCE and not hold and now_s >= truck.not_before_s:
+                    self._ask(truck, now_s)
+                    running += truck.task is not None
+        return received
+
+    def waiting(self) -> int:
+        """Return how many messages trucks are still to be asked for."""
+        return sum(
+            query.last - query.first + 1
+            for truck in self._trucks.values()
+            for _, query in [*truck.todo, *([truck.task[:2]] if truck.task is not None else [])]
+        )
+
+    def _ask_all(self) -> None:
+        try:
+            self._listing = self._bus.get(
+                spool_selector(self._realm),
+                handlers.FifoChannel(_REPLIES_WAITING),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=_LIST_TIMEOUT_S,
+            )
+        except zenoh.ZError as error:  # the session is closing
+            _log.debug("spool query: %s", error)
+
+    def _read_listing(self) -> None:
+        for _ in range(_REPLIES_PER_STEP):
+            try:
+                reply = self._listing.try_recv()
+            except zenoh.ZError:  # all have answered, or the time is over
+                self._listing = None
+                return
+            if reply is None:
+                return
+            if reply.ok is None:
+                continue
+            try:
+                where = parse_spool_key(str(reply.ok.key_expr))
+                boots = decode_contents(reply.ok.payload.to_bytes())
+            except ValueError as error:
+                _log.warning("spool contents: %s", error)
+                continue
+            self._compare(where, boots)
+
+    def _compare(self, where: Key, boots: list[Held]) -> None:
+        name = (where.realm, where.identifier)
+        truck = self._trucks.get(name)
+        if truck is None:
+            if len(self._trucks) >= _TRUCKS:
+                _log.warning("%s: more than %d trucks, its spool is not read", name[1], _TRUCKS)
+                return
+            truck = self._trucks[name] = _Truck()
+        todo = deque(entry for entry in truck.todo if entry[0] != where)
+        ripe = {entry: below for entry, below in truck.ripe.items() if entry[0] != where.stream}
+        newest = max((boot.boot_id for boot in boots), default=0)
+        for boot in boots:
+            entry = (where.stream, boot.boot_id)
+            seen = self._seen.streams.get((where, boot.boot_id), Intervals())
+            # What was sent in this moment may still be on its way; an earlier boot sends nothing.
+            below = truck.ripe.get(entry, 0) if boot.boot_id == newest else boot.next_sequence
+            ripe[entry] = boot.next_sequence
+            missing = shortfall(boot, seen, below)
+            for first, last in missing.confirmed:
+                self._confirmed(where, boot.boot_id, first, last)
+            for first, last in missing.lost:
+                self._lost(where, boot.boot_id, first, last)
+            for first, last in _joined(missing.fetch):
+                if truck.task is None or truck.task[:2] != (where, (boot.boot_id, first, last)):
+                    todo.append((where, Query(boot.boot_id, first, last)))
+        truck.ripe, truck.todo = ripe, deque(list(todo)[:MAX_RANGES])
+        self._busy = self._busy or bool(todo)
+        self._forgotten(truck, where, {boot.boot_id for boot in boots}, newest)
+
+    def _forgotten(self, truck: _Truck, where: Key, listed: set[int], newest: int) -> None:
+        """Give up the holes of earlier boots of which the truck has not spoken for two rounds."""
+        unlisted = {
+            name
+            for name, numbers in self._seen.streams.items()
+            if name[0] == where and name[1] < newest and name[1] not in listed and numbers.runs > 1
+        }
+        for name in unlisted & truck.unlisted:
+            for first, last in self._seen.streams[name].holes():
+                self._lost(*name, first, last)
+        truck.unlisted = {name for name in truck.unlisted if name[0] != where} | unlisted
+
+    def _ask(self, truck: _Truck, now_s: float) -> None:
+        where, query = truck.todo.popleft()
+        seen = self._seen.streams.get((where, query.boot_id), Intervals())
+        missing = seen.missing_of([(query.first, query.last)])
+        if not missing:  # it has come in the meantime
+            return
+        query = query._replace(first=missing[0][0], last=missing[-1][1])
+        try:
+            handler = self._bus.get(
+                f"{spool_key(where)}?{query.parameters()}",
+                handlers.FifoChannel(_REPLIES_WAITING),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=_PAGE_TIMEOUT_S,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA_LOW,  # the reply's, too: what is live goes first
+            )
+        except zenoh.ZError as error:
+            _log.debug("spool query: %s", error)
+            self._pause(truck, now_s)
+            return
+        truck.task = _Task(where, query, handler, now_s + 2 * _PAGE_TIMEOUT_S, Intervals())
+
+    def _read(self, truck: _Truck, task: _Task, now_s: float, received: list[Received]) -> None:
+        for _ in range(_REPLIES_PER_STEP):
+            try:
+                reply = task.handler.try_recv()
+            except zenoh.ZError:  # ended without the closing page
+                self._failed(truck, task, now_s)
+                return
+            if reply is None:
+                if now_s >= task.deadline_s:
+                    self._failed(truck, task, now_s)
+                return
+            if reply.ok is None:
+                continue
+            sample = reply.ok
+            attachment = None if sample.attachment is None else sample.attachment.to_bytes()
+            payload = sample.payload.to_bytes()
+            try:
+                if attachment is None:
+                    self._page_complete(truck, task, decode_page(payload, task.query))
+                    return
+                identity = decode_identity(attachment)
+            except ValueError as error:
+                _log.warning("%s: spool: %s", task.where.identifier, error)
+                continue
+            boot_id, first, last = task.query
+            if identity.boot_id == boot_id and first <= identity.sequence <= last:
+                task.got.add(identity.sequence)
+                seen = self._seen.streams.get((task.where, boot_id))
+                if seen is None or identity.sequence not in seen:
+                    received.append(Received(key(*task.where), payload, attachment, True, True))
+
+    def _page_complete(self, truck: _Truck, task: _Task, next_sequence: int | None) -> None:
+        truck.task = None
+        truck.failures = 0
+        where, (boot_id, first, last) = task.where, task.query
+        if next_sequence is not None:
+            truck.todo.appendleft((where, Query(boot_id, next_sequence, last)))
+            last = next_sequence - 1
+        seen = self._seen.streams.get((where, boot_id), Intervals())
+        # Held by its own account, but not to be read any more: a damaged disk.
+        for gap in task.got.missing_of([(first, last)]):
+            for a, b in seen.missing_of([gap]):
+                self._lost(where, boot_id, a, b)
+
+    def _failed(self, truck: _Truck, task: _Task, now_s: float) -> None:
+        truck.task = None
+        truck.todo.appendleft((task.where, task.query))
+        self._pause(truck, now_s)
+
+    def _pause(self, truck: _Truck, now_s: float) -> None:
+        pause_s = min(_LONGEST_PAUSE_S, _FIRST_PAUSE_S * 2.0**truck.failures)
+        truck.failures = min(truck.failures + 1, 10)
+        truck.not_before_s = now_s + pause_s
+
+
+def _without(ranges: Iterable[Range], others: Iterable[Range]) -> list[Range]:
+    taken = Intervals()
+    for first, last in others:
+        taken.add_range(first, last)
+    return taken.missing_of(ranges)
+
+
+def _joined(ranges: Iterable[Range]) -> list[Range]:
+    joined: list[Range] = []
+    for first, last in ranges:
+        if joined and first - joined[-1][1] <= _NEAR:
+            joined[-1] = (joined[-1][0], last)
+        else:
+            joined.append((first, last))
+    return joined

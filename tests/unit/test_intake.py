@@ -1,0 +1,354 @@
+"""What the logger lets in when clocks step, numbers run wild and strangers flood it."""
+
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.events import Event, EventKind
+from schemas.signals import GnssFix, Identity, encode_gnss, encode_identity
+from schemas.topics import Key
+from services.common.bus import Received
+from services.common.recording import Message, write_recording
+from services.logger import intake as module
+from services.logger.clocks import TruckClock
+from services.logger.completeness import KNOWN_AGE_S, known_on_disk
+from services.logger.intake import GAP_PATIENCE_S, MAX_BOOTS, Intake
+
+NOW_NS = 1_700_000_000_000_000_000
+S = 1_000_000_000
+HOUR_NS, DAY_NS = 3600 * S, 86_400 * S
+GNSS = Key("live", "vehicle", "truck-1", "gnss")
+
+
+def message(
+    sequence: int,
+    *,
+    boot_id: int = 1,
+    vehicle: str = "truck-1",
+    wall_ns: int | None = None,
+    device_ns: int | None = None,
+    speed: float = 10.0,
+    realm: str = "live",
+    **flags: bool,
+) -> Received:
+    device_ns = sequence * S // 10 if device_ns is None else device_ns
+    wall_ns = NOW_NS + device_ns if wall_ns is None else wall_ns
+    fix = GnssFix(boot_id, sequence, device_ns, wall_ns, 50.0, 8.0, 100.0, speed)
+    return Received(
+        f"driveby/v1/{realm}/vehicle/{vehicle}/gnss",
+        encode_gnss(fix),
+        encode_identity(boot_id, sequence),
+        flags.get("recovered", False),
+        flags.get("spooled", False),
+    )
+
+
+def make() -> Intake:
+    return Intake(None, "logger", 99)
+
+
+def at(now_s: float) -> tuple[int, float]:
+    return NOW_NS + round(now_s * S), now_s
+
+
+def kinds(events: list[tuple[Key, Event]]) -> list[EventKind]:
+    return [event.kind for _, event in events]
+
+
+@pytest.mark.parametrize("step_ns", [-HOUR_NS, DAY_NS])
+def test_a_step_of_the_trucks_clock_is_told_and_loses_nothing(step_ns: int) -> None:
+    intake = make()
+    written = []
+    for sequence in range(100):
+        device_ns = sequence * S // 10
+        wall_ns = NOW_NS + device_ns + (step_ns if sequence >= 60 else 0)
+        one = message(sequence, device_ns=device_ns, wall_ns=wall_ns)
+        written.append(intake.take(one, NOW_NS + device_ns))
+    assert [one.sequence for one in written if one is not None] == list(range(100))
+    [(where, event)] = intake.report(*at(10.0))
+    assert where.identifier == event.vehicle == "truck-1"
+    assert event.kind == EventKind.CLOCK_STEP
+    assert (event.first_sequence, event.boot_id) == (60, 1)
+    assert f"{step_ns / S:+.3f} s" in event.text
+
+
+@pytest.mark.parametrize("step_ns", [-HOUR_NS, DAY_NS])
+def test_a_step_of_the_loggers_clock_is_told_once_and_loses_nothing(step_ns: int) -> None:
+    intake = make()
+    events = []
+    for sequence in range(100):
+        now_s = sequence / 10
+        now_ns = NOW_NS + round(now_s * S) + (step_ns if sequence >= 60 else 0)
+        assert intake.take(message(sequence), now_ns) is not None
+        events += intake.report(now_ns, now_s)
+    [(_, event)] = events
+    assert (event.kind, event.vehicle) == (EventKind.CLOCK_STEP, "")
+    assert "the logger's wall clock jumped" in event.text
+
+
+def test_late_and_repeated_messages_are_no_clock_steps() -> None:
+    intake = make()
+    for sequence in (0, 1, 5, 3, 4, 2, 5, 6):
+        intake.take(message(sequence), NOW_NS + sequence * S // 10)
+    intake.take(message(0, boot_id=2, wall_ns=NOW_NS + DAY_NS), NOW_NS + DAY_NS)
+    assert EventKind.CLOCK_STEP not in kinds(intake.report(*at(86_400.0)))
+
+
+def test_small_steps_and_drift_are_no_steps() -> None:
+    clock = TruckClock(1)
+    for second in range(3600):
+        drift_ns = second * 100_000  # 100 ppm
+        assert clock.wall_against_device(NOW_NS + second * S + drift_ns, second * S) == 0
+
+
+def envelope(drift_ppm: float, offset_s: float, minutes: int) -> TruckClock:
+    """A truck whose clock is slow by so much; its messages take 5 to 205 ms, some 3 s."""
+    clock = TruckClock(1)
+    for number in range(minutes * 600 + 1):
+        now_ns = NOW_NS + number * S // 10
+        delay_ns = (
+            5_000_000 + (number * 7919 % 200) * 1_000_000 + (3 * S if number % 50 == 0 else 0)
+        )
+        behind_ns = round(offset_s * S + drift_ppm * 1e-6 * number * S / 10)
+        clock.arrived(now_ns - delay_ns - behind_ns, now_ns)
+    return clock
+
+
+@pytest.mark.parametrize(("drift_ppm", "offset_s"), [(0.0, 0.0), (50.0, 2.0), (-20.0, -100.0)])
+def test_drift_and_offset_are_found_under_delays(drift_ppm: float, offset_s: float) -> None:
+    found = envelope(drift_ppm, offset_s, 20).drift()
+    assert found is not None
+    assert found.drift_ppm == pytest.approx(drift_ppm, abs=1.0)
+    expected_s = offset_s + drift_ppm * 1e-6 * 1050  # in the middle of the last five minutes
+    assert found.offset_s == pytest.approx(expected_s + 0.005, abs=0.005)
+
+
+def test_a_minute_in_which_all_came_late_changes_neither() -> None:
+    clock = envelope(0.0, 1.0, 10)
+    for number in range(600):
+        now_ns = NOW_NS + 600 * S + number * S // 10
+        clock.arrived(now_ns - 31 * S, now_ns)
+    clock.arrived(NOW_NS + 659 * S, NOW_NS + 660 * S)
+    found = clock.drift()
+    assert found is not None
+    assert found.drift_ppm == pytest.approx(0.0, abs=1.0)
+    assert found.offset_s == pytest.approx(1.005, abs=0.005)
+
+
+def test_drift_is_told_when_it_is_known_and_when_it_has_moved() -> None:
+    intake = make()
+    told = []
+    for number in range(40 * 600):
+        now_s = number / 10
+        behind_ns = round(2 * S + 100e-6 * now_s * S)
+        one = message(number, device_ns=number * S // 10, wall_ns=at(now_s)[0] - behind_ns)
+        intake.take(one, at(now_s)[0])
+        if number % 10 == 0:
+            told += intake.report(*at(now_s))
+    assert set(kinds(told)) == {EventKind.CLOCK_DRIFT}
+    assert 3 <= len(told) <= 5  # 60 ms in ten minutes
+    assert told[0][1].text == "the truck's clock is 2.000 s behind the logger's"
+    assert "+100.0 ppm" in told[-1][1].text
+    figures = intake.clock_figures()
+    assert figures["clock_drift_ppm/truck-1"] == pytest.approx(100.0, abs=1.0)
+
+
+def test_a_replays_old_times_say_nothing_of_clocks() -> None:
+    intake = make()
+    for number in range(1000):
+        intake.take(message(number, realm="replay-x"), NOW_NS + DAY_NS + number * S)
+    assert intake.clock_figures() == {}
+
+
+def test_payload_and_attachment_must_agree() -> None:
+    intake = make()
+    forged = message(7)._replace(attachment=encode_identity(1, 8))
+    assert intake.take(forged, NOW_NS) is None
+    [(_, event)] = intake.report(*at(0.0))
+    assert event.kind == EventKind.REFUSED
+    assert "the payload says 1, 7 where its attachment says 1, 8" in event.text
+    assert intake.take(message(8), NOW_NS) is not None
+
+
+def test_a_sequence_that_begins_again_with_other_content_is_refused_not_dropped() -> None:
+    intake = make()
+    assert intake.take(message(3), NOW_NS) is not None
+    assert intake.take(message(3), NOW_NS) is None
+    assert intake.counts == {"received": 2, "accepted": 1, "duplicates": 1}
+    assert intake.take(message(3, speed=11.0), NOW_NS) is None
+    [(_, event)] = intake.report(*at(0.0))
+    assert "sequence 3 again, with another content" in event.text
+
+
+def test_an_impossible_rate_is_refused_but_no_replay_and_no_clock_that_stands_still() -> None:
+    intake = make()
+    flood = [intake.take(message(n, wall_ns=NOW_NS), NOW_NS + n) for n in range(7000)]
+    assert sum(one is not None for one in flood) == 6000
+    [(_, event)] = intake.report(*at(0.0))
+    assert "more than 500 messages a second" in event.text
+    # What we asked a truck for comes as fast as it can.
+    assert intake.take(message(9000, wall_ns=NOW_NS, recovered=True), NOW_NS + 7000) is not None
+    fast = [intake.take(message(n, vehicle="fast"), NOW_NS + n) for n in range(20_000)]
+    assert None not in fast
+    for n in range(20_000):
+        now_ns = NOW_NS + n * S // 10
+        assert intake.take(message(n, vehicle="frozen", wall_ns=NOW_NS), now_ns) is not None
+
+
+def test_a_flood_of_boots_takes_bounded_memory_and_harms_its_own_stream_only() -> None:
+    intake = make()
+    intake.take(message(0, boot_id=1), NOW_NS)
+    for boot_id in range(2, 500):
+        intake.take(message(0, boot_id=boot_id), NOW_NS)
+    assert len(intake.seen.streams) == MAX_BOOTS
+    assert intake.take(message(1, boot_id=1), NOW_NS) is not None
+    assert intake.take(message(0, boot_id=7, vehicle="truck-2"), NOW_NS) is not None
+    # An hour later the boot that was silent longest makes room for a new one.
+    intake.take(message(1, boot_id=3), NOW_NS)
+    later = NOW_NS + HOUR_NS + 1
+    assert intake.take(message(2, boot_id=1), later) is not None
+    assert intake.take(message(0, boot_id=1000), later) is not None
+    assert intake.forgotten == [(GNSS, 2)]
+    assert len(intake.seen.streams) == MAX_BOOTS + 1
+
+
+def test_a_flood_of_vehicles_takes_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_STREAMS", 20)
+    intake = make()
+    for number in range(100):
+        intake.take(message(0, vehicle=f"truck-{number}"), NOW_NS)
+    assert len(intake.seen.streams) == len(intake._streams) == 20
+    assert intake.counts["refused"] == 80
+    for second in range(5):
+        assert len(intake.report(*at(second))) <= module._MAX_REFUSED_SOURCES
+        for number in range(10_000):
+            intake.take(message(0, vehicle=f"v-{number}"), NOW_NS)
+    assert len(intake._refused) <= module._MAX_REFUSED_SOURCES
+    assert len(intake._refused_told_s) <= module._MAX_REFUSED_SOURCES
+
+
+def test_a_flood_of_holes_takes_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_RUNS", 10)
+    intake = make()
+    for sequence in range(0, 200, 2):
+        intake.take(message(sequence), NOW_NS)
+    assert intake.seen.streams[(GNSS, 1)].runs == 10
+    # What fills a hole or goes on is taken as before.
+    assert intake.take(message(3), NOW_NS) is not None
+    assert intake.take(message(19), NOW_NS) is not None
+
+
+def test_refusals_are_told_once_a_minute_and_all_counted() -> None:
+    intake = make()
+    told = []
+    for second in range(200):
+        intake.take(message(1)._replace(attachment=None), NOW_NS)
+        told += intake.report(*at(float(second)))
+    told += intake.report(*at(200.0), closing=True)
+    assert [event.messages for _, event in told] == [1, 60, 60, 60, 19]
+
+
+def test_what_is_lost_is_told_and_no_gap_any_more() -> None:
+    intake = make()
+    for sequence in (0, 1, 8, 9):
+        intake.take(message(sequence), NOW_NS)
+    intake.report(*at(0.0))
+    [(_, gap)] = intake.report(*at(GAP_PATIENCE_S))
+    assert (gap.kind, gap.messages, intake.counts["missing"]) == (EventKind.GAP, 6, 6)
+    intake.take(message(2, recovered=True), NOW_NS)
+    intake.take(message(3, recovered=True), NOW_NS)
+    intake.lose(GNSS, 1, 2, 7, NOW_NS)
+    events = intake.report(*at(20.0))
+    assert sorted(kinds(events)) == [EventKind.LOST, EventKind.RECOVERED]
+    [lost] = [event for _, event in events if event.kind == EventKind.LOST]
+    assert (lost.first_sequence, lost.last_sequence, lost.messages) == (4, 7, 4)
+    assert (intake.counts["missing"], intake.counts["lost"]) == (0, 4)
+    assert intake.settled == [(GNSS, 1, 4, 7)]
+    intake.lose(GNSS, 1, 2, 7, NOW_NS)
+    assert intake.report(*at(21.0)) == []
+
+
+def test_a_bad_message_from_a_spool_is_not_asked_for_for_ever() -> None:
+    intake = make()
+    intake.take(message(0), NOW_NS)
+    bad = message(1)._replace(payload=b"\xff")
+    assert intake.take(bad, NOW_NS) is None
+    assert intake.settled == []  # the truck's own copy may be better
+    assert intake.take(bad._replace(recovered=True, spooled=True), NOW_NS) is None
+    assert intake.settled == [(GNSS, 1, 1, 1)]
+    assert intake.counts["refused"] == 2
+
+
+def test_a_hole_that_shrinks_is_told_once() -> None:
+    intake = make()
+    for sequence in (0, 100):
+        intake.take(message(sequence), NOW_NS)
+    told = intake.report(*at(0.0))
+    for second in range(1, 30):
+        intake.take(message(second, recovered=True), NOW_NS)
+        told += intake.report(*at(float(second)))
+    gaps = [event for _, event in told if event.kind == EventKind.GAP]
+    assert [(gap.first_sequence, gap.last_sequence) for gap in gaps] == [(6, 99)]
+
+
+numbers = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(
+        st.tuples(
+            st.text(max_size=300) | st.sampled_from(["driveby/v1/live/vehicle/truck-1/gnss"]),
+            st.binary(max_size=60) | st.just(message(1).payload),
+            st.none() | st.binary(max_size=20) | st.builds(encode_identity, numbers, numbers),
+            st.booleans(),
+        ),
+        max_size=20,
+    )
+)
+def test_anything_goes_in_and_only_what_is_right_comes_out(
+    received: list[tuple[str, bytes, bytes | None, bool]],
+) -> None:
+    intake = make()
+    for one in received:
+        taken = intake.take(Received(*one, one[3]), NOW_NS)
+        if taken is not None:
+            assert taken.key == GNSS
+            assert Identity(taken.boot_id, taken.sequence) == (1, 1)
+    intake.report(*at(0.0), closing=True)
+
+
+def test_what_is_on_disk_is_known_and_not_written_again(tmp_path: Path) -> None:
+    def recording(realm: str, name: str, sequences: range, boot_id: int = 1) -> Path:
+        path = tmp_path / realm / "2023-11-14" / f"{name}.mcap"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        where = GNSS._replace(realm=realm)
+        made = [message(n, boot_id=boot_id) for n in sequences]
+        messages = [Message(where, one.payload, *one.identity(), NOW_NS, NOW_NS) for one in made]
+        write_recording(path, messages, site_toml=None, reason="test")
+        return path
+
+    recording("live", "truck-1-a", range(10))
+    recording("live", "truck-1-b", range(15, 20))
+    recording("replay-x", "truck-1-c", range(5))
+    broken = recording("sim-a", "truck-1-d", range(5), boot_id=2)
+    broken.write_bytes(broken.read_bytes()[:-100])
+    (tmp_path / "live" / "2023-11-14" / "no.mcap").write_bytes(b"nonsense")
+    now_s = time.time()
+    found = sorted(known_on_disk(tmp_path, None, now_s))
+    assert found == [
+        (GNSS, 1, 0, 9),
+        (GNSS, 1, 15, 19),
+        (GNSS._replace(realm="sim-a"), 2, 0, 4),
+    ]
+    assert list(known_on_disk(tmp_path, "live", now_s)) == found[:2]
+    assert list(known_on_disk(tmp_path, None, now_s + KNOWN_AGE_S + 60)) == []
+    intake = make()
+    for known in found:
+        assert intake.adopt(*known, NOW_NS)
+    assert intake.take(message(9), NOW_NS) is None
+    assert intake.take(message(10), NOW_NS) is not None
+    assert intake.counts["duplicates"] == 1
