@@ -363,9 +363,25 @@ def copied(credentials: Path, target: Path) -> Path:
     return target
 
 
-def test_a_truck_cannot_pose_as_the_router(credentials: Path, endpoint: str) -> None:
+@pytest.mark.faults
+@pytest.mark.parametrize("names_the_host", [False, True])
+def test_a_truck_cannot_pose_as_the_router(
+    credentials: Path,
+    endpoint: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    names_the_host: bool,
+) -> None:
+    """Two things keep it from that: its certificate names no host, and is not one for servers."""
+    copy = copied(credentials, tmp_path / "pose")
+    if names_the_host:
+        real = certs._alternative_names
+        monkeypatch.setattr(
+            certs, "_alternative_names", lambda subject, _: real(subject, certs.LOCAL_HOSTS)
+        )
+        certs_command(folder=copy, renew=["truck-1"])
     victim = credentials / "truck-2"
-    with raw_session(endpoint, credentials / "truck-1", listen=True):
+    with raw_session(endpoint, copy / "truck-1", listen=True):
         assert not opens(endpoint, victim)
         with pytest.raises(FailureError, match="refuses or does not prove a certificate"):
             open_session(connect=endpoint, timeout_s=0.1, tls=victim)
@@ -373,6 +389,7 @@ def test_a_truck_cannot_pose_as_the_router(credentials: Path, endpoint: str) -> 
         assert opens(endpoint, victim)
 
 
+@pytest.mark.faults
 def test_a_router_of_another_name_is_not_believed(
     credentials: Path, endpoint: str, tmp_path: Path
 ) -> None:
@@ -444,6 +461,7 @@ def test_a_router_between_trucks_and_logger_filters_both(credentials: Path, endp
         announcements.close()
 
 
+@pytest.mark.faults
 def test_a_link_ends_when_its_certificate_expires(
     credentials: Path, router: zenoh.Session, endpoint: str, tmp_path: Path
 ) -> None:
