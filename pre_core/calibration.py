@@ -51,8 +51,9 @@ def rank(draws: FloatArray, truth: FloatArray) -> FloatArray:
 def rank_from_quantiles(truth: float, low: float, middle: float, high: float) -> float:
     """The rank of the truth as far as the 2.5, 50 and 97.5 % quantiles tell.
 
-    The normal score is interpolated between them in the logarithm where all is positive (half a
-    logarithm beyond), linearly otherwise: exact for a normal and for a log-normal posterior.
+    The normal score is interpolated between them, and beyond them, linearly in the logarithm where
+    all is positive, linearly otherwise: exact for a log-normal posterior, and for a normal one that
+    reaches below zero. Draws (`rank`) need no such shape.
     """
     values = np.array([low, middle, high, truth])
     if np.all(values > 0.0):

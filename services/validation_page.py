@@ -137,18 +137,21 @@ def _aims(checks: list[Check]) -> str:
     for check in checks:
         measured = "none" if check.measured is None else f"{check.measured:.3g}"
         note = f" ({check.note})" if check.note else ""
-        wanted = (
-            f"≤ {check.high:g}"
-            if check.low == 0.0
-            else f"≥ {check.low:g}"
-            if check.high in (1.0, float("inf")) and check.low < 1.0
-            else f"{check.low:g} to {check.high:g}"
-        )
+        wanted = _wanted(check)
         name = check.name.replace("|", "\\|")
         rows.append(
             f"| {name} | {measured}{note} | {wanted} | {'met' if check.is_met else '**missed**'} |"
         )
     return "\n".join(rows)
+
+
+def _wanted(check: Check) -> str:
+    if check.low == check.high:
+        return f"{check.low:g}"
+    if check.low == 0.0:
+        return f"≤ {check.high:g}"
+    # Shares and p-values end at one anyway.
+    return f"≥ {check.low:g}" if check.high == 1.0 else f"{check.low:g} to {check.high:g}"
 
 
 def _drawn(outcome: Outcome, image: str) -> str:

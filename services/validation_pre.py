@@ -345,7 +345,7 @@ def judged_checks(line: Record) -> list[Check]:
         )
         ratio = max(e["std"] / e["bound"] for e in elements)
     return [
-        Check(f"{name}: largest error over what is allowed", over, 0.0, 1.0),
+        Check(f"{name}: error over what is allowed", over, 0.0, 1.0),
         Check(f"{name}: std over bound", ratio, 0.0, _LARGEST_STD_OVER_BOUND),
         Check(f"{name}: chi2", line["chi2_per_dof"], *_JUDGED_CHI2),
         Check(f"{name}: is good", float(line["verdict"] == "good"), 1.0, 1.0),
