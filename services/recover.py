@@ -3,11 +3,16 @@
 import json
 from pathlib import Path
 
-from services.common.errors import FailureError, InputError
-from services.common.recovery import Recovery, describe, recover_recording, recovered_path
+from services.common.errors import InputError
+from services.common.recovery import (
+    Recovery,
+    describe,
+    put_aside,
+    recover_recording,
+    recovered_path,
+)
 
 EXIT_CLEAN, EXIT_LOSSY = 0, 3
-ASIDE = ".crashed"
 
 
 def recover_command(
@@ -28,20 +33,6 @@ def recover_command(
     plain = f"{target}: {describe(recovery)}"
     line = json.dumps(_as_json(target, recovery)) if as_json else plain
     return EXIT_LOSSY if recovery.is_lossy else EXIT_CLEAN, line
-
-
-def put_aside(source: Path) -> Path:
-    """Rename a damaged recording so that it is none for `*.mcap`; return its new name."""
-    aside = source.with_name(source.name + ASIDE)
-    number = 2
-    while aside.exists():
-        aside = source.with_name(f"{source.name}{ASIDE}-{number}")
-        number += 1
-    try:
-        source.rename(aside)
-    except OSError as error:
-        raise FailureError(f"{source}: cannot be renamed: {error.strerror}") from None
-    return aside
 
 
 def _as_json(target: Path, recovery: Recovery) -> dict[str, object]:

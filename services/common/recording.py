@@ -187,26 +187,33 @@ class RecordingWriter:
         self._disk.sync(self._file.fileno())
         self._file.close()
 
-    def fail(self, reason: str, counts: Mapping[str, int], events: Iterable[Message]) -> None:
+    def fail(self, reason: str, counts: Mapping[str, int], events: Iterable[Message]) -> int | None:
         """Close the file after an OSError, with END and what happened if there is room for that.
 
-        Half a chunk at the end is cut off, and messages not yet in a chunk are given up. Never
-        raises OSError: without END the file is one that crashed, and as readable.
+        Half a chunk at the end is cut off, and messages not yet in a chunk are given up: their
+        number is returned, or None if what was written after the last `sync` may be lost too.
+        Never raises OSError: without END the file is one that crashed, and as readable.
         """
         writer = self._mcap.writer
-        self.messages -= writer.discard()
+        discarded = writer.discard()
+        self.messages -= discarded
         whole = writer.offset
-        with contextlib.suppress(OSError):
+        is_synced = False
+        try:
             self._cut(whole)
-            try:
-                for event in events:
-                    self.messages += 1
-                    _add(self._mcap, event)
-                _end(writer, reason, self.messages, counts, None)
-                self._disk.sync(self._file.fileno())
-            except OSError:
+            for event in events:
+                self.messages += 1
+                _add(self._mcap, event)
+            counts = {**counts, "not_written": discarded}
+            _end(writer, reason, self.messages, counts, None)
+            self._disk.sync(self._file.fileno())
+            is_synced = True
+        except OSError as error:
+            _log.error("%s: not even its end could be written: %s", self.path, error.strerror)
+            with contextlib.suppress(OSError):
                 self._cut(whole)
         self.abandon()
+        return discarded if is_synced else None
 
     def abandon(self) -> None:
         """Close the file as it is: what was synced stays readable."""

@@ -28,6 +28,8 @@ from services.common.recording import (
 )
 
 SUFFIX = ".recovered.mcap"
+ASIDE = ".crashed"
+"""Added to the name of a damaged recording whose place another one has taken."""
 SERVICE = "recover"
 """The service that the event in a recovered recording is from."""
 
@@ -59,6 +61,27 @@ class Recovery(NamedTuple):
 def recovered_path(source: Path) -> Path:
     """Return where a recovered recording is put unless told otherwise."""
     return source.with_name(source.name.removesuffix(".mcap") + SUFFIX)
+
+
+def put_aside(source: Path) -> Path:
+    """Rename a damaged recording so that it is none for `*.mcap`; return its new name."""
+    aside = source.with_name(source.name + ASIDE)
+    number = 2
+    while aside.exists():
+        aside = source.with_name(f"{source.name}{ASIDE}-{number}")
+        number += 1
+    try:
+        source.rename(aside)
+    except OSError as error:
+        raise FailureError(f"{source}: cannot be renamed: {error.strerror}") from None
+    return aside
+
+
+def is_name_taken(path: Path) -> bool:
+    """Whether a recording of that name is there, or one that was recovered or set aside."""
+    return (
+        path.exists() or recovered_path(path).exists() or path.with_name(path.name + ASIDE).exists()
+    )
 
 
 def recover_recording(source: Path, target: Path, time_ns: int | None = None) -> Recovery:

@@ -1,28 +1,31 @@
 """Hosts the router and records everything that the topic table says is logged."""
 
+import contextlib
 import logging
 import os
+import signal
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import zenoh
 
-from schemas.events import Event, EventKind, encode_event
+from schemas.events import Event, EventKind
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
-from schemas.topics import PREFIX, Key, check_identifier, check_realm
+from schemas.topics import PREFIX, check_identifier, check_realm
 from services.common.bus import Publisher, Received, Subscription, open_session
 from services.common.credentials import check_speaks_for
+from services.common.disk import DISK
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, read_text
 from services.common.playback import stopped_by_signals
 from services.common.recording import Message
 from services.logger.intake import Intake
-from services.logger.writer import FileWriter, Place, count_all
+from services.logger.own_events import OwnEvents
+from services.logger.writer import FileWriter, Limits, Place, count_all
 
 __all__ = ["run"]
 
@@ -46,6 +49,7 @@ def run(
     ready: Callable[[], None] | None = None,
     tls: Path | None = None,
     insecure: bool = False,
+    limits: Limits | None = None,
 ) -> int:
     """Record until SIGINT or SIGTERM, then finish the files; return 0, or 1 if anything was lost.
 
@@ -53,25 +57,31 @@ def run(
     `tcp/127.0.0.1:7447`. With `file` everything goes into that one file, else into
     `folder/REALM/DATE/VEHICLE-TIME.mcap`; no file is ever overwritten. `realm` limits the
     recording to one realm. The text of the site file `site` is put into every recording.
-    `tls` and `insecure` are those of `open_session`.
+    `tls` and `insecure` are those of `open_session`; `limits` says when the next file of a truck is
+    begun (SIGUSR1 asks for it at once) and how much room the disk must have.
     `ready` is called once, when messages can be received. A second signal ends the process at
     once; the files stay readable.
 
     InputError: a file that exists or cannot be made, a malformed endpoint, realm or site file.
-    FailureError: the address is in use, or writing failed (disk full).
+    FailureError: the address is in use, the disk has too little room, or writing failed.
     """
+    limits = limits or Limits()
     place = Place(folder, file, _check_realm(realm), _read_site(site))
     _check_service(service_id)
     check_speaks_for(tls, "logger", service_id)
     check_folder_writable(file.parent if file is not None else folder)
+    _check_room(file.parent if file is not None else folder, limits.min_free_bytes)
+    own = OwnEvents(service_id, time.time_ns())
     with (
         stopped_by_signals(on_second=_leave_at_once) as stop,
         open_session(listen=listen, tls=tls, insecure=insecure) as bus,
     ):
-        writer = FileWriter(place)
+        writer = FileWriter(place, limits, own=own)
         try:
-            logger = _Logger(place, service_id, writer, Intake(realm, service_id, time.time_ns()))
-            _record(logger, bus, stop, ready)
+            intake = Intake(realm, service_id, own.boot_id)
+            logger = _Logger(place, service_id, writer, intake, own)
+            with _rotated_by_signal(writer):
+                _record(logger, bus, stop, ready)
         except BaseException:
             writer.finish("logger failed", {})
             raise
@@ -85,6 +95,7 @@ class _Logger(NamedTuple):
     service_id: str
     writer: FileWriter
     intake: Intake
+    own: OwnEvents
 
 
 def _record(
@@ -108,9 +119,6 @@ def _record(
         while time.monotonic() < deadline and (received := subscription.receive()) is not None:
             _take(logger, received)
         _report(logger, announcements, closing=True)
-        if logger.writer.failure is not None:
-            event = Event(EventKind.WRITE_ERROR, time.time_ns(), logger.writer.failure)
-            announcements.event(logger.place.realm or "live", event)
         reason = "stopped by a signal"  # after a write error nothing is written any more
         logger.writer.finish(reason, count_all(logger.intake.counts, logger.writer))
     finally:
@@ -119,6 +127,10 @@ def _record(
 
 
 def _take(logger: _Logger, received: Received) -> None:
+    if not logger.writer.has_room(len(received.payload)):
+        # Not even looked at: what has not been seen can be fetched from the truck later.
+        logger.writer.count_drop(None)
+        return
     message = logger.intake.take(received, time.time_ns())
     if message is not None:
         logger.writer.put(message)
@@ -141,9 +153,8 @@ class _Announcements:
         self._bus = bus
         self._logger = logger
         self._publishers: dict[str, Publisher] = {}
-        self._event_numbers: Counter[str] = Counter()
-        self._boot_id = logger.intake.own_boot_id
-        self._pending: list[tuple[str, bytes, Identity]] = []
+        self._boot_id = logger.own.boot_id
+        self._pending: list[Message] = []
         self._lock = threading.Lock()
         self._drops_told = 0
         self._closing = threading.Event()
@@ -153,13 +164,10 @@ class _Announcements:
     def event(self, realm: str, event: Event) -> None:
         """Write an event to the recording of the vehicle concerned, and publish it."""
         _log.warning("%s: %s %s", event.kind, event.vehicle, event.text)
-        payload = encode_event(event)
-        identity = Identity(self._boot_id, self._event_numbers[realm])
-        self._event_numbers[realm] += 1
-        where = Key(realm, "service", self._logger.service_id, "event")
-        self._logger.writer.put(Message(where, payload, *identity, event.time_ns, event.time_ns))
+        message = self._logger.own.message(realm, event)
+        self._logger.writer.put(message, always=True)
         with self._lock:
-            self._pending.append((realm, payload, identity))
+            self._pending.append(message)
 
     def report_drops(self, now_ns: int) -> None:
         """Write down how many messages found the queue full since the last call."""
@@ -202,9 +210,12 @@ class _Announcements:
     def _publish_events(self) -> None:
         with self._lock:
             pending, self._pending = self._pending, []
-        for realm, payload, identity in pending:
-            name = self._logger.service_id
-            self._publisher(realm).put("service", name, "event", payload, identity)
+        while self._logger.writer.said:
+            pending.append(self._logger.writer.said.popleft())
+        for message in pending:
+            _, owner, name, stream = message.key
+            identity = Identity(message.boot_id, message.sequence)
+            self._publisher(message.key.realm).put(owner, name, stream, message.payload, identity)
 
     def _publish_durable(self) -> int:
         version, by_realm = self._logger.writer.durable()
@@ -217,12 +228,19 @@ class _Announcements:
     def _publish_health(self) -> None:
         writer = self._logger.writer
         figures = count_all(self._logger.intake.counts, writer)
-        figures |= {"queue": writer.waiting(), "written": writer.written}
+        figures |= {
+            "queue": writer.waiting(),
+            "queue_bytes": writer.waiting_bytes(),
+            "written": writer.written,
+            "files": writer.open_files(),
+        }
+        if writer.free_bytes is not None:
+            figures["disk_free_bytes"] = writer.free_bytes
         message = pb.Health(
             schema_version=1,
             time_ns=time.time_ns(),
             service=self._logger.service_id,
-            ok=writer.failure is None and not writer.dropped,
+            ok=writer.failure is None and not writer.dropped and not writer.is_disk_low,
             figures={name: float(value) for name, value in figures.items()},
             note=writer.failure or "",
         )
@@ -254,6 +272,27 @@ def _read_site(site: Path | None) -> str | None:
     text = read_text(site)
     parse_site(text, str(site))
     return text
+
+
+def _check_room(folder: Path, min_free_bytes: int) -> None:
+    free_bytes = DISK.free_bytes(folder)
+    if free_bytes < min_free_bytes:
+        raise FailureError(
+            f"only {free_bytes / 1e6:.0f} MB left on the disk of {folder}, "
+            f"{min_free_bytes / 1e6:.0f} MB are wanted (--min-free)"
+        )
+
+
+@contextlib.contextmanager
+def _rotated_by_signal(writer: FileWriter) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGUSR1, lambda *_: writer.rotate())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGUSR1, before)
 
 
 def _leave_at_once() -> None:

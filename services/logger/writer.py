@@ -1,28 +1,49 @@
-"""The logger's files: a thread that writes and syncs them, behind a bounded, counted queue."""
+"""The logger's files: a thread that writes and syncs them, behind a bounded, counted queue.
 
+A file is closed, with END and the reason, when it is old or large enough, when asked, and when its
+truck has been quiet for long; the next message of that truck begins a new one. Only this thread
+writes, between two messages, so that none is lost or repeated by it.
+"""
+
+import contextlib
 import logging
-import queue
 import threading
 import time
-from collections import Counter
-from collections.abc import Mapping
+from collections import Counter, OrderedDict, deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
+from schemas.events import Event, EventKind
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
-from schemas.signals import Identity
-from schemas.topics import topic
-from services.common.bus import Seen
+from schemas.topics import Key, topic
+from services.common.disk import DISK, Disk
+from services.common.errors import InputError
+from services.common.intervals import Intervals
 from services.common.recording import Message, RecordingWriter
+from services.common.recovery import is_name_taken
+from services.logger.backlog import Backlog
+from services.logger.own_events import OwnEvents
 
 _log = logging.getLogger(__name__)
-QUEUE_MESSAGES = 100_000
 SYNC_PERIOD_S = 0.5
 """Half of what is promised, so that a slow disk does not break the promise."""
 MAX_OPEN_FILES = 256
+QUIET_S = 300.0
+"""A truck that has said nothing for so long gets a new file when it comes back."""
+_SHORTEST_QUIET_S = 10.0
+"""Where too many files are open, the quietest is closed sooner, but no sooner than this."""
+_DISK_CHECK_S = 1.0
+_STOP_SHARE = 0.125
+"""Of the floor of free space: there recording stops, while files can still be closed well."""
+_MAX_DURABLE_STREAMS = 8000
+"""Some 90 bytes each, and the message may have a MiB."""
+_MAX_LATCHED_BYTES = 16 << 20
 _SERVICE_FILE = "_service"  # no vehicle can be called that
+_FileName = tuple[str, str]
 
 
 class Place(NamedTuple):
@@ -34,150 +55,427 @@ class Place(NamedTuple):
     site_toml: str | None
 
 
+class Limits(NamedTuple):
+    """When a file is closed and the next one begun, and how much room is left on the disk."""
+
+    age_s: float = 3600.0
+    bytes: int = 1 << 30
+    min_free_bytes: int = 0
+    """Below it the logger does not start, and says so while it runs; at an eighth it stops."""
+
+
+@dataclass
+class _Open:
+    """A file that is being written."""
+
+    file: RecordingWriter
+    since_s: float
+    last_s: float
+    dropped_before: int
+
+
 class FileWriter:
     """Writes messages in a thread of its own, so that a slow disk does not hold up the bus."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(
+        self,
+        place: Place,
+        limits: Limits = Limits(),  # noqa: B008  # a tuple does not change
+        *,
+        own: OwnEvents | None = None,
+        disk: Disk = DISK,
+        backlog: Backlog | None = None,
+    ) -> None:
         """Open the single file, if one is asked for; InputError if that cannot be done."""
         self.failure: str | None = None
         """Set once when writing failed; nothing is written after that."""
         self.dropped = 0
         """Messages that found the queue full, came after a failure or from one truck too many."""
         self.written = 0
+        self.free_bytes: int | None = None
+        """Room on the disk when it was last looked at."""
+        self.is_disk_low = False
+        """Whether that is less than the limits want."""
+        self.said: deque[Message] = deque()
+        """Events that this thread has written down itself and that are to be published."""
         self._place = place
-        self._files: dict[tuple[str, str], RecordingWriter] = {}
-        if place.file is not None:
-            self._files[("", "")] = self._open(place.file, place.realm, None)
-        self._queue: queue.Queue[Message | None] = queue.Queue(QUEUE_MESSAGES)
-        self._unsynced: list[Message] = []
-        self._durable = Seen()
-        self._durable_lock = threading.Lock()
-        self._durable_version = 0
+        self._limits = limits
+        self._disk = disk
+        self._own = own or OwnEvents("logger", time.time_ns())
+        self._files: dict[_FileName, _Open] = {}
+        self._closed_names: dict[_FileName, str] = {}
+        self._latched: OrderedDict[Key, Message] = OrderedDict()
+        self._latched_bytes = 0
+        self._dropped_of: Counter[_FileName] = Counter()
+        self._drop_lock = threading.Lock()
+        self._rotation_asked = threading.Event()
+        self._backlog = Backlog() if backlog is None else backlog
+        self._unsynced: list[tuple[_FileName, Message]] = []
+        self._durable = _Durable()
         self._end: tuple[str, Mapping[str, int]] = ("", {})
+        if place.file is not None:
+            self._open(("", ""), place.file, "logger started")
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
 
-    def put(self, message: Message) -> bool:
-        """Hand over a message; False (and counted) if the queue is full or writing failed."""
-        if self.failure is None:
-            try:
-                self._queue.put_nowait(message)
-                return True
-            except queue.Full:
-                pass
-        self.dropped += 1
+    def has_room(self, payload_bytes: int) -> bool:
+        """Whether `put` would take a message of that size."""
+        return self.failure is None and self._backlog.has_room(payload_bytes)
+
+    def put(self, message: Message, *, always: bool = False) -> bool:
+        """Hand over a message; False (and counted) if the queue is full or writing failed.
+
+        `always` is for what must be written down because the queue is full.
+        """
+        if self.failure is None and self._backlog.put(message, always=always):
+            return True
+        self.count_drop(message.key)
         return False
+
+    def count_drop(self, where: Key | None) -> None:
+        """Count a message that was not handed over because there was no room for it."""
+        with self._drop_lock:
+            self.dropped += 1
+            if where is not None:
+                self._dropped_of[(where.realm, where.identifier)] += 1
 
     def waiting(self) -> int:
         """Return how many messages wait in the queue."""
-        return self._queue.qsize()
+        return len(self._backlog)
+
+    def waiting_bytes(self) -> int:
+        """Return how much memory they take."""
+        return self._backlog.bytes
+
+    def open_files(self) -> int:
+        """Return how many files are being written."""
+        return len(self._files)
+
+    def rotate(self) -> None:
+        """Ask for all files to be closed; the next message of each truck begins a new one."""
+        self._rotation_asked.set()
+        self._backlog.wake()
 
     def finish(self, reason: str, counts: Mapping[str, int]) -> None:
         """Write what waits, then every file's END with its reason and counts; wait for that."""
         self._end = (reason, counts)
-        self._queue.put(None)
+        self._backlog.close()
         self._thread.join()
+
+    def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
+        """Take numbers of a stream for settled, so that `durable` can pass them.
+
+        `on_disk`: an earlier run has them on disk. Otherwise they are lost or refused for good.
+        """
+        self._durable.settle(where, boot_id, first, last, on_disk=on_disk)
 
     def durable(self) -> tuple[int, dict[str, pb.Durable]]:
         """Return what is on disk as messages by realm, and a number that rises with changes."""
-        with self._durable_lock:
-            by_realm: dict[str, pb.Durable] = {}
-            for (where, boot_id), numbers in self._durable.streams.items():
-                message = by_realm.setdefault(where.realm, pb.Durable(schema_version=1))
-                message.streams.add(
-                    owner=where.owner,
-                    identifier=where.identifier,
-                    stream=where.stream,
-                    boot_id=boot_id,
-                    sequence=numbers.contiguous_from_zero,
-                    count=numbers.size,
-                )
-            return self._durable_version, by_realm
+        return self._durable.messages()
 
     def durable_version(self) -> int:
         """Return the number of `durable` alone, which costs nothing."""
-        return self._durable_version
+        return self._durable.version
 
     def _run(self) -> None:
         try:
             self._write_all()
             reason, counts = self._end
-            for file in self._files.values():
-                file.finish(reason, counts)
+            for name in list(self._files):
+                self._close(name, reason, counts)
+        except _WriteFailed as failed:
+            self._stop(failed.name, f"recording stopped: {failed.reason}", failed.kind)
         except Exception as error:  # whatever it was, it must be told and nobody left waiting
-            reason = getattr(error, "strerror", None) or str(error)
-            self.failure = f"recording stopped: {reason}"
-            self.dropped += len(self._unsynced)
-            _log.error("%s", self.failure)
-            for file in self._files.values():
-                file.abandon()
-            self._discard()
+            _log.exception("writer")
+            self._stop(None, f"recording stopped: {error}", EventKind.WRITE_ERROR)
 
     def _write_all(self) -> None:
-        synced = time.monotonic()
-        while True:
-            try:
-                message = self._queue.get(timeout=SYNC_PERIOD_S / 2)
-            except queue.Empty:
-                pass
-            else:
-                if message is None:
+        synced_s = time.monotonic()
+        looked_s = 0.0
+        while not self._backlog.is_over:
+            message = self._backlog.take(SYNC_PERIOD_S / 2)
+            now_s = time.monotonic()
+            if message is not None:
+                self._write(message, now_s)
+            if self._rotation_asked.is_set():
+                self._rotation_asked.clear()
+                self._rotate_on_request()
+            if now_s - synced_s >= SYNC_PERIOD_S:
+                synced_s = now_s
+                if self._unsynced:
                     self._sync()
-                    return
-                file = self._file_of(message)
-                if file is None:
-                    self.dropped += 1
-                else:
-                    self._unsynced.append(message)
-                    file.write(message)
-            if self._unsynced and time.monotonic() - synced >= SYNC_PERIOD_S:
-                self._sync()
-                synced = time.monotonic()
+                self._close_old(now_s)
+            if now_s - looked_s >= _DISK_CHECK_S:
+                looked_s = now_s
+                self._look_at_disk()
+        self._sync()
+
+    def _write(self, message: Message, now_s: float) -> None:
+        name = self._name_of(message)
+        opened = self._files.get(name) or self._begin(name, message.key, now_s)
+        if opened is None:
+            self.count_drop(message.key)
+            return
+        opened.last_s = now_s
+        self._unsynced.append((name, message))
+        try:
+            opened.file.write(message)
+        except OSError as error:
+            raise _failed(name, error) from error
+        if topic(message.key.owner, message.key.stream).latched:
+            self._remember(message)
+        if self._place.file is None and opened.file.tell() >= self._limits.bytes:
+            self._close(name, "rotated: size")
 
     def _sync(self) -> None:
-        for file in self._files.values():
-            file.sync()
-        with self._durable_lock:
-            for message in self._unsynced:
-                self._durable.add(message.key, Identity(message.boot_id, message.sequence))
-            self.written += len(self._unsynced)
-            self._durable_version += 1
+        for name, opened in self._files.items():
+            with _failing(name):
+                opened.file.sync()
+        self._durable.add(message for _, message in self._unsynced)
+        self.written += len(self._unsynced)
         self._unsynced.clear()
 
-    def _file_of(self, message: Message) -> RecordingWriter | None:
-        """Return the file to write to; None if it would be one more than can be open."""
+    def _name_of(self, message: Message) -> _FileName:
         if self._place.file is not None:
-            return self._files[("", "")]
-        realm, name = message.key.realm, _vehicle_of(message)
-        if message.key.owner != "vehicle" and (realm, name) not in self._files:
-            name = _SERVICE_FILE
-        file = self._files.get((realm, name))
-        if file is None:
-            if len(self._files) >= MAX_OPEN_FILES:
-                _log.error("%s: more than %d vehicles, not recorded", name, MAX_OPEN_FILES)
-                return None
-            file = self._files[(realm, name)] = self._open(
-                _free_path(self._place, realm, name),
-                realm,
-                None if name == _SERVICE_FILE else name,
-            )
-        return file
+            return ("", "")
+        realm, vehicle = message.key.realm, _vehicle_of(message)
+        if message.key.owner != "vehicle" and (realm, vehicle) not in self._files:
+            return (realm, _SERVICE_FILE)
+        return (realm, vehicle)
 
-    def _open(self, path: Path, realm: str | None, vehicle: str | None) -> RecordingWriter:
+    def _begin(self, name: _FileName, where: Key, now_s: float) -> _Open | None:
+        """Open the next file of a truck; None if it would be one more than can be open."""
+        if len(self._files) >= MAX_OPEN_FILES:
+            quietest = min(self._files, key=lambda n: self._files[n].last_s)
+            if now_s - self._files[quietest].last_s < _SHORTEST_QUIET_S:
+                _log.error("%s: more than %d files, not recorded", name[1], MAX_OPEN_FILES)
+                return None
+            self._close(quietest, "quiet, and too many files are open")
+        previous = self._closed_names.get(name)
+        with _failing(name):
+            return self._open(
+                name,
+                _free_path(self._place, *name),
+                "logger started" if previous is None else "rotated",
+                previous,
+                [m for key, m in self._latched.items() if self._belongs(key, name, where)],
+            )
+
+    def _belongs(self, latched: Key, name: _FileName, where: Key) -> bool:
+        if latched == where:  # it comes by itself
+            return False
+        is_vehicle = latched.owner == "vehicle"
+        return latched.realm == name[0] and (
+            latched.identifier == name[1] if is_vehicle else name[1] == _SERVICE_FILE
+        )
+
+    def _open(
+        self,
+        name: _FileName,
+        path: Path,
+        reason: str,
+        previous: str | None = None,
+        latched: list[Message] | None = None,
+    ) -> _Open:
+        realm, vehicle = (self._place.realm, None) if name == ("", "") else name
         writer = RecordingWriter(
             path,
-            reason="logger started",
+            reason=reason,
             realm=realm,
-            vehicle=vehicle,
+            vehicle=None if vehicle == _SERVICE_FILE else vehicle,
             site_toml=self._place.site_toml,
+            previous=previous,
+            latched=latched or (),
+            disk=self._disk,
         )
         _log.info("recording to %s", path)
-        return writer
+        now_s = time.monotonic()
+        opened = self._files[name] = _Open(writer, now_s, now_s, self._dropped_of[name])
+        return opened
 
-    def _discard(self) -> None:
-        """Empty the queue after a failure, counting, until `finish` comes."""
-        while self._queue.get() is not None:
-            self.dropped += 1
+    def _close(self, name: _FileName, reason: str, counts: Mapping[str, int] | None = None) -> None:
+        opened = self._files[name]
+        if counts is None:
+            counts = {"dropped": self._dropped_of[name] - opened.dropped_before}
+        with _failing(name):
+            opened.file.finish(reason, counts)
+        del self._files[name]
+        self._closed_names[name] = opened.file.path.name
+        _log.info("closed %s: %s", opened.file.path, reason)
+
+    def _close_old(self, now_s: float) -> None:
+        if self._place.file is not None:
+            return
+        for name, opened in list(self._files.items()):
+            if now_s - opened.since_s >= self._limits.age_s:
+                self._close(name, "rotated: age")
+            elif name[1] != _SERVICE_FILE and now_s - opened.last_s >= QUIET_S:
+                self._close(name, "the truck is quiet")
+
+    def _rotate_on_request(self) -> None:
+        if self._place.file is not None:
+            _log.warning("%s is the only file asked for and goes on", self._place.file)
+            return
+        for name in list(self._files):
+            self._close(name, "rotated: on request")
+
+    def _remember(self, message: Message) -> None:
+        before = self._latched.pop(message.key, None)
+        self._latched_bytes -= len(before.payload) if before is not None else 0
+        self._latched[message.key] = message
+        self._latched_bytes += len(message.payload)
+        while self._latched_bytes > _MAX_LATCHED_BYTES:
+            _, oldest = self._latched.popitem(last=False)
+            self._latched_bytes -= len(oldest.payload)
+
+    def _look_at_disk(self) -> None:
+        folder = self._place.file.parent if self._place.file is not None else self._place.folder
+        try:
+            self.free_bytes = self._disk.free_bytes(folder)
+        except OSError as error:
+            _log.error("%s: %s", folder, error.strerror)
+            return
+        floor = self._limits.min_free_bytes
+        left = f"{self.free_bytes / 1e6:.0f} MB left on the disk of {folder}"
+        if self.free_bytes < floor * _STOP_SHARE:
+            raise _WriteFailed(None, f"only {left}", EventKind.DISK_LOW)
+        if self.free_bytes < floor and not self.is_disk_low:
+            self._say(Event(EventKind.DISK_LOW, time.time_ns(), left))
+        self.is_disk_low = self.free_bytes < floor
+
+    def _say(self, event: Event) -> None:
+        """Write an event to the file of every realm, and leave it to be published."""
+        _log.warning("%s: %s", event.kind, event.text)
+        realms = {realm for realm, _ in self._files if realm} or {self._place.realm or "live"}
+        for realm in sorted(realms):
+            message = self._own.message(realm, event)
+            self.said.append(message)
+            self._write(message, time.monotonic())
+
+    def _stop(self, failed: _FileName | None, failure: str, kind: EventKind) -> None:
+        """Close every file as well as can be, count what is lost and take nothing any more."""
+        _log.error("%s", failure)
+        event = Event(kind, time.time_ns(), failure)
+        lost: list[Message] = []
+        saved: list[Message] = []
+        for name, opened in self._files.items():
+            message = self._own.message(name[0] or self._place.realm or "live", event)
+            self.said.append(message)
+            mine = [m for n, m in self._unsynced if n == name]
+            number = self._close_badly(name, opened, failure, message, is_failed=name == failed)
+            number = len(mine) if number is None else min(number, len(mine))
+            saved += mine[: len(mine) - number]
+            lost += mine[len(mine) - number :]
+        # What was on its way to a file that could not even be opened.
+        lost += [m for n, m in self._unsynced if n not in self._files]
+        self._durable.add(saved)
+        self.written += len(saved)
+        for dropped in lost:
+            self.count_drop(dropped.key)
+        self._unsynced.clear()
+        self._files.clear()
+        self.failure = failure
+        while not self._backlog.is_over:
+            waited = self._backlog.take(SYNC_PERIOD_S)
+            if waited is not None:
+                self.count_drop(waited.key)
+
+    def _close_badly(
+        self, name: _FileName, opened: _Open, failure: str, event: Message, *, is_failed: bool
+    ) -> int | None:
+        """Close a file with an event; how many messages it lost, None if that is not known."""
+        counts = {"dropped": self._dropped_of[name] - opened.dropped_before}
+        if not is_failed:
+            try:
+                opened.file.write(event)
+                opened.file.finish(failure, counts)
+                return 0
+            except OSError as error:
+                _log.error("%s: %s", opened.file.path, error.strerror)
+        return opened.file.fail(failure, counts, [event])
+
+
+class _WriteFailed(Exception):  # noqa: N818  # says what happened, as OSError does not
+    def __init__(self, name: _FileName | None, reason: str, kind: EventKind) -> None:
+        super().__init__(reason)
+        self.name = name
+        self.reason = reason
+        self.kind = kind
+
+
+@contextlib.contextmanager
+def _failing(name: _FileName) -> Iterator[None]:
+    """Name the file that an error came from."""
+    try:
+        yield
+    except (OSError, InputError) as error:
+        raise _failed(name, error) from error
+
+
+def _failed(name: _FileName, error: OSError | InputError) -> _WriteFailed:
+    reason = getattr(error, "strerror", None) or str(error)
+    return _WriteFailed(name, reason, EventKind.WRITE_ERROR)
+
+
+class _Stream(NamedTuple):
+    stored: Intervals
+    """On disk."""
+    settled: Intervals
+    """On disk, or known to be lost or refused."""
+
+
+class _Durable:
+    """What is on disk by stream and boot; the ones that changed last stand last."""
+
+    def __init__(self) -> None:
+        self.version = 0
+        self._streams: dict[tuple[Key, int], _Stream] = {}
+        self._lock = threading.Lock()
+
+    def add(self, messages: Iterable[Message]) -> None:
+        """Note messages that have been synced."""
+        with self._lock:
+            changed: dict[tuple[Key, int], _Stream] = {}
+            for message in messages:
+                name = (message.key, message.boot_id)
+                stream = changed.get(name)
+                if stream is None:
+                    stream = changed[name] = self._stream(name)
+                stream.stored.add(message.sequence)
+                stream.settled.add(message.sequence)
+            self.version += 1
+
+    def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
+        """See `FileWriter.settle`."""
+        with self._lock:
+            stream = self._stream((where, boot_id))
+            stream.settled.add_range(first, last)
+            if on_disk:
+                stream.stored.add_range(first, last)
+            self.version += 1
+
+    def messages(self) -> tuple[int, dict[str, pb.Durable]]:
+        """See `FileWriter.durable`; of very many streams the ones that changed last."""
+        by_realm: dict[str, pb.Durable] = {}
+        with self._lock:
+            for (where, boot_id), stream in reversed(self._streams.items()):
+                message = by_realm.setdefault(where.realm, pb.Durable(schema_version=1))
+                if len(message.streams) < _MAX_DURABLE_STREAMS:
+                    message.streams.add(
+                        owner=where.owner,
+                        identifier=where.identifier,
+                        stream=where.stream,
+                        boot_id=boot_id,
+                        sequence=stream.settled.contiguous_from_zero,
+                        count=stream.stored.size,
+                    )
+            return self.version, by_realm
+
+    def _stream(self, name: tuple[Key, int]) -> _Stream:
+        """Return a stream and let it stand last."""
+        stream = self._streams.pop(name, None) or _Stream(Intervals(), Intervals())
+        self._streams[name] = stream
+        return stream
 
 
 def _vehicle_of(message: Message) -> str:
@@ -195,7 +493,7 @@ def _free_path(place: Place, realm: str, name: str) -> Path:
     stem = f"{name}-{now:%Y%m%dT%H%M%SZ}"
     path = folder / f"{stem}.mcap"
     number = 2
-    while path.exists():
+    while is_name_taken(path):
         path = folder / f"{stem}-{number}.mcap"
         number += 1
     return path
@@ -203,8 +501,5 @@ def _free_path(place: Place, realm: str, name: str) -> Path:
 
 def count_all(intake: Counter[str], writer: FileWriter) -> dict[str, int]:
     """Return every figure of the logger by name."""
-    figures = {
-        name: intake[name]
-        for name in ("received", "accepted", "refused", "duplicates", "recovered", "lost")
-    }
-    return figures | {"dropped": writer.dropped}
+    names = ("received", "accepted", "refused", "duplicates", "recovered", "lost", "missing")
+    return {name: intake[name] for name in names} | {"dropped": writer.dropped}

@@ -13,8 +13,10 @@ from schemas.signals import GnssFix, encode_gnss, encode_identity
 from schemas.topics import Key
 from services import logger
 from services.common.bus import Received
+from services.common.disk import DISK
 from services.common.errors import InputError
 from services.common.recording import Message, RecordingWriter, read_info, read_messages
+from services.logger.backlog import Backlog
 from services.logger.intake import GAP_PATIENCE_S, Intake
 from services.logger.writer import FileWriter, Place
 
@@ -202,9 +204,8 @@ def test_a_full_queue_is_counted_and_holds_nobody_up(
         go.wait(5)
         real(self, message)
 
-    monkeypatch.setattr("services.logger.writer.QUEUE_MESSAGES", 10)
     monkeypatch.setattr(RecordingWriter, "write", slow)
-    writer = FileWriter(place(tmp_path, tmp_path / "a.mcap"))
+    writer = FileWriter(place(tmp_path, tmp_path / "a.mcap"), backlog=Backlog(10))
     began = time.monotonic()
     taken = [writer.put(message) for message in messages(20)]
     assert time.monotonic() - began < 1.0
@@ -215,26 +216,27 @@ def test_a_full_queue_is_counted_and_holds_nobody_up(
     assert len(list(read_messages(tmp_path / "a.mcap"))) == sum(taken)
 
 
-def test_a_write_error_is_told_and_what_was_synced_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = FileWriter(place(tmp_path, tmp_path / "a.mcap"))
+def test_a_write_error_is_told_and_what_was_synced_stays(tmp_path: Path) -> None:
+    is_full = False
+
+    def sync(descriptor: int) -> None:
+        if is_full:
+            raise OSError(28, "No space left on device")
+        DISK.sync(descriptor)
+
+    writer = FileWriter(place(tmp_path, tmp_path / "a.mcap"), disk=DISK._replace(sync=sync))
     sent = messages(6)
     for message in sent[:3]:
         writer.put(message)
     wait_for(lambda: writer.durable_version() == 1)
-
-    def full(self: RecordingWriter, message: Message) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(RecordingWriter, "write", full)
+    is_full = True
     writer.put(sent[3])
     wait_for(lambda: writer.failure is not None)
     assert writer.failure == "recording stopped: No space left on device"
     assert not writer.put(sent[4])
     assert writer.dropped == 2
     writer.finish("done", {})
-    assert list(read_messages(tmp_path / "a.mcap")) == sent[:3]
+    assert list(read_messages(tmp_path / "a.mcap"))[:3] == sent[:3]
     [stream] = writer.durable()[1]["live"].streams
     assert stream.count == 3
 
