@@ -480,3 +480,23 @@ def test_a_link_ends_when_its_certificate_expires(
         assert not list(session.info.routers_zid())
     with raw_session(endpoint, credentials / "truck-1") as session:
         assert len(list(session.info.routers_zid())) == 1
+
+
+def test_noise_at_the_port_does_not_disturb_those_who_are_connected(
+    credentials: Path, router: zenoh.Session, endpoint: str
+) -> None:
+    """Whoever comes anew waits, for Zenoh rests a moment after each handshake that fails."""
+    heard = listen_to(router, [ACCEL])
+    host, port = endpoint.removeprefix("tls/").split(":")
+    failing = 20
+    with raw_session(endpoint, credentials / "truck-1") as truck:
+        for _ in range(failing):
+            with socket.create_connection((host, int(port))) as stranger:
+                stranger.sendall(b"\x16\x03\x01 no handshake" * 100)
+            put_all(truck, [ACCEL] * 5)
+        assert len(heard) == 5 * failing
+        began = time.monotonic()
+        with raw_session(endpoint, credentials / "truck-2", timeout_s=60.0) as late:
+            put_all(late, [f"{V1}/live/vehicle/truck-2/accel"])
+        delay_s = time.monotonic() - began
+    print(f"{failing} handshakes that failed held up the next connection by {delay_s:.1f} s")
