@@ -97,22 +97,22 @@ def pile_up(values: FloatArray, bins: int = 100) -> Rail:
 
 
 def spikes(values: FloatArray, height: float = 20.0) -> int:
-    """Number of single samples (n,) that stand out of their neighbours.
+    """Number of single samples (n,) that stand out of neighbours which go on smoothly without them.
 
-    A sample's distance from the cubic through its four neighbours, over the typical such distance
-    within a quarter of a second to either side.
+    A sample's distance from the cubic through its four nearest neighbours counts if it is more than
+    `height` times the typical one, and if the two nearest lie within a seventh of it of the cubic
+    through the others: a kink or a step of the signal, as an impact makes, is no single sample.
     """
     if values.size < 9:
         return 0
-    distance = np.abs(
-        values[2:-2] - (4.0 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6.0
-    )
+    x = values
+    centre = x[3:-3]
+    distance = np.abs(centre - (4.0 * (x[2:-4] + x[4:-2]) - x[1:-5] - x[5:-1]) / 6.0)
+    before = np.abs(x[2:-4] - (-0.3 * x[:-6] + x[1:-5] + 0.5 * x[4:-2] - 0.2 * x[5:-1]))
+    after = np.abs(x[4:-2] - (-0.3 * x[6:] + x[5:-1] + 0.5 * x[2:-4] - 0.2 * x[1:-5]))
     typical = np.median(distance)
-    if not typical > 0.0:
-        return 0
-    out = np.flatnonzero(distance > height * typical)
-    # One disturbed sample disturbs the distances of its neighbours.
-    return int(np.count_nonzero(np.diff(out, prepend=-10) > 3))
+    alone = np.maximum(before, after) < distance / 7.0
+    return int(np.count_nonzero((distance > height * typical) & alone)) if typical > 0.0 else 0
 
 
 class Pairing(NamedTuple):
