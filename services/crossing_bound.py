@@ -43,25 +43,8 @@ class Bound(NamedTuple):
 
 def bound_at_truth(seen: Seen, drawn: Drawn) -> dict[str, dict[str, float]]:
     """The bounds of a drawn crossing as JSON."""
-    problem, y = _problem(seen)
-    where = posterior.layout(problem)
-    errors = drawn.truth.channels
-    correction = 1.0 / ((1.0 + errors.common_gain) * (1.0 + errors.gain)) - 1.0
-    theta = equivalent_theta(
-        true_values(drawn.truth),
-        _elements(problem),
-        drawn.site.vehicles[0].total_mass_kg / total_mass_kg(drawn.truth.car),
-        _set_gains(problem, y, correction),
-    )
-    _set_theta(problem, y, theta, drawn.truth.car.wheelbase_m)
-    y[where.delays] = drawn.truth.channels.delay_s / problem.priors.delay_spread_s
-    true_m = np.interp(
-        _sample_times(seen) + seen.data.wall_offset_s,
-        drawn.start_s + drawn.step_s * np.arange(drawn.motion.position_m.size),
-        drawn.motion.position_m,
-    )
-    y[where.trajectory] = np.linalg.lstsq(problem.basis_position, true_m, rcond=None)[0]
-    return as_json(_bound_near(seen, problem, y))
+    problem, y = at_truth(seen, drawn)
+    return as_json(bound_of(problem, y, unseen_spread(seen, problem)))
 
 
 def bound_at(
@@ -72,7 +55,7 @@ def bound_at(
     `values` are by the names of docs/contract.md; the trajectory is the receiver's, moved so that
     the front axle enters the bridge at `entry_time` (s since 1970).
     """
-    problem, y = _problem(seen)
+    problem, y = problem_of(seen)
     where = posterior.layout(problem)
     names = parameters.names(_elements(problem))
     theta = np.array([values[name] for name in names])
@@ -84,11 +67,35 @@ def bound_at(
     )
     begin_m = 0.0 if seen.data.stay.direction > 0 else seen.data.bridge.span_m
     y[where.trajectory] += begin_m - entry_m
-    return as_json(_bound_near(seen, problem, y))
+    problem, y = _settled(problem, y)
+    return as_json(bound_of(problem, y, unseen_spread(seen, problem)))
 
 
-def _bound_near(seen: Seen, problem: posterior.Problem, y: Floats) -> Bound:
-    """The bound with truck and bridge as they are in y, and the nuisances that fit best there.
+def at_truth(seen: Seen, drawn: Drawn) -> tuple[posterior.Problem, Floats]:
+    """The posterior of a drawn crossing, and the truth in its coordinates (see `_settled`)."""
+    problem, y = problem_of(seen)
+    where = posterior.layout(problem)
+    errors = drawn.truth.channels
+    correction = 1.0 / ((1.0 + errors.common_gain) * (1.0 + errors.gain)) - 1.0
+    theta = equivalent_theta(
+        true_values(drawn.truth),
+        _elements(problem),
+        drawn.site.vehicles[0].total_mass_kg / total_mass_kg(drawn.truth.car),
+        _set_gains(problem, y, correction),
+    )
+    _set_theta(problem, y, theta, drawn.truth.car.wheelbase_m)
+    y[where.delays] = errors.delay_s / problem.priors.delay_spread_s
+    true_m = np.interp(
+        _sample_times(seen) + seen.data.wall_offset_s,
+        drawn.start_s + drawn.step_s * np.arange(drawn.motion.position_m.size),
+        drawn.motion.position_m,
+    )
+    y[where.trajectory] = np.linalg.lstsq(problem.basis_position, true_m, rcond=None)[0]
+    return _settled(problem, y)
+
+
+def _settled(problem: posterior.Problem, y: Floats) -> tuple[posterior.Problem, Floats]:
+    """Truck and bridge as they are in y, with the noise of this truck and the best nuisances.
 
     Initial states are known of no truth, and a common delay of all channels is nearly the same as
     a shift along the road.
@@ -96,8 +103,7 @@ def _bound_near(seen: Seen, problem: posterior.Problem, y: Floats) -> Bound:
     where = posterior.layout(problem)
     y[where.offset] = _best_offset(problem, y)
     problem = pre.with_noise_at(problem, y)
-    y = settle(problem, y, np.arange(where.gains.start, where.size))
-    return bound_of(problem, y, unseen_spread(seen, problem))
+    return problem, settle(problem, y, np.arange(where.gains.start, where.size))
 
 
 def as_json(bound: Bound) -> dict[str, dict[str, float]]:
@@ -122,10 +128,12 @@ def unseen_spread(seen: Seen, problem: posterior.Problem) -> float:
     return float(np.hypot(seen.data.vehicle.spread("total_mass_kg"), gain))
 
 
-def bound_of(problem: posterior.Problem, y: Floats, scale_error: float) -> Bound:
+def bound_of(
+    problem: posterior.Problem, y: Floats, scale_error: float, step: float = _STEP
+) -> Bound:
     """The bound at y (size,); `scale_error` is that of `unseen_spread`."""
     where = posterior.layout(problem)
-    jacobian = central_jacobian(problem, y, np.arange(where.size))
+    jacobian = central_jacobian(problem, y, np.arange(where.size), step)
     covariance = posterior.covariance(posterior.precision_root(jacobian))
     springs = np.arange(where.theta.stop - int(problem.estimated[-2:].sum()), where.theta.stop)
     for spring in springs:
@@ -204,7 +212,7 @@ def _sample_times(seen: Seen) -> Floats:
     return np.asarray(samples.start_s + np.arange(count) / samples.rate_hz)
 
 
-def _problem(seen: Seen) -> tuple[posterior.Problem, Floats]:
+def problem_of(seen: Seen) -> tuple[posterior.Problem, Floats]:
     """The posterior as the method sets it up for this crossing, and its nominal start."""
     samples = seen.data.samples
     assert samples is not None  # noqa: S101 - the crossing was identified

@@ -1,0 +1,102 @@
+"""The Cramér-Rao bound of a crossing at its truth: it belongs to a model that is right there."""
+
+import numpy as np
+import pytest
+
+from pre_core import posterior
+from schemas.reasons import Reason
+from schemas.results import Crossing
+from schemas.settings import IdentificationSettings
+from services import drawn_crossings
+from services.crossing_bound import at_truth, bound_at, bound_at_truth, bound_of, settle
+from services.drawn_crossings import Drawn, Seen, default_site, draw_truth, drive, see, true_values
+from services.worker.crossing_data import CrossingData, Passing, rejected
+
+SITE = default_site()
+SETTINGS = IdentificationSettings(method="pre", threads=1)
+SEED = 29
+
+
+def _not_identified(
+    data: CrossingData, settings: IdentificationSettings, **others: object
+) -> Crossing:
+    return rejected(data, settings, Passing(0.0, 1.0, 1.0), [Reason.FAILED])
+
+
+def plain_drive(noise_ug: float = 40.0, **conditions: float) -> Drawn:
+    """A steady crossing whose sensors have noise, but neither gain nor delay; true total mass."""
+    truth = draw_truth(SITE, SEED)
+    zero = np.zeros(4)
+    errors = truth.channels._replace(common_gain=0.0, gain=zero, delay_s=zero)
+    how = truth.conditions._replace(
+        rate_hz=1000.0,
+        noise_ug_per_rthz=noise_ug,
+        change_m_per_s=0.0,
+        speed_m_per_s=15.0,
+        **conditions,
+    )
+    mass = SITE.vehicles[0].total_mass_kg
+    car = truth.car._replace(body_mass_kg=mass - sum(truth.car.unsprung_mass_kg))
+    return drive(SITE, truth._replace(car=car, channels=errors, conditions=how), SEED)
+
+
+def data_of(drawn: Drawn, monkeypatch: pytest.MonkeyPatch) -> Seen:
+    monkeypatch.setattr(drawn_crossings, "identify", _not_identified)
+    (seen,) = see([drawn.run], drawn.site, SETTINGS)
+    return seen
+
+
+def test_the_model_is_right_at_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No search has been there: a generator or a model that were wrong would show here."""
+    drawn = plain_drive()
+    found = bound_at_truth(data_of(drawn, monkeypatch), drawn)
+    assert 0.9 < found["at_truth"]["chi2_per_dof"] < 1.08
+    rigidities = [found["std"][f"EI_{e + 1}"] for e in range(7)]
+    assert 0.01 < min(rigidities) < max(rigidities) < 0.4
+    # With the scale error every one is wider, by as much as the total mass says at least.
+    for e in range(7):
+        name = f"EI_{e + 1}"
+        assert found["std"][name] ** 2 - found["std_without_scale"][name] ** 2 > 0.99 * 0.01**2
+
+
+def test_the_bound_grows_with_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    quiet, loud = (
+        bound_at_truth(data_of(drawn, monkeypatch), drawn)["std_without_scale"]
+        for drawn in (plain_drive(25.0), plain_drive(50.0))
+    )
+    # The third element is known by the data: its bound is nearly proportional to their noise.
+    assert loud["EI_3"] / quiet["EI_3"] == pytest.approx(2.0, rel=0.15)
+
+
+def test_a_truth_known_by_its_entry_gives_the_same_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = plain_drive()
+    seen = data_of(drawn, monkeypatch)
+    full = bound_at_truth(seen, drawn)
+    near = 0.0 if drawn.truth.conditions.forward else SITE.bridges[0].span_m
+    entry = drawn.start_s + drawn.step_s * np.argmin(np.abs(drawn.motion.position_m - near))
+    part = bound_at(seen, true_values(drawn.truth), drawn.truth.car.wheelbase_m, float(entry))
+    assert part["at_truth"]["chi2_per_dof"] == pytest.approx(
+        full["at_truth"]["chi2_per_dof"], abs=0.01
+    )
+    for e in range(7):
+        name = f"EI_{e + 1}"
+        assert part["std"][name] == pytest.approx(full["std"][name], rel=0.03)
+
+
+def test_differences_are_fine_enough_and_nuisances_settle(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = plain_drive()
+    problem, y = at_truth(data_of(drawn, monkeypatch), drawn)
+    where = posterior.layout(problem)
+    nuisances = np.arange(where.gains.start, where.size)
+    moved = y.copy()
+    moved[where.delays] += [2.0, -2.0, 1.0, -1.0]  # of 0.5 ms
+    moved[where.gains] += 1.0
+    settled = settle(problem, moved, nuisances)
+    np.testing.assert_array_equal(settled[: nuisances[0]], y[: nuisances[0]])
+    rows = posterior.all_rows(problem, np.stack([y, moved, settled]))
+    squares = np.sum(rows * rows, axis=1)
+    assert squares[1] > squares[0] + 100.0
+    assert squares[2] == pytest.approx(squares[0], abs=0.1)
+    coarse, fine = (bound_of(problem, y, 0.0, step=step).std for step in (1e-4, 5e-5))
+    for name, value in fine.items():
+        assert coarse[name] == pytest.approx(value, rel=1e-4), name
