@@ -187,6 +187,7 @@ def _certs(options: argparse.Namespace) -> int:
 
 def _logger(options: argparse.Namespace) -> int:
     from services import logger
+    from services.logger.writer import Limits
 
     listen = options.listen or _default_endpoint(options)
     return logger.run(
@@ -199,6 +200,12 @@ def _logger(options: argparse.Namespace) -> int:
         ready=lambda: print(f"ready, listening at {listen}", flush=True),
         tls=options.tls,
         insecure=options.insecure,
+        limits=Limits(
+            age_s=options.rotate_minutes * 60.0,
+            bytes=round(options.rotate_mb * 1e6),
+            min_free_bytes=round(options.min_free * 1e6),
+        ),
+        budget_bytes=None if options.budget is None else round(options.budget * 1e6),
     )
 
 
@@ -476,6 +483,35 @@ def _add_live(commands: Any) -> None:
     p.add_argument("--realm", help="record this realm only (default: all)")
     _add_site(p, "site file to store in the recordings")
     _add_id(p, "logger")
+    room = p.add_argument_group("files and room")
+    room.add_argument(
+        "--rotate-minutes",
+        type=_number("minutes", low=0.01, high=1e6),
+        default=60.0,
+        metavar="MIN",
+        help="begin a truck's next file after so long (default: 60; SIGUSR1: at once)",
+    )
+    room.add_argument(
+        "--rotate-mb",
+        type=_number("a size in MB", low=0.1, high=1e6),
+        default=1000.0,
+        metavar="MB",
+        help="or when it is so large (default: 1000)",
+    )
+    room.add_argument(
+        "--min-free",
+        type=_number("a size in MB", low=0, high=1e9),
+        default=500.0,
+        metavar="MB",
+        help="room the disk must have; at an eighth of it recording ends (default: 500)",
+    )
+    room.add_argument(
+        "--budget",
+        type=_number("a size in MB", low=1, high=1e9),
+        metavar="MB",
+        help="delete the oldest recordings beyond it, if all of their crossings are identified "
+        "(default: delete nothing)",
+    )
 
     p = _command(
         commands,

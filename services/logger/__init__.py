@@ -23,6 +23,8 @@ from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, read_text
 from services.common.playback import stopped_by_signals
 from services.common.recording import Message
+from services.logger.completeness import Completeness
+from services.logger.housekeeping import House, Housekeeping
 from services.logger.intake import Intake
 from services.logger.own_events import OwnEvents
 from services.logger.writer import FileWriter, Limits, Place, count_all
@@ -34,6 +36,8 @@ _ANNOUNCE_PERIOD_S = 0.1
 _REPORT_PERIOD_S = 1.0
 _HEALTH_PERIOD_S = 60.0
 _DRAIN_S = 3.0
+_FETCH_ROOM = 32 << 20
+"""With less room in the writer's queue, bytes, trucks are not asked for what is missing."""
 _GOODBYE_S = 0.2
 _EXIT_AT_ONCE = 130
 
@@ -50,6 +54,7 @@ def run(
     tls: Path | None = None,
     insecure: bool = False,
     limits: Limits | None = None,
+    budget_bytes: int | None = None,
 ) -> int:
     """Record until SIGINT or SIGTERM, then finish the files; return 0, or 1 if anything was lost.
 
@@ -58,7 +63,9 @@ def run(
     `folder/REALM/DATE/VEHICLE-TIME.mcap`; no file is ever overwritten. `realm` limits the
     recording to one realm. The text of the site file `site` is put into every recording.
     `tls` and `insecure` are those of `open_session`; `limits` says when the next file of a truck is
-    begun (SIGUSR1 asks for it at once) and how much room the disk must have.
+    begun (SIGUSR1 asks for it at once) and how much room the disk must have. Recordings that an
+    earlier run left without END are recovered meanwhile; with `budget_bytes` the oldest ones are
+    deleted whose crossings have been identified.
     `ready` is called once, when messages can be received. A second signal ends the process at
     once; the files stay readable.
 
@@ -66,6 +73,8 @@ def run(
     FailureError: the address is in use, the disk has too little room, or writing failed.
     """
     limits = limits or Limits()
+    if file is not None and budget_bytes is not None:
+        raise InputError("--budget needs a folder of recordings, not --file")
     place = Place(folder, file, _check_realm(realm), _read_site(site))
     _check_service(service_id)
     check_speaks_for(tls, "logger", service_id)
@@ -81,7 +90,7 @@ def run(
             intake = Intake(realm, service_id, own.boot_id)
             logger = _Logger(place, service_id, writer, intake, own)
             with _rotated_by_signal(writer):
-                _record(logger, bus, stop, ready)
+                _record(logger, bus, stop, ready, budget_bytes)
         except BaseException:
             writer.finish("logger failed", {})
             raise
@@ -99,9 +108,24 @@ class _Logger(NamedTuple):
 
 
 def _record(
-    logger: _Logger, bus: zenoh.Session, stop: threading.Event, ready: Callable[[], None] | None
+    logger: _Logger,
+    bus: zenoh.Session,
+    stop: threading.Event,
+    ready: Callable[[], None] | None,
+    budget_bytes: int | None,
 ) -> None:
-    announcements = _Announcements(bus, logger)
+    place = logger.place
+    folder = place.folder if place.file is None else None
+    completeness = Completeness(bus, folder, place.realm, logger.intake, logger.writer)
+    announcements = _Announcements(bus, logger, completeness)
+    house = House(
+        place.folder,
+        place.realm,
+        logger.writer.limits.min_free_bytes,
+        budget_bytes,
+        announcements.event,
+    )
+    housekeeping = Housekeeping(house) if folder is not None else None
     subscription = Subscription(bus, f"{PREFIX}/{logger.place.realm or '*'}/**")
     try:
         if ready is not None:
@@ -111,9 +135,15 @@ def _record(
             received = subscription.receive(_ANNOUNCE_PERIOD_S)
             if received is not None:
                 _take(logger, received)
-            if time.monotonic() >= next_report_s:
-                next_report_s = time.monotonic() + _REPORT_PERIOD_S
+            now_s = time.monotonic()
+            for fetched in completeness.step(now_s, hold=not logger.writer.has_room(_FETCH_ROOM)):
+                _take(logger, fetched)
+            if now_s >= next_report_s:
+                next_report_s = now_s + _REPORT_PERIOD_S
+                completeness.report(now_s)
                 _report(logger, announcements, closing=False)
+        if housekeeping is not None:
+            housekeeping.close()
         subscription.close()
         deadline = time.monotonic() + _DRAIN_S
         while time.monotonic() < deadline and (received := subscription.receive()) is not None:
@@ -122,6 +152,9 @@ def _record(
         reason = "stopped by a signal"  # after a write error nothing is written any more
         logger.writer.finish(reason, count_all(logger.intake.counts, logger.writer))
     finally:
+        if housekeeping is not None:
+            housekeeping.close()
+        completeness.close()
         subscription.close()
         announcements.close()
 
@@ -149,8 +182,9 @@ class _Announcements:
     A put to a congested connection blocks, which must hold up neither receiving nor writing.
     """
 
-    def __init__(self, bus: zenoh.Session, logger: _Logger) -> None:
+    def __init__(self, bus: zenoh.Session, logger: _Logger, completeness: Completeness) -> None:
         self._bus = bus
+        self._completeness = completeness
         self._logger = logger
         self._publishers: dict[str, Publisher] = {}
         self._boot_id = logger.own.boot_id
@@ -227,7 +261,7 @@ class _Announcements:
 
     def _publish_health(self) -> None:
         writer = self._logger.writer
-        figures = count_all(self._logger.intake.counts, writer)
+        figures: dict[str, float] = dict(count_all(self._logger.intake.counts, writer))
         figures |= {
             "queue": writer.waiting(),
             "queue_bytes": writer.waiting_bytes(),
@@ -236,6 +270,7 @@ class _Announcements:
         }
         if writer.free_bytes is not None:
             figures["disk_free_bytes"] = writer.free_bytes
+        figures |= self._completeness.figures()
         message = pb.Health(
             schema_version=1,
             time_ns=time.time_ns(),
@@ -247,7 +282,7 @@ class _Announcements:
         realm = self._logger.place.realm or "live"
         payload = message.SerializeToString(deterministic=True)
         self._publisher(realm).put("service", self._logger.service_id, "health", payload)
-        _log.info("%s", ", ".join(f"{name} {value}" for name, value in figures.items()))
+        _log.info("%s", ", ".join(f"{name} {value:.15g}" for name, value in figures.items()))
 
 
 def _check_realm(realm: str | None) -> str | None:

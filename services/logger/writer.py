@@ -99,7 +99,7 @@ class FileWriter:
         self.said: deque[Message] = deque()
         """Events that this thread has written down itself and that are to be published."""
         self._place = place
-        self._limits = limits
+        self.limits = limits
         self._disk = disk
         self._own = own or OwnEvents("logger", time.time_ns())
         self._files: dict[_FileName, _Open] = {}
@@ -169,6 +169,10 @@ class FileWriter:
         """
         self._durable.settle(where, boot_id, first, last, on_disk=on_disk)
 
+    def forget(self, names: Iterable[tuple[Key, int]]) -> None:
+        """Speak of these streams and boots no more: they have been silent for long."""
+        self._durable.forget(names)
+
     def durable(self) -> tuple[int, dict[str, pb.Durable]]:
         """Return what is on disk as messages by realm, and a number that rises with changes."""
         return self._durable.messages()
@@ -224,7 +228,7 @@ class FileWriter:
             raise _failed(name, error) from error
         if topic(message.key.owner, message.key.stream).latched:
             self._remember(message)
-        if self._place.file is None and opened.file.tell() >= self._limits.bytes:
+        if self._place.file is None and opened.file.tell() >= self.limits.bytes:
             self._close(name, "rotated: size")
 
     def _sync(self) -> None:
@@ -307,7 +311,7 @@ class FileWriter:
         if self._place.file is not None:
             return
         for name, opened in list(self._files.items()):
-            if now_s - opened.since_s >= self._limits.age_s:
+            if now_s - opened.since_s >= self.limits.age_s:
                 self._close(name, "rotated: age")
             elif name[1] != _SERVICE_FILE and now_s - opened.last_s >= QUIET_S:
                 self._close(name, "the truck is quiet")
@@ -335,7 +339,7 @@ class FileWriter:
         except OSError as error:
             _log.error("%s: %s", folder, error.strerror)
             return
-        floor = self._limits.min_free_bytes
+        floor = self.limits.min_free_bytes
         left = f"{self.free_bytes / 1e6:.0f} MB left on the disk of {folder}"
         if self.free_bytes < floor * _STOP_SHARE:
             raise _WriteFailed(None, f"only {left}", EventKind.DISK_LOW)
@@ -453,6 +457,12 @@ class _Durable:
             if on_disk:
                 stream.stored.add_range(first, last)
             self.version += 1
+
+    def forget(self, names: Iterable[tuple[Key, int]]) -> None:
+        """See `FileWriter.forget`."""
+        with self._lock:
+            for name in names:
+                self._streams.pop(name, None)
 
     def messages(self) -> tuple[int, dict[str, pb.Durable]]:
         """See `FileWriter.durable`; of very many streams the ones that changed last."""
