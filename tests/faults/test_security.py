@@ -482,6 +482,7 @@ def test_a_link_ends_when_its_certificate_expires(
         assert len(list(session.info.routers_zid())) == 1
 
 
+@pytest.mark.faults
 def test_noise_at_the_port_does_not_disturb_those_who_are_connected(
     credentials: Path, router: zenoh.Session, endpoint: str
 ) -> None:
