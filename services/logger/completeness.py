@@ -13,9 +13,10 @@ from typing import Any, NamedTuple, Protocol
 import zenoh
 from zenoh import handlers
 
-from schemas.topics import Key, parse_key, selector
+from schemas.topics import Key, parse_key, selector, topic
 from services.common.bus import Received
 from services.common.errors import InputError
+from services.common.intervals import Intervals
 from services.common.recording import read_identities
 from services.logger.intake import Intake
 from services.logger.spool_recovery import SpoolRecovery
@@ -51,9 +52,6 @@ class Durable(Protocol):
     def forget(self, names: Iterable[tuple[Key, int]]) -> None:
         """Speak of these streams and boots no more."""
 
-    def waiting(self) -> int:
-        """Return how many messages wait to be written."""
-
 
 def known_on_disk(folder: Path, realm: str | None, now_s: float) -> Iterator[Known]:
     """Yield what trucks' streams have in the recordings below a folder, one file after the other.
@@ -88,6 +86,7 @@ class Completeness:
         """Read what earlier runs left in `folder`; None: this run has a file of its own."""
         self._intake = intake
         self._writer = writer
+        self._latched: dict[tuple[Key, int], Intervals] = {}
         if folder is not None:
             for known in known_on_disk(folder, realm, time.time()):
                 self._on_disk(*known)
@@ -113,6 +112,8 @@ class Completeness:
         intake.settled.clear()
         if intake.forgotten:
             self._writer.forget(intake.forgotten)
+            for name in intake.forgotten:
+                self._latched.pop(name, None)
             intake.forgotten.clear()
         self._read_tokens()
         self._figures = self._counted(now_s)
@@ -126,7 +127,12 @@ class Completeness:
         self._tokens.undeclare()
 
     def _on_disk(self, where: Key, boot_id: int, first: int, last: int) -> None:
-        if self._intake.adopt(where, boot_id, first, last, time.time_ns()):
+        if topic(where.owner, where.stream).latched:
+            # Known, but to be written again when it comes: every file has its own copy.
+            known = self._latched.setdefault((where, boot_id), Intervals())
+            if known.add_range(first, last):
+                self._writer.settle(where, boot_id, first, last, on_disk=True)
+        elif self._intake.adopt(where, boot_id, first, last, time.time_ns()):
             self._writer.settle(where, boot_id, first, last, on_disk=True)
 
     def _lost(self, where: Key, boot_id: int, first: int, last: int) -> None:

@@ -36,8 +36,8 @@ from services.common.intervals import Intervals
 __all__ = ["Shortfall", "SpoolRecovery", "shortfall"]
 
 _log = logging.getLogger(__name__)
-LIST_PERIOD_S = 5.0
-_LIST_TIMEOUT_S = 4.0
+LIST_PERIOD_S = 2.0
+_LIST_TIMEOUT_S = 1.5
 _PAGE_TIMEOUT_S = 10.0
 _QUERIES_AT_ONCE = 8
 _REPLIES_WAITING = 20_000

@@ -1,0 +1,23 @@
+"""The logger as a process: `python logger_process.py LISTEN FOLDER`."""
+
+import logging
+import sys
+from pathlib import Path
+
+from services import logger
+
+
+def main(listen: str, folder: str) -> int:
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr)
+    return logger.run(
+        listen=listen,
+        folder=Path(folder),
+        file=None,
+        realm=None,
+        site=None,
+        ready=lambda: print("ready", flush=True),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

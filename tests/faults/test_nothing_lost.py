@@ -1,0 +1,170 @@
+"""Trucks, loggers and routers are killed and frozen: everything is on disk in the end, once."""
+
+import random
+import signal
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from schemas.events import EventKind, decode_event
+from services.common.recording import read_messages
+
+pytestmark = pytest.mark.process
+
+MakeFleet = Callable[..., Any]
+
+
+def test_a_killed_truck_gives_what_it_had_not_said_when_it_starts_again(fleet: MakeFleet) -> None:
+    """There is no logger while it drives: only its spool knows."""
+    one = fleet(router=True)
+    one.start_router()
+    truck = one.start_truck()
+    truck.wait_for(30)
+    truck.kill()
+    again = one.start_truck()
+    again.wait_for(20)
+    one.start_logger()
+    again.wait_for(60)
+    again.finish()
+    one.stop_logger()
+    assert one.assert_complete() == 0
+    assert list((one.folder / "spool").glob("*/*.spool")) == []
+
+
+def test_a_truck_killed_while_the_logger_listens(fleet: MakeFleet) -> None:
+    one = fleet()
+    one.start_logger()
+    truck = one.start_truck(rate=100.0)
+    truck.wait_for(150)
+    truck.kill()
+    again = one.start_truck(rate=20.0)
+    again.wait_for(20)
+    again.finish()
+    one.stop_logger()
+    assert one.assert_complete() == 0
+
+
+def test_an_outage_longer_than_the_cache(fleet: MakeFleet) -> None:
+    """The publisher keeps 6000 batches; 8000 are made while there is no logger."""
+    one = fleet()
+    one.start_logger()
+    truck = one.start_truck(rate=1000.0)
+    truck.wait_for(100)
+    one.kill(one.logger)
+    truck.wait_for(8500)
+    one.start_logger()
+    truck.finish()
+    one.stop_logger()
+    assert one.assert_complete() == 0
+
+
+def kill_at_random(fleet: MakeFleet, seed: int, kills: int, *, what: str) -> int:
+    moments = random.Random(seed)
+    one = fleet(router=what != "logger")
+    one.start_logger()
+    if one.truck_endpoint != one.logger_endpoint:
+        one.start_router()
+    trucks = [one.start_truck(f"truck-{n}") for n in (1, 2, 3)]
+    for truck in trucks:
+        truck.wait_for(5)
+    for _ in range(kills):
+        time.sleep(moments.uniform(0.3, 3.0))
+        if what in ("logger", "both"):
+            one.kill(one.logger)
+        if what in ("router", "both"):
+            one.kill(one.router)
+        time.sleep(moments.uniform(0.0, 1.0))
+        if what in ("logger", "both"):
+            one.start_logger()
+        if what in ("router", "both"):
+            one.start_router()
+    time.sleep(1.0)
+    for truck in trucks:
+        truck.finish()
+    one.stop_logger()
+    twice: int = one.assert_complete()
+    return twice
+
+
+@pytest.mark.parametrize("what", ["logger", "router", "both"])
+def test_killed_at_a_random_moment(fleet: MakeFleet, what: str) -> None:
+    assert kill_at_random(fleet, 1, 1, what=what) == 0
+
+
+@pytest.mark.faults
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("what", ["logger", "router", "both"])
+def test_killed_ten_times(fleet: MakeFleet, what: str) -> None:
+    assert kill_at_random(fleet, 2, 10, what=what) == 0
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("seconds", [12.0])
+@pytest.mark.parametrize("what", ["truck", "logger", "router"])
+def test_frozen_for_longer_than_its_time_outs(fleet: MakeFleet, what: str, seconds: float) -> None:
+    """Zenoh gives up a silent connection after 10 s."""
+    one = fleet(router=True)
+    one.start_logger()
+    one.start_router()
+    frozen, healthy = one.start_truck("truck-1"), one.start_truck("truck-2")
+    frozen.wait_for(20)
+    healthy.wait_for(20)
+    process = {"truck": frozen.process, "logger": one.logger, "router": one.router}[what]
+    process.send_signal(signal.SIGSTOP)
+    before = max(healthy.said.values())
+    began = time.monotonic()
+    time.sleep(seconds)
+    # The caller of a gateway is never held up by the network.
+    driven_s = time.monotonic() - began
+    assert max(healthy.said.values()) - before > 0.5 * 20 * driven_s
+    process.send_signal(signal.SIGCONT)
+    time.sleep(2.0)
+    frozen.finish()
+    healthy.finish()
+    one.stop_logger()
+    assert one.assert_complete() == 0
+
+
+@pytest.mark.parametrize("what", ["truck"])
+def test_a_frozen_truck_delays_no_other(fleet: MakeFleet, what: str) -> None:
+    one = fleet()
+    one.start_logger()
+    frozen, healthy = one.start_truck("truck-1"), one.start_truck("truck-2")
+    frozen.wait_for(20)
+    frozen.process.send_signal(signal.SIGSTOP)
+    healthy.wait_for(max(healthy.said.values(), default=0) + 60)
+    late = one.start_truck("truck-3")
+    late.wait_for(40)
+    frozen.process.send_signal(signal.SIGCONT)
+    for truck in (frozen, healthy, late):
+        truck.finish()
+    one.stop_logger()
+    one.assert_complete()
+    for vehicle in ("truck-2", "truck-3"):
+        lags_s = [
+            (m.publish_time_ns - m.log_time_ns) * 1e-9
+            for path in (one.folder / "recordings").glob(f"*/*/{vehicle}-*.mcap")
+            for m in read_messages(path)
+            if m.key.stream == "accel"
+        ]
+        assert sorted(lags_s)[len(lags_s) // 2] < 0.5
+        assert max(lags_s) < 4.0, vehicle  # the first ones, while the logger meets the truck
+
+
+@pytest.mark.parametrize("jump_s", [-3600, 86_400])
+def test_a_truck_whose_wall_clock_jumps(fleet: MakeFleet, jump_s: int) -> None:
+    one = fleet()
+    one.start_logger()
+    truck = one.start_truck(DRIVEBY_TEST_CLOCK_STEP=f"30:{jump_s}")
+    truck.wait_for(50)
+    truck.finish()
+    one.stop_logger()
+    one.assert_complete()
+    [path] = (one.folder / "recordings").glob("*/*/truck-1-*.mcap")
+    events = [decode_event(m.payload) for m in read_messages(path) if m.key.stream == "event"]
+    steps = [event for event in events if event.kind == EventKind.CLOCK_STEP]
+    assert [(step.vehicle, step.first_sequence) for step in steps] == [("truck-1", 30)]
+    accel = [m.sequence for m in read_messages(path) if m.key.stream == "accel"]
+    assert accel == sorted(accel)

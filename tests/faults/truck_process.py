@@ -1,0 +1,61 @@
+"""A truck as a process: four channels of 50 samples and now and then a fix, until SIGTERM.
+
+Says `BOOT SEQUENCE` of every batch after it was handed over, so that a test knows what must arrive
+even if the process is killed in the next moment.
+
+    python truck_process.py ENDPOINT REALM VEHICLE SPOOL BATCHES_PER_S
+"""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from schemas.signals import CHANNELS, Channel, GnssFix
+from services.common.bus import open_session
+from services.common.playback import stopped_by_signals
+from services.common.spool import Spool
+from services.truck.gateway import Gateway
+
+STEP_ENV = "DRIVEBY_TEST_CLOCK_STEP"
+"""`AFTER_BATCHES:SECONDS`: the wall clock jumps."""
+
+
+def main(endpoint: str, realm: str, vehicle: str, spool: str, batches_per_s: str) -> None:
+    period_s = 1.0 / float(batches_per_s)
+    after, _, jump_s = os.environ.get(STEP_ENV, "0:0").partition(":")
+    channel = Channel(1000.0, np.random.default_rng(1).standard_normal(50))
+    with (
+        stopped_by_signals() as stop,
+        open_session(connect=endpoint, timeout_s=60) as session,
+    ):
+        gateway = Gateway(session, realm, vehicle, Spool(Path(spool)))
+        now = {"device_time_ns": time.monotonic_ns(), "wall_time_ns": time.time_ns()}
+        gateway.info(f'[vehicle]\nid = "{vehicle}"\n', **now)
+        number = 0
+        due = time.monotonic()
+        while not stop.is_set():
+            device_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+            if int(after) and number >= int(after):
+                wall_ns += int(jump_s) * 1_000_000_000
+            gateway.accel(
+                dict.fromkeys(CHANNELS, channel), device_time_ns=device_ns, wall_time_ns=wall_ns
+            )
+            if number % 2 == 0:
+                gateway.gnss(GnssFix(0, 0, device_ns, wall_ns, 50.0, 8.0, 100.0, 10.0))
+            print(gateway.boot_id, number, flush=True)
+            number += 1
+            due += period_s
+            time.sleep(max(0.0, due - time.monotonic()))
+        deadline = time.monotonic() + 40.0
+        # A logger that is about to come back has not spoken yet.
+        while (missing := gateway.delivery.wait(1.0)) and time.monotonic() < deadline:
+            pass
+        print(f"missing {missing} deferred {gateway.deferred}", flush=True)
+        gateway.close()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
