@@ -87,13 +87,24 @@ def record(
             }
             for name, p in estimates.items()
         },
-        "ranks": {
-            name: calibration.rank_from_quantiles(truth[name], p.q025, p.q50, p.q975)
-            for name, p in estimates.items()
-            if name in truth
-        },
+        "ranks": _ranks(truth, estimates, seen.draws),
         "bound": bound,
     }
+
+
+def _ranks(
+    truth: dict[str, float], estimates: dict[str, Parameter], draws: dict[str, Floats] | None
+) -> dict[str, float]:
+    """The truth's ranks among draws; where there are none, as far as three quantiles tell."""
+    ranks = {
+        name: calibration.rank_from_quantiles(truth[name], p.q025, p.q50, p.q975)
+        for name, p in estimates.items()
+        if name in truth
+    }
+    for name, values in (draws or {}).items():
+        if name in truth:
+            ranks[name] = float(calibration.rank(values[:, None], np.array([truth[name]]))[0])
+    return ranks
 
 
 def one_crossing(
@@ -182,8 +193,10 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "vehicle": parameters.VEHICLE_NAMES,
     "bridge": ("rhoA", "alpha", "beta"),
     "supports": ("k_rot_start", "k_rot_end"),
+    "wheelbase": ("wheelbase",),
     "derived": ("f1_hz", "max_deflection_m"),
 }
+"""Parameters whose ranks are told together; a group that no draws are kept of is left out."""
 SMALLEST_P = 0.01
 """Of the ranks of a group, whose parameters are tested one by one."""
 

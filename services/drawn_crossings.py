@@ -117,6 +117,8 @@ class Seen(NamedTuple):
     result: Crossing
     data: CrossingData
     settings: IdentificationSettings
+    draws: dict[str, Floats] | None = None
+    """Of the posterior by the names of `true_values`, (n,) each; None where a method keeps none."""
 
 
 def default_site() -> Site:
@@ -310,5 +312,6 @@ def true_values(truth: Truth) -> dict[str, float]:
         "m_s": car.body_mass_kg,
         "m_s1": car.body_mass_kg * (1.0 - rear_share),
         "m_s2": car.body_mass_kg * rear_share,
+        "wheelbase": car.wheelbase_m,
         "f1_hz": float(natural_frequencies_hz(beam, 1)[0]),
     }

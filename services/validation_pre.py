@@ -300,8 +300,8 @@ def control_checks(records: list[Record]) -> list[Check]:
     good = np.mean([line["verdict"] == "good" for line in records])
     named = np.mean([bool(_NOISE_REASONS & set(line["reasons"])) for line in records])
     return [
-        Check("half the noise declared: share good", float(good), 0.0, 0.02),
-        Check("half the noise declared: named as misfit", float(named), 0.95, 1.0),
+        Check("half the noise: share good", float(good), 0.0, 0.02),
+        Check("half the noise: named as misfit", float(named), 0.95, 1.0),
     ]
 
 
@@ -345,7 +345,7 @@ def judged_checks(line: Record) -> list[Check]:
         )
         ratio = max(e["std"] / e["bound"] for e in elements)
     return [
-        Check(f"{name}: error over what is allowed", over, 0.0, 1.0),
+        Check(f"{name}: error over allowed", over, 0.0, 1.0),
         Check(f"{name}: std over bound", ratio, 0.0, _LARGEST_STD_OVER_BOUND),
         Check(f"{name}: chi2", line["chi2_per_dof"], *_JUDGED_CHI2),
         Check(f"{name}: is good", float(line["verdict"] == "good"), 1.0, 1.0),
