@@ -316,9 +316,3 @@ def joined(parts: list[Cell]) -> Cell:
     count = sum(part.size for part in parts)
     total = sum(part.mean_square * part.size for part in parts)
     return Cell(total / count if count else 0.0, count)
-
-
-def excess_kurtosis(values: FloatArray) -> float:
-    """Fourth moment over the squared second of values (n,), less 3: zero for normal ones."""
-    square = values**2
-    return float(np.mean(square**2) / np.mean(square) ** 2 - 3.0)

@@ -24,9 +24,7 @@ class Reason(StrEnum):
     # How the truck was driven.
     SPEED_TOO_LOW = "speed_too_low"
     STOPPED_ON_BRIDGE = "stopped_on_bridge"
-    LEFT_THE_ROAD = "left_the_road"
     ACCELERATING_CG_UNKNOWN = "accelerating_cg_unknown"
-    SECOND_VEHICLE = "second_vehicle"
     AXLES_ALIKE = "axles_alike"
     # What the fit says.
     NO_NOISE_MODEL = "no_noise_model"
@@ -36,7 +34,6 @@ class Reason(StrEnum):
     NOISE_BELOW_DECLARED = "noise_below_declared"
     IMPLAUSIBLE_VEHICLE = "implausible_vehicle"
     POSITION_INCONSISTENT = "position_inconsistent"
-    SPAN_INCONSISTENT = "span_inconsistent"
     # How the search ended.
     NOT_CONVERGED = "not_converged"
     SAMPLER_DIAGNOSTICS = "sampler_diagnostics"
@@ -60,11 +57,9 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.INCOMPLETE_CROSSING: "The recording begins or ends while the truck is on the bridge.",
     Reason.SPEED_TOO_LOW: "The truck was too slow for its axles to feel the bridge's stiffness.",
     Reason.STOPPED_ON_BRIDGE: "The truck stopped or turned back on the bridge.",
-    Reason.LEFT_THE_ROAD: "The positions leave the line between the ends of the bridge.",
     Reason.ACCELERATING_CG_UNKNOWN: (
         "The truck braked or accelerated and the height of its centre of gravity is unknown."
     ),
-    Reason.SECOND_VEHICLE: "Another vehicle seems to have been on the bridge.",
     Reason.AXLES_ALIKE: (
         "The axle loads are nearly equal, so the difference between the wheels says little."
     ),
@@ -77,7 +72,6 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     ),
     Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
     Reason.POSITION_INCONSISTENT: "The position that fits disagrees with the receiver.",
-    Reason.SPAN_INCONSISTENT: "The span disagrees with the distance between the bridge's ends.",
     Reason.NOT_CONVERGED: "The search did not converge.",
     Reason.SAMPLER_DIAGNOSTICS: "The Markov chain did not pass its own checks.",
     Reason.FAILED: "The identification failed.",

@@ -47,6 +47,8 @@ _FALSE_ALARM_Z = 4.5
 _SLACK = (1.35, 1.35, 1.35, 1.15)
 """So many times the declared noise power a band may have: its density is a data sheet's, and the
 1/f noise of a sensor is not declared."""
+_NOISY = 1.2
+"""From here on a kind of residual is called noisier than declared, if it is white."""
 _GOOD_CHI2 = 1.25
 _SMALLEST_CHI2 = 0.6
 _LARGEST_VEHICLE_Z = 4.0
@@ -98,7 +100,7 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
         if quality.cell_excess(cell, _SLACK[key[2]]) > _FALSE_ALARM_Z
     }
     reasons: list[Reason] = []
-    if suspicious and _is_white(found):
+    if suspicious and _is_only_noise(found):
         reasons.append(Reason.NOISE_ABOVE_DECLARED)
     elif suspicious or fit.chi2_per_dof > _GOOD_CHI2:
         if fit.chi2_per_dof > _GOOD_CHI2:
@@ -117,16 +119,23 @@ def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:
     return np.where(travelled < 0.0, BEFORE, np.where(travelled > span, AFTER, ON)).astype(np.int64)
 
 
-def _is_white(found: dict[tuple[int, int, int], quality.Cell]) -> bool:
-    """Whether every kind of residual is like noise of some power: the same everywhere."""
+def _is_only_noise(found: dict[tuple[int, int, int], quality.Cell]) -> bool:
+    """Whether the rows are like noise of more power than declared, and of nothing else.
+
+    That power is read off the highest band, where there is nothing but noise; it may differ from
+    kind to kind, as the sensors do, and must be found everywhere else.
+    """
+    top = _BANDS_HZ.size - 2
+    powers = []
     for kind in (ROAD, BODY_FRONT, BODY_REAR):
         parts = {key: cell for key, cell in found.items() if key[0] == kind}
-        whole = quality.joined(list(parts.values()))
+        noise = quality.joined([cell for key, cell in parts.items() if key[2] == top])
+        power = max(noise.mean_square, 1.0)
+        powers.append(power)
         for key, cell in parts.items():
-            expected = max(whole.mean_square, 1e-300) * _SLACK[key[2]]
-            if quality.cell_excess(cell, expected) > _FALSE_ALARM_Z:
+            if quality.cell_excess(cell, power * _SLACK[key[2]]) > _FALSE_ALARM_Z:
                 return False
-    return True
+    return max(powers) > _NOISY
 
 
 def _loads_are_alike(vehicle: Vehicle) -> bool:

@@ -22,6 +22,8 @@ NORMAL_975 = 1.959963984540054
 _ROAD_SPACING_M = 0.05
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3
 """From here on load transfer matters, which the height of the centre of gravity decides."""
+LONGEST_SURE_OUTAGE_S = 1.5
+"""A trajectory through fixes further apart is a guess, unless the axles' own signals confirm it."""
 
 
 class CrossingData(NamedTuple):
@@ -111,7 +113,19 @@ def caveats(data: CrossingData, motion: Motion) -> list[Reason]:
         reasons.append(Reason.ACCELERATING_CG_UNKNOWN)
     if any(data.vehicle.tyre_damping_ns_per_m):
         reasons.append(Reason.TYRE_DAMPING_IGNORED)
+    stay = data.stay
+    if longest_outage_s(data.fixes.time_s, stay.entry_s, stay.exit_s) > LONGEST_SURE_OUTAGE_S:
+        reasons.append(Reason.POSITION_OUTAGE)
     return reasons
+
+
+def longest_outage_s(times_s: Floats, entry_s: float, exit_s: float) -> float:
+    """Longest time without a fix between the last one before the entry and the first after."""
+    inside = times_s[(times_s > entry_s) & (times_s < exit_s)]
+    before = times_s[times_s <= entry_s][-1:]
+    after = times_s[times_s >= exit_s][:1]
+    around = np.concatenate([before, inside, after])
+    return float(np.diff(around).max()) if around.size > 1 else np.inf
 
 
 def beam_of(data: CrossingData, theta: Floats) -> Beam:

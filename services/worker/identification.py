@@ -26,6 +26,7 @@ from services.common.crossing import Passage
 from services.common.streams import Samples
 from services.worker.checks import reasons_before_fit
 from services.worker.crossing_data import (
+    LONGEST_SURE_OUTAGE_S,
     NORMAL_975,
     CrossingData,
     Floats,
@@ -35,6 +36,7 @@ from services.worker.crossing_data import (
     detrended,
     gaussian,
     header,
+    longest_outage_s,
     nominal_parameters,
     rejected,
     road_result,
@@ -64,7 +66,8 @@ MARGIN_S = 1.0
 _SLOWEST_M_PER_S = 3.0
 """Below this the wheels feel next to nothing of the bridge's stiffness."""
 _STANDING_M_PER_S = 0.5
-_LONGEST_OUTAGE_S = 1.5
+_LONGEST_OUTAGE_S = 8.0
+"""So long without a fix the trajectory may be found from the axles' signals, by method `pre`."""
 _LARGEST_MISFIT = 0.002
 """Root mean square of R_1 - R_2 relative to the bridge's largest deflection under a wheel. Without
 noise a fit leaves 1e-5; from a few thousandths on the elements are not told apart."""
@@ -96,7 +99,7 @@ def identify(
     entry_s, exit_s = _entry_and_exit(data, trajectory)
     passing = Passing(entry_s, exit_s, _speed_m_per_s(data, entry_s, exit_s))
     reject = partial(rejected, data, settings, passing)
-    reasons = _unusable(data, trajectory, entry_s, exit_s)
+    reasons = _unusable(data, settings.method, trajectory, entry_s, exit_s)
     if reasons or trajectory is None or data.samples is None:
         return reject(reasons or [Reason.FAILED])
     try:
@@ -205,9 +208,13 @@ def _speed_m_per_s(data: CrossingData, entry_s: float, exit_s: float) -> float:
 
 
 def _unusable(
-    data: CrossingData, trajectory: Trajectory | None, entry_s: float, exit_s: float
+    data: CrossingData,
+    method: str,
+    trajectory: Trajectory | None,
+    entry_s: float,
+    exit_s: float,
 ) -> list[Reason]:
-    """Everything that forbids a fit, whatever the method."""
+    """Everything that forbids a fit before its samples are looked at."""
     reasons: list[Reason] = []
     match data.stay.passage:
         case Passage.TURNED_BACK:
@@ -221,8 +228,9 @@ def _unusable(
         reasons.append(Reason.CHANNEL_MISSING)
     if data.stay.passage is not Passage.THROUGH:
         return reasons
-    outage_s = _longest_outage_s(data.fixes.time_s, entry_s, exit_s)
-    if trajectory is None or outage_s > _LONGEST_OUTAGE_S:
+    outage_s = longest_outage_s(data.fixes.time_s, entry_s, exit_s)
+    longest_s = _LONGEST_OUTAGE_S if method == "pre" else LONGEST_SURE_OUTAGE_S
+    if trajectory is None or outage_s > longest_s:
         return [*reasons, Reason.POSITION_OUTAGE]
     times = np.linspace(entry_s, exit_s, 200)
     speed = data.stay.direction * trajectory.spline.derivative()(times)
@@ -231,14 +239,6 @@ def _unusable(
     elif np.median(speed) < _SLOWEST_M_PER_S:
         reasons.append(Reason.SPEED_TOO_LOW)
     return reasons
-
-
-def _longest_outage_s(times_s: Floats, entry_s: float, exit_s: float) -> float:
-    inside = times_s[(times_s > entry_s) & (times_s < exit_s)]
-    before = times_s[times_s <= entry_s][-1:]
-    after = times_s[times_s >= exit_s][:1]
-    around = np.concatenate([before, inside, after])
-    return float(np.diff(around).max()) if around.size > 1 else np.inf
 
 
 def _size(samples: Samples) -> int:

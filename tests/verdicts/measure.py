@@ -1,0 +1,42 @@
+"""Measures what docs/verdicts.md says.
+
+python -m tests.verdicts.measure            every fault: verdict, reasons, worst EI (an hour)
+python -m tests.verdicts.measure signals N  checks of signals over N drawn sound crossings
+"""
+
+import sys
+
+import numpy as np
+
+from tests.verdicts import faults
+from tests.verdicts.test_faults import TABLE, is_good
+from tests.verdicts.test_signals import reasons
+
+
+def table() -> None:
+    """One line for each fault, as the page has them."""
+    print("| fault | verdict | χ²/dof | reasons | largest error of EI, std |")
+    print("| --- | --- | --- | --- | --- |")
+    for name, row in TABLE.items():
+        case = faults.crossing(row.truth, row.fault)
+        result = faults.identified(case)
+        verdict = "good but for validation" if is_good(result) else result.verdict
+        chi2 = "" if result.chi2_per_dof is None else f"{result.chi2_per_dof:.3g}"
+        worst = ""
+        if result.parameters is not None:
+            worst = f"{np.abs(faults.z_scores(case, result)).max():.1f}"
+        told = ", ".join(f"`{r}`" for r in result.reasons if r != "not_validated")
+        print(f"| {name} | {verdict} | {chi2} | {told} | {worst} |", flush=True)
+
+
+def signals(count: int) -> None:
+    """Sound crossings of which something is said."""
+    accused = {seed: found for seed in range(count) if (found := reasons(seed))}
+    print(f"{len(accused)} of {count} sound crossings accused: {accused}")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["signals"]:
+        signals(int(sys.argv[2]))
+    else:
+        table()
