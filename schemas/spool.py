@@ -21,6 +21,9 @@ from schemas.signals import MAX_SEQUENCE, SCHEMA_VERSION, check_version
 from schemas.topics import PREFIX, Key, key, parse_key
 
 SUFFIX = "/spool"
+PAGE_MESSAGES = 1000
+PAGE_BYTES = 1 << 20
+"""What one answer holds at most; a single message that is larger is given alone."""
 MAX_RANGES = 10_000
 """More holes than that in what a truck holds are not told; each is a restart or a disk error."""
 _MAX_BOOT_ID = 2**64 - 1

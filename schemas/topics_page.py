@@ -5,6 +5,7 @@ A test compares the page with the table and runs the subscriber that the page sh
 
 from pathlib import Path
 
+from schemas.spool import PAGE_BYTES, PAGE_MESSAGES, SUFFIX
 from schemas.topics import IDENTIFIER, PREFIX, TOPICS, Topic
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "topics.md"
@@ -40,6 +41,8 @@ A key is `{PREFIX}/{{realm}}/{{owner}}/{{id}}/{{stream}}`, for example
 `{IDENTIFIER}`.
 """
 
+PAGE_MIB = PAGE_BYTES >> 20
+
 _TAIL = f"""
 - **reliable** publishers block instead of dropping, keep their last messages (*kept*) and are
   asked again for what was missed. **latest** may be dropped. A **latched** topic gives its last
@@ -54,6 +57,24 @@ _TAIL = f"""
   leave waits until `count` has reached what it sent.
 - A payload larger than *at most*, of another message, of another schema version or with
   impossible values is refused by the logger, counted, and reported in an `event`.
+
+## What a truck has on its own disk
+
+A truck with a spool answers queries, and a logger asks for what the bus did not bring: after the
+truck's process died, after an outage longer than what publishers keep, or while the connection does
+not take all. The key is that of the data with `{SUFFIX}` behind it (`schemas/spool.py`); ask with
+consolidation `NONE` and target `ALL`.
+
+- `{PREFIX}/{{realm}}/vehicle/*/*{SUFFIX}`: what is there. One `driveby.v1.SpoolContents` for each
+  stream: of every boot the next sequence, what is held, up to where a logger has confirmed it, how
+  many messages were given up for room.
+- `{PREFIX}/{{realm}}/vehicle/{{id}}/{{stream}}{SUFFIX}?boot=B;from=F;to=T`: messages F to T
+  that are held, payload and attachment as published; at last, without attachment, a
+  `driveby.v1.SpoolPage`.
+
+One answer holds at most {PAGE_MESSAGES} messages or {PAGE_MIB} MiB; `next` in the page says from
+where to ask on. What lies below it and did not come is not held any more. An answer without a page
+was cut off: ask again. A truck frees what `durable` confirms.
 
 ## A subscriber
 

@@ -234,6 +234,9 @@ def _truck(options: argparse.Namespace) -> int:
         speed=options.speed,
         vehicle=options.vehicle,
         tls=options.tls,
+        spool=options.spool,
+        spool_budget_bytes=options.spool_budget << 20,
+        site=options.site,
     )
 
 
@@ -535,7 +538,26 @@ def _add_live(commands: Any) -> None:
         "publish a recording as a truck that drives now",
         "driveby truck run.mcap --speed 4",
     )
-    p.add_argument("recording", type=Path, metavar="REC.mcap", help="what the truck will measure")
+    p.add_argument(
+        "recording",
+        type=Path,
+        metavar="REC.mcap | DIR",
+        help="what the truck will measure: a recording, or a folder of CSV files with --site",
+    )
+    _add_site(p, "of a folder of CSV files (a recording carries its own)")
+    p.add_argument(
+        "--spool",
+        type=Path,
+        metavar="DIR",
+        help="keep every message here, too, until a logger has it; one folder for each truck",
+    )
+    p.add_argument(
+        "--spool-budget",
+        type=_whole("MiB", 1, 1 << 30),
+        default=4096,
+        metavar="MIB",
+        help="room for the spool; over it the oldest is given up (default: 4096)",
+    )
     _add_endpoint(p)
     _add_realm(p)
     _add_speed(p, 1.0)

@@ -1,5 +1,6 @@
 """`driveby import`: files of a drive become a recording."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from schemas.site import Site, parse_site, read_site_text
@@ -8,7 +9,7 @@ from services.common.csv_import import read_folder, read_pair
 from services.common.errors import InputError
 from services.common.files import check_writable
 from services.common.naming import checked_identifier, identifier_from
-from services.common.recording import write_recording
+from services.common.recording import Message, write_recording
 from services.common.runs import Run, normalised, run_to_messages
 
 _LARGEST_RATE_ERROR = 0.05
@@ -37,6 +38,15 @@ def import_command(
     seconds = sum(float(run.accel_time_s[-1] - run.accel_time_s[0]) for run in runs)
     return (
         f"{output}: {drives} of {vehicle_id}, {seconds:.1f} s, {messages} messages, realm {realm}"
+    )
+
+
+def messages_of(folder: Path, site: Path, vehicle: str | None) -> Iterator[Message]:
+    """Return what `import_command` would write of a folder of CSV files or of comma2k19."""
+    parsed = parse_site(read_site_text(site), str(site))
+    vehicle_id = _vehicle(parsed, site, vehicle)
+    return run_to_messages(
+        _read([folder], parsed, site), parsed, _realm([folder], None), vehicle_id
     )
 
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from schemas.spool import Held
+from schemas.spool import PAGE_BYTES, PAGE_MESSAGES, Held
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, write_atomically
 from services.common.intervals import Intervals
@@ -33,9 +33,7 @@ from services.common.intervals import Intervals
 __all__ = ["DEFAULT_BUDGET_BYTES", "Page", "Spool", "SpooledMessage"]
 
 DEFAULT_BUDGET_BYTES = 4 << 30
-"""A day and a half of four channels at 1 kHz."""
-PAGE_MESSAGES = 1000
-PAGE_BYTES = 1 << 20
+"""More than a day of four channels at 1 kHz."""
 
 _log = logging.getLogger(__name__)
 _MAGIC = b"DBSPOOL1"

@@ -54,9 +54,11 @@ def run(
     tls: Path | None = None,
     spool: Path | None = None,
     spool_budget_bytes: int = DEFAULT_BUDGET_BYTES,
+    site: Path | None = None,
 ) -> int:
     """Play one vehicle of a recording as a truck that drives now; return 0.
 
+    Instead of a recording a folder of CSV files may be given (docs/contract.md), with its `site`.
     It is a new boot of that truck: new boot_id, sequences from 0, and times shifted as a whole
     so that the recording ends now (at `speed` 1 or less: begins now). **Only the publication is
     faster than real, not the data**: rates and the time between samples stay those of the
@@ -76,7 +78,7 @@ def run(
         check_realm(realm)
     except ValueError as error:
         raise InputError(str(error)) from None
-    streams = _read_vehicle(recording, vehicle)
+    streams = _read_vehicle(recording, vehicle, site)
     vehicle = next(iter(streams.values()))[0].key.identifier
     check_speaks_for(tls, "truck", vehicle)
     with (
@@ -107,11 +109,13 @@ def _open_spool(folder: Path | None, budget_bytes: int) -> Spool | None:
     return None if folder is None else Spool(folder, budget_bytes=budget_bytes)
 
 
-def _read_vehicle(recording: Path, vehicle: str | None) -> dict[str, list[Message]]:
+def _read_vehicle(
+    recording: Path, vehicle: str | None, site: Path | None
+) -> dict[str, list[Message]]:
     """Return the messages of one vehicle by stream, each stream in the order it was made."""
     streams: dict[str, list[Message]] = {}
     vehicles: set[str] = set()
-    for message in read_messages(recording):
+    for message in _messages(recording, vehicle, site):
         if message.key.owner != "vehicle":
             continue
         vehicles.add(message.key.identifier)
@@ -125,6 +129,16 @@ def _read_vehicle(recording: Path, vehicle: str | None) -> dict[str, list[Messag
     for messages in streams.values():
         messages.sort(key=lambda message: (message.boot_id, message.sequence))
     return streams
+
+
+def _messages(source: Path, vehicle: str | None, site: Path | None) -> Iterable[Message]:
+    if not source.is_dir():
+        return read_messages(source)
+    if site is None:
+        raise InputError(f"{source}: a folder of CSV files needs --site")
+    from services.importing import messages_of
+
+    return messages_of(source, site, vehicle)
 
 
 def _driven_now(

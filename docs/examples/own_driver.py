@@ -1,0 +1,28 @@
+"""A driver for sensors of your own: `python own_driver.py ENDPOINT SPOOL_FOLDER`, until Ctrl-C."""
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from schemas.signals import Channel, GnssFix
+from services.common.bus import open_session
+from services.common.playback import stopped_by_signals
+from services.common.spool import Spool
+from services.truck.gateway import Gateway
+
+SITE = '[vehicle]\nid = "truck-1"\n'  # your truck's part of the site file
+
+with stopped_by_signals() as stop, open_session(connect=sys.argv[1]) as session:
+    gateway = Gateway(session, "live", "truck-1", Spool(Path(sys.argv[2])))
+    gateway.info(SITE, device_time_ns=time.monotonic_ns(), wall_time_ns=time.time_ns())
+    while not stop.wait(0.05):
+        # Replace these two lines by your own: 50 ms at 1 kHz, m/s², up, without gravity.
+        now = {"device_time_ns": time.monotonic_ns(), "wall_time_ns": time.time_ns()}
+        front, rear = np.random.default_rng().standard_normal((2, 50))
+        channels = {"sprung_front": Channel(1000.0, front), "unsprung_rear": Channel(1000.0, rear)}
+        gateway.accel(channels, **now)
+        gateway.gnss(GnssFix(0, 0, *now.values(), 50.0, 8.0, 100.0, speed_m_per_s=10.0))
+    gateway.delivery.wait(10.0)  # what does not arrive in time stays in the spool
+    gateway.close()

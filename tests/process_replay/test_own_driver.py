@@ -1,0 +1,63 @@
+"""The driver shown in docs/examples is recorded."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from schemas.signals import decode_accel
+from services.common.recording import read_messages
+
+pytestmark = pytest.mark.process
+
+
+def test_it_is_recorded(
+    start: Callable[..., subprocess.Popen[str]],
+    terminate: Callable[[subprocess.Popen[str]], None],
+    endpoint: str,
+    tmp_path: Path,
+    project: Path,
+) -> None:
+    file = tmp_path / "live.mcap"
+    logger = start(
+        "services.logger", listen=endpoint, folder=tmp_path, file=file, realm=None, site=None
+    )
+    driver = subprocess.Popen(
+        [
+            sys.executable,
+            str(project / "docs" / "examples" / "own_driver.py"),
+            endpoint,
+            str(tmp_path / "spool"),
+        ],
+        env=os.environ | {"PYTHONPATH": str(project)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        deadline = time.monotonic() + 30
+        while time.monotonic() < deadline and not list((tmp_path / "spool").glob("*.spool")):
+            time.sleep(0.1)
+        time.sleep(1.5)
+        driver.send_signal(signal.SIGINT)
+        _, log = driver.communicate(timeout=30)
+    finally:
+        driver.kill()
+        driver.wait()
+    assert driver.returncode == 0, log
+    assert log == ""
+    terminate(logger)
+    streams: dict[str, list[int]] = {}
+    for message in read_messages(file):
+        streams.setdefault(message.key.stream, []).append(message.sequence)
+    assert len(streams["accel"]) >= 10
+    assert streams["info"] == [0]
+    for numbers in streams.values():
+        assert sorted(numbers) == list(range(len(numbers)))
+    batch = next(m for m in read_messages(file) if m.key.stream == "accel")
+    assert set(decode_accel(batch.payload).channels) == {"sprung_front", "unsprung_rear"}
+    assert list((tmp_path / "spool").glob("*.spool")) == []  # all of it is on the logger's disk
