@@ -1,0 +1,311 @@
+"""What is fetched from trucks' disks, what is given up, and what they answer: real sessions."""
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas import spool as wire
+from schemas.signals import Channel, GnssFix, Identity, decode_accel
+from schemas.spool import Held, Query
+from schemas.topics import Key
+from services.common.bus import Received, Seen, open_session
+from services.common.intervals import Intervals
+from services.common.spool import Spool
+from services.logger import spool_recovery
+from services.logger.spool_recovery import SpoolRecovery, shortfall
+from services.truck.gateway import Gateway
+
+ACCEL = Key("live", "vehicle", "truck-1", "accel")
+MIB = 1 << 20
+small = st.integers(0, 30)
+
+
+def intervals(numbers: set[int]) -> Intervals:
+    made = Intervals()
+    for number in numbers:
+        made.add(number)
+    return made
+
+
+def flat(ranges: list[tuple[int, int]]) -> set[int]:
+    return {n for first, last in ranges for n in range(first, last + 1)}
+
+
+@given(st.sets(small), st.sets(small), st.integers(-1, 30), small)
+def test_every_missing_number_is_fetched_confirmed_or_lost(
+    seen: set[int], held: set[int], durable: int, ripe: int
+) -> None:
+    boot = Held(1, 31, intervals(held).ranges(), durable, 0)
+    found = shortfall(boot, intervals(seen), ripe)
+    missing = set(range(ripe)) - seen
+    assert flat(found.confirmed) == {n for n in missing if n <= durable}
+    assert flat(found.fetch) == {n for n in missing if n > durable and n in held}
+    assert flat(found.lost) == {n for n in missing if n > durable and n not in held}
+
+
+@given(
+    st.lists(
+        st.builds(
+            lambda boot, numbers, durable, dropped: Held(
+                boot,
+                max(numbers, default=0) + 1,
+                intervals(numbers).ranges(),
+                min(durable, max(numbers, default=0)),
+                dropped,
+            ),
+            st.integers(0, 2**64 - 1),
+            st.sets(small),
+            st.integers(-1, 30),
+            small,
+        ),
+        unique_by=lambda held: held.boot_id,
+    )
+)
+def test_contents_round_trip(boots: list[Held]) -> None:
+    assert wire.decode_contents(wire.encode_contents(1, boots)) == sorted(boots)
+
+
+@given(st.binary(max_size=200), st.dictionaries(st.text(max_size=6), st.text(max_size=30)))
+def test_any_answer_and_any_query_is_read_or_a_value_error(
+    payload: bytes, parameters: dict[str, str]
+) -> None:
+    for call in (
+        lambda: wire.decode_contents(payload),
+        lambda: wire.decode_page(payload, Query(1, 2, 3)),
+        lambda: wire.parse_query(parameters),
+        lambda: wire.parse_spool_key(next(iter(parameters), "")),
+    ):
+        refused = ""
+        try:
+            call()
+        except ValueError as error:
+            refused = str(error)
+        assert "\n" not in refused
+
+
+@given(st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
+def test_queries_and_pages_round_trip(boot_id: int, first: int, last: int) -> None:
+    query = Query(boot_id, first, last)
+    parts = dict(part.split("=") for part in query.parameters().split(";"))
+    assert wire.parse_query(parts) == query
+    assert wire.decode_page(wire.encode_page(query, None), query) is None
+    if first < last:
+        assert wire.decode_page(wire.encode_page(query, last), query) == last
+    with pytest.raises(ValueError, match=r"another query|out of range"):
+        wire.decode_page(wire.encode_page(query, last + 1), query._replace(last=last))
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def router(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[zenoh.Session]:
+    monkeypatch.setattr(spool_recovery, "LIST_PERIOD_S", 0.2)
+    with open_session(listen=endpoint) as session:
+        yield session
+
+
+@pytest.fixture
+def client(router: zenoh.Session, endpoint: str) -> Iterator[zenoh.Session]:
+    with open_session(connect=endpoint, timeout_s=5) as session:
+        yield session
+
+
+class Logger:
+    """The part of a logger that asks; `seen` is what it has."""
+
+    def __init__(self, router: zenoh.Session) -> None:
+        self.seen = Seen()
+        self.confirmed: set[int] = set()
+        self.lost: set[int] = set()
+        self.received: list[Received] = []
+
+        def settle(into: set[int]) -> Callable[[Key, int, int, int], None]:
+            def call(where: Key, boot_id: int, first: int, last: int) -> None:
+                numbers = self.seen.streams.setdefault((where, boot_id), Intervals())
+                numbers.add_range(first, last)
+                if where.stream == "accel":
+                    into.update(range(first, last + 1))
+
+            return call
+
+        self.recovery = SpoolRecovery(
+            router, "live", self.seen, confirmed=settle(self.confirmed), lost=settle(self.lost)
+        )
+
+    def run(self, until: Callable[[], bool], timeout_s: float = 20.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not until():
+            assert time.monotonic() < deadline
+            for one in self.recovery.step(time.monotonic()):
+                assert one.recovered
+                assert one.spooled
+                assert self.seen.add(one.key(), one.identity())
+                self.received.append(one)
+            time.sleep(0.005)
+
+    def numbers(self, boot_id: int) -> list[int]:
+        return sorted(
+            one.identity().sequence
+            for one in self.received
+            if one.key() == ACCEL and one.identity().boot_id == boot_id
+        )
+
+
+def drive(gateway: Gateway, batches: int) -> None:
+    for number in range(batches):
+        now = {"device_time_ns": number * 50_000_000, "wall_time_ns": time.time_ns()}
+        gateway.accel({"sprung_front": Channel(1000.0, np.full(50, float(number)))}, **now)
+
+
+def test_what_an_earlier_boot_left_is_fetched_in_pages(
+    router: zenoh.Session, client: zenoh.Session, tmp_path: Path
+) -> None:
+    gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
+    first = gateway.boot_id
+    drive(gateway, 2500)
+    gateway.close()
+    gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
+    logger = Logger(router)
+    for sequence in (*range(100), 700, 701, 702):
+        logger.seen.add(ACCEL, Identity(first, sequence))
+    logger.run(lambda: len(logger.received) >= 2397)
+    had = {*range(100), 700, 701, 702}
+    assert logger.numbers(first) == [n for n in range(2500) if n not in had]
+    assert not logger.lost
+    batch = decode_accel(logger.received[5].payload)
+    assert batch.channels["sprung_front"].samples[0] == batch.sequence
+    gateway.close()
+
+
+def test_what_has_just_been_said_is_not_asked_for(
+    router: zenoh.Session, client: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may still be on its way; only what is missing for a round is fetched."""
+    monkeypatch.setattr(spool_recovery, "LIST_PERIOD_S", 1.0)
+    gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
+    drive(gateway, 10)
+    logger = Logger(router)
+    began = time.monotonic()
+    logger.run(lambda: time.monotonic() - began > 0.8)
+    assert logger.received == []
+    logger.run(lambda: len(logger.received) == 10)
+    gateway.close()
+
+
+def test_what_no_one_has_is_lost_and_what_was_confirmed_is_not(
+    router: zenoh.Session, client: zenoh.Session, tmp_path: Path
+) -> None:
+    spool = Spool(tmp_path, budget_bytes=MIB)
+    gateway = Gateway(client, "live", "truck-1", spool)
+    boot_id = gateway.boot_id
+    drive(gateway, 500)
+    spool.confirm({("accel", boot_id): 99})
+    drive_on = 0
+    while not spool.dropped():
+        gateway.accel(
+            {"sprung_front": Channel(1000.0, np.zeros(50))},
+            device_time_ns=drive_on, wall_time_ns=time.time_ns(),
+        )  # fmt: skip
+        drive_on += 1
+        if drive_on % 200 == 0:
+            spool.sync()
+    gateway.close()
+    gateway = Gateway(client, "live", "truck-1", Spool(tmp_path, budget_bytes=MIB))
+    [held] = [
+        boot
+        for boot in gateway._spool.spool.contents("accel")
+        if boot.boot_id == boot_id  # type: ignore[union-attr]
+    ]
+    logger = Logger(router)
+    logger.seen.add(ACCEL, Identity(boot_id, 50))
+    present = flat(held.held)
+    expected = {n for n in present if n > held.durable}
+    logger.run(lambda: len(logger.numbers(boot_id)) >= len(expected))
+    assert set(logger.numbers(boot_id)) == expected
+    assert logger.lost == set(range(held.durable + 1, min(present)))
+    assert logger.confirmed == set(range(held.durable + 1)) - {50}
+    assert held.dropped == len(logger.lost)
+    gateway.close()
+
+
+def test_a_damaged_record_is_lost_and_not_asked_for_for_ever(
+    router: zenoh.Session, client: zenoh.Session, tmp_path: Path
+) -> None:
+    gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
+    boot_id = gateway.boot_id
+    drive(gateway, 20)
+    [segment] = tmp_path.glob("*.spool")
+    content = bytearray(segment.read_bytes())
+    record = (len(content) - 20) // 20
+    content[20 + 7 * record + 100] ^= 1
+    segment.write_bytes(content)
+    logger = Logger(router)
+    logger.run(lambda: len(logger.received) == 19 and bool(logger.lost))
+    assert logger.lost == {7}
+    assert logger.numbers(boot_id) == [n for n in range(20) if n != 7]
+    gateway.close()
+
+
+def test_a_truck_that_does_not_answer_holds_up_no_other(
+    router: zenoh.Session, client: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mute = client.declare_queryable(
+        wire.spool_selector("live", "truck-0"), zenoh.handlers.FifoChannel(100)
+    )
+    gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
+    drive(gateway, 50)
+    logger = Logger(router)
+    logger.run(lambda: len(logger.received) == 50, timeout_s=5.0)
+    gateway.close()
+    mute.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_a_refused_batch_uses_up_no_number(
+    router: zenoh.Session, client: zenoh.Session, tmp_path: Path
+) -> None:
+    """A sensor that gives NaN must not leave a hole that nobody can fill."""
+    gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
+    drive(gateway, 1)
+    with pytest.raises(ValueError, match="not finite"):
+        gateway.accel(
+            {"sprung_front": Channel(1000.0, np.full(50, np.nan))},
+            device_time_ns=0, wall_time_ns=time.time_ns(),
+        )  # fmt: skip
+    with pytest.raises(ValueError, match="latitude"):
+        gateway.gnss(GnssFix(0, 0, 0, time.time_ns(), 91.0, 0.0, 0.0, 0.0))
+    drive(gateway, 1)
+    assert gateway._spool is not None
+    [held] = gateway._spool.spool.contents("accel")
+    assert held.held == [(0, 1)]
+    gateway.close()
+
+
+def test_a_full_disk_on_the_truck_stops_nothing(
+    router: zenoh.Session, client: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from schemas.topics import selector
+    from services.common.bus import Subscription
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with Subscription(router, selector("live", "vehicle")) as subscription:
+        gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
+        monkeypatch.setattr(Spool, "append", full)
+        drive(gateway, 30)
+        found = [subscription.receive(5.0) for _ in range(30)]
+        assert None not in found
+        assert gateway.unspooled == 30
+        gateway.close()
