@@ -133,6 +133,7 @@ class RecordingWriter:
         self.identities: Identities = {}
         self._disk = disk
         self._is_dirty = True
+        self._has_failed_sync = False
         fcntl.flock(self._file, fcntl.LOCK_EX)
         start = {"previous": previous} if previous else {}
         start |= {"repeated": str(len(latched))} if latched else {}
@@ -168,7 +169,7 @@ class RecordingWriter:
         """Close the chunk and bring everything written so far to the disk itself."""
         if self._is_dirty:
             self._mcap.writer.flush()
-            self._disk.sync(self._file.fileno())
+            self._sync_file()
             self._is_dirty = False
 
     def tell(self) -> int:
@@ -184,7 +185,7 @@ class RecordingWriter:
         """Write the END sentinel with its reason and counts, the index, and close the file."""
         self._mcap.writer.add_metadata(IDENTITIES, identities_text(self.identities))
         _end(self._mcap.writer, reason, self.messages, counts or {}, time_ns)
-        self._disk.sync(self._file.fileno())
+        self._sync_file()
         self._file.close()
 
     def fail(self, reason: str, counts: Mapping[str, int], events: Iterable[Message]) -> int | None:
@@ -198,7 +199,6 @@ class RecordingWriter:
         discarded = writer.discard()
         self.messages -= discarded
         whole = writer.offset
-        is_synced = False
         try:
             self._cut(whole)
             for event in events:
@@ -206,14 +206,15 @@ class RecordingWriter:
                 _add(self._mcap, event)
             counts = {**counts, "not_written": discarded}
             _end(writer, reason, self.messages, counts, None)
-            self._disk.sync(self._file.fileno())
-            is_synced = True
+            self._sync_file()
         except OSError as error:
             _log.error("%s: not even its end could be written: %s", self.path, error.strerror)
             with contextlib.suppress(OSError):
                 self._cut(whole)
+                self._sync_file()
         self.abandon()
-        return discarded if is_synced else None
+        # After one failure the next success says nothing: the system may have forgotten the pages.
+        return None if self._has_failed_sync else discarded
 
     def abandon(self) -> None:
         """Close the file as it is: what was synced stays readable."""
@@ -221,6 +222,13 @@ class RecordingWriter:
             self._file.close()
         except OSError as error:  # the handle is closed anyway
             _log.error("%s: %s", self.path, error.strerror)
+
+    def _sync_file(self) -> None:
+        try:
+            self._disk.sync(self._file.fileno())
+        except OSError:
+            self._has_failed_sync = True
+            raise
 
     def _cut(self, size: int) -> None:
         self._file.truncate(size)

@@ -57,6 +57,8 @@ class Housekeeping:
         self._crashed = sorted(_recordings(house, ".mcap"))
         self._kept_until: dict[Path, float] = {}
         self._is_over_budget = False
+        self.is_busy = True
+        """Whether there is something left to do now."""
         self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
         self._thread.start()
 
@@ -77,10 +79,13 @@ class Housekeeping:
                     _log.warning("%s", error)
             while self._house.budget_bytes is not None:
                 self._keep_budget(self._house.budget_bytes)
+                self.is_busy = False
                 if self._closing.wait(_BUDGET_PERIOD_S):
                     return
         except Exception:  # recording goes on without
             _log.exception("housekeeping ended")
+        finally:
+            self.is_busy = False
 
     def _recover(self, path: Path) -> None:
         size = path.stat().st_size

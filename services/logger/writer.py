@@ -343,9 +343,9 @@ class FileWriter:
         left = f"{self.free_bytes / 1e6:.0f} MB left on the disk of {folder}"
         if self.free_bytes < floor * _STOP_SHARE:
             raise _WriteFailed(None, f"only {left}", EventKind.DISK_LOW)
-        if self.free_bytes < floor and not self.is_disk_low:
+        was_low, self.is_disk_low = self.is_disk_low, self.free_bytes < floor
+        if self.is_disk_low and not was_low:
             self._say(Event(EventKind.DISK_LOW, time.time_ns(), left))
-        self.is_disk_low = self.free_bytes < floor
 
     def _say(self, event: Event) -> None:
         """Write an event to the file of every realm, and leave it to be published."""
@@ -359,9 +359,18 @@ class FileWriter:
     def _stop(self, failed: _FileName | None, failure: str, kind: EventKind) -> None:
         """Close every file as well as can be, count what is lost and take nothing any more."""
         _log.error("%s", failure)
-        event = Event(kind, time.time_ns(), failure)
-        lost: list[Message] = []
+        try:
+            self._close_all_badly(failed, failure, Event(kind, time.time_ns(), failure))
+        finally:
+            self.failure = failure
+        while not self._backlog.is_over:
+            waited = self._backlog.take(SYNC_PERIOD_S)
+            if waited is not None:
+                self.count_drop(waited.key)
+
+    def _close_all_badly(self, failed: _FileName | None, failure: str, event: Event) -> None:
         saved: list[Message] = []
+        lost: list[Message] = []
         for name, opened in self._files.items():
             message = self._own.message(name[0] or self._place.realm or "live", event)
             self.said.append(message)
@@ -372,31 +381,32 @@ class FileWriter:
             lost += mine[len(mine) - number :]
         # What was on its way to a file that could not even be opened.
         lost += [m for n, m in self._unsynced if n not in self._files]
+        self._files.clear()
+        self._unsynced.clear()
         self._durable.add(saved)
         self.written += len(saved)
         for dropped in lost:
             self.count_drop(dropped.key)
-        self._unsynced.clear()
-        self._files.clear()
-        self.failure = failure
-        while not self._backlog.is_over:
-            waited = self._backlog.take(SYNC_PERIOD_S)
-            if waited is not None:
-                self.count_drop(waited.key)
 
     def _close_badly(
         self, name: _FileName, opened: _Open, failure: str, event: Message, *, is_failed: bool
     ) -> int | None:
         """Close a file with an event; how many messages it lost, None if that is not known."""
         counts = {"dropped": self._dropped_of[name] - opened.dropped_before}
-        if not is_failed:
-            try:
-                opened.file.write(event)
-                opened.file.finish(failure, counts)
-                return 0
-            except OSError as error:
-                _log.error("%s: %s", opened.file.path, error.strerror)
-        return opened.file.fail(failure, counts, [event])
+        try:
+            if is_failed:
+                return opened.file.fail(failure, counts, [event])
+            opened.file.sync()
+        except OSError as error:
+            _log.error("%s: %s", opened.file.path, error.strerror)
+            return opened.file.fail(failure, counts, [event])
+        try:
+            opened.file.write(event)
+            opened.file.finish(failure, counts)
+        except OSError as error:  # all but event and END is safe
+            _log.error("%s: %s", opened.file.path, error.strerror)
+            opened.file.fail(failure, counts, [event])
+        return 0
 
 
 class _WriteFailed(Exception):  # noqa: N818  # says what happened, as OSError does not
