@@ -13,7 +13,8 @@ REALM = rf"live|(?:replay|sim|import)-{IDENTIFIER}"
 
 _IDENTIFIER = re.compile(IDENTIFIER)
 _REALM = re.compile(REALM)
-_MAX_KEY_CHARACTERS = 255  # far above the longest valid key; bounds the work on hostile ones
+MAX_KEY_CHARACTERS = 255
+"""Far above the longest valid key; bounds the work and the memory that hostile ones take."""
 
 Owner = Literal["vehicle", "bridge", "service"]
 Delivery = Literal["reliable", "latest"]
@@ -146,8 +147,8 @@ def key(realm: str, owner: str, identifier: str, stream: str) -> str:
 
 def parse_key(text: str) -> Key:
     """Take a key apart; ValueError if it is not one of ours, whatever the text."""
-    if len(text) > _MAX_KEY_CHARACTERS:
-        raise ValueError(f"key of {len(text)} characters; at most {_MAX_KEY_CHARACTERS}")
+    if len(text) > MAX_KEY_CHARACTERS:
+        raise ValueError(f"key of {len(text)} characters; at most {MAX_KEY_CHARACTERS}")
     parts = text.split("/")
     if len(parts) != 6 or "/".join(parts[:2]) != PREFIX:
         raise ValueError(f"key {text!r} is not {PREFIX}/REALM/OWNER/ID/STREAM")

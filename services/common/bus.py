@@ -47,7 +47,7 @@ from zenoh import ext, handlers
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity, decode_identity, encode_identity
-from schemas.topics import TOPICS, Key, key, parse_key, selector, topic
+from schemas.topics import MAX_KEY_CHARACTERS, TOPICS, Key, key, parse_key, selector, topic
 from services.common.credentials import (
     CONFIGURATION,
     LISTENERS,
@@ -72,6 +72,8 @@ _GAP_PATIENCE_S = 0.5
 _GAP_TRIES = 3
 _GAP_QUERY_TIMEOUT_S = 5.0
 _MAX_HOLES_PER_ROUND = 100
+_MAX_HOLES_PER_SOURCE = 10_000
+_MAX_SOURCES = 10_000
 _QUERIES_WAITING = 100
 
 
@@ -425,7 +427,16 @@ class Subscription:
             return
         name = (str(sample.key_expr), str(source.source_id.zid), str(source.source_id.eid))
         with self._lock:
-            self._sources.setdefault(name, _Source()).numbers.add(source.source_sn)
+            found = self._sources.get(name)
+            if found is None:
+                if len(name[0]) > MAX_KEY_CHARACTERS:
+                    return
+                if len(self._sources) >= _MAX_SOURCES:
+                    # The oldest: a publisher that has gone, or a stranger who makes up names.
+                    del self._sources[next(iter(self._sources))]
+                found = self._sources[name] = _Source()
+            if found.numbers.runs < _MAX_HOLES_PER_SOURCE:
+                found.numbers.add(source.source_sn)
 
     def _fill_gaps(self) -> None:
         while not self._closing.wait(_GAP_PATIENCE_S):

@@ -283,3 +283,16 @@ def test_seen_tells_duplicates_by_identity() -> None:
     assert seen.add(ACCEL, Identity(2, 0))
     assert seen.add(ACCEL._replace(identifier="truck-2"), Identity(1, 0))
     assert seen.add(ACCEL._replace(realm="sim-a"), Identity(1, 0))
+
+
+def test_made_up_publishers_take_bounded_memory(
+    router: zenoh.Session, client: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bus, "_MAX_SOURCES", 5)
+    with Subscription(router, "driveby/v1/**") as subscription:
+        for number in range(20):
+            publisher = Publisher(client, "live")
+            publisher.put("vehicle", f"truck-{number}", "accel", b"x")
+            publisher.close()
+        assert len(receive(subscription, 20)) == 20
+        assert len(subscription._sources) == 5
