@@ -74,6 +74,8 @@ _GAP_QUERY_TIMEOUT_S = 5.0
 _MAX_HOLES_PER_ROUND = 100
 _MAX_HOLES_PER_SOURCE = 10_000
 _MAX_SOURCES = 10_000
+_PATIENCE_WITH_SUBSCRIBER_US = 1_000_000
+"""Zenoh's own is 5 s; who is cut off connects again and gets what it missed."""
 _QUERIES_WAITING = 100
 
 
@@ -181,6 +183,10 @@ def _configuration(endpoint: str, tls: Path | None, *, is_client: bool) -> zenoh
         "transport/shared_memory/enabled": False,
         "timestamping/enabled": True,
     }
+    if not is_client:
+        # A router waits for a subscriber that has stopped reading, and with it wait all others.
+        block = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+        settings[block] = _PATIENCE_WITH_SUBSCRIBER_US
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
     if tls is not None:
