@@ -168,3 +168,28 @@ def test_a_truck_whose_wall_clock_jumps(fleet: MakeFleet, jump_s: int) -> None:
     assert [(step.vehicle, step.first_sequence) for step in steps] == [("truck-1", 30)]
     accel = [m.sequence for m in read_messages(path) if m.key.stream == "accel"]
     assert accel == sorted(accel)
+
+
+@pytest.mark.faults
+def test_a_frozen_subscriber_holds_up_the_logger_for_seconds_only(fleet: MakeFleet) -> None:
+    one = fleet()
+    one.start_logger()
+    viewer = one.python("subscriber_process.py", one.logger_endpoint, env={})
+    assert viewer.stdout.readline() == "ready\n"
+    trucks = [one.start_truck(f"truck-{n}", rate=1000.0) for n in (1, 2)]
+    for truck in trucks:
+        truck.wait_for(500)
+    viewer.send_signal(signal.SIGSTOP)
+    for truck in trucks:
+        truck.wait_for(max(truck.said.values()) + 12_000)
+    for truck in trucks:
+        truck.finish()
+    one.stop_logger()
+    assert one.assert_complete() == 0
+    lags_s = [
+        (message.publish_time_ns - message.log_time_ns) * 1e-9
+        for path in (one.folder / "recordings").glob("*/*/truck-*.mcap")
+        for message in read_messages(path)
+        if message.key.stream == "accel"
+    ]
+    assert max(lags_s) < 5.0  # Zenoh's own patience made it 10

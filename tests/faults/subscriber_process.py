@@ -1,0 +1,20 @@
+"""A viewer that reads everything: `python subscriber_process.py ENDPOINT`."""
+
+import sys
+
+from schemas.topics import selector
+from services.common.bus import Subscription, open_session
+
+
+def main(endpoint: str) -> None:
+    with (
+        open_session(connect=endpoint, timeout_s=10) as session,
+        Subscription(session, selector("live", "vehicle")) as subscription,
+    ):
+        print("ready", flush=True)
+        while True:
+            subscription.receive(1.0)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
