@@ -17,7 +17,7 @@ from schemas.reasons import Reason
 from schemas.site import Vehicle
 from services.worker.crossing_data import CrossingData, Floats
 
-# Before the fit. Sound: 400 drawn crossings (docs/verdicts.md).
+# Before the fit. Sound: 300 drawn crossings, none accused (docs/verdicts.md).
 _LONGEST_HOLD_S = 0.2
 """Noise and motion change every sample; a coarse converter (12 bits) holds one for 0.03 s."""
 _ALIKE = 1e-3
