@@ -1,5 +1,6 @@
 """Rewriting a damaged recording: all that still holds, and exact counts of what does not."""
 
+import fcntl
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -23,7 +24,6 @@ from services.common.recording import (
     RECOVERED,
     find_channels,
     identities_text,
-    is_being_written,
     program_version,
 )
 
@@ -98,13 +98,17 @@ def recover_recording(source: Path, target: Path, time_ns: int | None = None) ->
     now_ns = time.time_ns() if time_ns is None else time_ns
     if target.exists() and source.exists() and target.samefile(source):
         raise InputError(f"{target}: is the damaged recording itself; give another name")
-    if is_being_written(source):
-        raise InputError(f"{source}: is being written; stop its logger first")
     try:
         file = source.open("rb")
     except OSError as error:
         raise InputError(f"{source}: cannot be read: {error.strerror}") from None
     with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two at once would hinder each other
+        except BlockingIOError:
+            raise InputError(
+                f"{source}: is being written, or recovered by somebody else, at this moment"
+            ) from None
         if not any(not isinstance(item, Damage) for item in _read(source, file)):
             raise InputError(f"{source}: holds nothing of an MCAP recording that can be read")
         with replaced_atomically(target) as temporary, temporary.open("wb") as out:
