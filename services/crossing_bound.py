@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 _STEP = 1e-4
 """Of a central difference, in the coordinates of the posterior: multiples of a prior's spread, and
-metres of the trajectory. Halving it moves no bound by 1e-4 of itself (tests)."""
+metres of the trajectory. Halving it moves no bound by a thousandth of itself (tests)."""
 _NUISANCE_STEPS = 20
 _ENOUGH = 0.01
 """Of the sum of squares, whose standard deviation is tens: less is no step."""
@@ -55,14 +55,14 @@ def bound_at(
     `values` are by the names of docs/contract.md; the trajectory is the receiver's, moved so that
     the front axle enters the bridge at `entry_time` (s since 1970).
     """
-    problem, y = problem_of(seen)
+    problem, y, time_s = problem_of(seen)
     where = posterior.layout(problem)
     names = parameters.names(_elements(problem))
     theta = np.array([values[name] for name in names])
     _set_theta(problem, y, theta, wheelbase_m)
     entry_m = np.interp(
         entry_time - seen.data.wall_offset_s,
-        _sample_times(seen),
+        time_s,
         problem.basis_position @ y[where.trajectory],
     )
     begin_m = 0.0 if seen.data.stay.direction > 0 else seen.data.bridge.span_m
@@ -73,7 +73,7 @@ def bound_at(
 
 def at_truth(seen: Seen, drawn: Drawn) -> tuple[posterior.Problem, Floats]:
     """The posterior of a drawn crossing, and the truth in its coordinates (see `_settled`)."""
-    problem, y = problem_of(seen)
+    problem, y, time_s = problem_of(seen)
     where = posterior.layout(problem)
     errors = drawn.truth.channels
     correction = 1.0 / ((1.0 + errors.common_gain) * (1.0 + errors.gain)) - 1.0
@@ -86,7 +86,7 @@ def at_truth(seen: Seen, drawn: Drawn) -> tuple[posterior.Problem, Floats]:
     _set_theta(problem, y, theta, drawn.truth.car.wheelbase_m)
     y[where.delays] = errors.delay_s / problem.priors.delay_spread_s
     true_m = np.interp(
-        _sample_times(seen) + seen.data.wall_offset_s,
+        time_s + seen.data.wall_offset_s,
         drawn.start_s + drawn.step_s * np.arange(drawn.motion.position_m.size),
         drawn.motion.position_m,
     )
@@ -145,7 +145,14 @@ def bound_of(
         alone[names[i]] = float(problem.priors.spread[i] * std[place])
         is_scaled = names[i].startswith(("c_", "k_s", "k_u", "m_", "EI_")) or names[i] == "rhoA"
         full[names[i]] = float(np.hypot(alone[names[i]], scale_error if is_scaled else 0.0))
-    return Bound(full, alone, pre.chi2_per_dof(problem, y))
+    return Bound(full, alone, _chi2_per_dof(problem, y))
+
+
+def _chi2_per_dof(problem: posterior.Problem, y: Floats) -> float:
+    """Mean square of the white data; only the nuisances were fitted to them."""
+    where = posterior.layout(problem)
+    rows = posterior.data_rows(problem, y[None, :])[0]
+    return float(rows @ rows) / max(1, rows.size - (where.offset - where.gains.start))
 
 
 def central_jacobian(
@@ -205,19 +212,32 @@ def _elements(problem: posterior.Problem) -> int:
     return int(problem.priors.theta.size) - len(parameters.names(0))
 
 
-def _sample_times(seen: Seen) -> Floats:
-    samples = seen.data.samples
-    assert samples is not None  # noqa: S101 - the crossing was identified
-    count = samples.channels[CHANNELS[0]].size
-    return np.asarray(samples.start_s + np.arange(count) / samples.rate_hz)
+def problem_of(seen: Seen) -> tuple[posterior.Problem, Floats, Floats]:
+    """The posterior as the method sets it up for this crossing, its nominal start, its times (n,).
 
-
-def problem_of(seen: Seen) -> tuple[posterior.Problem, Floats]:
-    """The posterior as the method sets it up for this crossing, and its nominal start."""
+    Times are of the rows of `basis_position`, on the truck's clock.
+    """
     samples = seen.data.samples
     assert samples is not None  # noqa: S101 - the crossing was identified
     acceleration = np.stack([samples.channels[name] for name in CHANNELS])
-    return pre.prepare(inputs_of(seen.data, seen.settings, acceleration, samples.start_s))
+    inputs = inputs_of(seen.data, seen.settings, acceleration, samples.start_s)
+    problem, y = pre.prepare(inputs)
+    return problem, y, _times(problem, inputs.fixes)
+
+
+def _times(problem: posterior.Problem, fixes: posterior.Fixes) -> Floats:
+    """When the trajectory is at the rows of its basis: that spline which is the time itself.
+
+    The rows of the receiver determine it: at the fixes it is their time, its slope is one and its
+    third derivative nothing.
+    """
+    rows = problem.receiver_rows[:-1, :-1]
+    moments = fixes.time_s - fixes.time_s[0]
+    values = np.zeros(rows.shape[0])
+    values[: moments.size] = moments / fixes.position_noise_m
+    values[moments.size : 2 * moments.size] = 1.0 / fixes.speed_noise_m_per_s
+    coefficients = np.linalg.lstsq(rows, values, rcond=None)[0]
+    return np.asarray(fixes.time_s[0] + problem.basis_position @ coefficients)
 
 
 def _set_theta(problem: posterior.Problem, y: Floats, theta: Floats, wheelbase_m: float) -> None:

@@ -99,4 +99,4 @@ def test_differences_are_fine_enough_and_nuisances_settle(monkeypatch: pytest.Mo
     assert squares[2] == pytest.approx(squares[0], abs=0.1)
     coarse, fine = (bound_of(problem, y, 0.0, step=step).std for step in (1e-4, 5e-5))
     for name, value in fine.items():
-        assert coarse[name] == pytest.approx(value, rel=1e-4), name
+        assert coarse[name] == pytest.approx(value, rel=1e-3), name
