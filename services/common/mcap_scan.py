@@ -109,16 +109,16 @@ class Damage(NamedTuple):
 Item = Schema | Channel | RawMessage | Indexed | Attachment | Metadata | DataEnd | Footer | Damage
 
 
-def scan(file: BinaryIO) -> Iterator[Item]:
-    """Yield what holds in the file, in its order, and the damage between.
+def scan(file: BinaryIO, start: int = 0) -> Iterator[Item]:
+    """Yield what holds in the file, in its order, and the damage between; from a record's start.
 
     Of the summary come its schemas and channels, and the footer. A file that ends without a footer
     ends with a `Damage` that is cut off, of size 0 if not even a record was torn. OSError if
     reading fails.
     """
     size = os.fstat(file.fileno()).st_size
-    at = len(MCAP0_MAGIC)
-    if _read(file, 0, at) != MCAP0_MAGIC:
+    at = start or len(MCAP0_MAGIC)
+    if not start and _read(file, 0, at) != MCAP0_MAGIC:
         at = 0
     is_whole = is_chunked = False
     while at < size:
@@ -146,6 +146,26 @@ def scan(file: BinaryIO) -> Iterator[Item]:
     if not is_whole:
         text = f"cut off at byte {at} of {size}"
         yield Damage(at, 0, text, is_chunk=False, is_cut_off=True)
+
+
+def last_metadata(file: BinaryIO, name: str) -> tuple[Metadata, int] | None:
+    """Return the last metadata record of a name and where it ends, read from the file's end."""
+    encoded = name.encode()
+    mark = len(encoded).to_bytes(4, "little") + encoded
+    size = os.fstat(file.fileno()).st_size
+    end = size
+    while end > 0:
+        begin = max(0, end - _WINDOW_BYTES)
+        window = _read(file, begin, end - begin + len(mark))
+        found = window.rfind(mark)
+        while found >= 0:
+            record = _strong_record_at(file, max(0, begin + found - _HEADER.size), size)
+            item = next(record.items(), None) if record is not None else None
+            if record is not None and isinstance(item, Metadata) and item.name == name:
+                return item, record.end
+            found = window.rfind(mark, 0, found)
+        end = begin
+    return None
 
 
 class _Record(NamedTuple):
@@ -255,7 +275,10 @@ def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Rec
     elif head[_FRAME_AT:] == _FRAME or head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD:
         begin = at + _FRAME_AT
         inner_end = begin + _LENGTH.unpack_from(head, _FRAME_AT - _LENGTH.size)[0]
-        attempts += [(True, begin, end) for end in dict.fromkeys((inner_end, outer_end)) if end]
+        # The shorter first: what is compressed says itself where it ends, so that too many bytes
+        # decompress as well as the right ones.
+        ends = sorted({end for end in (inner_end, outer_end) if end is not None})
+        attempts += [(True, begin, end) for end in ends]
     for is_compressed, begin, end in attempts:
         if not begin <= end <= size or end - begin > MAX_RECORD_BYTES:
             continue

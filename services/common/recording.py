@@ -10,17 +10,16 @@ them. Besides the messages a file has
   without `driveby.end` was cut off: everything up to its last whole chunk can still be read. A file
   that continues another one names it as `previous` in `driveby.start`, and begins with that many
   latched messages again as `repeated` says;
-- metadata `driveby.identities` before the end: by key and boot, the sequence numbers in the file;
+- metadata `driveby.identities`, every minute and before the end: by key and boot, the sequence
+  numbers of all messages before it;
 - metadata `driveby.recovered`, if the file was rewritten by `driveby recover`: what was lost;
 - attachment `site.toml`, if the site was known to the writer.
 """
 
 import contextlib
 import fcntl
-import io
 import logging
 import os
-import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -29,10 +28,7 @@ from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Footer, Metadata, MetadataIndex
+from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from schemas.messages import descriptors
@@ -42,7 +38,7 @@ from services.common.errors import InputError
 from services.common.files import replaced_atomically
 from services.common.intervals import Intervals
 from services.common.mcap_file import McapWriter
-from services.common.mcap_scan import MAX_RECORD_BYTES, Damage, RawMessage, scan
+from services.common.mcap_scan import Damage, RawMessage, last_metadata, scan
 
 FORMAT = "1"
 ABOUT = "driveby"
@@ -54,7 +50,8 @@ SITE = "site.toml"
 
 _log = logging.getLogger(__name__)
 CHUNK_BYTES = 64 * 1024
-_RECORD_HEADER = struct.Struct("<BQ")
+_IDENTITIES_PERIOD_S = 60.0
+"""What is newer must be read message by message after a crash, before recording goes on."""
 
 Identities = dict[tuple[Key, int], Intervals]
 """By key and boot_id: the sequence numbers of the messages."""
@@ -134,6 +131,7 @@ class RecordingWriter:
         self._disk = disk
         self._is_dirty = True
         self._has_failed_sync = False
+        self._next_identities_s = time.monotonic() + _IDENTITIES_PERIOD_S
         fcntl.flock(self._file, fcntl.LOCK_EX)
         start = {"previous": previous} if previous else {}
         start |= {"repeated": str(len(latched))} if latched else {}
@@ -169,6 +167,9 @@ class RecordingWriter:
         """Close the chunk and bring everything written so far to the disk itself."""
         if self._is_dirty:
             self._mcap.writer.flush()
+            if time.monotonic() >= self._next_identities_s:
+                self._next_identities_s = time.monotonic() + _IDENTITIES_PERIOD_S
+                self._mcap.writer.add_metadata(IDENTITIES, identities_text(self.identities))
             self._sync_file()
             self._is_dirty = False
 
@@ -338,15 +339,23 @@ def read_info(path: Path) -> RecordingInfo:
 
 
 def read_identities(path: Path) -> Identities:
-    """Return which messages a recording holds; quick where its writer got to finish it.
+    """Return which messages a recording holds, without reading all of it if it is one of ours.
 
     InputError if the file is missing or not MCAP.
     """
-    known = _stored_identities(path)
-    if known is not None:
-        return known
     identities: Identities = {}
-    for item in _scan(path):
+    start = 0
+    with _opened(path) as file:
+        stored = last_metadata(file, IDENTITIES)
+    if stored is not None:
+        try:
+            identities = _parsed_identities(stored[0].metadata)
+            start = stored[1]
+        except ValueError:
+            _log.warning("%s: its %s cannot be read", path, IDENTITIES)
+    for item in _scan(path, start):
+        if isinstance(item, Metadata) and item.name == END:
+            break
         if isinstance(item, Message):
             numbers = identities.setdefault((item.key, item.boot_id), Intervals())
             numbers.add(item.sequence)
@@ -355,7 +364,10 @@ def read_identities(path: Path) -> Identities:
 
 def is_closed(path: Path) -> bool:
     """Whether a recording has an END sentinel and its index; InputError if it cannot be read."""
-    return _last_metadata(path, END) is not None
+    with _opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        file.seek(max(0, size - len(MCAP0_MAGIC)))
+        return file.read() == MCAP0_MAGIC and last_metadata(file, END) is not None
 
 
 def is_being_written(path: Path) -> bool:
@@ -440,57 +452,15 @@ def identities_text(identities: Identities) -> dict[str, str]:
     }
 
 
-def _stored_identities(path: Path) -> Identities | None:
-    stored = _last_metadata(path, IDENTITIES)
-    if stored is None or not is_closed(path):
-        return None
+def _parsed_identities(stored: Mapping[str, str]) -> Identities:
     identities: Identities = {}
-    try:
-        for name, ranges in stored.items():
-            where, _, boot_id = name.partition(" ")
-            numbers = identities[(parse_key(where), int(boot_id))] = Intervals()
-            for text in ranges.split(","):
-                first, _, last = text.partition("-")
-                numbers.add_range(int(first), int(last))
-    except ValueError:
-        return None  # damaged, or of another version of this program
+    for name, ranges in stored.items():
+        where, _, boot_id = name.partition(" ")
+        numbers = identities[(parse_key(where), int(boot_id))] = Intervals()
+        for text in ranges.split(","):
+            first, _, last = text.partition("-")
+            numbers.add_range(int(first), int(last))
     return identities
-
-
-def _last_metadata(path: Path, name: str) -> dict[str, str] | None:
-    """Return a metadata record of a whole file through its index, without reading the rest."""
-    tail = _RECORD_HEADER.size + 20 + len(MCAP0_MAGIC)
-    with _opened(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        if size < tail:
-            return None
-        file.seek(size - tail)
-        end = file.read(tail)
-        if not end.endswith(MCAP0_MAGIC) or end[0] != Opcode.FOOTER:
-            return None
-        try:
-            footer = Footer.read(ReadDataStream(io.BytesIO(end[_RECORD_HEADER.size :])))
-            if not footer.summary_start <= size - tail <= footer.summary_start + MAX_RECORD_BYTES:
-                return None
-            file.seek(footer.summary_start)
-            summary = file.read(size - tail - footer.summary_start)
-            found: dict[str, str] | None = None
-            at = 0
-            while at + _RECORD_HEADER.size <= len(summary):
-                opcode, length = _RECORD_HEADER.unpack_from(summary, at)
-                body = summary[at + _RECORD_HEADER.size : at + _RECORD_HEADER.size + length]
-                at += _RECORD_HEADER.size + length
-                if opcode != Opcode.METADATA_INDEX:
-                    continue
-                index = MetadataIndex.read(ReadDataStream(io.BytesIO(body)))
-                if index.name == name and _RECORD_HEADER.size < index.length <= MAX_RECORD_BYTES:
-                    file.seek(index.offset + _RECORD_HEADER.size)
-                    stored = file.read(index.length - _RECORD_HEADER.size)
-                    record = Metadata.read(ReadDataStream(io.BytesIO(stored)))
-                    found = dict(record.metadata) if record.name == name else found
-            return found
-        except (McapError, struct.error, ValueError, OverflowError):
-            return None
 
 
 @contextlib.contextmanager
@@ -504,7 +474,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         raise InputError(f"{path}: {why}") from None
 
 
-def _scan(path: Path) -> Iterator[Message | Metadata | Attachment | Damage]:
+def _scan(path: Path, start: int = 0) -> Iterator[Message | Metadata | Attachment | Damage]:
     """Yield all that is of use in a file, in its order, and what is damaged."""
     with _opened(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -513,7 +483,7 @@ def _scan(path: Path) -> Iterator[Message | Metadata | Attachment | Damage]:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise InputError(f"{path}: is not an MCAP file; a recording (.mcap) is expected")
         channels: dict[int, tuple[Key, int] | None] = {}
-        for item in scan(file):
+        for item in scan(file, start):
             if isinstance(item, RawMessage):
                 if item.channel_id not in channels:
                     # The chunk that said it is lost. Ours say it again in every chunk; of older

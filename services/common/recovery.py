@@ -100,6 +100,8 @@ def recover_recording(source: Path, target: Path, time_ns: int | None = None) ->
         raise InputError(f"{target}: is the damaged recording itself; give another name")
     try:
         file = source.open("rb")
+    except FileNotFoundError:
+        raise InputError(f"{source}: no such file") from None
     except OSError as error:
         raise InputError(f"{source}: cannot be read: {error.strerror}") from None
     with file:

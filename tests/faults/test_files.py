@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from schemas.events import EventKind, decode_event
+from schemas.proto import driveby_pb2 as pb
 from schemas.signals import (
     CHANNELS,
     AccelBatch,
@@ -202,6 +203,10 @@ def full_disk(capacity: int) -> Disk:
 
 def write_until_it_fails(tmp_path: Path, disk: Disk, trucks: int) -> tuple[FileWriter, int]:
     writer = FileWriter(place(tmp_path), disk=disk)
+    return writer, send_until_it_fails(writer, trucks)
+
+
+def send_until_it_fails(writer: FileWriter, trucks: int) -> int:
     sent = 0
     streams = [fixes(100_000, f"truck-{n}") for n in range(trucks)]
     while writer.failure is None and sent < 20_000:
@@ -211,7 +216,7 @@ def write_until_it_fails(tmp_path: Path, disk: Disk, trucks: int) -> tuple[FileW
         if sent % 100 == 0:
             time.sleep(0.001)
     writer.finish("done", {})
-    return writer, sent
+    return sent
 
 
 SEEDS = (0, *(pytest.param(n, marks=pytest.mark.faults) for n in range(1, 60)))
@@ -246,7 +251,8 @@ def test_a_disk_that_is_full_anywhere_is_told_and_counted(
             assert end["reason"] == writer.failure
             assert EventKind.WRITE_ERROR in events_of(path)
         else:
-            recover_recording(path, tmp_path / "r.mcap")
+            recovery = recover_recording(path, tmp_path / "r.mcap")
+            assert recovery.damaged_bytes == 0  # what was torn has been cut off
 
 
 @pytest.mark.parametrize("call", [3, 4, 9])
@@ -256,19 +262,24 @@ def test_a_failing_fsync_ends_the_recording_and_claims_nothing(
     """After it nobody knows what is on the disk: what was not synced before is counted as lost."""
     monkeypatch.setattr(writer_module, "SYNC_PERIOD_S", 0.01)
     calls = 0
+    safe: list[int] = []
 
     def sync(descriptor: int) -> None:
         nonlocal calls
         calls += 1
-        if calls >= call:
+        if calls == call:
+            safe.append(sum(stream.count for stream in durable_streams()))
             raise OSError(5, "Input/output error")
         DISK.sync(descriptor)
 
-    writer, sent = write_until_it_fails(tmp_path, DISK._replace(sync=sync), 1)
+    def durable_streams() -> list[pb.DurableStream]:
+        return [stream for said in writer.durable()[1].values() for stream in said.streams]
+
+    writer = FileWriter(place(tmp_path), disk=DISK._replace(sync=sync))
+    sent = send_until_it_fails(writer, 1)
     assert writer.failure == "recording stopped: Input/output error"
     assert writer.written + writer.dropped == sent
-    [stream] = writer.durable()[1]["live"].streams
-    assert stream.count == writer.written
+    assert sum(stream.count for stream in durable_streams()) == writer.written == safe[0]
     [path] = tmp_path.glob("live/*/*.mcap")
     assert len(data_of([path])) >= writer.written
 

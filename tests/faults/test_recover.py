@@ -190,6 +190,17 @@ def test_a_bit_flipped_in_200_places(whole: Whole, tmp_path: Path, part: int) ->
             assert data == whole.messages, place  # the frame itself says how it is compressed
 
 
+def test_a_chunk_comes_back_if_its_header_alone_is_damaged(whole: Whole, tmp_path: Path) -> None:
+    """Opcode, lengths, times, name of the compression; all but the checksum itself."""
+    begin = whole.chunks[30].begin
+    for place in (*range(33), *range(37, 53)):
+        content = bytearray(whole.content)
+        content[begin + place] ^= 1 << (place % 8)
+        recovery, data = recovered(damaged(tmp_path, bytes(content)))
+        assert data == whole.messages, place
+        assert recovery.lost == 0
+
+
 @pytest.mark.parametrize("size", [1, 100, 512, 4096])
 def test_a_stretch_of_zeros_costs_only_what_it_covers(
     whole: Whole, tmp_path: Path, size: int

@@ -17,6 +17,7 @@ from services.common.errors import InputError
 from services.common.recording import (
     Message,
     RecordingWriter,
+    read_identities,
     read_info,
     read_messages,
     read_site,
@@ -152,6 +153,39 @@ def test_what_was_synced_is_readable_without_an_end(tmp_path: Path) -> None:
     assert info.end is not None
     assert (info.end["reason"], info.end["lost"], info.end["messages"]) == ("done", "3", "20")
     assert list(read_messages(path)) == messages
+
+
+@pytest.mark.parametrize("ending", ["closed", "crashed", "damaged"])
+def test_which_messages_are_in_a_recording(
+    tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.common.recording._IDENTITIES_PERIOD_S", 0.0)
+    path = tmp_path / "a.mcap"
+    writer = RecordingWriter(path, reason="test")
+    messages = [m for m in fixes(1000) if m.sequence not in (5, 6, 500)]
+    for n, message in enumerate(messages):
+        writer.write(message)
+        if n % 100 == 0:
+            writer.sync()
+        if n == 1500:
+            half_way = path.stat().st_size
+    if ending == "closed":
+        writer.finish("done")
+    else:
+        writer.sync()
+        writer.abandon()
+    content = bytearray(path.read_bytes())
+    if ending == "damaged":  # the last one cannot be read, nor what stood before it
+        content[-20:] = bytes(20)
+    elif ending == "closed":
+        content[half_way // 2 : half_way] = bytes(half_way - half_way // 2)  # it is not read
+    path.write_bytes(content)
+    found = read_identities(path)
+    for stream in ("gnss", "location"):
+        numbers = found[(Key("sim-test", "vehicle", "truck-1", stream), 2**63 + 5)]
+        expected = [m.sequence for m in messages if m.key.stream == stream]
+        assert [n for a, b in numbers.ranges() for n in range(a, b + 1)] == expected
+    assert len(found) == 2
 
 
 def test_sync_reaches_the_disk_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
