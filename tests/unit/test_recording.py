@@ -159,7 +159,8 @@ def test_what_was_synced_is_readable_without_an_end(tmp_path: Path) -> None:
 def test_which_messages_are_in_a_recording(
     tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.common.recording._IDENTITIES_PERIOD_S", 0.0)
+    if ending != "closed":
+        monkeypatch.setattr("services.common.recording._IDENTITIES_PERIOD_S", 0.0)
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path, reason="test")
     messages = [m for m in fixes(1000) if m.sequence not in (5, 6, 500)]
