@@ -68,6 +68,21 @@ def beam_basis(
     )
 
 
+def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
+    """The same beam in coordinates in which the bridge `theta` (n + 15,) is diagonal.
+
+    Bridges near it are then nearly diagonal, which makes their modes quick to find.
+    """
+    n = basis.stiffness.shape[0] - 2
+    factors = np.concatenate([theta[EI_1 : EI_1 + n], theta[EI_1 + n + 3 : EI_1 + n + 5]])
+    _, shapes = eigh(np.tensordot(factors, basis.stiffness, axes=1))
+    return BeamBasis(
+        np.ascontiguousarray(shapes.T @ basis.stiffness @ shapes),
+        np.ascontiguousarray(basis.cubics @ shapes),
+        basis.lengths_m,
+    )
+
+
 @kernel
 def modal_filters(
     basis_stiffness: FloatArray,
@@ -118,6 +133,49 @@ def modal_filters(
 
 
 @kernel
+def diagonalise_bridge(
+    basis_stiffness: FloatArray, theta: FloatArray, matrix: FloatArray, vectors: FloatArray
+) -> bool:
+    """Eigenvalues times rho A on the diagonal of `matrix`, mode shapes in the rows of `vectors`.
+
+    Both are (m, m), of one bridge `theta` (n + 15,). False if not finite.
+    """
+    factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
+    elements = factors - 2
+    rho = EI_1 + elements
+    matrix[:] = 0.0
+    for e in range(factors):
+        factor = theta[EI_1 + e] if e < elements else theta[rho + 3 + e - elements]
+        if factor != 0.0:
+            for i in range(m):
+                to, unit = matrix[i], basis_stiffness[e, i]
+                for j in range(m):
+                    to[j] += factor * unit[j]
+    return diagonalise_one(matrix, vectors)
+
+
+@kernel
+def shape_cubics(
+    basis_cubics: FloatArray, vector: FloatArray, size: float, lane: int, out: FloatArray
+) -> None:
+    """Cubics of one mode in every part, times `size`, into out (parts, 4, lanes) at `lane`."""
+    m = vector.size
+    for e in range(basis_cubics.shape[0]):
+        for power in range(4):
+            row = basis_cubics[e, power]
+            # Four sums, so that each need not wait for the one before.
+            s0 = s1 = s2 = s3 = 0.0
+            for i in range(0, m - 3, 4):
+                s0 += vector[i] * row[i]
+                s1 += vector[i + 1] * row[i + 1]
+                s2 += vector[i + 2] * row[i + 2]
+                s3 += vector[i + 3] * row[i + 3]
+            for i in range(m - m % 4, m):
+                s0 += vector[i] * row[i]
+            out[e, power, lane] = size * ((s0 + s1) + (s2 + s3))
+
+
+@kernel
 def modal_filters_one(
     basis_stiffness: FloatArray,
     basis_cubics: FloatArray,
@@ -133,23 +191,13 @@ def modal_filters_one(
     `matrix` and `vectors` are (m, m). Written: `cubics` (parts, g, 4, 4) [part, group, power, mode]
     and `feedback` (g, 2, 4); lanes beyond the last mode stay zero.
     """
-    factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
-    elements = factors - 2
-    rho = EI_1 + elements
-    matrix[:] = 0.0
-    for e in range(factors):
-        factor = theta[EI_1 + e] if e < elements else theta[rho + 3 + e - elements]
-        if factor != 0.0:
-            for i in range(m):
-                to, unit = matrix[i], basis_stiffness[e, i]
-                for j in range(m):
-                    to[j] += factor * unit[j]
-    if not diagonalise_one(matrix, vectors):
+    rho = EI_1 + basis_stiffness.shape[0] - 2
+    if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
         return False
     a = 2.0 / step_s
     cubics[:] = 0.0
     feedback[:] = 0.0
-    for k in range(m):
+    for k in range(basis_stiffness.shape[1]):
         group, lane = k // LANES, k % LANES
         eigenvalue = matrix[k, k] / theta[rho]
         damping = theta[rho + 1] + theta[rho + 2] * eigenvalue
@@ -157,20 +205,7 @@ def modal_filters_one(
         feedback[group, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
         feedback[group, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
         size = 1.0 / np.sqrt(theta[rho] * b_0)
-        vector = vectors[k]
-        for e in range(basis_cubics.shape[0]):
-            for power in range(4):
-                row = basis_cubics[e, power]
-                # Four sums, so that each need not wait for the one before.
-                s0 = s1 = s2 = s3 = 0.0
-                for i in range(0, m - 3, 4):
-                    s0 += vector[i] * row[i]
-                    s1 += vector[i + 1] * row[i + 1]
-                    s2 += vector[i + 2] * row[i + 2]
-                    s3 += vector[i + 3] * row[i + 3]
-                for i in range(m - m % 4, m):
-                    s0 += vector[i] * row[i]
-                cubics[e, group, power, lane] = size * ((s0 + s1) + (s2 + s3))
+        shape_cubics(basis_cubics, vectors[k], size, lane, cubics[:, group])
     return True
 
 

@@ -18,6 +18,9 @@ LANES = 4
 # results depend only to rounding on which particles are evaluated together.
 kernel = njit(fastmath={"contract", "nsz"}, error_model="numpy", cache=True, nogil=True)
 
+# For sums over many terms, which may be taken in any order.
+summing = njit(fastmath={"contract", "nsz", "reassoc"}, error_model="numpy", cache=True, nogil=True)
+
 
 @kernel
 def load(a: FloatArray, i: int) -> Lanes:

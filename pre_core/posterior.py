@@ -14,19 +14,20 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import qr, solve_triangular
 
-from pre_core.pre_model import Crossing, Points, Work, evaluate, roads_and_deflections
-from pre_core.whitening import RowFilter, Whitener, filtered, whiten
+from pre_core.pre_model import Crossing, Points, Work, evaluate_white, roads_and_deflections
+from pre_core.whitening import RowFilter, Whitener
 
 FloatArray = NDArray[np.float64]
 
 CHANNELS = 4
-# Three directions in which four gains differ; what is common to all is a scale error that no
-# residual shows.
+# Three directions in which four gains differ; what is common to all comes beside them.
 _CONTRASTS = np.array(
     [[0.5, 0.5, -0.5, -0.5], [0.5, -0.5, 0.5, -0.5], [0.5, -0.5, -0.5, 0.5]], dtype=np.float64
 )
 _INITIAL_SPREAD = np.array([0.1, 0.1, 0.1])  # m, m/s, m/s²: wide; they are nuisances
 _JERK_M_PER_S3 = 1.0
+_DEGREE = 5
+"""Of the trajectory: load moves with its second derivative, which must not have kinks."""
 
 
 class Priors(NamedTuple):
@@ -37,6 +38,8 @@ class Priors(NamedTuple):
     wheelbase_m: float
     wheelbase_spread: float
     gain_spread: float
+    """Of each channel's gain, independent of the others'."""
+    common_gain_spread: float
     delay_spread_s: float
 
 
@@ -64,6 +67,7 @@ class Problem(NamedTuple):
     basis_acceleration: FloatArray  # (n, b), positive when speeding up
     receiver_rows: FloatArray  # (r, b + 1): rows of (coefficients, offset)
     receiver_values: FloatArray  # (r,)
+    noise_slope: FloatArray  # (t + 1 + 3,): see `all_rows`
     estimated: NDArray[np.bool_]  # (p,) which of theta are unknown
     works: tuple[Work, ...]
 
@@ -74,6 +78,8 @@ class Layout(NamedTuple):
     theta: slice
     wheelbase: int
     gains: slice
+    """Contrasts between the channels."""
+    common_gain: int
     delays: slice
     initial: slice
     trajectory: slice
@@ -85,11 +91,19 @@ def layout(problem: Problem) -> Layout:
     """Order: theta (what is estimated), wheelbase, gains, delays, initial states, trajectory."""
     t = int(problem.estimated.sum())
     gains = slice(t + 1, t + 4)
-    delays = slice(gains.stop, gains.stop + CHANNELS)
+    delays = slice(gains.stop + 1, gains.stop + 1 + CHANNELS)
     initial = slice(delays.stop, delays.stop + 3 * CHANNELS)
     trajectory = slice(initial.stop, initial.stop + problem.basis_position.shape[1])
     return Layout(
-        slice(0, t), t, gains, delays, initial, trajectory, trajectory.stop, trajectory.stop + 1
+        slice(0, t),
+        t,
+        gains,
+        gains.stop,
+        delays,
+        initial,
+        trajectory,
+        trajectory.stop,
+        trajectory.stop + 1,
     )
 
 
@@ -100,17 +114,21 @@ def trajectory_basis(
 
     Returns (n, b) positions, (n, b) accelerations, (r, b + 1), (r,) and (b + 1,).
     """
-    degree = 3
     time = start_s + step_s * np.arange(count, dtype=np.float64)
     first = min(float(time[0]), float(fixes.time_s[0]))
     last = max(float(time[-1]), float(fixes.time_s[-1]))
     spans = max(2, round((last - first) / knot_s))
     inner = np.linspace(first, last, spans + 1)
-    knots = np.concatenate([np.full(degree, first), inner, np.full(degree, last)])
-    b = knots.size - degree - 1
-    spline = BSpline(knots, np.eye(b), degree)
-    middles = 0.5 * (inner[1:] + inner[:-1])
-    jerk = spline.derivative(3)(middles) * np.sqrt(np.diff(inner))[:, None] / _JERK_M_PER_S3
+    knots = np.concatenate([np.full(_DEGREE, first), inner, np.full(_DEGREE, last)])
+    b = knots.size - _DEGREE - 1
+    spline = BSpline(knots, np.eye(b), _DEGREE)
+    # The third derivative is a parabola between knots: two points of Gauss integrate its square
+    # well enough for a prior.
+    apart = np.diff(inner)
+    middles, aside = 0.5 * (inner[1:] + inner[:-1]), apart / np.sqrt(12.0)
+    at = np.concatenate([middles - aside, middles + aside])
+    weight = np.sqrt(0.5 * np.concatenate([apart, apart])) / _JERK_M_PER_S3
+    jerk = spline.derivative(3)(at) * weight[:, None]
     position = spline(fixes.time_s) / fixes.position_noise_m
     velocity = spline.derivative()(fixes.time_s) / fixes.speed_noise_m_per_s
     rows = np.zeros((position.shape[0] + velocity.shape[0] + jerk.shape[0] + 1, b + 1))
@@ -130,6 +148,11 @@ def trajectory_basis(
     best = np.linalg.lstsq(rows, values, rcond=None)[0]
     acceleration = direction * spline.derivative(2)(time)
     return np.asarray(spline(time)), np.asarray(acceleration), rows, values, best
+
+
+def common_gain_spread(priors: Priors) -> float:
+    """Of the mean of the four gains: what is common to them, and the mean of what is each's own."""
+    return float(np.hypot(priors.common_gain_spread, 0.5 * priors.gain_spread))
 
 
 def points(problem: Problem, y: FloatArray) -> Points:
@@ -154,6 +177,7 @@ def points(problem: Problem, y: FloatArray) -> Points:
         coefficients @ problem.basis_position.T,
         coefficients @ problem.basis_acceleration.T,
         priors.gain_spread * (y[:, where.gains] @ _CONTRASTS),
+        np.exp(common_gain_spread(priors) * y[:, where.common_gain]),
         priors.delay_spread_s * y[:, where.delays],
         (y[:, where.initial].reshape(k, CHANNELS, 3) * _INITIAL_SPREAD),
     )
@@ -161,22 +185,39 @@ def points(problem: Problem, y: FloatArray) -> Points:
 
 def data_rows(problem: Problem, y: FloatArray) -> FloatArray:
     """White rows (k, 3 m) of the data alone."""
-    residuals = evaluate(problem.crossing, problem.works, points(problem, y))
-    return whiten(problem.noise, filtered(problem.rows, residuals))
-
-
-def all_rows(problem: Problem, y: FloatArray) -> FloatArray:
-    """Rows of data, receiver and priors: their squares sum to -2 log posterior + constant."""
-    where = layout(problem)
-    receiver = y[:, where.trajectory.start : where.offset + 1] @ problem.receiver_rows.T
-    return np.concatenate(
-        [
-            data_rows(problem, y),
-            receiver - problem.receiver_values,
-            y[:, : where.trajectory.start],
-        ],
-        axis=1,
+    out = np.empty((y.shape[0], problem.noise.reciprocal.size))
+    evaluate_white(
+        problem.crossing, problem.rows, problem.noise, problem.works, points(problem, y), out
     )
+    return out
+
+
+def all_rows(problem: Problem, y: FloatArray, temperature: float = 1.0) -> FloatArray:
+    """Rows of data, receiver and priors: their squares sum to -2 log posterior + constant.
+
+    At a `temperature` above one the data count as if their noise were so many times what it is.
+
+    The data's noise is itself a function of the truck: a softer damper passes less of it. Whitened
+    for one truck, |W e|^2 is expected to be tr(C_0^-1 C(y)) of noise alone and so pulls towards
+    trucks that pass less. The slope of that trace is taken off: as a quadratic prior is there
+    already, by moving its centre (`noise_slope`, half the slope).
+    """
+    where = layout(problem)
+    data = problem.noise.reciprocal.size
+    receiver = data + problem.receiver_values.size
+    out = np.empty((y.shape[0], receiver + where.trajectory.start))
+    evaluate_white(
+        problem.crossing, problem.rows, problem.noise, problem.works, points(problem, y), out
+    )
+    out[:, data:receiver] = (
+        y[:, where.trajectory.start : where.offset + 1] @ problem.receiver_rows.T
+    )
+    out[:, data:receiver] -= problem.receiver_values
+    out[:, receiver:] = y[:, : where.trajectory.start]
+    out[:, receiver : receiver + problem.noise_slope.size] -= problem.noise_slope / temperature**2
+    if temperature != 1.0:
+        out[:, :data] /= temperature
+    return out
 
 
 def start(problem: Problem, trajectory: FloatArray) -> FloatArray:
@@ -204,7 +245,7 @@ def covariance(root: FloatArray) -> FloatArray:
 
 
 def roads(problem: Problem, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Chainage (m,), road under the front and under the rear wheel there, for one point y.
+    """Chainage (m,), road (m) under the front and the rear wheel there, for one point y.
 
     On the bridge only, in the order of the rear wheel's samples.
     """

@@ -1,20 +1,26 @@
 """Method `pre`: from one crossing's signals to the optimum of its posterior.
 
 The posterior has one deep minimum and many shallow ones: with every element free, a bridge that is
-put half a metre too far can be explained almost as well by other rigidities. So the search first
-lets the bridge change only as a whole, with the data taken for far noisier than they are, and frees
-the elements once the trajectory is found; and it starts from several places along the road.
+put half a metre too far can be explained almost as well by other rigidities. So the search
+
+1. finds truck and trajectory while the bridge may change only as a whole, with the data taken for
+   far noisier than they are, and step by step less so;
+2. walks along the road: for every place of the bridge its parameters are fitted with all else held
+   to first order (all other columns are projected out of the rows), which costs little and leads
+   downhill to the right place;
+3. frees everything from the best place, and from the next best ones if that does not fit.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pre_core import least_squares
 from pre_core.bridge import FloatArray
 from pre_core.channels import channel_signals
-from pre_core.drs import beam_basis
+from pre_core.drs import beam_basis, rebased
 from pre_core.least_squares import Rows
 from pre_core.parameters import D_1, EI_1, KAPPA, M_U1
 from pre_core.posterior import (
@@ -30,23 +36,30 @@ from pre_core.posterior import (
     start,
     trajectory_basis,
 )
-from pre_core.pre_model import Crossing, workspace
+from pre_core.pre_model import Crossing, sinc_table, workspace
 from pre_core.search import Ending
 from pre_core.simulate import STANDARD_GRAVITY_M_PER_S2
-from pre_core.whitening import RowFilter, Whitener, row_filter, whitener
+from pre_core.whitening import Truck, noise_power, row_count, row_filter, whitener
 
-HIGHEST_HZ = 80.0
-"""Rows are used up to here: sensor noise in the rows grows with the square of the frequency and
-drowns what lies above."""
-_RATE_SHARE = 0.4  # of the sampling rate, where that is lower
 _KNOT_S = 0.4
+_SLOPE_STEP = 1e-3
 _MARGIN_M = 3.0  # of road before the first row, for the trajectory to move
 _COARSE = ((300.0, 4), (100.0, 4), (30.0, 4))
-_WHOLE = ((10.0, 8), (3.0, 8))
-_FREE = ((5.0, 8), (1.0, 15))
-"""Temperatures (noise is taken for this many times what it is) and the steps at each."""
-_ACCEPTED_CHI2 = 1.2
-_SHIFTS_M = (0.0, -0.6, 0.6, -1.2, 1.2, -1.8, 1.8, -2.4, 2.4, -3.0, 3.0, -3.6, 3.6)
+_FREE = ((5.0, 8, 0.2), (1.0, 25, 0.02))
+"""Temperatures (noise is taken for this many times what it is), the steps at each, and the gain in
+the sum of squares that is not worth another step."""
+_WALK_TEMPERATURE = 3.0
+_WALK_STEPS = 6
+_WALK_ENOUGH = 0.5
+_STRIDE_M = 0.6
+_REFINED_M = (0.3, 0.15)
+_PATIENCE = 1.5  # strides beyond the best place
+_REACH = 3.0  # of the offset's spread
+_APART_M = 0.2
+_MOST_PLACES = 4
+_ACCEPTED_Z, _ACCEPTED_EXCESS = 3.0, 0.05
+"""A minimum is taken for the right one if chi2 is no further above one than chance (so many
+standard deviations) and what the noise model leaves out explain."""
 
 Report = Callable[[str, float], None]
 
@@ -78,24 +91,25 @@ class Optimum(NamedTuple):
     ending: Ending
     chi2_per_dof: float
     evaluations: int
-    shifts: int
-    """How many starting places along the road were tried."""
+    starts: int
+    """How many places along the road all unknowns were freed from."""
 
 
 def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
     """The problem and the coordinates of its nominal start."""
-    n = inputs.acceleration_m_per_s2.shape[1]
+    model = channel_signals(inputs.acceleration_m_per_s2, inputs.step_s, inputs.slowest_rate_hz)
+    n = model.signals.shape[2]
     basis = beam_basis(inputs.element_lengths_m, inputs.parts)
     position, speeding, rows, values, best = trajectory_basis(
-        inputs.fixes, inputs.start_s, inputs.step_s, n, inputs.direction, _KNOT_S
+        inputs.fixes, inputs.start_s + model.start_s, model.step_s, n, inputs.direction, _KNOT_S
     )
     front = position @ best[:-1]
     travel = front if inputs.direction > 0 else inputs.span_m - front
     wheelbase = inputs.priors.wheelbase_m
     first = int(np.searchsorted(travel - wheelbase, travel[0] + _MARGIN_M))
     crossing = Crossing(
-        inputs.step_s,
-        channel_signals(inputs.acceleration_m_per_s2, inputs.step_s),
+        model.step_s,
+        model.signals,
         inputs.direction,
         inputs.span_m,
         inputs.total_mass_kg,
@@ -105,45 +119,71 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
         first,
         n - first,
+        sinc_table(),
     )
-    highest = min(HIGHEST_HZ, _RATE_SHARE * inputs.slowest_rate_hz)
-    row = row_filter(inputs.step_s, highest)
+    row = row_filter(model.step_s)
     theta = inputs.priors.theta
+    count = row_count(row, crossing.rows)
+    noise = whitener(
+        row, count, _truck(crossing, theta, wheelbase), inputs.density_m_per_s2_per_rthz
+    )
     problem = Problem(
         crossing,
         inputs.priors,
         row,
-        _noise(row, crossing, theta, wheelbase, inputs.density_m_per_s2_per_rthz),
+        noise,
         inputs.density_m_per_s2_per_rthz,
         position,
         speeding,
         rows,
         values,
+        np.zeros(0),
         (theta > 0.0) | (np.arange(theta.size) >= theta.size - 2),
-        tuple(workspace(crossing, theta.size) for _ in range(inputs.threads)),
+        tuple(workspace(crossing, theta.size, row) for _ in range(inputs.threads)),
     )
     return problem, start(problem, best)
 
 
-def _noise(
-    rows: RowFilter, crossing: Crossing, theta: FloatArray, wheelbase: float, density: FloatArray
-) -> Whitener:
+def _truck(crossing: Crossing, theta: FloatArray, wheelbase: float) -> Truck:
     d_1 = theta[D_1]
     d_2 = wheelbase - d_1
     m_s = crossing.total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
     inertia = theta[KAPPA] * m_s * d_1 * d_2
-    masses = ((m_s * d_2**2 + inertia) / wheelbase**2, (m_s * d_1**2 + inertia) / wheelbase**2)
-    count = (crossing.rows - rows.taps.size) // rows.every + 1
-    return whitener(rows, count, theta, masses, density)
+    return Truck(
+        theta,
+        (m_s * d_2**2 + inertia) / wheelbase**2,
+        (m_s * d_1**2 + inertia) / wheelbase**2,
+        (m_s * d_1 * d_2 - inertia) / wheelbase**2,
+    )
 
 
 def with_noise_at(problem: Problem, y: FloatArray) -> Problem:
-    """The problem with the noise as it is for the truck at y: its filter depends on the truck."""
-    at = points(problem, y[None, :])
-    noise = _noise(
-        problem.rows, problem.crossing, at.theta[0], float(at.wheelbase_m[0]), problem.density
+    """The problem with the noise as it is for the truck at y, and coordinates for its bridge."""
+    where = layout(problem)
+    unknowns = where.gains.stop
+    near = np.repeat(y[None, :], 1 + unknowns, axis=0)
+    near[np.arange(1, 1 + unknowns), np.arange(unknowns)] += _SLOPE_STEP
+    at = points(problem, near)
+    density = problem.density * (1.0 + at.gain)
+    trucks = [
+        _truck(problem.crossing, theta, float(wheelbase))
+        for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
+    ]
+    count = row_count(problem.rows, problem.crossing.rows)
+    noise = whitener(problem.rows, count, trucks[0], density[0])
+    truck = int(problem.estimated[:EI_1].sum())
+    changing = [*range(truck), *range(where.wheelbase, unknowns)]
+    slope = np.zeros(unknowns)
+    power = noise_power(problem.rows, trucks, density, changing)
+    slope[changing] = 0.5 * count * power / _SLOPE_STEP
+    basis = rebased(problem.crossing.basis, at.theta[0])
+    for work in problem.works:
+        work.modes_of[:] = np.nan
+    return problem._replace(
+        noise=noise,
+        noise_slope=slope,
+        crossing=problem.crossing._replace(basis=basis),
     )
-    return problem._replace(noise=noise)
 
 
 def chi2_per_dof(problem: Problem, y: FloatArray) -> float:
@@ -153,14 +193,7 @@ def chi2_per_dof(problem: Problem, y: FloatArray) -> float:
 
 
 def _tempered(problem: Problem, y: FloatArray, directions: FloatArray, temperature: float) -> Rows:
-    count = problem.noise.factor.shape[0]
-
-    def rows(v: FloatArray) -> FloatArray:
-        values = all_rows(problem, y + v @ directions.T)
-        values[:, :count] /= temperature
-        return values
-
-    return rows
+    return lambda v: all_rows(problem, y + v @ directions.T, temperature)
 
 
 def _descend(
@@ -173,9 +206,16 @@ def _descend(
 ) -> tuple[FloatArray, least_squares.State, Ending, int]:
     """Least squares along `directions` (f, d) from y; `enough` is a gain not worth a step."""
     rows = _tempered(problem, y, directions, temperature)
-    state = least_squares.begin(rows, np.zeros(directions.shape[1]))
-    evaluations = directions.shape[1] + 1
-    ending = Ending.STEPS_EXHAUSTED
+    start = np.zeros(directions.shape[1])
+    state, ending, evaluations = _minimised(rows, start, steps, enough)
+    return y + directions @ state.y, state, ending, evaluations
+
+
+def _minimised(
+    rows: Rows, start: FloatArray, steps: int, enough: float
+) -> tuple[least_squares.State, Ending, int]:
+    state = least_squares.begin(rows, start)
+    evaluations = start.size + 1
     for _ in range(steps):
         before = state.objective
         state, info = least_squares.descend(rows, state)
@@ -183,89 +223,148 @@ def _descend(
         if info.ending is not None:
             # Where no step helps any more, differences have reached their rounding: the bottom.
             ending = Ending.CONVERGED if info.ending is Ending.STUCK else info.ending
-            break
+            return state, ending, evaluations
         if before - state.objective < enough:
-            ending = Ending.CONVERGED
-            break
-    return y + directions @ state.y, state, ending, evaluations
+            return state, Ending.CONVERGED, evaluations
+    return state, Ending.STEPS_EXHAUSTED, evaluations
+
+
+def _bridge_places(problem: Problem) -> NDArray[np.int64]:
+    """Places in y of what is estimated of the bridge: elements, mass, damping, springs."""
+    place = np.full(problem.estimated.size, -1)
+    place[problem.estimated] = np.arange(int(problem.estimated.sum()))
+    bridge = place[EI_1:]
+    return bridge[bridge >= 0]
 
 
 def _whole_bridge(problem: Problem) -> FloatArray:
     """Directions in which all elements change alike and the supports have no springs."""
-    where = layout(problem)
-    unit = np.eye(where.size)
-    place = np.full(problem.estimated.size, -1)
-    place[problem.estimated] = np.arange(where.theta.stop)
-    elements = place[EI_1 : problem.estimated.size - 5]
-    springs = place[-2:]
-    single = [k for k in range(where.size) if k not in {*elements, *springs}]
+    size = layout(problem).size
+    unit = np.eye(size)
+    bridge = _bridge_places(problem)
+    elements = bridge[: problem.estimated.size - EI_1 - 5]
+    springs = bridge[-2:]
+    single = np.setdiff1d(np.arange(size), [*elements, *springs])
     together = unit[:, elements].sum(axis=1) / np.sqrt(elements.size)
     return np.column_stack([unit[:, single], together])
 
 
+class _Place(NamedTuple):
+    """How well the bridge, put `shift_m` further along the road, fits; its unknowns there."""
+
+    objective: float
+    shift_m: float
+    bridge: FloatArray
+
+
+def _walk(problem: Problem, y: FloatArray) -> tuple[list[_Place], int]:
+    """Places along the road, best first, and the evaluations that they took."""
+    where = layout(problem)
+    places = _bridge_places(problem)
+    free = np.eye(y.size)
+    here = least_squares.begin(
+        _tempered(problem, y, free, _WALK_TEMPERATURE), np.zeros(y.size)
+    ).jacobian
+    others, _ = np.linalg.qr(np.delete(here, places, axis=1))
+    evaluations = y.size + 1
+    seen: list[_Place] = []
+
+    def look(shift: float, start: FloatArray) -> None:
+        nonlocal evaluations
+        moved = y.copy()
+        moved[where.trajectory] += shift
+        rows = _tempered(problem, moved, free[:, places], _WALK_TEMPERATURE)
+
+        def projected(v: FloatArray) -> FloatArray:
+            values = rows(v)
+            return np.asarray(values - (values @ others) @ others.T)
+
+        state, _, used = _minimised(projected, start, _WALK_STEPS, _WALK_ENOUGH)
+        evaluations += used
+        if np.isfinite(state.objective):
+            seen.append(_Place(state.objective, shift, state.y))
+
+    def best() -> _Place:
+        return min(seen, key=lambda place: place.objective)
+
+    look(0.0, np.zeros(places.size))
+    reach = _STRIDE_M + _REACH / problem.receiver_rows[-1, -1]
+    for sign in (1.0, -1.0):
+        shift = sign * _STRIDE_M
+        while abs(shift) <= reach:
+            look(shift, np.zeros(places.size))
+            if seen and sign * (shift - best().shift_m) > _PATIENCE * _STRIDE_M:
+                break
+            shift += sign * _STRIDE_M
+    for stride in _REFINED_M if seen else ():
+        centre = best()
+        for sign in (1.0, -1.0):
+            look(centre.shift_m + sign * stride, centre.bridge)
+    return sorted(seen, key=lambda place: place.objective), evaluations
+
+
 def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) -> Optimum:
-    """The optimum of the posterior, searched for from several places along the road."""
+    """The optimum of the posterior. Its `ending` is NOT_FINITE if no place gave finite rows."""
     problem, y = prepare(inputs)
     whole = _whole_bridge(problem)
-    free = np.eye(y.size)
     evaluations = 0
     for temperature, steps in _COARSE:
         report("finding the truck", 0.05)
         y, _, _, used = _descend(problem, y, whole, temperature, steps, 0.5)
         evaluations += used
         problem = with_noise_at(problem, y)
+    report("finding the bridge", 0.2)
+    places, used = _walk(problem, y)
+    evaluations += used
     best: Optimum | None = None
-    where = layout(problem)
-    reach = 2.5 / problem.receiver_rows[-1, -1]  # of the offset's spread
-    tried = 0
-    for shift in _SHIFTS_M:
-        if abs(shift) > max(reach, 0.6):
+    tried: list[float] = []
+    for place in places:
+        if any(abs(place.shift_m - other) < _APART_M for other in tried):
             continue
-        tried += 1
-        report(f"finding the bridge, start {tried}", 0.1 + 0.03 * tried)
+        tried.append(place.shift_m)
+        report(f"freeing the elements, start {len(tried)}", 0.3 + 0.05 * len(tried))
         z = y.copy()
-        z[where.trajectory] += shift
-        bound = problem
-        for directions, stages, enough in ((whole, _WHOLE, 0.1), (free, _FREE, 0.01)):
-            for temperature, steps in stages:
-                z, state, ending, used = _descend(
-                    bound, z, directions, temperature, steps, max(enough, 0.2 * (temperature > 1))
-                )
-                evaluations += used
-                bound = with_noise_at(bound, z)
-        chi2 = chi2_per_dof(bound, z)
-        if best is None or chi2 < best.chi2_per_dof:
-            best = Optimum(bound, state._replace(y=z), ending, chi2, evaluations, tried)
-        if best.chi2_per_dof < _ACCEPTED_CHI2:
+        z[layout(problem).trajectory] += place.shift_m
+        z[_bridge_places(problem)] += place.bridge
+        found = _freed(problem, z)
+        evaluations += found.evaluations
+        if best is None or found.chi2_per_dof < best.chi2_per_dof:
+            best = found
+        rows = best.problem.noise.reciprocal.size
+        chance = _ACCEPTED_Z * np.sqrt(2.0 / rows)
+        if best.chi2_per_dof < 1.0 + _ACCEPTED_EXCESS + chance or len(tried) == _MOST_PLACES:
             break
-    assert best is not None  # noqa: S101 - the first shift is always tried
-    return _polished(best, evaluations, tried)
+    if best is None:
+        state = least_squares.begin(lambda at: all_rows(problem, at), y)
+        return Optimum(problem, state, Ending.NOT_FINITE, np.inf, evaluations, 0)
+    return best._replace(evaluations=evaluations, starts=len(tried))
 
 
-def _polished(found: Optimum, evaluations: int, tried: int) -> Optimum:
-    """Last steps with the noise of the truck that was found, and supports that do not push.
+def _freed(problem: Problem, y: FloatArray) -> Optimum:
+    """Least squares in all unknowns; supports do not push.
 
-    Least squares may leave a support spring below zero, where no posterior is; it is then held at
-    zero and the rest is brought to the optimum beside it. The slope that is left belongs to the
-    normal approximation (`normal_approximation`).
+    Where it leaves a support spring below zero, where no posterior is, that is held at zero and the
+    rest is brought to the optimum beside it. The slope that is left belongs to the normal
+    approximation (`normal_approximation`).
     """
-    where = layout(found.problem)
-    y = found.state.y.copy()
-    springs = np.arange(where.theta.stop - 2, where.theta.stop)
+    free = np.eye(y.size)
+    springs = np.arange(layout(problem).theta.stop - 2, layout(problem).theta.stop)
+    evaluations = 0
+    ending = Ending.STEPS_EXHAUSTED
+    problem = with_noise_at(problem, y)
+    for temperature, steps, enough in _FREE:
+        y, state, ending, used = _descend(problem, y, free, temperature, steps, enough)
+        evaluations += used
+        problem = with_noise_at(problem, y)
     held = springs[y[springs] < 0.0]
-    y[held] = 0.0
-    directions = np.delete(np.eye(y.size), held, axis=1)
-    y, _, ending, used = _descend(found.problem, y, directions, 1.0, 15, 0.1)
-    y[springs] = np.maximum(y[springs], 0.0)
-    state = least_squares.begin(lambda at: all_rows(found.problem, at), y)
-    return Optimum(
-        found.problem,
-        state,
-        ending,
-        chi2_per_dof(found.problem, y),
-        evaluations + used + y.size + 1,
-        tried,
-    )
+    if held.size:
+        y[held] = 0.0
+        directions = np.delete(free, held, axis=1)
+        y, _, ending, used = _descend(problem, y, directions, 1.0, 15, 0.02)
+        y[springs] = np.maximum(y[springs], 0.0)
+        evaluations += used
+    state = least_squares.begin(lambda at: all_rows(problem, at), y)
+    return Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations + y.size + 1, 1)
 
 
 def normal_approximation(found: Optimum) -> tuple[FloatArray, FloatArray]:

@@ -77,7 +77,7 @@ def _compile_pre(nominal: "NDArray[np.float64]") -> None:
         500.0,
         fixes,
         posterior.Priors(
-            nominal, np.full(nominal.size, 0.1), paper.TRUCK.wheelbase_m, 0.002, 0.01, 0.0005
+            nominal, np.full(nominal.size, 0.1), paper.TRUCK.wheelbase_m, 0.002, 0.01, 0.01, 0.0005
         ),
         2,
         1,

@@ -32,6 +32,8 @@ from services.worker.crossing_data import (
 _MICRO_G = 9.80665e-6
 _LEARNING_SHARE = 3
 _LEARNING_STAGES = 2
+_FINITE_ELEMENTS = 14
+"""At least so many, whatever the number of elements: quicker sensors would see a coarser mesh."""
 _SMALLEST_NOISE_UG = 0.1
 """A declared noise of zero cannot whiten anything; below this, model error dominates."""
 _GOOD_CHI2 = 1.25
@@ -91,7 +93,7 @@ def inputs_of(
         min(sensor.rate_hz),
         fixes,
         _priors(data),
-        settings.parts,
+        max(1, -(-_FINITE_ELEMENTS // bridge.elements)),
         settings.threads,
     )
 
@@ -121,6 +123,7 @@ def _priors(data: CrossingData) -> posterior.Priors:
         vehicle.wheelbase_m,
         vehicle.spread("wheelbase_m"),
         data.sensor.gain_spread,
+        data.sensor.common_gain_spread,
         data.sensor.delay_spread_s,
     )
 
@@ -156,7 +159,7 @@ def identify_pre(
     problem, y = found.problem, found.state.y
     diagnostics = {
         "iterations": float(found.evaluations),
-        "starts": float(found.shifts),
+        "starts": float(found.starts),
         "position_shift_m": _offset_m(problem, y),
     }
     if found.chi2_per_dof > _USABLE_CHI2:
