@@ -17,6 +17,22 @@ FloatArray = NDArray[np.float64]
 NORMAL_975 = 1.959963984540054
 
 
+class Scores(NamedTuple):
+    """Errors of the rigidities in all usable crossings, (crossings, elements) each."""
+
+    seeds: NDArray[np.int64]  # (crossings,)
+    is_good: NDArray[np.bool_]  # (crossings,)
+    z: FloatArray
+    """(mean - truth)/std of EI."""
+    z_log: FloatArray
+    """The same of ln EI, whose mean and std are read off the quantiles."""
+    is_covered: NDArray[np.bool_]
+    """The truth lies between the 2.5 and 97.5 % quantiles."""
+    std_log: FloatArray
+    bound: FloatArray
+    """Cramér-Rao bound of ln EI with the scale error."""
+
+
 class Share(NamedTuple):
     """A share of cases and its standard error between crossings."""
 

@@ -157,7 +157,7 @@ def noise_power(
     """
     half = 0.5 / (rows.every * rows.step_s)
     step = 2.0 * np.pi * half / _FEW_FREQUENCIES
-    below = step * (np.arange(_FEW_FREQUENCIES) + 0.5)
+    below = step * (np.arange(_FEW_FREQUENCIES, dtype=np.float64) + 0.5)
     above = 4.0 * np.pi * half - below
     power_below, power_above = (
         np.interp(omega, rows.omega, rows.power) for omega in (below, above)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import calibration, parameters
-from pre_core.calibration import NORMAL_975
+from pre_core.calibration import NORMAL_975, Scores
 from pre_core.road import Profile
 from schemas.results import Crossing, Parameter
 from schemas.settings import IdentificationSettings
@@ -171,22 +171,6 @@ class Check(NamedTuple):
     def is_met(self) -> bool:
         """Not met either where there is nothing to measure."""
         return self.measured is not None and self.low <= self.measured <= self.high
-
-
-class Scores(NamedTuple):
-    """Errors of the rigidities in all usable crossings, (crossings, elements) each."""
-
-    seeds: NDArray[np.int64]  # (crossings,)
-    is_good: NDArray[np.bool_]  # (crossings,)
-    z: Floats
-    """(mean - truth)/std of EI."""
-    z_log: Floats
-    """The same of ln EI, whose mean and std are read off the quantiles."""
-    is_covered: NDArray[np.bool_]
-    """The truth lies between the 2.5 and 97.5 % quantiles."""
-    std_log: Floats
-    bound: Floats
-    """Cramér-Rao bound of ln EI with the scale error."""
 
 
 GROUPS: dict[str, tuple[str, ...]] = {

@@ -3,11 +3,9 @@
 Nothing here computes more than a histogram: what is drawn is what `services.calibration` found.
 """
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -16,12 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MultipleLocator, PercentFormatter
 
+from pre_core.calibration import Scores
 from services.common.files import write_atomically
 from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
 from services.viewer.figure import DPI, GRID, INK, MUTED, STYLE
-
-if TYPE_CHECKING:
-    from services.calibration import Scores
 
 WIDTH_IN, HEIGHT_IN = 9.0, 7.0
 _POINT, _OTHER = VEHICLE_COLOURS["front"], VEHICLE_COLOURS["rear"]
