@@ -152,8 +152,8 @@ def _chi2_per_dof(problem: posterior.Problem, y: Floats) -> float:
     """Mean square of the white data; only the nuisances were fitted to them."""
     where = posterior.layout(problem)
     rows = posterior.data_rows(problem, y[None, :])[0]
-    fitted: int = where.offset - where.gains.start
-    return float(rows @ rows) / max(1, rows.size - fitted)
+    degrees: int = rows.size - (where.offset - where.gains.start)
+    return float(rows @ rows) / max(1, degrees)
 
 
 def central_jacobian(
