@@ -10,6 +10,9 @@ which leaves the approximation itself invariant, and accept by what the posterio
 every third time; rho near one gets a chain away from where the approximation is too thin. Many
 short chains start from draws of the approximation; their agreement (split R-hat; Gelman et al.,
 BDA 3, section 11.4) tells whether to believe them.
+
+A coordinate may be bent: where y is the logarithm of a stiffness the data depend on its reciprocal,
+and it is w = (1 - exp(-b (y - centre)))/b, not y, in which the posterior is nearly normal.
 """
 
 from collections.abc import Callable
@@ -29,6 +32,7 @@ RHO = (0.0, 0.7)
 """Taken in turn."""
 _SMALLEST_SHIFT = 0.35
 _SMALLEST_STRETCH = 0.2
+_STRAIGHTEST = 1e-9
 
 LogDensity = Callable[[FloatArray], FloatArray]
 """Logarithm of the target at points (k, f), up to a constant; minus infinity where impossible."""
@@ -37,8 +41,9 @@ LogDensity = Callable[[FloatArray], FloatArray]
 class Approximation(NamedTuple):
     """A normal with mean `centre`, cut off where the coordinates `positive` would be negative.
 
-    In the order `order` (the positive ones first), y = centre + L z, where z is w = shift + scale v
-    with standard normal v, those of the positive coordinates cut off one after the other.
+    In the order `order` (the positive ones first), the bent coordinates of y - centre are L z,
+    where z is w = shift + scale v with standard normal v, those of the positive coordinates cut off
+    one after the other.
     """
 
     centre: FloatArray  # (f,)
@@ -47,6 +52,7 @@ class Approximation(NamedTuple):
     positive: int
     shift: FloatArray  # (f,) of w; zero until the approximation has been adapted
     scale: FloatArray  # (f,)
+    bend: FloatArray  # (f,) zero: straight; of the positive ones it must be
     seed: int
 
 
@@ -68,15 +74,19 @@ class Info(NamedTuple):
 
 
 def approximation(
-    centre: FloatArray, covariance: FloatArray, positive: NDArray[np.int64], seed: int
+    centre: FloatArray,
+    covariance: FloatArray,
+    positive: NDArray[np.int64],
+    bend: FloatArray,
+    seed: int,
 ) -> Approximation:
-    """Bind a normal approximation (f,), (f, f) of the target."""
+    """Bind a normal approximation (f,), (f, f) of the target; `bend` (f,) as above."""
     others = np.setdiff1d(np.arange(centre.size), positive)
     order = np.concatenate([positive, others])
     factor = cholesky(covariance[np.ix_(order, order)], lower=True)
     f = centre.size
     return Approximation(
-        centre, np.asarray(factor), order, positive.size, np.zeros(f), np.ones(f), seed
+        centre, np.asarray(factor), order, positive.size, np.zeros(f), np.ones(f), bend, seed
     )
 
 
@@ -104,7 +114,7 @@ def _map(normal: Approximation, v: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points of standard normals v (k, f) and their log density, up to a constant."""
     w = normal.shift + normal.scale * v
     z = w.copy()
-    # The density of z times that of v over that of w: dy/dz is constant, dw/dv too.
+    # The density of z times that of v over that of w; dw/dv is constant.
     log_q = 0.5 * np.sum(w[:, : normal.positive] ** 2, axis=1) - 0.5 * np.sum(v**2, axis=1)
     for i in range(normal.positive):
         # The i-th ordered coordinate, centre + sum over j <= i of L_ij z_j, must stay >= 0.
@@ -115,7 +125,14 @@ def _map(normal: Approximation, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         z[:, i] = np.maximum(-ndtri_exp(log_ndtr(-w[:, i]) + log_tail), lowest)
         log_q += -0.5 * z[:, i] ** 2 - log_tail
     y = np.empty_like(w)
-    y[:, normal.order] = normal.centre[normal.order] + z @ normal.factor.T
+    y[:, normal.order] = z @ normal.factor.T
+    for k in np.flatnonzero(normal.bend):
+        inner = 1.0 - normal.bend[k] * y[:, k]
+        impossible = inner <= _STRAIGHTEST  # beyond the end of the bent coordinate
+        inner = np.where(impossible, _STRAIGHTEST, inner)
+        y[:, k] = -np.log(inner) / normal.bend[k]
+        log_q += np.where(impossible, np.inf, np.log(inner))
+    y += normal.centre
     cut = normal.order[: normal.positive]
     y[:, cut] = np.maximum(y[:, cut], 0.0)
     return y, log_q

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import qr, solve_triangular
 
+from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
 from pre_core.pre_model import Crossing, Points, Work, evaluate_white, roads_and_deflections
 from pre_core.whitening import RowFilter, Whitener
 
@@ -258,6 +259,36 @@ def roads(problem: Problem, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     on_bridge = np.flatnonzero((rear >= 0.0) & (rear <= crossing.span_m))
     front_height = np.interp(sign * rear[on_bridge], sign * front, height[0])
     return rear[on_bridge], front_height, height[1, on_bridge]
+
+
+def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
+    """Draws (count, m) in m of the error of the wheels' mean road that the sensors' noise makes.
+
+    Where `roads` gives the road for y. White noise of the accelerations goes through the integrals
+    and the input estimation of the truck at y; what it does to the deflection is left out.
+    """
+    crossing = problem.crossing
+    at = points(problem, y[None, :])
+    theta, front = at.theta[0], at.position_m[0]
+    n = crossing.signals.shape[2]
+    step = crossing.step_s
+    spread = problem.density * np.sqrt(0.5 / step)
+    a = spread[:, None] * rng.standard_normal((count, CHANNELS, n))
+    v = step * np.cumsum(a, axis=2)
+    z = step * np.cumsum(v, axis=2)
+    errors = []
+    for w in range(2):
+        spring = theta[C_S1 + w] * (v[:, 2 + w] - v[:, w]) + theta[K_S1 + w] * (
+            z[:, 2 + w] - z[:, w]
+        )
+        errors.append(z[:, 2 + w] + (theta[M_U1 + w] * a[:, 2 + w] + spring) / theta[K_U1 + w])
+    sign = 1.0 if crossing.direction > 0 else -1.0
+    rear = front - sign * at.wheelbase_m[0]
+    on_bridge = np.flatnonzero((rear >= 0.0) & (rear <= crossing.span_m))
+    front_error = np.stack(
+        [np.interp(sign * rear[on_bridge], sign * front, error) for error in errors[0]]
+    )
+    return np.asarray(0.5 * (front_error + errors[1][:, on_bridge]))
 
 
 def largest_deflections_m(problem: Problem, y: FloatArray) -> FloatArray:

@@ -61,6 +61,8 @@ _ACCEPTED_Z, _ACCEPTED_EXCESS = 3.0, 0.05
 """A minimum is taken for the right one if chi2 is no further above one than chance (so many
 standard deviations) and what the noise model leaves out explain."""
 
+_BEND = 0.8
+
 Report = Callable[[str, float], None]
 
 
@@ -365,6 +367,18 @@ def _freed(problem: Problem, y: FloatArray) -> Optimum:
         evaluations += used
     state = least_squares.begin(lambda at: all_rows(problem, at), y)
     return Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations + y.size + 1, 1)
+
+
+def bends(problem: Problem) -> FloatArray:
+    """How much each coordinate is to be bent for the chains (mcmc.py): those of ln EI are.
+
+    The deflection of a statically determinate beam is linear in 1/EI; a little less, for the prior
+    is normal in ln EI.
+    """
+    bend = np.zeros(layout(problem).size)
+    elements = _bridge_places(problem)[: problem.estimated.size - EI_1 - 5]
+    bend[elements] = _BEND * problem.priors.spread[EI_1 : EI_1 + elements.size]
+    return bend
 
 
 def normal_approximation(found: Optimum) -> tuple[FloatArray, FloatArray]:

@@ -44,7 +44,7 @@ class Bound(NamedTuple):
 def bound_at_truth(seen: Seen, drawn: Drawn) -> dict[str, dict[str, float]]:
     """The bounds of a drawn crossing as JSON."""
     problem, y = at_truth(seen, drawn)
-    return as_json(bound_of(problem, y, unseen_spread(seen, problem)))
+    return as_json(bound_of(problem, y, seen.data.vehicle.spread("total_mass_kg")))
 
 
 def bound_at(
@@ -68,7 +68,7 @@ def bound_at(
     begin_m = 0.0 if seen.data.stay.direction > 0 else seen.data.bridge.span_m
     y[where.trajectory] += begin_m - entry_m
     problem, y = _settled(problem, y)
-    return as_json(bound_of(problem, y, unseen_spread(seen, problem)))
+    return as_json(bound_of(problem, y, seen.data.vehicle.spread("total_mass_kg")))
 
 
 def at_truth(seen: Seen, drawn: Drawn) -> tuple[posterior.Problem, Floats]:
@@ -81,8 +81,8 @@ def at_truth(seen: Seen, drawn: Drawn) -> tuple[posterior.Problem, Floats]:
         true_values(drawn.truth),
         _elements(problem),
         drawn.site.vehicles[0].total_mass_kg / total_mass_kg(drawn.truth.car),
-        _set_gains(problem, y, correction),
     )
+    _set_gains(problem, y, correction)
     _set_theta(problem, y, theta, drawn.truth.car.wheelbase_m)
     y[where.delays] = errors.delay_s / problem.priors.delay_spread_s
     true_m = np.interp(
@@ -115,23 +115,10 @@ def as_json(bound: Bound) -> dict[str, dict[str, float]]:
     }
 
 
-def unseen_spread(seen: Seen, problem: posterior.Problem) -> float:
-    """Relative standard deviation of what scales all EI and is no unknown of the posterior.
-
-    Always the total mass; the common gain, and the mean of the channels' own, where only
-    differences between gains are unknowns.
-    """
-    sensor = seen.data.sensor
-    _, directions = _gain_directions(problem)
-    is_seen = float(np.abs(directions.sum(axis=1)).max()) > 1e-9
-    gain = 0.0 if is_seen else np.hypot(sensor.common_gain_spread, 0.5 * sensor.gain_spread)
-    return float(np.hypot(seen.data.vehicle.spread("total_mass_kg"), gain))
-
-
 def bound_of(
     problem: posterior.Problem, y: Floats, scale_error: float, step: float = _STEP
 ) -> Bound:
-    """The bound at y (size,); `scale_error` is that of `unseen_spread`."""
+    """The bound at y (size,); `scale_error` is of what scales all EI and no residual shows."""
     where = posterior.layout(problem)
     jacobian = central_jacobian(problem, y, np.arange(where.size), step)
     covariance = posterior.covariance(posterior.precision_root(jacobian))
@@ -193,19 +180,16 @@ def settle(
     return y
 
 
-def equivalent_theta(
-    values: dict[str, float], elements: int, scale: float, correction: float
-) -> Floats:
+def equivalent_theta(values: dict[str, float], elements: int, scale: float) -> Floats:
     """The parameters (p,) that the method would find without noise.
 
     The method takes the total mass for the nominal one. All forces are then off by `scale`, nominal
-    over true mass, and so are masses, springs and dampers. A `correction` of all gains that it does
-    not make leaves the bridge's deflection too large by its inverse: rigidities and mass follow.
+    over true mass, and so are masses, springs, dampers and rigidities.
     """
     theta = np.array([values[name] for name in parameters.names(elements)])
     theta[C_S1:KAPPA] *= scale
-    theta[EI_1 : EI_1 + elements + 1] *= scale * (1.0 + correction)
-    theta[-2:] *= scale * (1.0 + correction)
+    theta[EI_1 : EI_1 + elements + 1] *= scale
+    theta[-2:] *= scale
     return theta
 
 
@@ -251,24 +235,15 @@ def _set_theta(problem: posterior.Problem, y: Floats, theta: Floats, wheelbase_m
     y[where.wheelbase] = np.log(wheelbase_m / priors.wheelbase_m) / priors.wheelbase_spread
 
 
-def _gain_directions(problem: posterior.Problem) -> tuple[NDArray[np.int64], Floats]:
-    """Places of the gains in y, and the corrections (places, 4) that one of each makes."""
-    where = posterior.layout(problem)
-    places = np.arange(where.gains.start, where.gains.stop)
-    unit = np.zeros((places.size + 1, where.size))
-    unit[np.arange(places.size), places] = 1.0
-    gains = posterior.points(problem, unit).gain
-    return places, gains[:-1] - gains[-1]
-
-
-def _set_gains(problem: posterior.Problem, y: Floats, correction: Floats) -> float:
-    """Put corrections (4,) of the gains into y as far as it has room for them; what is left.
-
-    What is left is common to all channels: the correction that the rigidities have to take over.
-    """
-    places, directions = _gain_directions(problem)
-    y[places] = np.linalg.lstsq(directions.T, correction, rcond=None)[0]
-    return float((correction - y[places] @ directions).mean())
+def _set_gains(problem: posterior.Problem, y: Floats, correction: Floats) -> None:
+    """Put relative corrections (4,) of the gains into y; modified in place."""
+    where, priors = posterior.layout(problem), problem.priors
+    common = 1.0 + float(correction.mean())
+    y[where.common_gain] = np.log(common) / posterior.common_gain_spread(priors)
+    unit = np.zeros((4, where.size))
+    unit[np.arange(3), np.arange(where.gains.start, where.gains.stop)] = 1.0
+    directions = posterior.points(problem, unit).gain[:3]
+    y[where.gains] = np.linalg.lstsq(directions.T, (1.0 + correction) / common - 1.0, rcond=None)[0]
 
 
 def _best_offset(problem: posterior.Problem, y: Floats) -> float:

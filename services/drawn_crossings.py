@@ -278,10 +278,11 @@ def _motion(truth: Truth, bridge: Bridge, step_s: float, every: int) -> Motion:
 def see(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[Seen]:
     """Identify all crossings of the site's first truck through the engine, as from a recording."""
     kept: dict[str, CrossingData] = {}
+    draws: dict[str, dict[str, Floats]] = {}
 
     def keeping(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
         kept[data.crossing_id] = data
-        return identify(data, settings, **others)
+        return identify(data, settings, keep=draws.__setitem__, **others)
 
     header = Header(
         version=program_version(),
@@ -296,8 +297,19 @@ def see(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[S
         found += [out.result for out in engine.feed(message.key, message.payload)]
     found += [out.result for out in engine.finish()]
     return [
-        Seen(result, kept[result.crossing_id], settings) for result in found if result is not None
+        Seen(
+            result,
+            kept[result.crossing_id],
+            settings,
+            _flat(draws.get(result.crossing_id)),
+        )
+        for result in found
+        if result is not None
     ]
+
+
+def _flat(draws: dict[str, Floats] | None) -> dict[str, Floats] | None:
+    return None if draws is None else {name: values.ravel() for name, values in draws.items()}
 
 
 def true_values(truth: Truth) -> dict[str, float]:

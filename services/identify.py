@@ -3,17 +3,20 @@
 import logging
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.results import Crossing, Header, Results, results, results_json
 from schemas.settings import IdentificationSettings
 from schemas.site import Site, load_site, parse_site, site_hash
+from services.common.draws import Draws, check_draws, write_draws
 from services.common.errors import FailureError, InputError
 from services.common.files import check_writable, replaced_atomically, write_atomically
 from services.common.recording import Message, program_version, read_messages, read_site
 from services.common.streams import device_time_ns
 from services.worker.engine import Engine, Output
+from services.worker.identification import Keep, identify
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,15 +41,20 @@ def identify_command(
     InputError: a file that cannot be read or written, or has no accelerations or positions.
     """
     if draws_path is not None:
-        raise InputError("--draws: no method stores its chain yet, leave the option out")
-    for path in (json_path, rrd_path):
+        check_draws(draws_path, method)
+    for path in (json_path, rrd_path, draws_path):
         if path is not None:
             check_writable(path)
     known = site_of(recordings, site)
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
+    draws: dict[str, Draws] = {}
     with console.status("reading", spinner="dots") as status:
-        found = identify_recordings(recordings, known, settings, status.update)
+        found = identify_recordings(
+            recordings, known, settings, status.update, keep=draws.__setitem__
+        )
     _print(console, found, known)
+    if draws_path is not None:
+        write_draws(draws_path, draws)
     if json_path is not None:
         write_atomically(json_path, results_json(found))
     if rrd_path is not None:
@@ -84,8 +92,9 @@ def identify_recordings(
     site: Site,
     settings: IdentificationSettings,
     say: Callable[[str], None] = lambda text: None,
+    keep: Keep = lambda crossing_id, draws: None,
 ) -> Results:
-    """Results of all crossings in the recordings, in order of time."""
+    """Results of all crossings in the recordings, in order of time; `keep` is given their draws."""
     header = Header(
         version=program_version(),
         created=time.time(),
@@ -99,6 +108,7 @@ def identify_recordings(
         header,
         stopwatch=time.perf_counter,
         report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"),
+        identify=partial(identify, keep=keep),
     )
     found: list[Crossing] = []
     messages: dict[str, list[Message]] = {"accel": [], "gnss": []}

@@ -41,6 +41,7 @@ from services.worker.crossing_data import (
     rejected,
     road_result,
 )
+from services.worker.pre_method import Keep as Keep
 from services.worker.pre_method import identify_pre
 
 _log = logging.getLogger(__name__)
@@ -92,8 +93,9 @@ def identify(
     *,
     stopwatch: Stopwatch,
     report: Report = lambda stage, fraction: None,
+    keep: Keep = lambda crossing_id, draws: None,
 ) -> results.Crossing:
-    """The result of one crossing, whatever its data are."""
+    """The result of one crossing, whatever its data are; `keep` is given its draws, if any."""
     began = stopwatch()
     trajectory = _trajectory(data)
     entry_s, exit_s = _entry_and_exit(data, trajectory)
@@ -116,7 +118,9 @@ def identify(
         if broken:
             return reject(broken)
         if settings.method == "pre":
-            return identify_pre(data, settings, passing, *cut, report, lambda: stopwatch() - began)
+            return identify_pre(
+                data, settings, passing, *cut, report, lambda: stopwatch() - began, keep
+            )
         found = _fitted(data, settings, cut, report)
         if isinstance(found, Reason):
             return reject([found])
