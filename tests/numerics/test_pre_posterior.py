@@ -8,12 +8,14 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from pre_core import paper
+from pre_core.channels import channel_signals
 from pre_core.parameters import D_1, EI_1, K_U1, from_models
 from pre_core.posterior import (
     Fixes,
     Priors,
     Problem,
     all_rows,
+    common_gain_spread,
     covariance,
     data_rows,
     layout,
@@ -35,7 +37,7 @@ FloatArray = NDArray[np.float64]
 POSITION_NOISE_M, SPEED_NOISE_M_PER_S, OFFSET_SPREAD_M = 0.02, 0.03, 1.2
 SPRING_SPREAD = 4e8
 KNOT_S = 0.4
-DEGREE = 3
+DEGREE = 5
 JERK_M_PER_S3 = 1.0
 
 
@@ -45,7 +47,7 @@ class Case(NamedTuple):
     fixes: Fixes
     priors: Priors
     start_s: float
-    step_s: float
+    step_s: float  # of the model
     samples: int
 
 
@@ -67,37 +69,36 @@ def here(scenario_6: "Drive") -> Case:
     site = paper_site()
     vehicle, bridge = site.vehicles[0], site.bridges[0]
     rng = np.random.default_rng(5)
-    step_s = 1.0 / scenario_6.run.rate_hz
-    t = step_s * np.arange(scenario_6.run.accel_time_s.size)
+    sample_s = 1.0 / scenario_6.run.rate_hz
+    t = sample_s * np.arange(scenario_6.run.accel_time_s.size)
     travel = paper.SPEED_M_PER_S * (t - 3.0)
     kept = (travel > -10.0) & (travel < 42.0)
     density = 25.0 * MICRO_G_M_PER_S2
     acceleration = np.stack(
         [
             scenario_6.run.channels[name][kept]
-            + white_noise(int(kept.sum()), 1.0 / step_s, density, rng)
+            + white_noise(int(kept.sum()), 1.0 / sample_s, density, rng)
             for name in CHANNELS
         ]
     )
-    start_s = float(t[kept][0])
     fixes = fixes_of(np.arange(1.5, 8.0, 0.1), rng)
     nominal = from_models(truck_of(vehicle), beam_of(bridge, np.ones(7)))
     spread = np.full(nominal.size, 0.15)
     spread[EI_1 : EI_1 + 7] = 0.55
     spread[-2:] = SPRING_SPREAD
-    priors = Priors(nominal, spread, vehicle.wheelbase_m, 0.002, 0.01, 0.0005)
+    priors = Priors(nominal, spread, vehicle.wheelbase_m, 0.002, 0.01, 0.01, 0.0005)
     problem, y = prepare(
         Inputs(
             acceleration,
-            start_s,
-            step_s,
+            float(t[kept][0]),
+            sample_s,
             1,
             bridge.span_m,
             np.array(bridge.lengths_m),
             vehicle.total_mass_kg,
             0.0,
             np.full(4, density),
-            1.0 / step_s,
+            1.0 / sample_s,
             fixes,
             priors,
             2,
@@ -107,16 +108,19 @@ def here(scenario_6: "Drive") -> Case:
     where = layout(problem)
     ratio = paper.scenario_ratios(6)
     y[EI_1 : EI_1 + 7] = np.log(ratio) / 0.55
-    # A straight line has the coefficients x(g), g the means of each three knots (Greville).
+    # A straight line has the coefficients x(g), g the means of each five knots (Greville).
     first, last = float(fixes.time_s[0]), float(fixes.time_s[-1])
     spans = np.linspace(first, last, problem.basis_position.shape[1] - DEGREE + 1)
     knots = np.concatenate([np.full(DEGREE, first), spans, np.full(DEGREE, last)])
     greville = np.convolve(knots[1:-1], np.full(DEGREE, 1.0 / DEGREE), "valid")
     y[where.trajectory] = paper.SPEED_M_PER_S * (greville - 3.0)
-    true = paper.SPEED_M_PER_S * (t[kept] - 3.0)
+    model = channel_signals(acceleration, sample_s, 1.0 / sample_s)
+    start_s = float(t[kept][0]) + model.start_s
+    samples = model.signals.shape[2]
+    true = paper.SPEED_M_PER_S * (start_s + model.step_s * np.arange(samples) - 3.0)
     np.testing.assert_allclose(problem.basis_position @ y[where.trajectory], true, atol=1e-9)
     y[where.offset] = 0.0
-    return Case(problem, y, fixes, priors, start_s, step_s, int(kept.sum()))
+    return Case(problem, y, fixes, priors, start_s, model.step_s, samples)
 
 
 def test_places_of_all_unknowns(here: Case) -> None:
@@ -125,12 +129,13 @@ def test_places_of_all_unknowns(here: Case) -> None:
         range(where.theta.start, where.theta.stop),
         [where.wheelbase],
         range(where.gains.start, where.gains.stop),
+        [where.common_gain],
         range(where.delays.start, where.delays.stop),
         range(where.initial.start, where.initial.stop),
         range(where.trajectory.start, where.trajectory.stop),
         [where.offset],
     ]
-    assert [len(group) for group in groups[:5]] == [22, 1, 3, 4, 12]
+    assert [len(group) for group in groups[:6]] == [22, 1, 3, 1, 4, 12]
     assert [i for group in groups for i in group] == list(range(where.size))
 
 
@@ -164,6 +169,10 @@ def test_coordinates_are_standard_normal_under_the_priors(here: Case) -> None:
         np.cov(at.gain.T), expected, atol=6.0 * here.priors.gain_spread**2 / np.sqrt(draws)
     )
     np.testing.assert_allclose(at.gain.sum(axis=1), 0.0, atol=1e-15)
+    # What is common to all: that of the calibration, and the mean of four independent ones.
+    common = np.hypot(here.priors.common_gain_spread, here.priors.gain_spread / 2.0)
+    standard(np.log(at.common_gain), common)
+    np.testing.assert_allclose(common_gain_spread(here.priors), common)
 
 
 def test_prior_rows_are_the_coordinates(here: Case) -> None:
@@ -202,6 +211,11 @@ def test_receiver_rows_are_the_stated_gaussian(here: Case) -> None:
     fine = np.linspace(first, last, 40_001)
     middles = 0.5 * (fine[1:] + fine[:-1])
     jerk = np.sum(curve.derivative(3)(middles) ** 2) * (fine[1] - fine[0]) / JERK_M_PER_S3**2
+    # Two points of Gauss see nothing of the jerk's second Legendre polynomial between two knots, a
+    # parabola's part a (x^2 - h^2/12): its square's integral a^2 h^5/180 is left out.
+    apart = inner[1] - inner[0]
+    bend = 0.5 * curve.derivative(5)(0.5 * (inner[1:] + inner[:-1]))
+    jerk -= np.sum(bend**2) * apart**5 / 180.0 / JERK_M_PER_S3**2
     others = np.sum(slower**2) / SPEED_NOISE_M_PER_S**2 + jerk
     given = np.sum((error - offset) ** 2) / POSITION_NOISE_M**2 + (offset / OFFSET_SPREAD_M) ** 2
     residual = rows @ np.append(coefficients, offset) - values
@@ -250,6 +264,7 @@ def test_start_is_the_nominal_truck_and_bridge(here: Case) -> None:
     at = points(here.problem, start(here.problem, trajectory)[None])
     np.testing.assert_array_equal(at.theta[0], here.priors.theta)
     assert at.wheelbase_m[0] == here.priors.wheelbase_m
+    assert at.common_gain[0] == 1.0
     for correction in (at.gain, at.delay_s, at.initial):
         assert not correction.any()
 
@@ -310,6 +325,7 @@ def test_the_data_tell_more_than_the_priors(here: Case) -> None:
 def test_a_far_wrong_curvature_would_be_noticed(here: Case) -> None:
     """Negative control: with the data's noise declared half, the same second difference is four."""
     rows = data_rows(here.problem, here.y[None])[0]
-    noise = here.problem.noise._replace(factor=0.5 * here.problem.noise.factor)
+    noise = here.problem.noise
+    noise = noise._replace(factor=0.5 * noise.factor, reciprocal=2.0 * noise.reciprocal)
     halved = data_rows(here.problem._replace(noise=noise), here.y[None])[0]
     np.testing.assert_allclose(halved, 2.0 * rows, rtol=1e-9)
