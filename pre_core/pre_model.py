@@ -137,7 +137,8 @@ def _sinc_weights(phase: FloatArray) -> FloatArray:
     attenuation = 14.36 * width * (_SINC_TAPS - 1) + 7.95
     beta = 0.1102 * (attenuation - 8.7)
     distance = np.arange(_SINC_TAPS) - (half - 1) - phase[:, None]
-    window = np.i0(beta * np.sqrt(np.maximum(0.0, 1.0 - (distance / half) ** 2)))
+    # Less one: nothing at the ends, so that a tap which comes or goes changes nothing.
+    window = np.i0(beta * np.sqrt(np.maximum(0.0, 1.0 - (distance / half) ** 2))) - 1.0
     weight = np.sinc(2.0 * cutoff * distance) * window
     # Integrated accelerations drift far; parabolas are read exactly, wherever the taps begin.
     powers = distance[:, None, :] ** np.arange(3)[:, None]
