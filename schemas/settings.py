@@ -12,7 +12,7 @@ class IdentificationSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    method: Method = "least_squares"
+    method: Method = "pre"
     seed: Annotated[int, Field(ge=0, lt=1 << 64)] = 1
     parts: Annotated[int, Field(ge=1, le=8)] = 2
     """Finite elements in each element of the site file: with 1, its own mesh biases EI at the ends

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ENDPOINT: Final = "tcp/127.0.0.1:7447"
 TLS_ENDPOINT: Final = "tls/127.0.0.1:7447"
 RECORDINGS: Final = Path("recordings")
-METHODS: Final = ("least-squares", "random-walk", "pre")
+METHODS: Final = ("pre", "least-squares", "random-walk")
 SCENARIOS: Final = range(1, 13)
 
 EXIT_FAILED: Final = 1
@@ -465,7 +465,8 @@ def _add_live(commands: Any) -> None:
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="new folder for what it leaves behind")
     _add_speed(p, 4.0)
-    _add_noise(p, "accelerometers' noise density in µg/√Hz (default: 0)")
+    text = "accelerometers' noise density in µg/√Hz; 0: all exact, least squares (default: 25)"
+    _add_noise(p, text, 25.0)
 
     p = _command(
         commands,
@@ -677,9 +678,9 @@ def _add_seed(p: argparse.ArgumentParser) -> None:
     p.add_argument("--seed", type=_whole("a seed", 0), default=1, help="(default: 1)")
 
 
-def _add_noise(p: argparse.ArgumentParser, text: str) -> None:
+def _add_noise(p: argparse.ArgumentParser, text: str, default: float = 0.0) -> None:
     p.add_argument(
-        "--noise", type=_number("a noise density", low=0, high=1e6), default=0.0, help=text
+        "--noise", type=_number("a noise density", low=0, high=1e6), default=default, help=text
     )
 
 
