@@ -248,17 +248,35 @@ def covariance(root: FloatArray) -> FloatArray:
 def roads(problem: Problem, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Chainage (m,), road (m) under the front and the rear wheel there, for one point y.
 
-    On the bridge only, in the order of the rear wheel's samples.
+    On the bridge only, in the order of the rear wheel's samples. A bias common to all sensors bends
+    the whole record into a parabola, and nothing in the residuals shows it at constant speed: so
+    the record's own parabola, on the bridge and off, is taken off.
     """
     crossing = problem.crossing
     at = points(problem, y[None, :])
     height, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
-    front = at.position_m[0]
+    x, front, rear = _at_same_places(crossing, at, height[0], height[1])
+    bend = _parabola(x, 0.5 * (front + rear))
+    on_bridge = (x >= 0.0) & (x <= crossing.span_m)
+    return x[on_bridge], (front - bend)[on_bridge], (rear - bend)[on_bridge]
+
+
+def _at_same_places(
+    crossing: Crossing, at: Points, front_height: FloatArray, rear_height: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Chainage and heights under both wheels wherever the rear wheel follows the front one."""
     sign = 1.0 if crossing.direction > 0 else -1.0
-    rear = front - sign * at.wheelbase_m[0]
-    on_bridge = np.flatnonzero((rear >= 0.0) & (rear <= crossing.span_m))
-    front_height = np.interp(sign * rear[on_bridge], sign * front, height[0])
-    return rear[on_bridge], front_height, height[1, on_bridge]
+    front = at.position_m[0]
+    rear = (front - sign * at.wheelbase_m[0])[crossing.first_row :]
+    return (
+        rear,
+        np.interp(sign * rear, sign * front, front_height),
+        rear_height[crossing.first_row :],
+    )
+
+
+def _parabola(x: FloatArray, height: FloatArray) -> FloatArray:
+    return np.asarray(np.polynomial.Polynomial.fit(x, height, 2)(x))
 
 
 def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
@@ -269,7 +287,7 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
     """
     crossing = problem.crossing
     at = points(problem, y[None, :])
-    theta, front = at.theta[0], at.position_m[0]
+    theta = at.theta[0]
     n = crossing.signals.shape[2]
     step = crossing.step_s
     spread = problem.density * np.sqrt(0.5 / step)
@@ -282,13 +300,13 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
             z[:, 2 + w] - z[:, w]
         )
         errors.append(z[:, 2 + w] + (theta[M_U1 + w] * a[:, 2 + w] + spring) / theta[K_U1 + w])
-    sign = 1.0 if crossing.direction > 0 else -1.0
-    rear = front - sign * at.wheelbase_m[0]
-    on_bridge = np.flatnonzero((rear >= 0.0) & (rear <= crossing.span_m))
-    front_error = np.stack(
-        [np.interp(sign * rear[on_bridge], sign * front, error) for error in errors[0]]
-    )
-    return np.asarray(0.5 * (front_error + errors[1][:, on_bridge]))
+    drawn = []
+    for front_error, rear_error in zip(*errors, strict=True):
+        x, at_front, at_rear = _at_same_places(crossing, at, front_error, rear_error)
+        mean = 0.5 * (at_front + at_rear)
+        on_bridge = (x >= 0.0) & (x <= crossing.span_m)
+        drawn.append((mean - _parabola(x, mean))[on_bridge])
+    return np.stack(drawn)
 
 
 def largest_deflections_m(problem: Problem, y: FloatArray) -> FloatArray:
