@@ -83,6 +83,15 @@ def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
     )
 
 
+def first_frequencies_hz(basis: BeamBasis, theta: FloatArray) -> FloatArray:
+    """First natural frequency (k,) in Hz, undamped, of the bridges `theta` (k, n + 15)."""
+    n = basis.stiffness.shape[0] - 2
+    factors = np.concatenate([theta[:, EI_1 : EI_1 + n], theta[:, EI_1 + n + 3 :]], axis=1)
+    stiffness = np.tensordot(factors, basis.stiffness, axes=1)
+    lowest = np.linalg.eigvalsh(stiffness)[:, 0]
+    return np.asarray(np.sqrt(lowest / theta[:, EI_1 + n]) / (2.0 * np.pi))
+
+
 @kernel
 def modal_filters(
     basis_stiffness: FloatArray,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import mcmc, parameters, posterior, pre
-from pre_core.bridge import natural_frequencies_hz
+from pre_core.drs import first_frequencies_hz
 from pre_core.search import Ending
 from pre_core.simulate import Motion
 from pre_core.whitening import RESIDUALS
@@ -23,7 +23,6 @@ from services.worker.crossing_data import (
     CrossingData,
     Floats,
     Passing,
-    beam_of,
     caveats,
     detrended,
     header,
@@ -47,7 +46,7 @@ unless it is only the noise that is larger than declared."""
 _LARGEST_R_HAT = 1.05
 _SMALLEST_ESS = 100.0
 _ROAD_DRAWS = 40
-_FREQUENCY_DRAWS = 200
+_FREQUENCY_DRAWS = 1000
 
 Report = Callable[[str, float], None]
 Keep = Callable[[str, dict[str, Floats]], None]
@@ -316,7 +315,7 @@ def _values(
             names=tuple(names[i] for i in kept),
             matrix=tuple(tuple(row) for row in np.atleast_2d(covariance).tolist()),
         ),
-        "derived": _derived(data, problem, at.theta, flat, rng),
+        "derived": _derived(problem, at.theta, flat, rng),
         "road": _road(data, problem, flat, rng),
     }
 
@@ -350,16 +349,13 @@ def _chosen(count: int, wanted: int, rng: np.random.Generator) -> NDArray[np.int
 
 
 def _derived(
-    data: CrossingData,
     problem: posterior.Problem,
     theta: Floats,
     flat: Floats,
     rng: np.random.Generator,
 ) -> results.Derived:
     some = _chosen(theta.shape[0], _FREQUENCY_DRAWS, rng)
-    frequencies = np.empty(some.size)
-    for k, i in enumerate(some):
-        frequencies[k] = natural_frequencies_hz(beam_of(data, theta[i]), 1)[0]
+    frequencies = first_frequencies_hz(problem.crossing.basis, theta[some])
     few = _chosen(flat.shape[0], _ROAD_DRAWS, rng)
     deflections = posterior.largest_deflections_m(problem, flat[few])
     return results.Derived(
