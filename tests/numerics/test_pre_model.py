@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pre_core import paper
 from pre_core.channels import A, V, Z, channel_signals
-from pre_core.drs import beam_basis
+from pre_core.drs import BeamBasis, beam_basis, rebased
 from pre_core.parameters import EI_1, K_U1, KAPPA, from_models
 from pre_core.pre_model import (
     Crossing,
@@ -22,7 +22,7 @@ from pre_core.pre_model import (
     sinc_table,
     workspace,
 )
-from pre_core.sensors import MICRO_G_M_PER_S2, resample
+from pre_core.sensors import MICRO_G_M_PER_S2, resample, white_noise
 from pre_core.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.vehicle import body_masses_kg
 from pre_core.whitening import Truck, row_count, row_filter, white_rows, whitener
@@ -138,13 +138,18 @@ def residual(
     return evaluate(data, works, at)
 
 
-def in_noise(case: Case, residuals: FloatArray) -> FloatArray:
-    """Mean square of the three white rows, where 1 is the noise of 5 µg/√Hz: (3,)."""
+def white(case: Case, residuals: FloatArray) -> FloatArray:
+    """White rows (k, 3 m), where one is the noise of 5 µg/√Hz."""
     rows = row_filter(crossing(case).step_s)
     truck = Truck(case.theta, *body_masses_kg(truck_of(case.site.vehicles[0])))
     density = np.full(4, NOISE_UG * MICRO_G_M_PER_S2)
     noise = whitener(rows, row_count(rows, residuals.shape[2]), truck, density)
-    return np.asarray(np.mean(white_rows(rows, noise, residuals).reshape(-1, 3) ** 2, axis=0))
+    return white_rows(rows, noise, residuals)
+
+
+def in_noise(case: Case, residuals: FloatArray) -> FloatArray:
+    """Mean square of the three white rows, where 1 is the noise of 5 µg/√Hz: (3,)."""
+    return np.asarray(np.mean(white(case, residuals).reshape(-1, 3) ** 2, axis=0))
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +175,22 @@ def test_at_the_truth_little_of_the_noise_is_left(
     assert np.all(left[1:] < 0.01), left
 
 
+@pytest.mark.parametrize("rate_hz", [100.0, 200.0, 250.0, 500.0])
+def test_slower_sensors_leave_as_little(truth: Case, rate_hz: float) -> None:
+    """Their rows end sooner, at 25 Hz for 100 Hz; what is below is seen as well as at 1 kHz."""
+    read = np.stack([resample(row, truth.rate_hz, rate_hz, 0.0) for row in truth.acceleration])
+    # Its own low-pass needs a fifth of a second of samples that are not invented, at both ends.
+    cut = round(0.25 * rate_hz)
+    here = part(truth._replace(acceleration=read, rate_hz=rate_hz), cut, read.shape[1] - cut)
+    left = in_noise(here, residual(here, point(here)))
+    # Where a wheel comes on or leaves, what it feels has a kink: sampled, its error is step^2.
+    assert left[0] < 0.1 * max(1.0, crossing(here).step_s / 3e-3) ** 2, left
+    assert np.all(left[1:] < 0.01), left
+    at = point(here)
+    at.theta[0, EI_1 + 3] *= 1.05
+    assert in_noise(here, residual(here, at)).sum() > 2.0
+
+
 @pytest.mark.parametrize("name", ["truth", "backward"])
 @pytest.mark.parametrize(
     ("place", "ratio"), [(EI_1 + 3, 1.05), (EI_1 + 1, 1.05), (KAPPA, 0.99), (K_U1 + 1, 1.02)]
@@ -188,6 +209,108 @@ def test_place_and_wheelbase_stand_out(truth: Case) -> None:
     assert in_noise(truth, residual(truth, at._replace(position_m=at.position_m + 0.1))).sum() > 2.0
     longer = at._replace(wheelbase_m=at.wheelbase_m * 1.001)
     assert in_noise(truth, residual(truth, longer)).sum() > 2.0
+
+
+def moved(
+    case: Case, data: Crossing, at: Points, place_m: float, longer_m: float = 0.0
+) -> FloatArray:
+    """White rows with the bridge put elsewhere or with another wheelbase."""
+    there = at._replace(position_m=at.position_m + place_m, wheelbase_m=at.wheelbase_m + longer_m)
+    return white(case, residual(case, there, data=data))[0]
+
+
+@pytest.fixture(scope="module")
+def noisy(truth: Case) -> Case:
+    rng = np.random.default_rng(6)
+    noise = [white_noise(truth.acceleration.shape[1], 1e3, 2.5e-4, rng) for _ in range(4)]
+    return truth._replace(acceleration=truth.acceleration + np.stack(noise))
+
+
+def on_the_bearing(at: Points, axle: int, end_m: float, share: float) -> Points:
+    """Moved so that the axle is on that bearing at a sample, or so much of a step beyond it."""
+    wheel = at.position_m[0] - axle * at.wheelbase_m[0]
+    step = wheel[1] - wheel[0]
+    return at._replace(
+        position_m=at.position_m + end_m - wheel[np.argmin(np.abs(wheel - end_m))] + share * step
+    )
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, 1.0)], ids=["place", "wheelbase"])
+def test_smooth_in_place_and_wheelbase(noisy: Case, direction: tuple[float, float]) -> None:
+    """A difference of a micrometre agrees with one of a millimetre."""
+    data = crossing(noisy)
+    for share in (0.2, 0.5, 0.8):
+        at = on_the_bearing(point(noisy), 0, 0.0, share)
+        here = moved(noisy, data, at, 0.0)
+        forward = (moved(noisy, data, at, *(1e-6 * d for d in direction)) - here) / 1e-6
+        ahead = moved(noisy, data, at, *(1e-3 * d for d in direction))
+        central = (ahead - moved(noisy, data, at, *(-1e-3 * d for d in direction))) / 2e-3
+        assert np.linalg.norm(forward - central) < 1e-3 * np.linalg.norm(central), share
+
+
+@pytest.mark.parametrize("axle", [0, 1])
+@pytest.mark.parametrize("end_m", [0.0, 30.0])
+def test_an_axle_on_the_bearing_at_a_sample(noisy: Case, axle: int, end_m: float) -> None:
+    """On one side of it the axle is on the bridge a sample longer: nothing jumps.
+
+    What it feels there has a kink, for a bridge that others already bend: the slope of that one
+    sample differs.
+    """
+    data = crossing(noisy)
+    at = on_the_bearing(point(noisy), axle, end_m, 0.0)
+    before, here, after = (moved(noisy, data, at, d) for d in (-1e-6, 0.0, 1e-6))
+    central = (moved(noisy, data, at, 1e-3) - moved(noisy, data, at, -1e-3)) / 2e-3
+    for step in (here - before, after - here):
+        assert np.linalg.norm(step / 1e-6 - central) < 0.2 * np.linalg.norm(central)
+
+
+def test_common_gain_scales_all_but_the_weight(truth: Case) -> None:
+    """Sensors that read 3 % too little: with their gain known the residuals are 3 % smaller, roads
+    and deflections the same; with it unknown, the weight does not go with what they read."""
+    gain = 1.03
+    data = crossing(truth)
+    low = data._replace(signals=data.signals / gain)
+    at = point(truth)
+    at.theta[0, EI_1 + 3] *= 1.1  # residuals that are not zero
+    known = at._replace(common_gain=np.array([gain]))
+    expected = residual(truth, at, data=data)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(residual(truth, known, data=low), expected / gain, atol=1e-9 * scale)
+    unknown = residual(truth, at, data=low) - expected / gain
+    assert np.sum(white(truth, unknown) ** 2) > 10.0**2  # ten standard deviations
+    work = workspace(data, at.theta.shape[1], row_filter(data.step_s))
+    right = roads_and_deflections(data, work, at, 0)
+    ours = roads_and_deflections(low, work, known, 0)
+    for a, b in zip(ours, right, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
+
+
+def test_coordinates_of_another_bridge_leave_everything_alone(truth: Case) -> None:
+    """Frequencies and residuals of any bridge, in coordinates in which one bridge is diagonal."""
+    data = crossing(truth)
+    weak = truth.theta.copy()
+    weak[[EI_1 + 1, EI_1 + 5]] *= 0.5
+    weak[[START, END]] = 5e8, 0.0
+    other = rebased(data.basis, weak)
+    n = other.stiffness.shape[0] - 2
+
+    def stiffness(basis: BeamBasis, theta: FloatArray) -> FloatArray:
+        factors = np.concatenate([theta[EI_1 : EI_1 + n], theta[[START, END]]])
+        return np.tensordot(factors, basis.stiffness, axes=1)
+
+    own = stiffness(other, weak)
+    np.testing.assert_allclose(own, np.diag(np.diag(own)), atol=1e-9 * own.max())
+    for theta in (weak, truth.theta):
+        np.testing.assert_allclose(
+            np.linalg.eigvalsh(stiffness(other, theta)),
+            np.linalg.eigvalsh(stiffness(data.basis, theta)),
+            rtol=1e-9,
+        )
+    at = point(truth)
+    expected = residual(truth, at, data=data)
+    np.testing.assert_allclose(
+        residual(truth, at, data=data._replace(basis=other)), expected, atol=1e-10
+    )
 
 
 def test_load_moves_between_the_axles_while_accelerating() -> None:
