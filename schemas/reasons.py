@@ -38,7 +38,6 @@ class Reason(StrEnum):
     NOT_CONVERGED = "not_converged"
     SAMPLER_DIAGNOSTICS = "sampler_diagnostics"
     FAILED = "failed"
-    NOT_VALIDATED = "not_validated"
     TYRE_DAMPING_IGNORED = "tyre_damping_ignored"
 
 
@@ -75,7 +74,6 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.NOT_CONVERGED: "The search did not converge.",
     Reason.SAMPLER_DIAGNOSTICS: "The Markov chain did not pass its own checks.",
     Reason.FAILED: "The identification failed.",
-    Reason.NOT_VALIDATED: "The method has not been validated on simulated crossings of this site.",
     Reason.TYRE_DAMPING_IGNORED: (
         "The site file gives the tyres a damping, which the method does not model."
     ),

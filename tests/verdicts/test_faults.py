@@ -1,9 +1,7 @@
 """Every fault through method `pre`: its cause is named, or the answer is right all the same.
 
 Dampers that are not linear are never `good`. Of every other fault: not `good`, or every EI within
-three standard deviations. `good` here means that nothing but `not_validated` is against it: what a
-site's validation has to say is another matter. docs/verdicts.md has the table
-(`python -m tests.verdicts.measure`).
+three standard deviations. docs/verdicts.md has the table (`python -m tests.verdicts.measure`).
 """
 
 from itertools import combinations
@@ -12,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from schemas.results import Crossing
 from schemas.signals import CHANNELS
 from tests.verdicts import faults
 from tests.verdicts.faults import Case, Fault, Truth
@@ -100,11 +97,6 @@ TABLE: dict[str, Row] = {
 }
 
 
-def is_good(result: Crossing) -> bool:
-    """Whether nothing is against the answer but that the site has not been validated."""
-    return result.verdict != "rejected" and set(result.reasons) <= {"not_validated"}
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", TABLE)
@@ -113,8 +105,8 @@ def test_a_fault_is_recognised_or_harmless(name: str) -> None:
     case = faults.crossing(row.truth, row.fault)
     result = faults.identified(case)
     if "bilinear" in name:
-        assert not is_good(result)
-    if is_good(result):
+        assert result.verdict != "good"
+    if result.verdict == "good":
         assert np.abs(faults.z_scores(case, result)).max() < 3.0, faults.z_scores(case, result)
     if row.named:
         assert row.named & set(result.reasons), result.reasons
@@ -128,7 +120,7 @@ def test_a_sound_crossing_is_good(seed: int) -> None:
     truth = PAPER._replace(seed=seed)
     case: Case = faults.crossing(truth, Fault(site=faults.believed_nearly(seed)))
     result = faults.identified(case)
-    assert is_good(result), result.reasons
+    assert result.verdict == "good", result.reasons
     assert np.abs(faults.z_scores(case, result)).max() < 4.0
 
 
