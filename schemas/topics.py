@@ -5,6 +5,7 @@ A key is `driveby/v1/{realm}/{owner}/{identifier}/{stream}`, e.g.
 """
 
 import re
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 PREFIX = "driveby/v1"
@@ -145,6 +146,7 @@ def key(realm: str, owner: str, identifier: str, stream: str) -> str:
     return f"{PREFIX}/{realm}/{owner}/{identifier}/{stream}"
 
 
+@lru_cache(maxsize=10_000)  # the same few come thousands of times a second
 def parse_key(text: str) -> Key:
     """Take a key apart; ValueError if it is not one of ours, whatever the text."""
     if len(text) > MAX_KEY_CHARACTERS:

@@ -15,6 +15,10 @@ class Intervals:
 
     def add(self, number: int) -> bool:
         """Put a number in; False if it was there."""
+        if self._last and number == self._last[-1] + 1:  # as nearly all are
+            self._last[-1] = number
+            self.size += 1
+            return True
         at = bisect_right(self._first, number)
         if at and number <= self._last[at - 1]:
             return False

@@ -7,6 +7,7 @@ in one write, so that a write that fails leaves the writer as it was before.
 """
 
 import struct
+import threading
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 
@@ -38,6 +39,8 @@ _INDEX = struct.Struct("<BQHI")
 _ENTRY = struct.Struct("<QQ")
 _FOOTER_SUMMARY = struct.Struct("<BQQQ")
 _FOOTER_BYTES = 20
+_INDEX_BLOCK_BYTES = 8192
+_THREAD = threading.local()
 
 
 class McapWriter:
@@ -55,11 +58,12 @@ class McapWriter:
         self.messages = 0
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
+        self._encoded_channels: list[bytes] = []
         self._written_schemas = 0
         self._channel_messages: dict[int, int] = {}
         self._times: tuple[int, int] | None = None
         self._chunks = 0
-        self._chunk_index = bytearray()  # encoded: an hour has 7200 of them
+        self._chunk_index = _Compressed()  # an hour has 7200 entries
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._content = bytearray()
@@ -85,6 +89,7 @@ class McapWriter:
             raise ValueError(f"more than {(1 << 16) - 1} channels in one file")
         channel = Channel(len(self._channels) + 1, topic, encoding, dict(metadata), schema_id)
         self._channels.append(channel)
+        self._encoded_channels.append(_encoded(channel))
         return channel.id
 
     def add_message(
@@ -113,7 +118,7 @@ class McapWriter:
         if not self._entries:
             return
         content = bytes(self._content)
-        data = zstandard.compress(content)
+        data = _compressed(content)
         first_ns, last_ns = self._entry_times
         length = _CHUNK.size - _HEADER.size + len(data)
         head = _CHUNK.pack(
@@ -140,7 +145,7 @@ class McapWriter:
         )
         self._put(head + data + index)
         self._chunks += 1
-        self._chunk_index += _encoded(known)
+        self._chunk_index.add(_encoded(known))
         for channel_id, entries in self._entries.items():
             number = len(entries) // _ENTRY.size
             before = self._channel_messages.get(channel_id, 0)
@@ -216,20 +221,19 @@ class McapWriter:
             (Opcode.SCHEMA, _joined(self._schemas)),
             (Opcode.CHANNEL, _joined(self._channels)),
             (Opcode.STATISTICS, _encoded(statistics)),
-            (Opcode.CHUNK_INDEX, bytes(self._chunk_index)),
+            (Opcode.CHUNK_INDEX, self._chunk_index.joined()),
             (Opcode.ATTACHMENT_INDEX, _joined(self._attachments)),
             (Opcode.METADATA_INDEX, _joined(self._metadata)),
         )
 
     def _begin_channel(self, channel_id: int) -> None:
         """Put what is needed to read a channel into the chunk."""
-        channel = self._channels[channel_id - 1]
         # Schemas stand before the channels that need them, and once: they are large, and a reader
         # of ours finds them in its own tables.
         for schema in self._schemas[self._written_schemas :]:
             self._content += _encoded(schema)
         self._written_schemas = len(self._schemas)
-        self._content += _encoded(channel)
+        self._content += self._encoded_channels[channel_id - 1]
 
     def _put(self, data: bytes) -> None:
         self._write(data)
@@ -238,6 +242,31 @@ class McapWriter:
     def _clear(self) -> None:
         self._content.clear()
         self._entries.clear()
+
+
+class _Compressed:
+    """Bytes that are needed only at the end and take little memory until then."""
+
+    def __init__(self) -> None:
+        self._blocks: list[bytes] = []
+        self._last = bytearray()
+
+    def add(self, data: bytes) -> None:
+        self._last += data
+        if len(self._last) >= _INDEX_BLOCK_BYTES:
+            self._blocks.append(_compressed(self._last))
+            self._last.clear()
+
+    def joined(self) -> bytes:
+        return b"".join([*map(zstandard.decompress, self._blocks), self._last])
+
+
+def _compressed(data: bytes | bytearray) -> bytes:
+    # One for each thread and not one for each file: to make one takes as long as what it does.
+    compressor: zstandard.ZstdCompressor | None = getattr(_THREAD, "compressor", None)
+    if compressor is None:
+        compressor = _THREAD.compressor = zstandard.ZstdCompressor()
+    return compressor.compress(data)
 
 
 def _joined(records: Iterable[McapRecord]) -> bytes:

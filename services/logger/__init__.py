@@ -36,6 +36,8 @@ _ANNOUNCE_PERIOD_S = 0.1
 _REPORT_PERIOD_S = 1.0
 _HEALTH_PERIOD_S = 60.0
 _DRAIN_S = 3.0
+_AT_ONCE_S = 0.02
+"""For so long messages are taken before anything else gets its turn."""
 _FETCH_ROOM = 32 << 20
 """With less room in the writer's queue, bytes, trucks are not asked for what is missing."""
 _GOODBYE_S = 0.2
@@ -133,9 +135,11 @@ def _record(
         next_report_s = time.monotonic()
         while not stop.is_set() and logger.writer.failure is None:
             received = subscription.receive(_ANNOUNCE_PERIOD_S)
-            if received is not None:
+            began_s = now_s = time.monotonic()
+            while received is not None:
                 _take(logger, received)
-            now_s = time.monotonic()
+                now_s = time.monotonic()
+                received = subscription.receive() if now_s - began_s < _AT_ONCE_S else None
             for fetched in completeness.step(now_s, hold=not logger.writer.has_room(_FETCH_ROOM)):
                 _take(logger, fetched)
             if now_s >= next_report_s:

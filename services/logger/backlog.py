@@ -15,13 +15,18 @@ _OVERHEAD_BYTES = 500
 
 
 class Backlog:
-    """A first-in first-out queue between two threads, which never makes the first one wait."""
+    """A first-in first-out queue between two threads, which never makes the first one wait.
+
+    Nor does a message wake the second one: at thousands of messages a second that would cost more
+    than all that is done with them. It looks again and again, `wait` says how often.
+    """
 
     def __init__(self, messages: int = QUEUE_MESSAGES, size: int = QUEUE_BYTES) -> None:
         self._limit = messages
         self._limit_bytes = size
         self._queue: deque[Message] = deque()
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        self._woken = threading.Event()
         self._closed = False
         self.bytes = 0
         """Bytes that wait, with what Python needs for them."""
@@ -36,36 +41,36 @@ class Backlog:
 
     def put(self, message: Message, *, always: bool = False) -> bool:
         """Add a message; False if there is no room. `always`: a small reserve may be used."""
-        with self._changed:
+        with self._lock:
             has_room = self.has_room(len(message.payload))
             if not has_room and not (always and len(self._queue) < self._limit + _RESERVE_MESSAGES):
                 return False
             self._queue.append(message)
             self.bytes += len(message.payload) + _OVERHEAD_BYTES
-            self._changed.notify()
             return True
 
-    def take(self, timeout_s: float) -> Message | None:
-        """Return the oldest message, or None if there is none in time or none will come."""
-        with self._changed:
-            if not self._queue and not self._closed:
-                self._changed.wait(timeout_s)
+    def take(self) -> Message | None:
+        """Return the oldest message, or None if there is none."""
+        with self._lock:
             if not self._queue:
                 return None
             message = self._queue.popleft()
             self.bytes -= len(message.payload) + _OVERHEAD_BYTES
             return message
 
+    def wait(self, timeout_s: float) -> None:
+        """Wait so long, or until `wake` or `close`."""
+        self._woken.wait(timeout_s)
+        self._woken.clear()
+
     def wake(self) -> None:
-        """Let a waiting `take` return at once."""
-        with self._changed:
-            self._changed.notify()
+        """Let `wait` return at once."""
+        self._woken.set()
 
     def close(self) -> None:
         """Say that nothing will come any more."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
+        self._closed = True
+        self._woken.set()
 
     @property
     def is_over(self) -> bool:

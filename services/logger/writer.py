@@ -31,6 +31,8 @@ from services.logger.own_events import OwnEvents
 _log = logging.getLogger(__name__)
 SYNC_PERIOD_S = 0.5
 """Half of what is promised, so that a slow disk does not break the promise."""
+_LOOK_S = 0.05
+"""How often the writer looks for messages when there were none."""
 MAX_OPEN_FILES = 256
 QUIET_S = 300.0
 """A truck that has said nothing for so long gets a new file when it comes back."""
@@ -197,10 +199,12 @@ class FileWriter:
         synced_s = time.monotonic()
         looked_s = 0.0
         while not self._backlog.is_over:
-            message = self._backlog.take(SYNC_PERIOD_S / 2)
+            message = self._backlog.take()
             now_s = time.monotonic()
             if message is not None:
                 self._write(message, now_s)
+            else:
+                self._backlog.wait(_LOOK_S)
             if self._rotation_asked.is_set():
                 self._rotation_asked.clear()
                 self._rotate_on_request()
@@ -364,9 +368,11 @@ class FileWriter:
         finally:
             self.failure = failure
         while not self._backlog.is_over:
-            waited = self._backlog.take(SYNC_PERIOD_S)
+            waited = self._backlog.take()
             if waited is not None:
                 self.count_drop(waited.key)
+            else:
+                self._backlog.wait(SYNC_PERIOD_S)
 
     def _close_all_badly(self, failed: _FileName | None, failure: str, event: Event) -> None:
         saved: list[Message] = []

@@ -1,0 +1,285 @@
+"""The logger under load: python -m tests.benchmarks.logger_load [--trucks 100] [--seconds 300]
+
+Every truck has a connection of its own and publishes 20 batches a second of 4 × 50 random samples
+and 10 fixes, each as `gnss` and as `location`: 40 messages a second. All trucks are one process,
+the logger is another, on the same machine over loopback. No truck has a spool: what is missed
+must come from what publishers keep.
+
+The time from publication to fsync is that from the put of a message to the return of the fsync
+behind it, both by the same clock. Processor time is that of the logger's process with all of its
+threads, Zenoh's too. What is lost is counted in the files, when all is over.
+"""
+
+import argparse
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.signals import (
+    CHANNELS,
+    AccelBatch,
+    Channel,
+    GnssFix,
+    Identity,
+    VehicleInfo,
+    encode_accel,
+    encode_gnss,
+    encode_info,
+    encode_location,
+)
+from services.common.bus import Publisher, open_session
+from services.common.recording import read_identities, read_info
+
+BATCHES_PER_S = 20
+MESSAGES_PER_S = 40
+_SETTLE_S = 10.0
+_DRAIN_S = 5.0
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+_STREAMS = ("accel", "gnss", "location")
+_LATE = "late_us"
+
+
+class Usage(NamedTuple):
+    """Of a process, with all of its threads."""
+
+    at_s: float
+    processor_s: float
+    resident_bytes: int
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--trucks", type=int, default=100)
+    parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--folder", type=Path, help="on the disk to try (default: a new one)")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--rotate-minutes", type=float, default=60.0)
+    parser.add_argument("--role", choices=("logger", "fleet"), help=argparse.SUPPRESS)
+    parser.add_argument("--endpoint", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.role == "logger":
+        sys.exit(log(options.endpoint, options.folder, options.rotate_minutes))
+    if options.role == "fleet":
+        drive(options.endpoint, options.trucks, options.seconds)
+        return
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        figures = measure(Path(folder), options.trucks, options.seconds, options.rotate_minutes)
+    for name, value in figures.items():
+        print(f"{name:40} {value}", flush=True)
+    if options.json is not None:
+        options.json.write_text(json.dumps(figures, indent=1))
+
+
+def measure(
+    folder: Path, trucks: int, seconds: float, rotate_minutes: float
+) -> dict[str, float | str]:
+    """Let the trucks drive for so long, and return what was measured."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    with (folder / "logger.log").open("w") as log_file:
+        common = ["--endpoint", endpoint, "--folder", str(folder)]
+        logger = start("logger", *common, "--rotate-minutes", str(rotate_minutes), err=log_file)
+    assert logger.stdout is not None
+    assert logger.stdout.readline() == "ready\n", (folder / "logger.log").read_text()
+    fleet = start(
+        "fleet", *common, "--trucks", str(trucks), "--seconds", str(seconds + _SETTLE_S), err=None
+    )
+    assert fleet.stdout is not None
+    assert fleet.stdout.readline() == "driving\n"
+    time.sleep(_SETTLE_S)
+    logger.send_signal(signal.SIGUSR2)  # only from here on
+    usages = [usage(logger.pid)]
+    fleet_before = usage(fleet.pid)
+    loads = []
+    while fleet.poll() is None and usages[-1].at_s - usages[0].at_s < seconds:
+        time.sleep(1.0)
+        usages.append(usage(logger.pid))
+        loads.append(os.getloadavg()[0])
+    fleet_after = usage(fleet.pid)
+    sent = json.loads(fleet.stdout.readline())
+    late_s = sent.pop(_LATE) * 1e-6
+    time.sleep(_DRAIN_S)
+    began = time.monotonic()
+    logger.send_signal(signal.SIGTERM)
+    told, _ = logger.communicate(timeout=120)
+    stop_s = time.monotonic() - began
+    fleet.kill()
+    fleet.wait()
+    if logger.returncode not in (0, 1):
+        raise SystemExit((folder / "logger.log").read_text()[-2000:])
+    latency = json.loads(told.splitlines()[-1])
+    duration_s = usages[-1].at_s - usages[0].at_s
+    processor_s = usages[-1].processor_s - usages[0].processor_s
+    found, twice = recorded(folder)
+    messages = MESSAGES_PER_S * trucks * duration_s
+    memory = [u.resident_bytes / 1e6 for u in usages]
+    return {
+        "trucks": trucks,
+        "seconds": round(duration_s, 1),
+        "messages sent": sum(sent.values()),
+        "not in the files": sum(max(0, n - found.get(name, 0)) for name, n in sent.items()),
+        "twice in the files": twice,
+        "dropped by the logger": dropped(folder),
+        "logger, per cent of a core": round(100 * processor_s / duration_s, 1),
+        "logger, us of processor per message": round(1e6 * processor_s / messages, 1),
+        "trucks, per cent of a core": round(
+            100
+            * (fleet_after.processor_s - fleet_before.processor_s)
+            / (fleet_after.at_s - fleet_before.at_s),
+            1,
+        ),
+        "publication to fsync, p50 s": latency["p50"],
+        "publication to fsync, p99 s": latency["p99"],
+        "publication to fsync, max s": latency["max"],
+        "trucks behind their timetable, most, s": round(late_s, 3),
+        "logger's memory, first minute, MB": round(float(np.median(memory[:60])), 1),
+        "logger's memory, last minute, MB": round(float(np.median(memory[-60:])), 1),
+        "logger's memory, most, MB": round(max(memory), 1),
+        "load average, mean": round(float(np.mean(loads)), 2),
+        "SIGTERM to exit, s": round(stop_s, 2),
+    }
+
+
+def start(role: str, *arguments: str, err: object) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.benchmarks.logger_load", "--role", role, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=err,  # type: ignore[arg-type]
+        text=True,
+    )
+
+
+def usage(pid: int) -> Usage:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    ticks = int(fields[11]) + int(fields[12])
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return Usage(time.monotonic(), ticks / _TICKS_PER_S, pages * _PAGE)
+
+
+def recorded(folder: Path) -> tuple[dict[str, int], int]:
+    """Return how many different messages of each vehicle are in the files, and how many twice."""
+    found: dict[str, int] = {}
+    twice = 0
+    for path in sorted(folder.glob("live/*/truck-*.mcap")):
+        info = read_info(path)
+        own = 0
+        for (where, _), numbers in read_identities(path).items():
+            if where.owner == "vehicle" and where.stream != "info":
+                found[where.identifier] = found.get(where.identifier, 0) + numbers.size
+                own += numbers.size
+        written = sum(n for key, n in info.messages.items() if key.rsplit("/")[-1] in _STREAMS)
+        twice += written - own
+    return found, twice
+
+
+def dropped(folder: Path) -> int:
+    ends = [read_info(path).end or {} for path in folder.glob("live/*/*.mcap")]
+    return max((int(end.get("dropped", 0)) for end in ends), default=-1)
+
+
+# --- the logger's process
+
+
+def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
+    """Run the logger, and note when what was published was on the disk."""
+    from services import logger
+    from services.logger import writer
+
+    delays: list[np.ndarray] = []  # type: ignore[type-arg]
+    is_settled: list[bool] = []
+    signal.signal(signal.SIGUSR2, lambda *_: is_settled.append(True))
+
+    class Timed(writer._Durable):
+        def add(self, messages):  # type: ignore[no-untyped-def]
+            synced = list(messages)
+            now_ns = time.time_ns()
+            super().add(synced)
+            if is_settled:
+                times = (m.log_time_ns for m in synced if m.key.owner == "vehicle")
+                delays.append(now_ns - np.fromiter(times, np.int64))
+
+    writer._Durable = Timed  # type: ignore[misc]
+    code = logger.run(
+        listen=endpoint,
+        folder=folder,
+        file=None,
+        realm=None,
+        site=None,
+        ready=lambda: print("ready", flush=True),
+        limits=writer.Limits(age_s=rotate_minutes * 60.0),
+    )
+    every = np.concatenate(delays) * 1e-9 if delays else np.zeros(1)
+    p50, p99 = np.percentile(every, [50, 99])
+    print(json.dumps({"p50": round(p50, 3), "p99": round(p99, 3), "max": round(every.max(), 3)}))
+    return code
+
+
+# --- the trucks' process
+
+
+def drive(endpoint: str, trucks: int, seconds: float) -> None:
+    """Publish at the rated load, each truck at moments of its own; say how much was sent."""
+    rng = np.random.default_rng(1)
+    batches = [made_up(rng) for _ in range(50)]
+    sessions = [open_session(connect=endpoint, timeout_s=60) for _ in range(trucks)]
+    publishers = [Publisher(session, "live") for session in sessions]
+    for n, publisher in enumerate(publishers):
+        vehicle = f"truck-{n}"
+        info = VehicleInfo(publisher.boot_id, 0, 0, time.time_ns(), vehicle, "")
+        publisher.put("vehicle", vehicle, "info", encode_info(info), Identity(info.boot_id, 0))
+        for stream in _STREAMS:
+            publisher.declare("vehicle", vehicle, stream)
+    time.sleep(2.0)
+    print("driving", flush=True)
+    late_s = 0.0
+    began = time.monotonic()
+    for tick in range(round(seconds * BATCHES_PER_S)):
+        for n, publisher in enumerate(publishers):
+            due = began + (tick + n / trucks) / BATCHES_PER_S
+            wait_s = due - time.monotonic()
+            late_s = max(late_s, -wait_s)
+            if wait_s > 0:
+                time.sleep(wait_s)
+            publish(publisher, f"truck-{n}", tick, batches[(tick + n) % len(batches)])
+    sent = round(seconds * BATCHES_PER_S) * MESSAGES_PER_S // BATCHES_PER_S
+    told = {f"truck-{n}": sent for n in range(trucks)} | {_LATE: round(late_s * 1e6)}
+    print(json.dumps(told), flush=True)
+    time.sleep(600)  # the connections stay, and with them what publishers keep
+
+
+def made_up(rng: np.random.Generator) -> pb.AccelBatch:
+    channels = {name: Channel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+    batch = AccelBatch(1, 0, 0, time.time_ns(), channels)
+    return pb.AccelBatch.FromString(encode_accel(batch))
+
+
+def publish(publisher: Publisher, vehicle: str, tick: int, batch: pb.AccelBatch) -> None:
+    boot_id = publisher.boot_id
+    batch.boot_id, batch.sequence = boot_id, tick
+    batch.device_time_ns, batch.wall_time_ns = time.monotonic_ns(), time.time_ns()
+    identity = Identity(boot_id, tick)
+    publisher.put("vehicle", vehicle, "accel", batch.SerializeToString(), identity)
+    if tick % 2 == 0:
+        identity = Identity(boot_id, tick // 2)
+        fix = GnssFix(
+            *identity, batch.device_time_ns, batch.wall_time_ns, 50.0, 8.0, 100.0, 10.0, 90.0
+        )
+        publisher.put("vehicle", vehicle, "gnss", encode_gnss(fix), identity)
+        publisher.put("vehicle", vehicle, "location", encode_location(fix), identity)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    main()
