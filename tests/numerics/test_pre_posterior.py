@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 
 from pre_core import paper
 from pre_core.channels import channel_signals
-from pre_core.parameters import D_1, EI_1, K_U1, from_models
+from pre_core.parameters import C_S1, D_1, EI_1, K_S1, K_U1, M_U1, from_models
 from pre_core.posterior import (
     Fixes,
     Priors,
@@ -24,7 +24,7 @@ from pre_core.posterior import (
     start,
     trajectory_basis,
 )
-from pre_core.pre import Inputs, prepare
+from pre_core.pre import Inputs, prepare, with_noise_at
 from pre_core.sensors import MICRO_G_M_PER_S2, white_noise
 from schemas.signals import CHANNELS
 from services.simulation import beam_of, paper_site, truck_of
@@ -329,3 +329,50 @@ def test_a_far_wrong_curvature_would_be_noticed(here: Case) -> None:
     noise = noise._replace(factor=0.5 * noise.factor, reciprocal=2.0 * noise.reciprocal)
     halved = data_rows(here.problem._replace(noise=noise), here.y[None])[0]
     np.testing.assert_allclose(halved, 2.0 * rows, rtol=1e-9)
+
+
+def test_noise_does_not_pull_at_the_truck(here: Case) -> None:
+    """Over many draws of the sensors' noise the slope of -log posterior at the truth is zero.
+
+    Noise of a truck, whitened for the truck at the truth, is expected to have a smaller sum of
+    squares for trucks that pass less of it. Each draw counts with both signs, so that what is
+    linear in it cancels; what the data themselves give at the truth is subtracted. Without
+    `noise_slope` (negative control) dampers, springs and masses are pulled.
+    """
+    where = layout(here.problem)
+    problem = with_noise_at(here.problem, here.y)
+    places = [C_S1, C_S1 + 1, K_S1, K_S1 + 1, M_U1 + 1, K_U1, K_U1 + 1]
+    size = 1e-2
+    steps = np.zeros((2 * len(places), here.y.size))
+    for k, place in enumerate(places):
+        steps[2 * k, place], steps[2 * k + 1, place] = size, -size
+    rng = np.random.default_rng(17)
+    signals = problem.crossing.signals
+    samples = 5200  # at 1 kHz, as many as the crossing has
+
+    def slopes(shown: FloatArray) -> FloatArray:
+        """Of half the sum of squares, along each of the places."""
+        crossing = problem.crossing._replace(signals=shown)
+        rows = all_rows(problem._replace(crossing=crossing), here.y + steps)
+        sums = np.sum(rows**2, axis=1)
+        return np.asarray((sums[::2] - sums[1::2]) / (4.0 * size))
+
+    own = slopes(signals)
+    density = 25.0 * MICRO_G_M_PER_S2
+    pulls = []
+    for _ in range(40):
+        noise = np.stack([white_noise(samples, 1e3, density, rng) for _ in range(4)])
+        drawn = channel_signals(noise, 1e-3, 1e3).signals[:, :, : signals.shape[2]]
+        both = slopes(signals + drawn) + slopes(signals - drawn)
+        pulls.append(0.5 * both - own)
+    # `own` holds the slope of the prior, moved by `noise_slope`, so that it is not in `pulls`.
+    bias = np.mean(pulls, axis=0)
+    error = np.std(pulls, axis=0, ddof=1) / np.sqrt(len(pulls))
+    taken_off = problem.noise_slope[places]
+    assert np.all(np.abs(bias - taken_off) < np.maximum(4.0 * error, 0.05 * np.abs(taken_off)))
+    assert np.abs(bias / error).max() > 10.0  # negative control: without it there is a pull
+    # It is taken off: all_rows moves the centre of the prior by it, and by nothing else.
+    moved = all_rows(problem, here.y[None])[0, -where.trajectory.start :]
+    expected = here.y[: where.trajectory.start].copy()
+    expected[: problem.noise_slope.size] -= problem.noise_slope
+    np.testing.assert_allclose(moved, expected, atol=1e-12)
