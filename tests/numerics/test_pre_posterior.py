@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from pre_core import paper
+from pre_core import channels, paper
 from pre_core.channels import channel_signals
 from pre_core.parameters import C_S1, D_1, EI_1, K_S1, K_U1, M_U1, from_models
 from pre_core.posterior import (
@@ -42,6 +42,7 @@ JERK_M_PER_S3 = 1.0
 
 
 class Case(NamedTuple):
+    inputs: Inputs
     problem: Problem
     y: FloatArray  # at the truth
     fixes: Fixes
@@ -87,24 +88,23 @@ def here(scenario_6: "Drive") -> Case:
     spread[EI_1 : EI_1 + 7] = 0.55
     spread[-2:] = SPRING_SPREAD
     priors = Priors(nominal, spread, vehicle.wheelbase_m, 0.002, 0.01, 0.01, 0.0005)
-    problem, y = prepare(
-        Inputs(
-            acceleration,
-            float(t[kept][0]),
-            sample_s,
-            1,
-            bridge.span_m,
-            np.array(bridge.lengths_m),
-            vehicle.total_mass_kg,
-            0.0,
-            np.full(4, density),
-            1.0 / sample_s,
-            fixes,
-            priors,
-            2,
-            2,
-        )
+    inputs = Inputs(
+        acceleration,
+        float(t[kept][0]),
+        sample_s,
+        1,
+        bridge.span_m,
+        np.array(bridge.lengths_m),
+        vehicle.total_mass_kg,
+        0.0,
+        np.full(4, density),
+        1.0 / sample_s,
+        fixes,
+        priors,
+        2,
+        2,
     )
+    problem, y = prepare(inputs)
     where = layout(problem)
     ratio = paper.scenario_ratios(6)
     y[EI_1 : EI_1 + 7] = np.log(ratio) / 0.55
@@ -120,7 +120,7 @@ def here(scenario_6: "Drive") -> Case:
     true = paper.SPEED_M_PER_S * (start_s + model.step_s * np.arange(samples) - 3.0)
     np.testing.assert_allclose(problem.basis_position @ y[where.trajectory], true, atol=1e-9)
     y[where.offset] = 0.0
-    return Case(problem, y, fixes, priors, start_s, model.step_s, samples)
+    return Case(inputs, problem, y, fixes, priors, start_s, model.step_s, samples)
 
 
 def test_places_of_all_unknowns(here: Case) -> None:
@@ -320,6 +320,25 @@ def test_the_data_tell_more_than_the_priors(here: Case) -> None:
     deviation = 0.55 * np.sqrt(np.diag(covariance(root)))[EI_1 : EI_1 + 7]
     assert np.all(deviation > 0.01)
     assert np.all(deviation < 0.1)
+
+
+def test_rows_up_to_42_hz_tell_of_ei_what_rows_up_to_125_hz_tell(
+    here: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The Cramér-Rao bound at the truth, of the same samples with the model at 333 Hz and at 1 kHz.
+
+    Measured: 1 % apart at most. Negative control: at 100 Hz, with rows up to 12 Hz, it is 7 % to
+    26 % worse.
+    """
+    deviations = {}
+    for rate_hz in (340.0, 1000.0, 100.0):
+        monkeypatch.setattr(channels, "MODEL_RATE_HZ", rate_hz)
+        problem, start = prepare(here.inputs)
+        assert start.size == here.y.size
+        bound = covariance(precision_root(jacobian_of(here._replace(problem=problem), 1e-4)))
+        deviations[rate_hz] = np.sqrt(np.diag(bound))[EI_1 : EI_1 + 7]
+    np.testing.assert_allclose(deviations[340.0] / deviations[1000.0], 1.0, atol=0.02)
+    assert np.all(deviations[100.0] > 1.05 * deviations[340.0])
 
 
 def test_a_far_wrong_curvature_would_be_noticed(here: Case) -> None:
