@@ -77,6 +77,7 @@ _MAX_SOURCES = 10_000
 _PATIENCE_WITH_SUBSCRIBER_US = 1_000_000
 """Zenoh's own is 5 s; who is cut off connects again and gets what it missed."""
 _QUERIES_WAITING = 100
+_DURABLES_WAITING = 100
 
 
 class Received(NamedTuple):
@@ -504,7 +505,14 @@ class Delivery:
         self._sent: Counter[tuple[str, str, str, int]] = Counter()
         self._durable: dict[str, dict[tuple[str, str, str, int], _OnDisk]] = {}
         self._lock = threading.Lock()
-        self._subscription = Subscription(session, selector(realm, "service", "durable"))
+        # Each message tells everything: of many that nobody has read the last few are enough.
+        self._subscriber = ext.declare_advanced_subscriber(
+            session,
+            selector(realm, "service", "durable"),
+            handlers.RingChannel(_DURABLES_WAITING),
+            history=ext.HistoryConfig(detect_late_publishers=True),
+            recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )
 
     def sent(self, where: Key, identity: Identity) -> None:
         """Count a message that was published; every identity once."""
@@ -554,17 +562,17 @@ class Delivery:
 
     def close(self) -> None:
         """Stop following."""
-        self._subscription.close()
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def _read(self) -> None:
         with self._lock:
-            newest: dict[str, Received] = {}
-            while (received := self._subscription.receive()) is not None:
-                newest[received.key_text] = received  # each tells everything
-            for received in newest.values():
+            newest: dict[str, bytes] = {}
+            while (sample := self._subscriber.try_recv()) is not None:
+                newest[str(sample.key_expr)] = sample.payload.to_bytes()  # each tells everything
+            for where, payload in newest.items():
                 try:
-                    message = decode("driveby.v1.Durable", received.payload)
-                    service = received.key().identifier
+                    message = decode("driveby.v1.Durable", payload)
+                    service = parse_key(where).identifier
                 except ValueError as error:
                     _log.warning("durable: %s", error)
                     continue

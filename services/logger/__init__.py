@@ -33,9 +33,12 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 _ANNOUNCE_PERIOD_S = 0.1
+_DURABLE_PERIOD_S = 1.0
+"""`durable` speaks of all trucks to each of them, over a mobile network perhaps."""
 _REPORT_PERIOD_S = 1.0
 _HEALTH_PERIOD_S = 60.0
-_DRAIN_S = 3.0
+_DRAIN_S = 2.5
+_COUNT_S = 1.0
 _AT_ONCE_S = 0.02
 """For so long messages are taken before anything else gets its turn."""
 _FETCH_ROOM = 32 << 20
@@ -149,9 +152,7 @@ def _record(
         if housekeeping is not None:
             housekeeping.close()
         subscription.close()
-        deadline = time.monotonic() + _DRAIN_S
-        while time.monotonic() < deadline and (received := subscription.receive()) is not None:
-            _take(logger, received)
+        _drain(logger, subscription)
         _report(logger, announcements, closing=True)
         reason = "stopped by a signal"  # after a write error nothing is written any more
         logger.writer.finish(reason, count_all(logger.intake.counts, logger.writer))
@@ -171,6 +172,18 @@ def _take(logger: _Logger, received: Received) -> None:
     message = logger.intake.take(received, time.time_ns())
     if message is not None:
         logger.writer.put(message)
+
+
+def _drain(logger: _Logger, subscription: Subscription) -> None:
+    """Take what has come already, for as long as a user waits; count what is left then."""
+    deadline = time.monotonic() + _DRAIN_S
+    while (received := subscription.receive()) is not None:
+        if time.monotonic() < deadline:
+            _take(logger, received)
+        elif time.monotonic() < deadline + _COUNT_S:
+            logger.writer.count_drop(None)
+        else:
+            return
 
 
 def _report(logger: _Logger, announcements: "_Announcements", *, closing: bool) -> None:
@@ -227,11 +240,14 @@ class _Announcements:
 
     def _run(self) -> None:
         version = -1
+        next_durable_s = 0.0
         next_health_s = time.monotonic() + _HEALTH_PERIOD_S
         while True:
             closing = self._closing.wait(_ANNOUNCE_PERIOD_S)
             self._publish_events()
-            if self._logger.writer.durable_version() != version:
+            is_due = closing or time.monotonic() >= next_durable_s
+            if is_due and self._logger.writer.durable_version() != version:
+                next_durable_s = time.monotonic() + _DURABLE_PERIOD_S
                 version = self._publish_durable()
             if closing or time.monotonic() >= next_health_s:
                 next_health_s = time.monotonic() + _HEALTH_PERIOD_S
