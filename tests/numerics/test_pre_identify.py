@@ -6,43 +6,71 @@ takes many crossings.
 
 import json
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from pre_core.bridge import natural_frequencies_hz, refine
 from pre_core.paper import scenario_ratios
+from pre_core.road import Profile
+from pre_core.simulate import Simulation
 from schemas.results import Crossing, Results, results_json
 from schemas.settings import IdentificationSettings
+from services import simulation
+from services.common.runs import Run
 from services.identify import identify_recordings
-from services.simulation import beam_of, declared, paper_site, simulate_drive, write_drive
+from services.simulation import (
+    beam_of,
+    declared,
+    measured_run,
+    paper_site,
+    simulate_drive,
+    write_drive,
+)
 
 NOISE_UG = 25.0
 SEED = 3
 
 
+class Found(NamedTuple):
+    results: Results
+    largest_deflection_m: float
+    """True, under a wheel."""
+
+
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> Results:
+def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     """Scenario 6 at 10 m/s over a road of class A, 25 µg/√Hz, with errors of the receiver."""
     path: Path = tmp_path_factory.mktemp("pre") / "scenario-6.mcap"
     site = paper_site()
-    drive = simulate_drive(
-        site,
-        scenario_ratios(6),
-        road_class="A",
-        seed=SEED,
-        noise_ug_per_rthz=NOISE_UG,
-        receiver_errors=True,
-    )
+    simulated: list[Simulation] = []
+
+    def keeping(*arguments: Any, **named: Any) -> tuple[Run, Profile, Simulation]:
+        measured = measured_run(*arguments, **named)
+        simulated.append(measured[2])
+        return measured
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulation, "measured_run", keeping)
+        drive = simulate_drive(
+            site,
+            scenario_ratios(6),
+            road_class="A",
+            seed=SEED,
+            noise_ug_per_rthz=NOISE_UG,
+            receiver_errors=True,
+        )
     known = declared(site, NOISE_UG, drive.run.rate_hz)
     write_drive(path, drive, known)
-    return identify_recordings([path], known, IdentificationSettings(method="pre", seed=0))
+    results = identify_recordings([path], known, IdentificationSettings(method="pre", seed=0))
+    return Found(results, -float(simulated[0].wheel_deflection_m.min()))
 
 
 @pytest.fixture(scope="module")
-def crossing(found: Results) -> Crossing:
-    assert len(found.crossings) == 1
-    return found.crossings[0]
+def crossing(found: Found) -> Crossing:
+    assert len(found.results.crossings) == 1
+    return found.results.crossings[0]
 
 
 @pytest.mark.slow
@@ -64,14 +92,16 @@ def test_rigidities_lie_within_their_intervals(crossing: Crossing) -> None:
 
 
 @pytest.mark.slow
-def test_result_says_all_that_the_contract_asks(found: Results, crossing: Crossing) -> None:
-    text = results_json(found)
-    assert Results.model_validate(json.loads(text)) == found
+def test_result_says_all_that_the_contract_asks(found: Found, crossing: Crossing) -> None:
+    text = results_json(found.results)
+    assert Results.model_validate(json.loads(text)) == found.results
     assert "NaN" not in text
     assert crossing.parameters is not None
     assert {"r_hat", "ess", "acceptance", "iterations", "seconds"} <= set(crossing.diagnostics)
-    # Total mass 1 %, common gain 1 %, mean of four gains of 1 % each.
-    assert crossing.scale_error == pytest.approx(np.sqrt(0.01**2 + 0.01**2 + 0.005**2), rel=1e-6)
+    # Total mass 1 %; common gain 1 % and the mean of four gains of 1 % each, less what the static
+    # load tells of them. (The draws' standard deviation has an error of 2 %.)
+    assert crossing.scale_error is not None
+    assert 0.01 < crossing.scale_error < 1.06 * np.sqrt(0.01**2 + 0.01**2 + 0.005**2)
     assert crossing.covariance is not None
     matrix = np.array(crossing.covariance.matrix)
     assert matrix.shape == (len(crossing.covariance.names),) * 2
@@ -96,9 +126,11 @@ def test_result_says_all_that_the_contract_asks(found: Results, crossing: Crossi
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="the deflection's interval leaves out the error of the common gain")
-def test_deflection_knows_of_the_common_gain(crossing: Crossing) -> None:
-    """A deflection M/EI is proportional to the common gain; the mass cancels."""
-    assert crossing.derived is not None
-    deflection = crossing.derived.max_deflection_m
-    assert deflection.std / deflection.mean > np.hypot(0.01, 0.005)
+def test_deflection_is_that_of_the_simulation(found: Found) -> None:
+    """Within its interval, which is narrower than the common gain's own prior spread of 1.1 %: the
+    weight of the truck, which no sensor measures, tells of both."""
+    derived = found.results.crossings[0].derived
+    assert derived is not None
+    deflection = derived.max_deflection_m
+    assert abs(deflection.mean - found.largest_deflection_m) < 4.0 * deflection.std
+    assert 0.001 < deflection.std / deflection.mean < 0.012
