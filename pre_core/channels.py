@@ -27,6 +27,9 @@ PASS, STOP = 0.215, 0.4
 """Of the model's rate: signals below the first pass whole, nothing is left above the second."""
 _SENSOR_PASS = 0.45
 """Of a sensor's rate: up to there its samples are interpolated as they are."""
+SEEN_ASIDE = 32
+"""Samples on each side of a moment that `read_between` needs."""
+_BLOCK = 4096
 _SPLINE_RATE_HZ = 800.0
 """A quintic spline through samples at this rate is good to 1e-6 up to 70 Hz."""
 _STOP_BAND_DB = 90.0
@@ -105,6 +108,28 @@ def _interpolated(samples: FloatArray, times: int) -> tuple[FloatArray, int]:
         taps[phase::times] /= taps[phase::times].sum()
     fine = np.stack([np.convolve(row, taps, mode="valid") for row in sparse])
     return fine, taps.size // 2
+
+
+def read_between(samples: FloatArray, place: FloatArray) -> FloatArray:
+    """Samples (n,) read at `place` (m,), in samples from the first: a windowed sinc.
+
+    What lies below 0.45 of the rate is read as it is. NaN where the sinc does not see enough
+    samples on both sides (`SEEN_ASIDE`).
+    """
+    width = 1.0 - 2.0 * _SENSOR_PASS
+    beta = 0.1102 * (_STOP_BAND_DB - 8.7)
+    below = np.floor(place).astype(np.int64)
+    offsets = np.arange(1 - SEEN_ASIDE, SEEN_ASIDE + 1)
+    result = np.full(place.size, np.nan)
+    inside = np.flatnonzero((below >= SEEN_ASIDE - 1) & (below + SEEN_ASIDE < samples.size))
+    for begin in range(0, inside.size, _BLOCK):  # in blocks, to bound memory
+        at = inside[begin : begin + _BLOCK]
+        distance = offsets - (place[at] - below[at])[:, None]
+        window = np.i0(beta * np.sqrt(np.maximum(0.0, 1.0 - (distance / SEEN_ASIDE) ** 2))) - 1.0
+        weight = np.sinc((2.0 * _SENSOR_PASS + width) * distance) * window
+        weight /= weight.sum(axis=1, keepdims=True)  # a constant stays what it is
+        result[at] = np.einsum("mj,mj->m", weight, samples[below[at][:, None] + offsets])
+    return result
 
 
 def _derivatives(acceleration: FloatArray, step_s: float) -> FloatArray:

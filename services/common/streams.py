@@ -51,6 +51,8 @@ class Samples(NamedTuple):
     start_s: float
     rate_hz: float
     channels: dict[str, Floats]
+    slowest_rate_hz: float = np.inf
+    """Of the channel that is sampled most slowly, where that is slower than the grid."""
 
 
 class Boot:
@@ -172,7 +174,7 @@ class Boot:
     def samples(self, start_s: float, stop_s: float) -> Samples | None:
         """Samples from `start` to `stop`, on the grid of the fastest channel.
 
-        A slower channel is interpolated by cubic splines. A channel that this truck has but that
+        A slower channel is interpolated band-limited. A channel that this truck has but that
         has no sample in this stretch is NaN throughout. None: the truck has no channel at all.
         """
         chosen = [
@@ -198,7 +200,8 @@ class Boot:
             for name in CHANNELS
             if name in self._channels
         }
-        return Samples(fastest.start_s, fastest.rate_hz, channels)
+        slowest_hz = min(grid.rate_hz for grid in grids.values())
+        return Samples(fastest.start_s, fastest.rate_hz, channels, slowest_hz)
 
 
 def device_time_ns(stream: str, payload: bytes) -> int:
@@ -277,23 +280,24 @@ def _fit_clock(
 
 
 def _resampled(grid: _Grid, time_s: Floats) -> Floats:
-    """The values of a grid at other times; NaN in its gaps and beyond its ends."""
+    """The values of a grid at other times; NaN in and near its gaps and ends.
+
+    At times of its own samples (of most channels all are) a value is itself. Between them it takes
+    `SEEN_ASIDE` unbroken samples on both sides to tell it: a spline through fewer would lose what
+    is quick.
+    """
     place = (time_s - grid.start_s) * grid.rate_hz
     nearest = np.rint(place).astype(np.int64)
     inside = (nearest >= 0) & (nearest < grid.values.size)
-    values = np.full(time_s.size, np.nan)
-    # At times of its own samples (of most channels all are) a value is itself.
     own = inside & (np.abs(place - nearest) < 1e-3)
+    values = np.full(time_s.size, np.nan)
     values[own] = grid.values[nearest[own]]
-    known = np.isfinite(grid.values)
-    below = np.floor(place).astype(np.int64)
-    between = ~own & (below >= 0) & (below + 1 < grid.values.size)
-    between[between] = known[below[between]] & known[below[between] + 1]
-    if np.any(between) and known.sum() >= 4:
-        from scipy.interpolate import CubicSpline  # slow to import, seldom needed
+    between = inside & ~own
+    if np.any(between):
+        from pre_core.channels import read_between  # slow to import, seldom needed
 
-        at = np.flatnonzero(known)
-        values[between] = CubicSpline(at, grid.values[at])(place[between])
+        # A NaN among the samples of a moment makes that moment NaN.
+        values[between] = read_between(grid.values, place[between])
     return values
 
 

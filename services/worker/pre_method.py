@@ -95,7 +95,7 @@ def inputs_of(
         vehicle.total_mass_kg,
         vehicle.cg_height_m or 0.0,
         density,
-        min(sensor.rate_hz),
+        min(*sensor.rate_hz, data.samples.slowest_rate_hz),
         fixes,
         _priors(data),
         max(1, -(-_FINITE_ELEMENTS // bridge.elements)),
