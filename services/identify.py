@@ -53,8 +53,6 @@ def identify_command(
             recordings, known, settings, status.update, keep=draws.__setitem__
         )
     _print(console, found, known)
-    if draws_path is not None:
-        write_draws(draws_path, draws)
     if json_path is not None:
         write_atomically(json_path, results_json(found))
     if rrd_path is not None:
@@ -73,6 +71,8 @@ def identify_command(
                 )
         except RuntimeError as error:  # so Rerun says that its file could not be written
             raise FailureError(f"{rrd_path}: could not be written: {error}") from error
+    if draws_path is not None:  # last: several crossings do not fit into every kind of file
+        write_draws(draws_path, draws)
     return 0
 
 

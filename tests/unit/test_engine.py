@@ -27,9 +27,10 @@ START_S = 1_767_225_600.0
 SITE = paper_site()
 
 
-REAL = IdentificationSettings()
+REAL = IdentificationSettings(method="least_squares")
+"""The simulated drive has no noise: what was put in must come out exactly."""
 HASTY = IdentificationSettings(method="random_walk", particles=4, steps=1)
-"""For drives whose accelerations mean nothing: least squares would look for long."""
+"""For drives whose accelerations mean nothing: others would look for long."""
 
 
 def engine(site: Site = SITE, chosen: IdentificationSettings = HASTY) -> Engine:
