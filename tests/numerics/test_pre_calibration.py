@@ -42,7 +42,6 @@ def lines() -> list[Record]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-@pytest.mark.xfail(reason="four of the twelve are sampled at 200 Hz, which is not possible yet")
 def test_a_dozen_crossings(lines: list[Record]) -> None:
     drawn = lines[:CROSSINGS]
     assert [line["seed"] for line in drawn] == list(range(CROSSINGS))
@@ -71,7 +70,6 @@ def test_the_weak_edge_element_of_scenario_12(lines: list[Record]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-@pytest.mark.xfail(reason="no crossing is good yet: every result says not_validated")
 @pytest.mark.parametrize("name", JUDGED)
 def test_crossings_of_an_independent_simulator(shared: Path, name: str) -> None:
     folder = shared / "crossings" / name
