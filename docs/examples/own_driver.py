@@ -2,6 +2,7 @@
 
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from services.truck.gateway import Gateway
 
 SITE = '[vehicle]\nid = "truck-1"\n'  # your truck's part of the site file
 
-with stopped_by_signals() as stop, open_session(connect=sys.argv[1]) as session:
-    gateway = Gateway(session, "live", "truck-1", Spool(Path(sys.argv[2])))
+connect = partial(open_session, connect=sys.argv[1], timeout_s=0.0)
+with stopped_by_signals() as stop:
+    gateway = Gateway(connect, "live", "truck-1", Spool(Path(sys.argv[2])))
     gateway.info(SITE, device_time_ns=time.monotonic_ns(), wall_time_ns=time.time_ns())
     while not stop.wait(0.05):
         # Replace these two lines by your own: 50 ms at 1 kHz, m/s², up, without gravity.

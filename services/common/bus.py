@@ -154,8 +154,9 @@ def default_endpoint(tls: Path | None) -> str:
 
 def _why_not_connected(endpoint: str, timeout_s: float | None, tls: Path | None) -> str:
     refused = "" if tls is None else ", or the one there refuses or does not prove a certificate"
+    within = f" within {timeout_s:g} s" if timeout_s else ""
     return (
-        f"no router answers at {endpoint} within {timeout_s:g} s{refused}; "
+        f"no router answers at {endpoint}{within}{refused}; "
         "start `driveby logger` first or give another endpoint"
     )
 
@@ -226,11 +227,14 @@ class Publisher:
     used from several threads.
     """
 
-    def __init__(self, session: zenoh.Session, realm: str, boot_id: int | None = None) -> None:
+    def __init__(
+        self, session: zenoh.Session | None, realm: str, boot_id: int | None = None
+    ) -> None:
+        """Publish through a session; None: nothing can be put before `connect`."""
         self.realm = realm
         self.boot_id = time.time_ns() if boot_id is None else boot_id
         """The start of this process unless given: higher after every restart."""
-        self._session = session
+        self._opened = session
         self._publishers: dict[str, ext.AdvancedPublisher] = {}
         self._next_sequence: Counter[str] = Counter()
         self._latest: dict[str, tuple[bytes, bytes]] = {}
@@ -268,6 +272,16 @@ class Publisher:
             # Within the lock, or two threads could send two messages in the wrong order.
             publisher.put(payload, attachment=attachment)
         return identity
+
+    def connect(self, session: zenoh.Session) -> None:
+        """Give a publisher that was made without one its session."""
+        self._opened = session
+
+    @property
+    def _session(self) -> zenoh.Session:
+        if self._opened is None:
+            raise RuntimeError("the publisher has no session yet")
+        return self._opened
 
     def declare(self, owner: str, identifier: str, stream: str) -> None:
         """Declare the publisher of a key before its first message.
@@ -500,15 +514,22 @@ class Seen:
 class Delivery:
     """Follows what loggers of a realm have on disk, so that a publisher knows when it may leave."""
 
-    def __init__(self, session: zenoh.Session, realm: str) -> None:
+    def __init__(self, session: zenoh.Session | None, realm: str) -> None:
+        """Follow the loggers of a realm; without a session from `connect` on."""
         self.realm = realm
         self._sent: Counter[tuple[str, str, str, int]] = Counter()
         self._durable: dict[str, dict[tuple[str, str, str, int], _OnDisk]] = {}
         self._lock = threading.Lock()
+        self._subscriber: ext.AdvancedSubscriber[Any] | None = None
+        if session is not None:
+            self.connect(session)
+
+    def connect(self, session: zenoh.Session) -> None:
+        """Listen from now on, to what was said before, too."""
         # Each message tells everything: of many that nobody has read the last few are enough.
         self._subscriber = ext.declare_advanced_subscriber(
             session,
-            selector(realm, "service", "durable"),
+            selector(self.realm, "service", "durable"),
             handlers.RingChannel(_DURABLES_WAITING),
             history=ext.HistoryConfig(detect_late_publishers=True),
             recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
@@ -562,9 +583,12 @@ class Delivery:
 
     def close(self) -> None:
         """Stop following."""
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        if self._subscriber is not None:
+            self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def _read(self) -> None:
+        if self._subscriber is None:
+            return
         with self._lock:
             newest: dict[str, bytes] = {}
             while (sample := self._subscriber.try_recv()) is not None:

@@ -3,12 +3,16 @@
 `gateway` is what a program with sensors of its own uses; `run` drives a recording again.
 """
 
+import contextlib
 import logging
 import time
 from collections.abc import Iterable, Iterator
+from functools import partial
 from heapq import merge
 from pathlib import Path
 from typing import Any
+
+import zenoh
 
 from schemas.signals import (
     Identity,
@@ -33,7 +37,7 @@ from services.common.playback import (
 )
 from services.common.recording import Message, read_messages
 from services.common.spool import DEFAULT_BUDGET_BYTES, Spool
-from services.truck.gateway import Gateway
+from services.truck.gateway import Connect, Gateway
 
 __all__ = ["Gateway", "run"]
 
@@ -66,12 +70,13 @@ def run(
 
     `vehicle` chooses one of several; `tls` is a folder of its credentials, see `open_session`.
     With a folder `spool` every message goes to disk there first and stays until a logger has it
-    (see `services.common.spool`); what an earlier drive left there is offered, too. Returns when a
-    logger has everything on disk (see `services.common.bus`).
+    (see `services.common.spool`); what an earlier drive left there is offered, too, and there need
+    be no router yet: it drives at once and connects when it can. Returns when a logger has
+    everything on disk (see `services.common.bus`).
 
     InputError: the recording is missing, is none, or holds no such vehicle, or another truck uses
     the spool. FailureError: nobody answers at the endpoint within `connect_timeout_s` (None: wait
-    for ever), or the logger did not confirm everything.
+    for ever; with a spool it does not matter), or the logger did not confirm everything.
     """
     check_speed(speed)
     try:
@@ -81,27 +86,34 @@ def run(
     streams = _read_vehicle(recording, vehicle, site)
     vehicle = next(iter(streams.values()))[0].key.identifier
     check_speaks_for(tls, "truck", vehicle)
-    with (
-        stopped_by_signals() as stop,
-        open_session(connect=endpoint, timeout_s=connect_timeout_s, tls=tls) as session,
-    ):
-        gateway = Gateway(session, realm, vehicle, _open_spool(spool, spool_budget_bytes))
-        try:
-            messages = _driven_now(streams, realm, gateway.boot_id, speed)
-            keys = [queue[0].key for queue in streams.values()]
-            if not settle(gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S):
-                # A real truck drives on as well; its cache serves those who come late.
-                _log.warning("nobody subscribes to %s in realm %s yet", gateway.vehicle, realm)
+    with stopped_by_signals() as stop, contextlib.ExitStack() as stack:
+        if spool is None:
+            bus: zenoh.Session | Connect = stack.enter_context(
+                open_session(connect=endpoint, timeout_s=connect_timeout_s, tls=tls)
+            )
+        else:
+            bus = partial(open_session, connect=endpoint, timeout_s=0.0, tls=tls)
+        gateway = Gateway(bus, realm, vehicle, _open_spool(spool, spool_budget_bytes))
+        stack.callback(gateway.close)
+        messages = _driven_now(streams, realm, gateway.boot_id, speed)
+        keys = [queue[0].key for queue in streams.values()]
+        if gateway.is_online and not settle(gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S):
+            # A real truck drives on as well; its cache serves those who come late.
+            _log.warning("nobody subscribes to %s in realm %s yet", gateway.vehicle, realm)
 
-            def put(message: Message) -> None:
-                identity = Identity(message.boot_id, message.sequence)
-                gateway.put(message.key.stream, message.payload, identity, patient=True)
+        def put(message: Message) -> None:
+            identity = Identity(message.boot_id, message.sequence)
+            gateway.put(message.key.stream, message.payload, identity, patient=True)
 
-            sent = play(messages, put, gateway.delivery, speed=speed, stop=stop)
-            confirm(gateway.delivery, sent)
+        sent = play(messages, put, gateway.delivery, speed=speed, stop=stop)
+        confirm(gateway.delivery, sent)
+        if gateway.is_online:
             _log.info("%d messages of %s published in realm %s", sent, gateway.vehicle, realm)
-        finally:
-            gateway.close()
+        else:
+            _log.warning(
+                "%d messages of %s are in the spool, none were published: no router answered at %s",
+                sent, gateway.vehicle, endpoint,
+            )  # fmt: skip
     return 0
 
 

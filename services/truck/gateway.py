@@ -1,19 +1,22 @@
 """What a truck's computer does with each message: to its own disk first, then to the bus.
 
-    with open_session(connect="tcp/127.0.0.1:7447", timeout_s=None) as session:
-        gateway = Gateway(session, "live", "truck-1", Spool(Path("spool/truck-1")))
-        gateway.info(Path("site.toml").read_text(), device_time_ns=..., wall_time_ns=...)
-        for samples in my_driver():                      # every 50 ms
-            channels = {"sprung_front": Channel(1000.0, samples)}
-            gateway.accel(channels, device_time_ns=..., wall_time_ns=...)
-        gateway.close()
+    def connect():
+        return open_session(connect="tcp/127.0.0.1:7447", timeout_s=0.0)
+
+    gateway = Gateway(connect, "live", "truck-1", Spool(Path("spool/truck-1")))
+    gateway.info(Path("site.toml").read_text(), device_time_ns=..., wall_time_ns=...)
+    for samples in my_driver():                      # every 50 ms
+        channels = {"sprung_front": Channel(1000.0, samples)}
+        gateway.accel(channels, device_time_ns=..., wall_time_ns=...)
+    gateway.close()
 
 `docs/examples/own_driver.py` is a program that runs. The caller never waits for the network: a
 message is appended to the spool and put into a queue, from which a thread publishes. Where that
 queue is full, because the router does not take anything, the message stays in the spool, and the
 logger asks for it (`schemas.spool`) once it sees that it lacks it. What a logger has confirmed is
-freed. Without a spool, messages are published at once, and the end of this process is the end of
-those that nobody has fetched yet.
+freed. Where there is no router yet when a truck starts, a thread tries until there is one. Without
+a spool, messages are published at once, and the end of this process is the end of those that nobody
+has fetched yet.
 """
 
 import contextlib
@@ -22,6 +25,7 @@ import queue
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import zenoh
@@ -61,6 +65,9 @@ _FREE_EVERY = 10  # syncs
 _GOODBYE_S = 5.0
 _QUERIES_WAITING = 100
 _COMPLAINT_PERIOD_S = 60.0
+_CONNECT_PAUSE_S = 0.2
+Connect = Callable[[], zenoh.Session]
+"""Opens a session, or raises FailureError if nobody answers now."""
 
 
 class Gateway:
@@ -70,22 +77,49 @@ class Gateway:
     """
 
     def __init__(
-        self, session: zenoh.Session, realm: str, vehicle: str, spool: Spool | None = None
+        self,
+        session: zenoh.Session | Connect,
+        realm: str,
+        vehicle: str,
+        spool: Spool | None = None,
     ) -> None:
+        """Join the bus. With a spool, `session` may be a function that opens one.
+
+        It is called at once, and where it raises FailureError again and again by a thread, while
+        the spool already takes what is measured. The gateway closes a session that it has opened.
+        """
         self.vehicle = check_identifier(vehicle)
-        self.publisher = Publisher(
-            session, check_realm(realm), None if spool is None else spool.boot_id
-        )
-        self.delivery = Delivery(session, realm)
+        boot_id = None if spool is None else spool.boot_id
+        self.publisher = Publisher(None, check_realm(realm), boot_id)
+        self.delivery = Delivery(None, realm)
         self.deferred = 0
         """Messages that were spooled and not published, because the bus did not take them."""
         self.unspooled = 0
         """Messages that the disk did not take; they were published all the same."""
+        self.is_online = False
+        """Whether there is a session; once there is one, it connects again by itself."""
         self._next: Counter[str] = Counter()
         self._complained_s = float("-inf")
-        self._spool = None if spool is None else _SpoolService(session, self, spool)
-        # There while this process runs: services see trucks come and go by it.
-        self._alive = session.liveliness().declare_token(key(realm, "vehicle", vehicle, "alive"))
+        self._alive: Any = None
+        self._own_session: zenoh.Session | None = None
+        self._spool = None if spool is None else _SpoolService(self, spool)
+        self._closing = threading.Event()
+        self._connecting: threading.Thread | None = None
+        if isinstance(session, zenoh.Session):
+            self._join(session)
+            return
+        if spool is None:
+            raise ValueError("without a spool a session is needed")
+        try:
+            self._own_session = session()
+        except FailureError as error:
+            _log.warning("%s: %s; all goes to the spool meanwhile", vehicle, error)
+            self._connecting = threading.Thread(
+                target=self._connect, args=(session,), name="connect", daemon=True
+            )
+            self._connecting.start()
+        else:
+            self._join(self._own_session)
 
     @property
     def boot_id(self) -> int:
@@ -129,18 +163,49 @@ class Gateway:
         else:
             spooled = self._append(self._spool.spool, stream, payload, identity)
             # What is on no disk can only be published, however long that takes.
-            if not self._spool.publish(stream, payload, identity, wait=patient or not spooled):
+            wait = self.is_online and (patient or not spooled)
+            if not self._spool.publish(stream, payload, identity, wait=wait):
                 self.deferred += 1
         self._next[stream] = identity.sequence + 1
         self.delivery.sent(Key(self.publisher.realm, "vehicle", self.vehicle, stream), identity)
 
     def close(self) -> None:
         """Leave the bus. What is spooled and on no logger's disk the next boot offers again."""
-        self._alive.undeclare()  # type: ignore[no-untyped-call]
+        self._closing.set()
+        if self._connecting is not None:
+            self._connecting.join()
+        if self._alive is not None:
+            self._alive.undeclare()
         if self._spool is not None:
             self._spool.close()
         self.delivery.close()
         self.publisher.close()
+        if self._own_session is not None:
+            self._own_session.close()  # type: ignore[no-untyped-call]
+
+    def _connect(self, connect: Connect) -> None:
+        while not self._closing.is_set():
+            try:
+                self._own_session = connect()
+            except FailureError:
+                self._closing.wait(_CONNECT_PAUSE_S)
+            except Exception:  # a thread of a truck that nobody watches; it drives on
+                _log.exception("%s: no connection any more", self.vehicle)
+                return
+            else:
+                self._join(self._own_session)
+                _log.info("%s: connected", self.vehicle)
+                return
+
+    def _join(self, session: zenoh.Session) -> None:
+        self.publisher.connect(session)
+        self.delivery.connect(session)
+        # There while this process runs: services see trucks come and go by it.
+        alive = key(self.publisher.realm, "vehicle", self.vehicle, "alive")
+        self._alive = session.liveliness().declare_token(alive)
+        self.is_online = True
+        if self._spool is not None:
+            self._spool.join(session)
 
     def _identity(self, stream: str) -> Identity:
         """Return the identity of the next message; used up only by `put`, not by a refused one."""
@@ -164,7 +229,7 @@ class Gateway:
 class _SpoolService:
     """Three threads: one publishes, one syncs and frees, one answers queries."""
 
-    def __init__(self, session: zenoh.Session, gateway: Gateway, spool: Spool) -> None:
+    def __init__(self, gateway: Gateway, spool: Spool) -> None:
         self.spool = spool
         self._gateway = gateway
         self._realm = gateway.publisher.realm
@@ -172,21 +237,24 @@ class _SpoolService:
             _OUTBOX_MESSAGES
         )
         self._closing = threading.Event()
-        self._queryable: zenoh.Queryable[Any] = session.declare_queryable(
-            spool_selector(self._realm, gateway.vehicle),
+        self._queryable: zenoh.Queryable[Any] | None = None
+        self._threads: list[threading.Thread] = []
+        self._start("sync", self._sync_all)
+
+    def join(self, session: zenoh.Session) -> None:
+        """Publish, and answer queries, from now on."""
+        self._queryable = session.declare_queryable(
+            spool_selector(self._realm, self._gateway.vehicle),
             handlers.FifoChannel(_QUERIES_WAITING),
             complete=True,
         )
-        self._threads = [
-            threading.Thread(target=target, name=f"spool-{name}", daemon=True)
-            for name, target in (
-                ("publish", self._publish_all),
-                ("sync", self._sync_all),
-                ("answer", self._answer_all),
-            )
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._start("publish", self._publish_all)
+        self._start("answer", self._answer_all, self._queryable.handler)
+
+    def _start(self, name: str, target: Callable[..., None], *arguments: object) -> None:
+        thread = threading.Thread(target=target, args=arguments, name=f"spool-{name}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
 
     def publish(self, stream: str, payload: bytes, identity: Identity, *, wait: bool) -> bool:
         """Hand over a message for publication; False if the bus is behind."""
@@ -198,11 +266,12 @@ class _SpoolService:
 
     def close(self) -> None:
         """Publish what waits, as far as the bus takes it within seconds; close the spool."""
-        deadline = time.monotonic() + _GOODBYE_S
+        deadline = time.monotonic() + (_GOODBYE_S if self._queryable is not None else 0.0)
         while not self._outbox.empty() and time.monotonic() < deadline:
             time.sleep(0.01)
         self._closing.set()
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+        if self._queryable is not None:
+            self._queryable.undeclare()  # type: ignore[no-untyped-call]
         with contextlib.suppress(queue.Full):  # then the thread sees _closing after its message
             self._outbox.put_nowait(None)
         for thread in self._threads:
@@ -239,12 +308,12 @@ class _SpoolService:
         except (OSError, FailureError) as error:  # what is not freed now is freed later
             _log.error("%s: spool: %s", self._gateway.vehicle, error)
 
-    def _answer_all(self) -> None:
+    def _answer_all(self, queries: handlers.Handler[zenoh.Query]) -> None:
         # A thread of our own: one of Zenoh's that still calls Python while the interpreter ends
         # takes the process down with it.
         while True:
             try:
-                query = self._queryable.handler.recv()
+                query = queries.recv()
             except zenoh.ZError:  # undeclared
                 return
             with query:

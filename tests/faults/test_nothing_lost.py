@@ -33,6 +33,22 @@ def test_a_killed_truck_gives_what_it_had_not_said_when_it_starts_again(fleet: M
     assert list((one.folder / "spool").glob("*/*.spool")) == []
 
 
+def test_a_truck_that_starts_where_there_is_no_router(fleet: MakeFleet) -> None:
+    """It drives, is killed, starts again, and meets router and logger only then."""
+    one = fleet()
+    truck = one.start_truck()
+    truck.wait_for(30)
+    truck.kill()
+    again = one.start_truck()
+    again.wait_for(30)
+    one.start_logger()
+    again.wait_for(60)
+    again.finish()
+    one.stop_logger()
+    assert one.assert_complete() == 0
+    assert list((one.folder / "spool").glob("*/*.spool")) == []
+
+
 def test_a_truck_killed_while_the_logger_listens(fleet: MakeFleet) -> None:
     one = fleet()
     one.start_logger()

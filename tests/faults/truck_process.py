@@ -9,6 +9,7 @@ even if the process is killed in the next moment.
 import os
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +28,9 @@ def main(endpoint: str, realm: str, vehicle: str, spool: str, batches_per_s: str
     period_s = 1.0 / float(batches_per_s)
     after, _, jump_s = os.environ.get(STEP_ENV, "0:0").partition(":")
     channel = Channel(1000.0, np.random.default_rng(1).standard_normal(50))
-    with (
-        stopped_by_signals() as stop,
-        open_session(connect=endpoint, timeout_s=60) as session,
-    ):
-        gateway = Gateway(session, realm, vehicle, Spool(Path(spool)))
+    with stopped_by_signals() as stop:
+        connect = partial(open_session, connect=endpoint, timeout_s=0.0)
+        gateway = Gateway(connect, realm, vehicle, Spool(Path(spool)))
         now = {"device_time_ns": time.monotonic_ns(), "wall_time_ns": time.time_ns()}
         gateway.info(f'[vehicle]\nid = "{vehicle}"\n', **now)
         number = 0
