@@ -271,7 +271,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="driveby",
         description="Find how stiff every part of a bridge is from a truck that drives over it.",
-        epilog="example: driveby simulate --scenario 6 -o run.mcap && driveby identify run.mcap",
+        epilog="example: driveby simulate --scenario 6 --noise 25 -o run.mcap "
+        "&& driveby identify run.mcap",
         allow_abbrev=False,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
@@ -369,7 +370,9 @@ def _add_offline(commands: Any) -> None:
     _add_method(p)
     _add_file(p, "--json", "OUT.json", "write the results here")
     _add_file(p, "--rrd", "OUT.rrd", "write a Rerun recording here")
-    _add_file(p, "--draws", "OUT.npz", "write the chain here")
+    _add_file(
+        p, "--draws", "OUT.npz|OUT.nc", "write the Markov chains of method pre here, for ArviZ"
+    )
     _add_seed(p)
 
     p = _command(
@@ -695,7 +698,13 @@ def _add_speed(p: argparse.ArgumentParser, default: float, zero: str = "") -> No
 
 
 def _add_method(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--method", choices=METHODS, default=METHODS[0], help=f"(default: {METHODS[0]})")
+    p.add_argument(
+        "--method",
+        choices=METHODS,
+        default=METHODS[0],
+        help="pre: with intervals, for real sensors; least-squares: for simulations without noise; "
+        f"random-walk: the paper's search (default: {METHODS[0]})",
+    )
 
 
 def _add_endpoint(p: argparse.ArgumentParser) -> None:
@@ -810,15 +819,15 @@ def _say(line: str, code: int) -> int:
 
 class _JsonFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        return json.dumps(
-            {
-                "time": round(record.created, 6),
-                "level": record.levelname.lower(),
-                "logger": record.name,
-                "message": record.getMessage(),
-            },
-            ensure_ascii=False,
-        )
+        line = {
+            "time": round(record.created, 6),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if hasattr(record, "figures"):
+            line["figures"] = record.figures
+        return json.dumps(line, ensure_ascii=False)
 
 
 def _log(form: str, *, verbose: bool) -> None:

@@ -47,6 +47,11 @@ def identify_command(
             check_writable(path)
     known = site_of(recordings, site)
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
+    if method == "pre" and not any(known.sensor.noise_density_ug_per_rthz):
+        _log.warning(
+            "the site says that the sensors have no noise, which method pre cannot believe; "
+            "simulations without noise are for --method least-squares"
+        )
     draws: dict[str, Draws] = {}
     with console.status("reading", spinner="dots") as status:
         found = identify_recordings(
@@ -178,38 +183,72 @@ def _names(recordings: list[Path]) -> str:
 
 
 def _print(console: "Console", found: Results, site: Site) -> None:
-    from rich.table import Table
-
     if not found.crossings:
         bridges = ", ".join(bridge.id for bridge in site.bridges)
         console.print(f"no crossing of a known bridge ({bridges})")
         return
-    for crossing in found.crossings:
-        console.print(
-            f"[bold]{crossing.crossing_id}[/]  {crossing.direction.replace('_', ' ')}, "
-            f"{crossing.speed_m_per_s:.2f} m/s, {crossing.method.replace('_', ' ')}\n"
-            f"[bold]{crossing.verdict}[/]"
+    for number, crossing in enumerate(found.crossings):
+        if number > 0:
+            console.print()
+        _print_crossing(console, crossing, site)
+
+
+def _print_crossing(console: "Console", crossing: Crossing, site: Site) -> None:
+    from rich.table import Table
+
+    method = crossing.method.replace("_", " ")
+    console.print(
+        f"[bold]{crossing.crossing_id}[/]\n"
+        f"{crossing.vehicle} over {crossing.bridge}, {crossing.direction.replace('_', ' ')}, "
+        f"{crossing.speed_m_per_s:.2f} m/s, method {method}",
+        highlight=False,
+    )
+    console.print(f"verdict [bold]{crossing.verdict}[/]", highlight=False)
+    for code, text in zip(crossing.reasons, crossing.reason_texts, strict=True):
+        console.print(f"  {code}: {text}", highlight=False)
+    if crossing.parameters is None:
+        return
+    bridge = site.bridge(crossing.bridge)
+    has_meaning = "no_noise_model" not in crossing.reasons
+    table = Table(box=None, pad_edge=False)
+    for heading in ("element", "from (m)", "to (m)", "EI (GN·m²)"):
+        table.add_column(heading, justify="right")
+    if has_meaning:
+        table.add_column("95 % interval", justify="right")
+    table.add_column("of nominal", justify="right")
+    if has_meaning:
+        table.add_column("95 % interval", justify="right")
+    start = 0.0
+    for number, (length, sound) in enumerate(
+        zip(bridge.lengths_m, bridge.nominal_flexural_rigidity_nm2, strict=True), start=1
+    ):
+        p = crossing.parameters[f"EI_{number}"]
+        row = [f"EI_{number}", f"{start:.2f}", f"{start + length:.2f}"]
+        for unit, digits in ((1e9, 2), (sound, 3)):
+            row.append(f"{p.mean / unit:.{digits}f}")
+            if has_meaning:
+                row.append(f"{p.q025 / unit:.{digits}f} … {p.q975 / unit:.{digits}f}")
+        table.add_row(*row)
+        start += length
+    console.print(table)
+    for line in _remarks(crossing):
+        console.print(line, highlight=False)
+
+
+def _remarks(crossing: Crossing) -> Iterator[str]:
+    """How well the model fits, and what of the intervals all elements have in common."""
+    diagnostics = crossing.diagnostics
+    if crossing.scale_error is not None:
+        yield (
+            f"of that common to all elements: {100.0 * crossing.scale_error:.1f} % "
+            "(standard deviation; mass, gain)"
         )
-        for code, text in zip(crossing.reasons, crossing.reason_texts, strict=True):
-            console.print(f"  {code}: {text}")
-        if crossing.parameters is None:
-            continue
-        nominal = site.bridge(crossing.bridge).nominal_flexural_rigidity_nm2
-        has_meaning = "no_noise_model" not in crossing.reasons
-        table = Table("element", "EI (GN·m²)", "of nominal", box=None, pad_edge=False)
-        for column in table.columns:
-            column.justify = "right"
-        if has_meaning:
-            table.add_column("95 % interval", justify="right")
-        for number, sound in enumerate(nominal, start=1):
-            p = crossing.parameters[f"EI_{number}"]
-            interval = [f"{p.q025 / 1e9:.3f} … {p.q975 / 1e9:.3f}"] if has_meaning else []
-            table.add_row(f"EI_{number}", f"{p.mean / 1e9:.3f}", f"{p.mean / sound:.3f}", *interval)
-        console.print(table)
-        diagnostics = crossing.diagnostics
-        if "relative_misfit" in diagnostics:
-            console.print(
-                f"  the two roads differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm rms, "
-                f"{diagnostics['relative_misfit']:.2%} of the road; "
-                f"{diagnostics['seconds']:.1f} s"
-            )
+    if crossing.chi2_per_dof is not None:
+        yield f"misfit against the declared noise: chi2 {crossing.chi2_per_dof:.2f}, 1 expected"
+    if "relative_misfit" in diagnostics:
+        yield (
+            f"the two roads differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm rms, "
+            f"{100.0 * diagnostics['relative_misfit']:.2g} % of the road"
+        )
+    if "seconds" in diagnostics:
+        yield f"{diagnostics['seconds']:.1f} s"

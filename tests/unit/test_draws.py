@@ -1,5 +1,6 @@
 """The chains as a file, as ArviZ reads them: every unknown an array (chain, draw)."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,9 @@ def draws() -> Draws:
     return {name: rng.standard_normal((CHAINS, 30)) for name in NAMES}
 
 
-def test_the_draws_are_those_of_the_result(project: Path, tmp_path: Path) -> None:
+def test_the_draws_are_those_of_the_result_and_of_what_is_printed(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     sample = project / "recordings" / "sample" / "crossing.mcap"
     out, drawn = tmp_path / "out.json", tmp_path / "draws.npz"
     arguments = ["identify", str(sample), "--json", str(out), "--draws", str(drawn)]
@@ -29,6 +32,7 @@ def test_the_draws_are_those_of_the_result(project: Path, tmp_path: Path) -> Non
     (crossing,) = load_results(out).crossings
     assert crossing.parameters is not None
     assert crossing.covariance is not None
+    assert crossing.scale_error is not None
     with np.load(drawn) as file:
         arrays = dict(file)
     assert arrays.keys() == {*crossing.covariance.names, "wheelbase_m", "position_offset_m"}
@@ -39,6 +43,13 @@ def test_the_draws_are_those_of_the_result(project: Path, tmp_path: Path) -> Non
         assert arrays[name].mean() == pytest.approx(p.mean, rel=1e-9)
         assert arrays[name].std() == pytest.approx(p.std, rel=1e-9)
         assert np.quantile(arrays[name], 0.975) == pytest.approx(p.q975, rel=1e-9)
+    printed = capsys.readouterr().out
+    assert "\nverdict good\n" in printed
+    weak = crossing.parameters["EI_4"]
+    for unit, digits in ((1e9, 2), (1.56e10, 3)):
+        interval = f"{weak.q025 / unit:.{digits}f} … {weak.q975 / unit:.{digits}f}"
+        assert re.search(rf"EI_4 .* {weak.mean / unit:.{digits}f} +{interval}", printed), printed
+    assert f"common to all elements: {100.0 * crossing.scale_error:.1f} %" in printed
     # Neighbours along a chain are alike, across the chains they are not: the axes are not mixed up.
     rigidity = arrays["EI_4"] - arrays["EI_4"].mean()
     along = np.mean(rigidity[:, 1:] * rigidity[:, :-1]) / np.mean(rigidity**2)

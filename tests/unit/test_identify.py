@@ -259,9 +259,25 @@ def test_results_are_written_as_the_contract_says(recording: Path, tmp_path: Pat
     assert rrd.read_bytes()[:4] == b"RRF2"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.json", "out.rrd"]
     text = console.export_text()
-    assert re.search(r"EI_4\s+6\.2\d\d\s+0\.400", text)
+    assert re.search(r"EI_4\s+12\.86\s+17\.14\s+6\.2\d\s+0\.400\n", text)
     assert "no_noise_model" in text
     assert "95 %" not in text  # an interval that means nothing is not printed
+    assert "common to all" not in text
+
+
+def test_sensors_without_noise_are_not_for_the_method_of_noise(
+    empty_recording: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    site = tmp_path / "site.toml"
+    quiet = paper_site().sensor.model_copy(update={"noise_density_ug_per_rthz": (0.0,) * 4})
+    site.write_text(site_toml(paper_site().model_copy(update={"sensor": quiet})))
+    arguments = ["identify", str(empty_recording()), "--site", str(site), "--method"]
+    assert cli.main([*arguments, "pre"]) == 0
+    assert "are for --method least-squares" in capsys.readouterr().err
+    assert cli.main([*arguments, "least-squares"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_a_failing_writer_leaves_the_files_of_yesterday(
