@@ -12,6 +12,7 @@ from pre_core.channels import (
     A_3,
     MODEL_RATE_HZ,
     PASS,
+    SEEN_ASIDE,
     STOP,
     A,
     ModelSignals,
@@ -19,6 +20,7 @@ from pre_core.channels import (
     Z,
     channel_signals,
     low_pass,
+    read_between,
 )
 from pre_core.sensors import resample
 
@@ -219,3 +221,16 @@ def test_low_pass_has_unit_gain_and_stops() -> None:
         allowed = 10 ** (-(db - 3.0) / 20.0)
         assert np.abs(response[frequency <= pass_share] - 1.0).max() < 2.0 * allowed
         assert np.abs(response[frequency >= stop_share]).max() < allowed
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 0.44])
+def test_reading_between_samples(share: float) -> None:
+    """Sines up to 0.45 of the rate to 1e-4, at samples too; NaN where it does not see enough."""
+    n = 300
+    samples = np.cos(2.0 * np.pi * share * np.arange(n) + 0.3)
+    rng = np.random.default_rng(9)
+    place = np.concatenate([rng.uniform(SEEN_ASIDE, n - SEEN_ASIDE - 1, 500), [40.0, 41.0]])
+    truth = np.cos(2.0 * np.pi * share * place + 0.3)
+    np.testing.assert_allclose(read_between(samples, place), truth, atol=RIPPLE)
+    ends = np.array([-1.0, 0.5, SEEN_ASIDE - 1.5, n - SEEN_ASIDE + 0.5, n + 3.0])
+    assert np.isnan(read_between(samples, ends)).all()
