@@ -6,7 +6,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -302,7 +303,20 @@ class _Announcements:
         realm = self._logger.place.realm or "live"
         payload = message.SerializeToString(deterministic=True)
         self._publisher(realm).put("service", self._logger.service_id, "health", payload)
-        _log.info("%s", ", ".join(f"{name} {value:.15g}" for name, value in figures.items()))
+        _log.info("%s", _health_line(figures), extra={"figures": figures})
+
+
+def _health_line(figures: Mapping[str, float]) -> str:
+    """What a person wants to know once a minute; everything else is on `health`."""
+    known = defaultdict(float, figures)
+    return (
+        f"{known['trucks_alive']:.0f} trucks, {known['rate_per_s']:.0f} messages/s, "
+        f"lag {known['lag_s']:.2f} s, queue {known['queue']:.0f}, lost {known['lost']:.0f}, "
+        f"missing {known['missing']:.0f}, recovered {known['recovered']:.0f}, "
+        f"duplicates {known['duplicates']:.0f}, refused {known['refused']:.0f}, "
+        f"dropped {known['dropped']:.0f}, written {known['written']:.0f} to "
+        f"{known['files']:.0f} files, {known['disk_free_bytes'] / 1e9:.1f} GB left"
+    )
 
 
 def _check_realm(realm: str | None) -> str | None:

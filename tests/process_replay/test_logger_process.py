@@ -1,8 +1,10 @@
 """The logger as a process: bad messages, signals, disks that are full, files that exist."""
 
+import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -112,6 +114,32 @@ def test_interrupt_finishes_the_file(start: Start, endpoint: str, tmp_path: Path
     info = read_info(tmp_path / "live.mcap")
     assert info.end is not None
     assert not info.truncated
+
+
+def test_how_it_is_stands_in_the_log_as_text_and_as_json(endpoint: str, tmp_path: Path) -> None:
+    for form in ("text", "json"):
+        arguments = ["--log-format", form, "logger", "--listen", endpoint, "--folder", tmp_path]
+        logger = subprocess.Popen(
+            [sys.executable, "-m", "services", *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert logger.stdout is not None
+        assert "ready" in logger.stdout.readline()
+        time.sleep(1.2)  # the room on the disk is looked at once a second
+        logger.send_signal(signal.SIGTERM)
+        _, log = logger.communicate(timeout=10)
+        assert logger.returncode == 0, log
+        line = log.splitlines()[-1]
+        if form == "json":
+            told = [json.loads(line) for line in log.splitlines()]
+            [figures] = [line["figures"] for line in told if "figures" in line]
+            assert {"rate_per_s", "lag_s", "queue", "lost", "recovered", "duplicates"} <= {*figures}
+            assert figures["disk_free_bytes"] > 0
+        else:
+            assert "0 trucks, 0 messages/s, lag 0.00 s, queue 0, lost 0" in line
+            assert line.endswith(" GB left")
 
 
 def test_an_existing_file_is_left_alone(
