@@ -31,14 +31,11 @@ from schemas.signals import (
     Channel,
     GnssFix,
     Identity,
-    VehicleInfo,
     encode_accel,
-    encode_gnss,
-    encode_info,
-    encode_location,
 )
-from services.common.bus import Publisher, open_session
+from services.common.bus import open_session
 from services.common.recording import read_identities, read_info
+from services.truck.gateway import Gateway
 
 BATCHES_PER_S = 20
 MESSAGES_PER_S = 40
@@ -234,25 +231,23 @@ def drive(endpoint: str, trucks: int, seconds: float) -> None:
     rng = np.random.default_rng(1)
     batches = [made_up(rng) for _ in range(50)]
     sessions = [open_session(connect=endpoint, timeout_s=60) for _ in range(trucks)]
-    publishers = [Publisher(session, "live") for session in sessions]
-    for n, publisher in enumerate(publishers):
-        vehicle = f"truck-{n}"
-        info = VehicleInfo(publisher.boot_id, 0, 0, time.time_ns(), vehicle, "")
-        publisher.put("vehicle", vehicle, "info", encode_info(info), Identity(info.boot_id, 0))
+    gateways = [Gateway(session, "live", f"truck-{n}") for n, session in enumerate(sessions)]
+    for gateway in gateways:
+        gateway.info("", device_time_ns=time.monotonic_ns(), wall_time_ns=time.time_ns())
         for stream in _STREAMS:
-            publisher.declare("vehicle", vehicle, stream)
+            gateway.publisher.declare("vehicle", gateway.vehicle, stream)
     time.sleep(2.0)
     print("driving", flush=True)
     late_s = 0.0
     began = time.monotonic()
     for tick in range(round(seconds * BATCHES_PER_S)):
-        for n, publisher in enumerate(publishers):
+        for n, gateway in enumerate(gateways):
             due = began + (tick + n / trucks) / BATCHES_PER_S
             wait_s = due - time.monotonic()
             late_s = max(late_s, -wait_s)
             if wait_s > 0:
                 time.sleep(wait_s)
-            publish(publisher, f"truck-{n}", tick, batches[(tick + n) % len(batches)])
+            publish(gateway, tick, batches[(tick + n) % len(batches)])
     sent = round(seconds * BATCHES_PER_S) * MESSAGES_PER_S // BATCHES_PER_S
     told = {f"truck-{n}": sent for n in range(trucks)} | {_LATE: round(late_s * 1e6)}
     print(json.dumps(told), flush=True)
@@ -265,19 +260,13 @@ def made_up(rng: np.random.Generator) -> pb.AccelBatch:
     return pb.AccelBatch.FromString(encode_accel(batch))
 
 
-def publish(publisher: Publisher, vehicle: str, tick: int, batch: pb.AccelBatch) -> None:
-    boot_id = publisher.boot_id
-    batch.boot_id, batch.sequence = boot_id, tick
-    batch.device_time_ns, batch.wall_time_ns = time.monotonic_ns(), time.time_ns()
-    identity = Identity(boot_id, tick)
-    publisher.put("vehicle", vehicle, "accel", batch.SerializeToString(), identity)
+def publish(gateway: Gateway, tick: int, batch: pb.AccelBatch) -> None:
+    device_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+    batch.boot_id, batch.sequence = gateway.boot_id, tick
+    batch.device_time_ns, batch.wall_time_ns = device_ns, wall_ns
+    gateway.put("accel", batch.SerializeToString(), Identity(gateway.boot_id, tick))
     if tick % 2 == 0:
-        identity = Identity(boot_id, tick // 2)
-        fix = GnssFix(
-            *identity, batch.device_time_ns, batch.wall_time_ns, 50.0, 8.0, 100.0, 10.0, 90.0
-        )
-        publisher.put("vehicle", vehicle, "gnss", encode_gnss(fix), identity)
-        publisher.put("vehicle", vehicle, "location", encode_location(fix), identity)
+        gateway.gnss(GnssFix(0, 0, device_ns, wall_ns, 50.0, 8.0, 100.0, 10.0, 90.0))
 
 
 if __name__ == "__main__":
