@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo test test-all faults validate lint bench lock clean
+.PHONY: help install demo test test-all faults soak validate lint bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -37,6 +37,11 @@ test-all: $(STAMP) ## the default tests and the slow ones
 
 faults: $(STAMP) ## everything that tries to lose or break data (at most 20 minutes)
 	$(BIN)/python -m pytest tests/faults -m "faults or not faults"
+
+KILLS ?= 50
+MINUTES ?= 60
+soak: $(STAMP) ## 50 kills of each kind and an hour of 100 trucks (KILLS=50 MINUTES=60)
+	DRIVEBY_SOAK_KILLS=$(KILLS) DRIVEBY_SOAK_MINUTES=$(MINUTES) $(BIN)/python -m pytest tests/faults -m soak -s
 
 validate: $(STAMP) ## is the uncertainty true: tables, figure, docs/validation.md (long)
 	mkdir -p build

@@ -494,9 +494,9 @@ def _add_live(commands: Any) -> None:
     room.add_argument(
         "--rotate-minutes",
         type=_number("minutes", low=0.01, high=1e6),
-        default=60.0,
+        default=15.0,
         metavar="MIN",
-        help="begin a truck's next file after so long (default: 60; SIGUSR1: at once)",
+        help="begin a truck's next file after so long (default: 15; SIGUSR1: at once)",
     )
     room.add_argument(
         "--rotate-mb",

@@ -60,7 +60,7 @@ class Place(NamedTuple):
 class Limits(NamedTuple):
     """When a file is closed and the next one begun, and how much room is left on the disk."""
 
-    age_s: float = 3600.0
+    age_s: float = 900.0
     bytes: int = 1 << 30
     min_free_bytes: int = 0
     """Below it the logger does not start, and says so while it runs; at an eighth it stops."""

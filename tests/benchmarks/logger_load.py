@@ -35,11 +35,12 @@ from schemas.signals import (
 )
 from services.common.bus import open_session
 from services.common.recording import read_identities, read_info
+from services.logger.writer import Limits
 from services.truck.gateway import Gateway
 
 BATCHES_PER_S = 20
 MESSAGES_PER_S = 40
-_SETTLE_S = 10.0
+DEFAULT_MINUTES = Limits().age_s / 60.0
 _DRAIN_S = 5.0
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 _PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -61,7 +62,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--folder", type=Path, help="on the disk to try (default: a new one)")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--rotate-minutes", type=float, default=60.0)
+    parser.add_argument("--rotate-minutes", type=float, default=DEFAULT_MINUTES)
     parser.add_argument("--role", choices=("logger", "fleet"), help=argparse.SUPPRESS)
     parser.add_argument("--endpoint", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -79,7 +80,11 @@ def main() -> None:
 
 
 def measure(
-    folder: Path, trucks: int, seconds: float, rotate_minutes: float
+    folder: Path,
+    trucks: int,
+    seconds: float,
+    rotate_minutes: float = DEFAULT_MINUTES,
+    warm_up_s: float = 10.0,
 ) -> dict[str, float | str]:
     """Let the trucks drive for so long, and return what was measured."""
     with socket.socket() as probe:
@@ -91,11 +96,11 @@ def measure(
     assert logger.stdout is not None
     assert logger.stdout.readline() == "ready\n", (folder / "logger.log").read_text()
     fleet = start(
-        "fleet", *common, "--trucks", str(trucks), "--seconds", str(seconds + _SETTLE_S), err=None
+        "fleet", *common, "--trucks", str(trucks), "--seconds", str(seconds + warm_up_s), err=None
     )
     assert fleet.stdout is not None
     assert fleet.stdout.readline() == "driving\n"
-    time.sleep(_SETTLE_S)
+    time.sleep(warm_up_s)
     logger.send_signal(signal.SIGUSR2)  # only from here on
     usages = [usage(logger.pid)]
     fleet_before = usage(fleet.pid)

@@ -1,9 +1,11 @@
 """Trucks, loggers and routers are killed and frozen: everything is on disk in the end, once."""
 
+import os
 import random
 import signal
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,11 +13,14 @@ import pytest
 from schemas.events import EventKind, decode_event
 from services.common.recording import read_messages
 
+KILLS_ENV = "DRIVEBY_SOAK_KILLS"
+MINUTES_ENV = "DRIVEBY_SOAK_MINUTES"
 pytestmark = pytest.mark.process
 
 MakeFleet = Callable[..., Any]
 
 
+@pytest.mark.faults  # the next but one does the same, and more
 def test_a_killed_truck_gives_what_it_had_not_said_when_it_starts_again(fleet: MakeFleet) -> None:
     """There is no logger while it drives: only its spool knows."""
     one = fleet(router=True)
@@ -62,6 +67,7 @@ def test_a_truck_killed_while_the_logger_listens(fleet: MakeFleet) -> None:
     assert one.assert_complete() == 0
 
 
+@pytest.mark.faults
 def test_an_outage_longer_than_the_cache(fleet: MakeFleet) -> None:
     """The publisher keeps 6000 batches; 8000 are made while there is no logger."""
     one = fleet()
@@ -91,7 +97,13 @@ def kill_at_random(fleet: MakeFleet, seed: int, kills: int, *, what: str) -> int
             one.kill(one.logger)
         if what in ("router", "both"):
             one.kill(one.router)
+        if what == "truck":
+            at = moments.randrange(3)
+            trucks[at].kill()
         time.sleep(moments.uniform(0.0, 1.0))
+        if what == "truck":
+            trucks[at] = one.start_truck(f"truck-{at + 1}")
+            trucks[at].wait_for(5)
         if what in ("logger", "both"):
             one.start_logger()
         if what in ("router", "both"):
@@ -104,16 +116,41 @@ def kill_at_random(fleet: MakeFleet, seed: int, kills: int, *, what: str) -> int
     return twice
 
 
-@pytest.mark.parametrize("what", ["logger", "router", "both"])
+@pytest.mark.parametrize(
+    "what",
+    ["both", *(pytest.param(one, marks=pytest.mark.faults) for one in ("logger", "router"))],
+)
 def test_killed_at_a_random_moment(fleet: MakeFleet, what: str) -> None:
     assert kill_at_random(fleet, 1, 1, what=what) == 0
 
 
 @pytest.mark.faults
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("what", ["logger", "router", "both"])
+@pytest.mark.parametrize("what", ["logger", "router", "both", "truck"])
 def test_killed_ten_times(fleet: MakeFleet, what: str) -> None:
     assert kill_at_random(fleet, 2, 10, what=what) == 0
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("what", ["logger", "router", "both", "truck"])
+def test_killed_fifty_times(fleet: MakeFleet, what: str) -> None:
+    assert kill_at_random(fleet, 3, int(os.environ.get(KILLS_ENV, "50")), what=what) == 0
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3 * 3600)
+def test_an_hour_at_the_rated_load(tmp_path: Path) -> None:
+    """100 trucks; nothing is missing or there twice, and the memory stays what it is."""
+    from tests.benchmarks.logger_load import measure
+
+    minutes = float(os.environ.get(MINUTES_ENV, "60"))
+    figures = measure(tmp_path, trucks=100, seconds=60.0 * minutes, warm_up_s=120.0)
+    print("\n".join(f"{name:40} {value}" for name, value in figures.items()))
+    assert figures["not in the files"] == figures["twice in the files"] == 0
+    assert figures["dropped by the logger"] == 0
+    first, last = (figures[f"logger's memory, {when} minute, MB"] for when in ("first", "last"))
+    assert float(last) <= 1.05 * float(first)
 
 
 @pytest.mark.faults
@@ -169,7 +206,7 @@ def test_a_frozen_truck_delays_no_other(fleet: MakeFleet, what: str) -> None:
         assert max(lags_s) < 4.0, vehicle  # the first ones, while the logger meets the truck
 
 
-@pytest.mark.parametrize("jump_s", [-3600, 86_400])
+@pytest.mark.parametrize("jump_s", [-3600, pytest.param(86_400, marks=pytest.mark.faults)])
 def test_a_truck_whose_wall_clock_jumps(fleet: MakeFleet, jump_s: int) -> None:
     one = fleet()
     one.start_logger()
