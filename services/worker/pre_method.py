@@ -45,7 +45,8 @@ _USABLE_CHI2 = 2.0
 unless it is only the noise that is larger than declared."""
 _LARGEST_R_HAT = 1.05
 _SMALLEST_ESS = 100.0
-_ROAD_DRAWS = 40
+_ROAD_DRAWS = 80
+_DEFLECTION_DRAWS = 400
 _FREQUENCY_DRAWS = 1000
 
 Report = Callable[[str, float], None]
@@ -356,7 +357,7 @@ def _derived(
 ) -> results.Derived:
     some = _chosen(theta.shape[0], _FREQUENCY_DRAWS, rng)
     frequencies = first_frequencies_hz(problem.crossing.basis, theta[some])
-    few = _chosen(flat.shape[0], _ROAD_DRAWS, rng)
+    few = _chosen(flat.shape[0], _DEFLECTION_DRAWS, rng)
     deflections = posterior.largest_deflections_m(problem, flat[few])
     return results.Derived(
         f1_hz=_parameter("Hz", frequencies, None),
