@@ -2,6 +2,7 @@
 
 python -m tests.verdicts.measure            every fault: verdict, reasons, worst EI (an hour)
 python -m tests.verdicts.measure signals N  checks of signals over N drawn sound crossings
+python -m tests.verdicts.measure sound N    verdict and worst EI of N drawn sound crossings
 """
 
 import sys
@@ -34,8 +35,23 @@ def signals(count: int) -> None:
     print(f"{len(accused)} of {count} sound crossings accused: {accused}")
 
 
+def sound(count: int) -> None:
+    """Verdicts of crossings that nothing is wrong with."""
+    for seed in range(count):
+        fault = faults.Fault(site=faults.believed_nearly(seed))
+        case = faults.crossing(faults.drawn(seed), fault)
+        result = faults.identified(case)
+        worst = ""
+        if result.parameters is not None:
+            worst = f", worst EI {np.abs(faults.z_scores(case, result)).max():.1f} std"
+        told = ", ".join(result.reasons)
+        print(f"{seed}: {result.verdict} {told} chi2 {result.chi2_per_dof}{worst}", flush=True)
+
+
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["signals"]:
+    if sys.argv[1:2] == ["sound"]:
+        sound(int(sys.argv[2]))
+    elif sys.argv[1:2] == ["signals"]:
         signals(int(sys.argv[2]))
     else:
         table()
