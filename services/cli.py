@@ -565,7 +565,7 @@ def _add_live(commands: Any) -> None:
     _add_endpoint(p)
     _add_realm(p)
     _add_speed(p, 1.0)
-    p.add_argument("--vehicle", metavar="ID", help="publish as this vehicle (default: as recorded)")
+    p.add_argument("--vehicle", metavar="ID", help="which one drives, if there are several")
 
     p = _command(
         commands,

@@ -60,7 +60,7 @@ class Recovery(NamedTuple):
 
 def recovered_path(source: Path) -> Path:
     """Return where a recovered recording is put unless told otherwise."""
-    return source.with_name(source.name.removesuffix(".mcap") + SUFFIX)
+    return source.with_name(source.name.removesuffix(ASIDE).removesuffix(".mcap") + SUFFIX)
 
 
 def put_aside(source: Path) -> Path:

@@ -215,7 +215,8 @@ class _Announcements:
 
     def event(self, realm: str, event: Event) -> None:
         """Write an event to the recording of the vehicle concerned, and publish it."""
-        _log.warning("%s: %s %s", event.kind, event.vehicle, event.text)
+        about = f"{event.vehicle}: " if event.vehicle else ""
+        _log.warning("%s: %s%s", event.kind, about, event.text)
         message = self._logger.own.message(realm, event)
         self._logger.writer.put(message, always=True)
         with self._lock:

@@ -343,6 +343,12 @@ def test_a_recording_that_is_being_written_is_left_alone(tmp_path: Path) -> None
     recover_recording(writer.path, recovered_path(writer.path))
 
 
+def test_what_was_set_aside_is_recovered_to_the_same_place(tmp_path: Path) -> None:
+    expected = tmp_path / "a.recovered.mcap"
+    assert recovered_path(tmp_path / "a.mcap") == expected
+    assert recovered_path(tmp_path / "a.mcap.crashed") == expected
+
+
 def test_the_damaged_file_is_never_the_target(whole: Whole, tmp_path: Path) -> None:
     path = damaged(tmp_path, whole.content)
     (tmp_path / "link.mcap").symlink_to(path)
