@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.events import EventKind
+from schemas.events import EventKind, decode_event
 from schemas.signals import GnssFix, encode_gnss, encode_identity
 from schemas.topics import Key
 from services import logger
@@ -248,8 +248,9 @@ def test_an_existing_file_is_refused_before_anything_starts(tmp_path: Path) -> N
     assert not [thread for thread in threading.enumerate() if thread.name == "writer"]
 
 
-def test_what_has_come_is_written_before_the_file_is_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("drain_s", "written"), [(10.0, 50), (0.0, 0)])
+def test_what_has_come_is_written_or_counted_before_the_file_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, drain_s: float, written: int
 ) -> None:
     """A backlog that only shows once the subscription is closed: the end of a busy day."""
 
@@ -276,5 +277,11 @@ def test_what_has_come_is_written_before_the_file_is_closed(
         probe.bind(("127.0.0.1", 0))
         listen = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     file = tmp_path / "a.mcap"
-    assert logger.run(listen=listen, folder=tmp_path, file=file, realm=None, site=None) == 0
-    assert [message.sequence for message in read_messages(file)] == list(range(50))
+    monkeypatch.setattr("services.logger._DRAIN_S", drain_s)
+    code = logger.run(listen=listen, folder=tmp_path, file=file, realm=None, site=None)
+    found = list(read_messages(file))
+    assert [m.sequence for m in found if m.key.owner == "vehicle"] == list(range(written))
+    assert code == (0 if written == 50 else 1)
+    assert (read_info(file).end or {})["dropped"] == str(50 - written)
+    told = [decode_event(m.payload) for m in found if m.key.stream == "event"]
+    assert sum(e.messages for e in told if e.kind == EventKind.QUEUE_FULL) == 50 - written
