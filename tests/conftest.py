@@ -5,12 +5,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import settings
 
 if TYPE_CHECKING:
     from services.simulation import Drive
 
 # As the commands do, before anything imports numpy: see services/cli.py.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# No test depends on how quick the machine is.
+settings.register_profile("project", deadline=None)
+settings.load_profile("project")
 
 PROJECT = Path(__file__).parents[1]
 
