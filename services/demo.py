@@ -286,12 +286,16 @@ def _draw(folder: Path, crossing: Crossing, drive: Drive, site: Site) -> None:
 
 
 def _true_road(crossing: Crossing, drive: Drive) -> tuple[Floats, Floats] | None:
-    """The road under the wheels, like the estimate without its straight line."""
+    """The road under the wheels, with level, slope and curvature of the estimate.
+
+    Integrated accelerations do not show these three; the rest can be compared.
+    """
     if crossing.road is None:
         return None
     x = np.array(crossing.road.x_m)
     height = np.interp(x, drive.road.x_m, drive.road.height_m)
-    return x, height - np.polynomial.Polynomial.fit(x, height, 1)(x)
+    apart = height - np.array(crossing.road.mean_m)
+    return x, height - np.polynomial.Polynomial.fit(x, apart, 2)(x)
 
 
 def _print(console: "Console", crossing: Crossing, drive: Drive, site: Site) -> None:

@@ -73,9 +73,15 @@ class CrossingView(NamedTuple):
 
 
 def summary_line(view: CrossingView) -> str:
-    """Vehicle, bridge, speed and method in one line."""
-    method = view.method.replace("_", " ")
-    return f"{view.vehicle} over {view.bridge} · {view.speed_m_per_s:.1f} m/s · {method}"
+    """Vehicle, bridge, speed, method and goodness of fit in one line."""
+    parts = [
+        f"{view.vehicle} over {view.bridge}",
+        f"{view.speed_m_per_s:.1f} m/s",
+        f"method {view.method.replace('_', ' ')}",
+    ]
+    if view.chi2_per_dof is not None:
+        parts.append(f"χ² per degree of freedom {view.chi2_per_dof:.2f}")
+    return " · ".join(parts)
 
 
 def view_of_crossing(crossing: Crossing, bridge: Bridge) -> CrossingView:
