@@ -119,6 +119,7 @@ def measure(
     stop_s = time.monotonic() - began
     fleet.kill()
     fleet.wait()
+    fleet.stdout.close()
     if logger.returncode not in (0, 1):
         raise SystemExit((folder / "logger.log").read_text()[-2000:])
     latency = json.loads(told.splitlines()[-1])
