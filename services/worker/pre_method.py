@@ -35,7 +35,7 @@ _MICRO_G = 9.80665e-6
 _LEARNING_SHARE = 4
 _LEARNING_STAGES = 3
 _WELL_ACCEPTED = 0.5
-_LONGEST = 4
+_LONGEST = 8
 _FINITE_ELEMENTS = 14
 """At least so many, whatever the number of elements: quicker sensors would see a coarser mesh."""
 _SMALLEST_NOISE_UG = 0.1
