@@ -180,10 +180,12 @@ def test_frozen_for_longer_than_its_time_outs(fleet: MakeFleet, what: str, secon
     assert one.assert_complete() == 0
 
 
-@pytest.mark.parametrize("what", ["truck"])
-def test_a_frozen_truck_delays_no_other(fleet: MakeFleet, what: str) -> None:
-    one = fleet()
+@pytest.mark.parametrize("router", [False, pytest.param(True, marks=pytest.mark.faults)])
+def test_a_frozen_truck_delays_no_other(fleet: MakeFleet, router: bool) -> None:
+    one = fleet(router=router)
     one.start_logger()
+    if router:
+        one.start_router()
     frozen, healthy = one.start_truck("truck-1"), one.start_truck("truck-2")
     frozen.wait_for(20)
     frozen.process.send_signal(signal.SIGSTOP)
