@@ -19,6 +19,13 @@ DEVIATIONS = 4.5
 """Of an estimate: a right sampler misses it about once in 100 000 comparisons."""
 
 
+def straight(
+    centre: FloatArray, matrix: FloatArray, positive: NDArray[np.int64], seed: int
+) -> mcmc.Approximation:
+    """Without any bent coordinate."""
+    return mcmc.approximation(centre, matrix, positive, np.zeros(centre.size), seed)
+
+
 class Run(NamedTuple):
     draws: FloatArray  # (n, c, f)
     acceptance: float
@@ -110,7 +117,7 @@ def test_the_approximation_itself_is_always_accepted() -> None:
     matrix = some_covariance(6)
     centre = np.arange(6.0)
     target = gaussian(centre, matrix)
-    done = run(target, mcmc.approximation(centre, matrix, NONE, 3), steps=600)
+    done = run(target, straight(centre, matrix, NONE, 3), steps=600)
     assert done.acceptance == 1.0
     assert np.abs(misses(done.draws, centre, np.diag(matrix))).max() < DEVIATIONS
 
@@ -127,9 +134,9 @@ def test_normal_cut_off_in_two_of_five_dimensions(order: tuple[int, int], adapt:
     places = np.array(order)
     target = positive_only(gaussian(CENTRE, matrix), places)
     mean, variance = truncated_moments(CENTRE, matrix, CUT)
-    normal = mcmc.approximation(CENTRE, matrix, places, 5)
+    normal = straight(CENTRE, matrix, places, 5)
     if adapt:  # begin with a poor one, so that there is something to learn
-        normal = mcmc.approximation(CENTRE + 0.5, 1.5 * matrix, places, 5)
+        normal = straight(CENTRE + 0.5, 1.5 * matrix, places, 5)
     done = run(target, normal, adapt=adapt)
     assert done.draws[:, :, places].min() >= 0.0
     assert 0.1 < done.acceptance <= 1.0
@@ -156,19 +163,47 @@ def log_gamma_times_normal(y: FloatArray) -> FloatArray:
     return np.asarray(SHAPE * y[:, 0] - np.exp(y[:, 0]) - 0.5 * (y[:, 1] - 0.5 * y[:, 0]) ** 2)
 
 
-def skewed_approximation(seed: int = 9) -> mcmc.Approximation:
+def skewed_approximation(seed: int = 9, bend: float = 0.0) -> mcmc.Approximation:
     """The curvature at the optimum log(shape), as method `pre` would take it."""
     mode = np.log(SHAPE)
     precision = np.array([[SHAPE + 0.25, -0.5], [-0.5, 1.0]])
-    return mcmc.approximation(np.array([mode, 0.5 * mode]), np.linalg.inv(precision), NONE, seed)
+    return mcmc.approximation(
+        np.array([mode, 0.5 * mode]), np.linalg.inv(precision), NONE, np.array([bend, 0.0]), seed
+    )
 
 
-@pytest.mark.parametrize("adapt", [0, 200])
-def test_a_target_that_leans_to_one_side(adapt: int) -> None:
+@pytest.mark.parametrize("bend", [0.4, -0.3])
+def test_the_bent_approximation_itself_is_always_accepted(bend: float) -> None:
+    """A target that is normal in w = (1 - exp(-b (y - centre)))/b, with dw/dy = exp(-b (y - c))."""
+    centre, matrix = np.array([0.7, -0.2]), np.array([[0.09, 0.05], [0.05, 0.16]])
+    precision = np.linalg.inv(matrix)
+
+    def target(y: FloatArray) -> FloatArray:
+        w = y - centre
+        slope = -bend * w[:, 0]
+        w = np.stack([-np.expm1(slope) / bend, w[:, 1]], axis=1)
+        return np.asarray(-0.5 * np.einsum("ki,ij,kj->k", w, precision, w) + slope)
+
+    normal = mcmc.approximation(centre, matrix, NONE, np.array([bend, 0.0]), 6)
+    assert run(target, normal, steps=200).acceptance == 1.0
+    assert run(target, straight(centre, matrix, NONE, 6), steps=200).acceptance < 0.98
+
+
+def test_what_lies_beyond_the_bend_is_impossible() -> None:
+    """A bent coordinate ends at w = 1/b: nothing there is accepted, and the rest stays exact."""
+    normal = skewed_approximation(bend=0.9)
+    normal = normal._replace(factor=3.0 * normal.factor)
+    done = run(log_gamma_times_normal, normal, steps=4000)
+    assert np.all(np.isfinite(done.draws))
+    assert abs(done.draws[:, :, 0].mean() - digamma(SHAPE)) < 0.1
+
+
+@pytest.mark.parametrize(("adapt", "bend"), [(0, 0.0), (200, 0.0), (0, 0.2)])
+def test_a_target_that_leans_to_one_side(adapt: int, bend: float) -> None:
     """Means, variances and quantiles of log-gamma times normal, before and after adapting."""
     mean = np.array([digamma(SHAPE), 0.5 * digamma(SHAPE)])
     variance = np.array([polygamma(1, SHAPE), 1.0 + 0.25 * polygamma(1, SHAPE)])
-    normal = skewed_approximation()
+    normal = skewed_approximation(bend=bend)
     if adapt:
         normal = normal._replace(centre=normal.centre + np.array([0.5, -0.6]))
     done = run(log_gamma_times_normal, normal, steps=6000, adapt=adapt)
@@ -216,9 +251,7 @@ def test_a_poor_approximation_is_still_exact_in_many_dimensions() -> None:
     matrix = some_covariance(20)
     centre = np.linspace(-1.0, 1.0, 20)
     wrong = centre + 0.15 * np.sqrt(np.diag(matrix))
-    done = run(
-        gaussian(centre, matrix), mcmc.approximation(wrong, 0.85**2 * matrix, NONE, 2), steps=6000
-    )
+    done = run(gaussian(centre, matrix), straight(wrong, 0.85**2 * matrix, NONE, 2), steps=6000)
     assert np.abs(misses(done.draws, centre, np.diag(matrix))).max() < DEVIATIONS
 
 
