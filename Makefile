@@ -29,7 +29,7 @@ $(STAMP): $(PACKAGES) $(wildcard pre_core/*.py)
 demo: $(STAMP) ## a truck crosses a bridge: simulated, recorded, identified, drawn
 	$(BIN)/driveby demo
 
-test: $(STAMP) ## the default tests (at most 5 minutes on 2 cores)
+test: $(STAMP) ## the default tests (about 7 minutes on 2 cores)
 	$(BIN)/python -m pytest
 
 test-all: $(STAMP) ## the default tests and the slow ones
