@@ -226,8 +226,6 @@ def start(problem: Problem, trajectory: FloatArray) -> FloatArray:
     where = layout(problem)
     y = np.zeros(where.size)
     y[where.trajectory.start :] = trajectory
-    if problem.estimated[-1]:
-        y[where.theta.stop - 2 : where.theta.stop] = 0.0
     return y
 
 

@@ -21,7 +21,7 @@ from pre_core.channels import A_1, A_2, A_3, PASS, STOP, A, V, Z
 from pre_core.drs import BeamBasis
 from pre_core.lanes import LANES, kernel, summing
 from pre_core.parameters import C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1
-from pre_core.whitening import RESIDUALS, RowFilter, Whitener, filter_rows, row_count, solve
+from pre_core.whitening import RESIDUALS, RowFilter, Whitener, row_count, whiten_into
 
 FloatArray = NDArray[np.float64]
 
@@ -465,12 +465,7 @@ def _evaluate_white(
         if not _residuals(crossing, work, points, k, work.residual):
             out[k] = np.nan
             continue
-        white = out[k, : noise.reciprocal.size]
-        for i in range(RESIDUALS):
-            filter_rows(rows.taps, rows.every, work.residual[i], work.row)
-            for j in range(work.row.size):
-                white[RESIDUALS * j + i] = work.row[j]
-        solve(noise.factor, noise.reciprocal, white)
+        whiten_into(rows, noise, work.residual, work.row, out[k, : noise.reciprocal.size])
 
 
 def evaluate(crossing: Crossing, works: tuple[Work, ...], points: Points) -> FloatArray:

@@ -227,20 +227,18 @@ def solve(factor: FloatArray, reciprocal: FloatArray, b: FloatArray) -> None:
 
 
 @summing
-def _white(
-    taps: FloatArray,
-    every: int,
-    factor: FloatArray,
-    reciprocal: FloatArray,
-    residuals: FloatArray,
-    row: FloatArray,
-    out: FloatArray,
+def whiten_into(
+    rows: RowFilter, noise: Whitener, residuals: FloatArray, row: FloatArray, out: FloatArray
 ) -> None:
+    """Filter and interleave residuals (3, n), and whiten them into `out` (3 m,).
+
+    `row` (m,) is a work array.
+    """
     for i in range(RESIDUALS):
-        filter_rows(taps, every, residuals[i], row)
+        filter_rows(rows.taps, rows.every, residuals[i], row)
         for k in range(row.size):
             out[RESIDUALS * k + i] = row[k]
-    solve(factor, reciprocal, out)
+    solve(noise.factor, noise.reciprocal, out)
 
 
 def white_rows(rows: RowFilter, noise: Whitener, residuals: FloatArray) -> FloatArray:
@@ -259,5 +257,5 @@ def white_rows(rows: RowFilter, noise: Whitener, residuals: FloatArray) -> Float
     out = np.empty((flat.shape[0], RESIDUALS * count))
     row = np.empty(count)
     for k in range(flat.shape[0]):
-        _white(rows.taps, rows.every, noise.factor, noise.reciprocal, flat[k], row, out[k])
+        whiten_into(rows, noise, flat[k], row, out[k])
     return out.reshape(*many, RESIDUALS * count)
