@@ -4,16 +4,18 @@
 it is needed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from google.protobuf import descriptor_pb2
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.message import DecodeError, Message
 
 from schemas import events, signals
+from schemas.accel_check import check_accel
 from schemas.proto import driveby_pb2
+from schemas.signals import Stamp
 from schemas.topics import TOPICS, Topic
 
 LOCATION = "foxglove.LocationFix"
@@ -61,16 +63,6 @@ def decode(name: str, payload: bytes) -> Message:
         raise ValueError(f"not a {name}: {error}") from None
 
 
-class Stamp(NamedTuple):
-    """When a message was made, and who it says it is."""
-
-    wall_time_ns: int
-    device_time_ns: int | None = None
-    """Of the sender's monotonic clock; None where the message has none."""
-    identity: signals.Identity | None = None
-    """As in the payload itself; None where it has none."""
-
-
 def check_payload(row: Topic, payload: bytes) -> int:
     """Return the time in ns since 1970 UTC of a payload that `check_stamp` finds right."""
     return check_stamp(row, payload).wall_time_ns
@@ -83,33 +75,30 @@ def check_stamp(row: Topic, payload: bytes) -> Stamp:
     and when the message was made for all others: the `log_time` of a recording. ValueError names
     the topic and what is wrong: too large, not that message, another version, impossible values.
     """
-    where = f"{row.owner}/{row.stream}"
-    if len(payload) > row.max_bytes:
-        raise ValueError(f"{where}: {len(payload)} bytes; at most {row.max_bytes}")
     try:
-        return _checked_stamp(row.message, payload)
+        if len(payload) > row.max_bytes:
+            raise ValueError(f"{len(payload)} bytes; at most {row.max_bytes}")
+        return _stamp(row.message, payload)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+        raise ValueError(f"{row.owner}/{row.stream}: {error}") from None
 
 
-def _checked_stamp(name: str, payload: bytes) -> Stamp:
-    match name:
-        case "driveby.v1.AccelBatch":
-            return _stamp(signals.decode_accel(payload))
-        case "driveby.v1.GnssFix":
-            return _stamp(signals.decode_gnss(payload))
-        case "driveby.v1.VehicleInfo":
-            return _stamp(signals.decode_info(payload))
-        case "foxglove.LocationFix":
-            return Stamp(signals.check_location(payload))
-        case "driveby.v1.Event":
-            return Stamp(signals.check_wall_time(events.decode_event(payload).time_ns))
+def _stamp(name: str, payload: bytes) -> Stamp:
+    check = _CHECKS.get(name)
+    if check is not None:
+        return check(payload)
     message = decode(name, payload)
     signals.check_version(getattr(message, "schema_version", 0))
     time_field = "created_ns" if name == "driveby.v1.Estimate" else "time_ns"
     return Stamp(signals.check_wall_time(getattr(message, time_field, 0)))
 
 
-def _stamp(message: signals.AccelBatch | signals.GnssFix | signals.VehicleInfo) -> Stamp:
-    identity = signals.Identity(message.boot_id, message.sequence)
-    return Stamp(message.wall_time_ns, message.device_time_ns, identity)
+_CHECKS: dict[str, Callable[[bytes], Stamp]] = {
+    "driveby.v1.AccelBatch": check_accel,
+    "driveby.v1.GnssFix": lambda payload: signals.stamp(signals.decode_gnss(payload)),
+    "driveby.v1.VehicleInfo": lambda payload: signals.stamp(signals.decode_info(payload)),
+    "driveby.v1.Event": lambda payload: Stamp(
+        signals.check_wall_time(events.decode_event(payload).time_ns)
+    ),
+    LOCATION: lambda payload: Stamp(signals.check_location(payload)),
+}

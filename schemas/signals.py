@@ -7,6 +7,7 @@ ValueError what `decode_*` would refuse.
 
 import math
 import struct
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,9 +38,11 @@ _POSITIONS = {
     "unsprung_front": pb.UNSPRUNG_FRONT,
     "unsprung_rear": pb.UNSPRUNG_REAR,
 }
-_NAMES = {position: name for name, position in _POSITIONS.items()}
+ACCEL_NAMES: dict[int, str] = {position: name for name, position in _POSITIONS.items()}
+"""Name of a channel by its position in the protobuf message."""
 _CHANNEL_BYTES = 2 + 9 + 1
 """Of an encoded channel: position, rate, and the tag of the samples."""
+_FLOAT64 = np.dtype("<f8")
 _IDENTITY = struct.Struct("!QQ")
 _NS_PER_S = 1_000_000_000
 
@@ -49,6 +52,16 @@ class Identity(NamedTuple):
 
     boot_id: int
     sequence: int
+
+
+class Stamp(NamedTuple):
+    """When a message was made, and who it says it is."""
+
+    wall_time_ns: int
+    device_time_ns: int | None = None
+    """Of the sender's monotonic clock; None where the message has none."""
+    identity: Identity | None = None
+    """As in the payload itself; None where it has none."""
 
 
 class Channel(NamedTuple):
@@ -115,7 +128,7 @@ def decode_accel(payload: bytes) -> AccelBatch:
     _parse(message, payload)
     channels: dict[str, Channel] = {}
     for channel in message.channels:
-        name = _NAMES.get(channel.position)
+        name = ACCEL_NAMES.get(channel.position)
         if name is None:
             raise ValueError(f"channel at unknown position {int(channel.position)}")
         if name in channels:
@@ -199,6 +212,7 @@ def decode_info(payload: bytes) -> VehicleInfo:
     return info
 
 
+@cache
 def location_class() -> type[Message]:
     """Return the class foxglove.LocationFix; imported here because few need it."""
     from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
@@ -251,9 +265,9 @@ def decode_identity(attachment: bytes | None) -> Identity:
         raise ValueError("no attachment; 16 bytes with boot_id and sequence are expected")
     if len(attachment) != _IDENTITY.size:
         raise ValueError(f"attachment of {len(attachment)} bytes; {_IDENTITY.size} are expected")
-    identity = Identity(*_IDENTITY.unpack(attachment))
-    _check_identity(*identity)
-    return identity
+    boot_id, sequence = _IDENTITY.unpack(attachment)
+    _check_identity(boot_id, sequence)
+    return Identity(boot_id, sequence)
 
 
 def check_version(version: int) -> None:
@@ -302,15 +316,13 @@ def _samples(channel: pb.AccelChannel) -> npt.NDArray[np.float64]:
     whether something else, of an unknown field, stands behind them.
     """
     values = channel.acceleration_m_per_s2
-    size = 8 * len(values)
+    number = len(values)
     encoded = channel.SerializeToString()
-    if size and len(encoded) == _CHANNEL_BYTES + _varint_bytes(size) + size:
-        return np.frombuffer(encoded, "<f8", offset=len(encoded) - size)
+    size = 8 * number
+    varint_bytes = (size.bit_length() + 6) // 7
+    if number and len(encoded) == _CHANNEL_BYTES + varint_bytes + size:
+        return np.frombuffer(encoded, _FLOAT64, number, len(encoded) - size)
     return np.array(values[:], np.float64)
-
-
-def _varint_bytes(value: int) -> int:
-    return -(-value.bit_length() // 7)
 
 
 def _check_identity(boot_id: int, sequence: int) -> None:
@@ -320,32 +332,42 @@ def _check_identity(boot_id: int, sequence: int) -> None:
         raise ValueError(f"sequence {sequence} is not between 0 and {MAX_SEQUENCE}")
 
 
-def _check_header(message: AccelBatch | GnssFix | VehicleInfo) -> None:
+def stamp(message: AccelBatch | GnssFix | VehicleInfo | pb.AccelBatch) -> Stamp:
+    """Return the times and the identity of a message of a truck."""
+    identity = Identity(message.boot_id, message.sequence)
+    return Stamp(message.wall_time_ns, message.device_time_ns, identity)
+
+
+def check_header(message: AccelBatch | GnssFix | VehicleInfo | pb.AccelBatch) -> None:
+    """ValueError if the identity or a time of a message of a truck is impossible."""
     _check_identity(message.boot_id, message.sequence)
     if not 0 <= message.device_time_ns < 2**63:
         raise ValueError(f"device time {message.device_time_ns} ns is negative or too large")
     check_wall_time(message.wall_time_ns)
 
 
+def check_channel(name: str, rate_hz: float, samples: int) -> None:
+    """ValueError if a channel cannot have so many samples at that rate."""
+    if name not in _POSITIONS:
+        raise ValueError(f"no channel {name!r}; there are {', '.join(CHANNELS)}")
+    if not 0.0 < rate_hz <= MAX_RATE_HZ:
+        raise ValueError(f"{name}: rate {rate_hz} Hz is not between 0 and {MAX_RATE_HZ:.0f}")
+    if not samples:
+        raise ValueError(f"{name}: no sample")
+    # The rounding of n/rate must not refuse a batch of exactly one second.
+    if samples > MAX_BATCH_S * rate_hz * (1 + 1e-9) and samples > 1:
+        raise ValueError(f"{name}: {samples} samples at {rate_hz} Hz exceed one second")
+
+
 def _check_accel(batch: AccelBatch) -> None:
-    _check_header(batch)
+    check_header(batch)
     if not batch.channels:
         raise ValueError("no channel")
     for name, (rate_hz, samples) in batch.channels.items():
-        if name not in _POSITIONS:
-            raise ValueError(f"no channel {name!r}; there are {', '.join(CHANNELS)}")
-        if not 0.0 < rate_hz <= MAX_RATE_HZ:
-            raise ValueError(f"{name}: rate {rate_hz} Hz is not between 0 and {MAX_RATE_HZ:.0f}")
-        if samples.ndim != 1 or samples.size == 0:
+        if samples.ndim != 1:
             raise ValueError(f"{name}: samples of shape {samples.shape}; (n,) is expected")
-        # The rounding of n/rate must not refuse a batch of exactly one second.
-        if samples.size > MAX_BATCH_S * rate_hz * (1 + 1e-9) and samples.size > 1:
-            raise ValueError(f"{name}: {samples.size} samples at {rate_hz} Hz exceed one second")
-    every = np.concatenate([samples for _, samples in batch.channels.values()])
-    if np.abs(every).max() <= MAX_ACCELERATION_M_PER_S2:  # of a NaN it is false, too
-        return
-    for name, (_, samples) in batch.channels.items():
-        if not np.abs(samples).max() <= MAX_ACCELERATION_M_PER_S2:
+        check_channel(name, rate_hz, samples.size)
+        if not np.abs(samples).max() <= MAX_ACCELERATION_M_PER_S2:  # of a NaN it is false, too
             raise ValueError(
                 f"{name}: a sample is not finite or exceeds {MAX_ACCELERATION_M_PER_S2:.0f} m/s²"
             )
@@ -358,7 +380,7 @@ def _check_position(latitude_deg: float, longitude_deg: float, altitude_m: float
 
 
 def _check_gnss(fix: GnssFix) -> None:
-    _check_header(fix)
+    check_header(fix)
     _check_position(fix.latitude_deg, fix.longitude_deg, fix.altitude_m)
     _check_range("speed_m_per_s", fix.speed_m_per_s, -200.0, 200.0)
     if fix.heading_deg is not None:
@@ -370,7 +392,7 @@ def _check_gnss(fix: GnssFix) -> None:
 
 
 def _check_info(info: VehicleInfo) -> None:
-    _check_header(info)
+    check_header(info)
     check_identifier(info.vehicle_id)
     size = len(info.site_toml.encode())
     if size > MAX_SITE_BYTES:

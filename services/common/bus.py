@@ -30,6 +30,7 @@ import ipaddress
 import json
 import logging
 import math
+import os
 import queue
 import re
 import socket
@@ -77,6 +78,11 @@ _MAX_SOURCES = 10_000
 _PATIENCE_WITH_SUBSCRIBER_US = 1_000_000
 """Zenoh's own is 5 s; who is cut off connects again and gets what it missed."""
 _QUERIES_WAITING = 100
+_RUNTIME = "(rx: (handover: acc))"
+"""Of a router: what comes is read by the threads that wait for it. Zenoh's own pool of receiving
+threads has to be woken for every message, which costs more than all that it does with one."""
+_SourceName = tuple[str, zenoh.ZenohId, int]
+"""A key, and a publisher of Zenoh: session and number in it."""
 _DURABLES_WAITING = 100
 
 
@@ -133,6 +139,8 @@ def open_session(
             f"{listen} can be reached by other machines, and without --tls FOLDER anybody there "
             "could publish as a truck; say --insecure if that is wanted (see docs/security.md)"
         )
+    if listen is not None:
+        os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read at a process's first session
     deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
     config = _configuration(endpoint, tls, is_client=connect is not None)
     while True:
@@ -375,7 +383,7 @@ class Subscription:
         """
         self._session = session
         self._fetched: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-        self._sources: dict[tuple[str, str, str], _Source] = {}
+        self._sources: dict[_SourceName, _Source] = {}
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self.fetched = 0
@@ -393,15 +401,14 @@ class Subscription:
 
     def receive(self, timeout_s: float = 0.0) -> Received | None:
         """Return the next message, or None if none came within `timeout_s`."""
+        received = self._next()
+        if received is not None or timeout_s <= 0:
+            return received
         deadline = time.monotonic() + timeout_s
-        while True:
-            received = self._next()
-            if received is not None:
-                return received
-            left_s = deadline - time.monotonic()
-            if left_s <= 0:
-                return None
+        while received is None and (left_s := deadline - time.monotonic()) > 0:
             time.sleep(min(_IDLE_POLL_S, left_s))
+            received = self._next()
+        return received
 
     def close(self) -> None:
         """Stop receiving; what has already come can still be had from `receive`."""
@@ -432,25 +439,26 @@ class Subscription:
                 return None
             sample, recovered = self._fetched.get(), True
             self.fetched += 1
-        self._note(sample)
+        where = str(sample.key_expr)
+        self._note(where, sample)
         attachment = sample.attachment
         return Received(
-            str(sample.key_expr),
+            where,
             sample.payload.to_bytes(),
             None if attachment is None else attachment.to_bytes(),
             recovered,
         )
 
-    def _note(self, sample: zenoh.Sample) -> None:
+    def _note(self, where: str, sample: zenoh.Sample) -> None:
         """Remember the publisher's own numbering of the sample, which shows what is missing."""
         source = sample.source_info
         if source is None:
             return
-        name = (str(sample.key_expr), str(source.source_id.zid), str(source.source_id.eid))
+        name = (where, source.source_id.zid, source.source_id.eid)
         with self._lock:
             found = self._sources.get(name)
             if found is None:
-                if len(name[0]) > MAX_KEY_CHARACTERS:
+                if len(where) > MAX_KEY_CHARACTERS:
                     return
                 if len(self._sources) >= _MAX_SOURCES:
                     # The oldest: a publisher that has gone, or a stranger who makes up names.
@@ -469,7 +477,7 @@ class Subscription:
                 except zenoh.ZError as error:  # the session is closing or the router away
                     _log.debug("gap query for %s: %s", name[0], error)
 
-    def _due_holes(self) -> list[tuple[tuple[str, str, str], tuple[int, int]]]:
+    def _due_holes(self) -> list[tuple[_SourceName, tuple[int, int]]]:
         """Return holes that have lasted a round and were not asked for too often."""
         due = []
         with self._lock:
@@ -480,7 +488,7 @@ class Subscription:
                 due += [(name, hole) for hole, n in tries.items() if 0 < n <= _GAP_TRIES]
         return due[:_MAX_HOLES_PER_ROUND]
 
-    def _fetch(self, name: tuple[str, str, str], hole: tuple[int, int]) -> None:
+    def _fetch(self, name: _SourceName, hole: tuple[int, int]) -> None:
         where, zid, eid = name
         replies = self._session.get(
             f"{where}/@adv/pub/{zid}/{eid}/**?_sn={hole[0]}..{hole[1]}",
@@ -504,11 +512,15 @@ class Seen:
 
     def add(self, where: Key, identity: Identity) -> bool:
         """Note a message; False if it had been seen before."""
-        name = (where, identity.boot_id)
+        return self.numbers(where, identity.boot_id).add(identity.sequence)
+
+    def numbers(self, where: Key, boot_id: int) -> Intervals:
+        """Return the sequences that have been seen of a key and boot, to be added to."""
+        name = (where, boot_id)
         numbers = self.streams.get(name)
         if numbers is None:
             numbers = self.streams[name] = Intervals()
-        return numbers.add(identity.sequence)
+        return numbers
 
 
 class Delivery:

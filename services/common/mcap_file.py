@@ -40,6 +40,8 @@ _ENTRY = struct.Struct("<QQ")
 _FOOTER_SUMMARY = struct.Struct("<BQQQ")
 _FOOTER_BYTES = 20
 _INDEX_BLOCK_BYTES = 8192
+_LEVEL = 2
+"""Half the time of zstd's default 3, for files of the same size (quantised samples: 1 % more)."""
 _THREAD = threading.local()
 
 
@@ -265,7 +267,7 @@ def _compressed(data: bytes | bytearray) -> bytes:
     # One for each thread and not one for each file: to make one takes as long as what it does.
     compressor: zstandard.ZstdCompressor | None = getattr(_THREAD, "compressor", None)
     if compressor is None:
-        compressor = _THREAD.compressor = zstandard.ZstdCompressor()
+        compressor = _THREAD.compressor = zstandard.ZstdCompressor(level=_LEVEL)
     return compressor.compress(data)
 
 

@@ -40,6 +40,8 @@ _REPORT_PERIOD_S = 1.0
 _HEALTH_PERIOD_S = 60.0
 _DRAIN_S = 2.5
 _COUNT_S = 1.0
+_PAUSE_S = 0.05
+"""With nothing to do. Many messages one after the other cost a quarter less each than a few."""
 _AT_ONCE_S = 0.02
 """For so long messages are taken before anything else gets its turn."""
 _FETCH_ROOM = 32 << 20
@@ -138,7 +140,9 @@ def _record(
             ready()
         next_report_s = time.monotonic()
         while not stop.is_set() and logger.writer.failure is None:
-            received = subscription.receive(_ANNOUNCE_PERIOD_S)
+            received = subscription.receive()
+            if received is None:
+                stop.wait(_PAUSE_S)
             began_s = now_s = time.monotonic()
             while received is not None:
                 _take(logger, received)

@@ -21,7 +21,7 @@ _MINUTES = 60
 _PAIRS_FROM = 3
 _OFFSET_MINUTES = 5
 _TOLD_EVERY_S = 600.0
-_CHANGE_NS = 50_000_000
+_CHANGE_S = 0.05
 
 
 class ClockDrift(NamedTuple):
@@ -51,7 +51,9 @@ class TruckClock:
     _minutes: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=_MINUTES))
     _smallest: tuple[int, int] | None = None
     _began_ns: int | None = None
-    _told: tuple[float, int] | None = None
+    _drift: ClockDrift | None = None
+    """Of the minutes that are over: it changes once a minute and is asked for every second."""
+    _told: tuple[float, float] | None = None
 
     def wall_against_device(self, wall_ns: int, device_ns: int) -> int:
         """Note a message's two times, in order of sequence; return the step in ns or 0."""
@@ -71,19 +73,14 @@ class TruckClock:
         if self._began_ns is None or not 0 <= arrival_ns - self._began_ns < _MINUTE_NS:
             if self._smallest is not None:
                 self._minutes.append(self._smallest)
+                self._drift = self._fitted()
             self._began_ns, self._smallest = arrival_ns, (arrival_ns, delay_ns)
         elif self._smallest is None or delay_ns < self._smallest[1]:
             self._smallest = (arrival_ns, delay_ns)
 
     def drift(self) -> ClockDrift | None:
         """Return offset and drift over the last hour; None in the first minute."""
-        if not self._minutes:
-            return None
-        slopes = [
-            (b[1] - a[1]) / (b[0] - a[0]) for a, b in combinations(self._minutes, 2) if b[0] > a[0]
-        ]
-        ppm = median(slopes) * 1e6 if len(self._minutes) >= _PAIRS_FROM and slopes else None
-        return ClockDrift(self._offset_ns() * 1e-9, ppm)
+        return self._drift
 
     def due(self, now_s: float) -> ClockDrift | None:
         """Return the drift if it should be written down: first, and when it has moved by 50 ms.
@@ -93,20 +90,27 @@ class TruckClock:
         drift = self.drift()
         if drift is None:
             return None
-        offset_ns = self._offset_ns()
         if self._told is not None:
-            told_s, told_ns = self._told
-            if now_s - told_s < _TOLD_EVERY_S or abs(offset_ns - told_ns) < _CHANGE_NS:
+            told_s, told_offset_s = self._told
+            moved_s = abs(drift.offset_s - told_offset_s)
+            if now_s - told_s < _TOLD_EVERY_S or moved_s < _CHANGE_S:
                 return None
-        self._told = (now_s, offset_ns)
+        self._told = (now_s, drift.offset_s)
         return drift
 
-    def _offset_ns(self) -> int:
+    def _fitted(self) -> ClockDrift:
+        slopes = [
+            (b[1] - a[1]) / (b[0] - a[0]) for a, b in combinations(self._minutes, 2) if b[0] > a[0]
+        ]
+        ppm = median(slopes) * 1e6 if len(self._minutes) >= _PAIRS_FROM and slopes else None
         # Of several minutes, or one in which all came late would look like a clock that is behind.
-        return round(median(delay_ns for _, delay_ns in list(self._minutes)[-_OFFSET_MINUTES:]))
+        recent = list(self._minutes)[-_OFFSET_MINUTES:]
+        offset_ns = round(median(delay_ns for _, delay_ns in recent))
+        return ClockDrift(offset_ns * 1e-9, ppm)
 
     def forget(self) -> None:
         """Begin the envelope anew, after a step of either clock."""
         self._minutes.clear()
+        self._drift = None
         self._smallest = None
         self._began_ns = None

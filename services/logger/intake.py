@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from schemas.events import Event, EventKind
-from schemas.messages import Stamp, check_stamp
-from schemas.signals import Identity
+from schemas.messages import check_stamp
+from schemas.signals import Identity, Stamp
 from schemas.topics import Key, Topic, topic
 from services.common.bus import Received, Seen
 from services.common.intervals import Intervals
@@ -133,7 +133,7 @@ class Intake:
         except ValueError as error:
             self._refuse(where, str(error))
             return False
-        self.seen.streams.setdefault((where, boot_id), Intervals()).add_range(first, last)
+        self.seen.numbers(where, boot_id).add_range(first, last)
         return True
 
     def lose(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> None:
@@ -143,7 +143,7 @@ class Intake:
         except ValueError as error:
             self._refuse(where, str(error))
             return
-        seen = self.seen.streams.setdefault((where, boot_id), Intervals())
+        seen = self.seen.numbers(where, boot_id)
         for a, b in seen.missing_of([(first, last)]):
             self.counts["lost"] += seen.add_range(a, b)
             self._lost.setdefault((where, boot_id), Intervals()).add_range(a, b)
@@ -221,13 +221,13 @@ class Intake:
 
     def _is_new(self, where: Key, identity: Identity, stream: _Stream, payload: bytes) -> bool:
         name = (where, identity.boot_id)
-        before = self.seen.streams.get(name)
-        highest = before.highest if before is not None else None
+        numbers = self.seen.numbers(where, identity.boot_id)
+        highest = numbers.highest
         sequence = identity.sequence
-        if before is not None and before.runs >= MAX_RUNS and not _touches(before, sequence):
+        if numbers.runs >= MAX_RUNS and not _touches(numbers, sequence):
             raise ValueError(f"{where.stream}: more than {MAX_RUNS} holes in the sequence")
         crc = zlib.crc32(payload)
-        if not self.seen.add(where, identity):
+        if not numbers.add(sequence):
             if stream.recent.get(identity, crc) != crc:
                 raise ValueError(f"{where.stream}: sequence {sequence} again, with another content")
             return False

@@ -174,7 +174,7 @@ def with_channel(**fields: Any) -> bytes:
         (with_channel(position=0), "unknown position 0"),
         (with_channel(position=77), "unknown position 77"),
         (with_channel(position=2), "sprung_rear is there twice"),
-        (with_channel(acceleration_m_per_s2=[]), "shape"),
+        (with_channel(acceleration_m_per_s2=[]), "no sample"),
         (with_channel(acceleration_m_per_s2=[0.0, math.nan]), "not finite"),
         (with_channel(acceleration_m_per_s2=[math.inf]), "not finite"),
         (with_channel(acceleration_m_per_s2=[9806.65e3]), "exceeds"),
