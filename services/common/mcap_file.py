@@ -256,7 +256,8 @@ class _Compressed:
     def add(self, data: bytes) -> None:
         self._last += data
         if len(self._last) >= _INDEX_BLOCK_BYTES:
-            self._blocks.append(_compressed(self._last))
+            # A copy: zstandard's own bytes keep the room that they might have needed.
+            self._blocks.append(bytes(memoryview(_compressed(self._last))))
             self._last.clear()
 
     def joined(self) -> bytes:

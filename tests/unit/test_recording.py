@@ -2,8 +2,10 @@
 
 import io
 import os
+import random
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from schemas.messages import descriptors
 from schemas.signals import GnssFix, encode_gnss, encode_location
 from schemas.topics import Key
 from services.common.errors import InputError
+from services.common.mcap_file import McapWriter
 from services.common.recording import (
     Message,
     RecordingWriter,
@@ -56,6 +59,26 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert info.first_time_ns == START_NS
     assert info.last_time_ns == START_NS + 499 * 100_000_000
     assert (info.damaged_chunks, info.truncated) == (0, False)
+
+
+def test_a_file_that_is_open_for_an_hour_takes_little_memory() -> None:
+    """Its index is kept until the end: 7200 chunks, for each of hundreds of trucks."""
+    writer = McapWriter(lambda _: None, library="", chunk_bytes=1 << 20)
+    schema = writer.add_schema("a", "protobuf", b"")
+    channels = [writer.add_channel(f"a/{n}", "protobuf", schema, {}) for n in range(3)]
+    rng = random.Random(1)
+    tracemalloc.start()
+    try:
+        for chunk in range(7200):
+            for n, channel in enumerate(channels):
+                time_ns = START_NS + chunk * 500_000_000 + rng.randrange(1_000_000)
+                data = rng.randbytes(rng.randrange(50, 60) if n else 1)
+                writer.add_message(channel, chunk, time_ns, time_ns, data)
+            writer.flush()
+        taken, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert taken < 300_000
 
 
 def test_the_same_messages_give_the_same_bytes(tmp_path: Path) -> None:
