@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
-from scipy.signal import periodogram
+from scipy.signal import periodogram, welch
 
+from pre_core import road as road
 from pre_core.road import (
     GEOMETRIC_MEAN_M3,
     Profile,
@@ -233,3 +234,13 @@ def test_a_road_that_is_too_short_is_refused() -> None:
     profile = iso_8608_profile(0.0, 10.0, 0.1, "A", 1)
     with pytest.raises(ValueError, match="does not reach under"):
         under_wheels(profile, constant_speed(5.0, 10.0, 1000, 0.001), 4.4, 1)
+
+
+@pytest.mark.parametrize(("count", "length"), [(300, 300), (301, 301), (1000, 300), (1003, 301)])
+def test_spectrum_of_a_profile_is_welchs(count: int, length: int) -> None:
+    """Against scipy's: one segment and several, of an even and of an odd number of values."""
+    height = np.cumsum(np.random.default_rng(0).standard_normal(count))
+    frequency, density = road._welch(height, 0.1, length)
+    expected = welch(height, fs=10.0, nperseg=length, detrend="linear")
+    np.testing.assert_allclose(frequency, expected[0], rtol=1e-12)
+    np.testing.assert_allclose(density, expected[1], rtol=1e-9)
