@@ -68,7 +68,8 @@ class McapWriter:
         self._chunk_index = _Compressed()  # an hour has 7200 entries
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
-        self._content = bytearray()
+        self._content: list[bytes] = []
+        self._content_bytes = 0
         self._entries: dict[int, bytearray] = {}
         self._entry_times: tuple[int, int] = (0, 0)
         self._put(MCAP0_MAGIC + _encoded(Header("", library)))
@@ -104,22 +105,24 @@ class McapWriter:
             entries = self._entries[channel_id] = bytearray()
             if len(self._entries) == 1:
                 self._entry_times = (log_time_ns, log_time_ns)
-        entries += _ENTRY.pack(log_time_ns, len(self._content))
+        entries += _ENTRY.pack(log_time_ns, self._content_bytes)
         length = _MESSAGE_BYTES + len(data)
-        self._content += _MESSAGE.pack(
-            Opcode.MESSAGE, length, channel_id, sequence, log_time_ns, publish_time_ns
+        self._add(
+            _MESSAGE.pack(
+                Opcode.MESSAGE, length, channel_id, sequence, log_time_ns, publish_time_ns
+            )
         )
-        self._content += data
+        self._add(data)
         first_ns, last_ns = self._entry_times
         self._entry_times = (min(first_ns, log_time_ns), max(last_ns, log_time_ns))
-        if len(self._content) >= self._chunk_bytes:
+        if self._content_bytes >= self._chunk_bytes:
             self.flush()
 
     def flush(self) -> None:
         """Write the chunk with its index, if it holds a message."""
         if not self._entries:
             return
-        content = bytes(self._content)
+        content = b"".join(self._content)
         data = _compressed(content)
         first_ns, last_ns = self._entry_times
         length = _CHUNK.size - _HEADER.size + len(data)
@@ -233,9 +236,13 @@ class McapWriter:
         # Schemas stand before the channels that need them, and once: they are large, and a reader
         # of ours finds them in its own tables.
         for schema in self._schemas[self._written_schemas :]:
-            self._content += _encoded(schema)
+            self._add(_encoded(schema))
         self._written_schemas = len(self._schemas)
-        self._content += self._encoded_channels[channel_id - 1]
+        self._add(self._encoded_channels[channel_id - 1])
+
+    def _add(self, data: bytes) -> None:
+        self._content.append(data)
+        self._content_bytes += len(data)
 
     def _put(self, data: bytes) -> None:
         self._write(data)
@@ -243,6 +250,7 @@ class McapWriter:
 
     def _clear(self) -> None:
         self._content.clear()
+        self._content_bytes = 0
         self._entries.clear()
 
 

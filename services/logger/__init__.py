@@ -22,6 +22,7 @@ from services.common.credentials import check_speaks_for
 from services.common.disk import DISK
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, read_text
+from services.common.memory import give_back_memory
 from services.common.playback import stopped_by_signals
 from services.common.recording import Message
 from services.logger.completeness import Completeness
@@ -258,6 +259,7 @@ class _Announcements:
             if closing or time.monotonic() >= next_health_s:
                 next_health_s = time.monotonic() + _HEALTH_PERIOD_S
                 self._publish_health()
+                give_back_memory()
             if closing:
                 return
 

@@ -18,6 +18,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -31,6 +32,7 @@ from schemas.signals import (
     Channel,
     GnssFix,
     Identity,
+    decode_identity,
     encode_accel,
 )
 from services.common.bus import open_session
@@ -64,16 +66,25 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="on the disk to try (default: a new one)")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--rotate-minutes", type=float, default=DEFAULT_MINUTES)
-    parser.add_argument("--role", choices=("logger", "fleet"), help=argparse.SUPPRESS)
+    parser.add_argument("--plain", action="store_true", help="try a recorder of 30 lines instead")
+    parser.add_argument("--role", choices=("logger", "plain", "fleet"), help=argparse.SUPPRESS)
     parser.add_argument("--endpoint", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.role == "logger":
         sys.exit(log(options.endpoint, options.folder, options.rotate_minutes))
+    if options.role == "plain":
+        sys.exit(log_plainly(options.endpoint, options.folder))
     if options.role == "fleet":
         drive(options.endpoint, options.trucks, options.seconds)
         return
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        figures = measure(Path(folder), options.trucks, options.seconds, options.rotate_minutes)
+        figures = measure(
+            Path(folder),
+            options.trucks,
+            options.seconds,
+            options.rotate_minutes,
+            recorder="plain" if options.plain else "logger",
+        )
     for name, value in figures.items():
         print(f"{name:40} {value}", flush=True)
     if options.json is not None:
@@ -86,6 +97,7 @@ def measure(
     seconds: float,
     rotate_minutes: float = DEFAULT_MINUTES,
     warm_up_s: float = 10.0,
+    recorder: str = "logger",
 ) -> dict[str, float | str]:
     """Let the trucks drive for so long, and return what was measured."""
     with socket.socket() as probe:
@@ -93,7 +105,7 @@ def measure(
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     with (folder / "logger.log").open("w") as log_file:
         common = ["--endpoint", endpoint, "--folder", str(folder)]
-        logger = start("logger", *common, "--rotate-minutes", str(rotate_minutes), err=log_file)
+        logger = start(recorder, *common, "--rotate-minutes", str(rotate_minutes), err=log_file)
     assert logger.stdout is not None
     assert logger.stdout.readline() == "ready\n", (folder / "logger.log").read_text()
     fleet = start(
@@ -237,6 +249,63 @@ def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
         )
     )
     return code
+
+
+def log_plainly(endpoint: str, folder: Path) -> int:
+    """Record as the documentation of the libraries shows it: a yardstick of what the rest costs.
+
+    One file, what comes is written as it comes, and synced twice a second. Nothing is checked,
+    nothing is asked for again, nothing is told twice or taken out.
+    """
+    import zenoh
+    from mcap.writer import Writer
+
+    delays: list[int] = []
+    waiting: list[int] = []
+    is_settled: list[bool] = []
+    signal.signal(signal.SIGUSR2, lambda *_: is_settled.append(True))
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    channels: dict[str, int] = {}
+    lock = threading.Lock()
+    day = folder / "live" / "day"
+    day.mkdir(parents=True)
+    with (day / "truck-all.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+
+        def write(sample: zenoh.Sample) -> None:
+            now_ns = time.time_ns()
+            sent = sample.timestamp
+            sent_ns = round(sent.get_time().timestamp() * 1e9) if sent is not None else now_ns
+            attachment = sample.attachment
+            boot_id, sequence = decode_identity(attachment and attachment.to_bytes())
+            name = str(sample.key_expr)
+            with lock:
+                if name not in channels:
+                    boot = {"boot_id": str(boot_id)}
+                    channels[name] = writer.register_channel(name, "protobuf", 0, boot)
+                writer.add_message(
+                    channels[name], sent_ns, sample.payload.to_bytes(), now_ns, sequence
+                )
+                waiting.append(sent_ns // 1_000_000)
+
+        with open_session(listen=endpoint) as session:
+            session.declare_subscriber("driveby/v1/**", write)
+            print("ready", flush=True)
+            while not stop.wait(0.5):
+                with lock:
+                    writer.flush()
+                    file.flush()
+                    synced, waiting = waiting, []
+                os.fsync(file.fileno())
+                now_ms = round(time.time() * 1e3)
+                if is_settled:
+                    delays += [now_ms - at for at in synced]
+        writer.finish()
+    p50, p99, most = np.percentile(delays, [50, 99, 100]) / 1e3
+    print(json.dumps({"p50": round(p50, 3), "p99": round(p99, 3), "max": round(most, 3)}))
+    return 0
 
 
 # --- the trucks' process
