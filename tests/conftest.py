@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import settings
 
+from tests.endpoints import free_endpoint
+
 if TYPE_CHECKING:
     from services.simulation import Drive
 
@@ -32,6 +34,28 @@ def shared() -> Path:
     folder = PROJECT.parent / "shared"
     if not folder.is_dir():
         pytest.skip("the folder ../shared with reference data and recordings is not there")
+    return folder
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """An address at which nobody listens yet."""
+    return free_endpoint()
+
+
+@pytest.fixture
+def tls_endpoint() -> str:
+    """An address for TLS at which nobody listens yet."""
+    return free_endpoint("tls")
+
+
+@pytest.fixture(scope="session")
+def credentials(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `driveby certs` makes for two trucks; whoever changes something changes a copy."""
+    from services.certs import certs_command
+
+    folder = tmp_path_factory.mktemp("bus") / "certs"
+    certs_command(folder=folder, trucks=["truck-1", "truck-2"])
     return folder
 
 

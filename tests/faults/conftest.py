@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -15,15 +14,10 @@ from typing import Any
 import pytest
 
 from services.common.recording import read_messages
+from tests.endpoints import free_endpoint
 
 HERE = Path(__file__).parent
 Numbers = dict[tuple[str, str, int], set[int]]
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class Truck:

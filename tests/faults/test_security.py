@@ -22,6 +22,7 @@ from services.certs import certs_command
 from services.common.bus import Publisher, Received, Subscription, get_latest, open_session
 from services.common.credentials import CONFIGURATION, Subject, link_settings
 from services.common.errors import FailureError
+from tests.endpoints import free_endpoint
 
 V1 = "driveby/v1"
 REFUSED_S = 2.0
@@ -68,18 +69,10 @@ MAY_READ = {
 }
 
 
-@pytest.fixture(scope="module")
-def credentials(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("bus") / "certs"
-    certs_command(folder=folder, trucks=["truck-1", "truck-2"])
-    return folder
-
-
 @pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tls/127.0.0.1:{probe.getsockname()[1]}"
+def endpoint(tls_endpoint: str) -> str:
+    """Here everything speaks TLS."""
+    return tls_endpoint
 
 
 @pytest.fixture
@@ -417,10 +410,7 @@ def test_a_revoked_truck_says_nothing(credentials: Path, endpoint: str, tmp_path
 
 def test_a_router_between_trucks_and_logger_filters_both(credentials: Path, endpoint: str) -> None:
     """As in compose.yaml: a router of Zenoh's own, made from its ready-made configuration."""
-    own = endpoint.rsplit(":", 1)[0]
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        own = f"{own}:{probe.getsockname()[1]}"
+    own = free_endpoint("tls")
     config = zenoh.Config.from_file(credentials / "router" / CONFIGURATION)
     for name, value in link_settings(credentials / "router").items():
         config.insert_json5(f"transport/link/{name}", json.dumps(value))

@@ -2,7 +2,6 @@
 
 import contextlib
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -16,7 +15,6 @@ import zenoh
 from schemas.signals import Channel
 from schemas.spool import spool_selector
 from schemas.topics import Key
-from services.certs import certs_command
 from services.common.bus import open_session
 from services.common.errors import InputError
 from services.common.recording import read_messages
@@ -26,20 +24,6 @@ from services.truck import Gateway
 pytestmark = pytest.mark.process
 
 Driveby = Callable[..., subprocess.Popen[str]]
-
-
-@pytest.fixture(scope="module")
-def credentials(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("bus") / "certs"
-    certs_command(folder=folder, trucks=["truck-1", "truck-2"])
-    return folder
-
-
-@pytest.fixture
-def tls_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tls/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """The bus over real sessions in this process: identity, latching, fetching again, delivery."""
 
-import socket
 import sys
 import threading
 import time
@@ -27,29 +26,6 @@ from services.common.bus import (
 from services.common.errors import FailureError, InputError
 
 ACCEL = Key("live", "vehicle", "truck-1", "accel")
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def router(endpoint: str) -> Iterator[zenoh.Session]:
-    with open_session(listen=endpoint) as session:
-        yield session
-
-
-@pytest.fixture
-def client(router: zenoh.Session, endpoint: str) -> Iterator[zenoh.Session]:
-    with open_session(connect=endpoint, timeout_s=5) as session:
-        yield session
 
 
 def receive(subscription: Subscription, number: int, timeout_s: float = 10.0) -> list[Received]:

@@ -1,7 +1,6 @@
 """What the logger lets in, what it reports, and how it writes."""
 
 import contextlib
-import socket
 import threading
 import time
 from pathlib import Path
@@ -250,7 +249,7 @@ def test_an_existing_file_is_refused_before_anything_starts(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(("drain_s", "written"), [(10.0, 50), (0.0, 0)])
 def test_what_has_come_is_written_or_counted_before_the_file_is_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, drain_s: float, written: int
+    tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch, drain_s: float, written: int
 ) -> None:
     """A backlog that only shows once the subscription is closed: the end of a busy day."""
 
@@ -273,12 +272,9 @@ def test_what_has_come_is_written_or_counted_before_the_file_is_closed(
     monkeypatch.setattr(
         "services.logger.stopped_by_signals", lambda on_second: contextlib.nullcontext(stop)
     )
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        listen = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     file = tmp_path / "a.mcap"
     monkeypatch.setattr("services.logger._DRAIN_S", drain_s)
-    code = logger.run(listen=listen, folder=tmp_path, file=file, realm=None, site=None)
+    code = logger.run(listen=endpoint, folder=tmp_path, file=file, realm=None, site=None)
     found = list(read_messages(file))
     assert [m.sequence for m in found if m.key.owner == "vehicle"] == list(range(written))
     assert code == (0 if written == 50 else 1)

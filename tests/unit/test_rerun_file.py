@@ -2,7 +2,6 @@
 
 import io
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -51,6 +50,7 @@ from services.viewer.view import (
     viewer_program,
     write_views,
 )
+from tests.endpoints import free_port
 
 START_NS = 1_790_010_000_000_000_000
 RATE_HZ, BATCH = 1000.0, 50
@@ -424,9 +424,7 @@ def see(file: Path, folder: Path) -> tuple[list[View], np.ndarray]:
     drivers = [Path(root, "vulkan/icd.d") for root in ("/usr/share", "/etc", "/usr/local/share")]
     if not any(any(found.glob("*.json")) for found in drivers if found.is_dir()):
         pytest.skip("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     arguments = viewer_arguments(file, web=False)
     arguments[arguments.index("--port") + 1] = str(port)
     arguments += ["--headless", "--renderer=vulkan", "--window-size=1000x700"]

@@ -1,8 +1,7 @@
 """What is fetched from trucks' disks, what is given up, and what they answer: real sessions."""
 
-import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from schemas import spool as wire
 from schemas.signals import Channel, GnssFix, Identity, decode_accel
 from schemas.spool import Held, Query
 from schemas.topics import Key
-from services.common.bus import Received, Seen, open_session
+from services.common.bus import Received, Seen
 from services.common.intervals import Intervals
 from services.common.spool import Spool
 from services.logger import spool_recovery
@@ -103,23 +102,10 @@ def test_queries_and_pages_round_trip(boot_id: int, first: int, last: int) -> No
 
 
 @pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-@pytest.fixture
-def router(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[zenoh.Session]:
+def router(router: zenoh.Session, monkeypatch: pytest.MonkeyPatch) -> zenoh.Session:
+    """As everywhere, but trucks are asked five times a second."""
     monkeypatch.setattr(spool_recovery, "LIST_PERIOD_S", 0.2)
-    with open_session(listen=endpoint) as session:
-        yield session
-
-
-@pytest.fixture
-def client(router: zenoh.Session, endpoint: str) -> Iterator[zenoh.Session]:
-    with open_session(connect=endpoint, timeout_s=5) as session:
-        yield session
+    return router
 
 
 class Logger:

@@ -1,0 +1,20 @@
+"""A bus with two sessions in this process."""
+
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from services.common.bus import open_session
+
+
+@pytest.fixture
+def router(endpoint: str) -> Iterator[zenoh.Session]:
+    with open_session(listen=endpoint) as session:
+        yield session
+
+
+@pytest.fixture
+def client(router: zenoh.Session, endpoint: str) -> Iterator[zenoh.Session]:
+    with open_session(connect=endpoint, timeout_s=5) as session:
+        yield session
