@@ -117,12 +117,18 @@ def raw_session(
 
 
 def listen_to(session: zenoh.Session, keys: Iterable[str]) -> list[tuple[str, bytes]]:
-    """Subscribe to each alone, for a rule must include it whole; what comes fills the list."""
+    """Subscribe to each alone, for a rule must include it whole; what comes fills the list.
+
+    It does so in the thread that receives: what was said before an answer (`settle`) is in the
+    list when the answer has come. A thread of its own, which is Zenoh's custom, may come later.
+    """
     heard: list[tuple[str, bytes]] = []
+
+    def hear(sample: zenoh.Sample) -> None:
+        heard.append((str(sample.key_expr), sample.payload.to_bytes()))
+
     for key in keys:
-        session.declare_subscriber(
-            key, lambda sample: heard.append((str(sample.key_expr), sample.payload.to_bytes()))
-        )
+        session.declare_subscriber(key, zenoh.handlers.Callback(hear, indirect=False))
     return heard
 
 
