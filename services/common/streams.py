@@ -107,6 +107,10 @@ class Boot:
             self._fresh.append(fix)
             yield fix
 
+    def lacks_fixes(self) -> bool:
+        """Whether fixes that have come wait for one before them that has not."""
+        return bool(self._waiting)
+
     def forget_before(self, time_s: float) -> None:
         """Drop what is older, so that the memory stays bounded on a long drive."""
         limit_ns = max(self._forgotten_ns, round(time_s * _NS_PER_S))

@@ -27,11 +27,12 @@ from schemas.settings import IdentificationSettings
 from schemas.signals import MAX_BATCH_S, GnssFix, decode_accel, decode_gnss
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
-from services.common.crossing import MARGIN_M, Passage, Stay, find_stays
+from services.common.crossing import MARGIN_M, MERGE_S, Passage, Stay, find_stays
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
 from services.common.streams import PATIENCE_S, Boot
 from services.worker.crossing_data import CrossingData
 from services.worker.identification import MARGIN_S, Identify, Report, Stopwatch, identify
+from services.worker.told import Told, told_of
 
 _KEEP_S = 300.0
 """Samples older than this are forgotten."""
@@ -40,6 +41,8 @@ _LONGEST_STAY_S = 270.0
 _SILENCE_S = 120.0
 """So long may positions come without accelerations, as when both are fetched after an outage."""
 _FORGET_EVERY_S = 10.0
+_ROUNDING_S = 1e-6
+"""More than is lost when a time in nanoseconds becomes one in seconds."""
 _REACH_M = 50.0
 """Further away than this from the ends of a bridge no fix changes what happened on it."""
 
@@ -64,6 +67,10 @@ class _Truck:
         self.detected: dict[tuple[str, float], str] = {}
         """Crossing ids by bridge and about the time of entry."""
         self.done: set[str] = set()
+        self.decided: list[tuple[str, float, float, str]] = []
+        """Of what has been identified: bridge, times of the fixes around it, and crossing id."""
+        self.said: dict[str, set[pb.CrossingState]] = {}
+        """By crossing id: states that an earlier run of the worker has told."""
         self.side: dict[str, int] = {}
         """By bridge: far before its start (-1), far behind its end (1), or near (0)."""
 
@@ -73,6 +80,10 @@ class _Truck:
             known_bridge == bridge.id and crossing_id not in self.done
             for (known_bridge, _), crossing_id in self.detected.items()
         )
+
+
+_Wait = Callable[[_Truck, Stay, float], bool]
+"""Whether a crossing that is over, at the truck's time of now (s), waits for more of its data."""
 
 
 class Engine:
@@ -107,8 +118,37 @@ class Engine:
         self._trucks: dict[tuple[str, str, int], _Truck] = {}
         self._newest_boot: dict[tuple[str, str], int] = {}
         self._usable: dict[tuple[str, str], list[Crossing]] = {}
+        self._told: dict[tuple[str, str, str], list[Told]] = {}
+        """By realm, vehicle and bridge: what earlier runs told."""
         self.unknown_vehicles: set[str] = set()
         """Trucks that the site file does not know; nothing of theirs can be identified."""
+
+    def resume(self, said: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
+        """Go on from what earlier runs said, in its order; yield what they did not come to say.
+
+        To be called before the first message. A crossing that has a result by these settings and
+        this site file gets no other one, and counts in the states of its bridge; of one that has
+        none only those states are told that have not been told.
+        """
+        crossings = told_of(said, self._header)
+        for told in crossings:
+            self._told.setdefault((told.realm, told.vehicle, told.bridge), []).append(told)
+            if told.result is not None and told.result.parameters is not None:
+                self._usable.setdefault((told.realm, told.bridge), []).append(told.result)
+        for usable in self._usable.values():
+            usable.sort(key=lambda crossing: crossing.entry_time)
+        for told in crossings:
+            if told.result is None:
+                continue
+            if told.last is not None and pb.DONE not in told.states:
+                told.last.state = pb.DONE  # all else is as when it was told to be identified
+                yield Output(
+                    Key(told.realm, "bridge", told.bridge, "crossing"),
+                    told.last.SerializeToString(deterministic=True),
+                )
+            if told.result.parameters is not None and not told.is_in_state:
+                usable = self._usable[told.realm, told.bridge]
+                yield _state_message(told.realm, told.bridge, told.result, latest_state(usable))
 
     def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
         """Take one message of a vehicle; other streams are ignored. ValueError: malformed.
@@ -140,17 +180,31 @@ class Engine:
         for (realm, _, _), truck in list(self._trucks.items()):
             yield from self._finish(realm, truck)
 
-    def gone(self, realm: str, vehicle: str) -> Iterator[Output]:
+    def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Output]:
         """A truck has gone silent: decide the crossings that it has finished.
 
-        One that it is still in waits: the truck may only have lost its connection.
+        It may only have lost its connection, and bring what is missing when it has it again. So
+        one that it is still in waits, and until it is gone `for_good` one in which something is
+        missing; of what was to follow on the last that came nothing is needed.
         """
-        for name, truck in list(self._trucks.items()):
-            if name[:2] == (realm, vehicle):
-                yield from self._settle(realm, truck, all_there_is=True)
-                if np.isfinite(truck.latest_s):
-                    now_s = truck.latest_s
-                    yield from self._look(realm, truck, self._frames, now_s, complete=True)
+        for truck in self._boots_of(realm, vehicle):
+            if truck.boot.lacks_fixes() and not for_good:
+                continue
+            yield from self._settle(realm, truck, all_there_is=True)
+            if np.isfinite(truck.latest_s):
+                now_s = truck.latest_s
+                wait = (lambda *_: False) if for_good else self._has_hole
+                yield from self._look(realm, truck, self._frames, now_s, wait)
+
+    def has_undecided(self, realm: str, vehicle: str) -> bool:
+        """Whether a truck is known to have a crossing that is not decided, or may have one."""
+        return any(
+            truck.boot.lacks_fixes() or any(truck.is_busy_at(bridge) for bridge, _ in self._frames)
+            for truck in self._boots_of(realm, vehicle)
+        )
+
+    def _boots_of(self, realm: str, vehicle: str) -> list[_Truck]:
+        return [t for name, t in self._trucks.items() if name[:2] == (realm, vehicle)]
 
     def _settle(self, realm: str, truck: _Truck, *, all_there_is: bool = False) -> Iterator[Output]:
         """Look once at every fix: what is found does not depend on which came together."""
@@ -199,12 +253,15 @@ class Engine:
         truck: _Truck,
         bridges: list[tuple[Bridge, BridgeFrame]],
         now_s: float,
-        *,
-        complete: bool = False,
+        wait: _Wait | None = None,
     ) -> Iterator[Output]:
-        """Find crossings in the fixes that are known, and identify those that are complete."""
+        """Find crossings in the fixes that are known, and identify those that are complete.
+
+        A crossing that is over waits while `wait` says so.
+        """
         if not bridges:
             return
+        wait = wait or self._may_still_come
         fixes = truck.boot.fixes()
         for bridge, frame in bridges:
             chainage, lateral = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
@@ -219,7 +276,7 @@ class Engine:
                 margin_m=self._margin_m,
             )
             for stay in stays:
-                yield from self._advance(realm, truck, bridge, stay, now_s, complete=complete)
+                yield from self._advance(realm, truck, bridge, stay, now_s, wait)
 
     def _advance(
         self,
@@ -228,29 +285,32 @@ class Engine:
         bridge: Bridge,
         stay: Stay,
         now_s: float,
-        *,
-        complete: bool,
+        wait: _Wait,
     ) -> Iterator[Output]:
         begins = stay.passage is Passage.BEGINS_ON_BRIDGE
         if begins and stay.entry_s < truck.forgotten_s + _FORGET_EVERY_S:
             return  # what was before has been forgotten; this had been decided before that
-        crossing_id, is_new = self._identity(truck, bridge, stay)
+        crossing_id, is_new = self._identity(realm, truck, bridge, stay)
         if crossing_id in truck.done:
             return
         state = _StateMessages(realm, bridge, truck, stay, crossing_id)
-        if is_new:
+        said = truck.said.get(crossing_id, set())
+        if is_new and pb.DETECTED not in said:
             yield state.message(pb.DETECTED, stay.entry_s)
         if np.isfinite(now_s):
             if not stay.is_over and now_s - stay.entry_s < _LONGEST_STAY_S:
                 return
             if not stay.is_over:
                 stay = stay._replace(passage=Passage.TURNED_BACK)
-            elif not complete and self._may_still_come(truck, stay, now_s):
+            elif wait(truck, stay, now_s):
                 return
         truck.done.add(crossing_id)
-        yield state.message(pb.COMPLETE, stay.exit_s)
-        yield state.message(pb.IDENTIFYING, stay.exit_s)
+        truck.decided.append((bridge.id, *_fixes_around(truck, stay), crossing_id))
+        for begun in (pb.COMPLETE, pb.IDENTIFYING):
+            if begun not in said:
+                yield state.message(begun, stay.exit_s)
         result = self._identified(realm, truck, bridge, stay, crossing_id)
+        latest = self._bridge_state(realm, bridge, result)  # who asks for it with the result has it
         # A result is dated by the data that made it: the engine has no clock.
         header = self._header._replace(created=result.exit_time)
         estimate = crossing_to_protobuf(result, header)
@@ -260,13 +320,8 @@ class Engine:
             result,
         )
         yield state.message(pb.DONE, stay.exit_s)
-        latest = self._bridge_state(realm, bridge, result)
         if latest is not None:
-            message = bridge_to_protobuf(bridge.id, round(result.exit_time * 1e9), latest)
-            yield Output(
-                Key(realm, "bridge", bridge.id, "state"),
-                message.SerializeToString(deterministic=True),
-            )
+            yield _state_message(realm, bridge.id, result, latest)
 
     def _may_still_come(self, truck: _Truck, stay: Stay, now_s: float) -> bool:
         """Whether something of a crossing is missing that a little patience may bring."""
@@ -279,12 +334,32 @@ class Engine:
             return False  # newer ones have come long ago: it is lost
         return now_s < end_s + _SILENCE_S
 
-    def _identity(self, truck: _Truck, bridge: Bridge, stay: Stay) -> tuple[str, bool]:
+    def _has_hole(self, truck: _Truck, stay: Stay, now_s: float) -> bool:
+        """Whether a crossing lacks what is older than something that has come."""
+        latest_s = truck.boot.latest_accel_s()
+        if latest_s < stay.exit_s:
+            return True  # positions have come from behind the bridge
+        end_s = min(stay.exit_s + MARGIN_S, latest_s - _ROUNDING_S)
+        return truck.boot.lacks_accel(stay.entry_s - MARGIN_S - MAX_BATCH_S, end_s)
+
+    def _identity(self, realm: str, truck: _Truck, bridge: Bridge, stay: Stay) -> tuple[str, bool]:
         """The id of a stay: the same although its entry moves a little with every new fix."""
         for (known_bridge, entry_s), crossing_id in truck.detected.items():
-            if known_bridge == bridge.id and abs(entry_s - stay.entry_s) < 5.0:
+            if known_bridge == bridge.id and abs(entry_s - stay.entry_s) < MERGE_S:
+                return crossing_id, False
+        for known_bridge, begin_s, end_s, crossing_id in truck.decided:
+            # Fixes that came after all may move an entry far, but not to before the fixes that
+            # were known, and nobody is on a bridge twice at once.
+            if known_bridge == bridge.id and _overlap(begin_s, end_s, stay.entry_s, stay.exit_s):
                 return crossing_id, False
         wall_ns = truck.boot.wall_time_ns(stay.entry_s)
+        for told in self._told.get((realm, truck.vehicle.id, bridge.id), ()):
+            if _is_told(told, stay, wall_ns):
+                truck.detected[bridge.id, stay.entry_s] = told.crossing_id
+                truck.said[told.crossing_id] = told.states
+                if told.result is not None:
+                    truck.done.add(told.crossing_id)
+                return told.crossing_id, True
         moment = datetime.fromtimestamp(wall_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]
         crossing_id = f"{truck.vehicle.id}.{bridge.id}.{moment}Z"
         truck.detected[bridge.id, stay.entry_s] = crossing_id
@@ -330,6 +405,37 @@ class Engine:
             for (_, bridge), crossings in self._usable.items()
             if crossings
         }
+
+
+def _fixes_around(truck: _Truck, stay: Stay) -> tuple[float, float]:
+    """The time of the last fix before a stay and of the first one behind it."""
+    time_s = truck.boot.fixes().time_s
+    first = int(np.searchsorted(time_s, stay.entry_s, "right")) - 1
+    last = int(np.searchsorted(time_s, stay.exit_s, "left"))
+    return float(time_s[max(first, 0)]), float(time_s[min(last, time_s.size - 1)])
+
+
+def _overlap(begin: float, end: float, other_begin: float, other_end: float) -> bool:
+    return begin < other_end and other_begin < end
+
+
+def _is_told(told: Told, stay: Stay, entry_ns: int) -> bool:
+    """Whether a stay is a crossing that an earlier run has told of."""
+    if abs(told.entry_ns - entry_ns) < MERGE_S * 1e9:
+        return True
+    if not told.exit_ns:
+        # Of a history that begins on the bridge the entry is not known, only that it is earlier.
+        longest_ns = _LONGEST_STAY_S * 1e9
+        begins = stay.passage is Passage.BEGINS_ON_BRIDGE
+        return begins and 0 < entry_ns - told.entry_ns < longest_ns
+    exit_ns = entry_ns + round((stay.exit_s - stay.entry_s) * 1e9)
+    return _overlap(told.entry_ns, told.exit_ns, entry_ns, exit_ns)
+
+
+def _state_message(realm: str, bridge: str, result: Crossing, latest: BridgeResult) -> Output:
+    message = bridge_to_protobuf(bridge, round(result.exit_time * 1e9), latest)
+    payload = message.SerializeToString(deterministic=True)
+    return Output(Key(realm, "bridge", bridge, "state"), payload)
 
 
 def latest_state(usable: list[Crossing]) -> BridgeResult:

@@ -32,10 +32,10 @@ from services.worker.crossing_data import (
 )
 
 _MICRO_G = 9.80665e-6
-_LEARNING_SHARE = 4
+_LEARNING_SHARE = 0.4
 _LEARNING_STAGES = 3
 _WELL_ACCEPTED = 0.5
-_LONGEST = 8
+_LONGEST = 14
 _FINITE_ELEMENTS = 14
 """At least so many, whatever the number of elements: quicker sensors would see a coarser mesh."""
 _SMALLEST_NOISE_UG = 0.1
@@ -235,8 +235,8 @@ def _sample(
         rows = posterior.all_rows(problem, points)
         return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
 
-    wanted = max(len(mcmc.RHO), settings.draws // mcmc.CHAINS)
-    learning = max(len(mcmc.RHO), wanted // _LEARNING_SHARE)
+    wanted = settings.draws // mcmc.CHAINS
+    learning = round(_LEARNING_SHARE * wanted)
     state = mcmc.init(target, normal)
     for stage in range(_LEARNING_STAGES):
         seen, acceptance = [], []

@@ -1,0 +1,300 @@
+"""A run of the worker's deciding part that goes on from what earlier runs said."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.results import Crossing, Header, crossing_to_protobuf
+from schemas.settings import IdentificationSettings
+from schemas.site import site_hash
+from schemas.topics import Key
+from services.common.geodesy import bridge_frame, to_lat_lon
+from services.common.recording import Message
+from services.common.runs import GnssTrack, Run, run_to_messages
+from services.simulation import paper_site
+from services.worker.crossing_data import CrossingData, Passing, rejected
+from services.worker.engine import Engine, Output
+from services.worker.identification import Stopwatch
+
+REALM = "sim-test"
+START_S = 1_767_225_600.0
+SITE = paper_site()
+SETTINGS = IdentificationSettings(method="least_squares")
+HEADER = Header("0", 0.0, site_hash(SITE), SETTINGS.model_dump(mode="json"), SETTINGS.seed)
+Said = list[tuple[Key, bytes]]
+
+
+@dataclass
+class Identifications:
+    """A search that knows its answer at once, and counts."""
+
+    made: int = 0
+
+    def __call__(
+        self,
+        data: CrossingData,
+        settings: IdentificationSettings,
+        *,
+        stopwatch: Stopwatch,
+        report: object = None,
+    ) -> Crossing:
+        self.made += 1
+        stay = data.stay
+        passing = Passing(stay.entry_s, stay.exit_s, 10.0)
+        whole = data.samples is not None and not any(
+            np.isnan(channel).any() for channel in data.samples.channels.values()
+        )
+        if not whole:
+            return rejected(data, settings, passing, ["gap_on_bridge"])  # type: ignore[list-item]
+        one = {"unit": "N·m²", "mean": 1.0, "std": 0.1, "q025": 0.8, "q50": 1.0, "q975": 1.2}
+        return Crossing.model_validate(
+            rejected(data, settings, passing, ["failed"]).model_dump()  # type: ignore[list-item]
+            | {"verdict": "good", "reasons": (), "reason_texts": (), "parameters": {"EI_1": one}}
+        )
+
+
+def engine(counted: Identifications | None = None, header: Header = HEADER) -> Engine:
+    return Engine(SITE, SETTINGS, header, identify=counted or Identifications())
+
+
+def messages_of(
+    *legs: tuple[float, float],
+    begin_s: float = 0.0,
+    without_fixes: tuple[float, float] = (0.0, 0.0),
+) -> list[Message]:
+    """A drive through (time s, chainage m); the bridge is from 0 to 30 m, the wheelbase 4.4 m."""
+    times, places = np.array(legs).T
+    accel = np.arange(0.0, times[-1], 0.02)
+    fixes = np.arange(0.0, times[-1] + 0.05, 0.1)
+    front = np.interp(fixes, times, places)
+    latitude, longitude = to_lat_lon(bridge_frame(SITE.bridges[0]), front)
+    speed = np.abs(np.gradient(front, fixes))
+    rng = np.random.default_rng(1)
+    names = ("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear")
+    run = Run(
+        "made up",
+        START_S + accel,
+        50.0,
+        {name: rng.standard_normal(accel.size) for name in names},
+        GnssTrack(START_S + fixes, latitude, longitude, np.full(fixes.size, 5.0), speed, None),
+    )
+    return [
+        message
+        for message in run_to_messages([run], SITE, REALM, "truck-1")
+        if (time_s := message.log_time_ns * 1e-9 - START_S) >= begin_s
+        and not (message.key.stream == "gnss" and without_fixes[0] <= time_s < without_fixes[1])
+    ]
+
+
+def fed(one: Engine, messages: Iterable[Message]) -> list[Output]:
+    return [output for m in messages for output in one.feed(m.key, m.payload)]
+
+
+def said_by(outputs: Iterable[Output]) -> Said:
+    return [(output.key, output.payload) for output in outputs]
+
+
+def resumed(
+    said: Said,
+    messages: Iterable[Message],
+    counted: Identifications | None = None,
+    header: Header = HEADER,
+) -> list[Output]:
+    one = engine(counted, header)
+    return [*one.resume(said), *fed(one, messages), *one.finish()]
+
+
+def states(outputs: Iterable[Output]) -> list[pb.Crossing]:
+    return [pb.Crossing.FromString(o.payload) for o in outputs if o.key.stream == "crossing"]
+
+
+def bridge_states(outputs: Iterable[Output]) -> list[pb.BridgeState]:
+    return [pb.BridgeState.FromString(o.payload) for o in outputs if o.key.stream == "state"]
+
+
+THERE = ((0.0, -60.0), (20.0, 140.0))
+THERE_AND_BACK = (*THERE, (30.0, 140.0), (50.0, -60.0))
+TWO = messages_of(*THERE_AND_BACK)
+WHOLE = fed(engine(), TWO)
+
+
+def test_two_crossings_are_twelve_messages() -> None:
+    once = ["crossing", "crossing", "crossing", "estimate", "crossing", "state"]
+    assert [output.key.stream for output in WHOLE] == once + once
+
+
+@pytest.mark.parametrize("number", range(len(WHOLE) + 1))
+def test_wherever_a_run_is_cut_off_the_next_says_the_rest(number: int) -> None:
+    """Byte for byte, and in the same order; only what has no result is identified again."""
+    counted = Identifications()
+    before = said_by(WHOLE[:number])
+    after = resumed(before, TWO, counted)
+    assert before + said_by(after) == said_by(WHOLE)
+    assert counted.made == sum(output.result is not None for output in WHOLE[number:])
+
+
+@pytest.mark.parametrize("numbers", [(2, 5), (4, 9), (5, 6), (3, 3)])
+def test_a_run_may_be_cut_off_twice(numbers: tuple[int, int]) -> None:
+    first, second = numbers
+    said = said_by(WHOLE[:first])
+    said += said_by(resumed(said, TWO))[: second - first]
+    assert said + said_by(resumed(said, TWO)) == said_by(WHOLE)
+
+
+def test_earlier_crossings_count_in_the_next_state() -> None:
+    """The truck has gone meanwhile and nothing of the first crossing comes again."""
+    after = resumed(said_by(WHOLE[:6]), [m for m in TWO if m.log_time_ns * 1e-9 > START_S + 25.0])
+    assert [s.SerializeToString() for s in bridge_states(after)] == [WHOLE[11].payload]
+    (state,) = bridge_states(after)
+    first = WHOLE[3].result
+    assert first is not None
+    assert [out.crossing_id for out in state.crossings_left_out] == [first.crossing_id]
+
+
+def test_the_results_file_counts_the_crossing_that_it_is_written_for() -> None:
+    one = engine()
+    counted = [
+        (output.result.crossing_id, one.bridges()["bridge-1"].crossings_used)
+        for m in TWO
+        for output in one.feed(m.key, m.payload)
+        if output.result is not None
+    ]
+    assert [used for _, used in counted] == [(crossing_id,) for crossing_id, _ in counted]
+
+
+@pytest.mark.parametrize("begin_s", [6.5, 7.0, 9.0])
+def test_a_history_that_begins_on_the_bridge_is_no_second_crossing(begin_s: float) -> None:
+    """The truck was on the bridge from 6 to 9.4 s and the cache goes back to its middle only."""
+    rest = messages_of(*THERE, begin_s=begin_s)
+    assert fed_all_alone(rest)  # there is something to be mistaken
+    assert resumed(said_by(WHOLE[:6]), rest) == []
+
+
+@pytest.mark.parametrize("told", [1, 3])
+def test_half_a_crossing_that_was_told_of_keeps_its_name(told: int) -> None:
+    rest = messages_of(*THERE, begin_s=7.0)
+    after = resumed(said_by(WHOLE[:told]), rest)
+    assert len([o for o in after if o.result]) == 1
+    known = states(WHOLE)[0].crossing_id
+    assert {state.crossing_id for state in states(after)} == {known}
+    assert [s.state for s in states(WHOLE[:told] + after)] == [1, 2, 4, 5]
+
+
+def fed_all_alone(messages: list[Message]) -> list[Output]:
+    one = engine()
+    return [*fed(one, messages), *one.finish()]
+
+
+@pytest.mark.parametrize("change", ["settings", "site_hash", "seed"])
+def test_a_result_of_another_search_does_not_count(change: str) -> None:
+    other = {"settings": {"method": "pre"}, "site_hash": "other", "seed": 7}[change]
+    header = HEADER._replace(**{change: other})
+    after = resumed(said_by(WHOLE), TWO, header=header)
+    assert [s.state for s in states(after)] == [s.state for s in states(WHOLE)]
+    assert [s.crossing_id for s in states(after)] == [s.crossing_id for s in states(WHOLE)]
+    assert [list(s.crossings_used) for s in bridge_states(after)] == [
+        list(s.crossings_used) for s in bridge_states(WHOLE)
+    ]
+
+
+def test_another_version_of_the_program_does_not_identify_anew() -> None:
+    assert resumed(said_by(WHOLE), TWO, header=HEADER._replace(version="99", created=5.0)) == []
+
+
+def test_another_truck_bridge_or_realm_is_another_crossing() -> None:
+    for old, new in (("truck-1", "truck-2"), ("bridge-1", "bridge-2"), (REALM, "live")):
+        changed = [
+            (Key(*(new if part == old else part for part in key)), payload)
+            for key, payload in said_by(WHOLE[:6])
+        ]
+        if old == "truck-1":  # not in a key of a bridge
+            changed = [(key, of_truck(payload, new)) for key, payload in changed if is_state(key)]
+            result = WHOLE[3].result
+            assert result is not None
+            other = result.model_copy(update={"vehicle": new, "crossing_id": "other"})
+            estimate = crossing_to_protobuf(other, HEADER).SerializeToString(deterministic=True)
+            changed.append((WHOLE[3].key, estimate))
+        counted = Identifications()
+        resumed(changed, TWO, counted)
+        assert counted.made == 2, new
+
+
+def is_state(key: Key) -> bool:
+    return key.stream == "crossing"
+
+
+def of_truck(payload: bytes, vehicle: str) -> bytes:
+    message = pb.Crossing.FromString(payload)
+    message.vehicle, message.crossing_id = vehicle, "other"
+    return message.SerializeToString(deterministic=True)
+
+
+def test_what_is_malformed_is_left_out() -> None:
+    broken = [
+        (Key(REALM, "bridge", "bridge-1", stream), payload)
+        for stream in ("crossing", "estimate", "state")
+        for payload in (b"\xff\xff", b"\x08\x09", b"")
+    ]
+    said = said_by(WHOLE[:6])
+    assert resumed([*broken, *said, *broken], TWO) == WHOLE[6:]
+
+
+def without(messages: list[Message], stream: str, begin_s: float, stop_s: float) -> list[Message]:
+    return [m for m in messages if m not in between(messages, stream, begin_s, stop_s)]
+
+
+def between(messages: list[Message], stream: str, begin_s: float, stop_s: float) -> list[Message]:
+    return [
+        m
+        for m in messages
+        if m.key.stream == stream and begin_s <= m.log_time_ns * 1e-9 - START_S < stop_s
+    ]
+
+
+@pytest.mark.parametrize(
+    ("stream", "begin_s", "stop_s"),
+    [("accel", 7.0, 7.2), ("accel", 5.2, 5.4), ("accel", 9.0, 99.0), ("gnss", 5.0, 8.0)],
+)
+def test_who_lost_the_connection_may_bring_what_is_missing(
+    stream: str, begin_s: float, stop_s: float
+) -> None:
+    """Half a second behind the bridge the truck's token goes, and what is under way is lost."""
+    there = [m for m in messages_of(*THERE) if m.log_time_ns * 1e-9 < START_S + 10.0]
+    one = engine()
+    assert states(fed(one, without(there, stream, begin_s, stop_s)))[1:] == []
+    assert list(one.gone(REALM, "truck-1")) == []
+    assert one.has_undecided(REALM, "truck-1")
+    again = fed(one, between(there, stream, begin_s, stop_s))
+    (result,) = [o.result for o in [*again, *one.gone(REALM, "truck-1")] if o.result]
+    assert result.verdict == "good"
+    assert not one.has_undecided(REALM, "truck-1")
+
+
+def test_what_never_comes_is_given_up_when_the_truck_is_gone_for_good() -> None:
+    there = [m for m in messages_of(*THERE) if m.log_time_ns * 1e-9 < START_S + 10.0]
+    one = engine()
+    fed(one, without(there, "accel", 7.0, 7.2))
+    assert list(one.gone(REALM, "truck-1")) == []
+    outputs = list(one.gone(REALM, "truck-1", for_good=True))
+    assert [o.result.reasons for o in outputs if o.result] == [("gap_on_bridge",)]
+    late = fed(one, between(there, "accel", 7.0, 7.2))
+    assert [*late, *one.gone(REALM, "truck-1", for_good=True)] == []
+
+
+def test_fixes_that_come_after_the_decision_make_no_second_crossing() -> None:
+    """The receiver's fixes are missing while the truck halts before the bridge and crosses it:
+    the entry is thought to be 8 s before it was."""
+    legs = ((0.0, -60.0), (5.0, -10.0), (21.0, -10.0), (27.0, 50.0), (60.0, 380.0))
+    messages = messages_of(*legs)
+    one = engine()
+    first = fed(one, without(messages, "gnss", 5.0, 27.0))
+    first += one.gone(REALM, "truck-1", for_good=True)
+    second = fed(one, between(messages, "gnss", 5.0, 27.0))
+    second += [*one.gone(REALM, "truck-1", for_good=True), *one.finish()]
+    told = [o.result for o in first + second if o.result]
+    assert len(told) == 1
+    (whole,) = [o.result for o in fed_all_alone(messages) if o.result]
+    assert whole.entry_time - told[0].entry_time > 5.0  # or it would prove nothing
