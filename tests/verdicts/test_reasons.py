@@ -7,33 +7,8 @@ import pytest
 
 from pre_core.simulate import Motion
 from schemas.reasons import Reason
-from services.common.crossing import Passage, Stay
-from services.common.streams import Fixes
-from services.simulation import paper_site
-from services.worker.crossing_data import CrossingData, Floats, caveats, longest_outage_s
-
-SITE = paper_site()
-ENTRY_S, EXIT_S = 3.0, 6.44
-
-
-def crossing(fix_times_s: Floats, **vehicle: object) -> CrossingData:
-    truck = SITE.vehicles[0].model_copy(update=vehicle)
-    stay = Stay(Passage.THROUGH, 1, ENTRY_S, EXIT_S)
-    fixes = Fixes(fix_times_s, fix_times_s, fix_times_s, np.full(fix_times_s.size, 10.0))
-    place = 10.0 * (fix_times_s - ENTRY_S)
-    return CrossingData(
-        "x",
-        "sim-x",
-        truck,
-        SITE.bridges[0],
-        SITE.sensor,
-        SITE.receiver,
-        stay,
-        fixes,
-        place,
-        None,
-        0.0,
-    )
+from services.worker.crossing_data import caveats, longest_outage_s
+from tests.verdicts.steady import ENTRY_S, EXIT_S, steady_crossing
 
 
 def motion(acceleration_m_per_s2: float) -> Motion:
@@ -46,19 +21,19 @@ STEADY = np.arange(0.0, 9.0, 0.1)
 
 
 def test_a_steady_drive_has_no_caveat() -> None:
-    assert caveats(crossing(STEADY), motion(0.0)) == []
+    assert caveats(steady_crossing(STEADY), motion(0.0)) == []
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_braking_matters_where_the_height_of_the_mass_is_unknown(sign: float) -> None:
-    unknown = crossing(STEADY, cg_height_m=None)
+    unknown = steady_crossing(STEADY, cg_height_m=None)
     assert caveats(unknown, motion(0.31 * sign)) == [Reason.ACCELERATING_CG_UNKNOWN]
     assert caveats(unknown, motion(0.29 * sign)) == []
-    assert caveats(crossing(STEADY, cg_height_m=1.2), motion(0.9 * sign)) == []
+    assert caveats(steady_crossing(STEADY, cg_height_m=1.2), motion(0.9 * sign)) == []
 
 
 def test_tyres_that_damp_are_named() -> None:
-    damped = crossing(STEADY, tyre_damping_ns_per_m=(0.0, 100.0))
+    damped = steady_crossing(STEADY, tyre_damping_ns_per_m=(0.0, 100.0))
     assert caveats(damped, motion(0.0)) == [Reason.TYRE_DAMPING_IGNORED]
 
 
@@ -66,7 +41,7 @@ def test_tyres_that_damp_are_named() -> None:
 def test_a_receiver_that_fails_on_the_bridge_is_named(seconds: float, *, named: bool) -> None:
     middle = 0.5 * (ENTRY_S + EXIT_S)
     times = STEADY[np.abs(STEADY - middle) > 0.5 * seconds]
-    assert caveats(crossing(times), motion(0.0)) == [Reason.POSITION_OUTAGE] * named
+    assert caveats(steady_crossing(times), motion(0.0)) == [Reason.POSITION_OUTAGE] * named
 
 
 def test_an_outage_that_only_touches_the_bridge_counts_whole() -> None:

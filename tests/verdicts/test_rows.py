@@ -7,35 +7,16 @@ import pytest
 
 from pre_core import quality
 from schemas.reasons import Reason
-from services.common.crossing import Passage, Stay
-from services.common.streams import Fixes
-from services.simulation import paper_site
 from services.worker.checks import BODY_FRONT, ROAD, Fit, reasons_after_fit
 from services.worker.crossing_data import CrossingData, Floats
+from tests.verdicts.steady import steady_crossing
 
 STEP_S = 0.005
 ROWS = 1100
-SITE = paper_site()
 
 
 def crossing(**vehicle: Any) -> CrossingData:
-    truck = SITE.vehicles[0].model_copy(update=vehicle)
-    none = np.empty(0)
-    stay = Stay(Passage.THROUGH, 1, 0.0, 3.44)
-    fixes = Fixes(none, none, none, none)
-    return CrossingData(
-        "x",
-        "sim-x",
-        truck,
-        SITE.bridges[0],
-        SITE.sensor,
-        SITE.receiver,
-        stay,
-        fixes,
-        none,
-        None,
-        0.0,
-    )
+    return steady_crossing(np.empty(0), **vehicle)
 
 
 def fit(white: Floats, **changes: Any) -> Fit:
