@@ -12,11 +12,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.patches import Rectangle
-from matplotlib.text import Text
 
 from services.common.errors import InputError
 from services.viewer.crossing_view import CrossingView, RoadView
 from services.viewer.figure import STYLE, crossing_figure, draw_crossing
+from tests.unit.words import assert_words_apart, words
 
 RATIOS = np.array([1.0, 0.98, 1.01, 0.4, 1.02, 1.0, 0.99])
 NOMINAL_NM2 = 15.6e9
@@ -72,23 +72,6 @@ def bars(axes: Axes) -> list[Rectangle]:
 def labels(axes: Axes) -> set[str]:
     legend = axes.get_legend()
     return set() if legend is None else {text.get_text() for text in legend.get_texts()}
-
-
-def texts(figure: Figure) -> list[Text]:
-    """All words on the page; Matplotlib keeps tick labels beyond the ends that it does not draw."""
-    beyond = {
-        id(label)
-        for axes in figure.axes
-        for axis in (axes.xaxis, axes.yaxis)
-        for tick in axis.get_major_ticks()
-        if not min(axis.get_view_interval()) <= tick.get_loc() <= max(axis.get_view_interval())
-        for label in (tick.label1, tick.label2)
-    }
-    return [
-        text
-        for text in figure.findobj(Text)
-        if text.get_text().strip() and text.get_visible() and id(text) not in beyond
-    ]
 
 
 def test_bars_stand_on_their_elements_with_their_rigidity():
@@ -153,7 +136,7 @@ def test_rejected_crossing_shows_its_reason_and_no_number():
         truth=False,
     )
     assert bars(figure.axes[0]) == []
-    written = [text.get_text() for text in texts(figure)]
+    written = [text.get_text() for text in words(figure)]
     assert any(reason in text for text in written)
     assert "verdict: rejected" in written
     assert not any(text.startswith("$EI") for text in written)
@@ -190,19 +173,7 @@ LONG = {
 def test_all_words_stand_on_the_page_and_apart(changes: dict[str, object]):
     figure = draw(view(**changes))
     assert isinstance(figure.canvas, FigureCanvasAgg)
-    figure.canvas.draw()
-    page = figure.bbox
-    boxes = [(text.get_text(), text.get_window_extent()) for text in texts(figure)]
-    for words, box in boxes:
-        assert page.x0 <= box.x0, words
-        assert box.x1 <= page.x1, words
-        assert page.y0 <= box.y0, words
-        assert box.y1 <= page.y1, words
-    for index, (words, box) in enumerate(boxes):
-        for other_words, other in boxes[index + 1 :]:
-            assert not (
-                box.x0 < other.x1 and other.x0 < box.x1 and box.y0 < other.y1 and other.y0 < box.y1
-            ), f"{words!r} lies on {other_words!r}"
+    assert_words_apart(figure)
 
 
 def test_png_is_wide_enough_for_a_page_and_the_same_each_time(tmp_path: Path):

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.patches import StepPatch
-from matplotlib.text import Text
 
 from pre_core import paper
 from pre_core.search import Ending
@@ -24,6 +23,7 @@ from services.viewer.validation_figure import (
     overview_figure,
     posterior_figure,
 )
+from tests.unit.words import assert_words_apart, words
 
 PARTICLES = 400
 
@@ -52,37 +52,6 @@ def scenario(number: int, ours: dict[str, float] | None = None, spread: float = 
         {"random_walk": Ending.STEPS_DONE, "least_squares": Ending.CONVERGED},
         {"random_walk": 1.0, "least_squares": 1.0},
     )
-
-
-def words(figure: Figure) -> list[Text]:
-    """All words on the page; Matplotlib keeps tick labels beyond the ends that it does not draw."""
-    beyond = {
-        id(label)
-        for axes in figure.axes
-        for axis in (axes.xaxis, axes.yaxis)
-        for tick in axis.get_major_ticks()
-        if not min(axis.get_view_interval()) <= tick.get_loc() <= max(axis.get_view_interval())
-        for label in (tick.label1, tick.label2)
-    }
-    return [
-        text
-        for text in figure.findobj(Text)
-        if text.get_text().strip() and text.get_visible() and id(text) not in beyond
-    ]
-
-
-def check_words_apart(figure: Figure) -> None:
-    figure.canvas.draw()
-    page = figure.bbox
-    boxes = [(text.get_text(), text.get_window_extent()) for text in words(figure)]
-    for text, box in boxes:
-        assert page.x0 <= box.x0 < box.x1 <= page.x1, text
-        assert page.y0 <= box.y0 < box.y1 <= page.y1, text
-    for index, (text, box) in enumerate(boxes):
-        for other_text, other in boxes[index + 1 :]:
-            assert not (
-                box.x0 < other.x1 and other.x0 < box.x1 and box.y0 < other.y1 and other.y0 < box.y1
-            ), f"{text!r} lies on {other_text!r}"
 
 
 def histograms(axes: Axes) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -132,7 +101,7 @@ def test_what_lies_beyond_the_axis_is_told():
         "3 beyond",
     }
     assert {text.get_text() for text in panel(figure, r"$\alpha$").texts} == {"← -4"}
-    check_words_apart(figure)
+    assert_words_apart(figure)
 
 
 def test_overview_draws_truth_paper_and_both_searches():
@@ -162,14 +131,14 @@ def test_overview_without_the_paper_does_not_name_it():
 
 @pytest.mark.parametrize("count", [1, 2, 5, 12])
 def test_words_stand_apart_in_the_overview(count: int):
-    check_words_apart(
+    assert_words_apart(
         draw_overview([scenario(n) for n in paper.SCENARIOS[:count]], tables_of_paper())
     )
 
 
 @pytest.mark.parametrize("spread", [0.02, 1.0])
 def test_words_stand_apart_in_the_posterior(spread: float):
-    check_words_apart(draw_posterior(scenario(9, spread=spread), NAMES))
+    assert_words_apart(draw_posterior(scenario(9, spread=spread), NAMES))
 
 
 def test_fewer_parameters_leave_no_empty_panel():
