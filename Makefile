@@ -29,11 +29,14 @@ $(STAMP): $(PACKAGES) $(wildcard pre_core/*.py)
 demo: $(STAMP) ## a truck crosses a bridge: simulated, recorded, identified, drawn
 	$(BIN)/driveby demo
 
+# One worker computes while the other waits for processes (tests/conftest.py); more would only wait.
+BESIDE := -n 2 --dist loadgroup
+
 test: $(STAMP) ## the default tests (about 7 minutes on 2 cores)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(BESIDE)
 
 test-all: $(STAMP) ## the default tests and the slow ones
-	$(BIN)/python -m pytest -m "slow or not slow"
+	$(BIN)/python -m pytest $(BESIDE) -m "slow or not slow"
 
 faults: $(STAMP) ## everything that tries to lose or break data (at most 20 minutes)
 	$(BIN)/python -m pytest tests/faults -m "faults or not faults"

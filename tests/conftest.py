@@ -22,6 +22,17 @@ settings.load_profile("project")
 PROJECT = Path(__file__).parents[1]
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """With `make test`, tests that start processes or listen at a port do not run side by side.
+
+    They mostly wait, and what they wait for comes late where several of them do so at a time: one
+    of the two workers takes them one after another, while the other one computes.
+    """
+    listens = {"endpoint", "tls_endpoint"}.intersection(getattr(item, "fixturenames", ()))
+    if listens or item.get_closest_marker("process"):
+        item.add_marker(pytest.mark.xdist_group("processes"))
+
+
 @pytest.fixture(scope="session")
 def project() -> Path:
     """The root of the repository."""

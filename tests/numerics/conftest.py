@@ -34,7 +34,7 @@ def agree(record_property: Callable[[str, object], None]) -> Agree:
     """agree(what, known, ours, tolerance): record both for the table, and compare relatively."""
 
     def check(what: str, known: float, ours: float, tolerance: float) -> None:
-        record_property("known answer", (what, known, ours, tolerance))
+        record_property("known answer", (what, float(known), float(ours), tolerance))
         assert ours == pytest.approx(known, rel=tolerance), what
 
     return check
@@ -45,7 +45,7 @@ def measured(record_property: Callable[[str, object], None]) -> Agree:
     """measured(what, expected, ours, tolerance): the same for an absolute tolerance."""
 
     def check(what: str, expected: float, ours: float, tolerance: float) -> None:
-        record_property("measured", (what, expected, ours, tolerance))
+        record_property("measured", (what, float(expected), float(ours), tolerance))
         assert ours == pytest.approx(expected, abs=tolerance), what
 
     return check
