@@ -29,6 +29,8 @@ class Truck:
         self.said: dict[int, int] = {}
         """By boot_id the last sequence of accel."""
         self.last_line = ""
+        self.is_driving = True
+        """Until it is killed or told to end."""
         spool = fleet.folder / "spool" / vehicle
         self.process = fleet.python(
             "truck_process.py",
@@ -57,13 +59,18 @@ class Truck:
             time.sleep(0.02)
 
     def kill(self) -> None:
+        self.is_driving = False
         self.process.kill()
         self.process.wait()
         self._reader.join()
 
-    def finish(self, timeout_s: float = 90.0) -> None:
+    def stop(self) -> None:
         """End the drive; the truck leaves when a logger has everything."""
+        self.is_driving = False
         self.process.send_signal(signal.SIGTERM)
+
+    def wait(self, timeout_s: float = 90.0) -> None:
+        """Wait until it has left, which it must do with nothing missing."""
         assert self.process.wait(timeout=timeout_s) == 0
         self._reader.join()
         assert self.last_line.startswith("missing 0 "), (
@@ -156,6 +163,16 @@ class Fleet:
             repeated = [name for name, number in own.items() if number > 1]
             assert not repeated, f"{path}: {repeated[:5]}"
         return union, twice
+
+    def finish(self) -> int:
+        """End all drives and then the logger; return as `assert_complete` does."""
+        driving = [truck for truck in self.trucks if truck.is_driving]
+        for truck in driving:
+            truck.stop()
+        for truck in driving:
+            truck.wait()
+        self.stop_logger()
+        return self.assert_complete()
 
     def assert_complete(self) -> int:
         """Everything that any truck handed over is there; return how often in two files."""

@@ -31,10 +31,7 @@ def test_rotation_under_load_loses_and_repeats_nothing(fleet: MakeFleet) -> None
         for truck in trucks:
             truck.wait_for(batches)
         one.logger.send_signal(signal.SIGUSR1)
-    for truck in trucks:
-        truck.finish()
-    one.stop_logger()
-    assert one.assert_complete() == 0
+    assert one.finish() == 0
     ends = [(read_info(path).end or {}) for path in files(one) if "truck" in path.name]
     assert all(end["dropped"] == "0" for end in ends)
     reasons = [end["reason"] for end in ends]
@@ -58,10 +55,7 @@ def kill_and_recover(one: Fleet, rng: random.Random, kills: int) -> None:
     while not is_quiet(one):
         assert time.monotonic() < deadline, one.logs()
         time.sleep(0.1)
-    for truck in trucks:
-        truck.finish()
-    one.stop_logger()
-    assert one.assert_complete() == 0
+    assert one.finish() == 0
     assert all(is_closed(path) for path in files(one))
     recovered = [path for path in files(one) if path.name.endswith(".recovered.mcap")]
     crashed = list((one.folder / "recordings").glob("*/*/*.crashed"))

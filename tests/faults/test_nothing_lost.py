@@ -25,22 +25,16 @@ def test_a_killed_truck_gives_what_it_had_not_said_when_it_starts_again(fleet: M
     """There is no logger while it drives: only its spool knows."""
     one = fleet(router=True)
     one.start_router()
-    truck = one.start_truck()
-    truck.wait_for(30)
-    truck.kill()
-    again = one.start_truck()
-    again.wait_for(20)
-    one.start_logger()
-    again.wait_for(60)
-    again.finish()
-    one.stop_logger()
-    assert one.assert_complete() == 0
-    assert list((one.folder / "spool").glob("*/*.spool")) == []
+    drive_twice_before_there_is_a_logger(one)
 
 
 def test_a_truck_that_starts_where_there_is_no_router(fleet: MakeFleet) -> None:
     """It drives, is killed, starts again, and meets router and logger only then."""
-    one = fleet()
+    drive_twice_before_there_is_a_logger(fleet())
+
+
+def drive_twice_before_there_is_a_logger(one: Any) -> None:
+    """The first drive ends with a kill."""
     truck = one.start_truck()
     truck.wait_for(30)
     truck.kill()
@@ -48,9 +42,7 @@ def test_a_truck_that_starts_where_there_is_no_router(fleet: MakeFleet) -> None:
     again.wait_for(30)
     one.start_logger()
     again.wait_for(60)
-    again.finish()
-    one.stop_logger()
-    assert one.assert_complete() == 0
+    assert one.finish() == 0
     assert list((one.folder / "spool").glob("*/*.spool")) == []
 
 
@@ -62,9 +54,7 @@ def test_a_truck_killed_while_the_logger_listens(fleet: MakeFleet) -> None:
     truck.kill()
     again = one.start_truck(rate=20.0)
     again.wait_for(20)
-    again.finish()
-    one.stop_logger()
-    assert one.assert_complete() == 0
+    assert one.finish() == 0
 
 
 @pytest.mark.faults
@@ -77,9 +67,7 @@ def test_an_outage_longer_than_the_cache(fleet: MakeFleet) -> None:
     one.kill(one.logger)
     truck.wait_for(8500)
     one.start_logger()
-    truck.finish()
-    one.stop_logger()
-    assert one.assert_complete() == 0
+    assert one.finish() == 0
 
 
 def kill_at_random(fleet: MakeFleet, seed: int, kills: int, *, what: str) -> int:
@@ -109,10 +97,7 @@ def kill_at_random(fleet: MakeFleet, seed: int, kills: int, *, what: str) -> int
         if what in ("router", "both"):
             one.start_router()
     time.sleep(1.0)
-    for truck in trucks:
-        truck.finish()
-    one.stop_logger()
-    twice: int = one.assert_complete()
+    twice: int = one.finish()
     return twice
 
 
@@ -174,10 +159,7 @@ def test_frozen_for_longer_than_its_time_outs(fleet: MakeFleet, what: str, secon
     assert max(healthy.said.values()) - before > 0.5 * 20 * driven_s
     process.send_signal(signal.SIGCONT)
     time.sleep(2.0)
-    frozen.finish()
-    healthy.finish()
-    one.stop_logger()
-    assert one.assert_complete() == 0
+    assert one.finish() == 0
 
 
 @pytest.mark.parametrize("router", [False, pytest.param(True, marks=pytest.mark.faults)])
@@ -193,19 +175,21 @@ def test_a_frozen_truck_delays_no_other(fleet: MakeFleet, router: bool) -> None:
     late = one.start_truck("truck-3")
     late.wait_for(40)
     frozen.process.send_signal(signal.SIGCONT)
-    for truck in (frozen, healthy, late):
-        truck.finish()
-    one.stop_logger()
-    one.assert_complete()
+    one.finish()
     for vehicle in ("truck-2", "truck-3"):
-        lags_s = [
-            (m.publish_time_ns - m.log_time_ns) * 1e-9
-            for path in (one.folder / "recordings").glob(f"*/*/{vehicle}-*.mcap")
-            for m in read_messages(path)
-            if m.key.stream == "accel"
-        ]
-        assert sorted(lags_s)[len(lags_s) // 2] < 0.5
-        assert max(lags_s) < 4.0, vehicle  # the first ones, while the logger meets the truck
+        found_s = lags_s(one, vehicle)
+        assert sorted(found_s)[len(found_s) // 2] < 0.5
+        assert max(found_s) < 4.0, vehicle  # the first ones, while the logger meets the truck
+
+
+def lags_s(one: Any, vehicle: str = "truck-*") -> list[float]:
+    """Between what was sent and what was received, of every batch."""
+    return [
+        (message.publish_time_ns - message.log_time_ns) * 1e-9
+        for path in (one.folder / "recordings").glob(f"*/*/{vehicle}-*.mcap")
+        for message in read_messages(path)
+        if message.key.stream == "accel"
+    ]
 
 
 @pytest.mark.parametrize("jump_s", [-3600, pytest.param(86_400, marks=pytest.mark.faults)])
@@ -214,9 +198,7 @@ def test_a_truck_whose_wall_clock_jumps(fleet: MakeFleet, jump_s: int) -> None:
     one.start_logger()
     truck = one.start_truck(DRIVEBY_TEST_CLOCK_STEP=f"30:{jump_s}")
     truck.wait_for(50)
-    truck.finish()
-    one.stop_logger()
-    one.assert_complete()
+    one.finish()
     [path] = (one.folder / "recordings").glob("*/*/truck-1-*.mcap")
     events = [decode_event(m.payload) for m in read_messages(path) if m.key.stream == "event"]
     steps = [event for event in events if event.kind == EventKind.CLOCK_STEP]
@@ -237,14 +219,5 @@ def test_a_frozen_subscriber_holds_up_the_logger_for_seconds_only(fleet: MakeFle
     viewer.send_signal(signal.SIGSTOP)
     for truck in trucks:
         truck.wait_for(max(truck.said.values()) + 12_000)
-    for truck in trucks:
-        truck.finish()
-    one.stop_logger()
-    assert one.assert_complete() == 0
-    lags_s = [
-        (message.publish_time_ns - message.log_time_ns) * 1e-9
-        for path in (one.folder / "recordings").glob("*/*/truck-*.mcap")
-        for message in read_messages(path)
-        if message.key.stream == "accel"
-    ]
-    assert max(lags_s) < 5.0  # Zenoh's own patience made it 10
+    assert one.finish() == 0
+    assert max(lags_s(one)) < 5.0  # Zenoh's own patience made it 10
