@@ -26,6 +26,7 @@ from schemas.signals import (
 )
 from schemas.topics import Key
 from services.common.recording import Message, write_recording
+from tests.process_replay.starting import End, Process, Start
 
 # Runs one entry function as the command line would: exit code 2 for bad input, 1 for a failure.
 _RUNNER = """
@@ -49,15 +50,13 @@ except FailureError as error:
     sys.exit(print(error, file=sys.stderr) or 1)
 """
 
-Start = Callable[..., subprocess.Popen[str]]
-
 
 @pytest.fixture
 def start() -> Iterator[Start]:
     """Start a service in a process of its own; all are ended with the test."""
-    started: list[subprocess.Popen[str]] = []
+    started: list[Process] = []
 
-    def start_one(module: str, **arguments: Any) -> subprocess.Popen[str]:
+    def start_one(module: str, **arguments: Any) -> Process:
         process = subprocess.Popen(
             [sys.executable, "-c", _RUNNER, module, json.dumps(arguments, default=str)],
             stdout=subprocess.PIPE,
@@ -80,10 +79,10 @@ def start() -> Iterator[Start]:
 
 
 @pytest.fixture
-def finish() -> Callable[[subprocess.Popen[str]], None]:
+def finish() -> End:
     """Wait for a process that ends by itself; fail with its log if it did not end well."""
 
-    def wait(process: subprocess.Popen[str]) -> None:
+    def wait(process: Process) -> None:
         _, log = process.communicate(timeout=60)
         assert process.returncode == 0, log
 
@@ -91,10 +90,10 @@ def finish() -> Callable[[subprocess.Popen[str]], None]:
 
 
 @pytest.fixture
-def terminate() -> Callable[[subprocess.Popen[str]], None]:
+def terminate() -> End:
     """End a service as an operator would; it must be done within 5 s."""
 
-    def end(process: subprocess.Popen[str]) -> None:
+    def end(process: Process) -> None:
         began = time.monotonic()
         os.kill(process.pid, signal.SIGTERM)
         _, log = process.communicate(timeout=20)

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,19 +17,11 @@ from schemas.signals import encode_identity
 from schemas.topics import selector
 from services.common.bus import Subscription, get_latest, open_session
 from services.common.recording import read_info, read_messages
+from tests.process_replay.starting import End, Start, start_logger
 
 pytestmark = pytest.mark.process
 
-Start = Callable[..., subprocess.Popen[str]]
-End = Callable[[subprocess.Popen[str]], None]
 PREFIX = "driveby/v1"
-
-
-def start_logger(
-    start: Start, endpoint: str, file: Path, **arguments: object
-) -> subprocess.Popen[str]:
-    settings = {"realm": None, "site": None} | arguments
-    return start("services.logger", listen=endpoint, folder=file.parent, file=file, **settings)
 
 
 def test_bad_messages_are_refused_reported_and_never_written(

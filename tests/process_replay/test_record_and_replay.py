@@ -1,7 +1,6 @@
 """Truck, logger and replay as processes of their own: nothing lost, nothing changed."""
 
 import signal
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -12,12 +11,9 @@ import pytest
 
 from schemas.signals import decode_accel, decode_gnss
 from services.common.recording import Message, read_info, read_messages
+from tests.process_replay.starting import End, Start, start_logger
 
 pytestmark = pytest.mark.process
-
-Process = subprocess.Popen[str]
-Start = Callable[..., Process]
-End = Callable[[Process], None]
 
 
 def by_stream(messages: list[Message]) -> dict[str, list[Message]]:
@@ -25,12 +21,6 @@ def by_stream(messages: list[Message]) -> dict[str, list[Message]]:
     for message in messages:
         streams.setdefault(message.key.stream, []).append(message)
     return streams
-
-
-def start_logger(start: Start, endpoint: str, file: Path, realm: str | None = None) -> Process:
-    return start(
-        "services.logger", listen=endpoint, folder=file.parent, file=file, realm=realm, site=None
-    )
 
 
 def test_a_truck_is_recorded_completely_and_as_a_drive_of_now(
@@ -190,14 +180,7 @@ def test_one_file_per_vehicle_below_the_folder(
 
     second = tmp_path / "second.mcap"
     write_recording(second, drive_messages(20, "truck-2", 78), site_toml=None, reason="test")
-    logger = start(
-        "services.logger",
-        listen=endpoint,
-        folder=tmp_path / "recordings",
-        file=None,
-        realm=None,
-        site=None,
-    )
+    logger = start_logger(start, endpoint, None, folder=tmp_path / "recordings")
     both = [str(recording), str(second)]
     finish(start("services.replay", recordings=both, endpoint=endpoint, speed=0.0, name="x"))
     terminate(logger)

@@ -3,17 +3,18 @@
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from threading import Timer
 
 import pytest
 
+from tests.process_replay.starting import Start, start_logger
+
 pytestmark = pytest.mark.process
 
 
 def test_it_receives_a_truck(
-    start: Callable[..., subprocess.Popen[str]],
+    start: Start,
     endpoint: str,
     recording: Path,
     tmp_path: Path,
@@ -24,14 +25,7 @@ def test_it_receives_a_truck(
     assert len(code) == 1
     file = tmp_path / "subscriber.py"
     file.write_text(code[0])
-    start(
-        "services.logger",
-        listen=endpoint,
-        folder=tmp_path,
-        file=tmp_path / "live.mcap",
-        realm=None,
-        site=None,
-    )
+    start_logger(start, endpoint, tmp_path / "live.mcap")
     start(
         "services.truck",
         recording=recording,
