@@ -7,9 +7,10 @@ standard normal v to the approximation, the chains move by
 
 which leaves the approximation itself invariant, and accept by what the posterior differs from it
 (preconditioned Crank-Nicolson; Cotter et al. 2013). rho = 0 proposes anew and is accepted about
-every third time; rho near one gets a chain away from where the approximation is too thin. Many
-short chains start from draws of the approximation; their agreement (split R-hat; Gelman et al.,
-BDA 3, section 11.4) tells whether to believe them.
+every third time; rho near one gets a chain away from where the approximation is too thin. A step is
+one move of each kind. What is proposed anew does not depend on where the first move ends, so that
+both are evaluated together. Many short chains start from draws of the approximation; their
+agreement (split R-hat; Gelman et al., BDA 3, section 11.4) tells whether to believe them.
 
 A coordinate may be bent: where y is the logarithm of a stiffness the data depend on its reciprocal,
 and it is w = (1 - exp(-b (y - centre)))/b, not y, in which the posterior is nearly normal.
@@ -28,8 +29,10 @@ from pre_core.search import Ending
 FloatArray = NDArray[np.float64]
 
 CHAINS = 8
-RHO = (0.0, 0.7)
-"""Taken in turn."""
+MOVES = 2
+"""Of every chain in a step: each costs one evaluation of the target."""
+_RHO = 0.7
+"""Of a step's first move; that of the second is zero."""
 _SMALLEST_SHIFT = 0.35
 _SMALLEST_STRETCH = 0.2
 _STRAIGHTEST = 1e-9
@@ -152,24 +155,41 @@ def init(target: LogDensity, normal: Approximation) -> State:
 
 
 def step(target: LogDensity, normal: Approximation, state: State) -> tuple[State, Info]:
-    """One Metropolis-Hastings step of every chain."""
+    """One step of every chain: a Metropolis-Hastings move near by, and one anywhere."""
     rng = np.random.default_rng(np.random.SeedSequence(normal.seed, spawn_key=(state.steps + 1,)))
-    rho = RHO[state.steps % len(RHO)]
-    v = rho * state.v + np.sqrt(1.0 - rho**2) * rng.standard_normal(state.v.shape)
+    drawn = rng.standard_normal((MOVES, *state.v.shape))
+    drawn[0] = _RHO * state.v + np.sqrt(1.0 - _RHO**2) * drawn[0]
+    v = drawn.reshape(MOVES * CHAINS, -1)
     y, log_q = _map(normal, v)
     log_weight = _weigh(target, y, log_q)
-    with np.errstate(invalid="ignore"):  # both impossible: infinity less infinity
-        gain = log_weight - state.log_weight
-    accepted = np.log(rng.uniform(size=CHAINS)) < gain
-    accepted |= ~np.isfinite(state.log_weight) & np.isfinite(log_weight)
-    new = State(
-        np.where(accepted[:, None], v, state.v),
-        np.where(accepted[:, None], y, state.y),
-        np.where(accepted, log_weight, state.log_weight),
-        state.steps + 1,
+    acceptance = 0.0
+    for move in range(MOVES):
+        proposed = slice(move * CHAINS, (move + 1) * CHAINS)
+        proposal = State(v[proposed], y[proposed], log_weight[proposed], state.steps)
+        state, share = _accepted(state, proposal, rng.uniform(size=CHAINS))
+        acceptance += share / MOVES
+    ending = None if np.any(np.isfinite(state.log_weight)) else Ending.NOT_FINITE
+    return (
+        state._replace(steps=state.steps + 1),
+        Info(acceptance, -2.0 * float(np.max(state.log_weight)), ending),
     )
-    ending = None if np.any(np.isfinite(new.log_weight)) else Ending.NOT_FINITE
-    return new, Info(float(accepted.mean()), -2.0 * float(np.max(new.log_weight)), ending)
+
+
+def _accepted(state: State, proposal: State, uniform: FloatArray) -> tuple[State, float]:
+    """Each chain at its proposal if that is accepted; the share of them that are."""
+    with np.errstate(invalid="ignore"):  # both impossible: infinity less infinity
+        gain = proposal.log_weight - state.log_weight
+    accepted = np.log(uniform) < gain
+    accepted |= ~np.isfinite(state.log_weight) & np.isfinite(proposal.log_weight)
+    return (
+        State(
+            np.where(accepted[:, None], proposal.v, state.v),
+            np.where(accepted[:, None], proposal.y, state.y),
+            np.where(accepted, proposal.log_weight, state.log_weight),
+            state.steps,
+        ),
+        float(accepted.mean()),
+    )
 
 
 def split_r_hat(draws: FloatArray) -> FloatArray:

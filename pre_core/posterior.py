@@ -274,7 +274,9 @@ def _at_same_places(
 
 
 def _parabola(x: FloatArray, height: FloatArray) -> FloatArray:
-    return np.asarray(np.polynomial.Polynomial.fit(x, height, 2)(x))
+    """The parabola (m,) that fits the heights (m,) best, at x."""
+    basis, _ = np.linalg.qr(np.vander((x - x.mean()) / np.ptp(x), 3))
+    return np.asarray(basis @ (basis.T @ height))
 
 
 def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:

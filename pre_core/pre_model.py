@@ -305,13 +305,16 @@ def _deflect(crossing: Crossing, work: Work, front: FloatArray) -> None:
     for w in range(2):
         piecewise_exact.sharpened(work.load[w], work.sharp[w])
         _soften_ends(crossing, front, work.part[w], work.place[w], work.sharp[w])
+    last = n  # behind the last sample at which a wheel is on the bridge nothing is asked for
+    while last > 0 and work.part[0, last - 1] < 0 and work.part[1, last - 1] < 0:
+        last -= 1
     begin = 0
     arrived = False
-    while begin < n:
+    while begin < last:
         e1, e2 = work.part[0, begin], work.part[1, begin]
         stop = begin + 1
         while (
-            stop < n
+            stop < last
             and stop - begin < _LONGEST_STRETCH
             and work.part[0, stop] == e1
             and work.part[1, stop] == e2

@@ -21,6 +21,6 @@ class IdentificationSettings(BaseModel):
     """Least squares begins at the nominal values and, where it does not converge, elsewhere."""
     particles: Annotated[int, Field(ge=4, le=100_000)] = 500
     steps: Annotated[int, Field(ge=1, le=100_000)] = 600
-    draws: Annotated[int, Field(ge=100, le=1_000_000)] = 4000
-    """Draws from the posterior of method `pre`, all chains together."""
+    draws: Annotated[int, Field(ge=100, le=1_000_000)] = 1200
+    """Draws from the posterior of method `pre`, all chains together, before they are judged."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
