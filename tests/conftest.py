@@ -26,8 +26,11 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     """With `make test`, tests that start processes or listen at a port do not run side by side.
 
     They mostly wait, and what they wait for comes late where several of them do so at a time: one
-    of the two workers takes them one after another, while the other one computes.
+    of the two workers takes them one after another, while the other one computes. A test with a
+    group of its own is left in it.
     """
+    if item.get_closest_marker("xdist_group"):
+        return
     listens = {"endpoint", "tls_endpoint"}.intersection(getattr(item, "fixturenames", ()))
     if listens or item.get_closest_marker("process"):
         item.add_marker(pytest.mark.xdist_group("processes"))

@@ -22,7 +22,8 @@ from services.common.recording import read_info, read_messages
 from services.common.runs import run_to_messages
 from services.simulation import paper_site, simulate_drive
 
-pytestmark = pytest.mark.process
+# A group of their own: they share one demo, and depend on no time-out that is short.
+pytestmark = [pytest.mark.process, pytest.mark.xdist_group("demo")]
 
 RATIOS = [1.0, 1.0, 1.0, 0.4, 1.0, 1.0, 1.0]
 NOISE_UG = 25.0
