@@ -69,6 +69,9 @@ class ResultFiles:
         """
         try:
             self._write(message, result, bridges)
+        except (InputError, FailureError):
+            self._failed = True
+            raise
         except OSError as error:
             self._failed = True
             raise FailureError(f"{self.path}: cannot be written: {error.strerror}") from error
@@ -93,7 +96,9 @@ class ResultFiles:
             write_atomically(self.path.with_suffix(".json"), results_json(content))
 
     def finish(self) -> None:
-        """Close the recording; after a failed write it stays as it is on the disk."""
+        """Close the recording; after a failed write it stays as it is on the disk, without an END:
+        what it holds last has not been published.
+        """
         if self._writer is not None and not self._failed:
             self._writer.finish("stopped by a signal", {"crossings": len(self._crossings)})
         elif self._writer is not None:
