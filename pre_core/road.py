@@ -200,7 +200,7 @@ def _welch(values: FloatArray, spacing: float, length: int) -> tuple[FloatArray,
     density[0] *= 0.5
     if length % 2 == 0:
         density[-1] *= 0.5
-    return np.fft.rfftfreq(length, spacing), np.asarray(density)
+    return np.asarray(np.fft.rfftfreq(length, spacing)), np.asarray(density)
 
 
 def iso_8608_class(coefficient_m3: float) -> str:
