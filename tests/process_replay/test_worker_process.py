@@ -1,11 +1,13 @@
-"""The worker as a process: late, disturbed, stopped."""
+"""The worker as a process: late, disturbed, stopped, killed and started again."""
 
 import os
+import resource
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -16,9 +18,9 @@ from schemas.results import load_results
 from schemas.signals import Identity
 from schemas.site import site_toml
 from schemas.topics import selector
-from services.common.bus import Publisher, Received, Subscription, open_session
+from services.common.bus import Publisher, Received, Subscription, get_latest, open_session
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.common.recording import Message, read_info, read_messages
+from services.common.recording import Message, read_info, read_messages, read_site
 from services.common.runs import GnssTrack, run_to_messages
 from services.simulation import Drive, paper_site
 
@@ -28,8 +30,10 @@ Start = Callable[..., subprocess.Popen[str]]
 End = Callable[[subprocess.Popen[str]], None]
 Begin = Callable[[], subprocess.Popen[str]]
 REALM = "sim-worker"
-LONGEST_S = 60.0
+LONGEST_S = 100.0
 """For a worker that has to compile its kernels first."""
+LARGEST_FILE = 60_000
+"""Bytes: more than the recording of one result, less than the same as JSON."""
 
 
 @pytest.fixture(scope="module")
@@ -260,3 +264,264 @@ def test_results_that_exist_are_left_alone(worker: Begin, tmp_path: Path) -> Non
     assert process.returncode == 2
     assert log.splitlines()[-1].startswith(f"{tmp_path / 'results.mcap'}: exists")
     assert (tmp_path / "results.mcap").read_bytes() == b"precious"
+
+
+class Restartable(NamedTuple):
+    """A worker that finds what earlier runs left, and what all runs together have said."""
+
+    begin: Callable[..., subprocess.Popen[str]]
+    folder: Path
+
+    def stored(self) -> list[Message]:
+        """All messages of all results files."""
+        return [m for path in self.paths() for m in read_messages(path)]
+
+    def paths(self) -> list[Path]:
+        return sorted((self.folder / REALM).glob("results-2*.mcap"))
+
+    def in_json(self) -> list[str]:
+        """Crossing ids in all JSON files."""
+        paths = sorted((self.folder / REALM).glob("results-*.json"))
+        found = (load_results(path) for path in paths)
+        return [crossing.crossing_id for one in found for crossing in one.crossings]
+
+
+@pytest.fixture
+def restartable(start: Start, endpoint: str, site: Path, tmp_path: Path) -> Restartable:
+    folder = tmp_path / "of_runs"
+
+    def begin(method: str = "least_squares") -> subprocess.Popen[str]:
+        return start(
+            "services.worker",
+            endpoint=endpoint,
+            realm=REALM,
+            site=site,
+            folder=folder,
+            file=None,
+            method=method,
+            service_id="worker",
+        )
+
+    return Restartable(begin, folder)
+
+
+WHOLE = ["crossing"] * 3 + ["estimate", "crossing", "state"]
+STATES = [pb.DETECTED, pb.COMPLETE, pb.IDENTIFYING, pb.DONE]
+Name = tuple[str, int, int]
+
+
+def name_of(message: Received | Message) -> Name:
+    if isinstance(message, Message):
+        return message.key.stream, message.boot_id, message.sequence
+    return message.key().stream, *message.identity()
+
+
+def once(received: Iterable[Received]) -> dict[Name, bytes]:
+    """What a subscriber has that tells duplicates by identity: the first of each."""
+    first: dict[Name, bytes] = {}
+    for one in received:
+        assert first.setdefault(name_of(one), one.payload) == one.payload
+    return first
+
+
+def until_whole(subscription: Subscription, told: list[Received]) -> list[Received]:
+    """Go on until everything of one crossing has been told, and a little longer."""
+    told = list(told)
+    deadline = time.monotonic() + LONGEST_S
+    while len(once(told)) < len(WHOLE) and time.monotonic() < deadline:
+        told += after(subscription, 0.2)
+    return told + after(subscription, 1.5)
+
+
+def stop(process: subprocess.Popen[str]) -> str:
+    """As an operator would, who is patient; return the log."""
+    process.terminate()
+    _, log = process.communicate(timeout=LONGEST_S)
+    assert process.returncode == 0, log
+    return log
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.communicate()
+
+
+def check_once(told: list[Received], restartable: Restartable, recorded: Path) -> None:
+    """One crossing, told once: on the bus, in the results files, and in the logger's recording."""
+    on_bus = once(told)
+    stored = {name_of(message): message.payload for message in restartable.stored()}
+    assert len(stored) == len(restartable.stored())  # none in two files
+    assert on_bus == stored
+    assert sorted(stream for stream, _, _ in on_bus) == sorted(WHOLE)
+    states = [pb.Crossing.FromString(p) for name, p in on_bus.items() if name[0] == "crossing"]
+    assert sorted(state.state for state in states) == STATES
+    (estimate,) = (pb.Estimate.FromString(p) for n, p in on_bus.items() if n[0] == "estimate")
+    assert {state.crossing_id for state in states} == {estimate.crossing_id}
+    assert restartable.in_json() == [estimate.crossing_id]
+    logged = [name_of(m) for m in read_messages(recorded) if m.key.owner == "bridge"]
+    assert sorted(logged) == sorted(on_bus)
+
+
+def test_killed_in_the_middle_of_an_identification(
+    bus: zenoh.Session,
+    restartable: Restartable,
+    site: Path,
+    project: Path,
+    tmp_path: Path,
+) -> None:
+    """Method pre, which takes seconds; killed as soon as it says how far it is."""
+    sample = project / "recordings" / "sample" / "crossing.mcap"
+    text = read_site(sample)
+    assert text is not None
+    site.write_text(text)
+    with (
+        Subscription(bus, selector(REALM, "bridge")) as results,
+        Subscription(bus, selector(REALM, "service", "progress")) as progress,
+    ):
+        publisher = Publisher(bus, REALM)
+        publish(publisher, list(read_messages(sample)))
+        process = restartable.begin("pre")
+        until(progress, "progress")
+        kill(process)
+        before = after(results, 1.0)
+        assert [received.key().stream for received in before] == ["crossing"] * 3
+        process = restartable.begin("pre")
+        told = until_whole(results, before)
+        publisher.close()
+        stop(process)
+    check_once(told, restartable, tmp_path / "recorded.mcap")
+    assert len(restartable.paths()) == 2
+
+
+@pytest.mark.slow
+def test_killed_right_after_the_estimate(
+    bus: zenoh.Session,
+    restartable: Restartable,
+    drive_on: list[Message],
+    tmp_path: Path,
+) -> None:
+    """The truck still has everything and would have its crossing identified again. Files that
+    are none, and one that was cut off, lie in the way."""
+    folder = restartable.folder / REALM
+    folder.mkdir(parents=True)
+    (folder / "results-19990101T000000Z.mcap").write_bytes(b"")
+    (folder / "results-19990101T000001Z.mcap").write_bytes(b"no recording" * 1000)
+    with (
+        Subscription(bus, selector(REALM, "bridge")) as results,
+        Subscription(bus, selector(REALM, "service", "health")) as health,
+    ):
+        publisher = Publisher(bus, REALM)
+        publish(publisher, drive_on)
+        process = restartable.begin()
+        told = until(results, "estimate")
+        kill(process)
+        (path,) = restartable.paths()
+        cut_off = path.read_bytes()
+        (folder / "results-19990101T000002Z.mcap").write_bytes(cut_off[: len(cut_off) // 2])
+        after(health, 0.1)
+        process = restartable.begin()
+        until(health, "health")
+        told = until_whole(results, told) + after(results, 2.5)  # the history is looked at by now
+        latest = [
+            pb.BridgeState.FromString(p)
+            for p in get_latest(bus, selector(REALM, "bridge", "state"))
+        ]
+        publisher.close()
+        log = stop(process)
+    check_once(told, restartable, tmp_path / "recorded.mcap")
+    (state,) = latest
+    estimate = next(pb.Estimate.FromString(r.payload) for r in told if r.key().stream == "estimate")
+    assert list(state.crossings_used) == [estimate.crossing_id]
+    for number in range(2):
+        assert f"results-19990101T00000{number}Z.mcap" in log
+
+
+def test_what_is_on_the_disk_and_not_on_the_bus(
+    bus: zenoh.Session,
+    restartable: Restartable,
+    drive_on: list[Message],
+    tmp_path: Path,
+) -> None:
+    """The estimate is in the recording, the larger JSON file does not fit on the disk any more,
+    and so the worker ends between the two. Its truck has gone when the next run begins."""
+    with (
+        Subscription(bus, selector(REALM, "bridge")) as results,
+        Subscription(bus, selector(REALM, "service", "health")) as health,
+    ):
+        process = restartable.begin()
+        until(health, "health")
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (LARGEST_FILE, LARGEST_FILE))
+        publisher = Publisher(bus, REALM)
+        publish(publisher, drive_on)
+        _, log = process.communicate(timeout=LONGEST_S)
+        assert process.returncode == 1, log
+        publisher.close()
+        told = after(results, 0.5)
+        assert [received.key().stream for received in told] == ["crossing"] * 3
+        assert [m.key.stream for m in restartable.stored()] == ["crossing"] * 3 + ["estimate"]
+        process = restartable.begin()
+        told = until_whole(results, told)
+        stop(process)
+    check_once(told, restartable, tmp_path / "recorded.mcap")
+
+
+@pytest.mark.slow
+def test_a_signal_while_a_truck_that_may_have_left_is_waited_for(
+    bus: zenoh.Session,
+    restartable: Restartable,
+    drive_on: list[Message],
+    tmp_path: Path,
+) -> None:
+    """Nobody would give the next run its data: the crossing is decided before the end."""
+    began_ns = drive_on[0].log_time_ns
+    short = [m for m in drive_on if m.log_time_ns - began_ns < 7_200_000_000]
+    with (
+        Subscription(bus, selector(REALM, "bridge")) as results,
+        Subscription(bus, selector(REALM, "service", "health")) as health,
+    ):
+        process = restartable.begin()
+        until(health, "health")
+        publisher = Publisher(bus, REALM)
+        publish(publisher, short)
+        told = until(results, "crossing")
+        publisher.close()
+        stop(process)
+        told += after(results, 1.5)
+        check_once(told, restartable, tmp_path / "recorded.mcap")
+        after(health, 0.1)
+        process = restartable.begin()
+        again = until(results, "state") + until(health, "health") + after(results, 1.5)
+        stop(process)
+    again = [received for received in again if received.key().owner == "bridge"]
+    assert [name_of(received) for received in again] == [name_of(told[-1])]
+    check_once(told + again, restartable, tmp_path / "recorded.mcap")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(8))
+def test_killed_at_random_moments(
+    bus: zenoh.Session,
+    restartable: Restartable,
+    drive_on: list[Message],
+    tmp_path: Path,
+    seed: int,
+) -> None:
+    """Three times, each from the time on at which the worker has begun to listen."""
+    rng = np.random.default_rng(seed)
+    with (
+        Subscription(bus, selector(REALM, "bridge")) as results,
+        Subscription(bus, selector(REALM, "service", "health")) as health,
+    ):
+        publisher = Publisher(bus, REALM)
+        publish(publisher, drive_on)
+        for _ in range(3):
+            process = restartable.begin()
+            until(health, "health")
+            time.sleep(rng.uniform(0.8, 2.5))  # after a second the history is looked at
+            kill(process)
+        process = restartable.begin()
+        told = until_whole(results, [])
+        publisher.close()
+        stop(process)
+        told += after(results, 0.5)
+    check_once(told, restartable, tmp_path / "recorded.mcap")
