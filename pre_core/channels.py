@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.windowed_sinc import kaiser_beta, windowed_sinc
+
 FloatArray = NDArray[np.float64]
 
 Z, V, A, A_1, A_2, A_3 = range(6)
@@ -84,10 +86,9 @@ def low_pass(
     width = stop_share - pass_share
     count = int(np.ceil((stop_band_db - 7.95) / (14.36 * width))) + 1
     count |= 1
-    n = np.arange(count) - count // 2
-    beta = 0.1102 * (stop_band_db - 8.7)
-    window = np.i0(beta * np.sqrt(1.0 - (n / (count // 2 + 1)) ** 2)) / np.i0(beta)
-    taps = np.sinc((pass_share + stop_share) * n) * window
+    n = np.arange(count, dtype=np.float64) - count // 2
+    cutoff = 0.5 * (pass_share + stop_share)
+    taps = windowed_sinc(n, cutoff, count // 2 + 1, kaiser_beta(stop_band_db))
     return np.asarray(taps / taps.sum())
 
 
@@ -116,8 +117,7 @@ def read_between(samples: FloatArray, place: FloatArray) -> FloatArray:
     What lies below 0.45 of the rate is read as it is. NaN where the sinc does not see enough
     samples on both sides (`SEEN_ASIDE`).
     """
-    width = 1.0 - 2.0 * _SENSOR_PASS
-    beta = 0.1102 * (_STOP_BAND_DB - 8.7)
+    beta = kaiser_beta(_STOP_BAND_DB)
     below = np.floor(place).astype(np.int64)
     offsets = np.arange(1 - SEEN_ASIDE, SEEN_ASIDE + 1)
     result = np.full(place.size, np.nan)
@@ -125,8 +125,8 @@ def read_between(samples: FloatArray, place: FloatArray) -> FloatArray:
     for begin in range(0, inside.size, _BLOCK):  # in blocks, to bound memory
         at = inside[begin : begin + _BLOCK]
         distance = offsets - (place[at] - below[at])[:, None]
-        window = np.i0(beta * np.sqrt(np.maximum(0.0, 1.0 - (distance / SEEN_ASIDE) ** 2))) - 1.0
-        weight = np.sinc((2.0 * _SENSOR_PASS + width) * distance) * window
+        # The middle of the gap between the pass band and its image is half the rate.
+        weight = windowed_sinc(distance, 0.5, SEEN_ASIDE, beta, pedestal=1.0)
         weight /= weight.sum(axis=1, keepdims=True)  # a constant stays what it is
         result[at] = np.einsum("mj,mj->m", weight, samples[below[at][:, None] + offsets])
     return result

@@ -22,6 +22,7 @@ from pre_core.drs import BeamBasis
 from pre_core.lanes import LANES, kernel, summing
 from pre_core.parameters import C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1
 from pre_core.whitening import RESIDUALS, RowFilter, Whitener, row_count, whiten_into
+from pre_core.windowed_sinc import kaiser_beta, windowed_sinc
 
 FloatArray = NDArray[np.float64]
 
@@ -135,11 +136,8 @@ def _sinc_weights(phase: FloatArray) -> FloatArray:
     width = 1.0 - STOP - PASS
     half = _SINC_TAPS // 2
     attenuation = 14.36 * width * (_SINC_TAPS - 1) + 7.95
-    beta = 0.1102 * (attenuation - 8.7)
     distance = np.arange(_SINC_TAPS) - (half - 1) - phase[:, None]
-    # Less one: nothing at the ends, so that a tap which comes or goes changes nothing.
-    window = np.i0(beta * np.sqrt(np.maximum(0.0, 1.0 - (distance / half) ** 2))) - 1.0
-    weight = np.sinc(2.0 * cutoff * distance) * window
+    weight = windowed_sinc(distance, cutoff, half, kaiser_beta(attenuation), pedestal=1.0)
     # Integrated accelerations drift far; parabolas are read exactly, wherever the taps begin.
     powers = distance[:, None, :] ** np.arange(3)[:, None]
     moments = np.einsum("pit,pjt,pt->pij", powers, powers, weight)

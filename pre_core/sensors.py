@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.simulate import STANDARD_GRAVITY_M_PER_S2
+from pre_core.windowed_sinc import kaiser_beta, windowed_sinc
 
 FloatArray = NDArray[np.float64]
 
@@ -121,8 +122,6 @@ def resample(samples: FloatArray, rate_hz: float, new_rate_hz: float, delay_s: f
         cutoff = stop - 0.5 * width
         taps = (_STOP_BAND_DB - 7.95) / (2.285 * 2.0 * np.pi * width)  # Kaiser's formula
         half_length = max(_SMALLEST_HALF_LENGTH, int(np.ceil(taps / 2.0)))
-    from scipy.signal import kaiser_beta  # slow to import, seldom needed
-
     beta = kaiser_beta(_STOP_BAND_DB)
     offsets = np.arange(1 - half_length, half_length + 1)
     result = np.empty(count)
@@ -133,8 +132,7 @@ def resample(samples: FloatArray, rate_hz: float, new_rate_hz: float, delay_s: f
         # At most rates the samples lie at a few different places between the input samples.
         place, which = np.unique(np.round(wanted - first, 9), return_inverse=True)
         distance = offsets - place[:, None]
-        window = np.i0(beta * np.sqrt(np.maximum(0.0, 1.0 - (distance / half_length) ** 2)))
-        weight = np.sinc(2.0 * cutoff * distance) * window
+        weight = windowed_sinc(distance, cutoff, half_length, beta)
         weight /= weight.sum(axis=1, keepdims=True)  # a constant stays what it is
         values = samples[np.clip(index, 0, samples.size - 1)]
         result[begin : begin + _BLOCK] = np.einsum("mj,mj->m", weight[which], values)

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import scipy.signal
 from numpy.typing import NDArray
 
 from pre_core.channels import PASS, STOP
 from pre_core.pre_model import _weighted, sinc_table
+from pre_core.windowed_sinc import kaiser_beta, windowed_sinc
 
 FloatArray = NDArray[np.float64]
 
@@ -94,3 +96,17 @@ def test_images_are_gone() -> None:
         response = abs(weight @ np.exp(2j * np.pi * share * offsets))
         of = abs(share - round(share))
         assert response < (5e-5 if of <= PASS else 0.025), (share, response)
+
+
+@pytest.mark.parametrize("stop_band_db", [60.0, 90.0])
+def test_the_window_is_kaisers(stop_band_db: float) -> None:
+    """At whole distances, and with a cutoff that makes the sinc one in the middle alone."""
+    reach = 20
+    beta = kaiser_beta(stop_band_db)
+    assert beta == pytest.approx(scipy.signal.kaiser_beta(stop_band_db), rel=1e-14)
+    distance = np.arange(-reach, reach + 1.0)
+    ours = windowed_sinc(distance, 0.1, reach, beta)
+    expected = np.sinc(0.2 * distance) * scipy.signal.windows.kaiser(2 * reach + 1, beta)
+    np.testing.assert_allclose(ours / ours[reach], expected, atol=1e-15)
+    ends = windowed_sinc(distance[[0, -1]], 0.1, reach, beta, pedestal=1.0)
+    np.testing.assert_allclose(ends, 0.0, atol=1e-15)
