@@ -520,7 +520,8 @@ def test_killed_at_random_moments(
             time.sleep(rng.uniform(0.8, 2.5))  # after a second the history is looked at
             kill(process)
         process = restartable.begin()
-        told = until_whole(results, [])
+        until(health, "health")
+        told = until_whole(results, []) + after(results, 2.5)  # the history is looked at by now
         publisher.close()
         stop(process)
         told += after(results, 0.5)

@@ -165,22 +165,25 @@ def test_the_results_file_counts_the_crossing_that_it_is_written_for() -> None:
     assert [used for _, used in counted] == [(crossing_id,) for crossing_id, _ in counted]
 
 
-@pytest.mark.parametrize("begin_s", [6.5, 7.0, 9.0])
+SLOW = ((0.0, -30.0), (40.0, 90.0))
+"""On the bridge from 10 to 21.5 s: far longer than two entries of one crossing are apart."""
+
+
+@pytest.mark.parametrize("begin_s", [10.5, 15.5, 17.0])
 def test_a_history_that_begins_on_the_bridge_is_no_second_crossing(begin_s: float) -> None:
-    """The truck was on the bridge from 6 to 9.4 s and the cache goes back to its middle only."""
-    rest = messages_of(*THERE, begin_s=begin_s)
+    """The truck's cache goes back to the middle of the bridge only."""
+    rest = messages_of(*SLOW, begin_s=begin_s)
     assert fed_all_alone(rest)  # there is something to be mistaken
-    assert resumed(said_by(WHOLE[:6]), rest) == []
+    assert resumed(said_by(fed_all_alone(messages_of(*SLOW))), rest) == []
 
 
 @pytest.mark.parametrize("told", [1, 3])
 def test_half_a_crossing_that_was_told_of_keeps_its_name(told: int) -> None:
-    rest = messages_of(*THERE, begin_s=7.0)
-    after = resumed(said_by(WHOLE[:told]), rest)
+    whole = fed_all_alone(messages_of(*SLOW))
+    after = resumed(said_by(whole[:told]), messages_of(*SLOW, begin_s=17.0))
     assert len([o for o in after if o.result]) == 1
-    known = states(WHOLE)[0].crossing_id
-    assert {state.crossing_id for state in states(after)} == {known}
-    assert [s.state for s in states(WHOLE[:told] + after)] == [1, 2, 4, 5]
+    assert {state.crossing_id for state in states(after)} == {states(whole)[0].crossing_id}
+    assert [s.state for s in states(whole[:told] + after)] == [1, 2, 4, 5]
 
 
 def fed_all_alone(messages: list[Message]) -> list[Output]:
