@@ -1,4 +1,4 @@
-"""Logger, truck and replay as processes of the command line, each with its own certificate."""
+"""Services as processes of the command line, each with its own certificate."""
 
 import contextlib
 import signal
@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 import zenoh
 
+from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Channel
 from schemas.spool import spool_selector
-from schemas.topics import Key
-from services.common.bus import open_session
+from schemas.topics import Key, selector
+from services.common.bus import Subscription, open_session
 from services.common.errors import InputError
-from services.common.recording import read_messages
+from services.common.recording import read_messages, read_site
 from services.common.spool import Spool
 from services.truck import Gateway
 
@@ -51,6 +52,12 @@ def driveby() -> Iterator[Driveby]:
         if process.poll() is None:
             process.kill()
         process.communicate()
+
+
+def until(is_so: Callable[[], bool], timeout_s: float = 60.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not is_so():
+        assert time.monotonic() < deadline, "not in time"
 
 
 def identities(folder: Path) -> list[tuple[Key, int, int]]:
@@ -89,6 +96,48 @@ def test_everything_is_recorded_under_access_control(
     assert {key.realm for key, _, _ in found} == {"live", "replay-x"}
     for key in credentials.glob("*/key.pem"):
         assert key.read_text().splitlines()[1] not in log
+
+
+def test_a_crossing_is_identified_under_access_control(
+    driveby: Driveby, credentials: Path, tls_endpoint: str, project: Path, tmp_path: Path
+) -> None:
+    """Truck, logger, worker and viewer, each with what its own certificate lets it say and hear."""
+    crossing = project / "tests" / "data" / "noise_free.mcap"
+    site = tmp_path / "site.toml"
+    site.write_text(read_site(crossing) or "")
+    bus = ["--endpoint", tls_endpoint, "--tls"]
+    folder = tmp_path / "r"
+    driveby("logger", "--listen", tls_endpoint, "--tls", credentials / "logger", "--folder", folder)
+    worker = driveby(
+        *("worker", "--site", site, "--method", "least-squares"),
+        *("--file", tmp_path / "results.mcap", *bus, credentials / "worker"),
+    )
+    with (
+        open_session(connect=tls_endpoint, timeout_s=20.0, tls=credentials / "viewer") as session,
+        Subscription(session, selector("live", "service", "health")) as health,
+        Subscription(session, selector("live", "bridge")) as results,
+    ):
+
+        def is_listening() -> bool:
+            one = health.receive(0.2)
+            return one is not None and one.key().identifier == "worker"
+
+        until(is_listening)
+        truck = driveby("truck", crossing, "--speed", 20, *bus, credentials / "truck-1")
+        assert truck.wait(timeout=60) == 0
+        heard: dict[str, bytes] = {}
+
+        def is_told() -> bool:
+            one = results.receive(0.2)
+            if one is not None:
+                heard[one.key().stream] = one.payload
+            return "state" in heard
+
+        until(is_told)
+    worker.terminate()
+    assert worker.wait(timeout=30) == 0
+    found = pb.Estimate.FromString(heard["estimate"]).parameters
+    assert found["EI_4"].mean / found["EI_3"].mean == pytest.approx(0.4, rel=0.01)
 
 
 @pytest.mark.parametrize(
