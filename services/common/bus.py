@@ -78,9 +78,10 @@ _MAX_SOURCES = 10_000
 _PATIENCE_WITH_SUBSCRIBER_US = 1_000_000
 """Zenoh's own is 5 s; who is cut off connects again and gets what it missed."""
 _QUERIES_WAITING = 100
-_RUNTIME = "(rx: (handover: acc))"
+_RUNTIME = "(rx: (handover: acc), acc: (worker_threads: 2))"
 """Of a router: what comes is read by the threads that wait for it. Zenoh's own pool of receiving
-threads has to be woken for every message, which costs more than all that it does with one."""
+threads has to be woken for every message, which costs more than all that it does with one. There
+are two, as new connections wait for them too and one may be held up by a frozen subscriber."""
 _SourceName = tuple[str, zenoh.ZenohId, int]
 """A key, and a publisher of Zenoh: session and number in it."""
 _DURABLES_WAITING = 100
@@ -127,6 +128,9 @@ def open_session(
     and a router lets everybody say and hear only what its access control allows. Without it only
     this machine can be listened to, unless `insecure` says that whoever reaches the address may
     say and hear everything.
+
+    A process whose first session is a router's has Zenoh's threads set up for many publishers, by
+    the environment variable ZENOH_RUNTIME, unless it is set already.
 
     InputError for a malformed endpoint, bad credentials, or an address open to strangers;
     FailureError if nobody answers in time or the address cannot be listened at.
@@ -378,8 +382,8 @@ class Subscription:
     ) -> None:
         """Subscribe; `capacity` messages may wait (default: the largest of the topic table).
 
-        More would make the publishers wait, and after 5 s Zenoh cuts the connection: receive
-        quickly and do long work in another thread.
+        More would make the publishers wait, and after a second the router cuts the connection:
+        receive quickly and do long work in another thread.
         """
         self._session = session
         self._fetched: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
