@@ -175,11 +175,12 @@ def _take_all(
         while not closing.is_set():
             received = vehicles.receive(_POLL_S)
             token = alive.handler.try_recv()
+            now_s = time.monotonic()
             try:
                 if token is not None:
                     key = parse_key(str(token.key_expr))
                     is_alive = token.kind == zenoh.SampleKind.PUT
-                    _put(arrivals, Token(key.realm, key.identifier, is_alive), closing)
+                    _put(arrivals, Token(key.realm, key.identifier, is_alive, now_s), closing)
                 if received is None:
                     continue
                 key, identity = received.key(), received.identity()
@@ -187,7 +188,8 @@ def _take_all(
                 _log.warning("refused: %.200s", error)
                 continue
             if key.stream in ("accel", "gnss") and seen.add(key, identity):
-                _put(arrivals, Arrived(key, identity.boot_id, received.payload), closing)
+                arrived = Arrived(key, identity.boot_id, received.payload, now_s)
+                _put(arrivals, arrived, closing)
     alive.undeclare()  # type: ignore[no-untyped-call]
 
 
@@ -241,14 +243,16 @@ def _serve(
             next_health_s = time.monotonic() + _HEALTH_PERIOD_S
             _say_health(publisher, service_id, queued.qsize())
         batch: list[Arrived] = []
-        with contextlib.suppress(queue.Empty):
-            one = queued.get(timeout=_POLL_S)
-            if isinstance(one, Token):
-                arrivals.note(one, time.monotonic())
-            else:
-                batch += arrivals.add(one, time.monotonic())
+        one = _next(queued)
+        # After a long identification the queue holds what came meanwhile: whether a truck has gone
+        # is told by when its messages came, not by when they are looked at.
+        now_s = time.monotonic() if one is None else one.received_s
+        if isinstance(one, Token):
+            arrivals.note(one)
+        elif one is not None:
+            batch += arrivals.add(one)
         # In this order: what has come in the queue is newer than a history that is due.
-        for arrived in arrivals.due(time.monotonic()) + batch:
+        for arrived in arrivals.due(now_s) + batch:
             if stop.is_set() and not arrivals.is_leaving(arrived.key):
                 continue  # the next run gets it from the truck again
             try:
@@ -258,12 +262,19 @@ def _serve(
                 _log.warning("refused %s: %s", name, error)
         if stop.is_set():
             arrivals.hurry()
-        for gone in arrivals.gone(time.monotonic()):
+        for gone in arrivals.gone(now_s):
             said = engine.gone(gone.realm, gone.vehicle, for_good=gone.for_good)
             _publish(said, engine, publisher, files)
         for vehicle in engine.unknown_vehicles - told:
             told.add(vehicle)
             _log.warning("%s drives, but the site file has no such vehicle", vehicle)
+
+
+def _next(queued: _Queue) -> Arrived | Token | None:
+    try:
+        return queued.get(timeout=_POLL_S)
+    except queue.Empty:
+        return None
 
 
 def _may_lose(engine: Engine, arrivals: Arrivals) -> bool:

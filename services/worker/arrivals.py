@@ -23,6 +23,8 @@ class Arrived(NamedTuple):
     key: Key
     boot_id: int
     payload: bytes
+    received_s: float
+    """When it came, on any steady clock: it may wait long before anybody looks at it."""
 
 
 class Token(NamedTuple):
@@ -31,6 +33,7 @@ class Token(NamedTuple):
     realm: str
     vehicle: str
     is_alive: bool
+    received_s: float
 
 
 class Gone(NamedTuple):
@@ -55,8 +58,10 @@ _Vehicle = tuple[str, str]
 
 
 class Arrivals:
-    """Puts what comes in the order in which it is to be looked at; takes the moments at which
-    things come (s, any steady clock).
+    """Puts what comes in the order in which it is to be looked at.
+
+    What came first must be told first. `now_s` is a moment up to which everything that came has
+    been told: where more waits, the moment at which the last that was told came, not the clock's.
     """
 
     def __init__(self) -> None:
@@ -68,20 +73,20 @@ class Arrivals:
         self._lost: dict[_Vehicle, float] = {}
         """When a truck that has gone is taken not to come back."""
 
-    def add(self, arrived: Arrived, now_s: float) -> list[Arrived]:
+    def add(self, arrived: Arrived) -> list[Arrived]:
         """Take a message in; return it if it can be looked at now."""
         truck = (arrived.key.realm, arrived.key.identifier)
         if truck not in self._alive:
-            self._leaves[truck] = _Leave(now_s, _SILENT_S)
+            self._leaves[truck] = _Leave(arrived.received_s, _SILENT_S)
             self._lost.pop(truck, None)
         name = (arrived.key.realm, arrived.key.identifier, arrived.boot_id)
         if name in self._known:
             return [arrived]
         self._new.setdefault(name, []).append(arrived)
-        self._since.setdefault(name, now_s)
+        self._since.setdefault(name, arrived.received_s)
         return []
 
-    def note(self, token: Token, now_s: float) -> None:
+    def note(self, token: Token) -> None:
         """Note that a truck has come or gone."""
         truck = (token.realm, token.vehicle)
         if token.is_alive:
@@ -90,7 +95,7 @@ class Arrivals:
             self._lost.pop(truck, None)
         else:
             self._alive.discard(truck)
-            self._leaves[truck] = _Leave(now_s, _GONE_AFTER_S)
+            self._leaves[truck] = _Leave(token.received_s, _GONE_AFTER_S)
 
     def due(self, now_s: float) -> list[Arrived]:
         """What trucks that are new have sent in their first second, in order of time."""

@@ -1,0 +1,148 @@
+"""In which order and when the worker looks at what comes from the bus."""
+
+import queue
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.results import Header
+from schemas.settings import IdentificationSettings
+from schemas.topics import Key
+from services import worker
+from services.common.bus import Publisher
+from services.simulation import paper_site
+from services.worker.arrivals import Arrivals, Arrived, Gone, Token
+from services.worker.engine import Engine, Output
+from services.worker.result_files import ResultFiles
+
+REALM = "live"
+SETTINGS = IdentificationSettings(method="least_squares")
+HEADER = Header("0", 0.0, "abc", SETTINGS.model_dump(mode="json"), SETTINGS.seed)
+
+
+def message(at_s: float, number: int = 0, truck: str = "truck-1", boot_id: int = 1) -> Arrived:
+    payload = pb.AccelBatch(device_time_ns=number).SerializeToString()
+    return Arrived(Key(REALM, "vehicle", truck, "accel"), boot_id, payload, at_s)
+
+
+def token(at_s: float, *, is_alive: bool, truck: str = "truck-1") -> Token:
+    return Token(REALM, truck, is_alive, at_s)
+
+
+def gone(*, for_good: bool = False, truck: str = "truck-1") -> Gone:
+    return Gone(REALM, truck, for_good)
+
+
+def test_the_first_second_of_a_truck_is_put_in_order_of_time() -> None:
+    arrivals = Arrivals()
+    history = [message(0.0, 5), message(0.4, 2), message(0.9, 7)]
+    assert [arrivals.add(one) for one in history] == [[], [], []]
+    assert arrivals.due(0.99) == []
+    assert arrivals.due(1.0) == [history[1], history[0], history[2]]
+    assert arrivals.due(2.0) == []
+    late = message(3.0, 1)
+    assert arrivals.add(late) == [late]
+    assert arrivals.add(message(3.0, 1, boot_id=2)) == []  # that boot is new
+
+
+def test_what_is_malformed_is_looked_at_all_the_same() -> None:
+    arrivals = Arrivals()
+    broken = message(0.0)._replace(payload=b"\xff\xff")
+    arrivals.add(broken)
+    assert arrivals.due(1.0) == [broken]
+
+
+def test_a_truck_whose_token_has_gone() -> None:
+    arrivals = Arrivals()
+    arrivals.note(token(0.0, is_alive=True))
+    arrivals.add(message(0.0))
+    assert arrivals.gone(500.0) == []
+    arrivals.note(token(500.0, is_alive=False))
+    assert arrivals.gone(502.9) == []
+    assert arrivals.gone(503.0) == [gone()]
+    assert arrivals.gone(619.9) == []
+    assert arrivals.gone(620.0) == [gone(for_good=True)]
+    assert arrivals.gone(1e6) == []
+
+
+@pytest.mark.parametrize("back_s", [502.0, 600.0])
+def test_a_truck_whose_token_comes_back(back_s: float) -> None:
+    arrivals = Arrivals()
+    arrivals.note(token(500.0, is_alive=False))
+    before = arrivals.gone(back_s)
+    assert before == ([] if back_s < 503.0 else [gone()])
+    arrivals.note(token(back_s, is_alive=True))
+    assert arrivals.gone(1e6) == []
+
+
+def test_a_truck_without_token_has_gone_when_it_is_silent() -> None:
+    arrivals = Arrivals()
+    arrivals.add(message(0.0))
+    arrivals.add(message(9.0))
+    assert arrivals.gone(18.9) == []
+    assert arrivals.is_leaving(message(0.0).key)
+    assert arrivals.leaving() == {(REALM, "truck-1"): True}
+    arrivals.due(18.9)
+    assert arrivals.leaving() == {(REALM, "truck-1"): False}
+    assert arrivals.gone(19.0) == [gone()]
+    arrivals.add(message(100.0))
+    assert arrivals.gone(110.0) == [gone()]  # and not for good: it has spoken
+
+
+def test_who_is_in_a_hurry_waits_as_for_a_token() -> None:
+    arrivals = Arrivals()
+    arrivals.add(message(0.0))
+    arrivals.hurry()
+    assert arrivals.gone(2.9) == []
+    assert arrivals.gone(3.0) == [gone()]
+
+
+class Watched(Engine):
+    """An engine that notes what it is given, and stops the service at a payload."""
+
+    def __init__(self, stop: threading.Event, last: bytes) -> None:
+        super().__init__(paper_site(), SETTINGS, HEADER)
+        self.stop, self.last = stop, last
+        self.seen: list[Gone | bytes] = []
+
+    def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
+        self.seen.append(payload)
+        if payload == self.last:
+            self.stop.set()
+        return iter(())
+
+    def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Output]:
+        self.seen.append(Gone(realm, vehicle, for_good))
+        return iter(())
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> ResultFiles:
+    return ResultFiles(tmp_path / "results.mcap", "", HEADER, None)
+
+
+@pytest.mark.parametrize("away_s", [1.0, 50.0])
+def test_who_is_back_in_the_queue_has_not_gone(
+    files: ResultFiles, monkeypatch: pytest.MonkeyPatch, away_s: float
+) -> None:
+    """All this came during an identification of a quarter of an hour, and is looked at after it."""
+    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
+    monkeypatch.setattr("services.worker.time.monotonic", lambda: 1000.0)
+    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    with_token = [
+        token(0.0, is_alive=True),
+        message(0.0, 1),
+        message(5.0, 2),
+        token(6.0, is_alive=False),
+        token(6.0 + away_s, is_alive=True),
+        message(7.0 + away_s, 3),
+    ]
+    for one in with_token:
+        queued.put(one)
+    stop = threading.Event()
+    engine = Watched(stop, message(0.0, 3).payload)
+    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, threading.Event(), None)
+    assert engine.seen == [message(0.0, number).payload for number in (1, 2, 3)]
