@@ -10,6 +10,7 @@ last five minutes).
 
 import contextlib
 import logging
+import os
 import queue
 import threading
 import time
@@ -44,6 +45,8 @@ _POLL_S = 0.1
 _HEALTH_PERIOD_S = 60.0
 _LONGEST_QUEUE = 200_000
 _CONNECT_S = 1.0
+_EXIT_AT_ONCE = 130
+"""What a shell reports of a program that was interrupted."""
 _EVERY_RUN_ANEW = ("replay-", "import-")
 """Who replays a recording twice wants it twice."""
 
@@ -89,8 +92,7 @@ def run(
     if file.exists():
         raise InputError(f"{file}: exists, and results are never overwritten; give another name")
     files = ResultFiles(file, text, header, earlier.previous)
-    at_once = threading.Event()
-    with stopped_by_signals(at_once.set) as stop, contextlib.ExitStack() as stack:
+    with stopped_by_signals(_leave_at_once) as stop, contextlib.ExitStack() as stack:
         warm_up()
         bus = _connected(endpoint, tls, stop)
         if bus is None:
@@ -113,7 +115,7 @@ def run(
         try:
             _resume(engine, earlier, publisher, files)
             receiver.start()
-            _serve(engine, arrivals, publisher, service_id, files, stop, at_once, ready)
+            _serve(engine, arrivals, publisher, service_id, files, stop, ready)
         finally:
             closing.set()
             if receiver.is_alive():
@@ -123,6 +125,11 @@ def run(
         if failed.is_set():
             raise FailureError(f"{endpoint}: the connection to the bus failed, see the log")
     return 0
+
+
+def _leave_at_once() -> None:
+    # What was published is on the disk, and the next run takes it up as after a `kill -9`.
+    os._exit(_EXIT_AT_ONCE)
 
 
 def _check_names(realm: str, service_id: str) -> None:
@@ -227,18 +234,15 @@ def _serve(
     service_id: str,
     files: ResultFiles,
     stop: threading.Event,
-    at_once: threading.Event,
     ready: Callable[[], None] | None,
 ) -> None:
-    """Identify until `stop`, and then what nobody would give to the next run, unless `at_once`."""
+    """Identify until `stop`, and then what nobody would give to the next run."""
     arrivals = Arrivals()
     told: set[str] = set()
     next_health_s = 0.0
     if ready is not None:
         ready()
-    while not stop.is_set() or (
-        not at_once.is_set() and (not queued.empty() or _may_lose(engine, arrivals))
-    ):
+    while not stop.is_set() or not queued.empty() or _may_lose(engine, arrivals):
         if time.monotonic() >= next_health_s:
             next_health_s = time.monotonic() + _HEALTH_PERIOD_S
             _say_health(publisher, service_id, queued.qsize())

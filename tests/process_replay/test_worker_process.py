@@ -393,6 +393,28 @@ def test_killed_in_the_middle_of_an_identification(
     assert len(restartable.paths()) == 2
 
 
+def test_a_second_signal_ends_it_in_the_middle_of_an_identification(
+    bus: zenoh.Session, restartable: Restartable, site: Path, project: Path
+) -> None:
+    sample = project / "recordings" / "sample" / "crossing.mcap"
+    text = read_site(sample)
+    assert text is not None
+    site.write_text(text)
+    with Subscription(bus, selector(REALM, "service", "progress")) as progress:
+        publisher = Publisher(bus, REALM)
+        publish(publisher, list(read_messages(sample)))
+        process = restartable.begin("pre")
+        until(progress, "progress")
+        process.terminate()
+        time.sleep(0.3)
+        assert process.poll() is None  # the first one lets it finish
+        process.terminate()
+        _, log = process.communicate(timeout=LONGEST_S)
+        publisher.close()
+    assert process.returncode == 130, log
+    assert [message.key.stream for message in restartable.stored()] == ["crossing"] * 3
+
+
 @pytest.mark.slow
 def test_killed_right_after_the_estimate(
     bus: zenoh.Session,

@@ -144,5 +144,5 @@ def test_who_is_back_in_the_queue_has_not_gone(
         queued.put(one)
     stop = threading.Event()
     engine = Watched(stop, message(0.0, 3).payload)
-    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, threading.Event(), None)
+    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
     assert engine.seen == [message(0.0, number).payload for number in (1, 2, 3)]
