@@ -10,6 +10,7 @@ last five minutes).
 
 import contextlib
 import logging
+import math
 import os
 import queue
 import threading
@@ -32,7 +33,7 @@ from services.common.errors import FailureError, InputError
 from services.common.files import read_text
 from services.common.playback import stopped_by_signals
 from services.common.recording import Message, program_version
-from services.worker.arrivals import Arrivals, Arrived, Token
+from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
 from services.worker.engine import Engine, Output
 from services.worker.result_files import Earlier, ResultFiles, read_earlier
 from services.worker.warm_up import warm_up
@@ -236,13 +237,21 @@ def _serve(
     stop: threading.Event,
     ready: Callable[[], None] | None,
 ) -> None:
-    """Identify until `stop`, and then what nobody would give to the next run."""
+    """Identify until `stop`, and then what nobody would give to the next run.
+
+    Of that only what comes until `GONE_AFTER_S` after the stop was seen.
+    """
     arrivals = Arrivals()
     told: set[str] = set()
     next_health_s = 0.0
+    leave_at_s = math.inf
+    now_s = time.monotonic()
     if ready is not None:
         ready()
-    while not stop.is_set() or not queued.empty() or _may_lose(engine, arrivals):
+    # Who goes on talking goes on to the next run, too: what comes so late is not waited for.
+    while now_s < leave_at_s and (
+        not stop.is_set() or not queued.empty() or _may_lose(engine, arrivals)
+    ):
         if time.monotonic() >= next_health_s:
             next_health_s = time.monotonic() + _HEALTH_PERIOD_S
             _say_health(publisher, service_id, queued.qsize())
@@ -265,6 +274,7 @@ def _serve(
                 name = f"{arrived.key.stream} of {arrived.key.identifier}"
                 _log.warning("refused %s: %s", name, error)
         if stop.is_set():
+            leave_at_s = min(leave_at_s, time.monotonic() + GONE_AFTER_S)
             arrivals.hurry()
         for gone in arrivals.gone(now_s):
             said = engine.gone(gone.realm, gone.vehicle, for_good=gone.for_good)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 from schemas.topics import Key
 from services.common.streams import device_time_ns
 
-_GONE_AFTER_S = 3.0
+GONE_AFTER_S = 3.0
 """A truck whose token has gone is given this long for what is still on its way."""
 _SILENT_S = 10.0
 """So long must a truck be silent that has no token, such as a replayed one, to have gone."""
@@ -95,7 +95,7 @@ class Arrivals:
             self._lost.pop(truck, None)
         else:
             self._alive.discard(truck)
-            self._leaves[truck] = _Leave(token.received_s, _GONE_AFTER_S)
+            self._leaves[truck] = _Leave(token.received_s, GONE_AFTER_S)
 
     def due(self, now_s: float) -> list[Arrived]:
         """What trucks that are new have sent in their first second, in order of time."""
@@ -128,7 +128,7 @@ class Arrivals:
     def hurry(self) -> None:
         """Wait for nobody longer than for a truck whose token has gone."""
         for truck, leave in self._leaves.items():
-            patience_s = min(leave.patience_s, _GONE_AFTER_S)
+            patience_s = min(leave.patience_s, GONE_AFTER_S)
             self._leaves[truck] = leave._replace(patience_s=patience_s)
 
 

@@ -1,5 +1,6 @@
 """In which order and when the worker looks at what comes from the bus."""
 
+import itertools
 import queue
 import threading
 from collections.abc import Iterator
@@ -146,3 +147,41 @@ def test_who_is_back_in_the_queue_has_not_gone(
     engine = Watched(stop, message(0.0, 3).payload)
     worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
     assert engine.seen == [message(0.0, number).payload for number in (1, 2, 3)]
+
+
+class Undecided(Watched):
+    """The truck stands on the bridge."""
+
+    def has_undecided(self, realm: str, vehicle: str) -> bool:
+        return True
+
+
+def test_a_truck_without_token_that_goes_on_talking_does_not_hold_up_the_end(
+    files: ResultFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A message every tenth of a second, each of which says that it has not gone yet."""
+    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
+    monkeypatch.setattr("services.worker.time.monotonic", lambda: 10.0)
+    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    for number in range(1000):
+        queued.put(message(0.1 * number, number))
+    stop = threading.Event()
+    engine = Undecided(stop, message(0.0, 100).payload)
+    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
+    assert engine.seen == [message(0.0, number).payload for number in range(131)]
+
+
+def test_who_fell_silent_just_before_a_stop_is_decided_before_the_end(
+    files: ResultFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
+    moments = itertools.count(10.0, 0.04)
+    monkeypatch.setattr("services.worker.time.monotonic", lambda: next(moments))
+    monkeypatch.setattr(worker, "_POLL_S", 0.001)
+    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    queued.put(message(8.9, 1))
+    queued.put(message(10.0, 2))
+    stop = threading.Event()
+    engine = Undecided(stop, message(0.0, 2).payload)
+    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
+    assert engine.seen == [message(0.0, 1).payload, message(0.0, 2).payload, gone()]
