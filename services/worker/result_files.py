@@ -160,11 +160,11 @@ def _runs(folder: Path, realm: str, now_s: float) -> Iterable[_Run]:
             is_of_another = is_being_written(path)
             info = read_info(path)
             messages = [m for m in read_messages(path) if m.key.realm == realm]
-        except (InputError, OSError) as error:
+            began_s = int(info.start.get("time_ns", "0")) * 1e-9
+        except (ValueError, OSError) as error:  # any field may be damaged
             _log.warning("results of an earlier run are left out: %s", error)
             continue
         if messages:
-            began_s = int(info.start.get("time_ns", "0")) * 1e-9
             was_killed = info.end is None and not is_of_another
             yield _Run(path, messages, info.start.get("previous"), began_s, was_killed)
 

@@ -146,6 +146,22 @@ def test_no_damage_is_a_failure(tmp_path: Path, position: int) -> None:
     assert (1, 4) in sequences(read_earlier(tmp_path, REALM, NOW_S).said)
 
 
+def test_a_damaged_time_of_the_start_is_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Metadata have no checksum of their own that would tell."""
+    path = written(tmp_path / "results-1.mcap", estimate(0))
+    content = bytearray(path.read_bytes())
+    place = content.index(b"time_ns") + len(b"time_ns") + 4  # behind the length of the value
+    assert content[place : place + 1].isdigit()
+    content[place] ^= 0x40
+    path.write_bytes(content)
+    os.utime(path, (NOW_S, NOW_S))
+    written(tmp_path / "results-2.mcap", estimate(1), end=True)
+    assert sequences(read_earlier(tmp_path, REALM, NOW_S).said) == [(1, 1)]
+    assert "are left out" in caplog.text
+
+
 @pytest.mark.parametrize("stale", [False, True])
 def test_results_that_stand_in_the_recording_only_get_into_the_json_file(
     tmp_path: Path, *, stale: bool
