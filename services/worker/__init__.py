@@ -109,22 +109,28 @@ def run(
         closing, failed = threading.Event(), threading.Event()
 
         def receive() -> None:
-            _receive(bus, realm, arrivals, closing, failed)
-            stop.set()
+            try:
+                _receive(bus, realm, arrivals, closing, failed)
+            finally:
+                stop.set()
 
         receiver = threading.Thread(target=receive, name="receive", daemon=True)
         try:
             _resume(engine, earlier, publisher, files)
             receiver.start()
             _serve(engine, arrivals, publisher, service_id, files, stop, ready)
+        except BaseException:
+            files.abandon()
+            raise
         finally:
             closing.set()
             if receiver.is_alive():
                 receiver.join()
             publisher.close()
-            files.finish()
         if failed.is_set():
+            files.abandon()
             raise FailureError(f"{endpoint}: the connection to the bus failed, see the log")
+        files.finish()
     return 0
 
 
@@ -163,10 +169,11 @@ def _receive(
     """
     try:
         _take_all(bus, realm, arrivals, closing)
-    except zenoh.ZError as error:
+    except Exception as error:  # whatever it is, nothing more would be heard
         if not closing.is_set():
             failed.set()
-            _log.error("the connection to the bus failed: %s", error)
+            unforeseen = not isinstance(error, zenoh.ZError)
+            _log.error("the connection to the bus failed: %s", error, exc_info=unforeseen)
 
 
 def _take_all(

@@ -54,7 +54,6 @@ class ResultFiles:
         self._writer: RecordingWriter | None = None
         self._sequences: Counter[Key] = Counter()
         self._crossings: list[Crossing] = []
-        self._failed = False
 
     def next_identity(self, key: Key, boot_id: int) -> Identity:
         """The identity of the next message of a key."""
@@ -69,11 +68,7 @@ class ResultFiles:
         """
         try:
             self._write(message, result, bridges)
-        except (InputError, FailureError):
-            self._failed = True
-            raise
         except OSError as error:
-            self._failed = True
             raise FailureError(f"{self.path}: cannot be written: {error.strerror}") from error
 
     def _write(
@@ -96,12 +91,20 @@ class ResultFiles:
             write_atomically(self.path.with_suffix(".json"), results_json(content))
 
     def finish(self) -> None:
-        """Close the recording; after a failed write it stays as it is on the disk, without an END:
-        what it holds last has not been published.
-        """
-        if self._writer is not None and not self._failed:
+        """Close the recording of a run that ended well. FailureError if that is not possible."""
+        if self._writer is None:
+            return
+        try:
             self._writer.finish("stopped by a signal", {"crossings": len(self._crossings)})
-        elif self._writer is not None:
+        except OSError as error:
+            self._writer.abandon()
+            raise FailureError(f"{self.path}: cannot be ended: {error.strerror}") from error
+
+    def abandon(self) -> None:
+        """Close the recording of a run that failed as it is on the disk, without an END: what it
+        holds last may not have been published.
+        """
+        if self._writer is not None:
             self._writer.abandon()
 
 

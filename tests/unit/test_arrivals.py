@@ -5,8 +5,10 @@ import queue
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
+import zenoh
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Header
@@ -185,3 +187,17 @@ def test_who_fell_silent_just_before_a_stop_is_decided_before_the_end(
     engine = Undecided(stop, message(0.0, 2).payload)
     worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
     assert engine.seen == [message(0.0, 1).payload, message(0.0, 2).payload, gone()]
+
+
+def test_a_receiver_that_fails_in_any_way_is_not_taken_for_a_quiet_one(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def take_all(*_: object) -> None:
+        raise RuntimeError("unforeseen")
+
+    monkeypatch.setattr(worker, "_take_all", take_all)
+    closing, failed = threading.Event(), threading.Event()
+    bus = cast("zenoh.Session", None)
+    worker._receive(bus, REALM, queue.Queue(), closing, failed)
+    assert failed.is_set()
+    assert "unforeseen" in caplog.text

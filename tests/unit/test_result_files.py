@@ -1,12 +1,15 @@
 """What earlier runs of the worker left on the disk, and what the next one makes of it."""
 
 import os
+import resource
+import signal
 from pathlib import Path
 
 import pytest
 
 from schemas.results import Crossing, Header, crossing_to_protobuf, load_results
 from schemas.topics import Key
+from services.common.errors import FailureError
 from services.common.recording import Message, RecordingWriter
 from services.worker.result_files import Earlier, ResultFiles, read_earlier
 
@@ -205,6 +208,23 @@ def test_a_run_whose_results_could_not_be_written_has_no_end(tmp_path: Path) -> 
     (tmp_path / "results-1.json").mkdir()
     with pytest.raises(Exception, match=r"results-1\.json"):
         files.write(estimate(0), result(0), {})
-    files.finish()
+    files.abandon()
+    os.utime(files.path, (NOW_S, NOW_S))
+    assert sequences(read_earlier(tmp_path, REALM, NOW_S).unsure) == [(1, 0)]
+
+
+def test_a_disk_that_is_full_at_the_end_is_a_failure_in_one_line(tmp_path: Path) -> None:
+    """What was written before is whole."""
+    files = ResultFiles(tmp_path / "results-1.mcap", "site", HEADER, None)
+    files.write(estimate(0), result(0), {})
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (files.path.stat().st_size, before[1]))
+    try:
+        with pytest.raises(FailureError, match=r"results-1\.mcap: cannot be ended: File too large"):
+            files.finish()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
     os.utime(files.path, (NOW_S, NOW_S))
     assert sequences(read_earlier(tmp_path, REALM, NOW_S).unsure) == [(1, 0)]
