@@ -15,7 +15,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -275,11 +275,13 @@ def _serve(
         for arrived in arrivals.due(now_s) + batch:
             if stop.is_set() and not arrivals.is_leaving(arrived.key):
                 continue  # the next run gets it from the truck again
+            name = f"{arrived.key.stream} of {arrived.key.identifier}"
             try:
-                _publish(engine.feed(arrived.key, arrived.payload), engine, publisher, files)
+                outputs = engine.feed(arrived.key, arrived.payload)
             except ValueError as error:
-                name = f"{arrived.key.stream} of {arrived.key.identifier}"
                 _log.warning("refused %s: %s", name, error)
+                continue
+            _publish(outputs, engine, publisher, files)
         if stop.is_set():
             leave_at_s = min(leave_at_s, time.monotonic() + GONE_AFTER_S)
             arrivals.hurry()
@@ -307,16 +309,28 @@ def _publish(
     outputs: Iterable[Output], engine: Engine, publisher: Publisher, files: ResultFiles
 ) -> None:
     """Write each message to the disk and only then to the bus: nobody hears what may be lost."""
-    for output in outputs:
+    for output in _worked_out(outputs):
         _, owner, identifier, stream = output.key
         identity = files.next_identity(output.key, publisher.boot_id)
         now_ns = time.time_ns()
         message = Message(output.key, output.payload, *identity, now_ns, now_ns)
         files.write(message, output.result, engine.bridges())
-        publisher.put(owner, identifier, stream, output.payload, identity)
+        try:
+            publisher.put(owner, identifier, stream, output.payload, identity)
+        except ValueError as error:
+            raise FailureError(f"{stream} of {identifier} cannot be published: {error}") from error
         if output.result is not None:
             result = output.result
             _log.info("%s: %s %s", result.crossing_id, result.verdict, ", ".join(result.reasons))
+
+
+def _worked_out(outputs: Iterable[Output]) -> Iterator[Output]:
+    """What the engine says; an error of its own is nobody's message to blame."""
+    try:
+        yield from outputs
+    except ValueError as error:
+        _log.error("an error of the program", exc_info=True)
+        raise FailureError(f"a crossing could not be worked out: {error}") from error
 
 
 def _say_progress(

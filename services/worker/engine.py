@@ -24,7 +24,7 @@ from schemas.results import (
     direction_to_protobuf,
 )
 from schemas.settings import IdentificationSettings
-from schemas.signals import MAX_BATCH_S, GnssFix, decode_accel, decode_gnss
+from schemas.signals import MAX_BATCH_S, AccelBatch, GnssFix, decode_accel, decode_gnss
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
 from services.common.crossing import MARGIN_M, MERGE_S, Passage, Stay, find_stays
@@ -151,28 +151,30 @@ class Engine:
                 yield _state_message(told.realm, told.bridge, told.result, latest_state(usable))
 
     def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
-        """Take one message of a vehicle; other streams are ignored. ValueError: malformed.
+        """Take one message of a vehicle; other streams are ignored.
 
-        Yields as things happen, so that a state can be published before the long work begins.
+        ValueError, at once: malformed. What follows from the message comes from the iterator, as
+        things happen, so that a state can be published before the long work begins.
         """
         if key.owner != "vehicle" or key.stream not in ("accel", "gnss"):
-            return
+            return iter(())
         vehicle = self._vehicles.get(key.identifier)
         if vehicle is None:
             self.unknown_vehicles.add(key.identifier)
-            return
-        batch = decode_accel(payload) if key.stream == "accel" else None
-        fix = decode_gnss(payload) if batch is None else None
-        boot_id = batch.boot_id if batch is not None else fix.boot_id if fix is not None else 0
-        if boot_id < self._newest_boot.get((key.realm, key.identifier), 0):
+            return iter(())
+        decoded = decode_accel(payload) if key.stream == "accel" else decode_gnss(payload)
+        return self._take(key, vehicle, decoded)
+
+    def _take(self, key: Key, vehicle: Vehicle, message: AccelBatch | GnssFix) -> Iterator[Output]:
+        if message.boot_id < self._newest_boot.get((key.realm, key.identifier), 0):
             return  # its crossings have been decided
-        truck = self._truck(key, boot_id, vehicle)
-        if batch is not None:
-            truck.boot.add_accel(batch)
-            self._forget(truck, batch.device_time_ns * 1e-9)
-        if fix is not None:
-            yield from self._finish_older_boots(key, boot_id)
-            truck.boot.add_fix(fix)
+        truck = self._truck(key, message.boot_id, vehicle)
+        if isinstance(message, AccelBatch):
+            truck.boot.add_accel(message)
+            self._forget(truck, message.device_time_ns * 1e-9)
+        else:
+            yield from self._finish_older_boots(key, message.boot_id)
+            truck.boot.add_fix(message)
             yield from self._settle(key.realm, truck)
 
     def finish(self) -> Iterator[Output]:

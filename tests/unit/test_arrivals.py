@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import pytest
 import zenoh
 
@@ -16,6 +17,7 @@ from schemas.settings import IdentificationSettings
 from schemas.topics import Key
 from services import worker
 from services.common.bus import Publisher
+from services.common.errors import FailureError
 from services.simulation import paper_site
 from services.worker.arrivals import Arrivals, Arrived, Gone, Token
 from services.worker.engine import Engine, Output
@@ -201,3 +203,39 @@ def test_a_receiver_that_fails_in_any_way_is_not_taken_for_a_quiet_one(
     worker._receive(bus, REALM, queue.Queue(), closing, failed)
     assert failed.is_set()
     assert "unforeseen" in caplog.text
+
+
+class Broken(Watched):
+    """Takes every message, and fails in what follows from it."""
+
+    def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
+        yield from super().feed(key, payload)
+        raise np.linalg.LinAlgError("singular")  # a ValueError
+
+
+def test_an_error_of_the_program_is_not_blamed_on_a_message(
+    files: ResultFiles, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
+    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    queued.put(message(0.0, 1))
+    queued.put(message(2.0, 2))
+    stop = threading.Event()
+    engine = Broken(stop, message(0.0, 1).payload)
+    with pytest.raises(FailureError, match="could not be worked out: singular"):
+        worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
+    assert "refused" not in caplog.text
+
+
+def test_a_malformed_message_is_refused_and_named(
+    files: ResultFiles, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
+    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    queued.put(message(0.0)._replace(payload=b"\xff"))
+    queued.put(message(2.0)._replace(payload=b"\xfe"))
+    engine = Engine(paper_site(), SETTINGS, HEADER)
+    stop = threading.Event()
+    ready = threading.Timer(0.5, stop.set)
+    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, ready.start)
+    assert caplog.text.count("refused accel of truck-1") == 2
