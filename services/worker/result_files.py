@@ -39,7 +39,8 @@ _log = logging.getLogger(__name__)
 _KNOWN_AGE_S = 2 * 86_400.0
 """Older files are not read: no truck still sends what they are about."""
 _UNSURE_NS = 60 * 1_000_000_000
-"""What a run that was killed wrote in its last minute may not have reached every subscriber."""
+"""What a run wrote in its last minute may not have reached every subscriber: it was killed, or the
+router was away, which nobody tells a publisher."""
 
 
 class ResultFiles:
@@ -114,7 +115,7 @@ class Earlier(NamedTuple):
     said: tuple[Message, ...] = ()
     """All messages, each once, in the order of the runs."""
     unsure: tuple[Message, ...] = ()
-    """Those that may not have reached the bus: of runs that were killed, the last ones."""
+    """Those that may not have reached the bus: the last ones of runs that none went on with."""
     latched: tuple[Message, ...] = ()
     """The latest state of each bridge."""
     previous: str | None = None
@@ -128,7 +129,12 @@ class _Run(NamedTuple):
     messages: list[Message]
     previous: str | None
     began_s: float
+    goes_on: bool
+    """Another worker writes it."""
     was_killed: bool
+
+    def last_ns(self) -> int:
+        return max(message.publish_time_ns for message in self.messages)
 
 
 def read_earlier(folder: Path, realm: str, now_s: float) -> Earlier:
@@ -140,19 +146,22 @@ def read_earlier(folder: Path, realm: str, now_s: float) -> Earlier:
     runs = list(_runs(folder, realm, now_s))
     said: dict[tuple[Key, int, int], Message] = {}
     unsure: list[Message] = []
-    continued = {run.previous for run in runs}
+    # Who names it as the one before has published its last messages again, if it had the time.
+    continued = {run.previous for run in runs if not run.was_killed or _lived_long(run)}
     for run in runs:
         said |= {(m.key, m.boot_id, m.sequence): m for m in run.messages}
         if run.was_killed:
             _complete_json(run, list(said.values()))
-            # Who names it as the one before has published its last messages again.
-            if run.path.name not in continued:
-                last_ns = max(message.publish_time_ns for message in run.messages)
-                since_ns = last_ns - _UNSURE_NS
-                unsure += [m for m in run.messages if m.publish_time_ns >= since_ns]
+        if not run.goes_on and run.path.name not in continued:
+            since_ns = run.last_ns() - _UNSURE_NS
+            unsure += [m for m in run.messages if m.publish_time_ns >= since_ns]
     states = {message.key: message for message in said.values() if message.key.stream == "state"}
     previous = runs[-1].path.name if runs else None
     return Earlier(tuple(said.values()), tuple(unsure), tuple(states.values()), previous)
+
+
+def _lived_long(run: _Run) -> bool:
+    return run.last_ns() - run.began_s * 1e9 > _UNSURE_NS
 
 
 def _runs(folder: Path, realm: str, now_s: float) -> Iterable[_Run]:
@@ -160,7 +169,7 @@ def _runs(folder: Path, realm: str, now_s: float) -> Iterable[_Run]:
         try:
             if now_s - path.stat().st_mtime > _KNOWN_AGE_S:
                 continue
-            is_of_another = is_being_written(path)
+            goes_on = is_being_written(path)
             info = read_info(path)
             messages = [m for m in read_messages(path) if m.key.realm == realm]
             began_s = int(info.start.get("time_ns", "0")) * 1e-9
@@ -168,8 +177,8 @@ def _runs(folder: Path, realm: str, now_s: float) -> Iterable[_Run]:
             _log.warning("results of an earlier run are left out: %s", error)
             continue
         if messages:
-            was_killed = info.end is None and not is_of_another
-            yield _Run(path, messages, info.start.get("previous"), began_s, was_killed)
+            was_killed = info.end is None and not goes_on
+            yield _Run(path, messages, info.start.get("previous"), began_s, goes_on, was_killed)
 
 
 def _complete_json(run: _Run, said: list[Message]) -> None:

@@ -44,9 +44,16 @@ def estimate(number: int, boot_id: int = 1, time_s: float | None = None) -> Mess
     return Message(WHERE, payload, boot_id, number, moment_ns, moment_ns)
 
 
-def written(path: Path, *messages: Message, end: bool = False, previous: str | None = None) -> Path:
+def written(
+    path: Path,
+    *messages: Message,
+    end: bool = False,
+    previous: str | None = None,
+    began_s: float | None = None,
+) -> Path:
     """The file of a run; without `end` as a `kill -9` leaves it."""
-    writer = RecordingWriter(path, reason="test", realm=REALM, previous=previous)
+    began_ns = None if began_s is None else round(began_s * 1e9)
+    writer = RecordingWriter(path, reason="test", realm=REALM, previous=previous, time_ns=began_ns)
     for message in messages:
         writer.write(message)
         writer.sync()
@@ -66,11 +73,13 @@ def test_a_folder_that_is_not_there_holds_nothing(tmp_path: Path) -> None:
     assert read_earlier(tmp_path / "none", REALM, NOW_S) == Earlier()
 
 
-def test_a_run_that_ended_well_is_known_and_needs_nothing(tmp_path: Path) -> None:
+def test_the_last_minute_of_a_run_that_ended_well_is_unsure_too(tmp_path: Path) -> None:
+    """The router may have been away when it was stopped: to put a message tells nothing."""
     path = written(tmp_path / "results-1.mcap", estimate(0), estimate(1), end=True)
     found = read_earlier(tmp_path, REALM, NOW_S)
     assert sequences(found.said) == [(1, 0), (1, 1)]
-    assert (found.unsure, found.previous) == ((), path.name)
+    assert sequences(found.unsure) == [(1, 1)]  # the other is 100 s older
+    assert found.previous == path.name
     assert not path.with_suffix(".json").exists()
 
 
@@ -86,12 +95,25 @@ def test_the_last_minute_of_a_run_that_was_killed_is_unsure(tmp_path: Path) -> N
     assert sequences(found.unsure) == [(1, 1), (1, 2)]
 
 
-def test_a_run_that_was_continued_has_been_published_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", [True, False])
+@pytest.mark.parametrize("lived_s", [0.02, 59.0, 61.0])
+def test_a_run_that_was_continued_long_enough_has_been_published_again(
+    tmp_path: Path, *, end: bool, lived_s: float
+) -> None:
+    """Who is killed right after it has published that again has said it to nobody, either."""
     first = written(tmp_path / "results-1.mcap", estimate(0))
-    written(tmp_path / "results-2.mcap", estimate(1, boot_id=2), previous=first.name)
+    second = written(
+        tmp_path / "results-2.mcap",
+        estimate(1, boot_id=2, time_s=NOW_S + lived_s),
+        end=end,
+        previous=first.name,
+        began_s=NOW_S,
+    )
     found = read_earlier(tmp_path, REALM, NOW_S)
     assert sequences(found.said) == [(1, 0), (2, 1)]
-    assert sequences(found.unsure) == [(2, 1)]
+    is_continued = end or lived_s > 60.0
+    assert sequences(found.unsure) == ([] if is_continued else [(1, 0)]) + [(2, 1)]
+    assert found.previous == second.name
 
 
 def test_a_run_that_goes_on_is_known_and_left_alone(tmp_path: Path) -> None:
