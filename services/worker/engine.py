@@ -5,6 +5,7 @@ and says so. It opens nothing, reads no clock and asks nobody, so that a recordi
 through it gives the same bytes every time.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -34,6 +35,7 @@ from services.worker.crossing_data import CrossingData
 from services.worker.identification import MARGIN_S, Identify, Report, Stopwatch, identify
 from services.worker.told import Told, told_of
 
+_log = logging.getLogger(__name__)
 _KEEP_S = 300.0
 """Samples older than this are forgotten."""
 _LONGEST_STAY_S = 270.0
@@ -64,6 +66,10 @@ class _Truck:
         self.latest_s = -np.inf
         self.began_s = np.inf
         self.forgotten_s = -np.inf
+        self.clock_s = -np.inf
+        """The latest time that more than one message has told."""
+        self.doubtful_s = -np.inf
+        """One far ahead of it, which only one message has told yet."""
         self.detected: dict[tuple[str, float], str] = {}
         """Crossing ids by bridge and about the time of entry."""
         self.done: set[str] = set()
@@ -222,6 +228,15 @@ class Engine:
 
     def _forget(self, truck: _Truck, now_s: float) -> None:
         truck.began_s = min(truck.began_s, now_s)
+        if now_s > truck.clock_s + _KEEP_S and abs(now_s - truck.doubtful_s) > _KEEP_S:
+            # A single wrong time must not make the truck forget, and never take in again, all that
+            # is older than it.
+            if np.isfinite(truck.clock_s):
+                name = truck.vehicle.id
+                _log.warning("%s: a device time %.0f s ahead", name, now_s - truck.clock_s)
+            truck.doubtful_s = now_s
+            return
+        truck.clock_s = max(truck.clock_s, now_s)
         if now_s - _KEEP_S > max(truck.began_s, truck.forgotten_s) + _FORGET_EVERY_S:
             truck.forgotten_s = now_s - _KEEP_S
             truck.boot.forget_before(truck.forgotten_s)

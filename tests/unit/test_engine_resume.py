@@ -9,6 +9,7 @@ import pytest
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, Header, crossing_to_protobuf
 from schemas.settings import IdentificationSettings
+from schemas.signals import decode_accel, encode_accel
 from schemas.site import site_hash
 from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
@@ -45,7 +46,8 @@ class Identifications:
         stay = data.stay
         passing = Passing(stay.entry_s, stay.exit_s, 10.0)
         whole = data.samples is not None and not any(
-            np.isnan(channel).any() for channel in data.samples.channels.values()
+            channel.size == 0 or np.isnan(channel).any()
+            for channel in data.samples.channels.values()
         )
         if not whole:
             return rejected(data, settings, passing, ["gap_on_bridge"])  # type: ignore[list-item]
@@ -301,3 +303,17 @@ def test_fixes_that_come_after_the_decision_make_no_second_crossing() -> None:
     assert len(told) == 1
     (whole,) = [o.result for o in fed_all_alone(messages) if o.result]
     assert whole.entry_time - told[0].entry_time > 5.0  # or it would prove nothing
+
+
+@pytest.mark.parametrize("number", [0, 5])
+def test_one_batch_from_far_ahead_costs_no_crossing(
+    number: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It lies well before the bridge; what comes after it is taken in as ever."""
+    messages = messages_of(*THERE)
+    bad = [m for m in messages if m.key.stream == "accel"][number]
+    ahead = decode_accel(bad.payload)._replace(device_time_ns=2**62)
+    changed = [m._replace(payload=encode_accel(ahead)) if m is bad else m for m in messages]
+    (result,) = [o.result for o in fed_all_alone(changed) if o.result]
+    assert result.verdict == "good"
+    assert ("truck-1: a device time" in caplog.text) == (number > 0)
