@@ -50,10 +50,15 @@ def told_of(said: Iterable[tuple[Key, bytes]], header: Header) -> list[Told]:
                 _add_state(found, key, message)
             elif isinstance(message, pb.Estimate):
                 result, its_header = estimate_to_crossing(message)
+                # What was told before it was told of another search's result.
+                name = (key.realm, result.crossing_id)
+                in_states.discard(name)
+                if name in found:
+                    found[name].states.discard(pb.DONE)
                 if _same_search(its_header, header):
                     _add_result(found, key, result)
                 else:
-                    others.add((key.realm, result.crossing_id))
+                    others.add(name)
             elif isinstance(message, pb.BridgeState):
                 left_out = (crossing.crossing_id for crossing in message.crossings_left_out)
                 ids = chain(message.crossings_used, left_out)

@@ -205,6 +205,15 @@ def test_a_result_of_another_search_does_not_count(change: str) -> None:
     ]
 
 
+@pytest.mark.parametrize("number", [4, 5])
+def test_a_run_cut_off_after_one_of_another_search(number: int) -> None:
+    """That one told a `done` and a state of the bridge, too: of its own result."""
+    other = said_by(fed(engine(header=HEADER._replace(settings={"method": "pre"})), TWO)[:6])
+    whole = resumed(other, TWO)
+    after = resumed(other + said_by(whole[:number]), TWO)
+    assert said_by(after) == said_by(whole[number:])
+
+
 def test_another_version_of_the_program_does_not_identify_anew() -> None:
     assert resumed(said_by(WHOLE), TWO, header=HEADER._replace(version="99", created=5.0)) == []
 
