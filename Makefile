@@ -32,7 +32,7 @@ demo: $(STAMP) ## a truck crosses a bridge: simulated, recorded, identified, dra
 # One worker computes while the other waits for processes (tests/conftest.py); more would only wait.
 BESIDE := -n 2 --dist loadgroup
 
-test: $(STAMP) ## the default tests (about 7 minutes on 2 cores)
+test: $(STAMP) ## the default tests (under 5 minutes on 2 cores)
 	$(BIN)/python -m pytest $(BESIDE)
 
 test-all: $(STAMP) ## the default tests and the slow ones

@@ -30,6 +30,8 @@ _TRUCKS = 1000
 _TOKENS_WAITING = 1000
 _HISTORY = 60
 """Reports over which rate and lag are taken; there is one a second."""
+_KEPT_BY = ("vehicle", "bridge")
+"""Owners whose publishers, trucks and workers, outlive a logger and give the next one all again."""
 _NOT_OURS = ("replay-", "import-")
 """Who replays a recording twice wants it twice."""
 
@@ -54,7 +56,7 @@ class Durable(Protocol):
 
 
 def known_on_disk(folder: Path, realm: str | None, now_s: float) -> Iterator[Known]:
-    """Yield what trucks' streams have in the recordings below a folder, one file after the other.
+    """Yield what streams have in the recordings below a folder, one file after the other.
 
     Only of the last two days (`now_s` is the wall clock) and of the realms in which trucks drive.
     """
@@ -67,7 +69,7 @@ def known_on_disk(folder: Path, realm: str | None, now_s: float) -> Iterator[Kno
             _log.warning("%s: not read: %s", path, error)
             continue
         for (where, boot_id), numbers in identities.items():
-            if where.owner == "vehicle" and not where.realm.startswith(_NOT_OURS):
+            if where.owner in _KEPT_BY and not where.realm.startswith(_NOT_OURS):
                 for first, last in numbers.ranges():
                     yield Known(where, boot_id, first, last)
 

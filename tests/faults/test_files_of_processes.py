@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 
 from schemas.events import EventKind, decode_event
+from schemas.proto import driveby_pb2 as pb
+from services.common.bus import Publisher, open_session
 from services.common.errors import InputError
 from services.common.recording import is_closed, read_info, read_messages
 
@@ -40,6 +42,36 @@ def test_rotation_under_load_loses_and_repeats_nothing(fleet: MakeFleet) -> None
     for path in files(one):
         if "truck" in path.name:
             assert "info" in {message.key.stream for message in read_messages(path)}, path
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_results_of_a_worker_that_outlives_the_logger_are_there_once(
+    fleet: MakeFleet, how: signal.Signals
+) -> None:
+    """Its publishers give the next logger all that they keep."""
+    one = fleet()
+    one.start_logger()
+    with open_session(connect=one.logger_endpoint, timeout_s=10.0) as session:
+        worker = Publisher(session, "live")
+        for number in range(40):
+            if number == 20:
+                time.sleep(2.0)  # the first half is on the disk
+                assert one.logger is not None
+                one.logger.send_signal(how)
+                one.logger.wait()
+                one.start_logger()
+            now_ns = time.time_ns()
+            crossing = pb.Crossing(
+                schema_version=1, crossing_id=str(number), vehicle="truck-1", time_ns=now_ns
+            )
+            worker.put("bridge", "bridge-1", "crossing", crossing.SerializeToString())
+        time.sleep(3.0)  # for the history, and the gap that the logger left
+        one.stop_logger()
+        worker.close()
+    found = [
+        m.sequence for path in files(one) for m in read_messages(path) if m.key.owner == "bridge"
+    ]
+    assert sorted(found) == list(range(40))
 
 
 def kill_and_recover(one: Fleet, rng: random.Random, kills: int) -> None:
