@@ -220,6 +220,7 @@ def _worker(options: argparse.Namespace) -> int:
         file=options.file,
         method=options.method.replace("-", "_"),
         service_id=options.id,
+        ready=lambda: print(f"ready, waiting for crossings in realm {options.realm}", flush=True),
         tls=options.tls,
     )
 
@@ -476,7 +477,7 @@ def _add_live(commands: Any) -> None:
         "logger",
         _logger,
         "record all that travels; hosts the router that the others connect to",
-        f"driveby logger --listen {ENDPOINT} --folder recordings",
+        f"driveby logger --listen {ENDPOINT} --folder recordings --site site.toml",
     )
     p.add_argument("--listen", help=f"where to listen (default: {ENDPOINT})")
     _add_tls(p)

@@ -136,6 +136,8 @@ def _record(
     )
     housekeeping = Housekeeping(house) if folder is not None else None
     subscription = Subscription(bus, f"{PREFIX}/{logger.place.realm or '*'}/**")
+    if place.site_toml is None:
+        _log.info("no site file is put into the recordings (--site): `identify` will ask for one")
     try:
         if ready is not None:
             ready()

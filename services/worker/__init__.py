@@ -30,7 +30,7 @@ from schemas.topics import check_identifier, check_realm, parse_key, selector
 from services.common.bus import Publisher, Seen, Subscription, open_session
 from services.common.credentials import check_speaks_for
 from services.common.errors import FailureError, InputError
-from services.common.files import read_text
+from services.common.files import check_folder_writable, read_text
 from services.common.playback import stopped_by_signals
 from services.common.recording import Message, program_version
 from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
@@ -90,6 +90,7 @@ def run(
         file = folder / realm / f"results-{moment}.mcap"
         if not realm.startswith(_EVERY_RUN_ANEW):
             earlier = read_earlier(folder / realm, realm, time.time())
+    check_folder_writable(file.parent)
     if file.exists():
         raise InputError(f"{file}: exists, and results are never overwritten; give another name")
     files = ResultFiles(file, text, header, earlier.previous)
@@ -149,10 +150,15 @@ def _check_names(realm: str, service_id: str) -> None:
 
 def _connected(endpoint: str, tls: Path | None, stop: threading.Event) -> zenoh.Session | None:
     """A session as soon as a router answers; None if a signal came first."""
+    is_told = False
     while not stop.is_set():
         # Zenoh itself would wait for ever, and no signal would be heard meanwhile.
-        with contextlib.suppress(FailureError):
+        try:
             return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
+        except FailureError as error:
+            if not is_told:
+                _log.warning("%s; trying on", error)
+            is_told = True
     return None
 
 
