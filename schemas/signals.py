@@ -312,8 +312,8 @@ def _samples(channel: pb.AccelChannel) -> npt.NDArray[np.float64]:
     """Return the samples of a channel, which may not be written to.
 
     Encoded again they stand together at the end, and bytes are read four times as fast as one
-    number after the other: this is most of what a logger of many trucks computes. The length says
-    whether something else, of an unknown field, stands behind them.
+    number after the other. The length says whether something else, of an unknown field, stands
+    behind them.
     """
     values = channel.acceleration_m_per_s2
     number = len(values)

@@ -138,6 +138,11 @@ def check_realm(text: str) -> str:
     return text
 
 
+def is_replayed(realm: str) -> bool:
+    """Whether what travels in a realm was recorded before: who replays it twice wants it twice."""
+    return realm.startswith(("replay-", "import-"))
+
+
 def key(realm: str, owner: str, identifier: str, stream: str) -> str:
     """Return the Zenoh key; ValueError if a part is malformed or the topic does not exist."""
     topic(owner, stream)

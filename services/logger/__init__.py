@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import os
 import signal
 import threading
 import time
@@ -23,7 +22,7 @@ from services.common.disk import DISK
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, read_text
 from services.common.memory import give_back_memory
-from services.common.playback import stopped_by_signals
+from services.common.playback import leave_at_once, stopped_by_signals
 from services.common.recording import Message
 from services.logger.completeness import Completeness
 from services.logger.housekeeping import House, Housekeeping
@@ -48,7 +47,6 @@ _AT_ONCE_S = 0.02
 _FETCH_ROOM = 32 << 20
 """With less room in the writer's queue, bytes, trucks are not asked for what is missing."""
 _GOODBYE_S = 0.2
-_EXIT_AT_ONCE = 130
 
 
 def run(
@@ -91,7 +89,7 @@ def run(
     _check_room(file.parent if file is not None else folder, limits.min_free_bytes)
     own = OwnEvents(service_id, time.time_ns())
     with (
-        stopped_by_signals(on_second=_leave_at_once) as stop,
+        stopped_by_signals(on_second=leave_at_once) as stop,
         open_session(listen=listen, tls=tls, insecure=insecure) as bus,
     ):
         writer = FileWriter(place, limits, own=own)
@@ -371,7 +369,3 @@ def _rotated_by_signal(writer: FileWriter) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGUSR1, before)
-
-
-def _leave_at_once() -> None:
-    os._exit(_EXIT_AT_ONCE)

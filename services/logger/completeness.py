@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import zenoh
 from zenoh import handlers
 
-from schemas.topics import Key, parse_key, selector, topic
+from schemas.topics import Key, is_replayed, parse_key, selector, topic
 from services.common.bus import Received
 from services.common.errors import InputError
 from services.common.intervals import Intervals
@@ -32,8 +32,6 @@ _HISTORY = 60
 """Reports over which rate and lag are taken; there is one a second."""
 _KEPT_BY = ("vehicle", "bridge")
 """Owners whose publishers, trucks and workers, outlive a logger and give the next one all again."""
-_NOT_OURS = ("replay-", "import-")
-"""Who replays a recording twice wants it twice."""
 
 
 class Known(NamedTuple):
@@ -69,7 +67,7 @@ def known_on_disk(folder: Path, realm: str | None, now_s: float) -> Iterator[Kno
             _log.warning("%s: not read: %s", path, error)
             continue
         for (where, boot_id), numbers in identities.items():
-            if where.owner in _KEPT_BY and not where.realm.startswith(_NOT_OURS):
+            if where.owner in _KEPT_BY and not is_replayed(where.realm):
                 for first, last in numbers.ranges():
                     yield Known(where, boot_id, first, last)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from schemas.events import Event, EventKind
 from schemas.messages import check_stamp
 from schemas.signals import Identity, Stamp
-from schemas.topics import Key, Topic, topic
+from schemas.topics import Key, Topic, is_replayed, topic
 from services.common.bus import Received, Seen
 from services.common.intervals import Intervals
 from services.common.recording import Message
@@ -301,7 +301,7 @@ class Intake:
 
     def _watch_clock(self, where: Key, identity: Identity, stamp: Stamp, now_ns: int) -> None:
         """Compare a live message's times with those before it, and with when it came."""
-        if stamp.device_time_ns is None or where.realm.startswith(("replay-", "import-")):
+        if stamp.device_time_ns is None or is_replayed(where.realm):
             return
         truck = (where.realm, where.identifier)
         stream, highest = self._clock_stream.get(truck, (where.stream, -1))

@@ -11,7 +11,6 @@ last five minutes).
 import contextlib
 import logging
 import math
-import os
 import queue
 import threading
 import time
@@ -26,12 +25,12 @@ from schemas.results import Header
 from schemas.settings import IdentificationSettings
 from schemas.signals import Identity
 from schemas.site import parse_site, site_hash
-from schemas.topics import check_identifier, check_realm, parse_key, selector
+from schemas.topics import check_identifier, check_realm, is_replayed, parse_key, selector
 from services.common.bus import Publisher, Seen, Subscription, open_session
 from services.common.credentials import check_speaks_for
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, read_text
-from services.common.playback import stopped_by_signals
+from services.common.playback import leave_at_once, stopped_by_signals
 from services.common.recording import Message, program_version
 from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
 from services.worker.engine import Engine, Output
@@ -46,10 +45,6 @@ _POLL_S = 0.1
 _HEALTH_PERIOD_S = 60.0
 _LONGEST_QUEUE = 200_000
 _CONNECT_S = 1.0
-_EXIT_AT_ONCE = 130
-"""What a shell reports of a program that was interrupted."""
-_EVERY_RUN_ANEW = ("replay-", "import-")
-"""Who replays a recording twice wants it twice."""
 
 
 def run(
@@ -88,13 +83,14 @@ def run(
     if file is None:
         moment = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         file = folder / realm / f"results-{moment}.mcap"
-        if not realm.startswith(_EVERY_RUN_ANEW):
+        if not is_replayed(realm):
             earlier = read_earlier(folder / realm, realm, time.time())
     check_folder_writable(file.parent)
     if file.exists():
         raise InputError(f"{file}: exists, and results are never overwritten; give another name")
     files = ResultFiles(file, text, header, earlier.previous)
-    with stopped_by_signals(_leave_at_once) as stop, contextlib.ExitStack() as stack:
+    # A second signal: what was published is on the disk, and the next run takes it up.
+    with stopped_by_signals(leave_at_once) as stop, contextlib.ExitStack() as stack:
         warm_up()
         bus = _connected(endpoint, tls, stop)
         if bus is None:
@@ -133,11 +129,6 @@ def run(
             raise FailureError(f"{endpoint}: the connection to the bus failed, see the log")
         files.finish()
     return 0
-
-
-def _leave_at_once() -> None:
-    # What was published is on the disk, and the next run takes it up as after a `kill -9`.
-    os._exit(_EXIT_AT_ONCE)
 
 
 def _check_names(realm: str, service_id: str) -> None:
@@ -320,7 +311,8 @@ def _publish(
         identity = files.next_identity(output.key, publisher.boot_id)
         now_ns = time.time_ns()
         message = Message(output.key, output.payload, *identity, now_ns, now_ns)
-        files.write(message, output.result, engine.bridges())
+        bridges = {} if output.result is None else engine.bridges()
+        files.write(message, output.result, bridges)
         try:
             publisher.put(owner, identifier, stream, output.payload, identity)
         except ValueError as error:

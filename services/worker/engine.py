@@ -8,7 +8,7 @@ through it gives the same bytes every time.
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -88,6 +88,7 @@ class _Truck:
         )
 
 
+Name = TypeVar("Name")
 _Wait = Callable[[_Truck, Stay, float], bool]
 """Whether a crossing that is over, at the truck's time of now (s), waits for more of its data."""
 
@@ -139,10 +140,9 @@ class Engine:
         crossings = told_of(said, self._header)
         for told in crossings:
             self._told.setdefault((told.realm, told.vehicle, told.bridge), []).append(told)
-            if told.result is not None and told.result.parameters is not None:
-                self._usable.setdefault((told.realm, told.bridge), []).append(told.result)
-        for usable in self._usable.values():
-            usable.sort(key=lambda crossing: crossing.entry_time)
+        self._usable = usable_of(
+            ((told.realm, told.bridge), told.result) for told in crossings if told.result
+        )
         for told in crossings:
             if told.result is None:
                 continue
@@ -453,6 +453,15 @@ def _state_message(realm: str, bridge: str, result: Crossing, latest: BridgeResu
     message = bridge_to_protobuf(bridge, round(result.exit_time * 1e9), latest)
     payload = message.SerializeToString(deterministic=True)
     return Output(Key(realm, "bridge", bridge, "state"), payload)
+
+
+def usable_of(named: Iterable[tuple[Name, Crossing]]) -> dict[Name, list[Crossing]]:
+    """Those of the crossings that gave parameters, by name (of a bridge) in order of entry."""
+    usable: dict[Name, list[Crossing]] = {}
+    for name, crossing in sorted(named, key=lambda one: one[1].entry_time):
+        if crossing.parameters is not None:
+            usable.setdefault(name, []).append(crossing)
+    return usable
 
 
 def latest_state(usable: list[Crossing]) -> BridgeResult:

@@ -33,7 +33,7 @@ from services.common.recording import (
     read_info,
     read_messages,
 )
-from services.worker.engine import latest_state
+from services.worker.engine import latest_state, usable_of
 
 _log = logging.getLogger(__name__)
 _KNOWN_AGE_S = 2 * 86_400.0
@@ -216,8 +216,5 @@ def _crossings_in(messages: Iterable[Message]) -> list[tuple[Crossing, Header]]:
 
 
 def _bridges(crossings: Iterable[Crossing]) -> dict[str, BridgeResult]:
-    usable: dict[str, list[Crossing]] = {}
-    for crossing in sorted(crossings, key=lambda crossing: crossing.entry_time):
-        if crossing.parameters is not None:
-            usable.setdefault(crossing.bridge, []).append(crossing)
+    usable = usable_of((crossing.bridge, crossing) for crossing in crossings)
     return {bridge: latest_state(of_bridge) for bridge, of_bridge in usable.items()}
