@@ -477,14 +477,21 @@ def _derived_masses(data: CrossingData, fit: _Fit) -> dict[str, results.Paramete
 
 
 def _propagated(fit: _Fit, quantity: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
-    """A quantity (q,) of the parameters and its standard deviation to first order."""
+    """A quantity (q,) of the parameters and its standard deviation to first order.
+
+    Central differences of a thousandth, as at the bottom of the search: smaller ones to one side
+    would carry the processor's rounding into the spread.
+    """
     centre = np.atleast_1d(quantity(fit.theta))
     slopes = np.empty((centre.size, fit.free.size))
     for k, i in enumerate(fit.free):
-        moved = fit.theta.copy()
-        step = 1e-5 * moved[i]
-        moved[i] += step
-        slopes[:, k] = (np.atleast_1d(quantity(moved)) - centre) / step
+        ahead, behind = fit.theta.copy(), fit.theta.copy()
+        step = 1e-3 * fit.theta[i]
+        ahead[i] += step
+        behind[i] -= step
+        slopes[:, k] = (np.atleast_1d(quantity(ahead)) - np.atleast_1d(quantity(behind))) / (
+            2.0 * step
+        )
     variance = np.einsum("qi,ij,qj->q", slopes, fit.covariance, slopes)
     return centre, np.sqrt(np.maximum(variance, 0.0))
 

@@ -1,12 +1,15 @@
 """Writes reference_estimate.json: what the engine makes of two stored recordings.
 
-    .venv/bin/python tests/data/make_reference_estimate.py
+    .venv/bin/python tests/data/make_reference_estimate.py [--print] [sample] [noise_free]
 
-Run it when a change of the result is meant, and say in the commit why the numbers moved and how far
-(`git diff` shows it). tests/process_replay/test_reference.py compares with it.
+Run it when a change of the result is meant, for the recordings (all by default) whose result is to
+change, and say in the commit why the numbers moved and how far (`git diff` shows it).
+tests/process_replay/test_reference.py compares with it. With --print the file stays as it is.
 """
 
+import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,6 +75,19 @@ def digest(crossing: Crossing) -> dict[str, Any]:
     }
 
 
+def main() -> None:
+    """Identify the recordings that are named and write or print what was found."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--print", action="store_true", dest="printed")
+    parser.add_argument("names", nargs="*", metavar="NAME", choices=[*SOURCES, []])
+    arguments = parser.parse_args()
+    found = {name: digest(identified(SOURCES[name])) for name in arguments.names or SOURCES}
+    if arguments.printed:
+        json.dump(found, sys.stdout)
+    else:
+        kept = json.loads(REFERENCE.read_text())
+        REFERENCE.write_text(json.dumps(kept | found, indent=1) + "\n")
+
+
 if __name__ == "__main__":
-    found = {name: digest(identified(source)) for name, source in SOURCES.items()}
-    REFERENCE.write_text(json.dumps(found, indent=1) + "\n")
+    main()

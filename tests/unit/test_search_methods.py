@@ -195,6 +195,31 @@ def test_every_ending_is_a_sentence():
     assert len({ending.value for ending in Ending}) == len(Ending)
 
 
+@pytest.mark.parametrize("differences", [least_squares.FORWARD, least_squares.CENTRAL])
+def test_every_evaluation_of_a_step_is_counted(differences: least_squares.Differences):
+    evaluated = []
+
+    def rows(y: np.ndarray) -> np.ndarray:
+        evaluated.append(len(y))
+        return np.column_stack([np.exp(y) - 2.0, y[:, :1] * y[:, 1:2], np.ones(len(y))])
+
+    state = least_squares.begin(rows, np.zeros(3), differences)
+    evaluated.clear()
+    _, info = least_squares.descend(rows, state)
+    assert info.accepted
+    assert info.evaluations == sum(evaluated)
+
+
+def test_least_squares_ends_with_central_differences(window: Window):
+    """The reference estimate shows what for: tests/process_replay/test_reference.py."""
+    init, step = bind_least_squares(window, 3, 1)
+    assert init().differences == least_squares.FORWARD
+    state, infos, ending = search.run(init, step, least_squares.MAX_STEPS)
+    assert ending is Ending.CONVERGED
+    assert state.differences == least_squares.CENTRAL
+    assert state.objective <= min(info.objective for info in infos) * (1.0 + 1e-8)
+
+
 def test_a_kink_leaves_least_squares_stuck():
     state = least_squares.begin(lambda y: 1.0 + np.abs(y), np.zeros(1))
     assert least_squares.descend(lambda y: 1.0 + np.abs(y), state)[1].ending is Ending.STUCK
