@@ -74,11 +74,18 @@ def test_the_independent_crossings_are_read(shared: Path) -> None:
         "d1_clean_const_speed": 1,
         "d2_mems_gps_bias": 1,
         "d3_edge_damage_4_runs": 4,
+        "d4_bearings_that_give": 2,
+        "d5_swinging_bridge": 1,
+        "d6_leaf_springs": 2,
+        "d7_two_spans": 1,
+        "d8_real_road_12_runs": 12,
+        "d9_everything_16_runs": 16,
     }
-    for run in (run for found in runs.values() for run in found):
-        assert run.rate_hz == 1000
-        assert tuple(run.channels) == CHANNELS
-        assert run.gnss.speed_m_per_s.mean() == pytest.approx(10, abs=1)
+    for name, found in runs.items():
+        for run in found:
+            assert run.rate_hz == (1000 if name < "d4" else 500)
+            assert tuple(run.channels) == CHANNELS
+            assert 8.0 < run.gnss.speed_m_per_s.mean() < 16.0
     starts = [run.accel_time_s[0] for run in runs["d3_edge_damage_4_runs"]]
     assert starts == sorted(starts)
 

@@ -143,8 +143,8 @@ def test_equal_ends_have_no_frame() -> None:
         bridge_frame(Ends(1.0, 2.0, 1.0, 2.0, 30.0))
 
 
-def test_the_site_files_own_distance_agrees(shared, csv_example) -> None:  # type: ignore[no-untyped-def]
-    for path in [*(shared / "crossings").glob("*/site.toml"), csv_example / "site.toml"]:
+def test_the_site_files_own_distance_agrees(shared_sites, csv_example) -> None:  # type: ignore[no-untyped-def]
+    for path in [*shared_sites, csv_example / "site.toml"]:
         bridge = load_site(path).bridges[0]
         assert bridge.ends_distance_m == pytest.approx(
             bridge_frame(bridge).ground_length_m, rel=1e-6
