@@ -22,8 +22,8 @@ $(PACKAGES): requirements/dev.txt pyproject.toml
 	@touch $@
 
 # numba inlines kernels of one file into another's and would not see that they have changed.
-$(STAMP): $(PACKAGES) $(wildcard pre_core/*.py)
-	@$(BIN)/python -m services.precompile || true
+$(STAMP): $(PACKAGES) $(wildcard pre_core/*.py pre_core/*/*.py)
+	@$(BIN)/python -m services.execution.warm_up || true
 	@touch $@
 
 demo: $(STAMP) ## a truck crosses a bridge: simulated, recorded, identified, drawn

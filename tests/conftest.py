@@ -10,9 +10,9 @@ from hypothesis import settings
 from tests.endpoints import free_endpoint
 
 if TYPE_CHECKING:
-    from services.simulation import Drive
+    from services.simulation.drive import Drive
 
-# As the commands do, before anything imports numpy: see services/cli.py.
+# As the commands do, before anything imports numpy: see services/cli/main.py.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # No test depends on how quick the machine is.
@@ -75,7 +75,7 @@ def tls_endpoint() -> str:
 @pytest.fixture(scope="session")
 def credentials(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `driveby certs` makes for two trucks; whoever changes something changes a copy."""
-    from services.certs import certs_command
+    from services.security.certs import certs_command
 
     folder = tmp_path_factory.mktemp("bus") / "certs"
     certs_command(folder=folder, trucks=["truck-1", "truck-2"])
@@ -91,7 +91,7 @@ def csv_example() -> Path:
 @pytest.fixture(scope="session")
 def scenario_6() -> "Drive":
     """A crossing of the paper's scenario 6: fine mesh of 70 elements, 0.1 ms, no noise."""
-    from pre_core.paper import scenario_ratios
-    from services.simulation import paper_site, simulate_drive
+    from pre_core.paper.experiment import scenario_ratios
+    from services.simulation.drive import paper_site, simulate_drive
 
     return simulate_drive(paper_site(), scenario_ratios(6), road_class="A", seed=1)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from schemas.signals import Channel, GnssFix
-from services.common.bus import open_session
-from services.common.playback import stopped_by_signals
-from services.common.spool import Spool
+from services.bus.playback import stopped_by_signals
+from services.bus.session import open_session
 from services.truck.gateway import Gateway
+from services.truck.spool import Spool
 
 SITE = '[vehicle]\nid = "truck-1"\n'  # your truck's part of the site file
 

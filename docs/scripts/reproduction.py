@@ -17,20 +17,20 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from pre_core import least_squares, paper, parameters, random_walk, residual, search
-from pre_core.bridge import natural_frequencies_hz
-from pre_core.integrate import newmark_integrate, spline_integrate
-from pre_core.residual import Window
-from pre_core.vehicle import natural_frequencies_hz as vehicle_frequencies_hz
-from services.simulation import paper_site, simulate_drive
-from services.validation import (
+from pre_core import unknowns
+from pre_core.paper import experiment, random_walk, residual
+from pre_core.paper.crossing import ROAD_CLASS, ROAD_SEED, paper_window
+from pre_core.paper.integrate import newmark_integrate, spline_integrate
+from pre_core.paper.residual import Window
+from pre_core.physics.bridge import natural_frequencies_hz
+from pre_core.physics.vehicle import natural_frequencies_hz as vehicle_frequencies_hz
+from pre_core.search import levenberg_marquardt, loop
+from services.simulation.drive import paper_site, simulate_drive
+from services.validation.paper import (
     NAMES,
-    ROAD_CLASS,
-    ROAD_SEED,
     Cloud,
     cloud_of,
     compare_with_paper,
-    paper_window,
     table_columns,
     tables_of_paper,
 )
@@ -39,8 +39,8 @@ Floats = NDArray[np.float64]
 Proposal = Callable[[np.random.Generator, Floats], Floats]
 
 CONSOLE = Console(highlight=False, width=150)
-NOMINAL = parameters.from_models(paper.TRUCK, paper.beam(np.ones(paper.ELEMENTS)))
-FREE = parameters.paper_subset(paper.ELEMENTS)
+NOMINAL = unknowns.from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
+FREE = unknowns.paper_subset(experiment.ELEMENTS)
 
 
 class Walk(NamedTuple):
@@ -85,13 +85,13 @@ def one_at_a_time(std: float) -> Proposal:
 
 def window_of(scenario: int, road: tuple[str, int] = (ROAD_CLASS, ROAD_SEED)) -> Window:
     """The paper's experiment without noise."""
-    beam = paper.beam(paper.scenario_ratios(scenario))
-    return paper_window(paper.TRUCK, beam, 0.0, 0, road=road)
+    beam = experiment.beam(experiment.scenario_ratios(scenario))
+    return paper_window(experiment.TRUCK, beam, 0.0, 0, road=road)
 
 
 def truth_of(scenario: int) -> dict[str, float]:
     """True ratios by name."""
-    ratios = paper.scenario_ratios(scenario)
+    ratios = experiment.scenario_ratios(scenario)
     return dict.fromkeys(NAMES, 1.0) | {f"EI_{e + 1}": float(r) for e, r in enumerate(ratios)}
 
 
@@ -100,7 +100,7 @@ def objective(window: Window, work: residual.Workspace, ratios: Floats, limit: F
     theta = np.repeat(NOMINAL[None, :], ratios.shape[0], axis=0)
     theta[:, FREE] *= ratios
     total = np.full(ratios.shape[0], np.inf)
-    physical = np.all(ratios > 0.0, axis=1) & (theta[:, parameters.D_1] < window.wheelbase_m)
+    physical = np.all(ratios > 0.0, axis=1) & (theta[:, unknowns.D_1] < window.wheelbase_m)
     out = np.empty(int(physical.sum()))
     residual.objective_batch(window, work, theta[physical], limit[physical], out)
     total[physical] = out
@@ -165,7 +165,7 @@ def compare(tasks: list[Walk], title: str) -> None:
 
 def _figures(clouds: dict[int, Cloud]) -> list[str]:
     close = compare_with_paper(clouds)
-    rigidities = [f"EI_{e + 1}" for e in range(paper.ELEMENTS)]
+    rigidities = [f"EI_{e + 1}" for e in range(experiment.ELEMENTS)]
 
     def mean(scenario: int, *names: str) -> str:
         if scenario not in clouds:
@@ -241,16 +241,16 @@ def length(scenarios: tuple[int, ...]) -> None:
     )
 
 
-def fit(window: Window, start: Floats) -> tuple[Floats, int, search.Ending]:
+def fit(window: Window, start: Floats) -> tuple[Floats, int, loop.Ending]:
     """Least squares from `start` (ratios): the ratios found, steps, ending."""
-    problem = least_squares.Problem(window, NOMINAL, FREE)
+    problem = levenberg_marquardt.Problem(window, NOMINAL, FREE)
     work = residual.workspace(window)
-    state, infos, ending = search.run(
-        partial(least_squares.init, problem, work, NOMINAL[FREE] * start),
-        partial(least_squares.step, problem, work),
-        least_squares.MAX_STEPS,
+    state, infos, ending = loop.run(
+        partial(levenberg_marquardt.init, problem, work, NOMINAL[FREE] * start),
+        partial(levenberg_marquardt.step, problem, work),
+        levenberg_marquardt.MAX_STEPS,
     )
-    return least_squares.untransform(problem, state.y) / NOMINAL[FREE], len(infos), ending
+    return levenberg_marquardt.untransform(problem, state.y) / NOMINAL[FREE], len(infos), ending
 
 
 def starts(scenarios: tuple[int, ...], count: int = 20) -> None:
@@ -266,7 +266,7 @@ def starts(scenarios: tuple[int, ...], count: int = 20) -> None:
             cloud = cloud_of(columns, NAMES, truth_of(scenario))
             accuracy.append(min(cloud.accuracy.values()))
             steps.append(taken)
-            if ending is not search.Ending.CONVERGED:
+            if ending is not loop.Ending.CONVERGED:
                 CONSOLE.print(f"scenario {scenario}: {ending.value}")
         CONSOLE.print(
             f"scenario {scenario:2d}: {count} starts, 1 - S_A at worst {1 - min(accuracy):.1e}, "
@@ -280,17 +280,17 @@ def mesh(scenarios: tuple[int, ...]) -> None:
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("scenario", "rate", "integration", "parts"):
         table.add_column(column, justify="right")
-    for e in range(paper.ELEMENTS):
+    for e in range(experiment.ELEMENTS):
         table.add_column(f"EI_{e + 1}", justify="right")
     table.add_column("worst of the truck", justify="right")
     for scenario in scenarios:
         for rate in (1000.0, 200.0):
-            ratios = paper.scenario_ratios(scenario)
+            ratios = experiment.scenario_ratios(scenario)
             drive = simulate_drive(site, ratios, road_class="B", seed=1, rate_hz=rate).run
             time_s = drive.accel_time_s - drive.accel_time_s[0]
-            position = paper.SPEED_M_PER_S * (time_s - 3.0)
+            position = experiment.SPEED_M_PER_S * (time_s - 3.0)
             # The span and a second on either side: integration over more only adds drift.
-            part = np.flatnonzero((position > -10.0) & (position < paper.SPAN_M + 15.0))
+            part = np.flatnonzero((position > -10.0) & (position < experiment.SPAN_M + 15.0))
             for integrate, name in (
                 (newmark_integrate, "trapezoid"),
                 (spline_integrate, "spline"),
@@ -301,9 +301,11 @@ def mesh(scenarios: tuple[int, ...]) -> None:
                         1.0 / rate,
                         position[part],
                         1,
-                        element_lengths_m=np.full(paper.ELEMENTS, paper.SPAN_M / paper.ELEMENTS),
+                        element_lengths_m=np.full(
+                            experiment.ELEMENTS, experiment.SPAN_M / experiment.ELEMENTS
+                        ),
                         total_mass_kg=site.vehicles[0].total_mass_kg,
-                        wheelbase_m=paper.TRUCK.wheelbase_m,
+                        wheelbase_m=experiment.TRUCK.wheelbase_m,
                         integrate=integrate,
                         initial_state_known=False,
                         parts=parts,
@@ -329,8 +331,8 @@ def frequencies(scenarios: tuple[int, ...]) -> None:
         table.add_column(column, justify="right")
 
     def add(label: str, theirs: Floats, ratios: Floats) -> None:
-        right = natural_frequencies_hz(paper.beam(ratios), 4)
-        flipped = natural_frequencies_hz(paper.beam(ratios), 4, coupling_sign=-1.0)
+        right = natural_frequencies_hz(experiment.beam(ratios), 4)
+        flipped = natural_frequencies_hz(experiment.beam(ratios), 4, coupling_sign=-1.0)
         table.add_row(
             label,
             *(" ".join(f"{f:.2f}" for f in row) for row in (theirs, right, flipped)),
@@ -339,11 +341,11 @@ def frequencies(scenarios: tuple[int, ...]) -> None:
 
     for scenario in scenarios:
         theirs = np.array(printed["bridge_by_scenario"][str(scenario)])
-        add(str(scenario), theirs, paper.scenario_ratios(scenario))
+        add(str(scenario), theirs, experiment.scenario_ratios(scenario))
         if scenario == 12:
             add("12 with 0.2", theirs, np.array([1, 1, 1, 1, 1, 1, 0.2]))
     CONSOLE.print(table)
-    truck = " ".join(f"{f:.2f}" for f in vehicle_frequencies_hz(paper.TRUCK))
+    truck = " ".join(f"{f:.2f}" for f in vehicle_frequencies_hz(experiment.TRUCK))
     listed = " ".join(f"{f:.2f}" for f in printed["vehicle"])
     CONSOLE.print(f"vehicle: {listed} in Table 5, {truck} of Table 1's truck")
 

@@ -16,19 +16,19 @@ from schemas.events import Event, EventKind
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import PREFIX, check_identifier, check_realm
-from services.common.bus import Publisher, Received, Subscription, open_session
-from services.common.credentials import check_speaks_for
+from services.bus.credentials import check_speaks_for
+from services.bus.playback import leave_at_once, stopped_by_signals
+from services.bus.session import Publisher, Received, Subscription, open_session
 from services.common.disk import DISK
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, read_text
-from services.common.memory import give_back_memory
-from services.common.playback import leave_at_once, stopped_by_signals
-from services.common.recording import Message
 from services.logger.completeness import Completeness
 from services.logger.housekeeping import House, Housekeeping
 from services.logger.intake import Intake
+from services.logger.memory import give_back_memory
 from services.logger.own_events import OwnEvents
 from services.logger.writer import FileWriter, Limits, Place, count_all
+from services.recordings.recording import Message
 
 __all__ = ["run"]
 

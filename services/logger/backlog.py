@@ -3,7 +3,7 @@
 import threading
 from collections import deque
 
-from services.common.recording import Message
+from services.recordings.recording import Message
 
 QUEUE_MESSAGES = 200_000
 QUEUE_BYTES = 256 << 20

@@ -14,12 +14,12 @@ import zenoh
 from zenoh import handlers
 
 from schemas.topics import Key, is_replayed, parse_key, selector, topic
-from services.common.bus import Received
+from services.bus.session import Received
 from services.common.errors import InputError
 from services.common.intervals import Intervals
-from services.common.recording import read_identities
 from services.logger.intake import Intake
 from services.logger.spool_recovery import SpoolRecovery
+from services.recordings.recording import read_identities
 
 __all__ = ["Completeness", "Known", "known_on_disk"]
 

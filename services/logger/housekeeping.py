@@ -22,8 +22,8 @@ from schemas.events import Event, EventKind
 from schemas.topics import REALM
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError, InputError
-from services.common.recording import is_being_written, is_closed
-from services.common.recovery import ASIDE, put_aside, recovered_path
+from services.recordings.recording import is_being_written, is_closed
+from services.recordings.recovery import ASIDE, put_aside, recovered_path
 
 _log = logging.getLogger(__name__)
 _BUDGET_PERIOD_S = 10.0
@@ -144,7 +144,7 @@ class Housekeeping:
         realm = path.relative_to(self._house.folder).parts[0]
         results = sorted((self._house.folder / realm).glob("*.mcap"))
         arguments = [str(p) for p in (path, *others, *results)]
-        done = self._run_gently(["-m", "services.logger.processed", *arguments])
+        done = self._run_gently(["-m", "services.history.processed", *arguments])
         may_go = done is not None and done[0] == 0
         if not may_go:
             self._kept_until[path] = time.monotonic() + _ASK_AGAIN_S

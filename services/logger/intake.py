@@ -14,10 +14,10 @@ from schemas.events import Event, EventKind
 from schemas.messages import check_stamp
 from schemas.signals import Identity, Stamp
 from schemas.topics import Key, Topic, is_replayed, topic
-from services.common.bus import Received, Seen
+from services.bus.session import Received, Seen
 from services.common.intervals import Intervals
-from services.common.recording import Message
 from services.logger.clocks import TruckClock, clock_step_ns
+from services.recordings.recording import Message
 
 GAP_PATIENCE_S = 5.0
 """How long a missing message may take to be fetched before a gap is written down."""

@@ -5,7 +5,7 @@ from collections import Counter
 
 from schemas.events import Event, encode_event
 from schemas.topics import Key
-from services.common.recording import Message
+from services.recordings.recording import Message
 
 
 class OwnEvents:

@@ -30,7 +30,7 @@ from schemas.spool import (
     spool_selector,
 )
 from schemas.topics import Key, key
-from services.common.bus import Received, Seen
+from services.bus.session import Received, Seen
 from services.common.intervals import Intervals
 
 __all__ = ["Shortfall", "SpoolRecovery", "shortfall"]

@@ -24,10 +24,10 @@ from schemas.topics import Key, topic
 from services.common.disk import DISK, Disk
 from services.common.errors import InputError
 from services.common.intervals import Intervals
-from services.common.recording import Message, RecordingWriter
-from services.common.recovery import is_name_taken
 from services.logger.backlog import Backlog
 from services.logger.own_events import OwnEvents
+from services.recordings.recording import Message, RecordingWriter
+from services.recordings.recovery import is_name_taken
 
 _log = logging.getLogger(__name__)
 SYNC_PERIOD_S = 0.5

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from schemas.signals import Identity
 from schemas.topics import Key, check_realm, parse_key, topic
-from services.common.bus import Delivery, Publisher, open_session
-from services.common.credentials import check_speaks_for
+from services.bus.credentials import check_speaks_for
+from services.bus.playback import check_speed, confirm, play, settle, stopped_by_signals
+from services.bus.session import Delivery, Publisher, open_session
 from services.common.errors import FailureError, InputError
-from services.common.playback import check_speed, confirm, play, settle, stopped_by_signals
-from services.common.recording import Message, read_info, read_messages
+from services.recordings.recording import Message, read_info, read_messages
 
 __all__ = ["run"]
 

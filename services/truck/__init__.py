@@ -25,19 +25,19 @@ from schemas.signals import (
     location_class,
 )
 from schemas.topics import check_realm
-from services.common.bus import open_session
-from services.common.credentials import check_speaks_for
-from services.common.errors import InputError
-from services.common.playback import (
+from services.bus.credentials import check_speaks_for
+from services.bus.playback import (
     check_speed,
     confirm,
     play,
     settle,
     stopped_by_signals,
 )
-from services.common.recording import Message, read_messages
-from services.common.spool import DEFAULT_BUDGET_BYTES, Spool
+from services.bus.session import open_session
+from services.common.errors import InputError
+from services.recordings.recording import Message, read_messages
 from services.truck.gateway import Connect, Gateway
+from services.truck.spool import DEFAULT_BUDGET_BYTES, Spool
 
 __all__ = ["Gateway", "run"]
 
@@ -70,9 +70,9 @@ def run(
 
     `vehicle` chooses one of several; `tls` is a folder of its credentials, see `open_session`.
     With a folder `spool` every message goes to disk there first and stays until a logger has it
-    (see `services.common.spool`); what an earlier drive left there is offered, too, and there need
+    (see `services.truck.spool`); what an earlier drive left there is offered, too, and there need
     be no router yet: it drives at once and connects when it can. Returns when a logger has
-    everything on disk (see `services.common.bus`).
+    everything on disk (see `services.bus.session`).
 
     InputError: the recording is missing, is none, or holds no such vehicle, or another truck uses
     the spool. FailureError: nobody answers at the endpoint within `connect_timeout_s` (None: wait
@@ -148,7 +148,7 @@ def _messages(source: Path, vehicle: str | None, site: Path | None) -> Iterable[
         return read_messages(source)
     if site is None:
         raise InputError(f"{source}: a folder of CSV files needs --site")
-    from services.importing import messages_of
+    from services.drives.importing import messages_of
 
     return messages_of(source, site, vehicle)
 

@@ -52,9 +52,9 @@ from schemas.spool import (
     spool_selector,
 )
 from schemas.topics import Key, check_identifier, check_realm, key, topic
-from services.common.bus import Delivery, Publisher
+from services.bus.session import Delivery, Publisher
 from services.common.errors import FailureError
-from services.common.spool import Spool
+from services.truck.spool import Spool
 
 __all__ = ["Gateway"]
 

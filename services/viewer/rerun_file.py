@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from schemas.signals import CHANNELS, AccelBatch, GnssFix, decode_accel, decode_gnss
 from schemas.site import Site
 from services.common.files import replaced_atomically
-from services.common.recording import Message
+from services.recordings.recording import Message
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,

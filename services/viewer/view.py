@@ -20,7 +20,7 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, estimate_to_crossing, load_results
 from schemas.site import Site, load_site, parse_site
 from services.common.errors import FailureError, InputError
-from services.common.recording import Message, read_messages, read_site
+from services.recordings.recording import Message, read_messages, read_site
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.rerun_file import (
     VehicleSignals,

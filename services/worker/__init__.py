@@ -26,16 +26,16 @@ from schemas.settings import IdentificationSettings
 from schemas.signals import Identity
 from schemas.site import parse_site, site_hash
 from schemas.topics import check_identifier, check_realm, is_replayed, parse_key, selector
-from services.common.bus import Publisher, Seen, Subscription, open_session
-from services.common.credentials import check_speaks_for
+from services.bus.credentials import check_speaks_for
+from services.bus.playback import leave_at_once, stopped_by_signals
+from services.bus.session import Publisher, Seen, Subscription, open_session
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, read_text
-from services.common.playback import leave_at_once, stopped_by_signals
-from services.common.recording import Message, program_version
+from services.execution.warm_up import warm_up
+from services.history.result_files import Earlier, ResultFiles, read_earlier
+from services.identification.engine import Engine, Output
+from services.recordings.recording import Message, program_version
 from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
-from services.worker.engine import Engine, Output
-from services.worker.result_files import Earlier, ResultFiles, read_earlier
-from services.worker.warm_up import warm_up
 
 __all__ = ["run"]
 

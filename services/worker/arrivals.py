@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from schemas.topics import Key
-from services.common.streams import device_time_ns
+from services.identification.streams import device_time_ns
 
 GONE_AFTER_S = 3.0
 """A truck whose token has gone is given this long for what is still on its way."""

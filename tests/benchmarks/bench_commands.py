@@ -31,7 +31,8 @@ def peak_bytes():
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 bare = peak_bytes()
-from pre_core import random_walk, search
+from pre_core.paper import random_walk
+from pre_core.search import loop as search
 from tests.benchmarks import cases
 walk = random_walk.problem(cases.paper_window(6), cases.NOMINAL, cases.FREE, seed=1)
 random_walk.step(walk, random_walk.init(walk, 8))
@@ -48,7 +49,7 @@ import cProfile, json, pstats, sys, time
 from pathlib import Path
 began = time.perf_counter()
 from schemas.settings import IdentificationSettings
-from services.identify import identify_recordings, site_of
+from services.cli.identify import identify_recordings, site_of
 imported = time.perf_counter()
 recordings = [Path(sys.argv[1])]
 settings = IdentificationSettings.model_validate({"method": "least_squares", "seed": 0})
@@ -76,7 +77,7 @@ import json, resource, sys, time
 from pathlib import Path
 began = time.perf_counter()
 from schemas.settings import IdentificationSettings
-from services.identify import identify_recordings, site_of
+from services.cli.identify import identify_recordings, site_of
 imported = time.perf_counter()
 recordings = [Path(sys.argv[1])]
 settings = IdentificationSettings.model_validate({"seed": 0})
@@ -180,9 +181,9 @@ def test_identify_pre(benchmark: BenchmarkFixture, noisy: Path):
 
 
 _PLACES = {
-    "the kernels of J (pre_core/residual.py)": ("pre_core/residual.py",),
+    "the kernels of J (pre_core/paper/residual.py)": ("pre_core/paper/residual.py",),
     "linear algebra of the steps (least_squares.py, SciPy, NumPy)": (
-        "pre_core/least_squares.py",
+        "pre_core/search/levenberg_marquardt.py",
         "scipy",
         "numpy",
     ),
@@ -192,8 +193,8 @@ _PLACES = {
         "zstandard",
         "schemas/signals.py",
         "schemas/topics.py",
-        "services/common/recording.py",
-        "services/common/streams.py",
+        "services/recordings/recording.py",
+        "services/identification/streams.py",
         "struct",
         "decompress",
     ),

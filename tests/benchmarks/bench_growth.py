@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pre_core import paper, residual
-from pre_core.residual import Window
+from pre_core.paper import experiment, residual
+from pre_core.paper.residual import Window
 from tests.benchmarks import cases
 
 _ROUNDS = 15
@@ -15,7 +15,7 @@ _ROUNDS = 15
 
 class _Size(NamedTuple):
     window: Window
-    elements: int = paper.ELEMENTS
+    elements: int = experiment.ELEMENTS
     particles: int = 64
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pre_core import least_squares, paper, random_walk, residual, search
-from pre_core.simulate import simulate
+from pre_core.paper import experiment, random_walk, residual
+from pre_core.physics.simulate import simulate
+from pre_core.search import levenberg_marquardt, loop
 from tests.benchmarks import cases, plain_numpy
 
 BATCH = 500
@@ -48,7 +49,7 @@ def test_plain_numpy(
     benchmark: BenchmarkFixture, plain: Callable[[plain_numpy.Prepared, cases.Floats], float]
 ):
     window = cases.paper_window(cases.SCENARIO)
-    prepared = plain_numpy.prepare(window, paper.ELEMENTS, paper.SPAN_M)
+    prepared = plain_numpy.prepare(window, experiment.ELEMENTS, experiment.SPAN_M)
     vectors = itertools.cycle(cases.particles(20))
     benchmark.pedantic(
         lambda theta: plain(prepared, theta),
@@ -64,11 +65,11 @@ def test_paper_search(benchmark: BenchmarkFixture):
     random_walk.init(walk, 8)  # compiled, or loaded
 
     def whole_search() -> random_walk.State:
-        state, _, _ = search.run(
+        state, _, _ = loop.run(
             partial(random_walk.init, walk),
             partial(random_walk.step, walk),
             random_walk.STEPS,
-            at_the_end=search.Ending.STEPS_DONE,
+            at_the_end=loop.Ending.STEPS_DONE,
         )
         return state
 
@@ -80,19 +81,19 @@ def test_paper_search(benchmark: BenchmarkFixture):
 
 def test_least_squares(benchmark: BenchmarkFixture):
     window = cases.paper_window(cases.SCENARIO)
-    problem = least_squares.Problem(window, cases.NOMINAL, cases.FREE)
+    problem = levenberg_marquardt.Problem(window, cases.NOMINAL, cases.FREE)
     work = residual.workspace(window)
     nominal = cases.NOMINAL[cases.FREE]
     starts = iter(cases.start_ratios(21, seed=2))
     worst, steps, evaluations = [], [], []
 
     def from_start(start: cases.Floats) -> None:
-        state, infos, _ = search.run(
-            partial(least_squares.init, problem, work, nominal * start),
-            partial(least_squares.step, problem, work),
-            least_squares.MAX_STEPS,
+        state, infos, _ = loop.run(
+            partial(levenberg_marquardt.init, problem, work, nominal * start),
+            partial(levenberg_marquardt.step, problem, work),
+            levenberg_marquardt.MAX_STEPS,
         )
-        found = least_squares.untransform(problem, state.y) / nominal
+        found = levenberg_marquardt.untransform(problem, state.y) / nominal
         worst.append(float(cases.accuracy(found, cases.SCENARIO).min()))
         steps.append(len(infos))
         evaluations.append(cases.FREE.size + 1 + sum(info.evaluations for info in infos))
@@ -109,7 +110,7 @@ def test_simulation(benchmark: BenchmarkFixture):
     drive = cases.paper_drive()
     run = benchmark.pedantic(
         simulate,
-        args=(paper.TRUCK, drive.beam, drive.motion, drive.road, paper.STEP_S),
+        args=(experiment.TRUCK, drive.beam, drive.motion, drive.road, experiment.STEP_S),
         rounds=30,
         warmup_rounds=1,
     )

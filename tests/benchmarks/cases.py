@@ -8,27 +8,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core import paper, parameters, random_walk, residual
-from pre_core.bridge import Beam
-from pre_core.integrate import newmark_integrate
-from pre_core.residual import Window
-from pre_core.road import iso_8608_profile, under_wheels
-from pre_core.simulate import Motion, WheelRoad, constant_speed
-from pre_core.vehicle import total_mass_kg
-from services import validation
+from pre_core import unknowns
+from pre_core.paper import crossing, experiment, random_walk, residual
+from pre_core.paper.integrate import newmark_integrate
+from pre_core.paper.residual import Window
+from pre_core.physics.bridge import Beam
+from pre_core.physics.road import iso_8608_profile, under_wheels
+from pre_core.physics.simulate import Motion, WheelRoad, constant_speed
+from pre_core.physics.vehicle import total_mass_kg
 
 Floats = NDArray[np.float64]
 
 SCENARIO = 6
-FREE = parameters.paper_subset(paper.ELEMENTS)
-NOMINAL = parameters.from_models(paper.TRUCK, paper.beam(np.ones(paper.ELEMENTS)))
+FREE = unknowns.paper_subset(experiment.ELEMENTS)
+NOMINAL = unknowns.from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
 
 
 @cache
 def paper_window(scenario: int) -> Window:
     """One crossing of the paper: 14 degrees of freedom, 1 ms, no noise."""
-    beam = paper.beam(paper.scenario_ratios(scenario))
-    return validation.paper_window(paper.TRUCK, beam, 0.0, 1)
+    beam = experiment.beam(experiment.scenario_ratios(scenario))
+    return crossing.paper_window(experiment.TRUCK, beam, 0.0, 1)
 
 
 def particles(count: int, seed: int = 0) -> Floats:
@@ -53,14 +53,14 @@ def accuracy(ratios: Floats, scenario: int) -> Floats:
     """S_A (20,) of one vector of ratios (19,): the paper's twenty rows, m_s1 and m_s2 derived."""
     window = paper_window(scenario)
     masses = [
-        parameters.body_masses(theta, window.total_mass_kg, window.wheelbase_m)[1:]
+        unknowns.body_masses(theta, window.total_mass_kg, window.wheelbase_m)[1:]
         for theta in (full(ratios[None, :])[0], NOMINAL)
     ]
     truth = np.ones(FREE.size)
-    rigidities = slice(parameters.EI_1, parameters.EI_1 + paper.ELEMENTS)
+    rigidities = slice(unknowns.EI_1, unknowns.EI_1 + experiment.ELEMENTS)
     places = np.flatnonzero((rigidities.start <= FREE) & (rigidities.stop > FREE))
-    truth[places] = paper.scenario_ratios(scenario)
-    off = np.abs(ratios - truth)[FREE != parameters.D_1]
+    truth[places] = experiment.scenario_ratios(scenario)
+    off = np.abs(ratios - truth)[FREE != unknowns.D_1]
     return np.asarray(1.0 - np.concatenate([np.abs(masses[0] / masses[1] - 1.0), off]))
 
 
@@ -75,33 +75,35 @@ class Drive(NamedTuple):
 @cache
 def paper_drive() -> Drive:
     """The paper's truck from 10 m before the bridge until its rear axle has left it."""
-    beam = paper.beam(paper.scenario_ratios(SCENARIO))
-    travel = paper.SPAN_M + paper.TRUCK.wheelbase_m - paper.FRONT_AXLE_START_M
-    steps = round(travel / paper.SPEED_M_PER_S / paper.STEP_S)
-    motion = constant_speed(paper.FRONT_AXLE_START_M, paper.SPEED_M_PER_S, steps, paper.STEP_S)
+    beam = experiment.beam(experiment.scenario_ratios(SCENARIO))
+    travel = experiment.SPAN_M + experiment.TRUCK.wheelbase_m - experiment.FRONT_AXLE_START_M
+    steps = round(travel / experiment.SPEED_M_PER_S / experiment.STEP_S)
+    motion = constant_speed(
+        experiment.FRONT_AXLE_START_M, experiment.SPEED_M_PER_S, steps, experiment.STEP_S
+    )
     road = iso_8608_profile(-16.0, 46.0, 0.01, "B", 1)
-    return Drive(beam, motion, under_wheels(road, motion, paper.TRUCK.wheelbase_m, 1))
+    return Drive(beam, motion, under_wheels(road, motion, experiment.TRUCK.wheelbase_m, 1))
 
 
 def noise_window(
     *,
-    elements: int = paper.ELEMENTS,
+    elements: int = experiment.ELEMENTS,
     parts: int = 1,
     coordinates: int | None = None,
-    speed_m_per_s: float = paper.SPEED_M_PER_S,
+    speed_m_per_s: float = experiment.SPEED_M_PER_S,
 ) -> Window:
     """A crossing of the paper's span whose signals are noise: an evaluation takes as long."""
-    travel = paper.SPAN_M + paper.TRUCK.wheelbase_m + 1.0
-    steps = round(travel / speed_m_per_s / paper.STEP_S)
-    motion = constant_speed(-0.5, speed_m_per_s, steps, paper.STEP_S)
+    travel = experiment.SPAN_M + experiment.TRUCK.wheelbase_m + 1.0
+    steps = round(travel / speed_m_per_s / experiment.STEP_S)
+    motion = constant_speed(-0.5, speed_m_per_s, steps, experiment.STEP_S)
     return residual.build_window(
         np.random.default_rng(0).standard_normal((4, steps)),
-        paper.STEP_S,
+        experiment.STEP_S,
         motion.position_m,
         1,
-        element_lengths_m=np.full(elements, paper.SPAN_M / elements),
-        total_mass_kg=total_mass_kg(paper.TRUCK),
-        wheelbase_m=paper.TRUCK.wheelbase_m,
+        element_lengths_m=np.full(elements, experiment.SPAN_M / elements),
+        total_mass_kg=total_mass_kg(experiment.TRUCK),
+        wheelbase_m=experiment.TRUCK.wheelbase_m,
         integrate=newmark_integrate,
         initial_state_known=True,
         parts=parts,
@@ -111,12 +113,12 @@ def noise_window(
 
 def noise_particles(count: int, elements: int) -> Floats:
     """Vectors of parameters (count, elements + 15) for `noise_window`."""
-    beam = paper.beam(np.ones(paper.ELEMENTS))._replace(
-        element_lengths_m=np.full(elements, paper.SPAN_M / elements),
-        flexural_rigidity_nm2=np.full(elements, paper.FLEXURAL_RIGIDITY_NM2),
-        mass_per_length_kg_per_m=np.full(elements, paper.MASS_PER_LENGTH_KG_PER_M),
+    beam = experiment.beam(np.ones(experiment.ELEMENTS))._replace(
+        element_lengths_m=np.full(elements, experiment.SPAN_M / elements),
+        flexural_rigidity_nm2=np.full(elements, experiment.FLEXURAL_RIGIDITY_NM2),
+        mass_per_length_kg_per_m=np.full(elements, experiment.MASS_PER_LENGTH_KG_PER_M),
     )
-    nominal = parameters.from_models(paper.TRUCK, beam)
+    nominal = unknowns.from_models(experiment.TRUCK, beam)
     return np.asarray(nominal * np.random.default_rng(0).uniform(0.8, 1.2, (count, nominal.size)))
 
 
@@ -137,7 +139,7 @@ class Objective:
         theta = full(ratios)
         total = np.full(ratios.shape[0], np.inf)
         physical = np.all(ratios > 0.0, axis=1) & np.all(np.isfinite(ratios), axis=1)
-        physical &= theta[:, parameters.D_1] < self._window.wheelbase_m
+        physical &= theta[:, unknowns.D_1] < self._window.wheelbase_m
         chosen = np.flatnonzero(physical)
         total[chosen] = self._batch(theta[chosen])
         self.evaluations += ratios.shape[0]

@@ -35,9 +35,9 @@ from schemas.signals import (
     decode_identity,
     encode_accel,
 )
-from services.common.bus import open_session
-from services.common.recording import read_identities, read_info
+from services.bus.session import open_session
 from services.logger.writer import Limits
+from services.recordings.recording import read_identities, read_info
 from services.truck.gateway import Gateway
 
 BATCHES_PER_S = 20

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.signal import lfilter
 
-from pre_core.parameters import C_S1, D_1, EI_1, K_S1, K_U1, M_U1
-from pre_core.residual import Window
+from pre_core.paper.residual import Window
+from pre_core.unknowns import C_S1, D_1, EI_1, K_S1, K_U1, M_U1
 
 Floats = NDArray[np.float64]
 

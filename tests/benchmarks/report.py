@@ -35,7 +35,9 @@ def main() -> int:
         run = json.loads(options.load.read_text("utf-8"))
     else:
         load = os.getloadavg()[0]
-        subprocess.run([sys.executable, "-m", "services.precompile"], cwd=PROJECT, check=True)
+        subprocess.run(
+            [sys.executable, "-m", "services.execution.warm_up"], cwd=PROJECT, check=True
+        )
         run = _run() | {"load": load}
     if options.save is not None:
         options.save.write_text(json.dumps(run, indent=1), encoding="utf-8")

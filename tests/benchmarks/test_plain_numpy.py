@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pre_core import paper, residual
+from pre_core.paper import experiment, residual
 from tests.benchmarks import cases, plain_numpy
 
 
@@ -15,7 +15,7 @@ from tests.benchmarks import cases, plain_numpy
 def test_plain_numpy_agrees(plain: Callable[[plain_numpy.Prepared, cases.Floats], float]):
     window = cases.paper_window(cases.SCENARIO)
     work = residual.workspace(window)
-    prepared = plain_numpy.prepare(window, paper.ELEMENTS, paper.SPAN_M)
+    prepared = plain_numpy.prepare(window, experiment.ELEMENTS, experiment.SPAN_M)
     vectors = cases.particles(5)
     ours = np.array([residual.objective(window, work, theta) for theta in vectors])
     np.testing.assert_allclose([plain(prepared, theta) for theta in vectors], ours, rtol=1e-9)

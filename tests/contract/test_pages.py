@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from schemas.site import load_site
-from services import cli
+from services.cli import main as cli
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(
@@ -77,7 +77,7 @@ def test_compose_publishes_ports_on_loopback_only():
 def test_help_does_not_import_the_heavy_libraries():
     heavy = {"numba", "zenoh", "rerun", "matplotlib", "scipy", "pydantic"}
     code = (
-        "import sys\nfrom services import cli\n"
+        "import sys\nfrom services.cli import main as cli\n"
         "try:\n    cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
         f"print('LOADED', sorted({heavy!r} & sys.modules.keys()))"
     )

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from services.common.errors import InputError
-from services.common.recording import Message, is_closed, read_info, read_messages
+from services.recordings.recording import Message, is_closed, read_info, read_messages
 from tests.endpoints import free_endpoint
 
 HERE = Path(__file__).parent

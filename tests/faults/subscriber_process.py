@@ -3,7 +3,7 @@
 import sys
 
 from schemas.topics import selector
-from services.common.bus import Subscription, open_session
+from services.bus.session import Subscription, open_session
 
 
 def main(endpoint: str) -> None:

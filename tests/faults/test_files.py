@@ -29,11 +29,11 @@ from schemas.topics import Key
 from services import logger
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError
-from services.common.recording import Message, is_closed, read_info, read_messages
-from services.common.recovery import recover_recording
 from services.logger import writer as writer_module
 from services.logger.backlog import QUEUE_BYTES, Backlog
 from services.logger.writer import FileWriter, Limits, Place
+from services.recordings.recording import Message, is_closed, read_info, read_messages
+from services.recordings.recovery import recover_recording
 
 NOW_NS = 1_700_000_000_000_000_000
 

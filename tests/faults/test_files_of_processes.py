@@ -11,9 +11,9 @@ import pytest
 
 from schemas.events import EventKind, decode_event
 from schemas.proto import driveby_pb2 as pb
-from services.common.bus import Publisher, open_session
+from services.bus.session import Publisher, open_session
 from services.common.errors import InputError
-from services.common.recording import is_closed, read_info, read_messages
+from services.recordings.recording import is_closed, read_info, read_messages
 
 pytestmark = pytest.mark.process
 Fleet = Any  # of conftest.py, which tests do not import

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from schemas.events import EventKind, decode_event
-from services.common.recording import read_messages
+from services.recordings.recording import read_messages
 
 KILLS_ENV = "DRIVEBY_SOAK_KILLS"
 MINUTES_ENV = "DRIVEBY_SOAK_MINUTES"

@@ -14,7 +14,11 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import GnssFix, encode_gnss
 from schemas.topics import Key
 from services.common.disk import DISK
-from services.common.recording import (
+from services.history.processed import is_processed
+from services.logger import housekeeping
+from services.logger.housekeeping import House, Housekeeping
+from services.logger.writer import FileWriter, Place
+from services.recordings.recording import (
     Message,
     RecordingWriter,
     is_closed,
@@ -23,10 +27,6 @@ from services.common.recording import (
     read_site,
     write_recording,
 )
-from services.logger import housekeeping
-from services.logger.housekeeping import House, Housekeeping
-from services.logger.processed import is_processed
-from services.logger.writer import FileWriter, Place
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "crossing.mcap"
 NOW_NS = 1_700_000_000_000_000_000
@@ -134,7 +134,7 @@ def test_the_name_of_what_was_set_aside_is_not_used_again(
     assert path.name == taken[2]
     assert path.name.endswith("Z-3.mcap")
     monkeypatch.undo()
-    from services.common.recovery import is_name_taken
+    from services.recordings.recovery import is_name_taken
 
     for name in ("a.mcap", "a.recovered.mcap", "a.mcap.crashed"):
         assert not is_name_taken(tmp_path / "a.mcap")

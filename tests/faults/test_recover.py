@@ -18,17 +18,17 @@ from mcap.stream_reader import StreamReader
 from schemas.events import EventKind, decode_event
 from schemas.signals import GnssFix, encode_gnss
 from schemas.topics import Key
-from services import cli
+from services.cli import main as cli
 from services.common.errors import FailureError, InputError
-from services.common.mcap_scan import MAX_RECORD_BYTES
-from services.common.recording import (
+from services.recordings.mcap_scan import MAX_RECORD_BYTES
+from services.recordings.recording import (
     Message,
     RecordingWriter,
     read_info,
     read_messages,
     read_site,
 )
-from services.common.recovery import Recovery, recover_recording, recovered_path
+from services.recordings.recovery import Recovery, recover_recording, recovered_path
 
 NOW_NS = 1_700_000_000_000_000_000
 CHUNKS = 60

@@ -17,11 +17,11 @@ import pytest
 import zenoh
 
 from schemas.topics import selector
-from services import certs
-from services.certs import certs_command
-from services.common.bus import Publisher, Received, Subscription, get_latest, open_session
-from services.common.credentials import CONFIGURATION, Subject, link_settings
+from services.bus.credentials import CONFIGURATION, Subject, link_settings
+from services.bus.session import Publisher, Received, Subscription, get_latest, open_session
 from services.common.errors import FailureError
+from services.security import certs
+from services.security.certs import certs_command
 from tests.endpoints import free_endpoint
 
 V1 = "driveby/v1"

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from schemas.signals import CHANNELS, Channel, GnssFix
-from services.common.bus import open_session
-from services.common.playback import stopped_by_signals
-from services.common.spool import Spool
+from services.bus.playback import stopped_by_signals
+from services.bus.session import open_session
 from services.truck.gateway import Gateway
+from services.truck.spool import Spool
 
 STEP_ENV = "DRIVEBY_TEST_CLOCK_STEP"
 """`AFTER_BATCHES:SECONDS`: the wall clock jumps."""

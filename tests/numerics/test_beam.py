@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from pre_core import paper
-from pre_core.bridge import (
+from pre_core.paper import experiment
+from pre_core.physics.bridge import (
     element_mass,
     element_stiffness,
     interpolation_matrix,
@@ -25,8 +25,8 @@ from pre_core.bridge import (
     stiffness_matrix,
     uniform_beam,
 )
-from pre_core.simulate import WheelRoad, constant_speed, deflection_m, simulate
-from pre_core.vehicle import static_axle_loads_n
+from pre_core.physics.simulate import WheelRoad, constant_speed, deflection_m, simulate
+from pre_core.physics.vehicle import static_axle_loads_n
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
@@ -152,7 +152,7 @@ def test_seven_elements_are_close(agree: Agree) -> None:
 
 
 def test_refining_changes_no_physics() -> None:
-    beam = paper.beam(paper.scenario_ratios(9))._replace(
+    beam = experiment.beam(experiment.scenario_ratios(9))._replace(
         support_rotational_stiffness_nm_per_rad=(1e8, 3e8)
     )
     fine = refine(beam, 3)
@@ -186,7 +186,7 @@ def influence(x: FloatArray, a: float, force: float) -> FloatArray:
 def test_static_deflection_at_the_nodes_is_exact(front: float, parts: int) -> None:
     """Cubic elements under consistent loads have exact nodal values, wherever the truck stands."""
     beam = refine(uniform_beam(SPAN, [EI] * 7, RHO, 0.0, 0.0), parts)
-    loads = -np.array(static_axle_loads_n(paper.TRUCK, 9.80665))
+    loads = -np.array(static_axle_loads_n(experiment.TRUCK, 9.80665))
     axles = np.array([front, front - 4.4])
     nodes = np.linspace(0.0, SPAN, 7 * parts + 1)
     expected = sum(influence(nodes, a, p) for a, p in zip(axles, loads, strict=True))
@@ -197,7 +197,7 @@ def test_static_deflection_at_the_nodes_is_exact(front: float, parts: int) -> No
 
 def test_static_deflection_under_the_wheels(agree: Agree, measured: Agree) -> None:
     """Within an element the point load costs accuracy; refined four times it is gone to 1e-5."""
-    loads = -np.array(static_axle_loads_n(paper.TRUCK, 9.80665))
+    loads = -np.array(static_axle_loads_n(experiment.TRUCK, 9.80665))
     axles = np.array([16.3, 11.9])
     expected = np.sum([influence(axles, a, p) for a, p in zip(axles, loads, strict=True)], axis=0)
     meshes = np.array([1, 2, 4, 8])
@@ -225,7 +225,7 @@ def test_static_deflection_under_the_wheels(agree: Agree, measured: Agree) -> No
 )
 @settings(max_examples=30, deadline=None, derandomize=True)
 def test_maxwells_reciprocity(a: float, b: float, ratios: list[float]) -> None:
-    beam = paper.beam(np.array(ratios))
+    beam = experiment.beam(np.array(ratios))
     at_a, at_b, force = np.array([a]), np.array([b]), np.array([1e5])
     there = static_deflection_m(beam, at_a, force, at_b)
     back = static_deflection_m(beam, at_b, force, at_a)
@@ -236,10 +236,10 @@ def test_maxwells_reciprocity(a: float, b: float, ratios: list[float]) -> None:
 def test_element_wise_rigidity_by_the_unit_load_method(scenario: int, agree: Agree) -> None:
     """y(x) = integral of M(s) m(s, x)/EI(s) ds, by Gauss points between all kinks: no finite
     elements in it. Ours at the nodes, 7 elements."""
-    ratios = paper.scenario_ratios(scenario)
+    ratios = experiment.scenario_ratios(scenario)
     nodes = np.linspace(0.0, SPAN, 8)
     axles = np.array([19.2, 14.8])
-    loads = -np.array(static_axle_loads_n(paper.TRUCK, 9.80665))
+    loads = -np.array(static_axle_loads_n(experiment.TRUCK, 9.80665))
 
     def moment(s: FloatArray, a: float) -> FloatArray:
         return np.where(s <= a, s * (SPAN - a), a * (SPAN - s)) / SPAN
@@ -253,7 +253,7 @@ def test_element_wise_rigidity_by_the_unit_load_method(scenario: int, agree: Agr
             rigidity = EI * ratios[min(6, int(0.5 * (low + high) / SPAN * 7))]
             total = sum(p * moment(s, a) for a, p in zip(axles, loads, strict=True))
             expected[i] += 0.5 * (high - low) * np.sum(weights * total * moment(s, x)) / rigidity
-    ours = static_deflection_m(paper.beam(ratios), axles, loads, nodes)
+    ours = static_deflection_m(experiment.beam(ratios), axles, loads, nodes)
     np.testing.assert_allclose(ours, expected, rtol=1e-9, atol=1e-15)
     agree(
         f"unit-load method: scenario {scenario}, deflection at 4L/7, m", expected[4], ours[4], 1e-9
@@ -262,12 +262,12 @@ def test_element_wise_rigidity_by_the_unit_load_method(scenario: int, agree: Agr
 
 def test_a_truck_that_stands_on_the_bridge_sinks_to_the_static_deflection(agree: Agree) -> None:
     """simulate() on the 7 elements, 2 ms, with much damping to settle in 6 s; node 4 is at 4L/7."""
-    beam = paper.beam(paper.scenario_ratios(6))._replace(rayleigh_alpha_per_s=20.0)
+    beam = experiment.beam(experiment.scenario_ratios(6))._replace(rayleigh_alpha_per_s=20.0)
     steps = 4000
     smooth = WheelRoad(np.zeros((steps, 2)), np.zeros((steps, 2)))
     motion = constant_speed(16.3, 0.0, steps, 0.002)
-    run = simulate(paper.TRUCK, beam, motion, smooth, 0.002)
-    loads = -np.array(static_axle_loads_n(paper.TRUCK, 9.80665))
+    run = simulate(experiment.TRUCK, beam, motion, smooth, 0.002)
+    loads = -np.array(static_axle_loads_n(experiment.TRUCK, 9.80665))
     axles = np.array([16.3, 11.9])
     x = np.concatenate([[SPAN * 4 / 7], axles])
     expected = static_deflection_m(beam, axles, loads, x)
@@ -302,7 +302,7 @@ def test_interpolation_is_that_of_the_shape_functions(x: float, ratios: list[flo
 
 
 def test_modes_are_mass_normalised() -> None:
-    beam = paper.beam(paper.scenario_ratios(8))._replace(
+    beam = experiment.beam(experiment.scenario_ratios(8))._replace(
         support_rotational_stiffness_nm_per_rad=(2e8, 0.0)
     )
     basis = modes(beam)
@@ -329,13 +329,15 @@ class TestTable5:
         self, paper_tables: dict[str, Any], agree: Agree
     ) -> None:
         table = paper_tables["table5_natural_frequencies_hz"]["bridge_by_scenario"]["1"]
-        ours = natural_frequencies_hz(paper.beam(paper.scenario_ratios(1)), 4)
+        ours = natural_frequencies_hz(experiment.beam(experiment.scenario_ratios(1)), 4)
         for i, known in enumerate((3.29, 13.15, 29.6, 52.9)):
             agree(f"Table 2's beam, correct matrix: f_{i + 1}, Hz", known, float(ours[i]), 2e-3)
         assert np.all(np.abs(ours - table) > 0.07)
 
     def test_flipped_sign_gives_table_5(self, paper_tables: dict[str, Any], agree: Agree) -> None:
-        ours = natural_frequencies_hz(paper.beam(paper.scenario_ratios(1)), 4, coupling_sign=-1.0)
+        ours = natural_frequencies_hz(
+            experiment.beam(experiment.scenario_ratios(1)), 4, coupling_sign=-1.0
+        )
         for i, known in enumerate((3.37, 14.47, 36.02, 69.96)):
             agree(f"Table 2's beam, sign flipped: f_{i + 1}, Hz", known, float(ours[i]), 1.5e-3)
         table = paper_tables["table5_natural_frequencies_hz"]["bridge_by_scenario"]["1"]
@@ -346,7 +348,7 @@ class TestTable5:
         self, scenario: int, paper_tables: dict[str, Any], measured: Agree
     ) -> None:
         table = paper_tables["table5_natural_frequencies_hz"]["bridge_by_scenario"][str(scenario)]
-        beam = paper.beam(paper.scenario_ratios(scenario))
+        beam = experiment.beam(experiment.scenario_ratios(scenario))
         flipped = natural_frequencies_hz(beam, 2, coupling_sign=-1.0)
         for mode in range(2):
             measured(
@@ -365,7 +367,7 @@ class TestTable5:
         def misfit(ratio: float) -> float:
             ratios = np.ones(7)
             ratios[6] = ratio
-            ours = natural_frequencies_hz(paper.beam(ratios), 4, coupling_sign=-1.0)
+            ours = natural_frequencies_hz(experiment.beam(ratios), 4, coupling_sign=-1.0)
             return float(np.sqrt(np.mean((ours / table - 1.0) ** 2)))
 
         grid = np.arange(0.10, 0.50, 0.01)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core import paper
-from pre_core.bridge import Beam, element_cubics, interpolation_matrix, locate, refine
-from pre_core.integrate import newmark_integrate
-from pre_core.road import Profile, iso_8608_profile, under_wheels
-from pre_core.simulate import (
+from pre_core.paper import experiment
+from pre_core.paper.integrate import newmark_integrate
+from pre_core.physics.bridge import Beam, element_cubics, interpolation_matrix, locate, refine
+from pre_core.physics.road import Profile, iso_8608_profile, under_wheels
+from pre_core.physics.simulate import (
     Motion,
     Simulation,
     WheelRoad,
@@ -20,12 +20,12 @@ from pre_core.simulate import (
     rear_position_m,
     simulate,
 )
-from pre_core.vehicle import HalfCar, static_axle_loads_n
+from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
 
-FULL_CAR = paper.TRUCK._replace(
+FULL_CAR = experiment.TRUCK._replace(
     pitch_inertia_ratio=1.3, tyre_damping_ns_per_m=(3000.0, 2500.0), bilinear_damping=0.15
 )
 
@@ -53,7 +53,7 @@ def crossing(
 ) -> tuple[Beam, Motion, WheelRoad, Simulation]:
     """A crossing with changing speed of a bridge with springs at its supports: 14 elements."""
     if beam is None:
-        beam = refine(paper.beam(paper.scenario_ratios(6)), 2)._replace(
+        beam = refine(experiment.beam(experiment.scenario_ratios(6)), 2)._replace(
             support_rotational_stiffness_nm_per_rad=(2e8, 1e8)
         )
     motion = constant_acceleration(-1.0, 12.0, acceleration, round(seconds / step_s) + 1, step_s)
@@ -156,7 +156,7 @@ def energy_error(step_s: float, car: HalfCar) -> float:
 def test_energy_balance(kind: str, measured: Agree) -> None:
     """14 elements, 6 modes. The imbalance is that of the time step: it falls with its square, so
     that its size at 0.25 ms is a discretisation error and not a missing term."""
-    car = paper.TRUCK if kind == "linear" else FULL_CAR._replace(cg_height_m=1.2)
+    car = experiment.TRUCK if kind == "linear" else FULL_CAR._replace(cg_height_m=1.2)
     steps = np.array([0.002, 0.001, 0.0005, 0.00025])
     errors = [energy_error(float(h), car) for h in steps]
     order = float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
@@ -169,7 +169,7 @@ def test_driving_back_over_the_mirrored_bridge_feels_the_same() -> None:
     elements, 1 ms, speeding up, with tyre and bilinear damping."""
     span = 30.0
     lengths = np.array([3.0, 5.0, 4.0, 2.0, 6.0, 5.5, 4.5])
-    beam = paper.beam(np.array([1.0, 0.4, 0.9, 1.0, 0.7, 1.0, 0.6]))._replace(
+    beam = experiment.beam(np.array([1.0, 0.4, 0.9, 1.0, 0.7, 1.0, 0.6]))._replace(
         element_lengths_m=lengths, support_rotational_stiffness_nm_per_rad=(1e8, 4e8)
     )
     mirrored = beam._replace(
@@ -202,24 +202,28 @@ def test_driving_back_over_the_mirrored_bridge_feels_the_same() -> None:
 def test_coupling_tolerance(measured: Agree) -> None:
     """The error of stopping the exchange of forces early stays below the tolerance; with the
     paper's 1e-3 two exchanges a step are enough (7 elements, 1 ms)."""
-    beam = paper.beam(np.ones(7))
-    _, _, _, exact = crossing(0.001, car=paper.TRUCK, beam=beam, modes=None)
-    weight = np.array(static_axle_loads_n(paper.TRUCK, 9.80665))
+    beam = experiment.beam(np.ones(7))
+    _, _, _, exact = crossing(0.001, car=experiment.TRUCK, beam=beam, modes=None)
+    weight = np.array(static_axle_loads_n(experiment.TRUCK, 9.80665))
     for tolerance in (1e-3, 1e-6, 1e-9):
-        _, _, _, run = crossing(0.001, car=paper.TRUCK, beam=beam, modes=None, tolerance=tolerance)
+        _, _, _, run = crossing(
+            0.001, car=experiment.TRUCK, beam=beam, modes=None, tolerance=tolerance
+        )
         error = np.abs(run.contact_force_n - exact.contact_force_n).max(axis=0) / weight
         assert np.all(error <= tolerance)
-    _, _, _, paper_run = crossing(0.001, car=paper.TRUCK, beam=beam, modes=None, tolerance=1e-3)
+    _, _, _, paper_run = crossing(
+        0.001, car=experiment.TRUCK, beam=beam, modes=None, tolerance=1e-3
+    )
     assert paper_run.iterations == 2
     assert exact.iterations > 2
 
 
 def test_forces_that_do_not_settle_are_told() -> None:
     """One exchange at most is never enough to see that they stand still."""
-    beam = paper.beam(np.ones(7))
+    beam = experiment.beam(np.ones(7))
     motion = constant_speed(-1.0, 12.0, 500, 0.001)
-    road = smooth_road(motion, paper.TRUCK, 1)
-    run = simulate(paper.TRUCK, beam, motion, road, 0.001, tolerance=1e-15, max_iterations=2)
+    road = smooth_road(motion, experiment.TRUCK, 1)
+    run = simulate(experiment.TRUCK, beam, motion, road, 0.001, tolerance=1e-15, max_iterations=2)
     assert not run.converged
 
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from pre_core import posterior
+from pre_core.crossing import posterior
 from schemas.reasons import Reason
 from schemas.results import Crossing
 from schemas.settings import IdentificationSettings
-from services import drawn_crossings
-from services.crossing_bound import at_truth, bound_at, bound_at_truth, bound_of, settle
-from services.drawn_crossings import Drawn, Seen, default_site, draw_truth, drive, see, true_values
-from services.worker.crossing_data import CrossingData, Passing, rejected
+from services.identification.crossing_data import CrossingData, Passing, rejected
+from services.simulation import drawn as drawn_crossings
+from services.simulation.drawn import Drawn, Seen, default_site, draw_truth, drive, see, true_values
+from services.validation.bound import at_truth, bound_at, bound_at_truth, bound_of, settle
 
 SITE = default_site()
 SETTINGS = IdentificationSettings(method="pre", threads=1)

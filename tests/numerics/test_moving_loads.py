@@ -11,10 +11,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from pre_core.bridge import Beam, interpolation_matrix, modes, natural_frequencies_hz, uniform_beam
-from pre_core.newmark import newmark_modal
-from pre_core.simulate import WheelRoad, constant_speed, deflection_m, simulate
-from pre_core.vehicle import HalfCar
+from pre_core.physics.bridge import (
+    Beam,
+    interpolation_matrix,
+    modes,
+    natural_frequencies_hz,
+    uniform_beam,
+)
+from pre_core.physics.newmark import newmark_modal
+from pre_core.physics.simulate import WheelRoad, constant_speed, deflection_m, simulate
+from pre_core.physics.vehicle import HalfCar
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]

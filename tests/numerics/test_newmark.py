@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from pre_core import paper
-from pre_core.bridge import interpolation_matrix, mass_matrix, modes, stiffness_matrix
-from pre_core.integrate import newmark_integrate, spline_integrate
-from pre_core.newmark import newmark, newmark_modal
+from pre_core.paper import experiment
+from pre_core.paper.integrate import newmark_integrate, spline_integrate
+from pre_core.physics.bridge import interpolation_matrix, mass_matrix, modes, stiffness_matrix
+from pre_core.physics.newmark import newmark, newmark_modal
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
@@ -51,7 +51,7 @@ def test_second_order_on_a_damped_free_vibration(measured: Agree) -> None:
 
 def test_undamped_energy_is_kept_to_rounding() -> None:
     """Average acceleration neither adds nor takes energy, whatever the step."""
-    beam = paper.beam(np.ones(7))
+    beam = experiment.beam(np.ones(7))
     mass, stiffness = mass_matrix(beam), stiffness_matrix(beam)
     start = np.random.default_rng(5).standard_normal(14) * 1e-3
     run = newmark(
@@ -74,7 +74,7 @@ def wheel_forces(step_s: float) -> tuple[FloatArray, FloatArray]:
 @pytest.mark.parametrize("springs", [(0.0, 0.0), (3e8, 1e8)])
 def test_modal_equals_nodal_to_rounding(springs: tuple[float, float], measured: Agree) -> None:
     """7 elements, 1 ms, scenario 9, with and without rotational springs; all modes."""
-    beam = paper.beam(paper.scenario_ratios(9))._replace(
+    beam = experiment.beam(experiment.scenario_ratios(9))._replace(
         support_rotational_stiffness_nm_per_rad=springs
     )
     x, force = wheel_forces(0.001)

@@ -18,11 +18,10 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh, lu_factor, lu_solve
 from scipy.optimize import brentq
 
-from pre_core import paper
-from pre_core.integrate import newmark_integrate, spline_integrate
-from pre_core.jacobi import diagonalise
-from pre_core.parameters import EI_1, KAPPA, from_models, paper_subset
-from pre_core.residual import (
+from pre_core.kernels.jacobi import diagonalise
+from pre_core.paper import experiment
+from pre_core.paper.integrate import newmark_integrate, spline_integrate
+from pre_core.paper.residual import (
     Window,
     build_window,
     objective,
@@ -31,9 +30,10 @@ from pre_core.residual import (
     road_profiles,
     workspace,
 )
-from pre_core.road import iso_8608_profile, under_wheels
-from pre_core.simulate import Motion, constant_acceleration, constant_speed, simulate
-from pre_core.vehicle import HalfCar, total_mass_kg
+from pre_core.physics.road import iso_8608_profile, under_wheels
+from pre_core.physics.simulate import Motion, constant_acceleration, constant_speed, simulate
+from pre_core.physics.vehicle import HalfCar, total_mass_kg
+from pre_core.unknowns import EI_1, KAPPA, from_models, paper_subset
 
 FloatArray = NDArray[np.float64]
 
@@ -58,10 +58,10 @@ class Case(NamedTuple):
 
 def make_case(name: str, scenario: int = 6) -> Case:
     springs = (2e8, 5e7) if "springs" in name else (0.0, 0.0)
-    beam = paper.beam(paper.scenario_ratios(scenario))._replace(
+    beam = experiment.beam(experiment.scenario_ratios(scenario))._replace(
         support_rotational_stiffness_nm_per_rad=springs
     )
-    car: HalfCar = paper.TRUCK
+    car: HalfCar = experiment.TRUCK
     if "kappa" in name:
         car = car._replace(pitch_inertia_ratio=1.25)
     direction = -1 if "back" in name else 1
@@ -107,7 +107,7 @@ def window_of(case: Case) -> Window:
         case.motion.position_m,
         case.direction,
         element_lengths_m=LENGTHS,
-        total_mass_kg=total_mass_kg(paper.TRUCK),
+        total_mass_kg=total_mass_kg(experiment.TRUCK),
         wheelbase_m=WHEELBASE,
         integrate=spline_integrate if case.spline else newmark_integrate,
         initial_state_known=case.initial_state_known,
@@ -190,7 +190,7 @@ def plain_roads(case: Case, theta: FloatArray) -> tuple[FloatArray, FloatArray, 
     )
     # Forces on the body at its axles, from heave and pitch: F_1 + F_2 = m_s h'' and
     # F_1 d_1 - F_2 d_2 = I p'' + T, the load transfer T/D acting at both axles.
-    m_s = total_mass_kg(paper.TRUCK) - m_1 - m_2
+    m_s = total_mass_kg(experiment.TRUCK) - m_1 - m_2
     d_2 = WHEELBASE - d_1
     heave = (d_2 * a[0] + d_1 * a[1]) / WHEELBASE
     pitch = (a[0] - a[1]) / WHEELBASE
@@ -198,7 +198,7 @@ def plain_roads(case: Case, theta: FloatArray) -> tuple[FloatArray, FloatArray, 
     on_front = (m_s * heave * d_2 + inertia * pitch) / WHEELBASE
     on_rear = (m_s * heave * d_1 - inertia * pitch) / WHEELBASE
     transfer = (
-        total_mass_kg(paper.TRUCK)
+        total_mass_kg(experiment.TRUCK)
         * case.cg_height_m
         * case.motion.acceleration_m_per_s2[part]
         / WHEELBASE
@@ -433,7 +433,7 @@ def test_not_finite_is_infinite(paper_case: tuple[Case, Window]) -> None:
 
 
 def test_paper_subset_leaves_out_kappa_and_the_springs() -> None:
-    vector = from_models(paper.TRUCK, paper.beam(np.ones(7)))
+    vector = from_models(experiment.TRUCK, experiment.beam(np.ones(7)))
     left_out = sorted(set(range(vector.size)) - set(paper_subset(7).tolist()))
     assert left_out == [KAPPA, vector.size - 2, vector.size - 1]
     assert paper_subset(7).size == 19

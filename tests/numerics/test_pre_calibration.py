@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pre_core import calibration
+from pre_core.diagnostics import calibration
 from schemas.settings import IdentificationSettings
-from services.calibration import Record, in_processes, one_crossing, scores
-from services.drawn_crossings import default_site
-from services.validation_pre import HALF, JUDGED, judged_checks, one_judged, one_scenario
+from services.simulation.drawn import default_site
+from services.validation.calibration import Record, in_processes, one_crossing, scores
+from services.validation.uncertainty import HALF, JUDGED, judged_checks, one_judged, one_scenario
 
 SITE = default_site()
 SETTINGS = IdentificationSettings(method="pre", threads=1)

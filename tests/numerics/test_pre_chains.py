@@ -9,8 +9,8 @@ from scipy.integrate import quad
 from scipy.special import digamma, gammaln, polygamma
 from scipy.stats import loggamma, truncnorm
 
-from pre_core import mcmc
-from pre_core.search import Ending
+from pre_core.search import crank_nicolson
+from pre_core.search.loop import Ending
 
 FloatArray = NDArray[np.float64]
 NONE = np.array([], dtype=np.int64)
@@ -21,37 +21,37 @@ DEVIATIONS = 4.5
 
 def straight(
     centre: FloatArray, matrix: FloatArray, positive: NDArray[np.int64], seed: int
-) -> mcmc.Approximation:
+) -> crank_nicolson.Approximation:
     """Without any bent coordinate."""
-    return mcmc.approximation(centre, matrix, positive, np.zeros(centre.size), seed)
+    return crank_nicolson.approximation(centre, matrix, positive, np.zeros(centre.size), seed)
 
 
 class Run(NamedTuple):
     draws: FloatArray  # (n, c, f)
     acceptance: float
-    state: mcmc.State
+    state: crank_nicolson.State
 
 
 def run(
-    target: mcmc.LogDensity,
-    normal: mcmc.Approximation,
+    target: crank_nicolson.LogDensity,
+    normal: crank_nicolson.Approximation,
     *,
     steps: int = STEPS,
     adapt: int = 0,
 ) -> Run:
-    state = mcmc.init(target, normal)
+    state = crank_nicolson.init(target, normal)
     if adapt:
         seen = []
         for _ in range(adapt):
-            state, _ = mcmc.step(target, normal, state)
+            state, _ = crank_nicolson.step(target, normal, state)
             seen.append(state.v)
-        better = mcmc.adapted(normal, np.stack(seen[adapt // 3 :]))
+        better = crank_nicolson.adapted(normal, np.stack(seen[adapt // 3 :]))
         assert np.any(better.shift != 0.0) or np.any(better.scale != 1.0)
-        state = mcmc.moved(target, normal, better, state)
+        state = crank_nicolson.moved(target, normal, better, state)
         normal = better
     draws, acceptance = [], []
     for _ in range(steps):
-        state, info = mcmc.step(target, normal, state)
+        state, info = crank_nicolson.step(target, normal, state)
         draws.append(state.y)
         acceptance.append(info.acceptance)
     return Run(np.stack(draws), float(np.mean(acceptance)), state)
@@ -62,11 +62,11 @@ def misses(draws: FloatArray, mean: FloatArray, variance: FloatArray) -> FloatAr
     second = variance + mean**2
     both = np.concatenate([draws, draws**2], axis=2)
     expected = np.concatenate([mean, second])
-    error = both.std(axis=(0, 1)) / np.sqrt(mcmc.effective_sample_size(both))
+    error = both.std(axis=(0, 1)) / np.sqrt(crank_nicolson.effective_sample_size(both))
     return np.asarray((both.mean(axis=(0, 1)) - expected) / error)
 
 
-def gaussian(centre: FloatArray, matrix: FloatArray) -> mcmc.LogDensity:
+def gaussian(centre: FloatArray, matrix: FloatArray) -> crank_nicolson.LogDensity:
     precision = np.linalg.inv(matrix)
 
     def log_density(y: FloatArray) -> FloatArray:
@@ -75,7 +75,9 @@ def gaussian(centre: FloatArray, matrix: FloatArray) -> mcmc.LogDensity:
     return log_density
 
 
-def positive_only(target: mcmc.LogDensity, places: NDArray[np.int64]) -> mcmc.LogDensity:
+def positive_only(
+    target: crank_nicolson.LogDensity, places: NDArray[np.int64]
+) -> crank_nicolson.LogDensity:
     return lambda y: np.where(np.all(y[:, places] >= 0.0, axis=1), target(y), -np.inf)
 
 
@@ -141,7 +143,7 @@ def test_normal_cut_off_in_two_of_five_dimensions(order: tuple[int, int], adapt:
     assert done.draws[:, :, places].min() >= 0.0
     assert 0.1 < done.acceptance <= 1.0
     assert np.abs(misses(done.draws, mean, variance)).max() < DEVIATIONS
-    assert mcmc.split_r_hat(done.draws).max() < 1.02
+    assert crank_nicolson.split_r_hat(done.draws).max() < 1.02
 
 
 def test_quadrature_of_the_cut_normal_against_one_dimension() -> None:
@@ -163,11 +165,11 @@ def log_gamma_times_normal(y: FloatArray) -> FloatArray:
     return np.asarray(SHAPE * y[:, 0] - np.exp(y[:, 0]) - 0.5 * (y[:, 1] - 0.5 * y[:, 0]) ** 2)
 
 
-def skewed_approximation(seed: int = 9, bend: float = 0.0) -> mcmc.Approximation:
+def skewed_approximation(seed: int = 9, bend: float = 0.0) -> crank_nicolson.Approximation:
     """The curvature at the optimum log(shape), as method `pre` would take it."""
     mode = np.log(SHAPE)
     precision = np.array([[SHAPE + 0.25, -0.5], [-0.5, 1.0]])
-    return mcmc.approximation(
+    return crank_nicolson.approximation(
         np.array([mode, 0.5 * mode]), np.linalg.inv(precision), NONE, np.array([bend, 0.0]), seed
     )
 
@@ -184,7 +186,7 @@ def test_the_bent_approximation_itself_is_always_accepted(bend: float) -> None:
         w = np.stack([-np.expm1(slope) / bend, w[:, 1]], axis=1)
         return np.asarray(-0.5 * np.einsum("ki,ij,kj->k", w, precision, w) + slope)
 
-    normal = mcmc.approximation(centre, matrix, NONE, np.array([bend, 0.0]), 6)
+    normal = crank_nicolson.approximation(centre, matrix, NONE, np.array([bend, 0.0]), 6)
     assert run(target, normal, steps=200).acceptance == 1.0
     assert run(target, straight(centre, matrix, NONE, 6), steps=200).acceptance < 0.98
 
@@ -211,7 +213,7 @@ def test_a_target_that_leans_to_one_side(adapt: int, bend: float) -> None:
     for probability in (0.025, 0.25, 0.5, 0.975):
         quantile = loggamma(SHAPE).ppf(probability)
         below = (done.draws[:, :, :1] <= quantile).astype(np.float64)
-        n = mcmc.effective_sample_size(below)[0]
+        n = crank_nicolson.effective_sample_size(below)[0]
         error = np.sqrt(probability * (1.0 - probability) / n)
         assert abs(below.mean() - probability) < DEVIATIONS * error, probability
 
@@ -235,7 +237,7 @@ def test_a_target_moved_by_a_third_of_its_spread_is_caught(dimension: int) -> No
 def test_wrong_weights_would_be_caught() -> None:
     """Negative control: chains that take every proposal give the approximation, not the target."""
 
-    def flat(normal: mcmc.Approximation) -> mcmc.LogDensity:
+    def flat(normal: crank_nicolson.Approximation) -> crank_nicolson.LogDensity:
         # The approximation's own density as target: everything is accepted.
         return gaussian(normal.centre, normal.factor @ normal.factor.T)
 
@@ -259,11 +261,11 @@ def test_adapting_never_changes_a_point() -> None:
     target = log_gamma_times_normal
     normal = skewed_approximation()
     done = run(target, normal, steps=50)
-    v = np.random.default_rng(0).normal(0.6, 1.4, (100, mcmc.CHAINS, 2))
-    better = mcmc.adapted(normal, v)
+    v = np.random.default_rng(0).normal(0.6, 1.4, (100, crank_nicolson.CHAINS, 2))
+    better = crank_nicolson.adapted(normal, v)
     assert better.shift == pytest.approx(np.full(2, 0.6), abs=0.3)
     assert better.scale == pytest.approx(np.full(2, 1.4), abs=0.2)
-    after = mcmc.moved(target, normal, better, done.state)
+    after = crank_nicolson.moved(target, normal, better, done.state)
     np.testing.assert_allclose(after.y, done.state.y, rtol=1e-12)
     # Weights are target over approximation: from the densities of both normals, written out.
     factor = normal.factor
@@ -276,8 +278,8 @@ def test_adapting_never_changes_a_point() -> None:
 
 def test_little_that_stands_out_is_not_learnt() -> None:
     normal = skewed_approximation()
-    v = np.random.default_rng(0).standard_normal((200, mcmc.CHAINS, 2))
-    same = mcmc.adapted(normal, v)
+    v = np.random.default_rng(0).standard_normal((200, crank_nicolson.CHAINS, 2))
+    same = crank_nicolson.adapted(normal, v)
     assert not same.shift.any()
     np.testing.assert_array_equal(same.scale, 1.0)
 
@@ -292,13 +294,15 @@ def test_same_seed_same_draws() -> None:
 
 def test_a_run_stopped_and_resumed_is_the_same() -> None:
     normal = skewed_approximation()
-    state = mcmc.init(log_gamma_times_normal, normal)
+    state = crank_nicolson.init(log_gamma_times_normal, normal)
     for _ in range(30):
-        state, _ = mcmc.step(log_gamma_times_normal, normal, state)
-    resumed = mcmc.State(state.v.copy(), state.y.copy(), state.log_weight.copy(), state.steps)
+        state, _ = crank_nicolson.step(log_gamma_times_normal, normal, state)
+    resumed = crank_nicolson.State(
+        state.v.copy(), state.y.copy(), state.log_weight.copy(), state.steps
+    )
     for _ in range(5):
-        state, _ = mcmc.step(log_gamma_times_normal, normal, state)
-        resumed, _ = mcmc.step(log_gamma_times_normal, normal, resumed)
+        state, _ = crank_nicolson.step(log_gamma_times_normal, normal, state)
+        resumed, _ = crank_nicolson.step(log_gamma_times_normal, normal, resumed)
     np.testing.assert_array_equal(state.y, resumed.y)
 
 
@@ -307,7 +311,7 @@ def test_impossible_everywhere_is_an_ending() -> None:
         return np.full(y.shape[0], np.nan)
 
     normal = skewed_approximation()
-    _, info = mcmc.step(never, normal, mcmc.init(never, normal))
+    _, info = crank_nicolson.step(never, normal, crank_nicolson.init(never, normal))
     assert info.ending is Ending.NOT_FINITE
 
 
@@ -325,24 +329,24 @@ def autoregressive(phi: float, n: int, chains: int, seed: int = 0) -> FloatArray
 def test_effective_sample_size_of_known_autocorrelation(phi: float) -> None:
     """n (1 - phi)/(1 + phi) of an AR(1) chain."""
     n, chains = 8000, 8
-    ours = mcmc.effective_sample_size(autoregressive(phi, n, chains))[0]
+    ours = crank_nicolson.effective_sample_size(autoregressive(phi, n, chains))[0]
     assert ours == pytest.approx(n * chains * (1.0 - phi) / (1.0 + phi), rel=0.12)
 
 
 def test_chains_that_disagree_are_told() -> None:
     together = autoregressive(0.3, 1000, 8)
-    assert mcmc.split_r_hat(together)[0] < 1.01
+    assert crank_nicolson.split_r_hat(together)[0] < 1.01
     apart = together + 0.5 * np.arange(8)[None, :, None]
     # Between-chain variance B/n = 0.25 var(0 … 7) = 1.5, within 1: sqrt(1 + 1.5) or so.
     means = np.repeat(0.5 * np.arange(8.0), 2)
     expected = np.sqrt(1.0 + means.var(ddof=1))
-    assert mcmc.split_r_hat(apart)[0] == pytest.approx(expected, rel=0.05)
+    assert crank_nicolson.split_r_hat(apart)[0] == pytest.approx(expected, rel=0.05)
     drifting = together + np.linspace(0.0, 2.0, 1000)[:, None, None]
     # The halves lie one apart, a variance of 4/15 between 16 of them; within them 1 + 1/12.
     expected = np.sqrt(1.0 + (4.0 / 15.0) / (1.0 + 1.0 / 12.0))
-    assert mcmc.split_r_hat(drifting)[0] == pytest.approx(expected, rel=0.03)
+    assert crank_nicolson.split_r_hat(drifting)[0] == pytest.approx(expected, rel=0.03)
 
 
 def test_effective_sample_size_knows_of_chains_that_disagree() -> None:
     apart = autoregressive(0.3, 1000, 8) + 0.5 * np.arange(8)[None, :, None]
-    assert mcmc.effective_sample_size(apart)[0] < 100.0
+    assert crank_nicolson.effective_sample_size(apart)[0] < 100.0

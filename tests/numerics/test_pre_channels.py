@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from pre_core import channels
-from pre_core.channels import (
+from pre_core.crossing import channels
+from pre_core.crossing.channels import (
     A_1,
     A_2,
     A_3,
@@ -22,7 +22,7 @@ from pre_core.channels import (
     low_pass,
     read_between,
 )
-from pre_core.sensors import resample
+from pre_core.physics.sensors import resample
 
 FloatArray = NDArray[np.float64]
 

@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from pre_core.bridge import natural_frequencies_hz, refine
-from pre_core.paper import scenario_ratios
-from pre_core.road import Profile
-from pre_core.simulate import Simulation
+from pre_core.paper.experiment import scenario_ratios
+from pre_core.physics.bridge import natural_frequencies_hz, refine
+from pre_core.physics.road import Profile
+from pre_core.physics.simulate import Simulation
 from schemas.results import Crossing, Results, results_json
 from schemas.settings import IdentificationSettings
-from services import simulation
-from services.common.runs import Run
-from services.identify import identify_recordings
-from services.simulation import (
+from services.cli.identify import identify_recordings
+from services.drives.runs import Run
+from services.simulation import drive as simulation
+from services.simulation.drive import (
     beam_of,
     declared,
     measured_run,

@@ -10,11 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core import paper
-from pre_core.channels import A, V, Z, channel_signals
-from pre_core.drs import BeamBasis, beam_basis, rebased
-from pre_core.parameters import EI_1, K_U1, KAPPA, from_models
-from pre_core.pre_model import (
+from pre_core.crossing.channels import A, V, Z, channel_signals
+from pre_core.crossing.residuals import (
     Crossing,
     Points,
     evaluate,
@@ -22,16 +19,19 @@ from pre_core.pre_model import (
     sinc_table,
     workspace,
 )
-from pre_core.sensors import MICRO_G_M_PER_S2, resample, white_noise
-from pre_core.simulate import STANDARD_GRAVITY_M_PER_S2
-from pre_core.vehicle import body_masses_kg
-from pre_core.whitening import Truck, row_count, row_filter, white_rows, whitener
+from pre_core.crossing.whitening import Truck, row_count, row_filter, white_rows, whitener
+from pre_core.paper import experiment
+from pre_core.physics.beam_basis import BeamBasis, beam_basis, rebased
+from pre_core.physics.sensors import MICRO_G_M_PER_S2, resample, white_noise
+from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
+from pre_core.physics.vehicle import body_masses_kg
+from pre_core.unknowns import EI_1, K_U1, KAPPA, from_models
 from schemas.signals import CHANNELS
 from schemas.site import Site
-from services.simulation import beam_of, paper_site, simulate_drive, truck_of
+from services.simulation.drive import beam_of, paper_site, simulate_drive, truck_of
 
 if TYPE_CHECKING:
-    from services.simulation import Drive
+    from services.simulation.drive import Drive
 
 FloatArray = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ def case(
     site: Site,
     *,
     forward: bool = True,
-    speeds: tuple[float, float] = (paper.SPEED_M_PER_S, paper.SPEED_M_PER_S),
+    speeds: tuple[float, float] = (experiment.SPEED_M_PER_S, experiment.SPEED_M_PER_S),
 ) -> Case:
     vehicle, bridge = site.vehicles[0], site.bridges[0]
     here = Case(
@@ -160,7 +160,9 @@ def truth(scenario_6: "Drive") -> Case:
 @pytest.fixture(scope="module")
 def backward() -> Case:
     site = paper_site()
-    drive = simulate_drive(site, paper.scenario_ratios(6), road_class="A", seed=1, forward=False)
+    drive = simulate_drive(
+        site, experiment.scenario_ratios(6), road_class="A", seed=1, forward=False
+    )
     return case(drive, site, forward=False)
 
 
@@ -320,7 +322,7 @@ def test_load_moves_between_the_axles_while_accelerating() -> None:
     site = site.model_copy(update={"vehicles": (high,)})
     speeds = (9.0, 14.0)
     drive = simulate_drive(
-        site, paper.scenario_ratios(6), road_class="A", seed=3, speed_m_per_s=speeds
+        site, experiment.scenario_ratios(6), road_class="A", seed=3, speed_m_per_s=speeds
     )
     here = case(drive, site, speeds=speeds)
     assert point(here).acceleration_m_per_s2[0, 0] > 0.5
@@ -338,7 +340,7 @@ def test_axles_coupled_by_the_pitch_inertia() -> None:
     site = paper_site()
     stubby = site.vehicles[0].model_copy(update={"pitch_inertia_ratio": 0.8})
     site = site.model_copy(update={"vehicles": (stubby,)})
-    here = case(simulate_drive(site, paper.scenario_ratios(6), road_class="A", seed=1), site)
+    here = case(simulate_drive(site, experiment.scenario_ratios(6), road_class="A", seed=1), site)
     left = in_noise(here, residual(here, point(here)))
     assert left[0] < 0.1, left
     assert np.all(left[1:] < 0.01), left

@@ -12,12 +12,18 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from pre_core import piecewise_exact
-from pre_core.drs import beam_basis
-from pre_core.parameters import D_1, EI_1, K_S1, KAPPA, M_U1
-from pre_core.pre_model import Crossing, Points, roads_and_deflections, sinc_table, workspace
-from pre_core.simulate import STANDARD_GRAVITY_M_PER_S2
-from pre_core.whitening import row_filter
+from pre_core.crossing.residuals import (
+    Crossing,
+    Points,
+    roads_and_deflections,
+    sinc_table,
+    workspace,
+)
+from pre_core.crossing.whitening import row_filter
+from pre_core.physics import modal_response as piecewise_exact
+from pre_core.physics.beam_basis import beam_basis
+from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
+from pre_core.unknowns import D_1, EI_1, K_S1, KAPPA, M_U1
 
 FloatArray = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from pre_core import channels, paper
-from pre_core.channels import channel_signals
-from pre_core.parameters import C_S1, D_1, EI_1, K_S1, K_U1, M_U1, from_models
-from pre_core.posterior import (
+from pre_core.crossing import channels
+from pre_core.crossing.channels import channel_signals
+from pre_core.crossing.optimum import Inputs, prepare, with_noise_at
+from pre_core.crossing.posterior import (
     Fixes,
     Priors,
     Problem,
@@ -24,13 +24,14 @@ from pre_core.posterior import (
     start,
     trajectory_basis,
 )
-from pre_core.pre import Inputs, prepare, with_noise_at
-from pre_core.sensors import MICRO_G_M_PER_S2, white_noise
+from pre_core.paper import experiment
+from pre_core.physics.sensors import MICRO_G_M_PER_S2, white_noise
+from pre_core.unknowns import C_S1, D_1, EI_1, K_S1, K_U1, M_U1, from_models
 from schemas.signals import CHANNELS
-from services.simulation import beam_of, paper_site, truck_of
+from services.simulation.drive import beam_of, paper_site, truck_of
 
 if TYPE_CHECKING:
-    from services.simulation import Drive
+    from services.simulation.drive import Drive
 
 FloatArray = NDArray[np.float64]
 
@@ -53,11 +54,11 @@ class Case(NamedTuple):
 
 
 def fixes_of(time_s: FloatArray, rng: np.random.Generator) -> Fixes:
-    travel = paper.SPEED_M_PER_S * (time_s - 3.0)
+    travel = experiment.SPEED_M_PER_S * (time_s - 3.0)
     return Fixes(
         time_s,
         travel + POSITION_NOISE_M * rng.standard_normal(time_s.size),
-        paper.SPEED_M_PER_S + SPEED_NOISE_M_PER_S * rng.standard_normal(time_s.size),
+        experiment.SPEED_M_PER_S + SPEED_NOISE_M_PER_S * rng.standard_normal(time_s.size),
         POSITION_NOISE_M,
         SPEED_NOISE_M_PER_S,
         OFFSET_SPREAD_M,
@@ -72,7 +73,7 @@ def here(scenario_6: "Drive") -> Case:
     rng = np.random.default_rng(5)
     sample_s = 1.0 / scenario_6.run.rate_hz
     t = sample_s * np.arange(scenario_6.run.accel_time_s.size)
-    travel = paper.SPEED_M_PER_S * (t - 3.0)
+    travel = experiment.SPEED_M_PER_S * (t - 3.0)
     kept = (travel > -10.0) & (travel < 42.0)
     density = 25.0 * MICRO_G_M_PER_S2
     acceleration = np.stack(
@@ -106,18 +107,18 @@ def here(scenario_6: "Drive") -> Case:
     )
     problem, y = prepare(inputs)
     where = layout(problem)
-    ratio = paper.scenario_ratios(6)
+    ratio = experiment.scenario_ratios(6)
     y[EI_1 : EI_1 + 7] = np.log(ratio) / 0.55
     # A straight line has the coefficients x(g), g the means of each five knots (Greville).
     first, last = float(fixes.time_s[0]), float(fixes.time_s[-1])
     spans = np.linspace(first, last, problem.basis_position.shape[1] - DEGREE + 1)
     knots = np.concatenate([np.full(DEGREE, first), spans, np.full(DEGREE, last)])
     greville = np.convolve(knots[1:-1], np.full(DEGREE, 1.0 / DEGREE), "valid")
-    y[where.trajectory] = paper.SPEED_M_PER_S * (greville - 3.0)
+    y[where.trajectory] = experiment.SPEED_M_PER_S * (greville - 3.0)
     model = channel_signals(acceleration, sample_s, 1.0 / sample_s)
     start_s = float(t[kept][0]) + model.start_s
     samples = model.signals.shape[2]
-    true = paper.SPEED_M_PER_S * (start_s + model.step_s * np.arange(samples) - 3.0)
+    true = experiment.SPEED_M_PER_S * (start_s + model.step_s * np.arange(samples) - 3.0)
     np.testing.assert_allclose(problem.basis_position @ y[where.trajectory], true, atol=1e-9)
     y[where.offset] = 0.0
     return Case(inputs, problem, y, fixes, priors, start_s, model.step_s, samples)

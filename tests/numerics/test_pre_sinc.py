@@ -5,9 +5,9 @@ import pytest
 import scipy.signal
 from numpy.typing import NDArray
 
-from pre_core.channels import PASS, STOP
-from pre_core.pre_model import _weighted, sinc_table
-from pre_core.windowed_sinc import kaiser_beta, windowed_sinc
+from pre_core.crossing.channels import PASS, STOP
+from pre_core.crossing.residuals import _weighted, sinc_table
+from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 
 FloatArray = NDArray[np.float64]
 

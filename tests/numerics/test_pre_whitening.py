@@ -13,11 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import cholesky_banded, solve_banded
 
-from pre_core.channels import A, V, Z, channel_signals
-from pre_core.parameters import C_S1, K_S1, K_U1, M_U1, from_models
-from pre_core.sensors import MICRO_G_M_PER_S2, white_noise
-from pre_core.vehicle import HalfCar, body_masses_kg
-from pre_core.whitening import (
+from pre_core.crossing.channels import A, V, Z, channel_signals
+from pre_core.crossing.whitening import (
     EVERY,
     PASS,
     RowFilter,
@@ -30,7 +27,10 @@ from pre_core.whitening import (
     white_rows,
     whitener,
 )
-from services.simulation import beam_of, paper_site, truck_of
+from pre_core.physics.sensors import MICRO_G_M_PER_S2, white_noise
+from pre_core.physics.vehicle import HalfCar, body_masses_kg
+from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1, from_models
+from services.simulation.drive import beam_of, paper_site, truck_of
 
 FloatArray = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.signal import periodogram, welch
 
-from pre_core import road as road
-from pre_core.road import (
+from pre_core.physics import road
+from pre_core.physics.road import (
     GEOMETRIC_MEAN_M3,
     Profile,
     contact_patch_average,
@@ -24,7 +24,7 @@ from pre_core.road import (
     roughness_coefficient_m3,
     under_wheels,
 )
-from pre_core.simulate import constant_speed
+from pre_core.physics.simulate import constant_speed
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import csd, welch
 
-from pre_core.sensors import (
+from pre_core.physics.sensors import (
     MICRO_G_M_PER_S2,
     Accelerometer,
     Receiver,

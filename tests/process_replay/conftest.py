@@ -25,7 +25,7 @@ from schemas.signals import (
     encode_location,
 )
 from schemas.topics import Key
-from services.common.recording import Message, write_recording
+from services.recordings.recording import Message, write_recording
 from tests.process_replay.starting import End, Process, Start
 
 # Runs one entry function as the command line would: exit code 2 for bad input, 1 for a failure.

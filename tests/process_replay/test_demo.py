@@ -17,10 +17,10 @@ from rerun.chunk import RrdReader
 
 from schemas.results import load_results
 from schemas.signals import CHANNELS, decode_accel
-from services import cli
-from services.common.recording import read_info, read_messages
-from services.common.runs import run_to_messages
-from services.simulation import paper_site, simulate_drive
+from services.cli import main as cli
+from services.drives.runs import run_to_messages
+from services.recordings.recording import read_info, read_messages
+from services.simulation.drive import paper_site, simulate_drive
 
 # A group of their own: they share one demo, and depend on no time-out that is short.
 pytestmark = [pytest.mark.process, pytest.mark.xdist_group("demo")]

@@ -15,8 +15,8 @@ from schemas.events import EventKind, decode_event
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import encode_identity
 from schemas.topics import selector
-from services.common.bus import Subscription, get_latest, open_session
-from services.common.recording import read_info, read_messages
+from services.bus.session import Subscription, get_latest, open_session
+from services.recordings.recording import read_info, read_messages
 from tests.process_replay.starting import End, Start, start_logger
 
 pytestmark = pytest.mark.process

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from schemas.signals import decode_accel
-from services.common.recording import read_messages
+from services.recordings.recording import read_messages
 
 pytestmark = pytest.mark.process
 

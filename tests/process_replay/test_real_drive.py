@@ -12,11 +12,11 @@ from rerun.chunk import RrdReader
 from schemas.results import load_results
 from schemas.signals import decode_accel, decode_gnss, location_class
 from schemas.site import load_site, site_toml
-from services import cli
-from services.common.comma2k19 import read_comma2k19
+from services.cli import main as cli
 from services.common.geodesy import bridge_frame, to_chainage
-from services.common.recording import read_messages
-from services.importing import import_command
+from services.drives.comma2k19 import read_comma2k19
+from services.drives.importing import import_command
+from services.recordings.recording import read_messages
 
 pytestmark = pytest.mark.process
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from schemas.signals import decode_accel, decode_gnss
-from services.common.recording import Message, read_info, read_messages
+from services.recordings.recording import Message, read_info, read_messages
 from tests.process_replay.starting import End, Start, start_logger
 
 pytestmark = pytest.mark.process
@@ -176,7 +176,7 @@ def test_one_file_per_vehicle_below_the_folder(
     recording: Path,
     drive_messages: Callable[..., Iterator[Message]],
 ) -> None:
-    from services.common.recording import write_recording
+    from services.recordings.recording import write_recording
 
     second = tmp_path / "second.mcap"
     write_recording(second, drive_messages(20, "truck-2", 78), site_toml=None, reason="test")

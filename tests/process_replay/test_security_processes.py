@@ -16,11 +16,11 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Channel
 from schemas.spool import spool_selector
 from schemas.topics import Key, selector
-from services.common.bus import Subscription, open_session
+from services.bus.session import Subscription, open_session
 from services.common.errors import InputError
-from services.common.recording import read_messages, read_site
-from services.common.spool import Spool
+from services.recordings.recording import read_messages, read_site
 from services.truck import Gateway
+from services.truck.spool import Spool
 
 pytestmark = pytest.mark.process
 

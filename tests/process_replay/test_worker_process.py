@@ -18,11 +18,11 @@ from schemas.results import load_results
 from schemas.signals import Identity
 from schemas.site import site_toml
 from schemas.topics import selector
-from services.common.bus import Publisher, Received, Subscription, get_latest, open_session
+from services.bus.session import Publisher, Received, Subscription, get_latest, open_session
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.common.recording import Message, read_info, read_messages, read_site
-from services.common.runs import GnssTrack, run_to_messages
-from services.simulation import Drive, paper_site
+from services.drives.runs import GnssTrack, run_to_messages
+from services.recordings.recording import Message, read_info, read_messages, read_site
+from services.simulation.drive import Drive, paper_site
 
 pytestmark = pytest.mark.process
 

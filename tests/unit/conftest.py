@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from services.common.bus import open_session
+from services.bus.session import open_session
 
 
 @pytest.fixture

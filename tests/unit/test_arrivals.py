@@ -16,12 +16,12 @@ from schemas.results import Header
 from schemas.settings import IdentificationSettings
 from schemas.topics import Key
 from services import worker
-from services.common.bus import Publisher
+from services.bus.session import Publisher
 from services.common.errors import FailureError
-from services.simulation import paper_site
+from services.history.result_files import ResultFiles
+from services.identification.engine import Engine, Output
+from services.simulation.drive import paper_site
 from services.worker.arrivals import Arrivals, Arrived, Gone, Token
-from services.worker.engine import Engine, Output
-from services.worker.result_files import ResultFiles
 
 REALM = "live"
 SETTINGS = IdentificationSettings(method="least_squares")

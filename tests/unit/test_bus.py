@@ -12,8 +12,8 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import Key, selector
-from services.common import bus
-from services.common.bus import (
+from services.bus import session as bus
+from services.bus.session import (
     Delivery,
     Publisher,
     Received,

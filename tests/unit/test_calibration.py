@@ -10,8 +10,9 @@ import pytest
 from rich.console import Console
 from scipy.special import ndtr
 
-from pre_core.calibration import NORMAL_975
-from services.calibration import (
+from pre_core.diagnostics.calibration import NORMAL_975
+from services.cli.validate_pre import print_outcome
+from services.validation.calibration import (
     GROUPS,
     Check,
     by_condition,
@@ -20,13 +21,12 @@ from services.calibration import (
     rank_tests,
     scores,
 )
-from services.validation_page import validation_page
-from services.validation_pre import (
+from services.validation.page import validation_page
+from services.validation.uncertainty import (
     Outcome,
     aims,
     control_checks,
     judged_checks,
-    print_outcome,
     scenario_checks,
 )
 

@@ -16,11 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from cryptography.x509.verification import PolicyBuilder, Store
 
 from schemas.topics import TOPICS
-from services import certs
-from services.access_control import access_control
-from services.certs import certs_command
-from services.common.bus import open_session
-from services.common.credentials import (
+from services.bus.credentials import (
     AUTHORITY,
     CERTIFICATE,
     CONFIGURATION,
@@ -30,7 +26,11 @@ from services.common.credentials import (
     check_speaks_for,
     read_certificate,
 )
+from services.bus.session import open_session
 from services.common.errors import InputError
+from services.security import certs
+from services.security.access_control import access_control
+from services.security.certs import certs_command
 
 EVERYBODY = ("logger", "replay", "router", "truck-1", "viewer", "worker")
 

@@ -14,9 +14,10 @@ import pytest
 
 from schemas.signals import GnssFix, encode_gnss
 from schemas.topics import Key
-from services import cli, importing
+from services.cli import main as cli
 from services.common.errors import FailureError, InputError
-from services.common.recording import Message, read_info, read_site, write_recording
+from services.drives import importing
+from services.recordings.recording import Message, read_info, read_site, write_recording
 
 EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
 COMMANDS = (
@@ -231,7 +232,7 @@ def gnss_only(path: Path) -> None:
 def test_recordings_that_cannot_be_identified(
     capsys: pytest.CaptureFixture[str], drive: Path
 ) -> None:
-    pytest.importorskip("services.identify")
+    pytest.importorskip("services.cli.identify")
     output = drive.parent / "out.json"
     recording = drive.parent / "gnss.mcap"
     gnss_only(recording)
@@ -363,7 +364,7 @@ def test_log_format_may_stand_before_or_after_the_command(
 
 
 def driveby(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "services.cli", *arguments]
+    return [sys.executable, "-m", "services.cli.main", *arguments]
 
 
 def test_a_reader_that_leaves_early_is_no_error(project: Path) -> None:
@@ -375,7 +376,8 @@ def test_a_reader_that_leaves_early_is_no_error(project: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 2  # nothing was printed, so nothing broke
     code = """
-from services import cli, importing
+from services.cli import main as cli
+from services.drives import importing
 importing.import_command = lambda **_: "x" * 100_000
 raise SystemExit(cli.main(["import", "x", "--site", "s", "-o", "o"]))
 """
@@ -404,7 +406,7 @@ def test_help_and_version_are_quick(project: Path) -> None:
 
 def test_nothing_heavy_is_imported_at_the_start(project: Path) -> None:
     heavy = ("numpy", "numba", "zenoh", "rerun", "matplotlib", "pydantic", "scipy", "rich")
-    code = f"import services.cli, sys; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import services.cli.main, sys; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=project, capture_output=True, text=True, check=True
     )

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.common.comma2k19 import is_comma2k19, read_comma2k19
 from services.common.errors import InputError
+from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 
 
 @pytest.fixture

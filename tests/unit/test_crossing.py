@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.common.crossing import CORRIDOR_M, Passage, Stay, find_stays
+from services.identification.stays import CORRIDOR_M, Passage, Stay, find_stays
 
 Floats = NDArray[np.float64]
 

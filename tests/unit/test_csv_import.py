@@ -9,9 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from schemas.signals import CHANNELS
-from services.common.csv_import import read_folder, read_pair
 from services.common.errors import InputError
-from services.common.runs import Run
+from services.drives.csv_import import read_folder, read_pair
+from services.drives.runs import Run
 
 EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
 ACCEL = (EXAMPLE / "accel_00.csv").read_text()

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pre_core import parameters
-from services.drawn_crossings import Truth, _motion, default_site, draw_truth, drive, true_values
+from pre_core import unknowns
+from services.simulation.drawn import Truth, _motion, default_site, draw_truth, drive, true_values
 
 SEEDS = range(600)
 SITE = default_site()
@@ -122,5 +122,5 @@ def test_a_crossing_is_measured_with_the_errors_that_were_drawn() -> None:
         assert shifted / factor == pytest.approx(errors.delay_s[c], abs=5e-5)
         assert bias == pytest.approx(errors.bias_m_per_s2[c], abs=1e-3)
     assert erring.site.sensor.noise_density_ug_per_rthz == (0.0,) * 4
-    names = parameters.names(7)
+    names = unknowns.names(7)
     assert set(names) < set(true_values(truth))

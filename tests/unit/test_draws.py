@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.io import netcdf_file
 
-from pre_core.mcmc import CHAINS
+from pre_core.search.crank_nicolson import CHAINS
 from schemas.results import load_results
-from services import cli
-from services.common.draws import Draws, write_draws
+from services.cli import main as cli
 from services.common.errors import InputError
+from services.history.draws import Draws, write_draws
 
 NAMES = ["EI_1", "wheelbase_m"]
 

@@ -17,10 +17,10 @@ from schemas.signals import CHANNELS, decode_accel, encode_accel
 from schemas.site import Site, site_hash
 from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.common.recording import Message
-from services.common.runs import GnssTrack, Run, run_to_messages
-from services.simulation import Drive, paper_site
-from services.worker.engine import Engine, Output, feed_all
+from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.identification.engine import Engine, Output, feed_all
+from services.recordings.recording import Message
+from services.simulation.drive import Drive, paper_site
 
 Floats = NDArray[np.float64]
 START_S = 1_767_225_600.0
@@ -501,7 +501,7 @@ def test_what_fails_inside_is_a_verdict(
     def fail(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("SVD did not converge")
 
-    monkeypatch.setattr("pre_core.residual.build_window", fail)
+    monkeypatch.setattr("pre_core.paper.residual.build_window", fail)
     (crossing,) = results_in(fed(crossing_messages))
     assert (crossing.verdict, crossing.reasons) == ("rejected", ("failed",))
 

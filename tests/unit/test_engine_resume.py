@@ -13,12 +13,12 @@ from schemas.signals import decode_accel, encode_accel
 from schemas.site import site_hash
 from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.common.recording import Message
-from services.common.runs import GnssTrack, Run, run_to_messages
-from services.simulation import paper_site
-from services.worker.crossing_data import CrossingData, Passing, rejected
-from services.worker.engine import Engine, Output
-from services.worker.identification import Stopwatch
+from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.identification.crossing_data import CrossingData, Passing, rejected
+from services.identification.engine import Engine, Output
+from services.identification.identify import Stopwatch
+from services.recordings.recording import Message
+from services.simulation.drive import paper_site
 
 REALM = "sim-test"
 START_S = 1_767_225_600.0

@@ -16,19 +16,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pre_core.paper import scenario_ratios
+from pre_core.paper.experiment import scenario_ratios
 from schemas.results import Crossing, Results, load_results
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.site import Site, parse_site, site_hash, site_toml
-from services import cli
+from services.cli import main as cli
+from services.cli.identify import identify_command, identify_recordings, site_of
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.common.recording import Message, read_messages, read_site, write_recording
-from services.common.runs import GnssTrack, Run, run_to_messages
-from services.identify import identify_command, identify_recordings, site_of
-from services.importing import import_command
-from services.simulation import Drive, paper_site, simulate_drive, write_drive
+from services.drives.importing import import_command
+from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.recordings.recording import Message, read_messages, read_site, write_recording
+from services.simulation.drive import Drive, paper_site, simulate_drive, write_drive
 
 SOUND_NM2 = 1.56e10
 LEAST_SQUARES = IdentificationSettings(method="least_squares")

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from schemas.events import Event, EventKind
 from schemas.signals import GnssFix, Identity, encode_gnss, encode_identity
 from schemas.topics import Key
-from services.common.bus import Received
-from services.common.recording import Message, write_recording
+from services.bus.session import Received
 from services.logger import intake as module
 from services.logger.clocks import TruckClock
 from services.logger.completeness import KNOWN_AGE_S, known_on_disk
 from services.logger.intake import GAP_PATIENCE_S, MAX_BOOTS, Intake
+from services.recordings.recording import Message, write_recording
 
 NOW_NS = 1_700_000_000_000_000_000
 S = 1_000_000_000

@@ -11,13 +11,13 @@ from schemas.events import EventKind, decode_event
 from schemas.signals import GnssFix, encode_gnss, encode_identity
 from schemas.topics import Key
 from services import logger
-from services.common.bus import Received
+from services.bus.session import Received
 from services.common.disk import DISK
 from services.common.errors import InputError
-from services.common.recording import Message, RecordingWriter, read_info, read_messages
 from services.logger.backlog import Backlog
 from services.logger.intake import GAP_PATIENCE_S, Intake
 from services.logger.writer import FileWriter, Place
+from services.recordings.recording import Message, RecordingWriter, read_info, read_messages
 
 NOW_NS = 1_700_000_000_000_000_000
 KEY = "driveby/v1/live/vehicle/truck-1/gnss"

@@ -16,8 +16,8 @@ from schemas.messages import descriptors
 from schemas.signals import GnssFix, encode_gnss, encode_location
 from schemas.topics import Key
 from services.common.errors import InputError
-from services.common.mcap_file import McapWriter
-from services.common.recording import (
+from services.recordings.mcap_file import McapWriter
+from services.recordings.recording import (
     Message,
     RecordingWriter,
     read_identities,
@@ -183,7 +183,7 @@ def test_which_messages_are_in_a_recording(
     tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if ending != "closed":
-        monkeypatch.setattr("services.common.recording._IDENTITIES_PERIOD_S", 0.0)
+        monkeypatch.setattr("services.recordings.recording._IDENTITIES_PERIOD_S", 0.0)
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path, reason="test")
     messages = [m for m in fixes(1000) if m.sequence not in (5, 6, 500)]

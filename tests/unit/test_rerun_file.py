@@ -28,7 +28,7 @@ from schemas.signals import (
 from schemas.site import Site, parse_site
 from schemas.topics import Key
 from services.common.errors import InputError
-from services.common.recording import Message, write_recording
+from services.recordings.recording import Message, write_recording
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.rerun_file import (
     STRIP_HEIGHT,

@@ -10,8 +10,8 @@ import pytest
 from schemas.results import Crossing, Header, crossing_to_protobuf, load_results
 from schemas.topics import Key
 from services.common.errors import FailureError
-from services.common.recording import Message, RecordingWriter
-from services.worker.result_files import Earlier, ResultFiles, read_earlier
+from services.history.result_files import Earlier, ResultFiles, read_earlier
+from services.recordings.recording import Message, RecordingWriter
 
 REALM = "live"
 NOW_S = 1_800_000_000.0

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from schemas.signals import CHANNELS, decode_accel, decode_gnss, decode_info
 from schemas.site import Site, load_site, parse_site
-from services.common.csv_import import read_folder
-from services.common.recording import Message
-from services.common.runs import GnssTrack, Run, normalised, run_to_messages, sampling_rate_hz
+from services.drives.csv_import import read_folder
+from services.drives.runs import GnssTrack, Run, normalised, run_to_messages, sampling_rate_hz
+from services.recordings.recording import Message
 
 EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
 START_S = 1_790_000_000.0

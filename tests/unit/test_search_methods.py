@@ -11,13 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from pre_core import least_squares, paper, parameters, random_walk, residual, search
-from pre_core.residual import Window
-from pre_core.search import Ending
-from services.validation import DERIVED, NAMES, paper_window, table_columns
+from pre_core import unknowns
+from pre_core.paper import experiment, random_walk, residual
+from pre_core.paper.crossing import paper_window
+from pre_core.paper.residual import Window
+from pre_core.search import levenberg_marquardt, loop
+from pre_core.search.loop import Ending
+from services.validation.paper import DERIVED, NAMES, table_columns
 
-NOMINAL = parameters.from_models(paper.TRUCK, paper.beam(np.ones(paper.ELEMENTS)))
-FREE = parameters.paper_subset(paper.ELEMENTS)
+NOMINAL = unknowns.from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
+FREE = unknowns.paper_subset(experiment.ELEMENTS)
 PARTICLES = 12
 
 State = Any
@@ -38,12 +41,12 @@ def bind_random_walk(window: Window, seed: int, threads: int) -> tuple[Callable[
 
 
 def bind_least_squares(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
-    bound = least_squares.Problem(window, NOMINAL, FREE)
+    bound = levenberg_marquardt.Problem(window, NOMINAL, FREE)
     work = residual.workspace(window)
     start = NOMINAL[FREE] * np.random.default_rng(seed).uniform(0.8, 1.2, FREE.size)
     return (
-        partial(least_squares.init, bound, work, start),
-        partial(least_squares.step, bound, work),
+        partial(levenberg_marquardt.init, bound, work, start),
+        partial(levenberg_marquardt.step, bound, work),
     )
 
 
@@ -59,7 +62,9 @@ def method(request: pytest.FixtureRequest) -> Method:
 
 
 def data_of(scenario: int) -> Window:
-    return paper_window(paper.TRUCK, paper.beam(paper.scenario_ratios(scenario)), 0.0, 0)
+    return paper_window(
+        experiment.TRUCK, experiment.beam(experiment.scenario_ratios(scenario)), 0.0, 0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -121,27 +126,24 @@ def test_a_step_that_changes_its_argument_is_caught(window: Window):
 
 
 def test_the_seed_decides(method: Method, window: Window):
-    ends = [
-        frozen(search.run(*method.bind(window, seed, 2), method.steps)[0]) for seed in (5, 5, 6)
-    ]
+    ends = [frozen(loop.run(*method.bind(window, seed, 2), method.steps)[0]) for seed in (5, 5, 6)]
     assert ends[0] == ends[1]
     assert ends[0] != ends[2]
 
 
 def test_the_number_of_threads_changes_nothing(method: Method, window: Window):
     ends = {
-        frozen(search.run(*method.bind(window, 5, threads), method.steps)[0])
-        for threads in (1, 2, 3)
+        frozen(loop.run(*method.bind(window, 5, threads), method.steps)[0]) for threads in (1, 2, 3)
     }
     assert len(ends) == 1
 
 
 def test_a_stopped_and_resumed_search_is_the_uninterrupted_one(method: Method, window: Window):
     init, step = method.bind(window, 2, 2)
-    whole, infos, _ = search.run(init, step, 6)
-    half, first_infos, _ = search.run(init, step, 2)
+    whole, infos, _ = loop.run(init, step, 6)
+    half, first_infos, _ = loop.run(init, step, 2)
     _, other_step = method.bind(window, 2, 2)  # as a new process would
-    resumed, last_infos, _ = search.run(lambda: stored(half), other_step, 4)
+    resumed, last_infos, _ = loop.run(lambda: stored(half), other_step, 4)
     assert frozen(resumed) == frozen(whole)
     assert first_infos + last_infos == infos
 
@@ -160,7 +162,7 @@ def test_the_objective_never_grows(method: Method, window: Window):
 
 
 def test_sound_data_end_as_announced(method: Method, window: Window):
-    _, infos, ending = search.run(*method.bind(window, 1, 2), method.steps)
+    _, infos, ending = loop.run(*method.bind(window, 1, 2), method.steps)
     assert ending in method.endings
     assert len(infos) <= method.steps
     assert all(info.ending is None for info in infos[:-1])
@@ -168,8 +170,8 @@ def test_sound_data_end_as_announced(method: Method, window: Window):
 
 def test_too_few_steps_are_an_ending_of_their_own(method: Method, window: Window):
     init, step = method.bind(window, 1, 2)
-    assert search.run(init, step, 1)[2] is Ending.STEPS_EXHAUSTED
-    assert search.run(init, step, 1, at_the_end=Ending.STEPS_DONE)[2] is Ending.STEPS_DONE
+    assert loop.run(init, step, 1)[2] is Ending.STEPS_EXHAUSTED
+    assert loop.run(init, step, 1, at_the_end=Ending.STEPS_DONE)[2] is Ending.STEPS_DONE
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
@@ -177,14 +179,14 @@ def test_an_objective_that_is_not_finite_is_an_ending_not_an_exception(
     method: Method, window: Window, poison: float
 ):
     broken = window._replace(acceleration=np.full_like(window.acceleration, poison))
-    _, infos, ending = search.run(*method.bind(broken, 1, 2), method.steps)
+    _, infos, ending = loop.run(*method.bind(broken, 1, 2), method.steps)
     assert ending is Ending.NOT_FINITE
     assert len(infos) == 1
 
 
 def test_progress_is_told_once_a_step(method: Method, window: Window):
     told = []
-    _, infos, _ = search.run(
+    _, infos, _ = loop.run(
         *method.bind(window, 1, 2), 3, progress=lambda count, info: told.append((count, info))
     )
     assert told == list(enumerate(infos, start=1))
@@ -221,8 +223,8 @@ def test_least_squares_ends_with_central_differences(window: Window):
 
 
 def test_a_kink_leaves_least_squares_stuck():
-    state = least_squares.begin(lambda y: 1.0 + np.abs(y), np.zeros(1))
-    assert least_squares.descend(lambda y: 1.0 + np.abs(y), state)[1].ending is Ending.STUCK
+    state = levenberg_marquardt.begin(lambda y: 1.0 + np.abs(y), np.zeros(1))
+    assert levenberg_marquardt.descend(lambda y: 1.0 + np.abs(y), state)[1].ending is Ending.STUCK
 
 
 # The random walk
@@ -257,7 +259,7 @@ def test_the_random_walk_begins_in_the_papers_prior(window: Window):
 def test_the_particles_objective_is_their_own(window: Window):
     """Early stopping of an evaluation must not leave a wrong J with an accepted particle."""
     init, step = bind_random_walk(window, 4, 2)
-    state, _, _ = search.run(init, step, 25)
+    state, _, _ = loop.run(init, step, 25)
     theta = np.repeat(NOMINAL[None, :], PARTICLES, axis=0)
     theta[:, FREE] *= state.ratios
     rows = residual.residual_batch(window, residual.workspace(window), theta)
@@ -272,7 +274,7 @@ def test_impossible_particles_are_never_kept(window: Window):
     state, info = random_walk.step(bound, anything_is_better)
     assert 0.1 < info.acceptance < 0.9
     assert np.all(state.ratios > 0.0)
-    assert np.all(state.ratios[:, 0] * NOMINAL[parameters.D_1] < window.wheelbase_m)
+    assert np.all(state.ratios[:, 0] * NOMINAL[unknowns.D_1] < window.wheelbase_m)
 
 
 # Least squares
@@ -281,11 +283,11 @@ def test_impossible_particles_are_never_kept(window: Window):
 def worst_accuracy(window: Window, truth: np.ndarray, seed: int) -> float:
     """The smallest S_A of all twenty parameters from a random start in the paper's prior."""
     init, step = bind_least_squares(window, seed, 1)
-    state, _, ending = search.run(init, step, least_squares.MAX_STEPS)
+    state, _, ending = loop.run(init, step, levenberg_marquardt.MAX_STEPS)
     if ending is not Ending.CONVERGED:
         return -np.inf
-    bound = least_squares.Problem(window, NOMINAL, FREE)
-    ratios = least_squares.untransform(bound, state.y)[None, :] / NOMINAL[FREE]
+    bound = levenberg_marquardt.Problem(window, NOMINAL, FREE)
+    ratios = levenberg_marquardt.untransform(bound, state.y)[None, :] / NOMINAL[FREE]
     found = table_columns(ratios, nominal=NOMINAL, free=FREE, window=window)[0]
     return float(1.0 - np.abs(found - truth).max())
 
@@ -293,7 +295,7 @@ def worst_accuracy(window: Window, truth: np.ndarray, seed: int) -> float:
 def truth_of(scenario: int) -> np.ndarray:
     truth = np.ones(len(NAMES))
     first = NAMES.index("EI_1")
-    truth[first : first + paper.ELEMENTS] = paper.scenario_ratios(scenario)
+    truth[first : first + experiment.ELEMENTS] = experiment.scenario_ratios(scenario)
     return truth
 
 
@@ -321,7 +323,7 @@ def test_wrong_data_and_wrong_truths_are_not_called_found(window: Window):
 
 def test_derived_masses_follow_from_d_1_and_the_axles(window: Window):
     ratios = np.ones((1, FREE.size))
-    ratios[0, list(FREE).index(parameters.D_1)] = 1.2
+    ratios[0, list(FREE).index(unknowns.D_1)] = 1.2
     columns = table_columns(ratios, nominal=NOMINAL, free=FREE, window=window)[0]
     found = dict(zip(NAMES, columns, strict=True))
     d_1, wheelbase = 1.215, 4.4  # Table 1

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from schemas.spool import Held
 from services.common.errors import InputError
-from services.common.spool import Spool
+from services.truck.spool import Spool
 
 MIB = 1 << 20
 
@@ -91,7 +91,7 @@ def test_boots_follow_each_other_also_when_the_clock_went_back(
 @pytest.mark.process
 def test_what_was_appended_survives_kill_9(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from services.common.spool import Spool\n"
+        "import sys; from pathlib import Path; from services.truck.spool import Spool\n"
         "spool = Spool(Path(sys.argv[1])); number = 0\n"
         "while True:\n"
         "    spool.append('accel', number, number.to_bytes(4, 'big') * 400)\n"

@@ -14,12 +14,12 @@ from schemas import spool as wire
 from schemas.signals import Channel, GnssFix, Identity, decode_accel
 from schemas.spool import Held, Query
 from schemas.topics import Key
-from services.common.bus import Received, Seen
+from services.bus.session import Received, Seen
 from services.common.intervals import Intervals
-from services.common.spool import Spool
 from services.logger import spool_recovery
 from services.logger.spool_recovery import SpoolRecovery, shortfall
 from services.truck.gateway import Gateway
+from services.truck.spool import Spool
 
 ACCEL = Key("live", "vehicle", "truck-1", "accel")
 MIB = 1 << 20
@@ -282,7 +282,7 @@ def test_a_full_disk_on_the_truck_stops_nothing(
     router: zenoh.Session, client: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from schemas.topics import selector
-    from services.common.bus import Subscription
+    from services.bus.session import Subscription
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from schemas.signals import CHANNELS, AccelBatch, Channel, GnssFix, encode_accel, encode_gnss
-from services.common.streams import PATIENCE_S, Boot, Samples, device_time_ns
+from services.identification.streams import PATIENCE_S, Boot, Samples, device_time_ns
 
 Floats = NDArray[np.float64]
 

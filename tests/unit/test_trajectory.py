@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
+from pre_core.crossing.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
 
 Floats = NDArray[np.float64]
 

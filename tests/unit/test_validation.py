@@ -9,25 +9,24 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pre_core import paper
-from pre_core.search import Ending
+from pre_core.paper import experiment
+from pre_core.search.loop import Ending
 from schemas.site import site_toml
-from services import cli
+from services.cli import main as cli
+from services.cli.validate_paper import print_table, validate_command
 from services.common.errors import InputError
-from services.simulation import paper_site
-from services.validation import (
+from services.simulation.drive import paper_site
+from services.validation.paper import (
     DERIVED,
     NAMES,
     Cloud,
     Scenario,
     compare_with_paper,
-    print_table,
     run_scenario,
     tables_of_paper,
-    validate_command,
 )
 
-SOUND = paper.beam(np.ones(paper.ELEMENTS))
+SOUND = experiment.beam(np.ones(experiment.ELEMENTS))
 
 
 def run(
@@ -35,7 +34,7 @@ def run(
 ) -> Scenario:
     return run_scenario(
         scenario,
-        paper.TRUCK,
+        experiment.TRUCK,
         SOUND,
         noise_ug_per_rthz=noise,
         seed=seed,
@@ -210,7 +209,7 @@ def clouds_of_paper() -> dict[int, Cloud]:
             {},
             np.empty((0, len(NAMES))),
         )
-        for number in paper.SCENARIOS
+        for number in experiment.SCENARIOS
     }
 
 
@@ -263,7 +262,7 @@ def test_a_random_walk_of_few_steps_does_not_reproduce_the_paper():
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_the_paper_in_full():
-    found = [run(number) for number in paper.SCENARIOS]
+    found = [run(number) for number in experiment.SCENARIOS]
     close = compare_with_paper({scenario.number: scenario.random_walk for scenario in found})
     assert close["cells"] == 216
     assert close["std"] >= 195

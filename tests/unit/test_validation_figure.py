@@ -11,18 +11,18 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.patches import StepPatch
 
-from pre_core import paper
-from pre_core.search import Ending
+from pre_core.paper import experiment
+from pre_core.search.loop import Ending
 from services.common.errors import InputError
-from services.validation import NAMES, Cloud, Scenario, cloud_of, tables_of_paper
-from services.viewer.figure import STYLE
-from services.viewer.validation_figure import (
+from services.validation.paper import NAMES, Cloud, Scenario, cloud_of, tables_of_paper
+from services.validation.paper_figures import (
     describe,
     draw_overview,
     draw_posterior,
     overview_figure,
     posterior_figure,
 )
+from services.viewer.figure import STYLE
 from tests.unit.words import assert_words_apart, words
 
 PARTICLES = 400
@@ -37,7 +37,7 @@ def style():
 def scenario(number: int, ours: dict[str, float] | None = None, spread: float = 0.2) -> Scenario:
     rng = np.random.default_rng(number)
     truth = dict.fromkeys(NAMES, 1.0)
-    ratios = paper.scenario_ratios(number)
+    ratios = experiment.scenario_ratios(number)
     truth |= {f"EI_{e + 1}": float(ratio) for e, ratio in enumerate(ratios)}
     values = np.array([truth[name] for name in NAMES])
     cloud = values + spread * rng.standard_normal((PARTICLES, len(NAMES)))
@@ -132,7 +132,7 @@ def test_overview_without_the_paper_does_not_name_it():
 @pytest.mark.parametrize("count", [1, 2, 5, 12])
 def test_words_stand_apart_in_the_overview(count: int):
     assert_words_apart(
-        draw_overview([scenario(n) for n in paper.SCENARIOS[:count]], tables_of_paper())
+        draw_overview([scenario(n) for n in experiment.SCENARIOS[:count]], tables_of_paper())
     )
 
 

@@ -1,6 +1,6 @@
 """Crossings with something wrong: in the truck, on the bridge, in the sensors or in the site file.
 
-The truth is what `services.simulation` drives (a mesh ten times finer than the elements, 40 modes,
+The truth is what `simulation.drive` drives (a mesh ten times finer than the elements, 40 modes,
 steps of 0.1 ms) and a little more: dampers that are not linear, wheels on different roads, a second
 vehicle. Then the sensors, what breaks in them, and the site file that the owner believes in.
 """
@@ -11,25 +11,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core import simulate as forward
-from pre_core.bridge import refine
-from pre_core.road import WheelRoad, contact_patch_average, iso_8608_profile, under_wheels
-from pre_core.sensors import (
+from pre_core.physics import simulate as forward
+from pre_core.physics.bridge import refine
+from pre_core.physics.road import WheelRoad, contact_patch_average, iso_8608_profile, under_wheels
+from pre_core.physics.sensors import (
     Accelerometer,
     Receiver,
     measure_acceleration,
     measure_position,
 )
-from pre_core.vehicle import HalfCar
+from pre_core.physics.vehicle import HalfCar
 from schemas.results import Crossing, Header
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS, Channel, decode_accel, encode_accel
 from schemas.site import Bridge, Site, Vehicle, site_hash
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
-from services.common.recording import Message
-from services.common.runs import GnssTrack, Run, run_to_messages
-from services.simulation import START_TIME_S, beam_of, declared, paper_site, truck_of
-from services.worker.engine import Engine, feed_all
+from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.identification.engine import Engine, feed_all
+from services.recordings.recording import Message
+from services.simulation.drive import START_TIME_S, beam_of, declared, paper_site, truck_of
 
 Floats = NDArray[np.float64]
 Channels = dict[str, Floats]
@@ -65,7 +65,7 @@ class Fault(NamedTuple):
     second_vehicle_kg: float = 0.0
     noise: float = 1.0
     """True over declared."""
-    sensor: dict[str, Any] = {}  # noqa: RUF012 - of pre_core.sensors.Accelerometer, never changed
+    sensor: dict[str, Any] = {}  # noqa: RUF012 - of pre_core.physics.sensors.Accelerometer, never changed
     channels: Callable[[Channels, Floats], Channels] = lambda channels, time_s: channels
     """What becomes of the samples; times are seconds since the front axle's entry."""
     kept: Callable[[Floats], NDArray[np.bool_]] = lambda time_s: np.ones(time_s.shape, dtype=bool)

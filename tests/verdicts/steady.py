@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from services.common.crossing import Passage, Stay
-from services.common.streams import Fixes
-from services.simulation import paper_site
-from services.worker.crossing_data import CrossingData, Floats
+from services.identification.crossing_data import CrossingData, Floats
+from services.identification.stays import Passage, Stay
+from services.identification.streams import Fixes
+from services.simulation.drive import paper_site
 
 ENTRY_S, EXIT_S = 3.0, 6.44
 _SITE = paper_site()

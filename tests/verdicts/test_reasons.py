@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pre_core.simulate import Motion
+from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
-from services.worker.crossing_data import caveats, longest_outage_s
+from services.identification.crossing_data import caveats, longest_outage_s
 from tests.verdicts.steady import ENTRY_S, EXIT_S, steady_crossing
 
 

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pre_core import quality
+from pre_core.diagnostics import quality
 from schemas.reasons import Reason
-from services.worker.checks import BODY_FRONT, ROAD, Fit, reasons_after_fit
-from services.worker.crossing_data import CrossingData, Floats
+from services.identification.checks import BODY_FRONT, ROAD, Fit, reasons_after_fit
+from services.identification.crossing_data import CrossingData, Floats
 from tests.verdicts.steady import steady_crossing
 
 STEP_S = 0.005

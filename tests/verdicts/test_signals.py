@@ -1,7 +1,7 @@
 """What the accelerations alone show before any fit: every broken channel is named, no sound one is.
 
-The thresholds are in services/worker/checks.py; how far sound and broken signals lie from them was
-measured over more drives than these (docs/verdicts.md, tests/verdicts/measure.py).
+The thresholds are in services/identification/checks.py; how far sound and broken signals lie from
+them was measured over more drives than these (docs/verdicts.md, tests/verdicts/measure.py).
 """
 
 from functools import cache
@@ -10,11 +10,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from pre_core import quality
-from pre_core.simulate import Motion
+from pre_core.diagnostics import quality
+from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
 from schemas.signals import CHANNELS
-from services.worker.checks import reasons_before_fit
+from services.identification.checks import reasons_before_fit
 from tests.verdicts import faults
 from tests.verdicts.faults import Case, Fault, Truth
 

@@ -1,0 +1,388 @@
+"""Method `pre`: from one crossing's signals to the optimum of its posterior.
+
+The posterior has one deep minimum and many shallow ones: with every element free, a bridge that is
+put half a metre too far can be explained almost as well by other rigidities. So the search
+
+1. finds truck and trajectory while the bridge may change only as a whole, with the data taken for
+   far noisier than they are, and step by step less so;
+2. walks along the road: for every place of the bridge its parameters are fitted with all else held
+   to first order (all other columns are projected out of the rows), which costs little and leads
+   downhill to the right place;
+3. frees everything from the best place, and from the next best ones if that does not fit.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.crossing.channels import channel_signals
+from pre_core.crossing.posterior import (
+    Fixes,
+    Priors,
+    Problem,
+    all_rows,
+    covariance,
+    data_rows,
+    layout,
+    points,
+    precision_root,
+    start,
+    trajectory_basis,
+)
+from pre_core.crossing.residuals import Crossing, sinc_table, workspace
+from pre_core.crossing.whitening import Truck, noise_power, row_count, row_filter, whitener
+from pre_core.physics.beam_basis import beam_basis, rebased
+from pre_core.physics.bridge import FloatArray
+from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
+from pre_core.search import levenberg_marquardt
+from pre_core.search.levenberg_marquardt import Rows
+from pre_core.search.loop import Ending
+from pre_core.unknowns import D_1, EI_1, KAPPA, M_U1
+
+_KNOT_S = 0.4
+_SLOPE_STEP = 1e-3
+_MARGIN_M = 3.0  # of road before the first row, for the trajectory to move
+_COARSE = ((300.0, 4), (100.0, 4), (30.0, 4))
+_FREE = ((5.0, 8, 0.2), (1.0, 25, 0.02))
+"""Temperatures (noise is taken for this many times what it is), the steps at each, and the gain in
+the sum of squares that is not worth another step."""
+_WALK_TEMPERATURE = 3.0
+_WALK_STEPS = 6
+_WALK_ENOUGH = 0.5
+_STRIDE_M = 0.6
+_REFINED_M = (0.3, 0.15)
+_PATIENCE = 1.5  # strides beyond the best place
+_REACH = 3.0  # of the offset's spread
+_APART_M = 0.2
+_MOST_PLACES = 4
+_ACCEPTED_Z, _ACCEPTED_EXCESS = 3.0, 0.05
+"""A minimum is taken for the right one if chi2 is no further above one than chance (so many
+standard deviations) and what the noise model leaves out explain."""
+
+_BEND = 0.8
+
+Report = Callable[[str, float], None]
+
+
+class Inputs(NamedTuple):
+    """One crossing as method `pre` takes it; times in s on one clock, chainage in m."""
+
+    acceleration_m_per_s2: FloatArray  # (4, n)
+    start_s: float
+    step_s: float
+    direction: int
+    span_m: float
+    element_lengths_m: FloatArray
+    total_mass_kg: float
+    cg_height_m: float
+    density_m_per_s2_per_rthz: FloatArray  # (4,) one-sided
+    slowest_rate_hz: float
+    fixes: Fixes
+    priors: Priors
+    parts: int
+    threads: int
+
+
+class Optimum(NamedTuple):
+    """Where the search ended; `chi2_per_dof` is of the data against the declared noise."""
+
+    problem: Problem
+    state: levenberg_marquardt.State
+    ending: Ending
+    chi2_per_dof: float
+    evaluations: int
+    starts: int
+    """How many places along the road all unknowns were freed from."""
+
+
+def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
+    """The problem and the coordinates of its nominal start."""
+    model = channel_signals(inputs.acceleration_m_per_s2, inputs.step_s, inputs.slowest_rate_hz)
+    n = model.signals.shape[2]
+    basis = beam_basis(inputs.element_lengths_m, inputs.parts)
+    position, speeding, rows, values, best = trajectory_basis(
+        inputs.fixes, inputs.start_s + model.start_s, model.step_s, n, inputs.direction, _KNOT_S
+    )
+    front = position @ best[:-1]
+    travel = front if inputs.direction > 0 else inputs.span_m - front
+    wheelbase = inputs.priors.wheelbase_m
+    first = int(np.searchsorted(travel - wheelbase, travel[0] + _MARGIN_M))
+    crossing = Crossing(
+        model.step_s,
+        model.signals,
+        inputs.direction,
+        inputs.span_m,
+        inputs.total_mass_kg,
+        inputs.cg_height_m,
+        STANDARD_GRAVITY_M_PER_S2,
+        basis,
+        np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
+        first,
+        n - first,
+        sinc_table(),
+    )
+    row = row_filter(model.step_s)
+    theta = inputs.priors.theta
+    count = row_count(row, crossing.rows)
+    noise = whitener(
+        row, count, _truck(crossing, theta, wheelbase), inputs.density_m_per_s2_per_rthz
+    )
+    problem = Problem(
+        crossing,
+        inputs.priors,
+        row,
+        noise,
+        inputs.density_m_per_s2_per_rthz,
+        position,
+        speeding,
+        rows,
+        values,
+        np.zeros(0),
+        (theta > 0.0) | (np.arange(theta.size) >= theta.size - 2),
+        tuple(workspace(crossing, theta.size, row) for _ in range(inputs.threads)),
+    )
+    return problem, start(problem, best)
+
+
+def _truck(crossing: Crossing, theta: FloatArray, wheelbase: float) -> Truck:
+    d_1 = theta[D_1]
+    d_2 = wheelbase - d_1
+    m_s = crossing.total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
+    inertia = theta[KAPPA] * m_s * d_1 * d_2
+    return Truck(
+        theta,
+        (m_s * d_2**2 + inertia) / wheelbase**2,
+        (m_s * d_1**2 + inertia) / wheelbase**2,
+        (m_s * d_1 * d_2 - inertia) / wheelbase**2,
+    )
+
+
+def with_noise_at(problem: Problem, y: FloatArray) -> Problem:
+    """The problem with the noise as it is for the truck at y, and coordinates for its bridge."""
+    where = layout(problem)
+    unknowns = where.gains.stop
+    near = np.repeat(y[None, :], 1 + unknowns, axis=0)
+    near[np.arange(1, 1 + unknowns), np.arange(unknowns)] += _SLOPE_STEP
+    at = points(problem, near)
+    density = problem.density * (1.0 + at.gain)
+    trucks = [
+        _truck(problem.crossing, theta, float(wheelbase))
+        for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
+    ]
+    count = row_count(problem.rows, problem.crossing.rows)
+    noise = whitener(problem.rows, count, trucks[0], density[0])
+    truck = int(problem.estimated[:EI_1].sum())
+    changing = [*range(truck), *range(where.wheelbase, unknowns)]
+    slope = np.zeros(unknowns)
+    power = noise_power(problem.rows, trucks, density, changing)
+    slope[changing] = 0.5 * count * power / _SLOPE_STEP
+    basis = rebased(problem.crossing.basis, at.theta[0])
+    for work in problem.works:
+        work.modes_of[:] = np.nan
+    return problem._replace(
+        noise=noise,
+        noise_slope=slope,
+        crossing=problem.crossing._replace(basis=basis),
+    )
+
+
+def chi2_per_dof(problem: Problem, y: FloatArray) -> float:
+    """Mean square of the white rows; each of the trajectory's and truck's unknowns takes one."""
+    rows = data_rows(problem, y[None, :])[0]
+    return float(rows @ rows) / max(1, rows.size - y.size)
+
+
+def _tempered(problem: Problem, y: FloatArray, directions: FloatArray, temperature: float) -> Rows:
+    return lambda v: all_rows(problem, y + v @ directions.T, temperature)
+
+
+def _descend(
+    problem: Problem,
+    y: FloatArray,
+    directions: FloatArray,
+    temperature: float,
+    steps: int,
+    enough: float,
+) -> tuple[FloatArray, levenberg_marquardt.State, Ending, int]:
+    """Least squares along `directions` (f, d) from y; `enough` is a gain not worth a step."""
+    rows = _tempered(problem, y, directions, temperature)
+    start = np.zeros(directions.shape[1])
+    state, ending, evaluations = _minimised(rows, start, steps, enough)
+    return y + directions @ state.y, state, ending, evaluations
+
+
+def _minimised(
+    rows: Rows, start: FloatArray, steps: int, enough: float
+) -> tuple[levenberg_marquardt.State, Ending, int]:
+    state = levenberg_marquardt.begin(rows, start)
+    evaluations = start.size + 1
+    for _ in range(steps):
+        before = state.objective
+        state, info = levenberg_marquardt.descend(rows, state)
+        evaluations += info.evaluations
+        if info.ending is not None:
+            # Where no step helps any more, differences have reached their rounding: the bottom.
+            ending = Ending.CONVERGED if info.ending is Ending.STUCK else info.ending
+            return state, ending, evaluations
+        if before - state.objective < enough:
+            return state, Ending.CONVERGED, evaluations
+    return state, Ending.STEPS_EXHAUSTED, evaluations
+
+
+def _bridge_places(problem: Problem) -> NDArray[np.int64]:
+    """Places in y of what is estimated of the bridge: elements, mass, damping, springs."""
+    place = np.full(problem.estimated.size, -1)
+    place[problem.estimated] = np.arange(int(problem.estimated.sum()))
+    bridge = place[EI_1:]
+    return bridge[bridge >= 0]
+
+
+def _whole_bridge(problem: Problem) -> FloatArray:
+    """Directions in which all elements change alike and the supports have no springs."""
+    size = layout(problem).size
+    unit = np.eye(size)
+    bridge = _bridge_places(problem)
+    elements = bridge[: problem.estimated.size - EI_1 - 5]
+    springs = bridge[-2:]
+    single = np.setdiff1d(np.arange(size), [*elements, *springs])
+    together = unit[:, elements].sum(axis=1) / np.sqrt(elements.size)
+    return np.column_stack([unit[:, single], together])
+
+
+class _Place(NamedTuple):
+    """How well the bridge, put `shift_m` further along the road, fits; its unknowns there."""
+
+    objective: float
+    shift_m: float
+    bridge: FloatArray
+
+
+def _walk(problem: Problem, y: FloatArray) -> tuple[list[_Place], int]:
+    """Places along the road, best first, and the evaluations that they took."""
+    where = layout(problem)
+    places = _bridge_places(problem)
+    free = np.eye(y.size)
+    here = levenberg_marquardt.begin(
+        _tempered(problem, y, free, _WALK_TEMPERATURE), np.zeros(y.size)
+    ).jacobian
+    others, _ = np.linalg.qr(np.delete(here, places, axis=1))
+    evaluations = y.size + 1
+    seen: list[_Place] = []
+
+    def look(shift: float, start: FloatArray) -> None:
+        nonlocal evaluations
+        moved = y.copy()
+        moved[where.trajectory] += shift
+        rows = _tempered(problem, moved, free[:, places], _WALK_TEMPERATURE)
+
+        def projected(v: FloatArray) -> FloatArray:
+            values = rows(v)
+            return np.asarray(values - (values @ others) @ others.T)
+
+        state, _, used = _minimised(projected, start, _WALK_STEPS, _WALK_ENOUGH)
+        evaluations += used
+        if np.isfinite(state.objective):
+            seen.append(_Place(state.objective, shift, state.y))
+
+    def best() -> _Place:
+        return min(seen, key=lambda place: place.objective)
+
+    look(0.0, np.zeros(places.size))
+    reach = _STRIDE_M + _REACH / problem.receiver_rows[-1, -1]
+    for sign in (1.0, -1.0):
+        shift = sign * _STRIDE_M
+        while abs(shift) <= reach:
+            look(shift, np.zeros(places.size))
+            if seen and sign * (shift - best().shift_m) > _PATIENCE * _STRIDE_M:
+                break
+            shift += sign * _STRIDE_M
+    for stride in _REFINED_M if seen else ():
+        centre = best()
+        for sign in (1.0, -1.0):
+            look(centre.shift_m + sign * stride, centre.bridge)
+    return sorted(seen, key=lambda place: place.objective), evaluations
+
+
+def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) -> Optimum:
+    """The optimum of the posterior. Its `ending` is NOT_FINITE if no place gave finite rows."""
+    problem, y = prepare(inputs)
+    whole = _whole_bridge(problem)
+    evaluations = 0
+    for temperature, steps in _COARSE:
+        report("finding the truck", 0.05)
+        y, _, _, used = _descend(problem, y, whole, temperature, steps, 0.5)
+        evaluations += used
+        problem = with_noise_at(problem, y)
+    report("finding the bridge", 0.2)
+    places, used = _walk(problem, y)
+    evaluations += used
+    best: Optimum | None = None
+    tried: list[float] = []
+    for place in places:
+        if any(abs(place.shift_m - other) < _APART_M for other in tried):
+            continue
+        tried.append(place.shift_m)
+        report(f"freeing the elements, start {len(tried)}", 0.3 + 0.05 * len(tried))
+        z = y.copy()
+        z[layout(problem).trajectory] += place.shift_m
+        z[_bridge_places(problem)] += place.bridge
+        found = _freed(problem, z)
+        evaluations += found.evaluations
+        if best is None or found.chi2_per_dof < best.chi2_per_dof:
+            best = found
+        rows = best.problem.noise.reciprocal.size
+        chance = _ACCEPTED_Z * np.sqrt(2.0 / rows)
+        if best.chi2_per_dof < 1.0 + _ACCEPTED_EXCESS + chance or len(tried) == _MOST_PLACES:
+            break
+    if best is None:
+        state = levenberg_marquardt.begin(lambda at: all_rows(problem, at), y)
+        return Optimum(problem, state, Ending.NOT_FINITE, np.inf, evaluations, 0)
+    return best._replace(evaluations=evaluations, starts=len(tried))
+
+
+def _freed(problem: Problem, y: FloatArray) -> Optimum:
+    """Least squares in all unknowns; supports do not push.
+
+    Where it leaves a support spring below zero, where no posterior is, that is held at zero and the
+    rest is brought to the optimum beside it. The slope that is left belongs to the normal
+    approximation (`normal_approximation`).
+    """
+    free = np.eye(y.size)
+    springs = np.arange(layout(problem).theta.stop - 2, layout(problem).theta.stop)
+    evaluations = 0
+    ending = Ending.STEPS_EXHAUSTED
+    problem = with_noise_at(problem, y)
+    for temperature, steps, enough in _FREE:
+        y, state, ending, used = _descend(problem, y, free, temperature, steps, enough)
+        evaluations += used
+        problem = with_noise_at(problem, y)
+    held = springs[y[springs] < 0.0]
+    if held.size:
+        y[held] = 0.0
+        directions = np.delete(free, held, axis=1)
+        y, _, ending, used = _descend(problem, y, directions, 1.0, 15, 0.02)
+        y[springs] = np.maximum(y[springs], 0.0)
+        evaluations += used
+    state = levenberg_marquardt.begin(lambda at: all_rows(problem, at), y)
+    return Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations + y.size + 1, 1)
+
+
+def bends(problem: Problem) -> FloatArray:
+    """How much each coordinate is to be bent for the chains (mcmc.py): those of ln EI are.
+
+    The deflection of a statically determinate beam is linear in 1/EI; a little less, for the prior
+    is normal in ln EI.
+    """
+    bend = np.zeros(layout(problem).size)
+    elements = _bridge_places(problem)[: problem.estimated.size - EI_1 - 5]
+    bend[elements] = _BEND * problem.priors.spread[EI_1 : EI_1 + elements.size]
+    return bend
+
+
+def normal_approximation(found: Optimum) -> tuple[FloatArray, FloatArray]:
+    """Mean (f,) and covariance (f, f) of the Gauss-Newton approximation at the optimum."""
+    spread = covariance(precision_root(found.state.jacobian))
+    slope = found.state.jacobian.T @ found.state.residual
+    return found.state.y - spread @ slope, spread

@@ -1,0 +1,325 @@
+"""Method `pre`: the whitened likelihood of one crossing with its priors, and its optimum.
+
+All unknowns are put into coordinates y in which their prior is a standard normal
+(docs/method-pre.md): logarithms of positive quantities, multiples of the prior's spread for the
+others. The trajectory's spline coefficients have no prior of their own; the receiver's fixes take
+its place. The sum of squares of all rows is then -2 log posterior up to a constant, and its
+Gauss-Newton curvature the precision of the normal that the Markov chains are steered by.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import qr, solve_triangular
+
+from pre_core.crossing.residuals import (
+    Crossing,
+    Points,
+    Work,
+    evaluate_white,
+    roads_and_deflections,
+)
+from pre_core.crossing.whitening import RowFilter, Whitener
+from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
+
+FloatArray = NDArray[np.float64]
+
+CHANNELS = 4
+# Three directions in which four gains differ; what is common to all comes beside them.
+_CONTRASTS = np.array(
+    [[0.5, 0.5, -0.5, -0.5], [0.5, -0.5, 0.5, -0.5], [0.5, -0.5, -0.5, 0.5]], dtype=np.float64
+)
+_INITIAL_SPREAD = np.array([0.1, 0.1, 0.1])  # m, m/s, m/s²: wide; they are nuisances
+_JERK_M_PER_S3 = 1.0
+_DEGREE = 5
+"""Of the trajectory: load moves with its second derivative, which must not have kinks."""
+
+
+class Priors(NamedTuple):
+    """What is known before the crossing; relative spreads are those of a log-normal."""
+
+    theta: FloatArray  # (p,) nominal values
+    spread: FloatArray  # (p,) relative; of the two support springs absolute (half-normal at zero)
+    wheelbase_m: float
+    wheelbase_spread: float
+    gain_spread: float
+    """Of each channel's gain, independent of the others'."""
+    common_gain_spread: float
+    delay_spread_s: float
+
+
+class Fixes(NamedTuple):
+    """The receiver's fixes near the crossing, of the front axle's chainage; (m,) each."""
+
+    time_s: FloatArray
+    position_m: FloatArray
+    velocity_m_per_s: FloatArray
+    position_noise_m: float
+    speed_noise_m_per_s: float
+    offset_spread_m: float
+    """Slow error and latency together: common to all fixes."""
+
+
+class Problem(NamedTuple):
+    """Everything that stays the same during a search."""
+
+    crossing: Crossing
+    priors: Priors
+    rows: RowFilter
+    noise: Whitener
+    density: FloatArray  # (4,) one-sided, m/s²/√Hz
+    basis_position: FloatArray  # (n, b): trajectory = basis @ coefficients
+    basis_acceleration: FloatArray  # (n, b), positive when speeding up
+    receiver_rows: FloatArray  # (r, b + 1): rows of (coefficients, offset)
+    receiver_values: FloatArray  # (r,)
+    noise_slope: FloatArray  # (t + 1 + 3,): see `all_rows`
+    estimated: NDArray[np.bool_]  # (p,) which of theta are unknown
+    works: tuple[Work, ...]
+
+
+class Layout(NamedTuple):
+    """Places of the groups of unknowns in y."""
+
+    theta: slice
+    wheelbase: int
+    gains: slice
+    """Contrasts between the channels."""
+    common_gain: int
+    delays: slice
+    initial: slice
+    trajectory: slice
+    offset: int
+    size: int
+
+
+def layout(problem: Problem) -> Layout:
+    """Order: theta (what is estimated), wheelbase, gains, delays, initial states, trajectory."""
+    t = int(problem.estimated.sum())
+    gains = slice(t + 1, t + 4)
+    delays = slice(gains.stop + 1, gains.stop + 1 + CHANNELS)
+    initial = slice(delays.stop, delays.stop + 3 * CHANNELS)
+    trajectory = slice(initial.stop, initial.stop + problem.basis_position.shape[1])
+    return Layout(
+        slice(0, t),
+        t,
+        gains,
+        gains.stop,
+        delays,
+        initial,
+        trajectory,
+        trajectory.stop,
+        trajectory.stop + 1,
+    )
+
+
+def trajectory_basis(
+    fixes: Fixes, start_s: float, step_s: float, count: int, direction: int, knot_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Spline basis at the samples, the receiver's rows, and the coefficients that fit them best.
+
+    Returns (n, b) positions, (n, b) accelerations, (r, b + 1), (r,) and (b + 1,).
+    """
+    time = start_s + step_s * np.arange(count, dtype=np.float64)
+    first = min(float(time[0]), float(fixes.time_s[0]))
+    last = max(float(time[-1]), float(fixes.time_s[-1]))
+    spans = max(2, round((last - first) / knot_s))
+    inner = np.linspace(first, last, spans + 1)
+    knots = np.concatenate([np.full(_DEGREE, first), inner, np.full(_DEGREE, last)])
+    b = knots.size - _DEGREE - 1
+    spline = BSpline(knots, np.eye(b), _DEGREE)
+    # The third derivative is a parabola between knots: two points of Gauss integrate its square
+    # well enough for a prior.
+    apart = np.diff(inner)
+    middles, aside = 0.5 * (inner[1:] + inner[:-1]), apart / np.sqrt(12.0)
+    at = np.concatenate([middles - aside, middles + aside])
+    weight = np.sqrt(0.5 * np.concatenate([apart, apart])) / _JERK_M_PER_S3
+    jerk = spline.derivative(3)(at) * weight[:, None]
+    position = spline(fixes.time_s) / fixes.position_noise_m
+    velocity = spline.derivative()(fixes.time_s) / fixes.speed_noise_m_per_s
+    rows = np.zeros((position.shape[0] + velocity.shape[0] + jerk.shape[0] + 1, b + 1))
+    m = fixes.time_s.size
+    rows[:m, :b] = position
+    rows[:m, b] = 1.0 / fixes.position_noise_m
+    rows[m : 2 * m, :b] = velocity
+    rows[2 * m : -1, :b] = jerk
+    rows[-1, b] = 1.0 / fixes.offset_spread_m
+    values = np.concatenate(
+        [
+            fixes.position_m / fixes.position_noise_m,
+            fixes.velocity_m_per_s / fixes.speed_noise_m_per_s,
+            np.zeros(jerk.shape[0] + 1),
+        ]
+    )
+    best = np.linalg.lstsq(rows, values, rcond=None)[0]
+    acceleration = direction * spline.derivative(2)(time)
+    return np.asarray(spline(time)), np.asarray(acceleration), rows, values, best
+
+
+def common_gain_spread(priors: Priors) -> float:
+    """Of the mean of the four gains: what is common to them, and the mean of what is each's own."""
+    return float(np.hypot(priors.common_gain_spread, 0.5 * priors.gain_spread))
+
+
+def points(problem: Problem, y: FloatArray) -> Points:
+    """What the points y (k, size) mean."""
+    where = layout(problem)
+    priors = problem.priors
+    k = y.shape[0]
+    p = priors.theta.size
+    theta = np.repeat(priors.theta[None, :], k, axis=0)
+    springs = np.zeros(p, dtype=bool)
+    springs[-2:] = True
+    logs = np.flatnonzero(problem.estimated & ~springs)
+    values = np.zeros((k, p))
+    values[:, problem.estimated] = y[:, where.theta]
+    theta[:, logs] = priors.theta[logs] * np.exp(priors.spread[logs] * values[:, logs])
+    spring = np.flatnonzero(problem.estimated & springs)
+    theta[:, spring] = priors.spread[spring] * values[:, spring]
+    coefficients = y[:, where.trajectory]
+    return Points(
+        theta,
+        priors.wheelbase_m * np.exp(priors.wheelbase_spread * y[:, where.wheelbase]),
+        coefficients @ problem.basis_position.T,
+        coefficients @ problem.basis_acceleration.T,
+        priors.gain_spread * (y[:, where.gains] @ _CONTRASTS),
+        np.exp(common_gain_spread(priors) * y[:, where.common_gain]),
+        priors.delay_spread_s * y[:, where.delays],
+        (y[:, where.initial].reshape(k, CHANNELS, 3) * _INITIAL_SPREAD),
+    )
+
+
+def data_rows(problem: Problem, y: FloatArray) -> FloatArray:
+    """White rows (k, 3 m) of the data alone."""
+    out = np.empty((y.shape[0], problem.noise.reciprocal.size))
+    evaluate_white(
+        problem.crossing, problem.rows, problem.noise, problem.works, points(problem, y), out
+    )
+    return out
+
+
+def all_rows(problem: Problem, y: FloatArray, temperature: float = 1.0) -> FloatArray:
+    """Rows of data, receiver and priors: their squares sum to -2 log posterior + constant.
+
+    At a `temperature` above one the data count as if their noise were so many times what it is.
+
+    The data's noise is itself a function of the truck: a softer damper passes less of it. Whitened
+    for one truck, |W e|^2 is expected to be tr(C_0^-1 C(y)) of noise alone and so pulls towards
+    trucks that pass less. The slope of that trace is taken off: as a quadratic prior is there
+    already, by moving its centre (`noise_slope`, half the slope).
+    """
+    where = layout(problem)
+    data = problem.noise.reciprocal.size
+    receiver = data + problem.receiver_values.size
+    out = np.empty((y.shape[0], receiver + where.trajectory.start))
+    evaluate_white(
+        problem.crossing, problem.rows, problem.noise, problem.works, points(problem, y), out
+    )
+    out[:, data:receiver] = (
+        y[:, where.trajectory.start : where.offset + 1] @ problem.receiver_rows.T
+    )
+    out[:, data:receiver] -= problem.receiver_values
+    out[:, receiver:] = y[:, : where.trajectory.start]
+    out[:, receiver : receiver + problem.noise_slope.size] -= problem.noise_slope / temperature**2
+    if temperature != 1.0:
+        out[:, :data] /= temperature
+    return out
+
+
+def start(problem: Problem, trajectory: FloatArray) -> FloatArray:
+    """Coordinates of the nominal values and of a trajectory (b + 1,)."""
+    where = layout(problem)
+    y = np.zeros(where.size)
+    y[where.trajectory.start :] = trajectory
+    return y
+
+
+def precision_root(jacobian: FloatArray) -> FloatArray:
+    """Upper triangle R (f, f) with R'R the Gauss-Newton precision of y."""
+    (r,) = qr(jacobian, mode="r")
+    f = jacobian.shape[1]
+    signs = np.sign(np.diag(r[:f]))
+    return np.asarray(signs[:, None] * r[:f])
+
+
+def covariance(root: FloatArray) -> FloatArray:
+    """(R'R)^-1."""
+    inverse = solve_triangular(root, np.eye(root.shape[0]))
+    return np.asarray(inverse @ inverse.T)
+
+
+def roads(problem: Problem, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Chainage (m,), road (m) under the front and the rear wheel there, for one point y.
+
+    On the bridge only, in the order of the rear wheel's samples. A bias common to all sensors bends
+    the whole record into a parabola, and nothing in the residuals shows it at constant speed: so
+    the record's own parabola, on the bridge and off, is taken off.
+    """
+    crossing = problem.crossing
+    at = points(problem, y[None, :])
+    height, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
+    x, front, rear = _at_same_places(crossing, at, height[0], height[1])
+    bend = _parabola(x, 0.5 * (front + rear))
+    on_bridge = (x >= 0.0) & (x <= crossing.span_m)
+    return x[on_bridge], (front - bend)[on_bridge], (rear - bend)[on_bridge]
+
+
+def _at_same_places(
+    crossing: Crossing, at: Points, front_height: FloatArray, rear_height: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Chainage and heights under both wheels wherever the rear wheel follows the front one."""
+    sign = 1.0 if crossing.direction > 0 else -1.0
+    front = at.position_m[0]
+    rear = (front - sign * at.wheelbase_m[0])[crossing.first_row :]
+    return (
+        rear,
+        np.interp(sign * rear, sign * front, front_height),
+        rear_height[crossing.first_row :],
+    )
+
+
+def _parabola(x: FloatArray, height: FloatArray) -> FloatArray:
+    """The parabola (m,) that fits the heights (m,) best, at x."""
+    basis, _ = np.linalg.qr(np.vander((x - x.mean()) / np.ptp(x), 3))
+    return np.asarray(basis @ (basis.T @ height))
+
+
+def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
+    """Draws (count, m) in m of the error of the wheels' mean road that the sensors' noise makes.
+
+    Where `roads` gives the road for y. White noise of the accelerations goes through the integrals
+    and the input estimation of the truck at y; what it does to the deflection is left out.
+    """
+    crossing = problem.crossing
+    at = points(problem, y[None, :])
+    theta = at.theta[0]
+    n = crossing.signals.shape[2]
+    step = crossing.step_s
+    spread = problem.density * np.sqrt(0.5 / step)
+    a = spread[:, None] * rng.standard_normal((count, CHANNELS, n))
+    v = step * np.cumsum(a, axis=2)
+    z = step * np.cumsum(v, axis=2)
+    errors = []
+    for w in range(2):
+        spring = theta[C_S1 + w] * (v[:, 2 + w] - v[:, w]) + theta[K_S1 + w] * (
+            z[:, 2 + w] - z[:, w]
+        )
+        errors.append(z[:, 2 + w] + (theta[M_U1 + w] * a[:, 2 + w] + spring) / theta[K_U1 + w])
+    drawn = []
+    for front_error, rear_error in zip(*errors, strict=True):
+        x, at_front, at_rear = _at_same_places(crossing, at, front_error, rear_error)
+        mean = 0.5 * (at_front + at_rear)
+        on_bridge = (x >= 0.0) & (x <= crossing.span_m)
+        drawn.append((mean - _parabola(x, mean))[on_bridge])
+    return np.stack(drawn)
+
+
+def largest_deflections_m(problem: Problem, y: FloatArray) -> FloatArray:
+    """Largest deflection under a wheel (k,), positive downwards, of the points y (k, size)."""
+    at = points(problem, y)
+    largest = np.empty(y.shape[0])
+    for k in range(y.shape[0]):
+        _, deflection = roads_and_deflections(problem.crossing, problem.works[0], at, k)
+        largest[k] = -deflection.min()
+    return largest

@@ -1,0 +1,543 @@
+"""The residuals of one crossing for one set of unknowns: road mismatch and two body equations.
+
+Everything that method `pre` estimates may change here from one evaluation to the next: truck,
+bridge, wheelbase, trajectory, and each channel's gain, delay, initial state and bias. Rows follow
+the samples of the rear wheel: row n compares the road under the rear wheel at sample n with the
+road under the front wheel when it was at the same place; the front body equation is taken at that
+moment too, so that the noise of all three residuals of a row meets at no delay. All of it happens
+at the model's own rate (channels.py), in which every signal is smooth; the rows are then made white
+(whitening.py).
+"""
+
+from collections.abc import Callable
+from threading import Thread
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.crossing.channels import A_1, A_2, A_3, PASS, STOP, A, V, Z
+from pre_core.crossing.whitening import RESIDUALS, RowFilter, Whitener, row_count, whiten_into
+from pre_core.kernels.lanes import LANES, kernel, summing
+from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
+from pre_core.physics import modal_response
+from pre_core.physics.beam_basis import BeamBasis
+from pre_core.unknowns import C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1
+
+FloatArray = NDArray[np.float64]
+
+_LONGEST_STRETCH = 128
+_PHASES = 64
+_SINC_TAPS = 16
+_FEW = 4  # points that are not worth starting a thread
+
+
+class Crossing(NamedTuple):
+    """The data of one crossing on an even grid of n samples."""
+
+    step_s: float
+    signals: FloatArray  # (4, 6, n): see channels.py
+    direction: int
+    span_m: float
+    total_mass_kg: float
+    cg_height_m: float
+    gravity_m_per_s2: float
+    basis: BeamBasis
+    edges_m: FloatArray  # (parts + 1,)
+    first_row: int
+    rows: int
+    """Samples first_row … first_row + rows - 1 of the rear wheel are compared."""
+    sinc: FloatArray  # (phases + 1, 2, taps): see `sinc_table`
+
+
+class Points(NamedTuple):
+    """k points at which to evaluate; see `evaluate`.
+
+    A gain common to all sensors scales everything that is measured, signal and noise, and changes
+    no residual but for the static load, which is not measured: residuals are left in the sensors'
+    own scale, and the loads that are known (weight, load transfer) are brought to it.
+    """
+
+    theta: FloatArray  # (k, p): truck and bridge, as in parameters.py
+    wheelbase_m: FloatArray  # (k,)
+    position_m: FloatArray  # (k, n): chainage of the front axle
+    acceleration_m_per_s2: FloatArray  # (k, n): positive when speeding up
+    gain: FloatArray  # (k, 4): relative corrections, of mean zero
+    common_gain: FloatArray  # (k,): factor by which all four sensors read too little
+    delay_s: FloatArray  # (k, 4): corrections, read from Taylor's series
+    initial: FloatArray  # (k, 4, 3): displacement, velocity, bias to be added
+
+
+class Work(NamedTuple):
+    """Work arrays of one thread; modified in place."""
+
+    matrix: FloatArray  # (m, m)
+    vectors: FloatArray  # (m, m)
+    cubics: FloatArray  # (parts, groups, 4, 4)
+    feedback: FloatArray  # (groups, 5, 4)
+    state: FloatArray  # (groups, 2, 4)
+    force: FloatArray  # (2, stretch, 4)
+    lanes: FloatArray  # (2, stretch, 4)
+    place: FloatArray  # (2, n)
+    part: NDArray[np.int64]  # (2, n)
+    corrected: FloatArray  # (4, 3, n)
+    load: FloatArray  # (2, n)
+    sharp: FloatArray  # (2, n)
+    road: FloatArray  # (2, n)
+    body: FloatArray  # (2, n)
+    residual: FloatArray  # (3, rows)
+    row: FloatArray  # (filtered rows,)
+    modes_of: FloatArray  # (p,) the bridge whose modes are in `cubics`
+
+
+def workspace(crossing: Crossing, parameters: int, rows: RowFilter) -> Work:
+    """Allocate for this crossing."""
+    parts, _, m = crossing.basis.cubics.shape
+    groups = (m + LANES - 1) // LANES
+    n = crossing.signals.shape[2]
+    return Work(
+        np.zeros((m, m)),
+        np.zeros((m, m)),
+        np.zeros((parts, groups, 4, LANES)),
+        np.zeros((groups, modal_response.COEFFICIENTS, LANES)),
+        np.zeros((groups, 2, LANES)),
+        np.zeros((2, _LONGEST_STRETCH, LANES)),
+        np.zeros((2, _LONGEST_STRETCH, LANES)),
+        np.zeros((2, n)),
+        np.zeros((2, n), dtype=np.int64),
+        np.zeros((4, 3, n)),
+        np.zeros((2, n)),
+        np.zeros((2, n)),
+        np.zeros((2, n)),
+        np.zeros((2, n)),
+        np.zeros((RESIDUALS, crossing.rows)),
+        np.zeros(row_count(rows, crossing.rows)),
+        np.full(parameters, np.nan),
+    )
+
+
+def sinc_table() -> FloatArray:
+    """Weights (phases + 1, 2, taps) that read the model's signals between two samples.
+
+    Row p reads at p/phases of the way from sample taps/2 - 1 of those weighted to the next; beside
+    the weights are their slopes per phase, so that cubics between the rows are smooth in the place.
+    A sinc in Kaiser's window: what the model's signals contain (up to channels.STOP of the rate)
+    has its images from 1 - STOP on.
+    """
+    phase = np.arange(_PHASES + 1) / _PHASES
+    step = 1e-4
+    before, at, after = (_sinc_weights(phase + shift) for shift in (-step, 0.0, step))
+    slope = (after - before) / (2.0 * step * _PHASES)
+    return np.ascontiguousarray(np.stack([at, slope], axis=1))
+
+
+def _sinc_weights(phase: FloatArray) -> FloatArray:
+    cutoff = 0.5 * (PASS + 1.0 - STOP)
+    width = 1.0 - STOP - PASS
+    half = _SINC_TAPS // 2
+    attenuation = 14.36 * width * (_SINC_TAPS - 1) + 7.95
+    distance = np.arange(_SINC_TAPS) - (half - 1) - phase[:, None]
+    weight = windowed_sinc(distance, cutoff, half, kaiser_beta(attenuation), pedestal=1.0)
+    # Integrated accelerations drift far; parabolas are read exactly, wherever the taps begin.
+    powers = distance[:, None, :] ** np.arange(3)[:, None]
+    moments = np.einsum("pit,pjt,pt->pij", powers, powers, weight)
+    share = np.linalg.solve(moments, np.tile([[1.0], [0.0], [0.0]], (phase.size, 1, 1)))
+    return np.asarray(weight * np.einsum("pi,pit->pt", share[:, :, 0], powers))
+
+
+@kernel
+def _correct(
+    signals: FloatArray,
+    step: float,
+    gain: FloatArray,
+    delay: FloatArray,
+    initial: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Displacement, velocity and acceleration (4, 3, n) of the four points."""
+    n = signals.shape[2]
+    middle = n // 2
+    for c in range(4):
+        g = 1.0 + gain[c]
+        d = delay[c]
+        d1, d2, d3 = g * d, g * 0.5 * d * d, g * d * d * d / 6.0
+        z0, v0, b = initial[c, 0], initial[c, 1], initial[c, 2]
+        z, v, a = signals[c, Z], signals[c, V], signals[c, A]
+        a1, a2, a3 = signals[c, A_1], signals[c, A_2], signals[c, A_3]
+        out_z, out_v, out_a = out[c, 0], out[c, 1], out[c, 2]
+        # One store a loop: more keep the compiler from using the vector registers.
+        for i in range(n):
+            t = step * (i - middle)
+            out_z[i] = g * z[i] + d1 * v[i] + d2 * a[i] + d3 * a1[i] + z0 + t * (v0 + 0.5 * b * t)
+        for i in range(n):
+            t = step * (i - middle)
+            out_v[i] = g * v[i] + d1 * a[i] + d2 * a1[i] + d3 * a2[i] + v0 + b * t
+        for i in range(n):
+            out_a[i] = g * a[i] + d1 * a1[i] + d2 * a2[i] + d3 * a3[i] + b
+
+
+@kernel
+def _wheels(
+    crossing: Crossing,
+    work: Work,
+    theta: FloatArray,
+    wheelbase: float,
+    gravity: float,
+    speeding: FloatArray,
+) -> None:
+    """Minus the input profile (`road`), contact force (`load`) and body equation (`body`).
+
+    `gravity` is in the scale of the sensors: one over the common gain.
+    """
+    d_1 = theta[D_1]
+    d_2 = wheelbase - d_1
+    m_s = crossing.total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
+    inertia = theta[KAPPA] * m_s * d_1 * d_2
+    square = wheelbase * wheelbase
+    m_12 = (m_s * d_1 * d_2 - inertia) / square
+    transfer = crossing.total_mass_kg * crossing.cg_height_m / wheelbase * gravity
+    n = work.road.shape[1]
+    for w in range(2):
+        sign = 1.0 - 2.0 * w
+        d_far = d_2 if w == 0 else d_1
+        m_ii = (m_s * d_far * d_far + inertia) / square
+        m_u = theta[M_U1 + w]
+        c, k, k_u = theta[C_S1 + w], theta[K_S1 + w], theta[K_U1 + w]
+        weight = gravity * crossing.gravity_m_per_s2 * (m_s * d_far / wheelbase + m_u)
+        z_s, v_s, a_s = work.corrected[w, 0], work.corrected[w, 1], work.corrected[w, 2]
+        z_u, v_u, a_u = work.corrected[2 + w, 0], work.corrected[2 + w, 1], work.corrected[2 + w, 2]
+        a_other = work.corrected[1 - w, 2]
+        road, load, body = work.road[w], work.load[w], work.body[w]
+        soft, hard = 1.0 / k_u, 1.0 / k
+        for i in range(n):
+            spring = c * (v_u[i] - v_s[i]) + k * (z_u[i] - z_s[i])
+            road[i] = -z_u[i] - (m_u * a_u[i] + spring) * soft
+        for i in range(n):
+            inertial = m_ii * a_s[i] + m_12 * a_other[i]
+            load[i] = sign * transfer * speeding[i] - weight - inertial - m_u * a_u[i]
+        for i in range(n):
+            spring = c * (v_u[i] - v_s[i]) + k * (z_u[i] - z_s[i])
+            inertial = m_ii * a_s[i] + m_12 * a_other[i]
+            body[i] = (inertial - spring - sign * transfer * speeding[i]) * hard
+
+
+@kernel
+def _locate(crossing: Crossing, work: Work, front: FloatArray, wheelbase: float) -> None:
+    edges = crossing.edges_m
+    parts = edges.size - 1
+    n = front.size
+    for w in range(2):
+        offset = 0.0 if w == 0 else -crossing.direction * wheelbase
+        e = 0 if crossing.direction > 0 else parts - 1
+        for i in range(n):
+            x = front[i] + offset
+            if x < 0.0 or x > edges[parts]:
+                work.part[w, i] = -1
+                work.place[w, i] = 0.0
+                continue
+            while e < parts - 1 and x > edges[e + 1]:
+                e += 1
+            while e > 0 and x < edges[e]:
+                e -= 1
+            work.part[w, i] = e
+            work.place[w, i] = (x - edges[e]) / (edges[e + 1] - edges[e])
+
+
+@kernel
+def _bridge(crossing: Crossing, work: Work, theta: FloatArray) -> bool:
+    """Modes of this bridge into the work arrays, unless they are there already."""
+    same = True
+    for i in range(EI_1, theta.size):
+        if theta[i] != work.modes_of[i]:
+            same = False
+    if same:
+        return True
+    basis = crossing.basis
+    if not modal_response.modal_filters(
+        basis.stiffness,
+        basis.cubics,
+        theta,
+        crossing.step_s,
+        work.matrix,
+        work.vectors,
+        work.cubics,
+        work.feedback,
+    ):
+        work.modes_of[:] = np.nan
+        return False
+    work.modes_of[:] = theta
+    return True
+
+
+@kernel
+def _soften_ends(
+    crossing: Crossing,
+    front: FloatArray,
+    part: NDArray[np.int64],
+    place: FloatArray,
+    force: FloatArray,
+) -> None:
+    """Weigh a wheel's force at its first and last sample on the bridge.
+
+    Between the bearing and that sample, f of a step away, the load on a mode grows from nothing
+    over f of the step, not over the whole: a weight of (1 + f)/2 keeps its impulse. Without it the
+    deflection depends on where between two samples a wheel comes on.
+    """
+    n = part.size
+    parts = crossing.edges_m.size - 1
+    for i in range(1, n - 1):
+        if part[i] < 0 or (part[i - 1] >= 0 and part[i + 1] >= 0):
+            continue
+        length = crossing.edges_m[part[i] + 1] - crossing.edges_m[part[i]]
+        from_start = place[i] * length if part[i] == 0 else np.inf
+        from_end = (1.0 - place[i]) * length if part[i] == parts - 1 else np.inf
+        step = np.abs(front[i + 1] - front[i - 1]) * 0.5
+        force[i] *= 0.5 + 0.5 * min(1.0, min(from_start, from_end) / step)
+
+
+@kernel
+def _deflect(crossing: Crossing, work: Work, front: FloatArray) -> None:
+    """Add the bridge's deflection to `road` (which is minus the input profile)."""
+    work.state[:] = 0.0
+    n = work.road.shape[1]
+    for w in range(2):
+        modal_response.sharpened(work.load[w], work.sharp[w])
+        _soften_ends(crossing, front, work.part[w], work.place[w], work.sharp[w])
+    last = n  # behind the last sample at which a wheel is on the bridge nothing is asked for
+    while last > 0 and work.part[0, last - 1] < 0 and work.part[1, last - 1] < 0:
+        last -= 1
+    begin = 0
+    arrived = False
+    while begin < last:
+        e1, e2 = work.part[0, begin], work.part[1, begin]
+        stop = begin + 1
+        while (
+            stop < last
+            and stop - begin < _LONGEST_STRETCH
+            and work.part[0, stop] == e1
+            and work.part[1, stop] == e2
+        ):
+            stop += 1
+        arrived = arrived or e1 >= 0 or e2 >= 0
+        if arrived:
+            for w in range(2):
+                for i in range(begin, stop):
+                    p = work.sharp[w, i]
+                    for lane in range(LANES):
+                        work.force[w, i - begin, lane] = p
+                        work.lanes[w, i - begin, lane] = 0.0
+            modal_response.advance(
+                work.cubics,
+                e1,
+                e2,
+                work.feedback,
+                work.state,
+                work.place[:, begin:stop],
+                work.force,
+                work.lanes,
+            )
+            for w in range(2):
+                for i in range(begin, stop):
+                    y = work.lanes[w, i - begin]
+                    work.road[w, i] += (y[0] + y[1]) + (y[2] + y[3])
+        begin = stop
+
+
+@summing
+def _weighted(
+    low: FloatArray, high: FloatArray, share: float, x: FloatArray, y: FloatArray
+) -> tuple[float, float]:
+    """Sums of x and of y with weights between those of two rows of the table (2, taps)."""
+    rest = 1.0 - share
+    value_high = share * share * (3.0 - 2.0 * share)
+    value_low = 1.0 - value_high
+    slope_low = share * rest * rest
+    slope_high = -share * share * rest
+    sum_x = sum_y = 0.0
+    for k in range(_SINC_TAPS):
+        weight = (value_low * low[0, k] + value_high * high[0, k]) + (
+            slope_low * low[1, k] + slope_high * high[1, k]
+        )
+        sum_x += weight * x[k]
+        sum_y += weight * y[k]
+    return sum_x, sum_y
+
+
+@kernel
+def _compare(
+    crossing: Crossing, work: Work, front: FloatArray, wheelbase: float, out: FloatArray
+) -> bool:
+    """The residuals of every row into `out` (3, rows); False if the front is not known there."""
+    sign = 1.0 if crossing.direction > 0 else -1.0
+    n = front.size
+    sinc = crossing.sinc
+    taps = sinc.shape[2]
+    ahead = taps // 2
+    j = ahead - 1
+    r, b = work.road[0], work.body[0]
+    road, body_front = out[0], out[1]
+    for row in range(crossing.rows):
+        i = crossing.first_row + row
+        wanted = sign * front[i] - wheelbase
+        while j < n - ahead - 1 and sign * front[j + 1] < wanted:
+            j += 1
+        x1, x2 = sign * front[j], sign * front[j + 1]
+        if not (x1 <= wanted <= x2) or x2 <= x1:
+            return False
+        # Inverse of the parabola through the samples around, to first order in its curvature, which
+        # is a few thousandths of its slope; what is left out is a millionth of a sample.
+        slope = 1.0 / (x2 - x1)
+        f = (wanted - x1) * slope
+        curvature = 0.5 * (sign * (front[j + 2] + front[j - 1]) - x1 - x2) * slope
+        f -= 0.5 * f * (f - 1.0) * curvature
+        place = min(max(f, 0.0), 1.0) * _PHASES
+        phase = min(int(place), _PHASES - 1)
+        share = place - phase
+        low, high = sinc[phase], sinc[phase + 1]
+        begin = j - ahead + 1
+        front_road, front_body = _weighted(
+            low, high, share, r[begin : begin + taps], b[begin : begin + taps]
+        )
+        road[row] = work.road[1, i] - front_road  # both hold y - u, minus the road
+        body_front[row] = front_body
+    out[2] = work.body[1, crossing.first_row : crossing.first_row + crossing.rows]
+    return True
+
+
+@kernel
+def _residuals(crossing: Crossing, work: Work, points: Points, k: int, out: FloatArray) -> bool:
+    """Residuals of point k into `out` (3, rows); False if the point is impossible."""
+    theta = points.theta[k]
+    if not theta[D_1] < points.wheelbase_m[k]:
+        return False
+    for i in range(theta.size):
+        if not np.isfinite(theta[i]):
+            return False
+    if not _roads(crossing, work, points, k):
+        return False
+    _deflect(crossing, work, points.position_m[k])
+    return _compare(crossing, work, points.position_m[k], points.wheelbase_m[k], out)
+
+
+@kernel
+def _roads(crossing: Crossing, work: Work, points: Points, k: int) -> bool:
+    """Everything of point k that comes before the bridge's deflection into the work arrays."""
+    _correct(
+        crossing.signals,
+        crossing.step_s,
+        points.gain[k],
+        points.delay_s[k],
+        points.initial[k],
+        work.corrected,
+    )
+    _wheels(
+        crossing,
+        work,
+        points.theta[k],
+        points.wheelbase_m[k],
+        1.0 / points.common_gain[k],
+        points.acceleration_m_per_s2[k],
+    )
+    _locate(crossing, work, points.position_m[k], points.wheelbase_m[k])
+    return _bridge(crossing, work, points.theta[k])
+
+
+@kernel
+def _evaluate(
+    crossing: Crossing, work: Work, points: Points, begin: int, stop: int, out: FloatArray
+) -> None:
+    for k in range(begin, stop):
+        if not _residuals(crossing, work, points, k, out[k]):
+            out[k] = np.nan
+
+
+@kernel
+def _evaluate_white(
+    crossing: Crossing,
+    rows: RowFilter,
+    noise: Whitener,
+    work: Work,
+    points: Points,
+    begin: int,
+    stop: int,
+    out: FloatArray,
+) -> None:
+    for k in range(begin, stop):
+        if not _residuals(crossing, work, points, k, work.residual):
+            out[k] = np.nan
+            continue
+        whiten_into(rows, noise, work.residual, work.row, out[k, : noise.reciprocal.size])
+
+
+def evaluate(crossing: Crossing, works: tuple[Work, ...], points: Points) -> FloatArray:
+    """Residuals (k, 3, rows) in m: R_1 - R_2, front and rear body equation over k_s.
+
+    NaN where a point is impossible (or its trajectory turns round). One thread for each of `works`.
+    """
+    out = np.empty((points.theta.shape[0], RESIDUALS, crossing.rows))
+
+    def part(work: Work, begin: int, stop: int) -> None:
+        _evaluate(crossing, work, points, begin, stop, out)
+
+    _in_threads(part, works, out.shape[0])
+    return out
+
+
+def evaluate_white(
+    crossing: Crossing,
+    rows: RowFilter,
+    noise: Whitener,
+    works: tuple[Work, ...],
+    points: Points,
+    out: FloatArray,
+) -> None:
+    """White rows of k points into the first columns of `out` (k, 3 m or more); NaN as above."""
+
+    def part(work: Work, begin: int, stop: int) -> None:
+        _evaluate_white(crossing, rows, noise, work, points, begin, stop, out)
+
+    _in_threads(part, works, out.shape[0])
+
+
+def _in_threads(
+    part: Callable[[Work, int, int], None], works: tuple[Work, ...], count: int
+) -> None:
+    if count < _FEW or len(works) == 1:
+        part(works[0], 0, count)
+        return
+    bounds = [count * i // len(works) for i in range(len(works) + 1)]
+    others = [
+        Thread(target=part, args=(works[i], bounds[i], bounds[i + 1])) for i in range(1, len(works))
+    ]
+    for thread in others:
+        thread.start()
+    part(works[0], 0, bounds[1])
+    for thread in others:
+        thread.join()
+
+
+@kernel
+def _one(crossing: Crossing, work: Work, points: Points, k: int, deflection: FloatArray) -> bool:
+    """Leave point k's roads in `work.road` (minus the road) and the deflections in (2, n)."""
+    if not _roads(crossing, work, points, k):
+        return False
+    deflection[:] = work.road
+    _deflect(crossing, work, points.position_m[k])
+    for w in range(2):
+        for i in range(deflection.shape[1]):
+            deflection[w, i] = work.road[w, i] - deflection[w, i]
+    return True
+
+
+def roads_and_deflections(
+    crossing: Crossing, work: Work, points: Points, k: int
+) -> tuple[FloatArray, FloatArray]:
+    """Road heights (2, n) in m under both wheels at every sample, the bridge's deflections (2, n).
+
+    Raises ValueError for an impossible point.
+    """
+    deflection = np.empty_like(work.road)
+    if not _one(crossing, work, points, k, deflection):
+        raise ValueError("the bridge of this point has no modes")
+    gain = points.common_gain[k]
+    return -gain * work.road, gain * deflection

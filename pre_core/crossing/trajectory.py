@@ -1,0 +1,107 @@
+"""Where the front axle was at every sample: a smooth curve through a receiver's fixes.
+
+The curve is a cubic B-spline x(t) that minimises
+
+    sum ((x(t_i) - x_i)/s_x)^2 + sum ((x'(t_i) - v_i)/s_v)^2 + integral (x'''/s_j)^2 dt,
+
+so that constant speed and constant acceleration cost nothing (P-splines; Eilers and Marx 1996).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import lstsq
+
+from pre_core.physics.simulate import Motion
+
+FloatArray = NDArray[np.float64]
+
+_KNOT_SPACING_S = 0.5
+_JERK_M_PER_S3 = 0.3
+"""Scale of the jerk of a truck that is driven steadily, in m/s^3 over one second."""
+
+
+class Trajectory(NamedTuple):
+    """A fitted curve; `misfit` is the root mean square of the fixes' standardised residuals."""
+
+    spline: BSpline
+    misfit: float
+
+
+def fit_trajectory(
+    time_s: FloatArray,
+    position_m: FloatArray,
+    velocity_m_per_s: FloatArray,
+    *,
+    position_noise_m: float,
+    speed_noise_m_per_s: float,
+    start_s: float,
+    stop_s: float,
+) -> Trajectory:
+    """Fit x(t) over [start, stop] to fixes (m,) of position and signed velocity.
+
+    Needs at least two fixes; raises ValueError otherwise.
+    """
+    if time_s.size < 2:
+        raise ValueError("a trajectory needs at least two fixes")
+    degree = 3
+    first = min(start_s, float(time_s[0]))
+    last = max(stop_s, float(time_s[-1]))
+    spans = max(1, round((last - first) / _KNOT_SPACING_S))
+    inner = np.linspace(first, last, spans + 1)
+    knots = np.concatenate([np.full(degree, first), inner, np.full(degree, last)])
+    count = knots.size - degree - 1
+    basis = BSpline(knots, np.eye(count), degree)
+    # The third derivative of a cubic spline is constant between knots.
+    middles = 0.5 * (inner[1:] + inner[:-1])
+    jerk = basis.derivative(3)(middles) * np.sqrt(np.diff(inner))[:, None]
+    fixes = np.vstack([basis(time_s), basis.derivative()(time_s)])
+    weight = np.concatenate(
+        [
+            np.full(time_s.size, 1.0 / position_noise_m),
+            np.full(time_s.size, 1.0 / speed_noise_m_per_s),
+        ]
+    )
+    # A fit about the straight line through the fixes: the small numbers keep their digits.
+    line = np.polynomial.Polynomial.fit(time_s, position_m, 1)
+    measured = np.concatenate([position_m - line(time_s), velocity_m_per_s - line.deriv()(time_s)])
+    system = np.vstack([fixes * weight[:, None], jerk / _JERK_M_PER_S3])
+    right = np.concatenate([measured * weight, np.zeros(jerk.shape[0])])
+    coefficients = lstsq(system, right)[0]
+    residual = (fixes @ coefficients - measured) * weight
+    greville = np.array([knots[i + 1 : i + 1 + degree].mean() for i in range(count)])
+    spline = BSpline(knots, coefficients + line(greville), degree)
+    return Trajectory(spline, float(np.sqrt(np.mean(residual**2))))
+
+
+def motion_at(trajectory: Trajectory, time_s: FloatArray, direction: int) -> Motion:
+    """Position, speed and acceleration (positive when speeding up) of the front axle at times."""
+    spline = trajectory.spline
+    return Motion(
+        np.asarray(spline(time_s)),
+        np.asarray(spline.derivative(1)(time_s)),
+        direction * np.asarray(spline.derivative(2)(time_s)),
+    )
+
+
+def passing_time_s(
+    trajectory: Trajectory, position_m: float, direction: int, start_s: float, stop_s: float
+) -> float:
+    """The first time at which the front axle has reached a chainage; NaN if it does not."""
+    t = np.linspace(start_s, stop_s, max(2, round((stop_s - start_s) / 0.01) + 1))
+    beyond = direction * (trajectory.spline(t) - position_m) >= 0.0
+    first = int(np.argmax(beyond))
+    if not beyond[first]:
+        return float("nan")
+    if first == 0:
+        return float(t[0])
+    low, high = float(t[first - 1]), float(t[first])
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if direction * (float(trajectory.spline(middle)) - position_m) >= 0.0:
+            high = middle
+        else:
+            low = middle
+    return high

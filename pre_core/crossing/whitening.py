@@ -1,0 +1,261 @@
+"""What sensor noise does to the residuals, and how to make it white.
+
+Three residuals are taken at every row, all as displacements: the mismatch of the two roads and the
+two body equations divided by k_s. White acceleration noise of densities n_s, n_u enters them as
+
+    s^2 R_i   : [1 + (m_u s^2 + c_s s + k_s)/k_u] n_u - [(c_s s + k_s)/k_u] n_s
+    s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
+
+(front less rear in the mismatch; n_s' is the noise of the other body sensor). Rows are low-passed,
+decimated and differenced twice by one FIR filter; the noise is then stationary with a covariance
+that vanishes beyond the filter's length, so that a banded Cholesky factor whitens it exactly, ends
+included. The front's residuals of a row are taken when the front wheel was where the rear wheel is
+now, so that a sensor which speaks in both is taken for two.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.crossing.channels import low_pass
+from pre_core.kernels.lanes import summing
+from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
+
+FloatArray = NDArray[np.float64]
+
+RESIDUALS = 3
+_SOURCES = 6  # s1, s2, u1, u2; and the other body sensor at the front's and at the rear's moment
+EVERY = 3
+"""A row every so many samples of the model."""
+PASS = 1.0 / 8.0
+"""Of the model's rate: what is below passes whole; half is left at half the rate of the rows."""
+_STOP_BAND_DB = 70.0
+_TABLE = 1024  # frequencies of the numerical integral over the noise spectrum
+_FEW_FREQUENCIES = 48
+_SETTLED = 1e-12
+
+
+class RowFilter(NamedTuple):
+    """Low-pass, decimation and second difference in one: row k sees samples from k `every` on."""
+
+    taps: FloatArray
+    every: int
+    step_s: float
+    """Of the samples before the filter."""
+    omega: FloatArray  # (f,) middles of even intervals of angular frequency, up to where it stops
+    power: FloatArray  # (f,) from white noise of an acceleration to the rows, times the interval
+    turn: NDArray[np.complex128]  # (f, lags) phase that a wave gains from row to row
+
+
+class Truck(NamedTuple):
+    """What the sensors' noise passes through: parameters and the body's masses above the axles."""
+
+    theta: FloatArray
+    m_11: float
+    m_22: float
+    m_12: float
+
+
+class Whitener(NamedTuple):
+    """Lower banded Cholesky factor of the noise covariance of the interleaved filtered rows."""
+
+    factor: FloatArray  # (3 m, band + 1): row i holds columns i - band … i
+    reciprocal: FloatArray  # (3 m,) of the diagonal
+
+
+def row_filter(step_s: float) -> RowFilter:
+    """Pass what is below an eighth of the model's rate; see `PASS`."""
+    stop = 1.0 / EVERY - PASS
+    apart = EVERY * step_s
+    second_difference = np.zeros(2 * EVERY + 1)
+    second_difference[[0, EVERY, 2 * EVERY]] = np.array([1.0, -2.0, 1.0]) / apart**2
+    taps = np.convolve(low_pass(PASS, stop, _STOP_BAND_DB), second_difference)
+    interval = 1.1 * stop / step_s / _TABLE
+    omega = 2.0 * np.pi * interval * (np.arange(_TABLE) + 0.5)
+    # The taps are symmetrical: their response is real but for a delay.
+    offsets = np.arange(taps.size) - taps.size // 2
+    response = np.cos(np.outer(omega * step_s, offsets)) @ taps
+    # Noise of an acceleration reaches displacements through 1/omega^2; the taps contain the second
+    # difference, so that the product is finite at low frequencies.
+    power = response**2 / omega**4 * interval
+    lags = (taps.size - 1) // EVERY + 1
+    turn = np.exp(1j * np.outer(omega * apart, np.arange(lags)))
+    return RowFilter(taps, EVERY, step_s, np.asarray(omega), power, turn)
+
+
+def row_count(rows: RowFilter, samples: int) -> int:
+    """How many rows see no end of so many samples."""
+    return max(0, (samples - rows.taps.size) // rows.every + 1)
+
+
+@summing
+def filter_rows(taps: FloatArray, every: int, x: FloatArray, out: FloatArray) -> None:
+    """Rows of x (n,) into out (m,); the taps are symmetrical."""
+    for k in range(out.size):
+        seen = x[k * every : k * every + taps.size]
+        total = 0.0
+        for j in range(taps.size):
+            total += taps[j] * seen[j]
+        out[k] = total
+
+
+def _responses(truck: Truck, omega: FloatArray) -> NDArray[np.complex128]:
+    """From the noise of the six sources to the residuals: (3, 6, f), displacements."""
+    s = 1j * omega
+    theta = truck.theta
+    out = np.zeros((RESIDUALS, _SOURCES, omega.size), dtype=np.complex128)
+    for w, sign, m_ii in ((0, 1.0, truck.m_11), (1, -1.0, truck.m_22)):
+        c, k = theta[C_S1 + w], theta[K_S1 + w]
+        k_u, m_u = theta[K_U1 + w], theta[M_U1 + w]
+        out[0, 2 + w] = sign * (1.0 + (m_u * s**2 + c * s + k) / k_u)
+        out[0, w] = -sign * (c * s + k) / k_u
+        out[1 + w, w] = (m_ii * s**2 + c * s) / k + 1.0
+        out[1 + w, 2 + w] = -(c * s / k + 1.0)
+        out[1 + w, 4 + w] = truck.m_12 * s**2 / k
+    return out
+
+
+def _spectrum(truck: Truck, density: FloatArray, omega: FloatArray) -> NDArray[np.complex128]:
+    """One-sided spectra of the residuals' noise as accelerations: (3, 3, f)."""
+    responses = _responses(truck, omega)
+    sources = np.concatenate([density, density[[1, 0]]])
+    weighted = responses * (sources**2)[None, :, None]
+    return np.asarray(np.einsum("icf,jcf->ijf", weighted, responses.conj()))
+
+
+def whitener(rows: RowFilter, count: int, truck: Truck, density: FloatArray) -> Whitener:
+    """Factor for `count` filtered rows; `density` (4,) is one-sided, in m/s²/√Hz.
+
+    Raises ValueError where the densities leave some row without noise.
+    """
+    spectrum = _spectrum(truck, density, rows.omega) * rows.power
+    covariance = np.real(spectrum @ rows.turn)  # of a one-sided density: E[e_i(t + lag) e_j(t)]
+    lags = covariance.shape[2]
+    band = RESIDUALS * lags - 1
+    one = np.zeros((RESIDUALS, band + 1))
+    for lag in range(lags):
+        for i in range(RESIDUALS):
+            for j in range(RESIDUALS):
+                offset = RESIDUALS * lag + i - j  # row (k + lag, i) against column (k, j)
+                if 0 <= offset <= band:
+                    one[i, band - offset] = covariance[i, j, lag]
+    one[:, band] *= 1.0 + 1e-10
+    factor = np.zeros((RESIDUALS * count, band + 1))
+    if not _cholesky(one, factor):
+        raise ValueError("the noise covariance is not positive: are all densities above zero?")
+    return Whitener(factor, 1.0 / factor[:, band])
+
+
+def noise_power(
+    rows: RowFilter, trucks: list[Truck], density: FloatArray, which: list[int]
+) -> FloatArray:
+    """What tr(C_0^-1 C) per row becomes for other trucks, less what it is for the first: (w,).
+
+    `which` (w,) counts from the second truck on; `density` (trucks, 4). The rows' spectra are those
+    of an endless record, folded at half the rate of the rows.
+    """
+    half = 0.5 / (rows.every * rows.step_s)
+    step = 2.0 * np.pi * half / _FEW_FREQUENCIES
+    below = step * (np.arange(_FEW_FREQUENCIES, dtype=np.float64) + 0.5)
+    above = 4.0 * np.pi * half - below
+    power_below, power_above = (
+        np.interp(omega, rows.omega, rows.power) for omega in (below, above)
+    )
+
+    def folded(truck: int) -> NDArray[np.complex128]:
+        low = _spectrum(trucks[truck], density[truck], below) * power_below
+        high = _spectrum(trucks[truck], density[truck], above) * power_above
+        return np.moveaxis(low + high.conj(), 2, 0)
+
+    first = np.linalg.inv(folded(0))
+    traces = [np.einsum("fij,fji->", first, folded(1 + k)).real for k in which]
+    return np.asarray(traces) / _FEW_FREQUENCIES - RESIDUALS
+
+
+@summing
+def _cholesky(one: FloatArray, a: FloatArray) -> bool:
+    """Factor the banded covariance that repeats the rows `one` (3, band + 1) into a (n, band + 1).
+
+    Rows of the factor converge to rows that repeat too; from there on they are copied.
+    """
+    n, width = a.shape
+    band = width - 1
+    kinds = one.shape[0]
+    settled = False
+    for i in range(n):
+        if settled:
+            for j in range(width):
+                a[i, j] = a[i - kinds, j]
+            continue
+        change = 0.0
+        for j in range(max(0, i - band), i + 1):
+            low = max(0, i - band)  # columns before it are zero in row i
+            total = one[i % kinds, j - i + band]
+            x = a[i, low - i + band : j - i + band]
+            y = a[j, low - j + band : band]
+            for k in range(x.size):
+                total -= x[k] * y[k]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                a[i, band] = np.sqrt(total)
+            else:
+                a[i, j - i + band] = total / a[j, band]
+        if i >= band + kinds and i % kinds == kinds - 1:
+            for back in range(kinds):
+                for j in range(width):
+                    step = a[i - back, j] - a[i - back - kinds, j]
+                    change = max(change, abs(step) / a[i - back, band])
+            settled = change < _SETTLED
+    return True
+
+
+@summing
+def solve(factor: FloatArray, reciprocal: FloatArray, b: FloatArray) -> None:
+    """Forward substitution of one right-hand side b (n,) in place."""
+    n, width = factor.shape
+    band = width - 1
+    for i in range(n):
+        low = max(0, i - band)
+        x = factor[i, low - i + band : band]
+        y = b[low:i]
+        total = b[i]
+        for k in range(x.size):
+            total -= x[k] * y[k]
+        b[i] = total * reciprocal[i]
+
+
+@summing
+def whiten_into(
+    rows: RowFilter, noise: Whitener, residuals: FloatArray, row: FloatArray, out: FloatArray
+) -> None:
+    """Filter and interleave residuals (3, n), and whiten them into `out` (3 m,).
+
+    `row` (m,) is a work array.
+    """
+    for i in range(RESIDUALS):
+        filter_rows(rows.taps, rows.every, residuals[i], row)
+        for k in range(row.size):
+            out[RESIDUALS * k + i] = row[k]
+    solve(noise.factor, noise.reciprocal, out)
+
+
+def white_rows(rows: RowFilter, noise: Whitener, residuals: FloatArray) -> FloatArray:
+    """White rows (…, 3 m) of residuals (…, 3, n): filtered, interleaved, of unit variance.
+
+    Raises ValueError if the whitener was made for another number of rows.
+    """
+    *many, kinds, n = residuals.shape
+    count = row_count(rows, n)
+    if kinds != RESIDUALS or noise.reciprocal.size != RESIDUALS * count:
+        raise ValueError(
+            f"residuals of shape {residuals.shape} give {kinds} x {count} rows, the whitener is "
+            f"for {RESIDUALS} x {noise.reciprocal.size // RESIDUALS}"
+        )
+    flat = np.ascontiguousarray(residuals).reshape(-1, RESIDUALS, n)
+    out = np.empty((flat.shape[0], RESIDUALS * count))
+    row = np.empty(count)
+    for k in range(flat.shape[0]):
+        whiten_into(rows, noise, flat[k], row, out[k])
+    return out.reshape(*many, RESIDUALS * count)

@@ -1,0 +1,1 @@
+"""What the vector kernels are written in: four lanes, Jacobi's eigenvalues, one filter."""

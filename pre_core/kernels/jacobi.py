@@ -1,0 +1,136 @@
+"""Eigenvalues and eigenvectors of small symmetric matrices: one, or four at once.
+
+A LAPACK call on one 14 x 14 matrix costs more than the time integration it serves. Cyclic Jacobi
+rotations (Golub and Van Loan, Matrix Computations, section 8.5) are branch-free, so that four
+matrices share the vector registers, and they are quick here because the caller hands over matrices
+that are already nearly diagonal.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.kernels.lanes import LANES, Lanes, fma, kernel, load, mul, store
+
+FloatArray = NDArray[np.float64]
+
+MAX_SWEEPS = 30
+_NEGLIGIBLE = 1e-16
+"""Of a_pq^2/(a_pp a_qq) before a sweep: convergence is quadratic, so that after it what is left is
+far below rounding."""
+
+
+@kernel
+def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArray) -> float:
+    """Cosine and sine (4,) that annul a_pq, and how far a_pq was from negligible (> 0: not)."""
+    left = -1.0
+    for lane in range(LANES):
+        off = a[p, q, lane]
+        app = a[p, p, lane]
+        aqq = a[q, q, lane]
+        half = 0.5 * (aqq - app)
+        root = np.sqrt(half * half + off * off) + 1e-300  # no 0/0 where nothing is to be done
+        t = off / (half + (root if half >= 0.0 else -root))
+        c = 1.0 / np.sqrt(1.0 + t * t)
+        cosine[lane] = c
+        sine[lane] = t * c
+        left = max(left, off * off - _NEGLIGIBLE * np.abs(app * aqq))
+    return left
+
+
+@kernel
+def _rotate(x: FloatArray, i: int, y: FloatArray, j: int, c: Lanes, s: Lanes, n: Lanes) -> None:
+    """Rows i of x and j of y become c x - s y and s x + c y; n is -s."""
+    xi = load(x, i)
+    yj = load(y, j)
+    store(x, i, fma(c, xi, mul(n, yj)))
+    store(y, j, fma(s, xi, mul(c, yj)))
+
+
+@kernel
+def diagonalise(a: FloatArray, v: FloatArray) -> bool:
+    """Rotate `a` (m, m, 4) to diagonal form, four matrices at once; both are modified in place.
+
+    Only the upper triangle of `a` is read and kept. On return its diagonal holds the eigenvalues,
+    unsorted, and the *rows* of `v` (m, m, 4) the orthonormal eigenvectors. False if some matrix
+    does not get there in MAX_SWEEPS (which happens only where it holds a value that is not finite).
+    """
+    m = a.shape[0]
+    v[:] = 0.0
+    for k in range(m):
+        for lane in range(LANES):
+            v[k, k, lane] = 1.0
+    cosine = np.empty(LANES)
+    sine = np.empty(LANES)
+    for _ in range(MAX_SWEEPS):
+        left = -1.0
+        for p in range(m - 1):
+            row_p = a[p]
+            for q in range(p + 1, m):
+                row_q = a[q]
+                left = max(left, _rotation(a, p, q, cosine, sine))
+                c = (cosine[0], cosine[1], cosine[2], cosine[3])
+                s = (sine[0], sine[1], sine[2], sine[3])
+                n = (-s[0], -s[1], -s[2], -s[3])
+                # The 2 x 2 block itself: a_pp - t a_pq, a_qq + t a_pq, 0.
+                for lane in range(LANES):
+                    change = sine[lane] / cosine[lane] * row_p[q, lane]
+                    row_p[p, lane] -= change
+                    row_q[q, lane] += change
+                    row_p[q, lane] = 0.0
+                for k in range(p):
+                    _rotate(a[k], p, a[k], q, c, s, n)
+                for k in range(p + 1, q):
+                    _rotate(row_p, k, a[k], q, c, s, n)
+                for k in range(q + 1, m):
+                    _rotate(row_p, k, row_q, k, c, s, n)
+                v_p, v_q = v[p], v[q]
+                for k in range(m):
+                    _rotate(v_p, k, v_q, k, c, s, n)
+        if left <= 0.0:
+            return True
+    return False
+
+
+@kernel
+def diagonalise_one(a: FloatArray, v: FloatArray) -> bool:
+    """The same for one matrix `a` (m, m), of which both triangles are read; `v` is (m, m).
+
+    Here a rotation that would change nothing is skipped, which four matrices cannot agree on.
+    """
+    m = a.shape[0]
+    v[:] = 0.0
+    for k in range(m):
+        v[k, k] = 1.0
+    for _ in range(MAX_SWEEPS):
+        left = False
+        for p in range(m - 1):
+            for q in range(p + 1, m):
+                off, app, aqq = a[p, q], a[p, p], a[q, q]
+                size = off * off
+                if size <= _NEGLIGIBLE**2 * np.abs(app * aqq):
+                    continue
+                # Written so that a NaN counts as something left.
+                left = left or not size <= _NEGLIGIBLE * np.abs(app * aqq)
+                half = 0.5 * (aqq - app)
+                root = np.sqrt(half * half + size)
+                t = off / (half + (root if half >= 0.0 else -root))
+                c = 1.0 / np.sqrt(1.0 + t * t)
+                s = t * c
+                row_p, row_q = a[p], a[q]
+                for k in range(m):
+                    x, y = row_p[k], row_q[k]
+                    row_p[k] = c * x - s * y
+                    row_q[k] = s * x + c * y
+                for k in range(m):
+                    a[k, p] = row_p[k]
+                    a[k, q] = row_q[k]
+                a[p, p], a[q, q] = app - t * off, aqq + t * off
+                a[p, q] = a[q, p] = 0.0
+                v_p, v_q = v[p], v[q]
+                for k in range(m):
+                    x, y = v_p[k], v_q[k]
+                    v_p[k] = c * x - s * y
+                    v_q[k] = s * x + c * y
+        if not left:
+            return True
+    return False

@@ -1,0 +1,57 @@
+"""Input estimation problem (IEP): what each wheel must have been fed to move as it did.
+
+From the equation of motion of an axle (paper eq. 1, last two rows),
+
+    u_i = z_ui + (m_ui z''_ui + c_si (z'_ui - z'_si) + k_si (z_ui - z_si)) / k_ui,
+
+which is linear in four signals that do not depend on the parameters. Initial displacement, initial
+velocity and a constant bias of any channel change these signals by 1, t and t^2 only.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.paper.integrate import Integrated
+from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
+
+FloatArray = NDArray[np.float64]
+
+
+def iep_signals(
+    acceleration_m_per_s2: FloatArray,
+    step_s: float,
+    integrate: Callable[[FloatArray, float], Integrated],
+) -> FloatArray:
+    """The four signals of each wheel: (2, 4, n) z_u, z''_u, z'_u - z'_s, z_u - z_s.
+
+    `acceleration` is (4, n): sprung front, sprung rear, unsprung front, unsprung rear.
+    """
+    velocity, displacement = integrate(acceleration_m_per_s2, step_s)
+    sprung, unsprung = slice(0, 2), slice(2, 4)
+    return np.stack(
+        [
+            displacement[unsprung],
+            acceleration_m_per_s2[unsprung],
+            velocity[unsprung] - velocity[sprung],
+            displacement[unsprung] - displacement[sprung],
+        ],
+        axis=1,
+    )
+
+
+def input_profiles(signals: FloatArray, theta: FloatArray) -> FloatArray:
+    """Input profiles u (2, n) of the two wheels for one vector of parameters."""
+    wheel = np.arange(2)
+    k_u = theta[K_U1 + wheel]
+    factors = np.stack(
+        [
+            np.ones(2),
+            theta[M_U1 + wheel] / k_u,
+            theta[C_S1 + wheel] / k_u,
+            theta[K_S1 + wheel] / k_u,
+        ],
+        axis=1,
+    )
+    return np.asarray(np.einsum("wj,wjn->wn", factors, signals))

@@ -1,0 +1,121 @@
+"""The paper's search (section 3.1): a cloud of particles, each walking downhill at random.
+
+A particle moves by a random step if its J does not grow, and stays otherwise (paper eq. 23). The
+paper calls it MCMC; it is not a sampler of a posterior, since no probability decides, and the
+spread of its particles is no uncertainty: it follows from the width of the step. It is here for
+comparison.
+
+The paper does not print the distribution of the step. Here it is Gaussian with a standard deviation
+of 7 % of the sound value, in all coordinates at once (docs/reproduction.md tells how it was found).
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.kernels.lanes import LANES
+from pre_core.paper.residual import Window, Workspace, objective_batch, workspace
+from pre_core.search.loop import Ending
+from pre_core.unknowns import D_1
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+PARTICLES = 500
+STEPS = 600
+PRIOR_LOW, PRIOR_HIGH = 0.8, 1.2
+STEP_RATIO = 0.07
+
+
+class Problem(NamedTuple):
+    """What stays the same: data, sound values, which of them are free, a workspace per thread."""
+
+    window: Window
+    nominal: FloatArray  # (p,)
+    free: IntArray  # (f,)
+    step_ratio: float
+    seed: int
+    workspaces: tuple[Workspace, ...]
+
+
+class State(NamedTuple):
+    """The particles (k, f) as ratios to the sound values, their J (k,), and the steps taken."""
+
+    ratios: FloatArray
+    objective: FloatArray
+    steps: int
+
+
+class Info(NamedTuple):
+    """What one step did."""
+
+    objective: float  # the smallest J of all particles
+    acceptance: float
+    ending: Ending | None
+
+
+def problem(
+    window: Window,
+    nominal: FloatArray,
+    free: IntArray,
+    seed: int,
+    *,
+    step_ratio: float = STEP_RATIO,
+    threads: int = 2,
+) -> Problem:
+    """Bind the data; the answer does not depend on the number of threads."""
+    return Problem(
+        window, nominal, free, step_ratio, seed, tuple(workspace(window) for _ in range(threads))
+    )
+
+
+def _random(seed: int, count: int) -> np.random.Generator:
+    """Random numbers of one step: they follow from the seed and the step alone."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(count,)))
+
+
+def _evaluate(bound: Problem, ratios: FloatArray, limit: FloatArray) -> FloatArray:
+    """J (k,) of particles; exact wherever it does not exceed `limit` (k,)."""
+    theta = np.repeat(bound.nominal[None, :], ratios.shape[0], axis=0)
+    theta[:, bound.free] *= ratios
+    physical = np.all(theta[:, bound.free] > 0.0, axis=1)
+    physical &= theta[:, D_1] < bound.window.wheelbase_m
+    total = np.full(ratios.shape[0], np.inf)
+    candidates = np.flatnonzero(physical)
+    if candidates.size == 0:
+        return total
+    blocks = (candidates.size + LANES - 1) // LANES
+    bounds = np.linspace(0, blocks, len(bound.workspaces) + 1).astype(int) * LANES
+
+    def part(i: int) -> None:
+        chosen = candidates[bounds[i] : bounds[i + 1]]
+        if chosen.size:
+            out = np.empty(chosen.size)
+            objective_batch(bound.window, bound.workspaces[i], theta[chosen], limit[chosen], out)
+            total[chosen] = out
+
+    with ThreadPoolExecutor(len(bound.workspaces)) as pool:
+        list(pool.map(part, range(len(bound.workspaces))))
+    return total
+
+
+def init(bound: Problem, particles: int = PARTICLES) -> State:
+    """Particles uniform between 0.8 and 1.2 of the sound values."""
+    rng = _random(bound.seed, 0)
+    ratios = rng.uniform(PRIOR_LOW, PRIOR_HIGH, (particles, bound.free.size))
+    return State(ratios, _evaluate(bound, ratios, np.full(particles, np.inf)), 0)
+
+
+def step(bound: Problem, state: State) -> tuple[State, Info]:
+    """Propose one random step for every particle and keep those that do not make J larger."""
+    rng = _random(bound.seed, state.steps + 1)
+    proposal = state.ratios + bound.step_ratio * rng.standard_normal(state.ratios.shape)
+    objective = _evaluate(bound, proposal, state.objective)
+    accepted = np.isfinite(objective) & (objective <= state.objective)
+    ratios = np.where(accepted[:, None], proposal, state.ratios)
+    kept = np.where(accepted, objective, state.objective)
+    best = float(kept.min())
+    ending = None if np.isfinite(best) else Ending.NOT_FINITE
+    return State(ratios, kept, state.steps + 1), Info(best, float(accepted.mean()), ending)

@@ -1,0 +1,573 @@
+"""The paper's residual: the road that the front wheel felt less the road that the rear wheel felt.
+
+r_i = u_i - y_i (IEP less DRS) at each wheel; R_1(x) - R_2(x) vanishes for the right parameters, and
+J = integral of (R_1 - R_2)^2 dx (paper eq. 21). Everything that does not depend on the parameters
+is computed once, in a `Window`.
+"""
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
+from pre_core.paper.iep import iep_signals, input_profiles
+from pre_core.paper.integrate import Integrated
+from pre_core.physics.beam_basis import (
+    BeamBasis,
+    advance,
+    beam_basis,
+    modal_filters,
+    modal_filters_one,
+)
+from pre_core.physics.bridge import locate
+from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2, rear_position_m
+from pre_core.unknowns import C_S1, D_1, K_S1, K_U1, KAPPA, M_U1
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_LONGEST_STRETCH = 128  # steps: four particles' work arrays of one stretch stay in the L1 cache
+_STENCIL = 2  # samples to either side that the cubic interpolation needs
+
+
+class Window(NamedTuple):
+    """One crossing, prepared for many evaluations.
+
+    n samples from shortly before the first axle enters until the last has left; m rows: the samples
+    at which the rear axle is between the ends of the compared stretch of road.
+    """
+
+    step_s: float
+    total_mass_kg: float
+    wheelbase_m: float
+    gravity_m_per_s2: float
+    acceleration: FloatArray  # (4, n)
+    load_transfer_n: FloatArray  # (n,): taken off the front axle's load, put on the rear's
+    signals: FloatArray  # (2, 4, n): see iep.py
+    stretches: IntArray  # (s, 4): first sample, last + 1, part under front, under rear (-1 none)
+    place: FloatArray  # (2, n): place 0..1 within the part
+    first_row: int  # sample of row 0
+    front_sample: IntArray  # (m,): first of the four samples at which the front passed the same x
+    front_weight: FloatArray  # (m, 4)
+    row_weight: FloatArray  # (m,): square root of dx
+    nuisance: FloatArray  # (m, q): orthonormal weighted columns that a row's sums must not see
+    x_m: FloatArray  # (m,) chainage of the rows
+    basis: BeamBasis
+
+
+class WindowError(ValueError):
+    """The samples do not cover the crossing; the message says what is missing."""
+
+
+def _stretches(element: IntArray) -> IntArray:
+    changes = np.flatnonzero(np.any(np.diff(element, axis=1) != 0, axis=0)) + 1
+    bounds = np.concatenate([[0], changes, [element.shape[1]]])
+    rows = [
+        (begin, min(begin + _LONGEST_STRETCH, stop), element[0, begin], element[1, begin])
+        for start, stop in itertools.pairwise(bounds)
+        for begin in range(start, stop, _LONGEST_STRETCH)
+    ]
+    return np.array(rows, dtype=np.int64)
+
+
+def _cubic_weights(travel: FloatArray, wanted: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Four-point Lagrange interpolation of a function of the increasing `travel` at `wanted`.
+
+    In the variable "sample number", in which the points are evenly spaced: the number belonging to
+    `wanted` is found by cubic interpolation too, so that a changing speed costs no accuracy.
+    """
+    sample = np.interp(wanted, travel, np.arange(travel.size))
+    base = np.clip(np.floor(sample).astype(np.int64) - 1, 0, travel.size - 4)
+    fraction = sample - base
+
+    def weights(f: FloatArray) -> FloatArray:
+        return np.stack(
+            [
+                -(f - 1.0) * (f - 2.0) * (f - 3.0) / 6.0,
+                f * (f - 2.0) * (f - 3.0) / 2.0,
+                -f * (f - 1.0) * (f - 3.0) / 2.0,
+                f * (f - 1.0) * (f - 2.0) / 6.0,
+            ],
+            axis=1,
+        )
+
+    points = travel[base[:, None] + np.arange(4)]
+    for _ in range(3):  # secant steps: travel is almost linear in the sample number
+        error = wanted - np.einsum("mj,mj->m", weights(fraction), points)
+        fraction = fraction + error / (points[:, 2] - points[:, 1])
+    return base, weights(fraction)
+
+
+def build_window(
+    acceleration_m_per_s2: FloatArray,
+    step_s: float,
+    front_position_m: FloatArray,
+    direction: int,
+    *,
+    element_lengths_m: FloatArray,
+    total_mass_kg: float,
+    wheelbase_m: float,
+    integrate: Callable[[FloatArray, float], Integrated],
+    initial_state_known: bool,
+    bias_known: bool = True,
+    speed_change_m_per_s2: FloatArray | None = None,
+    cg_height_m: float = 0.0,
+    gravity_m_per_s2: float = STANDARD_GRAVITY_M_PER_S2,
+    parts: int = 1,
+    coordinates: int | None = None,
+) -> Window:
+    """Prepare one crossing.
+
+    `acceleration` (4, N) and `front_position` (N,) are evenly spaced in time by `step_s`;
+    `direction` is 1 driving from start to end, else -1. With `initial_state_known` the truck was at
+    rest at the first sample, as in the paper; otherwise whatever initial displacement and velocity
+    (and, unless `bias_known`, constant bias) the channels had is projected out of the residual.
+    `parts` and `coordinates` refine the beam (see `beam_basis`); the defaults are the paper's mesh.
+
+    Raises WindowError if the samples do not reach from the entry to the exit.
+    """
+    span = float(element_lengths_m.sum())
+    front = np.asarray(front_position_m, dtype=np.float64)
+    rear = rear_position_m(front, wheelbase_m, direction)
+    travel_front = front if direction > 0 else span - front
+    travel_rear = travel_front - wheelbase_m
+    # The first passage only: before and after it the truck may do as it likes.
+    entry = int(np.argmax(travel_front >= 0.0))
+    leave = int(np.argmax(travel_rear > span))
+    if entry < _STENCIL:
+        raise WindowError("the samples begin after the front axle has entered the bridge")
+    if travel_rear[leave] <= span:
+        raise WindowError("the samples end before the rear axle has left the bridge")
+    begin = entry - _STENCIL
+    if np.any(np.diff(travel_front[begin : leave + 1]) <= 0.0):
+        raise WindowError("the truck stops or turns round during the crossing")
+    if initial_state_known:
+        signals = iep_signals(acceleration_m_per_s2, step_s, integrate)[:, :, begin : leave + 1]
+    else:
+        signals = iep_signals(acceleration_m_per_s2[:, begin : leave + 1], step_s, integrate)
+    part = slice(begin, leave + 1)
+    basis = beam_basis(element_lengths_m, parts, coordinates)
+    element, place = locate(basis.lengths_m, np.stack([front[part], rear[part]]))
+
+    first_row = int(np.argmax(travel_rear >= 0.0)) - begin
+    rows = slice(first_row + begin, leave)
+    base, weight = _cubic_weights(travel_front[part], travel_rear[rows])
+    if np.any(base + 3 >= np.arange(rows.start, rows.stop) - begin):
+        raise WindowError("the samples are too far apart for this wheelbase and speed")
+    dx = np.gradient(travel_rear)[rows]
+    row_weight = np.sqrt(dx)
+    columns: list[FloatArray] = []
+    if not initial_state_known:
+        t = step_s * np.arange(leave + 1 - begin, dtype=np.float64)
+        t_rear = t[rows.start - begin : rows.stop - begin]
+        t_front = np.einsum("mj,mj->m", weight, t[base[:, None] + np.arange(4)])
+        columns = [np.ones_like(t_rear), t_front, t_rear]
+        if not bias_known:
+            columns += [t_front**2, t_rear**2]
+    transfer = np.zeros(leave + 1 - begin)
+    if speed_change_m_per_s2 is not None:
+        transfer = total_mass_kg * cg_height_m / wheelbase_m * speed_change_m_per_s2[part]
+    return Window(
+        step_s,
+        total_mass_kg,
+        wheelbase_m,
+        gravity_m_per_s2,
+        np.ascontiguousarray(acceleration_m_per_s2[:, part]),
+        transfer,
+        np.ascontiguousarray(signals),
+        _stretches(element),
+        np.ascontiguousarray(place),
+        first_row,
+        base,
+        weight,
+        row_weight,
+        _orthonormal(columns, row_weight),
+        np.ascontiguousarray(rear[rows]),
+        basis,
+    )
+
+
+def _orthonormal(columns: list[FloatArray], row_weight: FloatArray) -> FloatArray:
+    if not columns:
+        return np.zeros((row_weight.size, 0))
+    matrix = np.stack(columns, axis=1) * row_weight[:, None]
+    matrix /= np.linalg.norm(matrix, axis=0)
+    u, s, _ = np.linalg.svd(matrix, full_matrices=False)
+    # At constant speed the columns are dependent to rounding; below 1e-9 a direction is noise.
+    return np.ascontiguousarray(u[:, s > 1e-9 * s[0]])
+
+
+class Workspace(NamedTuple):
+    """Work arrays of one thread; modified in place."""
+
+    matrix: FloatArray  # (m, m, 4)
+    vectors: FloatArray  # (m, m, 4)
+    cubics: FloatArray  # (n, m, 4, 4)
+    feedback: FloatArray  # (m, 2, 4)
+    state: FloatArray  # (m, 2, 4)
+    force: FloatArray  # (2, stretch, 4)
+    road: FloatArray  # (2, n, 4): minus the two road profiles
+    seen: FloatArray  # (q, 4): sums of the rows with the nuisance columns
+
+
+def workspace(window: Window) -> Workspace:
+    """Allocate the work arrays for this window."""
+    elements, _, m = window.basis.cubics.shape
+    return Workspace(
+        np.zeros((m, m, LANES)),
+        np.zeros((m, m, LANES)),
+        np.zeros((elements, m, 4, LANES)),
+        np.zeros((m, 2, LANES)),
+        np.zeros((m, 2, LANES)),
+        np.zeros((2, _LONGEST_STRETCH, LANES)),
+        np.zeros((2, window.signals.shape[2], LANES)),
+        np.zeros((window.nuisance.shape[1], LANES)),
+    )
+
+
+@kernel
+def _vehicle_factors(
+    theta: FloatArray, total_mass: float, wheelbase: float, gravity: float, out: FloatArray
+) -> None:
+    """Rows of `out` (13, 4): minus the IEP factors of front (3) and rear (3), static loads (2),
+    m_11, m_22, m_12, m_u1, m_u2."""
+    for lane in range(LANES):
+        p = theta[lane]
+        d_1 = p[D_1]
+        d_2 = wheelbase - d_1
+        m_s = total_mass - p[M_U1] - p[M_U1 + 1]
+        inertia = p[KAPPA] * m_s * d_1 * d_2
+        for w in range(2):
+            k_u = p[K_U1 + w]
+            out[3 * w, lane] = -p[M_U1 + w] / k_u
+            out[3 * w + 1, lane] = -p[C_S1 + w] / k_u
+            out[3 * w + 2, lane] = -p[K_S1 + w] / k_u
+        out[6, lane] = gravity * (m_s * d_2 / wheelbase + p[M_U1])
+        out[7, lane] = gravity * (m_s * d_1 / wheelbase + p[M_U1 + 1])
+        out[8, lane] = (m_s * d_2 * d_2 + inertia) / (wheelbase * wheelbase)
+        out[9, lane] = (m_s * d_1 * d_1 + inertia) / (wheelbase * wheelbase)
+        out[10, lane] = (m_s * d_1 * d_2 - inertia) / (wheelbase * wheelbase)
+        out[11, lane] = p[M_U1]
+        out[12, lane] = p[M_U1 + 1]
+
+
+@kernel
+def _march_stretch(
+    window: Window,
+    work: Workspace,
+    factors: FloatArray,
+    begin: int,
+    stop: int,
+    element_front: int,
+    element_rear: int,
+    cubics: FloatArray,
+    feedback: FloatArray,
+) -> None:
+    """Minus the road under both wheels, y - u, of one stretch into `work.road`: IEP, then DRS."""
+    a = window.acceleration
+    s = window.signals
+    u1, c1, k1 = load(factors, 0), load(factors, 1), load(factors, 2)
+    u2, c2, k2 = load(factors, 3), load(factors, 4), load(factors, 5)
+    w1, w2 = load(factors, 6), load(factors, 7)
+    m11, m22, m12 = load(factors, 8), load(factors, 9), load(factors, 10)
+    mu1, mu2 = load(factors, 11), load(factors, 12)
+    front, rear = work.road[0], work.road[1]
+    p1, p2 = work.force[0], work.force[1]
+    one = (1.0, 1.0, 1.0, 1.0)
+    for n in range(begin, stop):
+        r = fma_scalar(u1, s[0, 1, n], fma_scalar(c1, s[0, 2, n], scale(k1, s[0, 3, n])))
+        store(front, n, fma_scalar(one, -s[0, 0, n], r))
+        r = fma_scalar(u2, s[1, 1, n], fma_scalar(c2, s[1, 2, n], scale(k2, s[1, 3, n])))
+        store(rear, n, fma_scalar(one, -s[1, 0, n], r))
+        t = window.load_transfer_n[n]
+        f = fma_scalar(m11, a[0, n], fma_scalar(m12, a[1, n], fma_scalar(mu1, a[2, n], w1)))
+        store(p1, n - begin, (t - f[0], t - f[1], t - f[2], t - f[3]))
+        f = fma_scalar(m22, a[1, n], fma_scalar(m12, a[0, n], fma_scalar(mu2, a[3, n], w2)))
+        store(p2, n - begin, (-t - f[0], -t - f[1], -t - f[2], -t - f[3]))
+    advance(
+        cubics[max(element_front, 0)],
+        cubics[max(element_rear, 0)],
+        element_front >= 0,
+        element_rear >= 0,
+        feedback,
+        work.state,
+        window.place[0, begin:stop],
+        window.place[1, begin:stop],
+        work.force,
+        front[begin:stop],
+        rear[begin:stop],
+    )
+
+
+@kernel
+def march_particles(
+    window: Window, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
+) -> None:
+    """J of four particles `theta` (4, p) into `total` (4,); their roads are left in `work.road`.
+
+    An evaluation stops early once every particle's J has passed its `limit`, which decides a
+    comparison J <= limit exactly; `total` is then some value above the limit. J that is not finite
+    is returned as infinity.
+    """
+    total[:] = np.inf
+    for i in range(theta.shape[0]):
+        for j in range(theta.shape[1]):
+            if not np.isfinite(theta[i, j]):
+                return
+    basis = window.basis
+    if not modal_filters(
+        basis.stiffness,
+        basis.cubics,
+        theta,
+        window.step_s,
+        work.matrix,
+        work.vectors,
+        work.cubics,
+        work.feedback,
+    ):
+        return
+    factors = np.empty((13, LANES))
+    _vehicle_factors(
+        theta, window.total_mass_kg, window.wheelbase_m, window.gravity_m_per_s2, factors
+    )
+    work.state[:] = 0.0
+    work.seen[:] = 0.0
+    columns = window.nuisance.shape[1]
+    front, rear = work.road[0], work.road[1]
+    rows = window.front_sample.size
+    squares = (0.0, 0.0, 0.0, 0.0)
+    for part in range(window.stretches.shape[0]):
+        begin, stop, e1, e2 = window.stretches[part]
+        _march_stretch(window, work, factors, begin, stop, e1, e2, work.cubics, work.feedback)
+        for row in range(max(0, begin - window.first_row), min(rows, stop - window.first_row)):
+            n = window.front_sample[row]
+            w = window.front_weight[row]
+            r = fma_scalar(load(front, n), -w[0], load(rear, row + window.first_row))
+            r = fma_scalar(load(front, n + 1), -w[1], r)
+            r = fma_scalar(load(front, n + 2), -w[2], r)
+            r = scale(fma_scalar(load(front, n + 3), -w[3], r), window.row_weight[row])
+            squares = fma(r, r, squares)
+            for q in range(columns):
+                seen = fma_scalar(r, window.nuisance[row, q], load(work.seen, q))
+                store(work.seen, q, seen)
+        if (
+            columns == 0
+            and squares[0] > limit[0]
+            and squares[1] > limit[1]
+            and squares[2] > limit[2]
+            and squares[3] > limit[3]
+        ):
+            break
+    for q in range(columns):
+        seen = load(work.seen, q)
+        squares = sub(squares, mul(seen, seen))
+    for lane in range(LANES):
+        if np.isfinite(squares[lane]):
+            total[lane] = squares[lane]
+
+
+@kernel
+def _rows(window: Window, road: FloatArray, lane: int, out: FloatArray) -> None:
+    """Weighted rows of one particle into `out` (m,), nuisance columns not yet removed."""
+    front, rear = road[0], road[1]
+    for row in range(out.size):
+        n = window.front_sample[row]
+        r = rear[row + window.first_row, lane]
+        for j in range(4):
+            r -= window.front_weight[row, j] * front[n + j, lane]
+        out[row] = r * window.row_weight[row]
+
+
+@kernel
+def objective_batch(
+    window: Window, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
+) -> None:
+    """J of many particles, four at a time: `theta` (k, p), `limit` (k,), output `total` (k,)."""
+    count = theta.shape[0]
+    four = np.empty((LANES, theta.shape[1]))
+    four_limit = np.empty(LANES)
+    four_total = np.empty(LANES)
+    for begin in range(0, count, LANES):
+        for lane in range(LANES):
+            source = min(begin + lane, count - 1)
+            four[lane] = theta[source]
+            four_limit[lane] = limit[source]
+        march_particles(window, work, four, four_limit, four_total)
+        for lane in range(min(LANES, count - begin)):
+            total[begin + lane] = four_total[lane]
+
+
+@kernel
+def _residual_batch(window: Window, work: Workspace, theta: FloatArray, out: FloatArray) -> None:
+    count = theta.shape[0]
+    four = np.empty((LANES, theta.shape[1]))
+    no_limit = np.full(LANES, np.inf)
+    for begin in range(0, count, LANES):
+        for lane in range(LANES):
+            four[lane] = theta[min(begin + lane, count - 1)]
+        totals = np.empty(LANES)
+        march_particles(window, work, four, no_limit, totals)
+        for lane in range(min(LANES, count - begin)):
+            if np.isfinite(totals[lane]):
+                _rows(window, work.road, lane, out[begin + lane])
+            else:
+                out[begin + lane] = np.nan
+
+
+def residual_batch(window: Window, work: Workspace, theta: FloatArray) -> FloatArray:
+    """Weighted residual rows (k, m) of vectors (k, p); their squares sum to J. NaN: not finite."""
+    theta = np.ascontiguousarray(theta)
+    out = np.empty((theta.shape[0], window.front_sample.size))
+    _residual_batch(window, work, theta, out)
+    if window.nuisance.shape[1]:
+        out -= (out @ window.nuisance) @ window.nuisance.T
+    return out
+
+
+@kernel
+def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
+    """J of one vector (p,), quicker than a batch of one: modes, not particles, share the lanes."""
+    if not np.all(np.isfinite(theta)):
+        return np.inf
+    basis = window.basis
+    elements, modes = work.cubics.shape[0], work.cubics.shape[1]
+    groups = (modes + LANES - 1) // LANES
+    cubics = np.empty((elements, groups, 4, LANES))
+    feedback = np.empty((groups, 2, LANES))
+    matrix = np.empty((modes, modes))
+    vectors = np.empty((modes, modes))
+    if not modal_filters_one(
+        basis.stiffness,
+        basis.cubics,
+        theta,
+        window.step_s,
+        matrix,
+        vectors,
+        cubics,
+        feedback,
+    ):
+        return np.inf
+    four = np.empty((LANES, theta.size))
+    for lane in range(LANES):
+        for i in range(theta.size):
+            four[lane, i] = theta[i]
+    scratch = np.empty((2, _LONGEST_STRETCH))
+    factors = np.empty((13, LANES))
+    _vehicle_factors(
+        four, window.total_mass_kg, window.wheelbase_m, window.gravity_m_per_s2, factors
+    )
+    work.state[:] = 0.0
+    work.seen[:] = 0.0
+    columns = window.nuisance.shape[1]
+    rows = window.front_sample.size
+    total = 0.0
+    front, rear = work.road[0], work.road[1]
+    for part in range(window.stretches.shape[0]):
+        begin, stop, e1, e2 = window.stretches[part]
+        _one_particle_stretch(window, work, factors, begin, stop, scratch)
+        advance(
+            cubics[max(e1, 0)],
+            cubics[max(e2, 0)],
+            e1 >= 0,
+            e2 >= 0,
+            feedback,
+            work.state,
+            window.place[0, begin:stop],
+            window.place[1, begin:stop],
+            work.force,
+            front[begin:stop],
+            rear[begin:stop],
+        )
+        for n in range(begin, stop):
+            front[n, 0] = (front[n, 0] + front[n, 1]) + (front[n, 2] + front[n, 3])
+            rear[n, 0] = (rear[n, 0] + rear[n, 1]) + (rear[n, 2] + rear[n, 3])
+        for row in range(max(0, begin - window.first_row), min(rows, stop - window.first_row)):
+            n = window.front_sample[row]
+            w = window.front_weight[row]
+            r = w[0] * front[n, 0] + w[1] * front[n + 1, 0]
+            r += w[2] * front[n + 2, 0] + w[3] * front[n + 3, 0]
+            r = (r - rear[row + window.first_row, 0]) * window.row_weight[row]
+            total += r * r
+            for q in range(columns):
+                work.seen[q, 0] += window.nuisance[row, q] * r
+    for q in range(columns):
+        total -= work.seen[q, 0] ** 2
+    return total if np.isfinite(total) else np.inf
+
+
+@kernel
+def _one_particle_stretch(
+    window: Window,
+    work: Workspace,
+    factors: FloatArray,
+    begin: int,
+    stop: int,
+    scratch: FloatArray,
+) -> None:
+    """Minus the input profiles into lane 0 of `work.road` (the modes of the other lanes begin at
+    zero), and the contact forces into all lanes of `work.force`."""
+    a = window.acceleration
+    s = window.signals
+    for w in range(2):
+        own, other = a[w], a[1 - w]
+        unsprung = a[2 + w]
+        z, acceleration, rate, stroke = s[w, 0], s[w, 1], s[w, 2], s[w, 3]
+        inertia, damping = factors[3 * w, 0], factors[3 * w + 1, 0]
+        stiffness = factors[3 * w + 2, 0]
+        load_n, m_own, m_other = factors[6 + w, 0], factors[8 + w, 0], factors[10, 0]
+        m_u = factors[11 + w, 0]
+        sign = 1.0 - 2.0 * w
+        # One store a loop: with more, the compiler gives up proving that the arrays do not overlap
+        # and leaves the vector registers unused.
+        u, p = scratch[0], scratch[1]
+        a_u, rate_w, stroke_w, z_w = (
+            acceleration[begin:stop],
+            rate[begin:stop],
+            stroke[begin:stop],
+            z[begin:stop],
+        )
+        for i in range(a_u.size):
+            u[i] = inertia * a_u[i] + damping * rate_w[i] + stiffness * stroke_w[i] - z_w[i]
+        own_w, other_w, unsprung_w, transfer = (
+            own[begin:stop],
+            other[begin:stop],
+            unsprung[begin:stop],
+            window.load_transfer_n[begin:stop],
+        )
+        for i in range(own_w.size):
+            inertial = m_own * own_w[i] + m_other * other_w[i] + m_u * unsprung_w[i]
+            p[i] = sign * transfer[i] - load_n - inertial
+        road, force = work.road[w], work.force[w]
+        for i in range(stop - begin):
+            store(road, begin + i, (u[i], 0.0, 0.0, 0.0))
+            store(force, i, (p[i], p[i], p[i], p[i]))
+
+
+class Roads(NamedTuple):
+    """The two road profiles that a vector of parameters implies, over the compared stretch."""
+
+    x_m: FloatArray  # (m,)
+    front_m: FloatArray  # (m,)
+    rear_m: FloatArray  # (m,)
+
+
+def road_profiles(window: Window, work: Workspace, theta: FloatArray) -> Roads:
+    """Road under the front and under the rear wheel at the rows' chainages, in order of travel."""
+    four = np.repeat(theta[None, :], LANES, axis=0)
+    march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
+    front = -work.road[0, :, 0]
+    gathered = front[window.front_sample[:, None] + np.arange(4)]
+    rear = -work.road[1, window.first_row : window.first_row + window.x_m.size, 0]
+    return Roads(window.x_m.copy(), np.einsum("mj,mj->m", window.front_weight, gathered), rear)
+
+
+def largest_deflection_m(window: Window, theta: FloatArray) -> float:
+    """Largest deflection of the bridge under a wheel during the crossing, positive downwards."""
+    work = workspace(window)
+    four = np.repeat(theta[None, :], LANES, axis=0)
+    march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
+    deflection = input_profiles(window.signals, theta) + work.road[:, :, 0]  # y = u - r
+    return float(-deflection.min())

@@ -1,0 +1,324 @@
+"""Dynamic response simulation (DRS): the bridge's deflection under wheels whose forces are known.
+
+For one time step Newmark's average acceleration on a mode of unit mass, q'' + c q' + lambda q = p,
+is the bilinear transform of its transfer function,
+
+    b_0 q[n] + b_1 q[n-1] + b_2 q[n-2] = p[n] + 2 p[n-1] + p[n-2],
+    b_0 = a^2 + a c + lambda,  b_1 = 2 (lambda - a^2),  b_2 = a^2 - a c + lambda,  a = 2/step,
+
+so that a mode costs a handful of multiplications a step. The recursion here is the direct form II,
+w[n] = p[n] - (b_1 w[n-1] + b_2 w[n-2])/b_0, q[n] = (w[n] + 2 w[n-1] + w[n-2])/b_0, with 1/b_0 split
+evenly into the mode shapes. It starts from rest before the first wheel arrives.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from pre_core.kernels.jacobi import diagonalise, diagonalise_one
+from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store
+from pre_core.physics.bridge import (
+    element_cubics,
+    mass_matrix,
+    uniform_beam,
+    unit_stiffness_matrices,
+)
+from pre_core.unknowns import EI_1
+
+FloatArray = NDArray[np.float64]
+
+
+class BeamBasis(NamedTuple):
+    """What every evaluation shares: the beam in coordinates in which the sound one is diagonal.
+
+    `stiffness` (n + 2, m, m): dK/dEI_e and dK/dk_rot of the n elements and two supports, in
+    coordinates that make the mass matrix of 1 kg/m the identity. `cubics` (n parts, 4, m):
+    deflection in each part of an element for each coordinate. `lengths_m` (n parts,).
+    """
+
+    stiffness: FloatArray
+    cubics: FloatArray
+    lengths_m: FloatArray
+
+
+def beam_basis(
+    element_lengths_m: FloatArray, parts: int = 1, coordinates: int | None = None
+) -> BeamBasis:
+    """Coordinates: the lowest modes of the uniform beam whose elements are cut into `parts`.
+
+    All 2 n parts of them by default, which is the finite-element model itself. Fewer are quicker
+    but poor for a beam that is not uniform or has springs at its supports, whose kinked curvature
+    smooth modes do not span: f_1 of the paper's scenario 6 is 1 % off with 14 of 28.
+    """
+    n = element_lengths_m.size
+    lengths = np.repeat(element_lengths_m / parts, parts)
+    unit = uniform_beam(1.0, np.ones(n * parts), 1.0, 0.0, 0.0)._replace(element_lengths_m=lengths)
+    fine = unit_stiffness_matrices(lengths)
+    count = fine.shape[1] if coordinates is None else min(coordinates, fine.shape[1])
+    units = np.concatenate(
+        [fine[: n * parts].reshape(n, parts, *fine.shape[1:]).sum(axis=1), fine[n * parts :]]
+    )
+    _, shapes = eigh(units[:n].sum(axis=0), mass_matrix(unit), subset_by_index=(0, count - 1))
+    return BeamBasis(
+        np.ascontiguousarray(shapes.T @ units @ shapes),
+        np.ascontiguousarray(element_cubics(lengths, shapes)),
+        lengths,
+    )
+
+
+def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
+    """The same beam in coordinates in which the bridge `theta` (n + 15,) is diagonal.
+
+    Bridges near it are then nearly diagonal, which makes their modes quick to find.
+    """
+    n = basis.stiffness.shape[0] - 2
+    factors = np.concatenate([theta[EI_1 : EI_1 + n], theta[EI_1 + n + 3 : EI_1 + n + 5]])
+    _, shapes = eigh(np.tensordot(factors, basis.stiffness, axes=1))
+    return BeamBasis(
+        np.ascontiguousarray(shapes.T @ basis.stiffness @ shapes),
+        np.ascontiguousarray(basis.cubics @ shapes),
+        basis.lengths_m,
+    )
+
+
+def first_frequencies_hz(basis: BeamBasis, theta: FloatArray) -> FloatArray:
+    """First natural frequency (k,) in Hz, undamped, of the bridges `theta` (k, n + 15)."""
+    n = basis.stiffness.shape[0] - 2
+    factors = np.concatenate([theta[:, EI_1 : EI_1 + n], theta[:, EI_1 + n + 3 :]], axis=1)
+    stiffness = np.tensordot(factors, basis.stiffness, axes=1)
+    lowest = np.linalg.eigvalsh(stiffness)[:, 0]
+    return np.asarray(np.sqrt(lowest / theta[:, EI_1 + n]) / (2.0 * np.pi))
+
+
+@kernel
+def modal_filters(
+    basis_stiffness: FloatArray,
+    basis_cubics: FloatArray,
+    theta: FloatArray,
+    step_s: float,
+    matrix: FloatArray,
+    vectors: FloatArray,
+    cubics: FloatArray,
+    feedback: FloatArray,
+) -> bool:
+    """Modes of four bridges as the coefficients of their recursions; False if not finite.
+
+    `theta` is (4, n + 15). Written: `cubics` (parts, m, 4, 4) [part, mode, power, particle], scaled
+    by 1/sqrt(b_0), and `feedback` (m, 2, 4): -b_1/b_0 and -b_2/b_0.
+    """
+    factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
+    elements = factors - 2
+    rho = EI_1 + elements
+    for i in range(m):
+        for j in range(i, m):  # the upper triangle is all that is read
+            total = (0.0, 0.0, 0.0, 0.0)
+            for e in range(factors):
+                place = EI_1 + e if e < elements else rho + 3 + e - elements
+                factor = (theta[0, place], theta[1, place], theta[2, place], theta[3, place])
+                total = fma_scalar(factor, basis_stiffness[e, i, j], total)
+            store(matrix[i], j, total)
+    if not diagonalise(matrix, vectors):
+        return False
+    a = 2.0 / step_s
+    for k in range(m):
+        for lane in range(LANES):
+            eigenvalue = matrix[k, k, lane] / theta[lane, rho]
+            damping = theta[lane, rho + 1] + theta[lane, rho + 2] * eigenvalue
+            b_0 = a * a + a * damping + eigenvalue
+            feedback[k, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
+            feedback[k, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
+            matrix[k, k, lane] = 1.0 / np.sqrt(theta[lane, rho] * b_0)
+    for e in range(basis_cubics.shape[0]):
+        for k in range(m):
+            size = load(matrix[k], k)
+            for power in range(4):
+                total = (0.0, 0.0, 0.0, 0.0)
+                for i in range(m):
+                    total = fma_scalar(load(vectors[k], i), basis_cubics[e, power, i], total)
+                store(cubics[e, k], power, mul(total, size))
+    return True
+
+
+@kernel
+def diagonalise_bridge(
+    basis_stiffness: FloatArray, theta: FloatArray, matrix: FloatArray, vectors: FloatArray
+) -> bool:
+    """Eigenvalues times rho A on the diagonal of `matrix`, mode shapes in the rows of `vectors`.
+
+    Both are (m, m), of one bridge `theta` (n + 15,). False if not finite.
+    """
+    factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
+    elements = factors - 2
+    rho = EI_1 + elements
+    matrix[:] = 0.0
+    for e in range(factors):
+        factor = theta[EI_1 + e] if e < elements else theta[rho + 3 + e - elements]
+        if factor != 0.0:
+            for i in range(m):
+                to, unit = matrix[i], basis_stiffness[e, i]
+                for j in range(m):
+                    to[j] += factor * unit[j]
+    return diagonalise_one(matrix, vectors)
+
+
+@kernel
+def shape_cubics(
+    basis_cubics: FloatArray, vector: FloatArray, size: float, lane: int, out: FloatArray
+) -> None:
+    """Cubics of one mode in every part, times `size`, into out (parts, 4, lanes) at `lane`."""
+    m = vector.size
+    for e in range(basis_cubics.shape[0]):
+        for power in range(4):
+            row = basis_cubics[e, power]
+            # Four sums, so that each need not wait for the one before.
+            s0 = s1 = s2 = s3 = 0.0
+            for i in range(0, m - 3, 4):
+                s0 += vector[i] * row[i]
+                s1 += vector[i + 1] * row[i + 1]
+                s2 += vector[i + 2] * row[i + 2]
+                s3 += vector[i + 3] * row[i + 3]
+            for i in range(m - m % 4, m):
+                s0 += vector[i] * row[i]
+            out[e, power, lane] = size * ((s0 + s1) + (s2 + s3))
+
+
+@kernel
+def modal_filters_one(
+    basis_stiffness: FloatArray,
+    basis_cubics: FloatArray,
+    theta: FloatArray,
+    step_s: float,
+    matrix: FloatArray,
+    vectors: FloatArray,
+    cubics: FloatArray,
+    feedback: FloatArray,
+) -> bool:
+    """The same for one bridge `theta` (n + 15,), its modes in the lanes: g groups of four.
+
+    `matrix` and `vectors` are (m, m). Written: `cubics` (parts, g, 4, 4) [part, group, power, mode]
+    and `feedback` (g, 2, 4); lanes beyond the last mode stay zero.
+    """
+    rho = EI_1 + basis_stiffness.shape[0] - 2
+    if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
+        return False
+    a = 2.0 / step_s
+    cubics[:] = 0.0
+    feedback[:] = 0.0
+    for k in range(basis_stiffness.shape[1]):
+        group, lane = k // LANES, k % LANES
+        eigenvalue = matrix[k, k] / theta[rho]
+        damping = theta[rho + 1] + theta[rho + 2] * eigenvalue
+        b_0 = a * a + a * damping + eigenvalue
+        feedback[group, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
+        feedback[group, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
+        size = 1.0 / np.sqrt(theta[rho] * b_0)
+        shape_cubics(basis_cubics, vectors[k], size, lane, cubics[:, group])
+    return True
+
+
+@kernel
+def _one_mode_two_wheels(
+    front: FloatArray,
+    rear: FloatArray,
+    feedback: FloatArray,
+    state: FloatArray,
+    front_place: FloatArray,
+    rear_place: FloatArray,
+    force: FloatArray,
+    deflection_front: FloatArray,
+    deflection_rear: FloatArray,
+) -> None:
+    a0, a1, a2, a3 = load(front, 0), load(front, 1), load(front, 2), load(front, 3)
+    b0, b1, b2, b3 = load(rear, 0), load(rear, 1), load(rear, 2), load(rear, 3)
+    f1, f2 = load(feedback, 0), load(feedback, 1)
+    w1, w2 = load(state, 0), load(state, 1)
+    before = add(w1, w2)
+    force_front, force_rear = force[0], force[1]
+    for n in range(front_place.size):
+        x = front_place[n]
+        z = rear_place[n]
+        a = fma_scalar(fma_scalar(fma_scalar(a3, x, a2), x, a1), x, a0)
+        b = fma_scalar(fma_scalar(fma_scalar(b3, z, b2), z, b1), z, b0)
+        p = fma(a, load(force_front, n), mul(b, load(force_rear, n)))
+        w = fma(f1, w1, fma(f2, w2, p))
+        after = add(w, w1)
+        q = add(after, before)
+        before = after
+        w2 = w1
+        w1 = w
+        store(deflection_front, n, fma(a, q, load(deflection_front, n)))
+        store(deflection_rear, n, fma(b, q, load(deflection_rear, n)))
+    store(state, 0, w1)
+    store(state, 1, w2)
+
+
+@kernel
+def _one_mode_one_wheel(
+    cubic: FloatArray,
+    feedback: FloatArray,
+    state: FloatArray,
+    wheel_place: FloatArray,
+    force: FloatArray,
+    deflection: FloatArray,
+) -> None:
+    a0, a1, a2, a3 = load(cubic, 0), load(cubic, 1), load(cubic, 2), load(cubic, 3)
+    f1, f2 = load(feedback, 0), load(feedback, 1)
+    w1, w2 = load(state, 0), load(state, 1)
+    before = add(w1, w2)
+    for n in range(wheel_place.size):
+        x = wheel_place[n]
+        a = fma_scalar(fma_scalar(fma_scalar(a3, x, a2), x, a1), x, a0)
+        w = fma(f1, w1, fma(f2, w2, mul(a, load(force, n))))
+        after = add(w, w1)
+        q = add(after, before)
+        before = after
+        w2 = w1
+        w1 = w
+        store(deflection, n, fma(a, q, load(deflection, n)))
+    store(state, 0, w1)
+    store(state, 1, w2)
+
+
+@kernel
+def advance(
+    front_cubics: FloatArray,
+    rear_cubics: FloatArray,
+    front_on: bool,
+    rear_on: bool,
+    feedback: FloatArray,
+    state: FloatArray,
+    front_place: FloatArray,
+    rear_place: FloatArray,
+    force: FloatArray,
+    deflection_front: FloatArray,
+    deflection_rear: FloatArray,
+) -> None:
+    """March all modes over a stretch in which each wheel stays in one element (or off the bridge).
+
+    Cubics are (m, 4, 4) of the element under each wheel, `feedback` and `state` (m, 2, 4), places
+    (steps,), `force` (2, steps, 4), deflections (steps, 4). `state` is updated and the deflections
+    are *added* to. What the fourth axis is (particles, or groups of modes) does not matter here.
+    """
+    for k in range(feedback.shape[0]):
+        if front_on and rear_on:
+            _one_mode_two_wheels(
+                front_cubics[k],
+                rear_cubics[k],
+                feedback[k],
+                state[k],
+                front_place,
+                rear_place,
+                force,
+                deflection_front,
+                deflection_rear,
+            )
+        elif front_on:
+            _one_mode_one_wheel(
+                front_cubics[k], feedback[k], state[k], front_place, force[0], deflection_front
+            )
+        elif rear_on:
+            _one_mode_one_wheel(
+                rear_cubics[k], feedback[k], state[k], rear_place, force[1], deflection_rear
+            )

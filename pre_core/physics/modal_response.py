@@ -1,0 +1,228 @@
+"""A mode's response to a force that is linear between samples: exact at any step.
+
+For q'' + c q' + lambda q = p with p linear between samples (Nigam and Jennings 1969) the samples of
+q obey
+
+    q[n] + a_1 q[n-1] + a_2 q[n-2] = b_0 p[n] + b_1 p[n-1] + b_2 p[n-2],
+
+a_1 = -2 exp(-s h) cos(w h), a_2 = exp(-2 s h), s = c/2, w^2 = lambda - s^2; the b follow from r_n,
+the response to a unit ramp after n steps h:
+
+    b_0 = r_1/h,  b_1 = (r_2 - 2 r_1)/h + a_1 b_0,  b_2 = (r_3 - 2 r_2 + r_1)/h + a_1 (…) + a_2 b_0.
+
+Newmark's scheme, in contrast, shifts a mode at a fifth of the sampling rate by a tenth of its
+frequency. A force that is not linear between samples loses (omega h)^2/12 of its part at omega to
+the straight lines; `sharpened` gives that back.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, store
+from pre_core.physics.beam_basis import diagonalise_bridge, shape_cubics
+from pre_core.unknowns import EI_1
+
+FloatArray = NDArray[np.float64]
+
+COEFFICIENTS = 5
+"""Of a mode: -a_1, -a_2 and b_0, b_1, b_2 over their sum."""
+
+
+@kernel
+def _ramp_response(time: float, damping: float, eigenvalue: float) -> float:
+    """Displacement after `time` of a mode at rest when a force of one per second has grown."""
+    half = 0.5 * damping
+    square = eigenvalue - half * half
+    # q = t/lambda - c/lambda^2 + exp(-half t) (C cos + S sin/w) with q(0) = q'(0) = 0.
+    c = damping / (eigenvalue * eigenvalue)
+    s = half * c - 1.0 / eigenvalue
+    if square > 0.0:
+        root = np.sqrt(square)
+        decay = np.exp(-half * time)
+        cosine, sine = decay * np.cos(root * time), decay * np.sin(root * time) / root
+    else:
+        root = np.sqrt(-square)
+        quick = np.exp(-(half + root) * time)
+        slow = np.exp(-eigenvalue / (half + root) * time)
+        cosine = 0.5 * (slow + quick)
+        sine = 0.5 * (slow - quick) / root if root * time > 1e-6 else time * slow
+    return time / eigenvalue - c + c * cosine + s * sine
+
+
+@kernel
+def mode_coefficients(eigenvalue: float, damping: float, step: float, out: FloatArray) -> float:
+    """Coefficients (5,) of one mode (see COEFFICIENTS); returns the sum of the b."""
+    half = 0.5 * damping
+    square = eigenvalue - half * half
+    if square > 0.0:
+        a_1 = -2.0 * np.exp(-half * step) * np.cos(np.sqrt(square) * step)
+    else:
+        root = np.sqrt(-square)
+        a_1 = -(np.exp(-(half + root) * step) + np.exp(-eigenvalue / (half + root) * step))
+    a_2 = np.exp(-damping * step)
+    r_1 = _ramp_response(step, damping, eigenvalue)
+    r_2 = _ramp_response(2.0 * step, damping, eigenvalue)
+    r_3 = _ramp_response(3.0 * step, damping, eigenvalue)
+    h_0, h_1, h_2 = r_1 / step, (r_2 - 2.0 * r_1) / step, (r_3 - 2.0 * r_2 + r_1) / step
+    b_0 = h_0
+    b_1 = h_1 + a_1 * h_0
+    b_2 = h_2 + a_1 * h_1 + a_2 * h_0
+    total = b_0 + b_1 + b_2
+    out[0], out[1] = -a_1, -a_2
+    out[2], out[3], out[4] = b_0 / total, b_1 / total, b_2 / total
+    return total
+
+
+@kernel
+def modal_filters(
+    basis_stiffness: FloatArray,
+    basis_cubics: FloatArray,
+    theta: FloatArray,
+    step_s: float,
+    matrix: FloatArray,
+    vectors: FloatArray,
+    cubics: FloatArray,
+    feedback: FloatArray,
+) -> bool:
+    """Modes of one bridge `theta` (n + 15,) in the lanes, g groups of four; False: not finite.
+
+    `matrix` and `vectors` are (m, m). Written: `cubics` (parts, g, 4, 4) [part, group, power, mode]
+    times the root of the sum of the b, and `feedback` (g, 5, 4); lanes beyond the last mode stay
+    zero.
+    """
+    rho = EI_1 + basis_stiffness.shape[0] - 2
+    if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
+        return False
+    cubics[:] = 0.0
+    feedback[:] = 0.0
+    one = np.empty(COEFFICIENTS)
+    for k in range(basis_stiffness.shape[1]):
+        group, lane = k // LANES, k % LANES
+        eigenvalue = matrix[k, k] / theta[rho]
+        damping = theta[rho + 1] + theta[rho + 2] * eigenvalue
+        total = mode_coefficients(eigenvalue, damping, step_s, one)
+        if not total > 0.0:
+            return False
+        feedback[group, :, lane] = one
+        size = np.sqrt(total / theta[rho])
+        shape_cubics(basis_cubics, vectors[k], size, lane, cubics[:, group])
+    return True
+
+
+@kernel
+def sharpened(force: FloatArray, out: FloatArray) -> None:
+    """p - (p[n+1] - 2 p[n] + p[n-1])/12 of a force (n,): see the module's docstring."""
+    last = force.size - 1
+    out[0], out[last] = force[0], force[last]
+    for n in range(1, last):
+        out[n] = force[n] - (force[n + 1] - 2.0 * force[n] + force[n - 1]) / 12.0
+
+
+@kernel
+def _two_wheels(
+    front: FloatArray,
+    rear: FloatArray,
+    feedback: FloatArray,
+    state: FloatArray,
+    place: FloatArray,
+    force: FloatArray,
+    deflection: FloatArray,
+) -> None:
+    a0, a1, a2, a3 = load(front, 0), load(front, 1), load(front, 2), load(front, 3)
+    b0, b1, b2, b3 = load(rear, 0), load(rear, 1), load(rear, 2), load(rear, 3)
+    f1, f2 = load(feedback, 0), load(feedback, 1)
+    n0, n1, n2 = load(feedback, 2), load(feedback, 3), load(feedback, 4)
+    w1, w2 = load(state, 0), load(state, 1)
+    place_front, place_rear = place[0], place[1]
+    force_front, force_rear = force[0], force[1]
+    deflection_front, deflection_rear = deflection[0], deflection[1]
+    for n in range(place.shape[1]):
+        x = place_front[n]
+        z = place_rear[n]
+        a = fma_scalar(fma_scalar(fma_scalar(a3, x, a2), x, a1), x, a0)
+        b = fma_scalar(fma_scalar(fma_scalar(b3, z, b2), z, b1), z, b0)
+        p = fma(a, load(force_front, n), mul(b, load(force_rear, n)))
+        w = fma(f1, w1, fma(f2, w2, p))
+        q = fma(n0, w, fma(n1, w1, mul(n2, w2)))
+        w2 = w1
+        w1 = w
+        store(deflection_front, n, fma(a, q, load(deflection_front, n)))
+        store(deflection_rear, n, fma(b, q, load(deflection_rear, n)))
+    store(state, 0, w1)
+    store(state, 1, w2)
+
+
+@kernel
+def _one_wheel(
+    cubic: FloatArray,
+    feedback: FloatArray,
+    state: FloatArray,
+    place: FloatArray,
+    force: FloatArray,
+    deflection: FloatArray,
+) -> None:
+    a0, a1, a2, a3 = load(cubic, 0), load(cubic, 1), load(cubic, 2), load(cubic, 3)
+    f1, f2 = load(feedback, 0), load(feedback, 1)
+    n0, n1, n2 = load(feedback, 2), load(feedback, 3), load(feedback, 4)
+    w1, w2 = load(state, 0), load(state, 1)
+    for n in range(place.size):
+        x = place[n]
+        a = fma_scalar(fma_scalar(fma_scalar(a3, x, a2), x, a1), x, a0)
+        w = fma(f1, w1, fma(f2, w2, mul(a, load(force, n))))
+        q = fma(n0, w, fma(n1, w1, mul(n2, w2)))
+        w2 = w1
+        w1 = w
+        store(deflection, n, fma(a, q, load(deflection, n)))
+    store(state, 0, w1)
+    store(state, 1, w2)
+
+
+@kernel
+def _no_wheel(feedback: FloatArray, state: FloatArray, steps: int) -> None:
+    f1, f2 = load(feedback, 0), load(feedback, 1)
+    w1, w2 = load(state, 0), load(state, 1)
+    for _ in range(steps):
+        w = fma(f1, w1, mul(f2, w2))
+        w2 = w1
+        w1 = w
+    store(state, 0, w1)
+    store(state, 1, w2)
+
+
+@kernel
+def advance(
+    cubics: FloatArray,
+    part_front: int,
+    part_rear: int,
+    feedback: FloatArray,
+    state: FloatArray,
+    place: FloatArray,
+    force: FloatArray,
+    deflection: FloatArray,
+) -> None:
+    """March all modes over a stretch in which each wheel stays in one part (-1: off the bridge).
+
+    `cubics` (parts, g, 4, 4), `feedback` (g, 5, 4), `state` (g, 2, 4), `place` (2, steps), `force`
+    (2, steps, 4), `deflection` (2, steps, 4). `state` is updated, the deflections are *added* to.
+    """
+    for g in range(feedback.shape[0]):
+        if part_front >= 0 and part_rear >= 0:
+            _two_wheels(
+                cubics[part_front, g],
+                cubics[part_rear, g],
+                feedback[g],
+                state[g],
+                place,
+                force,
+                deflection,
+            )
+        elif part_front >= 0:
+            _one_wheel(
+                cubics[part_front, g], feedback[g], state[g], place[0], force[0], deflection[0]
+            )
+        elif part_rear >= 0:
+            _one_wheel(
+                cubics[part_rear, g], feedback[g], state[g], place[1], force[1], deflection[1]
+            )
+        else:  # a span shorter than the wheelbase swings on between the axles
+            _no_wheel(feedback[g], state[g], place.shape[1])

@@ -1,0 +1,345 @@
+"""The coupled forward problem: a half-car drives over a rough road and a bridge.
+
+Vehicle and bridge are each marched with Newmark's average acceleration; within every step they
+exchange wheel displacement and contact force until the forces stand still (paper section 2.1).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pre_core.physics import bridge as _bridge
+from pre_core.physics import vehicle as _vehicle
+
+FloatArray = NDArray[np.float64]
+
+STANDARD_GRAVITY_M_PER_S2 = 9.80665
+
+
+class Motion(NamedTuple):
+    """Where the front axle is at the times 0, step, 2 step, …: (steps,) each.
+
+    `position_m` is the chainage x_1; driving from the bridge's end to its start it decreases.
+    """
+
+    position_m: FloatArray
+    speed_m_per_s: FloatArray
+    """dx_1/dt, negative when the chainage decreases."""
+    acceleration_m_per_s2: FloatArray
+    """Rate of change of the magnitude of the speed: positive when the truck speeds up."""
+
+
+class WheelRoad(NamedTuple):
+    """Height of the road under each wheel (steps, 2) and its rate of change (steps, 2)."""
+
+    height_m: FloatArray
+    rate_m_per_s: FloatArray
+
+
+class Simulation(NamedTuple):
+    """What the truck and the bridge did; `converged` is False if a step's forces did not settle."""
+
+    displacement_m: FloatArray  # (steps, 4): z_s1, z_s2, z_u1, z_u2
+    velocity_m_per_s: FloatArray  # (steps, 4)
+    acceleration_m_per_s2: FloatArray  # (steps, 4)
+    contact_force_n: FloatArray  # (steps, 2), up positive on the bridge: negative while loaded
+    wheel_deflection_m: FloatArray  # (steps, 2): the bridge under each wheel
+    modal_displacement: FloatArray  # (steps, modes)
+    modal_velocity: FloatArray  # (steps, modes)
+    modes: _bridge.Modes
+    converged: bool
+    iterations: int
+
+
+def constant_speed(start_m: float, speed_m_per_s: float, steps: int, step_s: float) -> Motion:
+    """Motion from x_1 = start at a constant (signed) speed."""
+    position = start_m + speed_m_per_s * step_s * np.arange(steps, dtype=np.float64)
+    return Motion(position, np.full(steps, speed_m_per_s), np.zeros(steps))
+
+
+def constant_acceleration(
+    start_m: float,
+    speed_m_per_s: float,
+    acceleration_m_per_s2: float,
+    steps: int,
+    step_s: float,
+) -> Motion:
+    """Motion from x_1 = start; the signed speed says the direction, acceleration > 0 speeds up."""
+    t = step_s * np.arange(steps)
+    sign = np.sign(speed_m_per_s)
+    position = start_m + speed_m_per_s * t + 0.5 * sign * acceleration_m_per_s2 * t**2
+    speed = speed_m_per_s + sign * acceleration_m_per_s2 * t
+    return Motion(position, speed, np.full(steps, acceleration_m_per_s2))
+
+
+def rear_position_m(front_position_m: FloatArray, wheelbase_m: float, direction: int) -> FloatArray:
+    """x_2 = x_1 - D driving from start to end (direction 1), x_1 + D the other way (-1)."""
+    return front_position_m - direction * wheelbase_m
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _march(
+    step_s: float,
+    inverse_mass: FloatArray,
+    inverse_effective: FloatArray,
+    damping: FloatArray,
+    stiffness: FloatArray,
+    bilinear_n_s_per_m: FloatArray,
+    tyre_stiffness: FloatArray,
+    tyre_damping: FloatArray,
+    static_load: FloatArray,
+    load_transfer: FloatArray,
+    eigenvalues: FloatArray,
+    modal_damping: FloatArray,
+    cubics: FloatArray,
+    element_lengths: FloatArray,
+    element: NDArray[np.int64],
+    place: FloatArray,
+    wheel_speed: FloatArray,
+    road: FloatArray,
+    road_rate: FloatArray,
+    tolerance: float,
+    max_iterations: int,
+    z: FloatArray,
+    zd: FloatArray,
+    zdd: FloatArray,
+    contact: FloatArray,
+    deflection: FloatArray,
+    q: FloatArray,
+    qd: FloatArray,
+) -> int:
+    steps = road.shape[0]
+    count = eigenvalues.size
+    qdd = np.zeros(count)
+    modal_effective = 1.0 + 0.5 * step_s * modal_damping + 0.25 * step_s**2 * eigenvalues
+    effective = np.ones(count)
+    shape = np.zeros((2, count))
+    slope = np.zeros((2, count))
+    q_guess = np.zeros(count)
+    qd_guess = np.zeros(count)
+    q_new = np.zeros(count)
+    qd_new = np.zeros(count)
+    qdd_new = np.zeros(count)
+    z_guess = np.zeros(4)
+    zd_guess = np.zeros(4)
+    z_new = np.zeros(4)
+    zd_new = np.zeros(4)
+    zdd_new = np.zeros(4)
+    free = np.zeros(4)
+    force = np.zeros(4)
+    p = np.zeros(2)
+    y = np.zeros(2)
+    yd = np.zeros(2)
+    worst = 0
+    # At time 0 displacement and velocity are given (zero) and only the accelerations are unknown.
+    quarter = 0.0
+    half = 0.0
+    inverse = inverse_mass
+    for n in range(steps):
+        if n == 1:
+            quarter = 0.25 * step_s**2
+            half = 0.5 * step_s
+            inverse = inverse_effective
+            effective = modal_effective
+        for i in range(4):
+            if n > 0:
+                z_guess[i] = z[n - 1, i] + step_s * zd[n - 1, i] + quarter * zdd[n - 1, i]
+                zd_guess[i] = zd[n - 1, i] + half * zdd[n - 1, i]
+        for k in range(count):
+            if n > 0:
+                q_guess[k] = q[n - 1, k] + step_s * qd[n - 1, k] + quarter * qdd[k]
+                qd_guess[k] = qd[n - 1, k] + half * qdd[k]
+        on_bridge = False
+        for w in range(2):
+            e = element[n, w]
+            if e >= 0:
+                on_bridge = True
+                xi = place[n, w]
+                length = element_lengths[e]
+                for k in range(count):
+                    c0, c1, c2, c3 = (
+                        cubics[e, 0, k],
+                        cubics[e, 1, k],
+                        cubics[e, 2, k],
+                        cubics[e, 3, k],
+                    )
+                    shape[w, k] = ((c3 * xi + c2) * xi + c1) * xi + c0
+                    slope[w, k] = ((3.0 * c3 * xi + 2.0 * c2) * xi + c1) / length
+            else:
+                shape[w, :] = 0.0
+                slope[w, :] = 0.0
+        for i in range(4):
+            free[i] = 0.0
+            for j in range(4):
+                free[i] -= damping[i, j] * zd_guess[j] + stiffness[i, j] * z_guess[j]
+        free[0] += load_transfer[n]
+        free[1] -= load_transfer[n]
+        if n > 0:
+            for w in range(2):
+                p[w] = contact[n - 1, w]
+        else:
+            for w in range(2):
+                p[w] = -static_load[w]
+        zd_new[:] = zd_guess
+        iterations = 0
+        while True:
+            iterations += 1
+            # The bridge under the latest contact forces.
+            for w in range(2):
+                y[w] = 0.0
+                yd[w] = 0.0
+            if on_bridge:
+                for k in range(count):
+                    load = shape[0, k] * p[0] + shape[1, k] * p[1]
+                    acceleration = (
+                        load - modal_damping[k] * qd_guess[k] - eigenvalues[k] * q_guess[k]
+                    ) / effective[k]
+                    qdd_new[k] = acceleration
+                    q_new[k] = q_guess[k] + quarter * acceleration
+                    qd_new[k] = qd_guess[k] + half * acceleration
+                    for w in range(2):
+                        y[w] += shape[w, k] * q_new[k]
+                        yd[w] += shape[w, k] * qd_new[k] + slope[w, k] * wheel_speed[n] * q_new[k]
+            else:
+                for k in range(count):
+                    acceleration = (
+                        -modal_damping[k] * qd_guess[k] - eigenvalues[k] * q_guess[k]
+                    ) / effective[k]
+                    qdd_new[k] = acceleration
+                    q_new[k] = q_guess[k] + quarter * acceleration
+                    qd_new[k] = qd_guess[k] + half * acceleration
+            # The truck on the road and the deflected bridge.
+            for i in range(4):
+                force[i] = free[i]
+            for w in range(2):
+                force[2 + w] += tyre_stiffness[w] * (road[n, w] + y[w]) + tyre_damping[w] * (
+                    road_rate[n, w] + yd[w]
+                )
+                stroke_rate = zd_new[w] - zd_new[2 + w]
+                damper = bilinear_n_s_per_m[w] * abs(stroke_rate)
+                force[w] -= damper
+                force[2 + w] += damper
+            for i in range(4):
+                acceleration = 0.0
+                for j in range(4):
+                    acceleration += inverse[i, j] * force[j]
+                zdd_new[i] = acceleration
+                z_new[i] = z_guess[i] + quarter * acceleration
+                zd_new[i] = zd_guess[i] + half * acceleration
+            change = 0.0
+            for w in range(2):
+                u = road[n, w] + y[w]
+                ud = road_rate[n, w] + yd[w]
+                latest = -(
+                    static_load[w]
+                    + tyre_stiffness[w] * (u - z_new[2 + w])
+                    + tyre_damping[w] * (ud - zd_new[2 + w])
+                )
+                change = max(change, abs(latest - p[w]) / static_load[w])
+                p[w] = latest
+            if iterations > 1 and change <= tolerance:
+                break
+            if iterations >= max_iterations:
+                return -1
+        worst = max(worst, iterations)
+        for i in range(4):
+            z[n, i] = z_new[i]
+            zd[n, i] = zd_new[i]
+            zdd[n, i] = zdd_new[i]
+        for k in range(count):
+            q[n, k] = q_new[k]
+            qd[n, k] = qd_new[k]
+            qdd[k] = qdd_new[k]
+        for w in range(2):
+            contact[n, w] = p[w]
+            deflection[n, w] = y[w]
+    return worst
+
+
+def simulate(
+    car: _vehicle.HalfCar,
+    beam: _bridge.Beam,
+    motion: Motion,
+    road: WheelRoad,
+    step_s: float,
+    *,
+    modes: int | None = None,
+    tolerance: float = 1e-12,
+    max_iterations: int = 50,
+    gravity_m_per_s2: float = STANDARD_GRAVITY_M_PER_S2,
+) -> Simulation:
+    """Drive the truck along `motion` and return accelerations, forces and deflections.
+
+    The truck starts at rest in its static equilibrium on a flat road at height zero and the bridge
+    at rest, unloaded. All `modes` of the mesh are kept unless fewer are asked for. `tolerance` is
+    the largest change of a contact force between two iterations, relative to the static axle load;
+    the paper uses 1e-3.
+
+    Because the scheme is that of average acceleration, integrating the accelerations with the same
+    scheme from zero (paper.integrate.newmark_integrate) gives the displacements to rounding.
+    """
+    basis = _bridge.modes(beam, modes)
+    cubics = _bridge.element_cubics(beam.element_lengths_m, basis.shapes)
+    direction = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
+    wheels = np.stack(
+        [
+            motion.position_m,
+            rear_position_m(motion.position_m, car.wheelbase_m, direction),
+        ],
+        axis=1,
+    )
+    element, place = _bridge.locate(beam.element_lengths_m, wheels)
+    mass, damping, stiffness = _vehicle.matrices(car)
+    transfer = (
+        _vehicle.total_mass_kg(car)
+        * motion.acceleration_m_per_s2
+        * car.cg_height_m
+        / car.wheelbase_m
+    )
+    effective = mass + 0.5 * step_s * damping + 0.25 * step_s**2 * stiffness
+    steps = motion.position_m.size
+    count = basis.eigenvalues_per_s2.size
+    z, zd, zdd = (np.zeros((steps, 4)) for _ in range(3))
+    contact, deflection = np.zeros((steps, 2)), np.zeros((steps, 2))
+    q, qd = np.zeros((steps, count)), np.zeros((steps, count))
+    iterations = _march(
+        step_s,
+        np.asarray(np.linalg.inv(mass), dtype=np.float64),
+        np.asarray(np.linalg.inv(effective), dtype=np.float64),
+        damping,
+        stiffness,
+        car.bilinear_damping * np.array(car.suspension_damping_ns_per_m),
+        np.array(car.tyre_stiffness_n_per_m),
+        np.array(car.tyre_damping_ns_per_m),
+        np.array(_vehicle.static_axle_loads_n(car, gravity_m_per_s2)),
+        transfer,
+        basis.eigenvalues_per_s2,
+        basis.damping_per_s,
+        cubics,
+        beam.element_lengths_m,
+        element,
+        place,
+        motion.speed_m_per_s,
+        np.ascontiguousarray(road.height_m),
+        np.ascontiguousarray(road.rate_m_per_s),
+        tolerance,
+        max_iterations,
+        z,
+        zd,
+        zdd,
+        contact,
+        deflection,
+        q,
+        qd,
+    )
+    return Simulation(
+        z, zd, zdd, contact, deflection, q, qd, basis, iterations > 0, max(iterations, 0)
+    )
+
+
+def deflection_m(beam: _bridge.Beam, run: Simulation, x_m: FloatArray) -> FloatArray:
+    """Deflection (steps, m) of the bridge at m fixed chainages, up positive."""
+    shapes = _bridge.interpolation_matrix(beam, x_m) @ run.modes.shapes
+    return np.asarray(run.modal_displacement @ shapes.T)

@@ -1,0 +1,1 @@
+"""Ways to search, one file each and all of one shape, and the one loop that runs them."""

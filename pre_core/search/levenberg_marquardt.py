@@ -1,0 +1,225 @@
+"""Least squares on the paper's residual: Levenberg-Marquardt in logarithms of the unknowns.
+
+Without noise the surface is benign (docs/reproduction.md): from anywhere in the paper's prior about
+ten steps lead to the one minimum. All unknowns are positive, so the search moves in logarithms and
+needs no bounds, except that d_1 must lie between the axles: there it moves in the logit.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr, solve_triangular
+
+from pre_core.paper.residual import Window, Workspace, residual_batch
+from pre_core.search.loop import Ending
+from pre_core.unknowns import D_1
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MAX_STEPS = 60
+_FIRST_DAMPING = 1e-3
+_SMALLEST_DAMPING = 1e-14
+_GIVE_UP_DAMPING = 1e8
+_CONVERGED_STEP = 1e-9  # in logarithms
+_LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
+
+
+class Problem(NamedTuple):
+    """What stays the same during a search: the data, all parameters, and which of them are free."""
+
+    window: Window
+    fixed: FloatArray  # (p,) values of the parameters that are not searched for
+    free: IntArray  # (f,)
+
+
+class Differences(NamedTuple):
+    """How a Jacobian is taken, and the gain at which a search that uses it is at the bottom."""
+
+    step: float  # in search coordinates
+    central: bool
+    converged_gain: float  # relative decrease of J that the linear model still promises
+    rounding: (
+        float  # a relative rise of J by less than this is rounding, and no reason to turn back
+    )
+
+
+FORWARD = Differences(1e-6, central=False, converged_gain=1e-7, rounding=0.0)
+"""On the way: f evaluations, six digits. What is in the others depends on the processor's rounding
+and moves the bottom by about 1e-6, little beside a standard deviation of any real crossing."""
+
+CENTRAL = Differences(1e-3, central=True, converged_gain=1e-12, rounding=1e-9)
+"""At the bottom: 2f evaluations, a rounding a thousand times smaller. The error of the formula is
+larger, a few 1e-7 of a slope, but the same on every processor: so is the bottom, to 1e-9."""
+
+
+class State(NamedTuple):
+    """Where the search is: `y` are the transformed free parameters (f,)."""
+
+    y: FloatArray
+    residual: FloatArray  # (m,)
+    jacobian: FloatArray  # (m, f), d residual/d y
+    objective: float
+    damping: float
+    differences: Differences
+
+
+class Info(NamedTuple):
+    """What one step did."""
+
+    objective: float
+    step_size: float  # largest change of a logarithm
+    damping: float
+    accepted: bool
+    evaluations: int
+    ending: Ending | None
+
+
+def transform(problem: Problem, values: FloatArray) -> FloatArray:
+    """Free parameters (…, f) in physical units to search coordinates."""
+    y = np.log(values)
+    at = np.flatnonzero(problem.free == D_1)
+    d_1 = values[..., at]
+    y[..., at] = np.log(d_1 / (problem.window.wheelbase_m - d_1))
+    return np.asarray(y)
+
+
+def untransform(problem: Problem, y: FloatArray) -> FloatArray:
+    """Search coordinates (…, f) to free parameters in physical units."""
+    values = np.exp(y)
+    at = np.flatnonzero(problem.free == D_1)
+    values[..., at] = problem.window.wheelbase_m / (1.0 + np.exp(-y[..., at]))
+    return np.asarray(values)
+
+
+def full_vector(problem: Problem, y: FloatArray) -> FloatArray:
+    """All parameters (…, p) in physical units for search coordinates (…, f)."""
+    theta = np.broadcast_to(problem.fixed, (*y.shape[:-1], problem.fixed.size)).copy()
+    theta[..., problem.free] = untransform(problem, y)
+    return theta
+
+
+def derivative_of_values(problem: Problem, y: FloatArray) -> FloatArray:
+    """d value/d y (f,) at y: for carrying a covariance into physical units."""
+    values = untransform(problem, y)
+    slope = values.copy()
+    at = np.flatnonzero(problem.free == D_1)
+    slope[at] = values[at] * (1.0 - values[at] / problem.window.wheelbase_m)
+    return slope
+
+
+Rows = Callable[[FloatArray], FloatArray]
+"""Residual rows (k, m) at points (k, f); a row that is not finite marks an impossible point."""
+
+
+def begin(rows: Rows, y: FloatArray, differences: Differences = FORWARD) -> State:
+    """The state at search coordinates `y` (f,) of any least-squares problem."""
+    residual = rows(y[None, :])[0]
+    jacobian = _jacobian(rows, y, residual, differences)
+    return State(y, residual, jacobian, _square(residual), _FIRST_DAMPING, differences)
+
+
+def descend(rows: Rows, state: State) -> tuple[State, Info]:
+    """One Levenberg-Marquardt step of any problem: damping grows until the objective falls."""
+    if not (np.isfinite(state.objective) and np.all(np.isfinite(state.jacobian))):
+        return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.NOT_FINITE)
+    scale = np.linalg.norm(state.jacobian, axis=0)
+    scale[scale == 0.0] = 1.0
+    (r,) = qr(np.column_stack([state.jacobian / scale, state.residual]), mode="r")
+    f = state.y.size
+    triangle, projected = r[:f, :f], r[:f, f]
+    # Where even the full linear step promises next to nothing, the search is at the bottom.
+    if _square(projected) <= state.differences.converged_gain * state.objective:
+        return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.CONVERGED)
+    damping = state.damping
+    evaluations = 0
+    while damping < _GIVE_UP_DAMPING:
+        change = _damped(triangle, projected, damping) / scale
+        size = float(np.abs(change).max())
+        if size > _LARGEST_STEP:
+            change *= _LARGEST_STEP / size
+            size = _LARGEST_STEP
+        trial = state.y + change
+        residual = rows(trial[None, :])[0]
+        objective = _square(residual)
+        evaluations += 1
+        # False for NaN too.
+        if objective < state.objective * (1.0 + state.differences.rounding):
+            eased = max(damping * 0.1, _SMALLEST_DAMPING)
+            jacobian = _jacobian(rows, trial, residual, state.differences)
+            evaluations += _evaluations(state.differences, f)
+            ending = Ending.CONVERGED if size < _CONVERGED_STEP else None
+            return (
+                State(trial, residual, jacobian, objective, eased, state.differences),
+                Info(objective, size, damping, True, evaluations, ending),
+            )
+        if size < _CONVERGED_STEP:
+            return state, Info(state.objective, size, damping, False, evaluations, Ending.CONVERGED)
+        damping *= 10.0
+    return state, Info(state.objective, 0.0, damping, False, evaluations, Ending.STUCK)
+
+
+def _square(residual: FloatArray) -> float:
+    return float(residual @ residual)
+
+
+def _jacobian(
+    rows: Rows, y: FloatArray, residual: FloatArray, differences: Differences
+) -> FloatArray:
+    moves = differences.step * np.eye(y.size)
+    if not differences.central:
+        return np.asarray(((rows(y + moves) - residual) / differences.step).T)
+    ahead, behind = np.split(rows(np.vstack([y + moves, y - moves])), 2)
+    return np.asarray(((ahead - behind) / (2.0 * differences.step)).T)
+
+
+def _evaluations(differences: Differences, f: int) -> int:
+    return 2 * f if differences.central else f
+
+
+def _damped(triangle: FloatArray, projected: FloatArray, damping: float) -> FloatArray:
+    """Minimiser of |R x + p|^2 + damping |x|^2."""
+    f = projected.size
+    stacked = np.vstack([triangle, np.sqrt(damping) * np.eye(f)])
+    q, small = qr(stacked, mode="economic")
+    return np.asarray(solve_triangular(small, q.T @ np.concatenate([-projected, np.zeros(f)])))
+
+
+def _rows_of(problem: Problem, work: Workspace) -> Rows:
+    return lambda y: residual_batch(problem.window, work, full_vector(problem, y))
+
+
+def init(problem: Problem, work: Workspace, start: FloatArray) -> State:
+    """Begin at the free parameters `start` (f,) in physical units."""
+    return begin(_rows_of(problem, work), transform(problem, start))
+
+
+def step(problem: Problem, work: Workspace, state: State) -> tuple[State, Info]:
+    """One step on the paper's residual; at the bottom forward differences give way to central ones.
+
+    So the way costs no more than it must, and where it ends does not depend on the processor.
+    """
+    rows = _rows_of(problem, work)
+    state, info = descend(rows, state)
+    if state.differences.central or info.ending not in (Ending.CONVERGED, Ending.STUCK):
+        return state, info
+    jacobian = _jacobian(rows, state.y, state.residual, CENTRAL)
+    polished = state._replace(jacobian=jacobian, differences=CENTRAL)
+    evaluations = info.evaluations + _evaluations(CENTRAL, state.y.size)
+    return polished, info._replace(evaluations=evaluations, ending=None)
+
+
+def covariance(state: State) -> FloatArray:
+    """Gauss-Newton covariance (f, f) of y, scaled by the residual's own variance.
+
+    It takes the rows for independent, which double-integrated sensor noise is not: a formal figure,
+    not an uncertainty.
+    """
+    rows, f = state.jacobian.shape
+    scale = np.linalg.norm(state.jacobian, axis=0)
+    scale[scale == 0.0] = 1.0
+    (r,) = qr(state.jacobian / scale, mode="r")
+    inverse = solve_triangular(r[:f], np.eye(f)) / scale[:, None]
+    return np.asarray(inverse @ inverse.T * state.objective / max(1, rows - f))

@@ -1,0 +1,1 @@
+"""The bus: sessions, publishers, subscriptions, delivery, playback and credentials (Zenoh)."""

@@ -1,0 +1,344 @@
+"""`driveby demo`: logger, worker and truck as three processes, and what comes of them.
+
+A crossing of the paper's scenario 6 (element 4 at 40 %) is simulated, played as a truck that drives
+now, recorded by the logger, identified by the worker, received by this process as a subscriber to
+the live result, and drawn.
+"""
+
+import contextlib
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.paper import experiment
+from schemas.messages import decode
+from schemas.proto import driveby_pb2 as pb
+from schemas.results import Crossing, estimate_to_crossing
+from schemas.site import Site, site_toml
+from services.bus.session import Received, Subscription, open_session
+from services.common.errors import FailureError, InputError
+from services.common.files import write_atomically
+from services.recordings.recording import read_info, read_messages
+from services.simulation.drive import Drive, declared, paper_site, simulate_drive, write_drive
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+Floats = NDArray[np.float64]
+
+SCENARIO = 6
+REALM = "sim-demo"
+ROAD_CLASS = "A"
+SEED = 1
+_READY_S = 60.0
+"""The worker may have to compile its kernels first."""
+_RESULT_S = 60.0
+_STOP_S = 10.0
+_RECORDING, _RESULTS, _VIEWS, _FIGURE = "recording.mcap", "results.mcap", "demo.rrd", "demo.png"
+
+
+class _Services(NamedTuple):
+    endpoint: str
+    site: Path
+    folder: Path
+    method: str
+
+
+def demo_command(*, out: Path | None, speed: float, noise: float, console: "Console") -> int:
+    """Run the demonstration; 0 only if the crossing was recorded, identified and received.
+
+    With a `noise` in µg/√Hz the receiver errs as real ones do, too; with zero everything is exact,
+    and the method is the one that knows of no noise.
+
+    FailureError says which of them did not happen. InputError: the folder exists.
+    """
+    folder = _new_folder(out)
+    try:
+        return _run(folder, speed, noise, console)
+    except KeyboardInterrupt:
+        shutil.rmtree(folder, ignore_errors=True)  # half a demo is of no use to anybody
+        raise
+
+
+def _run(folder: Path, speed: float, noise: float, console: "Console") -> int:
+    began = time.monotonic()
+    with (
+        _terminated_as_interrupted(),
+        console.status("simulating a crossing of the paper's bridge", spinner="dots") as status,
+    ):
+        site = declared(paper_site(), noise, 1000.0)
+        drive = simulate_drive(
+            site,
+            experiment.scenario_ratios(SCENARIO),
+            road_class=ROAD_CLASS,
+            seed=SEED,
+            noise_ug_per_rthz=noise,
+            receiver_errors=noise > 0.0,
+        )
+        with tempfile.TemporaryDirectory(prefix="driveby-demo-") as temporary:
+            source = Path(temporary) / "drive.mcap"
+            sent = write_drive(source, drive, site)
+            site_path = Path(temporary) / "site.toml"
+            write_atomically(site_path, site_toml(site))
+            method = "pre" if noise > 0.0 else "least-squares"
+            services = _Services(_free_endpoint(), site_path, folder, method)
+            crossing = _live(services, source, speed, status.update)
+        _check_recording(folder / _RECORDING, sent)
+        status.update("drawing")
+        _draw(folder, crossing, drive, site)
+    _print(console, crossing, drive, site)
+    _say_where(console, folder, time.monotonic() - began)
+    return 0
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM ends the processes too, as Ctrl-C does, instead of leaving them behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _new_folder(out: Path | None) -> Path:
+    moment = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
+    folder = out or Path("recordings") / f"demo-{moment}"
+    try:
+        folder.mkdir(parents=True, exist_ok=False)
+    except FileExistsError:
+        raise InputError(f"{folder}: exists, the demo wants a new folder") from None
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+    return folder
+
+
+def _free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _live(services: _Services, source: Path, speed: float, say: Callable[[str], None]) -> Crossing:
+    """Run the three processes until the result has come over the bus; return it."""
+    endpoint, site, folder, method = services
+    common = ["--realm", REALM, "--site", str(site)]
+    say("starting the logger, which hosts the router")
+    with contextlib.ExitStack() as stack:
+        logger = stack.enter_context(
+            _process(
+                folder, "logger", "--listen", endpoint, "--file", str(folder / _RECORDING), *common
+            )
+        )
+        bus = stack.enter_context(open_session(connect=endpoint, timeout_s=_READY_S))
+        health = stack.enter_context(
+            Subscription(bus, f"driveby/v1/{REALM}/service/worker/health", capacity=100)
+        )
+        bridge = stack.enter_context(
+            Subscription(bus, f"driveby/v1/{REALM}/bridge/**", capacity=1000)
+        )
+        say("starting the worker (the very first start compiles its kernels)")
+        worker = stack.enter_context(
+            _process(
+                folder,
+                "worker",
+                *("--endpoint", endpoint, "--file", str(folder / _RESULTS), "--method", method),
+                *common,
+            )
+        )
+        _wait(health, lambda received: True, [logger, worker], _READY_S, "the worker is not ready")
+        say(f"the truck drives, at {speed:g} times real speed")
+        truck = stack.enter_context(
+            _process(
+                folder,
+                "truck",
+                str(source),
+                *("--endpoint", endpoint, "--realm", REALM, "--speed", f"{speed:g}"),
+            )
+        )
+
+        def is_estimate(received: Received) -> bool:
+            if received.key().stream == "crossing":
+                state = decode("driveby.v1.Crossing", received.payload)
+                assert isinstance(state, pb.Crossing)  # noqa: S101 - `decode` made it so
+                say(f"crossing {pb.CrossingState.Name(state.state).lower().replace('_', ' ')}")
+            return received.key().stream == "estimate"
+
+        estimate = _wait(
+            bridge, is_estimate, [logger, worker, truck], _RESULT_S, "no result was received"
+        )
+        say("stopping")
+        _finish(truck, None)
+        _finish(worker, signal.SIGTERM)
+        health.close()
+        bridge.close()
+        bus.close()  # type: ignore[no-untyped-call]
+        _finish(logger, signal.SIGTERM)
+    crossing, _ = estimate_to_crossing(pb.Estimate.FromString(estimate.payload))
+    if crossing.parameters is None:
+        raise FailureError(f"the crossing was rejected: {' '.join(crossing.reason_texts)}")
+    return crossing
+
+
+class _Running(NamedTuple):
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+
+@contextlib.contextmanager
+def _process(folder: Path, name: str, *arguments: str) -> Iterator[_Running]:
+    """Start a sub-command as a process of its own; its log stays in the folder if it fails."""
+    log = folder / f"{name}.log"
+    with log.open("wb") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "services", name, *arguments],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+        )
+    try:
+        yield _Running(name, process, log)
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+    log.unlink()
+
+
+def _wait(
+    subscription: Subscription,
+    wanted: Callable[[Received], bool],
+    running: list[_Running],
+    timeout_s: float,
+    otherwise: str,
+) -> Received:
+    """The first message wanted; FailureError if a process dies or the time runs out."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        received = subscription.receive(0.1)
+        if received is not None and wanted(received):
+            return received
+        for one in running:
+            # A truck that has driven may leave; a service may not, however well it ended.
+            if one.process.poll() not in (None, 0 if one.name == "truck" else None):
+                raise FailureError(f"the {one.name} ended early: {_last_line(one.log)}")
+    raise FailureError(f"{otherwise} after {timeout_s:.0f} s; see the logs beside {running[0].log}")
+
+
+def _finish(running: _Running, with_signal: signal.Signals | None) -> None:
+    if with_signal is not None:
+        running.process.send_signal(with_signal)
+    try:
+        code = running.process.wait(timeout=_STOP_S)
+    except subprocess.TimeoutExpired:
+        raise FailureError(f"the {running.name} does not end; see {running.log}") from None
+    if code != 0:
+        raise FailureError(f"the {running.name} ended with {code}: {_last_line(running.log)}")
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return lines[-1] if lines else f"see {log}"
+
+
+def _check_recording(path: Path, sent: int) -> None:
+    """Every message of the truck is in the recording, which was closed properly."""
+    info = read_info(path)
+    recorded = sum(count for key, count in info.messages.items() if "/vehicle/" in key)
+    if info.end is None or info.truncated or recorded != sent:
+        raise FailureError(f"{path}: holds {recorded} of the truck's {sent} messages")
+
+
+def _draw(folder: Path, crossing: Crossing, drive: Drive, site: Site) -> None:
+    from services.viewer.crossing_view import view_of_crossing
+    from services.viewer.figure import crossing_figure
+    from services.viewer.rerun_file import signals_of_messages
+    from services.viewer.view import write_views
+
+    write_views(
+        folder / _VIEWS,
+        vehicles=signals_of_messages(read_messages(folder / _RECORDING)),
+        crossings=[crossing],
+        site=site,
+    )
+    crossing_figure(
+        folder / _FIGURE,
+        crossing=view_of_crossing(crossing, site.bridge(crossing.bridge)),
+        element_truth=drive.rigidity_ratios.tolist(),
+        road_truth=_true_road(crossing, drive),
+    )
+
+
+def _true_road(crossing: Crossing, drive: Drive) -> tuple[Floats, Floats] | None:
+    """The road under the wheels, with level, slope and curvature of the estimate.
+
+    Integrated accelerations do not show these three; the rest can be compared.
+    """
+    if crossing.road is None:
+        return None
+    x = np.array(crossing.road.x_m)
+    height = np.interp(x, drive.road.x_m, drive.road.height_m)
+    apart = height - np.array(crossing.road.mean_m)
+    return x, height - np.polynomial.Polynomial.fit(x, apart, 2)(x)
+
+
+def _print(console: "Console", crossing: Crossing, drive: Drive, site: Site) -> None:
+    from rich.table import Table
+
+    parameters = crossing.parameters or {}
+    nominal = site.bridge(crossing.bridge).nominal_flexural_rigidity_nm2
+    has_meaning = "no_noise_model" not in crossing.reasons
+    table = Table(title="Flexural rigidity as a ratio to the sound bridge", title_justify="left")
+    table.add_column("element")
+    for heading in ("truth", "estimate", "interval (95 %)", "holds the truth"):
+        table.add_column(heading, justify="right")
+    for number, (sound, truth) in enumerate(
+        zip(nominal, drive.rigidity_ratios, strict=True), start=1
+    ):
+        p = parameters.get(f"EI_{number}")
+        if p is None:
+            table.add_row(f"EI_{number}", f"{truth:.3f}", "—", "—", "—")
+            continue
+        interval, holds = "means nothing *", "—"
+        if has_meaning:
+            interval = f"{p.q025 / sound:.3f} … {p.q975 / sound:.3f}"
+            holds = "yes" if p.q025 <= truth * sound <= p.q975 else "no"
+        table.add_row(f"EI_{number}", f"{truth:.3f}", f"{p.mean / sound:.3f}", interval, holds)
+    console.print(table)
+    if not has_meaning:
+        console.print(
+            "* The method least-squares has no noise model, so it cannot say how sure it is.",
+            highlight=False,
+        )
+    if not crossing.reasons:
+        console.print(f"verdict {crossing.verdict}", highlight=False)
+    for code, text in zip(crossing.reasons, crossing.reason_texts, strict=True):
+        console.print(f"verdict {crossing.verdict} ({code}): {text}", highlight=False)
+
+
+def _say_where(console: "Console", folder: Path, seconds: float) -> None:
+    lines = [
+        f"\n{folder}/ ({seconds:.0f} s)",
+        f"  {_RECORDING:<16} what the logger recorded; driveby identify {folder / _RECORDING}",
+        f"  {_RESULTS:<16} what the worker found; results.json is the same as text",
+        f"  {_VIEWS:<16} everything in pictures; driveby view {folder / _VIEWS}",
+        f"  {_FIGURE:<16} flexural rigidity and road profiles at a glance",
+    ]
+    for line in lines:
+        console.print(line, highlight=False, soft_wrap=True)

@@ -1,0 +1,39 @@
+"""`driveby recover`: a damaged recording becomes one that every reader opens."""
+
+import json
+from pathlib import Path
+
+from services.common.errors import InputError
+from services.recordings.recovery import (
+    Recovery,
+    describe,
+    put_aside,
+    recover_recording,
+    recovered_path,
+)
+
+EXIT_CLEAN, EXIT_LOSSY = 0, 3
+
+
+def recover_command(
+    *, source: Path, output: Path | None, set_aside: bool, as_json: bool
+) -> tuple[int, str]:
+    """Recover one recording; return 0 (nothing was lost) or 3, and a line that says what was found.
+
+    Writes to `output`, or beside the recording. With `set_aside` the damaged file is then renamed
+    to `….mcap.crashed`, so that a folder holds every recording once. InputError and FailureError
+    as of `recover_recording`; then nothing has changed.
+    """
+    if set_aside and output is not None:
+        raise InputError("--set-aside goes with the usual name beside the recording, not with -o")
+    target = output or recovered_path(source)
+    recovery = recover_recording(source, target)
+    if set_aside:
+        put_aside(source)
+    plain = f"{target}: {describe(recovery)}"
+    line = json.dumps(_as_json(target, recovery)) if as_json else plain
+    return EXIT_LOSSY if recovery.is_lossy else EXIT_CLEAN, line
+
+
+def _as_json(target: Path, recovery: Recovery) -> dict[str, object]:
+    return {"recording": str(target)} | recovery._asdict() | {"lossy": recovery.is_lossy}

@@ -1,0 +1,128 @@
+"""`driveby validate --method pre`: runs all parts, prints their tables, writes page and figure."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from schemas.site import load_site
+from services.cli.progress import progress_bar
+from services.cli.validate_paper import make_folder
+from services.common.files import check_writable, write_atomically
+from services.simulation.drawn import default_site
+from services.validation.calibration import Check, by_condition, ranks_of, scores
+from services.validation.uncertainty import (
+    Outcome,
+    aims,
+    as_json,
+    largest_z,
+    noises,
+    number,
+    percent,
+    reasons_of,
+    run_parts,
+    scenario_rows,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def validate_pre_command(
+    *,
+    crossings: int,
+    control: int,
+    scenarios: tuple[int, ...],
+    folder: Path,
+    site: Path | None,
+    processes: int,
+    json_path: Path | None,
+    figures: Path | None,
+    page: Path | None,
+    console: "Console",
+) -> int:
+    """Run all parts, print their tables, write what was asked for; 1 if an aim was missed."""
+    for path in (json_path, page):
+        if path is not None:
+            check_writable(path)
+    if figures is not None:
+        make_folder(figures)
+    known = default_site() if site is None else load_site(site)
+    with progress_bar(console) as bar:
+        task = bar.add_task("crossings", total=None)
+        outcome = run_parts(
+            known,
+            crossings=crossings,
+            control=control,
+            scenarios=scenarios,
+            folder=folder,
+            processes=processes,
+            progress=lambda done, jobs: bar.update(task, completed=done, total=jobs),
+        )
+    if json_path is not None:
+        write_atomically(json_path, json.dumps(as_json(outcome), indent=1) + "\n")
+    if figures is not None and len(outcome.drawn) > 1:
+        from services.validation.calibration_figure import calibration_figure
+
+        calibration_figure(
+            figures / "calibration.png",
+            scores(outcome.drawn),
+            ranks_of(outcome.drawn),
+            f"{len(outcome.drawn)} simulated crossings whose truth was drawn from the priors",
+        )
+    if page is not None:
+        from services.validation.page import validation_page
+
+        write_atomically(page, validation_page(outcome))
+    all_checks = aims(outcome)
+    print_outcome(console, outcome, all_checks)
+    return 0 if all(check.is_met for check in all_checks) else 1
+
+
+def print_outcome(console: "Console", outcome: Outcome, all_checks: list[Check]) -> None:
+    """The tables of all parts, at most 80 characters wide, and the aims."""
+    from rich.table import Table
+
+    def table(*columns: str) -> Table:
+        made = Table(box=None, pad_edge=False, header_style="bold")
+        for k, column in enumerate(columns):
+            made.add_column(column, justify="left" if k == 0 else "right", no_wrap=True)
+        return made
+
+    if len(outcome.drawn) > 1:
+        console.print("[bold]crossings drawn from the priors[/]", highlight=False)
+        shown = table("", "crossings", "good", "coverage", "rms z")
+        for name, count, good, covered, rms in by_condition(outcome.drawn):
+            shown.add_row(name, str(count), f"{good:.0%}", percent(covered), number(rms))
+        console.print(shown)
+        for text in reasons_of(outcome.drawn):
+            console.print(f"  {text}", highlight=False)
+    if outcome.scenarios:
+        console.print("[bold]the paper's scenarios, EI / sound EI[/]", highlight=False)
+        shown = table(
+            "scenario", "element", "truth", "paper", *(f"{n:g} µg" for n in noises(outcome))
+        )
+        for row in scenario_rows(outcome):
+            shown.add_row(*row)
+        console.print(shown)
+    for line in outcome.judged:
+        worst = largest_z(line)
+        console.print(
+            f"{line['folder']} run {line['run']}: {line['verdict']}, chi2 "
+            f"{number(line['chi2_per_dof'])}, largest |z| {number(worst)}",
+            highlight=False,
+        )
+    if outcome.judged_from is None:
+        console.print("no crossings of an independent simulator here: that part is left out")
+    shown = table("aim", "measured", "from", "to", "")
+    for check in all_checks:
+        measured = "none" if check.measured is None else f"{check.measured:.3f}"
+        style = None if check.is_met else "bold red"
+        shown.add_row(
+            check.name,
+            f"{measured} {check.note}".strip(),
+            f"{check.low:g}",
+            f"{check.high:g}",
+            "met" if check.is_met else "MISSED",
+            style=style,
+        )
+    console.print(shown)

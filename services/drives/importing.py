@@ -1,0 +1,93 @@
+"""`driveby import`: files of a drive become a recording."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from schemas.site import Site, parse_site, read_site_text
+from services.common.errors import InputError
+from services.common.files import check_writable
+from services.common.naming import checked_identifier, identifier_from
+from services.drives.comma2k19 import is_comma2k19, read_comma2k19
+from services.drives.csv_import import read_folder, read_pair
+from services.drives.runs import Run, normalised, run_to_messages
+from services.recordings.recording import Message, write_recording
+
+_LARGEST_RATE_ERROR = 0.05
+
+
+def import_command(
+    *, sources: list[Path], site: Path, output: Path, vehicle: str | None, name: str | None
+) -> str:
+    """Write the recording of a folder, or of a pair of CSV files; return a line that says so.
+
+    Nothing is written if anything is wrong (InputError).
+    """
+    check_writable(output)
+    text = read_site_text(site)
+    parsed = parse_site(text, str(site))
+    vehicle_id = _vehicle(parsed, site, vehicle)
+    realm = _realm(sources, name)
+    runs = _read(sources, parsed, site)
+    messages = write_recording(
+        output,
+        run_to_messages(runs, parsed, realm, vehicle_id),
+        site_toml=text,
+        reason="import complete",
+    )
+    drives = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+    seconds = sum(float(run.accel_time_s[-1] - run.accel_time_s[0]) for run in runs)
+    return (
+        f"{output}: {drives} of {vehicle_id}, {seconds:.1f} s, {messages} messages, realm {realm}"
+    )
+
+
+def messages_of(folder: Path, site: Path, vehicle: str | None) -> Iterator[Message]:
+    """Return what `import_command` would write of a folder of CSV files or of comma2k19."""
+    parsed = parse_site(read_site_text(site), str(site))
+    vehicle_id = _vehicle(parsed, site, vehicle)
+    return run_to_messages(
+        _read([folder], parsed, site), parsed, _realm([folder], None), vehicle_id
+    )
+
+
+def _read(sources: list[Path], site: Site, site_path: Path) -> list[Run]:
+    if len(sources) == 1 and sources[0].suffix == ".csv":
+        raise InputError(f"{sources[0]}: the positions are missing, give accel.csv and gps.csv")
+    if len(sources) == 1 and is_comma2k19(sources[0]):
+        return [read_comma2k19(sources[0])]  # knows its axes and its rate itself
+    if len(sources) == 1:
+        runs = read_folder(sources[0])
+    elif len(sources) == 2:
+        runs = [read_pair(*sources)]
+    else:
+        raise InputError(f"{len(sources)} files given, a folder or accel.csv gps.csv expected")
+    for run in runs:
+        _check_rate(run, site, site_path)
+    return [normalised(run, site.sensor) for run in runs]
+
+
+def _check_rate(run: Run, site: Site, site_path: Path) -> None:
+    """Times in the wrong unit and the wrong site file show in the rate."""
+    declared = site.sensor.rate_hz
+    if not any(abs(run.rate_hz / rate - 1) <= _LARGEST_RATE_ERROR for rate in declared):
+        raise InputError(
+            f"{run.source}: time_s gives a rate of {run.rate_hz:g} Hz, but sensor.rate_hz of "
+            f"{site_path} is {declared[0]:g} Hz, one of them must be mended"
+        )
+
+
+def _vehicle(site: Site, path: Path, wanted: str | None) -> str:
+    known = [vehicle.id for vehicle in site.vehicles]
+    if wanted is None and len(known) == 1:
+        return known[0]
+    if wanted in known:
+        return wanted
+    problem = "holds several vehicles" if wanted is None else f"holds no vehicle {wanted}"
+    raise InputError(f"{path}: {problem}, choose with --vehicle one of {', '.join(known)}")
+
+
+def _realm(sources: list[Path], name: str | None) -> str:
+    if name is not None:
+        return f"import-{checked_identifier(name, '--name')}"
+    first = sources[0].resolve()
+    return f"import-{identifier_from((first.parent if first.suffix == '.csv' else first).name)}"

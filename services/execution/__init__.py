@@ -1,0 +1,1 @@
+"""Where identifications run: here, in processes, or elsewhere."""

@@ -1,0 +1,140 @@
+"""Compiles the numerical kernels ahead of time: `python -m services.execution.warm_up`.
+
+numba keeps the compiled form beside the sources, for every later start of any command. It notices
+that a kernel's own file has changed, but not that another kernel, which it has inlined, has: so
+everything is compiled anew when any source is newer than what was compiled from it.
+
+`make install` ends with this. An installation must not fail for want of a cache (a read-only
+folder, a processor that the compiler does not know): the first command then compiles for itself.
+"""
+
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pre_core import unknowns
+from pre_core.crossing import optimum, posterior
+from pre_core.paper import experiment, random_walk, residual
+from pre_core.paper.crossing import paper_window
+from pre_core.paper.integrate import spline_integrate
+from pre_core.physics.simulate import constant_speed
+from pre_core.physics.vehicle import total_mass_kg
+from pre_core.search import levenberg_marquardt, loop
+
+PACKAGE = Path(__file__).parents[2] / "pre_core"
+_SOUND = experiment.beam(np.ones(experiment.ELEMENTS))
+
+
+def main() -> int:
+    """Compile what is not compiled yet and say so in one line; the exit code is always 0."""
+    began = time.perf_counter()
+    try:
+        _forget_stale(PACKAGE)
+        warm_up()
+        _warm_up_validation()
+    except Exception as error:  # noqa: BLE001, RUF100 - see the module's docstring
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        sys.stdout.write(f"kernels not compiled, the first command will do it ({what})\n")
+    else:
+        sys.stdout.write(f"kernels compiled ({time.perf_counter() - began:.0f} s)\n")
+    return 0
+
+
+def warm_up() -> None:
+    """Run every kernel of an identification once, whatever its method, on crossings of noise.
+
+    For who must not wait for a compiler when the first truck comes.
+    """
+    _warm_up_pre()
+    _warm_up_paper()
+
+
+def _warm_up_pre() -> None:
+    """The kernels of method `pre`, on four seconds of noise at 10 m/s."""
+    nominal = unknowns.from_models(experiment.TRUCK, _SOUND)
+    step_s, count = 0.002, 2700
+    time_s = step_s * np.arange(0, count, 50, dtype=np.float64)
+    fixes = posterior.Fixes(
+        time_s, experiment.SPEED_M_PER_S * time_s - 10.0, np.full(time_s.size, 10.0), 0.4, 0.07, 1.5
+    )
+    inputs = optimum.Inputs(
+        np.random.default_rng(0).standard_normal((4, count)),
+        0.0,
+        step_s,
+        1,
+        experiment.SPAN_M,
+        np.full(experiment.ELEMENTS, experiment.SPAN_M / experiment.ELEMENTS),
+        total_mass_kg(experiment.TRUCK),
+        1.0,
+        np.full(4, 1e-3),
+        500.0,
+        fixes,
+        posterior.Priors(
+            nominal,
+            np.full(nominal.size, 0.1),
+            experiment.TRUCK.wheelbase_m,
+            0.002,
+            0.01,
+            0.01,
+            0.0005,
+        ),
+        2,
+        1,
+    )
+    problem, y = optimum.prepare(inputs)
+    posterior.all_rows(problem, y[None, :])
+    posterior.roads(problem, y)
+
+
+def _warm_up_paper() -> None:
+    """The kernels of the paper's residual and of its searches, on noise from five metres before."""
+    step_s = 0.01
+    motion = constant_speed(-5.0, experiment.SPEED_M_PER_S, 450, step_s)
+    window = residual.build_window(
+        np.random.default_rng(0).standard_normal((4, motion.position_m.size)),
+        step_s,
+        motion.position_m,
+        1,
+        element_lengths_m=np.full(experiment.ELEMENTS, experiment.SPAN_M / experiment.ELEMENTS),
+        total_mass_kg=total_mass_kg(experiment.TRUCK),
+        wheelbase_m=experiment.TRUCK.wheelbase_m,
+        integrate=spline_integrate,
+        initial_state_known=False,
+        bias_known=False,
+    )
+    theta = unknowns.from_models(experiment.TRUCK, _SOUND)
+    free = unknowns.paper_subset(experiment.ELEMENTS)
+    problem = levenberg_marquardt.Problem(window, theta, free)
+    work = residual.workspace(window)
+    loop.run(
+        partial(levenberg_marquardt.init, problem, work, theta[free]),
+        partial(levenberg_marquardt.step, problem, work),
+        1,
+    )
+    residual.objective(window, work, theta)
+    walk = random_walk.problem(window, theta, free, 0, threads=1)
+    random_walk.step(walk, random_walk.init(walk, particles=1))
+
+
+def _warm_up_validation() -> None:
+    """What else a simulation and a reproduction of the paper call."""
+    window = paper_window(experiment.TRUCK, _SOUND, 0.0, 0)
+    nominal = unknowns.from_models(experiment.TRUCK, _SOUND)
+    free = unknowns.paper_subset(experiment.ELEMENTS)
+    walk = random_walk.problem(window, nominal, free, 0, threads=1)
+    random_walk.step(walk, random_walk.init(walk, particles=1))
+
+
+def _forget_stale(package: Path) -> None:
+    newest = max(source.stat().st_mtime for source in package.rglob("*.py"))
+    compiled = [*package.rglob("__pycache__/*.nbi"), *package.rglob("__pycache__/*.nbc")]
+    if any(file.stat().st_mtime < newest for file in compiled):
+        for file in compiled:
+            file.unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

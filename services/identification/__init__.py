@@ -1,0 +1,1 @@
+"""From messages to crossings and from a crossing to a result. No I/O, no clock."""

@@ -1,0 +1,211 @@
+"""Whether an answer can be trusted: from signals, site and fit to the reasons against it.
+
+`reasons_before_fit` looks at the four accelerations alone, by the physics that any truck obeys;
+`reasons_after_fit` at what the fit leaves over. What is measured is in
+`pre_core.diagnostics.quality`; here are the thresholds, each with what it was measured to be on
+sound crossings and on broken ones (docs/verdicts.md).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.diagnostics import quality
+from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2, Motion
+from schemas.reasons import Reason
+from schemas.site import Vehicle
+from services.identification.crossing_data import CrossingData, Floats
+
+# Before the fit. Sound: 300 drawn crossings, none accused (docs/verdicts.md).
+_LONGEST_HOLD_S = 0.2
+"""Noise and motion change every sample; a coarse converter (12 bits) holds one for 0.03 s."""
+_ALIKE = 1e-3
+"""Two channels that differ by less than this part of what they show are one."""
+_PILE_UP = 8.0
+_PILE_VISITS = 3
+"""Sound: at most 5.8 over three visits; a range of half of what is needed: 12 to 67."""
+_REPEATS = 4
+_SPIKE_HEIGHT = 20.0
+"""Over the typical distance from the neighbours. Sound: at most 7."""
+_LARGEST_MEAN_M_PER_S2 = 0.3 * STANDARD_GRAVITY_M_PER_S2
+"""No truck falls for seconds: a mean of this size is gravity or a broken sensor."""
+_UNEXPLAINED = 0.3
+_BETTER = 0.5
+"""Part of the body's motion that the body equations leave over. Sound: at most 0.10; two channels
+exchanged or one inverted: at least 0.36, and then at most 0.10 once they are put right."""
+_LEAD = 0.6
+"""Correlation of what both axles feel at one place. Sound: 0.71 to 0.99 (with the axles exchanged:
+-0.72 to 0.49)."""
+
+
+# After the fit.
+_BANDS_HZ = np.array([0.0, 6.0, 12.0, 30.0, np.inf])
+"""What bridge, body and wheels do lies mostly in the first three; the rest is noise."""
+_FALSE_ALARM_Z = 4.5
+"""Of 36 cells, by chance above it in 1e-4 of the crossings."""
+_SLACK = (1.35, 1.35, 1.35, 1.15)
+"""So many times the declared noise power a band may have: its density is a data sheet's, and the
+1/f noise of a sensor is not declared."""
+_NOISY = 1.2
+"""From here on a kind of residual is called noisier than declared, if it is white."""
+_GOOD_CHI2 = 1.25
+_SMALLEST_CHI2 = 0.6
+_LARGEST_VEHICLE_Z = 4.0
+_LARGEST_POSITION_Z = 4.0
+_ALIKE_LOADS = 0.1
+_UNINFORMED = 0.8
+
+ROAD, BODY_FRONT, BODY_REAR = range(3)
+BEFORE, ON, AFTER = range(3)
+
+
+class Fit(NamedTuple):
+    """What is left over by a fit of method `pre`."""
+
+    white: Floats
+    """(m, 3): mismatch of the roads, front and rear body equation, of unit variance by the noise
+    that the site file declares. Not inflated."""
+    step_s: float
+    """Between rows."""
+    place_m: Floats
+    """(m,) chainage at which a row compares the roads: the rear axle's at the row's middle."""
+    chi2_per_dof: float
+    prior_z: dict[str, float]
+    """Unknowns of the truck in multiples of their prior's spread: c_s1 … kappa, wheelbase."""
+    position_z: float
+    """The receiver's slow error in multiples of its spread."""
+    rigidity_spread: Floats
+    """(elements,) standard deviation of ln EI, over the prior's."""
+
+
+def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
+    """What the fit says against its own answer, the most telling first; empty if nothing does."""
+    reasons = _of_the_rows(data, fit)
+    if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > _LARGEST_VEHICLE_Z:
+        reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
+    if abs(fit.position_z) > _LARGEST_POSITION_Z:
+        reasons.append(Reason.POSITION_INCONSISTENT)
+    if fit.rigidity_spread.min() > _UNINFORMED and _loads_are_alike(data.vehicle):
+        reasons.append(Reason.AXLES_ALIKE)
+    return reasons
+
+
+def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
+    stretch = _stretches(data, fit)
+    found = quality.cells(fit.white, stretch, fit.step_s, _BANDS_HZ)
+    suspicious = {
+        key: cell
+        for key, cell in found.items()
+        if quality.cell_excess(cell, _SLACK[key[2]]) > _FALSE_ALARM_Z
+    }
+    reasons: list[Reason] = []
+    if suspicious and _is_only_noise(found):
+        reasons.append(Reason.NOISE_ABOVE_DECLARED)
+    elif suspicious or fit.chi2_per_dof > _GOOD_CHI2:
+        if fit.chi2_per_dof > _GOOD_CHI2:
+            reasons.append(Reason.MODEL_MISFIT)
+        else:
+            reasons.append(Reason.RESIDUALS_COLOURED)
+    if fit.chi2_per_dof < _SMALLEST_CHI2:
+        reasons.append(Reason.NOISE_BELOW_DECLARED)
+    return reasons
+
+
+def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:
+    """Whether a row compares the roads before, on or behind the bridge (m,)."""
+    span = data.bridge.span_m
+    travelled = fit.place_m if data.stay.direction > 0 else span - fit.place_m
+    return np.where(travelled < 0.0, BEFORE, np.where(travelled > span, AFTER, ON)).astype(np.int64)
+
+
+def _is_only_noise(found: dict[tuple[int, int, int], quality.Cell]) -> bool:
+    """Whether the rows are like noise of more power than declared, and of nothing else.
+
+    That power is read off the highest band, where there is nothing but noise; it may differ from
+    kind to kind, as the sensors do, and must be found everywhere else.
+    """
+    top = _BANDS_HZ.size - 2
+    powers = []
+    for kind in (ROAD, BODY_FRONT, BODY_REAR):
+        parts = {key: cell for key, cell in found.items() if key[0] == kind}
+        noise = quality.joined([cell for key, cell in parts.items() if key[2] == top])
+        power = max(noise.mean_square, 1.0)
+        powers.append(power)
+        for key, cell in parts.items():
+            if quality.cell_excess(cell, power * _SLACK[key[2]]) > _FALSE_ALARM_Z:
+                return False
+    return max(powers) > _NOISY
+
+
+def _loads_are_alike(vehicle: Vehicle) -> bool:
+    share = vehicle.front_axle_to_cg_m / vehicle.wheelbase_m
+    front = vehicle.sprung_mass_kg * (1.0 - share) + vehicle.unsprung_mass_kg[0]
+    rear = vehicle.sprung_mass_kg * share + vehicle.unsprung_mass_kg[1]
+    return abs(front - rear) < _ALIKE_LOADS * (front + rear)
+
+
+def reasons_before_fit(
+    vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion, direction: int
+) -> list[Reason]:
+    """What the accelerations (4, n) alone say against the crossing: all of it forbids a fit.
+
+    `motion` is where the front axle was at every sample.
+    """
+    return _broken(acceleration, step_s) or _order_and_signs(
+        vehicle, acceleration, step_s, motion, direction
+    )
+
+
+def _broken(acceleration: Floats, step_s: float) -> list[Reason]:
+    """The most plain of what is wrong with single channels: it makes the others show as well."""
+    if any(quality.longest_hold(values) * step_s > _LONGEST_HOLD_S for values in acceleration):
+        return [Reason.CHANNEL_STUCK]
+    if quality.smallest_difference(acceleration) < _ALIKE:
+        return [Reason.CHANNELS_ALIKE]
+    if np.abs(acceleration.mean(axis=1)).max() > _LARGEST_MEAN_M_PER_S2:
+        return [Reason.CHANNEL_BIASED]
+    if any(_is_saturated(values) for values in acceleration):
+        return [Reason.SENSOR_SATURATED]
+    if any(quality.spikes(values, _SPIKE_HEIGHT) > 0 for values in acceleration):
+        return [Reason.SIGNAL_SPIKES]
+    return []
+
+
+def _is_saturated(values: Floats) -> bool:
+    rail = quality.pile_up(values)
+    piled_up = rail.ratio > _PILE_UP and rail.visits >= _PILE_VISITS
+    return piled_up or quality.repeated_extremes(values) >= _REPEATS
+
+
+def _order_and_signs(
+    vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion, direction: int
+) -> list[Reason]:
+    d_1, wheelbase = vehicle.front_axle_to_cg_m, vehicle.wheelbase_m
+    body = vehicle.sprung_mass_kg * np.array([wheelbase - d_1, d_1]) / wheelbase
+    found = quality.pairing(
+        acceleration,
+        step_s,
+        np.array(vehicle.suspension_stiffness_n_per_m) / body,
+        np.array(vehicle.suspension_damping_ns_per_m) / body,
+    )
+    if found.recorded > _UNEXPLAINED:
+        turned = [
+            reversed_ < _BETTER * upright
+            for upright, reversed_ in zip(found.upright, found.reversed_, strict=True)
+            if upright > _UNEXPLAINED
+        ]
+        if all(turned) and min(found.reversed_) < found.best:
+            return [Reason.CHANNEL_INVERTED]
+        if found.best < _BETTER * found.recorded:
+            return [Reason.CHANNEL_SWAPPED]
+        return []  # something else is wrong, which the fit will show
+    travelled = direction * (motion.position_m - motion.position_m[0])
+    if np.any(np.diff(travelled) <= 0.0):
+        return []
+    right, exchanged = quality.lead(acceleration[2], acceleration[3], step_s, travelled, wheelbase)
+    if right < -_LEAD:
+        return [Reason.CHANNEL_INVERTED]
+    if exchanged > _LEAD > 2.0 * right:
+        return [Reason.CHANNEL_SWAPPED]
+    return []

@@ -1,0 +1,395 @@
+"""Method `pre` on one crossing: posterior, verdict, and the result with its uncertainty.
+
+What the numbers are is in `pre_core.crossing.optimum` and `pre_core.search.crank_nicolson`; this is
+where a site file becomes priors, draws become parameters, and diagnostics become a verdict
+(docs/contract.md).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core import unknowns
+from pre_core.crossing import optimum, posterior
+from pre_core.crossing.whitening import RESIDUALS
+from pre_core.physics.beam_basis import first_frequencies_hz
+from pre_core.physics.simulate import Motion
+from pre_core.search import crank_nicolson
+from pre_core.search.loop import Ending
+from schemas import results
+from schemas.reasons import Reason
+from schemas.settings import IdentificationSettings
+from services.identification.checks import Fit, reasons_after_fit
+from services.identification.crossing_data import (
+    CrossingData,
+    Floats,
+    Passing,
+    caveats,
+    detrended,
+    header,
+    nominal_parameters,
+    rejected,
+    road_result,
+)
+
+_MICRO_G = 9.80665e-6
+_LEARNING_SHARE = 0.4
+_LEARNING_STAGES = 3
+_WELL_ACCEPTED = 0.5
+_LONGEST = 14
+_FINITE_ELEMENTS = 14
+"""At least so many, whatever the number of elements: quicker sensors would see a coarser mesh."""
+_SMALLEST_NOISE_UG = 0.1
+"""A declared noise of zero cannot whiten anything; below this, model error dominates."""
+_USABLE_CHI2 = 2.0
+"""Intervals that are widened by the square root of this are wide; a model that fits worse is wrong,
+unless it is only the noise that is larger than declared."""
+_LARGEST_R_HAT = 1.05
+_SMALLEST_ESS = 100.0
+_ROAD_DRAWS = 80
+_DEFLECTION_DRAWS = 400
+_FREQUENCY_DRAWS = 1000
+
+Report = Callable[[str, float], None]
+Keep = Callable[[str, dict[str, Floats]], None]
+"""Takes the draws of a crossing: its identifier, and (chains, draws) of every unknown by name."""
+
+
+class _Chain(NamedTuple):
+    draws: Floats  # (n, chains, f)
+    r_hat: float
+    ess: float
+    acceptance: float
+
+
+def inputs_of(
+    data: CrossingData, settings: IdentificationSettings, acceleration: Floats, start_s: float
+) -> optimum.Inputs:
+    """The crossing and the site's knowledge as method `pre` takes them."""
+    vehicle, bridge, sensor, receiver = data.vehicle, data.bridge, data.sensor, data.receiver
+    assert data.samples is not None  # noqa: S101 - it was checked before
+    step_s = 1.0 / data.samples.rate_hz
+    stop_s = start_s + step_s * (acceleration.shape[1] - 1)
+    time_s = data.fixes.time_s - receiver.latency_s
+    near = (time_s > start_s - 1.0) & (time_s < stop_s + 1.0)
+    direction = data.stay.direction
+    speed = np.abs(data.fixes.speed_m_per_s[near])
+    fixes = posterior.Fixes(
+        time_s[near],
+        data.chainage_m[near] + direction * vehicle.gps_antenna_to_front_axle_m,
+        direction * speed,
+        max(receiver.position_noise_m, 0.01),
+        max(receiver.speed_noise_m_per_s, 0.003),
+        float(
+            np.hypot(
+                max(receiver.position_spread_m, 0.01), receiver.latency_spread_s * speed.mean()
+            )
+        ),
+    )
+    density = np.maximum(np.array(sensor.noise_density_ug_per_rthz), _SMALLEST_NOISE_UG) * _MICRO_G
+    return optimum.Inputs(
+        acceleration,
+        start_s,
+        step_s,
+        direction,
+        bridge.span_m,
+        np.array(bridge.lengths_m),
+        vehicle.total_mass_kg,
+        vehicle.cg_height_m or 0.0,
+        density,
+        min(*sensor.rate_hz, data.samples.slowest_rate_hz),
+        fixes,
+        _priors(data),
+        max(1, -(-_FINITE_ELEMENTS // bridge.elements)),
+        settings.threads,
+    )
+
+
+def _priors(data: CrossingData) -> posterior.Priors:
+    vehicle, bridge = data.vehicle, data.bridge
+    pairs = (
+        "suspension_damping_ns_per_m",
+        "suspension_stiffness_n_per_m",
+        "unsprung_mass_kg",
+        "tyre_stiffness_n_per_m",
+    )
+    springs = [bridge.support_spread_nm_per_rad] * 2
+    spread = [
+        vehicle.spread("front_axle_to_cg_m"),
+        *(vehicle.spread(key) for key in pairs for _ in range(2)),
+        vehicle.spread("pitch_inertia_ratio"),
+        *[bridge.spread("flexural_rigidity_nm2")] * bridge.elements,
+        bridge.spread("mass_per_length_kg_per_m"),
+        bridge.spread("rayleigh_alpha_per_s"),
+        bridge.spread("rayleigh_beta_s"),
+        *springs,
+    ]
+    return posterior.Priors(
+        nominal_parameters(vehicle, bridge),
+        np.array(spread),
+        vehicle.wheelbase_m,
+        vehicle.spread("wheelbase_m"),
+        data.sensor.gain_spread,
+        data.sensor.common_gain_spread,
+        data.sensor.delay_spread_s,
+    )
+
+
+def identify_pre(
+    data: CrossingData,
+    settings: IdentificationSettings,
+    passing: Passing,
+    acceleration: Floats,
+    start_s: float,
+    motion: Motion,
+    report: Report,
+    elapsed: Callable[[], float],
+    keep: Keep,
+) -> results.Crossing:
+    """The posterior of one crossing as a result; a fit that explains nothing is rejected."""
+    found = optimum.find_optimum(inputs_of(data, settings, acceleration, start_s), report)
+    if found.ending is Ending.NOT_FINITE:
+        return rejected(data, settings, passing, [Reason.NOT_FINITE])
+    problem, y = found.problem, found.state.y
+    diagnostics = {
+        "iterations": float(found.evaluations),
+        "starts": float(found.starts),
+        "position_shift_m": float(y[posterior.layout(problem).offset]),
+    }
+    reasons = reasons_after_fit(data, _fit(data, found))
+    if found.ending is not Ending.CONVERGED:
+        reasons.append(Reason.NOT_CONVERGED)
+    if found.chi2_per_dof > _USABLE_CHI2 and Reason.NOISE_ABOVE_DECLARED not in reasons:
+        diagnostics["seconds"] = elapsed()
+        return rejected(
+            data,
+            settings,
+            passing,
+            reasons,
+            chi2_per_dof=found.chi2_per_dof,
+            diagnostics=diagnostics,
+        )
+    inflation = float(np.sqrt(max(1.0, found.chi2_per_dof)))
+    chain = _sample(found, settings, inflation, report)
+    diagnostics |= {
+        "r_hat": chain.r_hat,
+        "ess": chain.ess,
+        "acceptance": chain.acceptance,
+        "draws": float(chain.draws.shape[0] * chain.draws.shape[1]),
+    }
+    if chain.r_hat > _LARGEST_R_HAT or chain.ess < _SMALLEST_ESS:
+        reasons.append(Reason.SAMPLER_DIAGNOSTICS)
+    reasons += caveats(data, motion)
+    values = _values(data, problem, chain, settings, keep)
+    diagnostics["seconds"] = elapsed()
+    return results.Crossing(
+        **header(data, settings, passing),
+        verdict="suspect" if reasons else "good",
+        reasons=tuple(dict.fromkeys(reasons)),
+        chi2_per_dof=found.chi2_per_dof,
+        diagnostics=diagnostics,
+        **values,
+    )
+
+
+def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
+    """What the checks after the fit look at."""
+    problem, y = found.problem, found.state.y
+    where, rows, crossing = posterior.layout(problem), problem.rows, problem.crossing
+    white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
+    at = posterior.points(problem, y[None, :])
+    middle = crossing.first_row + rows.taps.size // 2 + rows.every * np.arange(white.shape[0])
+    rear = at.position_m[0] - data.stay.direction * at.wheelbase_m[0]
+    names = unknowns.names(data.bridge.elements)
+    estimated = [name for name, known in zip(names, problem.estimated, strict=True) if known]
+    vehicle = set(unknowns.VEHICLE_NAMES)
+    prior_z = {name: float(y[k]) for k, name in enumerate(estimated) if name in vehicle}
+    _, covariance = optimum.normal_approximation(found)
+    elements = [k for k, name in enumerate(estimated) if name.startswith("EI_")]
+    return Fit(
+        white,
+        rows.every * rows.step_s,
+        rear[middle],
+        found.chi2_per_dof,
+        prior_z | {"wheelbase": float(y[where.wheelbase])},
+        float(problem.receiver_rows[-1, -1] * y[where.offset]),
+        np.sqrt(np.diag(covariance)[elements]),
+    )
+
+
+def _sample(
+    found: optimum.Optimum, settings: IdentificationSettings, inflation: float, report: Report
+) -> _Chain:
+    """Markov chains on the posterior; where the fit is imperfect, of noise so much larger.
+
+    They run until they agree, or for `_LONGEST` times the draws that the settings ask for.
+    """
+    problem = found.problem
+    where = posterior.layout(problem)
+    springs = np.arange(where.theta.stop - 2, where.theta.stop)
+    centre, covariance = optimum.normal_approximation(found)
+    normal = crank_nicolson.approximation(
+        centre, inflation**2 * covariance, springs, optimum.bends(problem), settings.seed
+    )
+
+    def target(points: Floats) -> Floats:
+        rows = posterior.all_rows(problem, points)
+        return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
+
+    wanted = settings.draws // crank_nicolson.CHAINS
+    learning = round(_LEARNING_SHARE * wanted)
+    state = crank_nicolson.init(target, normal)
+    for stage in range(_LEARNING_STAGES):
+        seen, acceptance = [], []
+        for count in range(learning):
+            report("learning the posterior's shape", 0.5 + 0.1 * (stage + count / learning))
+            state, info = crank_nicolson.step(target, normal, state)
+            seen.append(state.v)
+            acceptance.append(info.acceptance)
+        if np.mean(acceptance) > _WELL_ACCEPTED:
+            break
+        better = crank_nicolson.adapted(normal, np.stack(seen[learning // 3 :]))
+        state = crank_nicolson.moved(target, normal, better, state)
+        normal = better
+    draws, acceptance = [], []
+    for run in range(_LONGEST):
+        for count in range(wanted):
+            done = (run + count / wanted) / (run + 1)
+            report("sampling the posterior", 0.7 + 0.3 * done)
+            state, info = crank_nicolson.step(target, normal, state)
+            draws.append(state.y)
+            acceptance.append(info.acceptance)
+        kept = np.stack(draws)
+        of_interest = kept[:, :, where.theta]
+        r_hat = float(crank_nicolson.split_r_hat(of_interest).max())
+        ess = float(crank_nicolson.effective_sample_size(of_interest).min())
+        if r_hat < _LARGEST_R_HAT and ess > _SMALLEST_ESS:
+            break
+    return _Chain(kept, r_hat, ess, float(np.mean(acceptance)))
+
+
+def _values(
+    data: CrossingData,
+    problem: posterior.Problem,
+    chain: _Chain,
+    settings: IdentificationSettings,
+    keep: Keep,
+) -> dict[str, Any]:
+    """Scale error, parameters, covariance, derived quantities and road from the draws."""
+    flat = chain.draws.reshape(-1, chain.draws.shape[2])
+    at = posterior.points(problem, flat)
+    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(10**9,)))
+    # The total mass scales every force and stiffness of truck and bridge alike; no residual shows
+    # its error. That of the common gain is among the unknowns.
+    mass_spread = data.vehicle.spread("total_mass_kg")
+    scale = np.exp(mass_spread * rng.standard_normal(flat.shape[0]))
+    names = unknowns.names(data.bridge.elements)
+    theta = at.theta.copy()
+    scaled = [
+        i
+        for i, name in enumerate(names)
+        if name.startswith(("c_", "k_", "m_", "EI_")) or name == "rhoA"
+    ]
+    theta[:, scaled] *= scale[:, None]
+    kept = [i for i in range(len(names)) if problem.estimated[i]]
+    values = {
+        names[i]: _parameter(unknowns.unit(names[i]), theta[:, i], _prior(problem, i)) for i in kept
+    }
+    masses = unknowns.body_masses(at.theta, data.vehicle.total_mass_kg, data.vehicle.wheelbase_m)
+    for k, name in enumerate(("m_s", "m_s1", "m_s2")):
+        values[name] = _parameter("kg", masses[:, k] * scale, None)
+    covariance = np.cov(theta[:, kept].T)
+    draws = {names[i]: theta[:, i] for i in kept}
+    draws |= {
+        "wheelbase_m": at.wheelbase_m,
+        "position_offset_m": flat[:, posterior.layout(problem).offset],
+    }
+    steps, chains = chain.draws.shape[:2]
+    keep(
+        data.crossing_id,
+        {name: np.ascontiguousarray(x.reshape(steps, chains).T) for name, x in draws.items()},
+    )
+    return {
+        "scale_error": float(np.hypot(mass_spread, np.log(at.common_gain).std())),
+        "parameters": values,
+        "covariance": results.Covariance(
+            names=tuple(names[i] for i in kept),
+            matrix=tuple(tuple(row) for row in np.atleast_2d(covariance).tolist()),
+        ),
+        "derived": _derived(problem, at.theta, flat, rng),
+        "road": _road(data, problem, flat, rng),
+    }
+
+
+def _parameter(unit: str, draws: Floats, prior: results.Prior | None) -> results.Parameter:
+    low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
+    return results.Parameter(
+        unit=unit,
+        mean=float(draws.mean()),
+        std=float(draws.std()),
+        q025=float(low),
+        q50=float(middle),
+        q975=float(high),
+        prior=prior,
+    )
+
+
+def _prior(problem: posterior.Problem, i: int) -> results.Prior:
+    priors = problem.priors
+    if i >= priors.theta.size - 2:
+        return results.Prior(
+            distribution="half_normal", location=0.0, scale=float(priors.spread[i])
+        )
+    return results.Prior(
+        distribution="log_normal", location=float(priors.theta[i]), scale=float(priors.spread[i])
+    )
+
+
+def _chosen(count: int, wanted: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    return rng.choice(count, min(count, wanted), replace=False)
+
+
+def _derived(
+    problem: posterior.Problem,
+    theta: Floats,
+    flat: Floats,
+    rng: np.random.Generator,
+) -> results.Derived:
+    some = _chosen(theta.shape[0], _FREQUENCY_DRAWS, rng)
+    frequencies = first_frequencies_hz(problem.crossing.basis, theta[some])
+    few = _chosen(flat.shape[0], _DEFLECTION_DRAWS, rng)
+    deflections = posterior.largest_deflections_m(problem, flat[few])
+    return results.Derived(
+        f1_hz=_parameter("Hz", frequencies, None),
+        max_deflection_m=_parameter("m", deflections, None),
+    )
+
+
+def _road(
+    data: CrossingData, problem: posterior.Problem, flat: Floats, rng: np.random.Generator
+) -> results.Road:
+    """The profile at the posterior's mean point, and its spread over some draws.
+
+    Both wheels feel the same road with errors of their own. The posterior knows of their difference
+    alone; their mean's is drawn from the sensors' noise.
+    """
+    few = _chosen(flat.shape[0], _ROAD_DRAWS, rng)
+    centre = flat.mean(axis=0)
+    x, front, rear = posterior.roads(problem, centre)
+    road = road_result(data, x, front, rear)
+    grid = np.array(road.x_m)
+    noise = posterior.road_noise(problem, centre, few.size, rng)
+    profiles = []
+    for i, error in zip(few, noise, strict=True):
+        own_x, own_front, own_rear = posterior.roads(problem, flat[i])
+        mean = np.interp(grid, *_rising(own_x, 0.5 * (own_front + own_rear)))
+        error = np.interp(grid, *_rising(x, error))
+        profiles.append(detrended(grid, mean + error))
+    spread = np.std(profiles, axis=0)
+    return road.model_copy(update={"std_m": tuple(spread.tolist())})
+
+
+def _rising(x: Floats, values: Floats) -> tuple[Floats, Floats]:
+    return (x, values) if x[0] < x[-1] else (x[::-1], values[::-1])

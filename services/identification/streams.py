@@ -1,0 +1,314 @@
+"""From single messages to arrays: one boot of one truck, ordered, without duplicates, on one clock.
+
+Batches and fixes may come late, twice or not at all. Within a boot they are ordered by sequence and
+placed by the truck's monotonic clock, which no step of the wall clock can disturb. What is asked
+about a stretch of time depends on the messages of that stretch alone, not on the order in which
+they came nor on what came later.
+"""
+
+from bisect import insort
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.signals import CHANNELS, MAX_BATCH_S, AccelBatch, GnssFix
+
+Floats = NDArray[np.float64]
+
+PATIENCE_S = 10.0
+"""How much newer data may come before a message that is missing is taken to be lost."""
+_NS_PER_S = 1_000_000_000
+_LARGEST_RATE_ERROR = 0.02
+"""A crystal is good to 1e-4; beyond this the declared rate is another sensor's."""
+_CLOCK_ERROR = 1e-3
+"""How far the declared rate may be off before it says that other samples are missing."""
+_WALL_CLOCK_S = 10.0
+"""The wall clock is read off the fixes of this long before a moment."""
+_JITTER = 8.0
+"""Times of batches that are off by this many times the usual are off for another reason."""
+
+
+class Fixes(NamedTuple):
+    """Fixes in order of time: all arrays (m,)."""
+
+    time_s: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    speed_m_per_s: Floats
+
+
+class Samples(NamedTuple):
+    """Samples of a truck on one even grid.
+
+    `channels` maps each channel that the truck has to (n,) accelerations in m/s², NaN where samples
+    are missing. Sample k is at `start_s` + k/`rate_hz`, on the clock of `Boot`.
+    """
+
+    start_s: float
+    rate_hz: float
+    channels: dict[str, Floats]
+    slowest_rate_hz: float = np.inf
+    """Of the channel that is sampled most slowly, where that is slower than the grid."""
+
+
+class Boot:
+    """All messages of one boot of a truck that are still of interest.
+
+    Times are seconds on the truck's own clock. Not relative to the first message: which one came
+    first is chance, and would change the last digits of all that follows.
+    """
+
+    def __init__(self) -> None:
+        self._batches: dict[int, AccelBatch] = {}
+        self._fixes: list[tuple[int, GnssFix]] = []
+        """By sequence; up to the first one that is missing, and the stragglers."""
+        self._waiting: dict[int, GnssFix] = {}
+        """Those that came before one that is missing."""
+        self._next_fix = 0
+        self._fresh: list[GnssFix] = []
+        self._columns: Floats = np.empty((4, 0))
+        """Known fixes as `fixes` gives them, but for the fresh ones: thousands, asked for often."""
+        self._forgotten_ns = -1
+        self._channels: set[str] = set()
+
+    def add_accel(self, batch: AccelBatch) -> None:
+        """Take a batch in; one that is here already is ignored."""
+        if batch.device_time_ns >= self._forgotten_ns:
+            self._batches.setdefault(batch.sequence, batch)
+            self._channels.update(batch.channels)
+
+    def add_fix(self, fix: GnssFix) -> None:
+        """Take a fix in; one that is here already is ignored. `settle` makes it known."""
+        if fix.sequence >= self._next_fix:
+            self._waiting.setdefault(fix.sequence, fix)
+        elif fix.device_time_ns >= self._forgotten_ns and fix.sequence not in dict(self._fixes):
+            insort(self._fixes, (fix.sequence, fix))
+            self._fresh.append(fix)
+
+    def settle(self, *, all_there_is: bool = False) -> Iterator[GnssFix]:
+        """Make fixes known to `fixes` one by one, in their order, and yield them.
+
+        A fix waits for those before it, until they are taken to be lost or `all_there_is` has come.
+        """
+        while self._waiting:
+            sequence = min(self._waiting)
+            if sequence != self._next_fix and not all_there_is:
+                latest_ns = max(fix.device_time_ns for fix in self._waiting.values())
+                waited_ns = latest_ns - self._waiting[sequence].device_time_ns
+                if waited_ns < PATIENCE_S * _NS_PER_S:
+                    return
+            fix = self._waiting.pop(sequence)
+            self._next_fix = sequence + 1
+            self._fixes.append((sequence, fix))
+            self._fresh.append(fix)
+            yield fix
+
+    def lacks_fixes(self) -> bool:
+        """Whether fixes that have come wait for one before them that has not."""
+        return bool(self._waiting)
+
+    def forget_before(self, time_s: float) -> None:
+        """Drop what is older, so that the memory stays bounded on a long drive."""
+        limit_ns = max(self._forgotten_ns, round(time_s * _NS_PER_S))
+        self._forgotten_ns = limit_ns
+        for sequence in [s for s, b in self._batches.items() if b.device_time_ns < limit_ns]:
+            del self._batches[sequence]
+        self._fixes = [(s, f) for s, f in self._fixes if f.device_time_ns >= limit_ns]
+        known_s = self.fixes().time_s
+        self._columns = np.ascontiguousarray(self._columns[:, known_s >= limit_ns / _NS_PER_S])
+
+    def latest_accel_s(self) -> float:
+        """Time after the last sample that has come; -inf without any."""
+        return max(
+            (_end_ns(batch) / _NS_PER_S for batch in self._batches.values()), default=-np.inf
+        )
+
+    def lacks_accel(self, start_s: float, stop_s: float) -> bool:
+        """Whether batches between two times have not come, but may still."""
+        start_ns, stop_ns = round(start_s * _NS_PER_S), round(stop_s * _NS_PER_S)
+        ordered = sorted(self._batches)
+        begin = stop = -1
+        for sequence in ordered:
+            batch = self._batches[sequence]
+            if batch.device_time_ns <= start_ns:
+                begin = sequence
+            if _end_ns(batch) >= stop_ns:
+                stop = sequence
+                break
+        if stop < 0:
+            return True
+        begin = max(begin, 0)
+        return sum(begin <= sequence <= stop for sequence in ordered) != stop - begin + 1
+
+    def wall_time_ns(self, time_s: float) -> int:
+        """Wall time (ns since 1970 UTC) of a time on this clock, by the fixes up to then.
+
+        Their median: single stamps jitter. There must be a fix.
+        """
+        time_ns = round(time_s * _NS_PER_S)
+        before = [
+            fix.wall_time_ns - fix.device_time_ns
+            for _, fix in self._fixes
+            if time_ns - _WALL_CLOCK_S * _NS_PER_S < fix.device_time_ns <= time_ns
+        ]
+        if not before:
+            nearest = min(self._fixes, key=lambda item: abs(item[1].device_time_ns - time_ns))[1]
+            before = [nearest.wall_time_ns - nearest.device_time_ns]
+        return time_ns + sorted(before)[len(before) // 2]
+
+    def fixes(self) -> Fixes:
+        """All settled fixes in order of time."""
+        if self._fresh:
+            rows = [
+                (f.device_time_ns / _NS_PER_S, f.latitude_deg, f.longitude_deg, f.speed_m_per_s)
+                for f in self._fresh
+            ]
+            self._fresh.clear()
+            columns = np.concatenate([self._columns, np.array(rows).T], axis=1)
+            if np.any(np.diff(columns[0]) <= 0.0):
+                columns = columns[:, np.lexsort(columns[::-1])]
+                columns = columns[:, np.concatenate([[True], np.diff(columns[0]) > 0.0])]
+            self._columns = np.ascontiguousarray(columns)
+        return Fixes(*self._columns)
+
+    def samples(self, start_s: float, stop_s: float) -> Samples | None:
+        """Samples from `start` to `stop`, on the grid of the fastest channel.
+
+        A slower channel is interpolated band-limited. A channel that this truck has but that
+        has no sample in this stretch is NaN throughout. None: the truck has no channel at all.
+        """
+        chosen = [
+            batch
+            for _, batch in sorted(self._batches.items())
+            if start_s - MAX_BATCH_S < _seconds(batch.device_time_ns) <= stop_s
+        ]
+        grids = {
+            name: grid
+            for name in CHANNELS
+            if (grid := _grid(name, chosen, start_s, stop_s)) is not None
+        }
+        if not grids:
+            if not self._channels:
+                return None
+            return Samples(start_s, 1.0, {name: np.empty(0) for name in sorted(self._channels)})
+        fastest = max(grids.values(), key=lambda grid: grid.rate_hz)
+        time = fastest.start_s + np.arange(fastest.values.size) / fastest.rate_hz
+        channels = {
+            name: _resampled(grids[name], time)
+            if name in grids
+            else np.full(fastest.values.size, np.nan)
+            for name in CHANNELS
+            if name in self._channels
+        }
+        slowest_hz = min(grid.rate_hz for grid in grids.values())
+        return Samples(fastest.start_s, fastest.rate_hz, channels, slowest_hz)
+
+
+def device_time_ns(stream: str, payload: bytes) -> int:
+    """The time on the truck's clock of a message of `accel` or `gnss`; ValueError: malformed."""
+    message = pb.AccelBatch() if stream == "accel" else pb.GnssFix()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError as error:
+        raise ValueError(f"not a {message.DESCRIPTOR.full_name}: {error}") from None
+    return message.device_time_ns
+
+
+class _Grid(NamedTuple):
+    start_s: float
+    rate_hz: float
+    values: Floats
+
+
+def _grid(name: str, batches: list[AccelBatch], start_s: float, stop_s: float) -> _Grid | None:
+    parts = [batch for batch in batches if name in batch.channels]
+    if not parts:
+        return None
+    declared = float(np.median([batch.channels[name].rate_hz for batch in parts]))
+    first_ns = parts[0].device_time_ns
+    times = np.array([batch.device_time_ns - first_ns for batch in parts]) / _NS_PER_S
+    sizes = [batch.channels[name].samples.size for batch in parts]
+    numbers = _numbers(times * declared, sizes, [batch.sequence for batch in parts])
+    rate, offset_s = _fit_clock(numbers, times, declared)
+    values = np.full(int(numbers[-1]) + sizes[-1], np.nan)
+    for number, batch in zip(numbers.tolist(), parts, strict=True):
+        samples = batch.channels[name].samples
+        values[number : number + samples.size] = samples
+    # The times of the ends relative to the first sample: exact to far less than a sample.
+    zero_s = first_ns / _NS_PER_S + offset_s
+    begin = max(0, int(np.ceil((start_s - zero_s) * rate - 1e-6)))
+    stop = min(values.size, int(np.floor((stop_s - zero_s) * rate + 1e-6)) + 1)
+    if stop <= begin:
+        return None
+    return _Grid(zero_s + begin / rate, rate, values[begin:stop])
+
+
+def _numbers(at: Floats, sizes: list[int], sequences: list[int]) -> NDArray[np.int64]:
+    """Numbers (b,) of the first samples of batches, from the times `at` in sampling intervals.
+
+    A batch that follows on the one before has the next numbers, whatever jitter its time has. Where
+    batches are missing, as many samples are missing as those would have had, unless the time says
+    otherwise; so also where a batch starts later than its predecessor ends.
+    """
+    usual = int(np.median(sizes))
+    before = np.array(sizes[:-1], dtype=np.int64)
+    jumps = np.diff(at) - before
+    skipped = np.diff(sequences) - 1
+    # What is off by more than half a batch is no jitter, however usual.
+    followed = np.abs(jumps[skipped == 0])
+    jitter = np.quantile(followed, 0.5, method="lower") if followed.size else 0.0
+    lost = skipped * usual
+    tolerance = max(0.5, min(_JITTER * jitter, 0.5 * usual)) + _CLOCK_ERROR * lost
+    missing = np.where(np.abs(jumps - lost) < tolerance, lost, np.rint(jumps)).astype(np.int64)
+    return np.concatenate([[0], np.cumsum(np.maximum(before + missing, 0))])
+
+
+def _fit_clock(
+    numbers: NDArray[np.int64], times_s: Floats, declared_hz: float
+) -> tuple[float, float]:
+    """True rate and time of sample 0 after `times_s[0]`, from the times of the batches.
+
+    The times of an honest sampler lie on a line to rounding; then the declared rate stands.
+    """
+    if numbers.size < 3 or np.all(np.abs(times_s - numbers / declared_hz) < 1e-3 / declared_hz):
+        return declared_hz, 0.0
+    centred = numbers - numbers.mean()
+    slope = float(centred @ times_s / max(centred @ centred, 1.0))
+    if not abs(slope * declared_hz - 1.0) < _LARGEST_RATE_ERROR:
+        return declared_hz, 0.0
+    return 1.0 / slope, float(times_s.mean() - slope * numbers.mean())
+
+
+def _resampled(grid: _Grid, time_s: Floats) -> Floats:
+    """The values of a grid at other times; NaN in and near its gaps and ends.
+
+    At times of its own samples (of most channels all are) a value is itself. Between them it takes
+    `SEEN_ASIDE` unbroken samples on both sides to tell it: a spline through fewer would lose what
+    is quick.
+    """
+    place = (time_s - grid.start_s) * grid.rate_hz
+    nearest = np.rint(place).astype(np.int64)
+    inside = (nearest >= 0) & (nearest < grid.values.size)
+    own = inside & (np.abs(place - nearest) < 1e-3)
+    values = np.full(time_s.size, np.nan)
+    values[own] = grid.values[nearest[own]]
+    between = inside & ~own
+    if np.any(between):
+        from pre_core.crossing.channels import read_between  # slow to import, seldom needed
+
+        # A NaN among the samples of a moment makes that moment NaN.
+        values[between] = read_between(grid.values, place[between])
+    return values
+
+
+def _end_ns(batch: AccelBatch) -> int:
+    longest = max(channel.samples.size / channel.rate_hz for channel in batch.channels.values())
+    return batch.device_time_ns + round(longest * _NS_PER_S)
+
+
+def _seconds(device_time_ns: int) -> float:
+    return device_time_ns / _NS_PER_S

@@ -1,0 +1,1 @@
+"""MCAP files: written so that they stay readable, read even if damaged, recovered."""

@@ -1,0 +1,1 @@
+"""Credentials for the bus, and who may say and hear what on it."""

@@ -1,0 +1,121 @@
+"""Who may say and hear what on the bus: Zenoh's access control, made from the table of topics.
+
+Pure: names in, settings out. A router with these settings drops every message that no rule
+allows. It knows who speaks by the common name of the certificate.
+
+A rule of Zenoh is about one direction of one kind of message. Whoever publishes a key also
+answers for it (the cache of an advanced publisher, the last message of a latched topic, the
+truck's spool) and announces itself; whoever reads a key also asks for it. So two sets of keys per
+subject, what it publishes and what it reads, give all rules. To each key belongs the tree
+`KEY/@adv/**`, where advanced publishers have their cache, their announcements and their presence;
+`**` does not match it.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+from schemas.topics import PREFIX, TOPICS
+from services.bus.credentials import Subject
+
+_SAYS = ("put", "reply", "declare_queryable", "liveliness_token")
+_ASKS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
+_EVERYTHING = [f"{PREFIX}/**"]
+_REPLAYS = "replay-$*"
+_SERVICE_STREAMS = {
+    "logger": ("health", "event", "durable"),
+    "worker": ("health", "progress", "event"),
+}
+"""`durable` lets a truck forget its data: nobody but a logger may say it."""
+
+
+def access_control(subjects: Iterable[Subject]) -> dict[str, Any]:
+    """Return the value of Zenoh's key `access_control` that lets these in, and nobody else.
+
+    A truck publishes its own keys and reads `durable`, for that tells it what it may forget. A
+    logger publishes about itself and reads everything; a worker publishes results and reads
+    trucks and results; a viewer reads results. A replay publishes in realms of replays only.
+    Routers trust each other: each filters what its own clients say.
+    """
+    rules: list[dict[str, Any]] = []
+    named: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+    for subject in sorted(subjects):
+        own = _rules(str(subject), published_by(subject), read_by(subject))
+        rules += own
+        named.append({"id": str(subject), "cert_common_names": [str(subject)]})
+        policies.append({"rules": [rule["id"] for rule in own], "subjects": [str(subject)]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": named,
+        "policies": policies,
+    }
+
+
+def published_by(subject: Subject) -> list[str]:
+    """Return the key expressions on which a subject may publish and answer."""
+    role, name = subject
+    match role:
+        case "truck":
+            return [*_keys("vehicle", name), f"{PREFIX}/*/vehicle/{name}/*/spool"]
+        case "logger":
+            return _keys("service", name, _SERVICE_STREAMS[role])
+        case "worker":
+            return [*_keys("bridge"), *_keys("service", name, _SERVICE_STREAMS[role])]
+        case "replay":
+            logged = [row for row in TOPICS if row.logged]
+            return [f"{PREFIX}/{_REPLAYS}/{row.owner}/*/{row.stream}" for row in logged]
+        case "router":
+            return _EVERYTHING
+    return []
+
+
+def read_by(subject: Subject) -> list[str]:
+    """Return the key expressions to which a subject may subscribe and for which it may ask."""
+    match subject.role:
+        case "truck" | "replay":
+            return _keys("service", streams=("durable",))
+        case "logger" | "router":
+            return _EVERYTHING
+        case "worker":
+            return [
+                f"{PREFIX}/*/vehicle/**",
+                f"{PREFIX}/*/bridge/**",
+                *_keys("service", streams=("durable",)),
+            ]
+        case "viewer":
+            return [f"{PREFIX}/*/bridge/**", *_keys("service", streams=("health", "progress"))]
+    return []
+
+
+def _keys(owner: str, identifier: str = "*", streams: Iterable[str] | None = None) -> list[str]:
+    """Return one expression for each stream of the table, in every realm."""
+    return [
+        f"{PREFIX}/*/{owner}/{identifier}/{row.stream}"
+        for row in TOPICS
+        if row.owner == owner and (streams is None or row.stream in streams)
+    ]
+
+
+def _rules(name: str, published: list[str], read: list[str]) -> list[dict[str, Any]]:
+    # What others ask for comes with their key expression, which may be wider than one's own keys.
+    # A rule applies only to expressions that it includes, hence everything; Zenoh passes on
+    # nothing but what meets the receiver's keys.
+    rules = [
+        ("publishes", "ingress", _SAYS, published),
+        ("is asked", "egress", _ASKS, _EVERYTHING if published else []),
+        ("asks", "ingress", _ASKS, read),
+        ("reads", "egress", _SAYS, read),
+    ]
+    return [
+        {
+            "id": f"{name} {what}",
+            "permission": "allow",
+            "flows": [flow],
+            "messages": list(messages),
+            "key_exprs": [*keys, *(f"{key}/@adv/**" for key in keys)],
+        }
+        for what, flow, messages, keys in rules
+        if keys
+    ]

@@ -1,0 +1,415 @@
+"""`driveby certs`: a private authority, and a folder of credentials for everybody on the bus.
+
+What lies in the folder afterwards:
+
+    authority/ca.pem       whom everybody believes
+    authority/ca-key.pem   makes certificates; may be kept elsewhere between two runs
+    authority/issued/      a copy of every certificate, the list of who may take part
+    authority/revoked/     those who may no longer
+    NAME/                  what NAME needs on its machine: see services.bus.credentials
+
+Zenoh knows no list of revoked certificates. What keeps somebody out is the access control of the
+routers, which lists those who may take part; it is written anew by every run.
+"""
+
+import ipaddress
+import json
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from schemas.topics import check_identifier
+from services.bus.credentials import (
+    AUTHORITY,
+    CERTIFICATE,
+    CONFIGURATION,
+    KEY,
+    LISTENERS,
+    Subject,
+    link_settings,
+    parse_subject,
+    read_certificate,
+    subject_of,
+)
+from services.common.errors import FailureError, InputError
+from services.common.files import read_bytes, write_atomically
+from services.security.access_control import access_control
+
+AUTHORITY_DAYS = 3650
+FIRST = tuple(Subject(role, role) for role in ("router", "logger", "worker", "viewer", "replay"))
+"""Made together with the authority."""
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
+PLACE = "/etc/driveby/tls"
+"""Where the ready-made configurations expect the folder on its machine."""
+
+_AUTHORITY_KEY = "ca-key.pem"
+_FOLDER, _ISSUED, _REVOKED = "authority", "issued", "revoked"
+_PORT = 7447
+_CLOCK_SLACK = timedelta(days=1)
+"""Certificates are valid from a day ago: a truck's clock may be slow."""
+_HOST = re.compile(r"(?=.{1,253}\Z)(?!-)[A-Za-z0-9-]{1,63}(\.(?!-)[A-Za-z0-9-]{1,63})*")
+
+_Key = ec.EllipticCurvePrivateKey
+
+
+class _Authority(NamedTuple):
+    folder: Path
+    certificate: x509.Certificate
+
+    def key(self) -> _Key:
+        path = self.folder / _AUTHORITY_KEY
+        if not path.exists():
+            raise InputError(
+                f"{path}: the authority's private key is not here; "
+                "bring it back for as long as certificates are made"
+            )
+        try:
+            key = load_pem_private_key(read_bytes(path), password=None)
+        except (ValueError, TypeError):
+            raise InputError(f"{path}: is no private key in PEM form without a password") from None
+        if not isinstance(key, _Key) or key.public_key() != self.certificate.public_key():
+            raise InputError(f"{path}: is not the key of {AUTHORITY} beside it")
+        return key
+
+    def issued(self) -> dict[str, x509.Certificate]:
+        """Return the certificates of those who may take part, by name."""
+        paths = sorted((self.folder / _ISSUED).glob("*.pem"))
+        return {path.stem: read_certificate(path) for path in paths}
+
+    def subjects(self) -> dict[str, Subject]:
+        try:
+            return {name: subject_of(one) for name, one in self.issued().items()}
+        except ValueError as error:
+            raise InputError(f"{self.folder / _ISSUED}: {error}") from None
+
+
+def certs_command(
+    *,
+    folder: Path,
+    trucks: Sequence[str] = (),
+    others: Sequence[str] = (),
+    renew: Sequence[str] = (),
+    revoke: Sequence[str] = (),
+    hosts: Sequence[str] = (),
+    days: int = 365,
+) -> list[str]:
+    """Make credentials in `folder` and return lines that say what there is now.
+
+    The first run makes the authority, `FIRST` and the trucks named. A later one adds `trucks` and
+    `others` (ROLE/NAME), gives the names in `renew` a new key and certificate and takes those in
+    `revoke` off the list, and leaves everything else as it is. Certificates of routers and loggers
+    name this machine and `hosts`.
+
+    InputError: a malformed name, one that exists already or was revoked, a name that is not there
+    to be renewed or revoked, no authority's key. Nothing is made then.
+    """
+    for host in hosts:
+        _check_host(host)
+    authority = _existing(folder)
+    wanted = [_truck(name) for name in trucks] + [_other(text) for text in others]
+    if authority is None:
+        if renew or revoke:
+            raise InputError(f"{folder}: has no authority yet, so there is nothing to change")
+        wanted = [*FIRST, *wanted]
+    _check_new(folder, authority, wanted)
+    renewed = [] if authority is None else _known(authority, renew)
+    revoked = [] if authority is None else _known(authority, revoke)
+    if both := set(renewed) & set(revoked):
+        raise InputError(f"{min(both).name}: either renew or revoke it")
+    if hosts and not any(subject.role in LISTENERS for subject in [*wanted, *renewed]):
+        raise InputError("--host concerns routers and loggers; name one in --add or --renew")
+    try:
+        if authority is None:
+            authority = _make_authority(folder)
+        key = authority.key() if wanted or renewed else None
+        for subject in revoked:
+            _revoke(authority, subject)
+        for subject in [*wanted, *renewed]:
+            assert key is not None  # noqa: S101 - read above, before anything is changed
+            _issue(folder, authority, key, subject, hosts, days)
+        _write_access_control(folder, authority)
+    except OSError as error:
+        raise FailureError(f"{folder}: {error.strerror}: {error.filename}") from None
+    return _summary(folder, authority)
+
+
+def _truck(name: str) -> Subject:
+    try:
+        return Subject("truck", check_identifier(name))
+    except ValueError as error:
+        raise InputError(f"--trucks: {error}") from None
+
+
+def _other(text: str) -> Subject:
+    try:
+        return parse_subject(text)
+    except ValueError as error:
+        raise InputError(f"--add: {error}") from None
+
+
+def _check_host(host: str) -> None:
+    if not (_is_address(host) or _HOST.fullmatch(host)):
+        raise InputError(f"--host {host[:80]!r}: the name or the address of a machine is expected")
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _existing(folder: Path) -> _Authority | None:
+    place = folder / _FOLDER
+    if not place.exists():
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: is a file, the name of a folder is expected")
+        if not folder.absolute().parent.is_dir():
+            raise InputError(f"{folder}: the folder {folder.absolute().parent} does not exist")
+        if folder.exists() and folder.stat().st_mode & 0o022:
+            raise InputError(f"{folder}: others may write there; chmod 700 {folder}")
+        return None
+    return _Authority(place, read_certificate(place / AUTHORITY))
+
+
+def _check_new(folder: Path, authority: _Authority | None, wanted: Iterable[Subject]) -> None:
+    """Nothing is overwritten, and no name stands for two."""
+    taken = set() if authority is None else set(authority.issued())
+    for subject in wanted:
+        name = subject.name
+        if authority is not None and (authority.folder / _REVOKED / f"{name}.pem").exists():
+            raise InputError(
+                f"{name}: was revoked, and its old key would come alive again; "
+                "take another name or make a new authority in another folder"
+            )
+        if name in taken or (folder / name).exists():
+            raise InputError(f"{folder / name}: exists and is not overwritten; --renew replaces it")
+        if name == _FOLDER:
+            raise InputError(f"{name!r} is the name of the authority's folder, take another")
+        taken.add(name)
+
+
+def _known(authority: _Authority, names: Iterable[str]) -> list[Subject]:
+    subjects = authority.subjects()
+    for name in names:
+        if name not in subjects:
+            there = ", ".join(subjects)
+            raise InputError(f"{name[:80]!r}: has no certificate here; there are {there}")
+    return [subjects[name] for name in dict.fromkeys(names)]
+
+
+def _make_authority(folder: Path) -> _Authority:
+    folder.mkdir(mode=0o700, exist_ok=True)
+    key = ec.generate_private_key(ec.SECP256R1())
+    now = datetime.now(UTC)
+    # The number tells one authority from another one that replaces it.
+    name = f"driveby {now:%Y-%m-%d} {secrets.token_hex(4)}"
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    certificate = (
+        _builder(key, now, now + timedelta(days=AUTHORITY_DAYS))
+        .subject_name(subject)
+        .issuer_name(subject)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_key_usage(signs_certificates=True), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    with _new_folder(folder / _FOLDER) as new:
+        (new / _ISSUED).mkdir(mode=0o700)
+        (new / _REVOKED).mkdir(mode=0o700)
+        _write_key(new / _AUTHORITY_KEY, key)
+        (new / AUTHORITY).write_bytes(certificate.public_bytes(Encoding.PEM))
+    return _Authority(folder / _FOLDER, certificate)
+
+
+def _issue(
+    folder: Path,
+    authority: _Authority,
+    authority_key: _Key,
+    subject: Subject,
+    hosts: Sequence[str],
+    days: int,
+) -> None:
+    """Make a key and a certificate; one of the same name is replaced."""
+    listens = subject.role in LISTENERS
+    copy = authority.folder / _ISSUED / f"{subject.name}.pem"
+    if listens:
+        before = _hosts_of(read_certificate(copy)) if copy.exists() else LOCAL_HOSTS
+        hosts = tuple(dict.fromkeys([*before, *hosts]))
+    key = ec.generate_private_key(ec.SECP256R1())
+    now = datetime.now(UTC)
+    until = min(now + timedelta(days=days), authority.certificate.not_valid_after_utc)
+    usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
+    if listens:  # or a truck could pose as the router
+        usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
+    builder = (
+        _builder(key, now, until)
+        .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, str(subject))]))
+        .issuer_name(authority.certificate.subject)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_key_usage(signs_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key()),
+            critical=False,
+        )
+        .add_extension(_alternative_names(subject, hosts if listens else ()), critical=False)
+    )
+    certificate = builder.sign(authority_key, hashes.SHA256()).public_bytes(Encoding.PEM)
+    with _new_folder(folder / subject.name) as new:
+        _write_key(new / KEY, key)
+        (new / CERTIFICATE).write_bytes(certificate)
+        public = authority.certificate.public_bytes(Encoding.PEM)
+        (new / AUTHORITY).write_bytes(public)
+        if not listens:
+            (new / CONFIGURATION).write_text(_client_configuration(_router_host(authority)))
+        # On the list before the folder is there: a name that is listed is never issued twice.
+        write_atomically(copy, certificate)
+
+
+def _builder(key: _Key, now: datetime, until: datetime) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _CLOCK_SLACK)
+        .not_valid_after(until)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _alternative_names(subject: Subject, hosts: Sequence[str]) -> x509.SubjectAlternativeName:
+    """The hosts of one who listens; of others a name that no host can have."""
+    if not hosts:
+        return x509.SubjectAlternativeName([x509.UniformResourceIdentifier(f"driveby:{subject}")])
+    return x509.SubjectAlternativeName(
+        [
+            x509.IPAddress(ipaddress.ip_address(host)) if _is_address(host) else x509.DNSName(host)
+            for host in hosts
+        ]
+    )
+
+
+def _hosts_of(certificate: x509.Certificate) -> list[str]:
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    return [str(one.value) for one in names if not isinstance(one, x509.UniformResourceIdentifier)]
+
+
+def _router_host(authority: _Authority) -> str:
+    """Where a client would find the router: the first host that is not this machine's own name."""
+    for name in ("router", "logger"):
+        certificate = authority.issued().get(name)
+        hosts = [] if certificate is None else _hosts_of(certificate)
+        for host in hosts:
+            if host not in LOCAL_HOSTS:
+                return f"[{host}]" if ":" in host else host
+    return "127.0.0.1"
+
+
+def _revoke(authority: _Authority, subject: Subject) -> None:
+    name = f"{subject.name}.pem"
+    (authority.folder / _ISSUED / name).rename(authority.folder / _REVOKED / name)
+
+
+def _write_access_control(folder: Path, authority: _Authority) -> None:
+    subjects = list(authority.subjects().values())
+    settings = _common_settings("router") | {
+        "listen": {"endpoints": [f"tls/127.0.0.1:{_PORT}"]},
+        "access_control": access_control(subjects),
+    }
+    for subject in subjects:
+        if subject.role in LISTENERS:
+            place = folder / subject.name  # anew if its folder has moved to its machine
+            place.mkdir(mode=0o700, exist_ok=True)
+            write_atomically(place / CONFIGURATION, _json5(settings))
+
+
+def _client_configuration(host: str) -> str:
+    endpoints = {"endpoints": [f"tls/{host}:{_PORT}"]}
+    return _json5(_common_settings("client") | {"connect": endpoints})
+
+
+def _common_settings(mode: str) -> dict[str, Any]:
+    return {
+        "mode": mode,
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": True},
+        "transport": {"shared_memory": {"enabled": False}, "link": link_settings(PLACE)},
+    }
+
+
+def _json5(settings: dict[str, Any]) -> str:
+    return (
+        f"// Made by `driveby certs`, which writes it anew. Expects its folder at {PLACE}.\n"
+        f"{json.dumps(settings, indent=2)}\n"
+    )
+
+
+def _write_key(path: Path, key: _Key) -> None:
+    """Write a private key that never, not for an instant, anybody else can read."""
+    pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(pem)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def _new_folder(target: Path) -> Iterator[Path]:
+    """A folder that is whole or absent: made beside, readable by its owner alone, then renamed."""
+    new = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+    new.mkdir(mode=0o700)
+    try:
+        yield new
+        if target.exists():
+            target.rename(new.with_suffix(".old"))
+        new.rename(target)
+    finally:
+        for left in (new, new.with_suffix(".old")):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _summary(folder: Path, authority: _Authority) -> list[str]:
+    lines = [f"{folder}/"]
+    issued = authority.issued()
+    for name, subject in authority.subjects().items():
+        until = issued[name].not_valid_after_utc
+        place = f"{name}/" if (folder / name / KEY).exists() else f"({name})"
+        lines.append(f"  {place:<20} {subject!s:<28} until {until:%Y-%m-%d}")
+    lines.append(
+        f"  {_FOLDER}/{_AUTHORITY_KEY} makes certificates: keep it off line. "
+        "Each other folder goes to its machine; routers and loggers are to be started anew."
+    )
+    return lines

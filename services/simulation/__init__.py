@@ -1,0 +1,1 @@
+"""Crossings that were never driven: of a known truth, or drawn from ranges."""

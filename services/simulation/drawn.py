@@ -1,0 +1,329 @@
+"""Crossings whose truth is drawn from the priors of a site, identified and set beside the truth.
+
+If a method's intervals are true, then over many such crossings they cover the truth as often as
+they say (simulation-based calibration). So everything that the method calls unknown is drawn from
+what it is told of it: truck, rigidity of every element, mass per length, damping, support springs,
+wheelbase, gains and delays of the channels, the receiver's errors, and also the total mass and the
+gain common to all channels, which no residual shows. Nothing is cut off: what a prior allows may
+come. The rest is varied as drives vary: road, speed, direction, rates, noise density.
+
+The truth is computed by the simulation of `services.simulation.drive` (ten finite elements in each
+element, 40 modes, steps of at most 0.1 ms), measured, put into messages and fed to the worker's
+engine: the identification gets what it would get from a recording.
+"""
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core import unknowns
+from pre_core.physics.bridge import Beam, natural_frequencies_hz
+from pre_core.physics.road import Profile
+from pre_core.physics.sensors import Accelerometer, Receiver
+from pre_core.physics.simulate import Motion
+from pre_core.physics.vehicle import HalfCar
+from schemas.results import Crossing, Header
+from schemas.settings import IdentificationSettings
+from schemas.site import Bridge, Site, Vehicle, site_hash
+from services.drives.runs import Run, run_to_messages
+from services.identification.crossing_data import CrossingData
+from services.identification.engine import Engine
+from services.identification.identify import identify
+from services.recordings.recording import program_version
+from services.simulation.drive import beam_of, declared, measured_run, paper_site
+
+Floats = NDArray[np.float64]
+
+REALM = "sim-calibration"
+_SETTLE_S = 3.0
+"""The truck drives this long before its recording begins: it starts at rest on a rough road."""
+_BEFORE_S, _AFTER_S = 4.0, 3.5
+_LONGEST_STEP_S = 1e-4
+_SLOW_ERROR_S = 300.0
+
+_ROADS = ("A", "B")
+_SPEED_M_PER_S = (5.0, 25.0)
+_NOISE_UG = (25.0, 100.0)
+_RATES_HZ = (1000.0, 500.0, 200.0, 2000.0)
+_RATE_SHARES = (0.6, 0.15, 0.15, 0.1)
+_FIX_RATES_HZ = (10.0, 1.0)
+_FIX_RATE_SHARES = (0.7, 0.3)
+_BIAS_M_PER_S2 = 0.03
+_CHANGING_SHARE = 0.4
+"""Of the crossings with acceleration and braking up to 1 m/s²; the others drive as steadily as a
+driver does. Where the height of the centre of gravity is unknown, all do."""
+_STEADY_M_PER_S2, _CHANGING_M_PER_S2 = (0.0, 0.1), (0.1, 1.0)
+_PERIOD_S = (6.0, 16.0)
+_CG_HEIGHT_M = 1.1
+_LARGEST_CHANGE = 0.3
+"""Of the speed, to either side."""
+
+
+class Conditions(NamedTuple):
+    """How a crossing is driven and measured: what an owner knows or does not care about."""
+
+    road_class: str
+    road_seed: int
+    speed_m_per_s: float
+    """At the entry; it changes as a sine of `change_m_per_s` and `period_s` from `phase` on."""
+    change_m_per_s: float
+    period_s: float
+    phase: float
+    forward: bool
+    rate_hz: float
+    fix_rate_hz: float
+    noise_ug_per_rthz: float
+
+
+class Channels(NamedTuple):
+    """The errors of the four channels, (4,) each; `common` is that of all gains."""
+
+    common_gain: float
+    gain: Floats
+    delay_s: Floats
+    bias_m_per_s2: Floats
+
+
+class Truth(NamedTuple):
+    """Everything behind one crossing."""
+
+    car: HalfCar
+    beam: Beam
+    channels: Channels
+    latency_s: float
+    conditions: Conditions
+
+
+class Drawn(NamedTuple):
+    """One crossing as it is recorded, with what is behind it."""
+
+    truth: Truth
+    run: Run
+    site: Site
+    """What the owner declares: the nominal values, and the noise density."""
+    motion: Motion
+    start_s: float
+    """Time of the first position of `motion` on the clock of `run`."""
+    step_s: float
+    road: Profile
+    largest_deflection_m: float
+
+
+class Seen(NamedTuple):
+    """The result of a crossing, and the data that it was made of."""
+
+    result: Crossing
+    data: CrossingData
+    settings: IdentificationSettings
+    draws: dict[str, Floats] | None = None
+    """Of the posterior by the names of `true_values`, (n,) each; None where a method keeps none."""
+
+
+def default_site() -> Site:
+    """The paper's truck and bridge; the truck's owner knows how high its centre of gravity is."""
+    site = paper_site()
+    vehicle = site.vehicles[0].model_copy(update={"cg_height_m": _CG_HEIGHT_M})
+    return site.model_copy(update={"vehicles": (vehicle,)})
+
+
+def draw_truth(site: Site, seed: int) -> Truth:
+    """Draw everything that the site's priors and the conditions above leave open."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7247]))
+    vehicle, bridge, sensor = site.vehicles[0], site.bridges[0], site.sensor
+
+    def log_normal(nominal: float, spread: float) -> float:
+        return float(nominal * np.exp(spread * rng.standard_normal()))
+
+    def of_truck(key: str) -> float:
+        return log_normal(getattr(vehicle, key), vehicle.spread(key))
+
+    def pair(key: str) -> tuple[float, float]:
+        front, rear = getattr(vehicle, key)
+        return log_normal(front, vehicle.spread(key)), log_normal(rear, vehicle.spread(key))
+
+    unsprung = pair("unsprung_mass_kg")
+    car = HalfCar(
+        body_mass_kg=of_truck("total_mass_kg") - sum(unsprung),
+        front_axle_to_cg_m=of_truck("front_axle_to_cg_m"),
+        wheelbase_m=of_truck("wheelbase_m"),
+        suspension_damping_ns_per_m=pair("suspension_damping_ns_per_m"),
+        suspension_stiffness_n_per_m=pair("suspension_stiffness_n_per_m"),
+        unsprung_mass_kg=unsprung,
+        tyre_stiffness_n_per_m=pair("tyre_stiffness_n_per_m"),
+        pitch_inertia_ratio=of_truck("pitch_inertia_ratio"),
+        cg_height_m=0.0 if vehicle.cg_height_m is None else of_truck("cg_height_m"),
+    )
+    ei_spread = bridge.spread("flexural_rigidity_nm2")
+    ratios = np.exp(ei_spread * rng.standard_normal(bridge.elements))
+    beam = beam_of(bridge, ratios)
+    mass_per_length = log_normal(
+        bridge.mass_per_length_kg_per_m, bridge.spread("mass_per_length_kg_per_m")
+    )
+    start, end = np.abs(bridge.support_spread_nm_per_rad * rng.standard_normal(2))
+    beam = beam._replace(
+        mass_per_length_kg_per_m=np.full(bridge.elements, mass_per_length),
+        rayleigh_alpha_per_s=log_normal(
+            bridge.rayleigh_alpha_per_s, bridge.spread("rayleigh_alpha_per_s")
+        ),
+        rayleigh_beta_s=log_normal(bridge.rayleigh_beta_s, bridge.spread("rayleigh_beta_s")),
+        support_rotational_stiffness_nm_per_rad=(float(start), float(end)),
+    )
+    channels = Channels(
+        float(sensor.common_gain_spread * rng.standard_normal()),
+        sensor.gain_spread * rng.standard_normal(4),
+        sensor.delay_spread_s * rng.standard_normal(4),
+        _BIAS_M_PER_S2 * rng.standard_normal(4),
+    )
+    receiver = site.receiver
+    latency = receiver.latency_s + receiver.latency_spread_s * float(rng.standard_normal())
+    return Truth(car, beam, channels, latency, _draw_conditions(vehicle, rng))
+
+
+def _draw_conditions(vehicle: Vehicle, rng: np.random.Generator) -> Conditions:
+    speed = rng.uniform(*_SPEED_M_PER_S)
+    changing = vehicle.cg_height_m is not None and rng.uniform() < _CHANGING_SHARE
+    acceleration = rng.uniform(*(_CHANGING_M_PER_S2 if changing else _STEADY_M_PER_S2))
+    period = rng.uniform(*_PERIOD_S)
+    return Conditions(
+        road_class=str(rng.choice(_ROADS)),
+        road_seed=int(rng.integers(1 << 31)),
+        speed_m_per_s=float(speed),
+        change_m_per_s=float(min(acceleration * period / (2.0 * np.pi), _LARGEST_CHANGE * speed)),
+        period_s=float(period),
+        phase=float(rng.uniform(0.0, 2.0 * np.pi)),
+        forward=bool(rng.uniform() < 0.5),
+        rate_hz=float(rng.choice(_RATES_HZ, p=_RATE_SHARES)),
+        fix_rate_hz=float(rng.choice(_FIX_RATES_HZ, p=_FIX_RATE_SHARES)),
+        noise_ug_per_rthz=float(np.exp(rng.uniform(*np.log(_NOISE_UG)))),
+    )
+
+
+def drive(site: Site, truth: Truth, seed: int) -> Drawn:
+    """Drive and measure one crossing; `seed` is that of noise and receiver."""
+    vehicle, bridge, how = site.vehicles[0], site.bridges[0], truth.conditions
+    every = max(1, int(np.ceil(1.0 / (how.rate_hz * _LONGEST_STEP_S))))
+    step_s = 1.0 / (how.rate_hz * every)
+    settling = round(_SETTLE_S * how.rate_hz) * every
+    motion = _motion(truth, bridge, step_s, every)
+    errors = truth.channels
+    sensors = [
+        Accelerometer(
+            how.rate_hz,
+            noise_density_ug_per_rthz=how.noise_ug_per_rthz,
+            bias_m_per_s2=float(errors.bias_m_per_s2[c]),
+            gain_error=float((1.0 + errors.common_gain) * (1.0 + errors.gain[c]) - 1.0),
+            delay_s=float(errors.delay_s[c]),
+        )
+        for c in range(4)
+    ]
+    receiver = Receiver(
+        how.fix_rate_hz,
+        position_noise_m=site.receiver.position_noise_m,
+        position_spread_m=site.receiver.position_spread_m,
+        correlation_s=_SLOW_ERROR_S,
+        speed_noise_m_per_s=site.receiver.speed_noise_m_per_s,
+        latency_s=truth.latency_s,
+    )
+    run, road, happened = measured_run(
+        bridge,
+        truth.car,
+        truth.beam,
+        motion,
+        step_s,
+        settling,
+        (how.road_class, how.road_seed),
+        sensors,
+        receiver,
+        np.random.default_rng(np.random.SeedSequence([seed, 0x6E])),
+        antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
+    )
+    return Drawn(
+        truth,
+        run,
+        declared(site, how.noise_ug_per_rthz, how.rate_hz),
+        motion,
+        float(run.accel_time_s[0]) - settling * step_s,
+        step_s,
+        road,
+        float(-happened.wheel_deflection_m.min()),
+    )
+
+
+def _motion(truth: Truth, bridge: Bridge, step_s: float, every: int) -> Motion:
+    """From `_SETTLE_S` + `_BEFORE_S` before the entry to `_AFTER_S` after the exit."""
+    how, car = truth.conditions, truth.car
+    omega = 2.0 * np.pi / how.period_s
+    # At the entry, t = 0, the speed is what the conditions say.
+    level = how.speed_m_per_s - how.change_m_per_s * np.sin(how.phase)
+    slowest = level - how.change_m_per_s
+    longest = (bridge.span_m + car.wheelbase_m) / slowest
+    before = _SETTLE_S + _BEFORE_S
+    # Whole sampling intervals, so that the recording begins with a sample.
+    first = -round(before / (step_s * every)) * every
+    time_s = step_s * np.arange(first, round((longest + _AFTER_S) / step_s) + 1)
+    phase = omega * time_s + how.phase
+    swing = how.change_m_per_s / omega
+    travel = level * time_s - swing * (np.cos(phase) - np.cos(how.phase))
+    speed = level + how.change_m_per_s * np.sin(phase)
+    acceleration = how.change_m_per_s * omega * np.cos(phase)
+    left = int(np.searchsorted(travel, bridge.span_m + car.wheelbase_m))
+    stop = min(left + round(_AFTER_S / (step_s * every)) * every, time_s.size)
+    sign = 1.0 if how.forward else -1.0
+    position = travel if how.forward else bridge.span_m - travel
+    return Motion(position[:stop], sign * speed[:stop], acceleration[:stop])
+
+
+def see(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[Seen]:
+    """Identify all crossings of the site's first truck through the engine, as from a recording."""
+    kept: dict[str, CrossingData] = {}
+    draws: dict[str, dict[str, Floats]] = {}
+
+    def keeping(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+        kept[data.crossing_id] = data
+        return identify(data, settings, keep=draws.__setitem__, **others)
+
+    header = Header(
+        version=program_version(),
+        created=0.0,
+        site_hash=site_hash(site),
+        settings=settings.model_dump(mode="json"),
+        seed=settings.seed,
+    )
+    engine = Engine(site, settings, header, stopwatch=time.perf_counter, identify=keeping)
+    found = []
+    for message in run_to_messages(runs, site, REALM, site.vehicles[0].id):
+        found += [out.result for out in engine.feed(message.key, message.payload)]
+    found += [out.result for out in engine.finish()]
+    return [
+        Seen(
+            result,
+            kept[result.crossing_id],
+            settings,
+            _flat(draws.get(result.crossing_id)),
+        )
+        for result in found
+        if result is not None
+    ]
+
+
+def _flat(draws: dict[str, Floats] | None) -> dict[str, Floats] | None:
+    return None if draws is None else {name: values.ravel() for name, values in draws.items()}
+
+
+def true_values(truth: Truth) -> dict[str, float]:
+    """The truth under the names of docs/contract.md."""
+    car, beam = truth.car, truth.beam
+    vector = unknowns.from_models(car, beam)
+    names = unknowns.names(beam.flexural_rigidity_nm2.size)
+    values = dict(zip(names, vector.tolist(), strict=True))
+    d_1 = car.front_axle_to_cg_m
+    rear_share = d_1 / car.wheelbase_m
+    return values | {
+        "m_s": car.body_mass_kg,
+        "m_s1": car.body_mass_kg * (1.0 - rear_share),
+        "m_s2": car.body_mass_kg * rear_share,
+        "wheelbase": car.wheelbase_m,
+        "f1_hz": float(natural_frequencies_hz(beam, 1)[0]),
+    }

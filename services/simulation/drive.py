@@ -1,0 +1,304 @@
+"""Simulated crossings: the truth of a site file or of the paper's scenarios, driven and measured.
+
+The truth is computed on a mesh ten times finer than the elements, with 40 modes and steps of at
+most 0.1 ms, so that no identification shares its discretisation.
+"""
+
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.paper import experiment
+from pre_core.physics.bridge import Beam, refine, uniform_beam
+from pre_core.physics.road import Profile, contact_patch_average, iso_8608_profile, under_wheels
+from pre_core.physics.sensors import (
+    Accelerometer,
+    Receiver,
+    measure_acceleration,
+    measure_position,
+)
+from pre_core.physics.simulate import Motion, Simulation, constant_acceleration, simulate
+from pre_core.physics.vehicle import HalfCar
+from schemas.signals import CHANNELS
+from schemas.site import Bridge, Site, Vehicle, load_site, parse_site, site_toml
+from services.common.errors import FailureError, InputError
+from services.common.files import check_writable
+from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
+from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.recordings.recording import write_recording
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+Floats = NDArray[np.float64]
+
+START_TIME_S = 1_767_225_600.0
+"""2026-01-01 00:00 UTC: simulated drives begin then, so that the same call gives the same file."""
+_PARTS = 10
+_MODES = 40
+_LONGEST_STEP_S = 1e-4
+_SETTLE_S = 3.0
+"""The truck drives this long before its recording begins: it starts at rest on a rough road."""
+_BEFORE_S, _AFTER_S = 3.0, 2.5
+_ROAD_SPACING_M = 0.01
+_CONTACT_PATCH_M = 0.2
+_FIX_RATE_HZ = 10.0
+_SLOW_ERROR_S = 300.0
+"""A receiver's slow error is forgotten within minutes: a crossing sees it as almost constant."""
+_ALTITUDE_M = 25.0
+
+
+class Drive(NamedTuple):
+    """What the truck measured, and the truth behind it."""
+
+    run: Run
+    road: Profile
+    """As the tyres felt it."""
+    rigidity_ratios: Floats
+    """EI of each element over the site's nominal value."""
+
+
+def paper_site() -> Site:
+    """The site of the paper: Tables 1 and 2."""
+    text = resources.files("services").joinpath("data/paper.toml").read_text(encoding="utf-8")
+    return parse_site(text, "paper.toml")
+
+
+def simulate_command(
+    *,
+    site: Path | None,
+    scenario: int | None,
+    ei: Sequence[float] | None,
+    road: str,
+    seed: int,
+    noise: float,
+    speed: tuple[float, float],
+    direction: str,
+    gps_noise: bool,
+    rate: float | None,
+    output: Path,
+    console: "Console",
+) -> int:
+    """Write the recording of one simulated crossing."""
+    check_writable(output)
+    known = paper_site() if site is None else load_site(site)
+    ratios = _ratios(known.bridges[0], scenario, ei)
+    with console.status("simulating", spinner="dots"):
+        drive = simulate_drive(
+            known,
+            ratios,
+            road_class=road,
+            seed=seed,
+            noise_ug_per_rthz=noise,
+            speed_m_per_s=speed,
+            forward=direction == "start_to_end",
+            receiver_errors=gps_noise,
+            rate_hz=rate,
+        )
+        messages = write_drive(output, drive, declared(known, noise, drive.run.rate_hz))
+    seconds = drive.run.accel_time_s[-1] - drive.run.accel_time_s[0]
+    console.print(f"{output}: {seconds:.1f} s, {messages} messages", highlight=False)
+    return 0
+
+
+def declared(site: Site, noise_ug_per_rthz: float, rate_hz: float) -> Site:
+    """The site as the owner of this simulated truck would declare it: its own sensors' noise."""
+    sensor = site.sensor.model_copy(
+        update={
+            "noise_density_ug_per_rthz": (noise_ug_per_rthz,) * 4,
+            "rate_hz": (rate_hz,) * 4,
+        }
+    )
+    return site.model_copy(update={"sensor": sensor})
+
+
+def write_drive(path: Path, drive: Drive, site: Site, realm: str = "sim-drive") -> int:
+    """Write the recording that the truck would have made, with the site in it."""
+    messages = run_to_messages([drive.run], site, realm, site.vehicles[0].id)
+    return write_recording(path, messages, site_toml=site_toml(site), reason="simulation complete")
+
+
+def simulate_drive(
+    site: Site,
+    rigidity_ratios: Floats,
+    *,
+    road_class: str,
+    seed: int,
+    noise_ug_per_rthz: float = 0.0,
+    speed_m_per_s: tuple[float, float] = (experiment.SPEED_M_PER_S, experiment.SPEED_M_PER_S),
+    forward: bool = True,
+    receiver_errors: bool = False,
+    rate_hz: float | None = None,
+) -> Drive:
+    """Drive the site's first truck over its first bridge.
+
+    The speed changes evenly from the first to the second value between 3 s before the entry and the
+    end. FailureError if the coupled simulation does not settle.
+    """
+    vehicle, bridge = site.vehicles[0], site.bridges[0]
+    car, beam = truck_of(vehicle), beam_of(bridge, rigidity_ratios)
+    rate = rate_hz or max(site.sensor.rate_hz)
+    every = max(1, round(1.0 / (rate * _LONGEST_STEP_S)))
+    step_s = 1.0 / (rate * every)
+    begin, end = speed_m_per_s
+    mean = 0.5 * (begin + end)
+    driven_s = _BEFORE_S + (bridge.span_m + vehicle.wheelbase_m) / mean + _AFTER_S
+    acceleration = (end - begin) / driven_s
+    settle = round(_SETTLE_S * rate) * every
+    steps = settle + int(np.ceil(driven_s * rate)) * every + 1
+    # At the moment the recording begins the truck has its first speed and 3 s to the bridge.
+    first_speed = begin - acceleration * _SETTLE_S
+    approach = begin * _BEFORE_S + 0.5 * acceleration * _BEFORE_S**2
+    approach += first_speed * _SETTLE_S + 0.5 * acceleration * _SETTLE_S**2
+    sign = 1 if forward else -1
+    start = -approach if forward else bridge.span_m + approach
+    motion = constant_acceleration(start, sign * first_speed, acceleration, steps, step_s)
+    sensor = Accelerometer(rate, noise_density_ug_per_rthz=noise_ug_per_rthz)
+    run, road = measured_run(
+        bridge,
+        car,
+        beam,
+        motion,
+        step_s,
+        settle,
+        (road_class, seed),
+        (sensor,) * len(CHANNELS),
+        _receiver(site, perfect=not receiver_errors),
+        np.random.default_rng(seed),
+        antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
+    )[:2]
+    return Drive(run, road, np.asarray(rigidity_ratios, dtype=np.float64))
+
+
+def measured_run(
+    bridge: Bridge,
+    car: HalfCar,
+    beam: Beam,
+    motion: Motion,
+    step_s: float,
+    settling_steps: int,
+    road: tuple[str, int],
+    sensors: Sequence[Accelerometer],
+    receiver: Receiver,
+    rng: np.random.Generator,
+    *,
+    antenna_to_front_axle_m: float = 0.0,
+) -> tuple[Run, Profile, Simulation]:
+    """Drive `car` over `beam` along `motion` and measure it with one sensor per channel.
+
+    `road` is an ISO 8608 class and the seed of its phases. The recording begins after
+    `settling_steps`; the sensors are of one rate, of which the steps are a whole fraction. Returns
+    the recording, the road as the tyres felt it and all that truck and bridge did. FailureError if
+    the coupled simulation does not settle.
+    """
+    sign = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
+    reach = car.wheelbase_m + 1.0
+    low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
+    raw = iso_8608_profile(np.floor(low), np.ceil(high), _ROAD_SPACING_M, *road)
+    profile = contact_patch_average(raw, _CONTACT_PATCH_M)
+    felt = under_wheels(profile, motion, car.wheelbase_m, sign)
+    fine = simulate(car, refine(beam, _PARTS), motion, felt, step_s, modes=_modes(bridge))
+    if not fine.converged:
+        raise FailureError("the simulation did not converge: are the site's values possible?")
+    recorded = fine.acceleration_m_per_s2[settling_steps:]
+    accel_rng, gnss_rng = rng.spawn(2)
+    rate = sensors[0].rate_hz
+    channels = {
+        name: measure_acceleration(recorded[:, i], 1.0 / step_s, sensors[i], accel_rng)
+        for i, name in enumerate(CHANNELS)
+    }
+    time_s = START_TIME_S + np.arange(channels[CHANNELS[0]].size) / rate
+    antenna = motion.position_m[settling_steps:] - sign * antenna_to_front_axle_m
+    speed = np.abs(motion.speed_m_per_s[settling_steps:])
+    gnss = _fixes(bridge, step_s, antenna, speed, receiver, gnss_rng, forward=sign > 0)
+    return Run("simulation", time_s, rate, channels, gnss), profile, fine
+
+
+def truck_of(vehicle: Vehicle) -> HalfCar:
+    """The site's nominal truck."""
+    return HalfCar(
+        body_mass_kg=vehicle.sprung_mass_kg,
+        front_axle_to_cg_m=vehicle.front_axle_to_cg_m,
+        wheelbase_m=vehicle.wheelbase_m,
+        suspension_damping_ns_per_m=vehicle.suspension_damping_ns_per_m,
+        suspension_stiffness_n_per_m=vehicle.suspension_stiffness_n_per_m,
+        unsprung_mass_kg=vehicle.unsprung_mass_kg,
+        tyre_stiffness_n_per_m=vehicle.tyre_stiffness_n_per_m,
+        pitch_inertia_ratio=vehicle.pitch_inertia_ratio,
+        tyre_damping_ns_per_m=vehicle.tyre_damping_ns_per_m,
+        cg_height_m=vehicle.cg_height_m or 0.0,
+    )
+
+
+def beam_of(bridge: Bridge, rigidity_ratios: Floats) -> Beam:
+    """The site's nominal bridge with these ratios of the flexural rigidity."""
+    return uniform_beam(
+        bridge.span_m,
+        np.array(bridge.nominal_flexural_rigidity_nm2) * rigidity_ratios,
+        bridge.mass_per_length_kg_per_m,
+        bridge.rayleigh_alpha_per_s,
+        bridge.rayleigh_beta_s,
+    )._replace(element_lengths_m=np.array(bridge.lengths_m))
+
+
+def _ratios(bridge: Bridge, scenario: int | None, ei: Sequence[float] | None) -> Floats:
+    if scenario is not None:
+        ratios = experiment.scenario_ratios(scenario)
+        option = "--scenario"
+    else:
+        ratios = np.array(ei or (), dtype=np.float64)
+        option = "--ei"
+    if ratios.size != bridge.elements:
+        raise InputError(
+            f"{option}: gives {ratios.size} elements, but {bridge.id} of the site has "
+            f"{bridge.elements}"
+        )
+    return ratios
+
+
+def _modes(bridge: Bridge) -> int:
+    return min(_MODES, 2 * bridge.elements * _PARTS)
+
+
+def _receiver(site: Site, *, perfect: bool) -> Receiver:
+    """The receiver of the site file, or one without error."""
+    if perfect:
+        return Receiver(_FIX_RATE_HZ)
+    declared_errors = site.receiver
+    return Receiver(
+        _FIX_RATE_HZ,
+        position_noise_m=declared_errors.position_noise_m,
+        position_spread_m=declared_errors.position_spread_m,
+        correlation_s=_SLOW_ERROR_S,
+        speed_noise_m_per_s=declared_errors.speed_noise_m_per_s,
+        latency_s=declared_errors.latency_s,
+    )
+
+
+def _fixes(
+    bridge: Bridge,
+    step_s: float,
+    antenna: Floats,
+    speed: Floats,
+    receiver: Receiver,
+    rng: np.random.Generator,
+    *,
+    forward: bool,
+) -> GnssTrack:
+    """What the receiver reports of the drive of its antenna."""
+    time_s = step_s * np.arange(antenna.size, dtype=np.float64)
+    fixes = measure_position(time_s, antenna, np.zeros_like(antenna), speed, receiver, rng)
+    frame = bridge_frame(bridge)
+    latitude, longitude = to_lat_lon(frame, fixes.chainage_m, fixes.lateral_m)
+    return GnssTrack(
+        START_TIME_S + fixes.time_s,
+        latitude,
+        longitude,
+        np.full(latitude.size, _ALTITUDE_M),
+        fixes.speed_m_per_s,
+        np.full(latitude.size, heading_deg(frame, start_to_end=forward)),
+    )

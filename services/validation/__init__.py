@@ -1,0 +1,1 @@
+"""Is what the methods say true? Against the paper, a known truth, and a bound."""

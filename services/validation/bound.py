@@ -1,0 +1,258 @@
+"""How well one crossing can be known at all: the Cramér-Rao bound of its data at the truth.
+
+The bound is that of all rows of the posterior - white data, receiver, priors - differentiated at
+the true values of every unknown of truck and bridge, with all nuisances (trajectory, gains, delays,
+initial states) free: the inverse of J'J, of which J is the Jacobian by central differences. A
+support spring cannot be negative, which the inverse does not know: its variance is replaced by
+that of a normal about the true value cut off at zero, and what follows for the others is taken
+along (`without_negative`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core import unknowns
+from pre_core.crossing import optimum, posterior
+from pre_core.diagnostics.calibration import without_negative
+from pre_core.physics.vehicle import total_mass_kg
+from pre_core.unknowns import C_S1, EI_1, KAPPA
+from schemas.signals import CHANNELS
+from services.identification.pre_method import inputs_of
+from services.simulation.drawn import Drawn, Seen, true_values
+
+Floats = NDArray[np.float64]
+
+_STEP = 1e-4
+"""Of a central difference, in the coordinates of the posterior: multiples of a prior's spread, and
+metres of the trajectory. Halving it moves no bound by a thousandth of itself (tests)."""
+_NUISANCE_STEPS = 20
+_ENOUGH = 0.01
+"""Of the sum of squares, whose standard deviation is tens: less is no step."""
+
+
+class Bound(NamedTuple):
+    """Relative standard deviations (of supports absolute), by parameter name."""
+
+    std: dict[str, float]
+    """With the scale error, as results give it."""
+    std_without_scale: dict[str, float]
+    chi2_per_dof: float
+    """Of the data at the truth: the model itself, whatever a search finds."""
+
+
+def bound_at_truth(seen: Seen, drawn: Drawn) -> dict[str, dict[str, float]]:
+    """The bounds of a drawn crossing as JSON."""
+    problem, y = at_truth(seen, drawn)
+    return as_json(bound_of(problem, y, seen.data.vehicle.spread("total_mass_kg")))
+
+
+def bound_at(
+    seen: Seen, values: dict[str, float], wheelbase_m: float, entry_time: float
+) -> dict[str, dict[str, float]]:
+    """The bounds of a crossing of which only truck and bridge are known, as JSON.
+
+    `values` are by the names of docs/contract.md; the trajectory is the receiver's, moved so that
+    the front axle enters the bridge at `entry_time` (s since 1970).
+    """
+    problem, y, time_s = problem_of(seen)
+    where = posterior.layout(problem)
+    names = unknowns.names(_elements(problem))
+    theta = np.array([values[name] for name in names])
+    _set_theta(problem, y, theta, wheelbase_m)
+    entry_m = np.interp(
+        entry_time - seen.data.wall_offset_s,
+        time_s,
+        problem.basis_position @ y[where.trajectory],
+    )
+    begin_m = 0.0 if seen.data.stay.direction > 0 else seen.data.bridge.span_m
+    y[where.trajectory] += begin_m - entry_m
+    problem, y = _settled(problem, y)
+    return as_json(bound_of(problem, y, seen.data.vehicle.spread("total_mass_kg")))
+
+
+def at_truth(seen: Seen, drawn: Drawn) -> tuple[posterior.Problem, Floats]:
+    """The posterior of a drawn crossing, and the truth in its coordinates (see `_settled`)."""
+    problem, y, time_s = problem_of(seen)
+    where = posterior.layout(problem)
+    errors = drawn.truth.channels
+    correction = 1.0 / ((1.0 + errors.common_gain) * (1.0 + errors.gain)) - 1.0
+    theta = equivalent_theta(
+        true_values(drawn.truth),
+        _elements(problem),
+        drawn.site.vehicles[0].total_mass_kg / total_mass_kg(drawn.truth.car),
+    )
+    _set_gains(problem, y, correction)
+    _set_theta(problem, y, theta, drawn.truth.car.wheelbase_m)
+    y[where.delays] = errors.delay_s / problem.priors.delay_spread_s
+    true_m = np.interp(
+        time_s + seen.data.wall_offset_s,
+        drawn.start_s + drawn.step_s * np.arange(drawn.motion.position_m.size),
+        drawn.motion.position_m,
+    )
+    y[where.trajectory] = np.linalg.lstsq(problem.basis_position, true_m, rcond=None)[0]
+    return _settled(problem, y)
+
+
+def _settled(problem: posterior.Problem, y: Floats) -> tuple[posterior.Problem, Floats]:
+    """Truck and bridge as they are in y, with the noise of this truck and the best nuisances.
+
+    Initial states are known of no truth, and a common delay of all channels is nearly the same as
+    a shift along the road.
+    """
+    where = posterior.layout(problem)
+    y[where.offset] = _best_offset(problem, y)
+    problem = optimum.with_noise_at(problem, y)
+    return problem, settle(problem, y, np.arange(where.gains.start, where.size))
+
+
+def as_json(bound: Bound) -> dict[str, dict[str, float]]:
+    """Plain dictionaries."""
+    return {
+        "std": bound.std,
+        "std_without_scale": bound.std_without_scale,
+        "at_truth": {"chi2_per_dof": bound.chi2_per_dof},
+    }
+
+
+def bound_of(
+    problem: posterior.Problem, y: Floats, scale_error: float, step: float = _STEP
+) -> Bound:
+    """The bound at y (size,); `scale_error` is of what scales all EI and no residual shows."""
+    where = posterior.layout(problem)
+    jacobian = central_jacobian(problem, y, np.arange(where.size), step)
+    covariance = posterior.covariance(posterior.precision_root(jacobian))
+    springs = np.arange(where.theta.stop - int(problem.estimated[-2:].sum()), where.theta.stop)
+    for spring in springs:
+        covariance = without_negative(covariance, int(spring), float(y[spring]))
+    std = np.sqrt(np.diag(covariance))
+    names = unknowns.names(_elements(problem))
+    alone, full = {}, {}
+    for place, i in enumerate(np.flatnonzero(problem.estimated)):
+        alone[names[i]] = float(problem.priors.spread[i] * std[place])
+        is_scaled = names[i].startswith(("c_", "k_s", "k_u", "m_", "EI_")) or names[i] == "rhoA"
+        full[names[i]] = float(np.hypot(alone[names[i]], scale_error if is_scaled else 0.0))
+    return Bound(full, alone, _chi2_per_dof(problem, y))
+
+
+def _chi2_per_dof(problem: posterior.Problem, y: Floats) -> float:
+    """Mean square of the white data; only the nuisances were fitted to them."""
+    where = posterior.layout(problem)
+    rows = posterior.data_rows(problem, y[None, :])[0]
+    degrees: int = rows.size - (where.offset - where.gains.start)
+    return float(rows @ rows) / max(1, degrees)
+
+
+def central_jacobian(
+    problem: posterior.Problem, y: Floats, columns: NDArray[np.int64], step: float = _STEP
+) -> Floats:
+    """Derivatives (rows, columns) of all rows at y by central differences."""
+    moved = np.repeat(y[None, :], 2 * columns.size, axis=0)
+    moved[np.arange(columns.size), columns] += step
+    moved[columns.size + np.arange(columns.size), columns] -= step
+    values = posterior.all_rows(problem, moved)
+    return np.asarray((values[: columns.size] - values[columns.size :]).T / (2.0 * step))
+
+
+def settle(
+    problem: posterior.Problem,
+    y: Floats,
+    columns: NDArray[np.int64],
+    steps: int = _NUISANCE_STEPS,
+) -> Floats:
+    """The best y in these columns alone, the others held: Gauss-Newton with halved steps."""
+    rows = posterior.all_rows(problem, y[None, :])[0]
+    for _ in range(steps):
+        jacobian = central_jacobian(problem, y, columns)
+        move = np.linalg.lstsq(jacobian, -rows, rcond=None)[0]
+        for share in (1.0, 0.5, 0.25, 0.1, 0.02):
+            tried = y.copy()
+            tried[columns] += share * move
+            new = posterior.all_rows(problem, tried[None, :])[0]
+            if np.all(np.isfinite(new)) and new @ new < rows @ rows:
+                break
+        else:
+            return y
+        is_there = rows @ rows - new @ new < _ENOUGH
+        y, rows = tried, new
+        if is_there:
+            return y
+    return y
+
+
+def equivalent_theta(values: dict[str, float], elements: int, scale: float) -> Floats:
+    """The parameters (p,) that the method would find without noise.
+
+    The method takes the total mass for the nominal one. All forces are then off by `scale`, nominal
+    over true mass, and so are masses, springs, dampers and rigidities.
+    """
+    theta = np.array([values[name] for name in unknowns.names(elements)])
+    theta[C_S1:KAPPA] *= scale
+    theta[EI_1 : EI_1 + elements + 1] *= scale
+    theta[-2:] *= scale
+    return theta
+
+
+def _elements(problem: posterior.Problem) -> int:
+    return int(problem.priors.theta.size) - len(unknowns.names(0))
+
+
+def problem_of(seen: Seen) -> tuple[posterior.Problem, Floats, Floats]:
+    """The posterior as the method sets it up for this crossing, its nominal start, its times (n,).
+
+    Times are of the rows of `basis_position`, on the truck's clock.
+    """
+    samples = seen.data.samples
+    assert samples is not None  # noqa: S101 - the crossing was identified
+    acceleration = np.stack([samples.channels[name] for name in CHANNELS])
+    inputs = inputs_of(seen.data, seen.settings, acceleration, samples.start_s)
+    problem, y = optimum.prepare(inputs)
+    return problem, y, _times(problem, inputs.fixes)
+
+
+def _times(problem: posterior.Problem, fixes: posterior.Fixes) -> Floats:
+    """When the trajectory is at the rows of its basis: that spline which is the time itself.
+
+    The rows of the receiver determine it: at the fixes it is their time, its slope is one and its
+    third derivative nothing.
+    """
+    rows = problem.receiver_rows[:-1, :-1]
+    moments = fixes.time_s - fixes.time_s[0]
+    values = np.zeros(rows.shape[0])
+    values[: moments.size] = moments / fixes.position_noise_m
+    values[moments.size : 2 * moments.size] = 1.0 / fixes.speed_noise_m_per_s
+    coefficients = np.linalg.lstsq(rows, values, rcond=None)[0]
+    return np.asarray(fixes.time_s[0] + problem.basis_position @ coefficients)
+
+
+def _set_theta(problem: posterior.Problem, y: Floats, theta: Floats, wheelbase_m: float) -> None:
+    """Put physical values (p,) into the coordinates y; modified in place."""
+    priors, where = problem.priors, posterior.layout(problem)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.log(theta / priors.theta) / priors.spread
+        values[-2:] = theta[-2:] / priors.spread[-2:]
+    y[where.theta] = values[problem.estimated]
+    y[where.wheelbase] = np.log(wheelbase_m / priors.wheelbase_m) / priors.wheelbase_spread
+
+
+def _set_gains(problem: posterior.Problem, y: Floats, correction: Floats) -> None:
+    """Put relative corrections (4,) of the gains into y; modified in place."""
+    where, priors = posterior.layout(problem), problem.priors
+    common = 1.0 + float(correction.mean())
+    y[where.common_gain] = np.log(common) / posterior.common_gain_spread(priors)
+    unit = np.zeros((4, where.size))
+    unit[np.arange(3), np.arange(where.gains.start, where.gains.stop)] = 1.0
+    directions = posterior.points(problem, unit).gain[:3]
+    y[where.gains] = np.linalg.lstsq(directions.T, (1.0 + correction) / common - 1.0, rcond=None)[0]
+
+
+def _best_offset(problem: posterior.Problem, y: Floats) -> float:
+    """The offset of all fixes from the trajectory in y."""
+    where = posterior.layout(problem)
+    column = problem.receiver_rows[:, -1]
+    on = column != 0.0
+    trajectory = problem.receiver_rows[:, :-1] @ y[where.trajectory]
+    return float(
+        column[on] @ (problem.receiver_values - trajectory)[on] / (column[on] @ column[on])
+    )
