@@ -1,83 +1,143 @@
-"""The vector of unknowns and its names (docs/contract.md, "Parameter names").
+"""The table of unknowns: what is estimated of a truck and a bridge, one row each.
 
-One order everywhere: d_1, c_s1, c_s2, k_s1, k_s2, m_u1, m_u2, k_u1, k_u2, kappa, EI_1 … EI_n, rhoA,
-alpha, beta, k_rot_start, k_rot_end. A search may leave some of them fixed.
+A vector of parameters theta has the rows of the truck first, then those of the bridge, then EI of
+every element. To add an unknown, add a row here and its effect in `physics` (and what sensor noise
+it passes on, `crossing/whitening`); priors, search, results and validation follow from the row.
 """
+
+from functools import cache
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.physics.bridge import Beam
-from pre_core.physics.vehicle import HalfCar
-
 FloatArray = NDArray[np.float64]
 
-D_1, C_S1, C_S2, K_S1, K_S2, M_U1, M_U2, K_U1, K_U2, KAPPA = range(10)
-EI_1 = 10
-VEHICLE_NAMES = ("d_1", "c_s1", "c_s2", "k_s1", "k_s2", "m_u1", "m_u2", "k_u1", "k_u2", "kappa")
-BRIDGE_NAMES = ("rhoA", "alpha", "beta", "k_rot_start", "k_rot_end")
-UNITS = {
-    "d_1": "m",
-    "c_s1": "N·s/m",
-    "c_s2": "N·s/m",
-    "k_s1": "N/m",
-    "k_s2": "N/m",
-    "m_u1": "kg",
-    "m_u2": "kg",
-    "k_u1": "N/m",
-    "k_u2": "N/m",
-    "kappa": "1",
-    "rhoA": "kg/m",
-    "alpha": "1/s",
-    "beta": "s",
-    "k_rot_start": "N·m/rad",
-    "k_rot_end": "N·m/rad",
-    "m_s": "kg",
-    "m_s1": "kg",
-    "m_s2": "kg",
-}
+TRUCK, BRIDGE = "truck", "bridge"
+
+
+class Unknown(NamedTuple):
+    """One row. Its prior is log-normal about the nominal value, unless that is zero."""
+
+    name: str
+    """As in results (docs/contract.md, "Parameter names")."""
+    unit: str
+    part: str
+    """TRUCK or BRIDGE."""
+    key: str
+    """Name of the quantity in `HalfCar`, `Beam` and the site file."""
+    which: int = 0
+    """Which of a pair (front, rear) or (start, end)."""
+    mass_power: int = 0
+    """Of the total mass to which it is proportional where all accelerations are given: a truck
+    that is twice as heavy has twice as stiff springs, and so has the bridge that it bends alike."""
+    may_be_zero: bool = False
+    """Nominally zero it is estimated all the same, with a half-normal prior at zero; any other
+    unknown whose nominal value is zero is taken for known."""
+    may_be_absent: bool = False
+    """Then part of its prior lies on exactly zero: there is no such spring, or the bearing does
+    not give."""
+    in_paper: bool = True
+
+
+SCALARS: Final = (
+    Unknown("d_1", "m", TRUCK, "front_axle_to_cg_m"),
+    Unknown("c_s1", "N·s/m", TRUCK, "suspension_damping_ns_per_m", 0, 1),
+    Unknown("c_s2", "N·s/m", TRUCK, "suspension_damping_ns_per_m", 1, 1),
+    Unknown("k_s1", "N/m", TRUCK, "suspension_stiffness_n_per_m", 0, 1),
+    Unknown("k_s2", "N/m", TRUCK, "suspension_stiffness_n_per_m", 1, 1),
+    Unknown("m_u1", "kg", TRUCK, "unsprung_mass_kg", 0, 1),
+    Unknown("m_u2", "kg", TRUCK, "unsprung_mass_kg", 1, 1),
+    Unknown("k_u1", "N/m", TRUCK, "tyre_stiffness_n_per_m", 0, 1),
+    Unknown("k_u2", "N/m", TRUCK, "tyre_stiffness_n_per_m", 1, 1),
+    Unknown("kappa", "1", TRUCK, "pitch_inertia_ratio", in_paper=False),
+    Unknown("rhoA", "kg/m", BRIDGE, "mass_per_length_kg_per_m", 0, 1),
+    Unknown("alpha", "1/s", BRIDGE, "rayleigh_alpha_per_s"),
+    Unknown("beta", "s", BRIDGE, "rayleigh_beta_s"),
+    Unknown(
+        "k_rot_start",
+        "N·m/rad",
+        BRIDGE,
+        "support_rotational_stiffness_nm_per_rad",
+        0,
+        1,
+        may_be_zero=True,
+        in_paper=False,
+    ),
+    Unknown(
+        "k_rot_end",
+        "N·m/rad",
+        BRIDGE,
+        "support_rotational_stiffness_nm_per_rad",
+        1,
+        1,
+        may_be_zero=True,
+        in_paper=False,
+    ),
+)
+"""All but EI, in the order of theta."""
+ELEMENT: Final = Unknown("EI", "N·m²", BRIDGE, "flexural_rigidity_nm2", 0, 1)
+"""The row that every element has; in results its name is EI_1, EI_2, …"""
+DERIVED_UNITS: Final = {"m_s": "kg", "m_s1": "kg", "m_s2": "kg"}
+
+
+def place(name: str) -> int:
+    """Place in theta of any unknown but EI; KeyError if the table has none of this name."""
+    for i, row in enumerate(SCALARS):
+        if row.name == name:
+            return i
+    raise KeyError(name)
+
+
+# Places as constants, for kernels. Pairs stand beside each other.
+D_1: Final = place("d_1")
+C_S1: Final = place("c_s1")
+K_S1: Final = place("k_s1")
+M_U1: Final = place("m_u1")
+K_U1: Final = place("k_u1")
+KAPPA: Final = place("kappa")
+RHO_A: Final = place("rhoA")
+ALPHA: Final = place("alpha")
+BETA: Final = place("beta")
+K_ROT: Final = place("k_rot_start")
+FIRST_OF_BRIDGE: Final = RHO_A
+EI_1: Final = len(SCALARS)
+
+
+@cache
+def table(elements: int) -> tuple[Unknown, ...]:
+    """The rows of theta for a bridge of so many elements."""
+    rigidities = (ELEMENT._replace(name=f"EI_{e + 1}", which=e) for e in range(elements))
+    return (*SCALARS, *rigidities)
 
 
 def names(elements: int) -> tuple[str, ...]:
-    """Names of the elements + 15 entries of the vector."""
-    rigidities = tuple(f"EI_{e + 1}" for e in range(elements))
-    return VEHICLE_NAMES + rigidities + BRIDGE_NAMES
+    """Names of the entries of theta."""
+    return tuple(row.name for row in table(elements))
 
 
 def unit(name: str) -> str:
-    """SI unit of a parameter."""
-    return "N·m²" if name.startswith("EI_") else UNITS[name]
+    """SI unit of an unknown, or of a mass that is derived; KeyError if there is none."""
+    if name in DERIVED_UNITS:
+        return DERIVED_UNITS[name]
+    return ELEMENT.unit if name.startswith(f"{ELEMENT.name}_") else SCALARS[place(name)].unit
+
+
+def element_count(theta: FloatArray) -> int:
+    """Elements of the bridge that theta (…, p) describes."""
+    return int(theta.shape[-1]) - EI_1
+
+
+def of_part(part: str, elements: int) -> NDArray[np.bool_]:
+    """Which entries of theta (p,) are of the truck, or of the bridge."""
+    return np.array([row.part == part for row in table(elements)])
+
+
+def mass_powers(elements: int) -> FloatArray:
+    """Powers (p,) of the total mass to which the entries of theta are proportional."""
+    return np.array([row.mass_power for row in table(elements)], dtype=np.float64)
 
 
 def paper_subset(elements: int) -> NDArray[np.int64]:
-    """Places of the paper's n + 12 unknowns: all but kappa and the support springs."""
-    left_out = {"kappa", "k_rot_start", "k_rot_end"}
-    return np.array([i for i, name in enumerate(names(elements)) if name not in left_out])
-
-
-def from_models(car: HalfCar, beam: Beam) -> FloatArray:
-    """The vector that describes this truck and this bridge (of one mass per length throughout)."""
-    if np.ptp(beam.mass_per_length_kg_per_m) > 0.0:
-        raise ValueError("the unknown rhoA is one number: the beam must be of one mass per length")
-    return np.array(
-        [
-            car.front_axle_to_cg_m,
-            *car.suspension_damping_ns_per_m,
-            *car.suspension_stiffness_n_per_m,
-            *car.unsprung_mass_kg,
-            *car.tyre_stiffness_n_per_m,
-            car.pitch_inertia_ratio,
-            *beam.flexural_rigidity_nm2,
-            beam.mass_per_length_kg_per_m[0],
-            beam.rayleigh_alpha_per_s,
-            beam.rayleigh_beta_s,
-            *beam.support_rotational_stiffness_nm_per_rad,
-        ]
-    )
-
-
-def body_masses(theta: FloatArray, total_mass_kg: float, wheelbase_m: float) -> FloatArray:
-    """Derived m_s, m_s1 = m_s d_2/D, m_s2 = m_s d_1/D: (..., 3) for vectors (..., p)."""
-    m_s = total_mass_kg - theta[..., M_U1] - theta[..., M_U2]
-    rear_share = theta[..., D_1] / wheelbase_m
-    return np.stack([m_s, m_s * (1.0 - rear_share), m_s * rear_share], axis=-1)
+    """Places of the paper's n + 12 unknowns."""
+    return np.flatnonzero([row.in_paper for row in table(elements)])

@@ -70,6 +70,16 @@ class _Spreadable(_Table):
         value: float = getattr(self, f"{key}_spread")
         return value
 
+    def nominal(self, key: str) -> tuple[float, ...]:
+        """Return what is known of a quantity before, one value or several."""
+        value: float | tuple[float, ...] = getattr(self, key)
+        return value if isinstance(value, tuple) else (value,)
+
+    def scale_at_zero(self, key: str) -> float:
+        """Return the scale of the half-normal prior of a quantity that is nominally zero."""
+        value: float = getattr(self, f"{key}_scale_at_zero")
+        return value
+
 
 class Vehicle(_Spreadable):
     """A truck with two axles. Nominal values are those of a data sheet."""
@@ -164,13 +174,21 @@ class Bridge(_Spreadable):
         assert self.flexural_rigidity_nm2 is not None  # noqa: S101 - the validator saw to it
         return (self.flexural_rigidity_nm2,) * self.elements
 
+    def nominal(self, key: str) -> tuple[float, ...]:
+        """Return what is known of a quantity before: of bearings, that nothing need be there."""
+        if key == "flexural_rigidity_nm2":
+            return self.nominal_flexural_rigidity_nm2
+        if key == "support_rotational_stiffness_nm_per_rad":
+            return (0.0, 0.0)
+        return super().nominal(key)
+
     @property
     def lengths_m(self) -> tuple[float, ...]:
         """Length of each element; they add up to the span."""
         return self.element_lengths_m or (self.span_m / self.elements,) * self.elements
 
     @property
-    def support_spread_nm_per_rad(self) -> float:
+    def support_rotational_stiffness_nm_per_rad_scale_at_zero(self) -> float:
         """Scale of the half-normal prior of the supports' rotational stiffness."""
         if self.support_rotational_stiffness_spread_nm_per_rad is not None:
             return self.support_rotational_stiffness_spread_nm_per_rad

@@ -23,6 +23,7 @@ from pre_core.paper.crossing import ROAD_CLASS, ROAD_SEED, paper_window
 from pre_core.paper.integrate import newmark_integrate, spline_integrate
 from pre_core.paper.residual import Window
 from pre_core.physics.bridge import natural_frequencies_hz
+from pre_core.physics.models import from_models
 from pre_core.physics.vehicle import natural_frequencies_hz as vehicle_frequencies_hz
 from pre_core.search import levenberg_marquardt, loop
 from services.simulation.drive import paper_site, simulate_drive
@@ -39,7 +40,7 @@ Floats = NDArray[np.float64]
 Proposal = Callable[[np.random.Generator, Floats], Floats]
 
 CONSOLE = Console(highlight=False, width=150)
-NOMINAL = unknowns.from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
+NOMINAL = from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
 FREE = unknowns.paper_subset(experiment.ELEMENTS)
 
 

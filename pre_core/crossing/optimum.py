@@ -32,14 +32,14 @@ from pre_core.crossing.posterior import (
     trajectory_basis,
 )
 from pre_core.crossing.residuals import Crossing, sinc_table, workspace
-from pre_core.crossing.whitening import Truck, noise_power, row_count, row_filter, whitener
+from pre_core.crossing.whitening import noise_power, row_count, row_filter, truck_of, whitener
 from pre_core.physics.beam_basis import beam_basis, rebased
 from pre_core.physics.bridge import FloatArray
 from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import Rows
 from pre_core.search.loop import Ending
-from pre_core.unknowns import D_1, EI_1, KAPPA, M_U1
+from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE
 
 _KNOT_S = 0.4
 _SLOPE_STEP = 1e-3
@@ -127,7 +127,10 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
     theta = inputs.priors.theta
     count = row_count(row, crossing.rows)
     noise = whitener(
-        row, count, _truck(crossing, theta, wheelbase), inputs.density_m_per_s2_per_rthz
+        row,
+        count,
+        truck_of(theta, crossing.total_mass_kg, wheelbase),
+        inputs.density_m_per_s2_per_rthz,
     )
     problem = Problem(
         crossing,
@@ -140,23 +143,9 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         rows,
         values,
         np.zeros(0),
-        (theta > 0.0) | (np.arange(theta.size) >= theta.size - 2),
         tuple(workspace(crossing, theta.size, row) for _ in range(inputs.threads)),
     )
     return problem, start(problem, best)
-
-
-def _truck(crossing: Crossing, theta: FloatArray, wheelbase: float) -> Truck:
-    d_1 = theta[D_1]
-    d_2 = wheelbase - d_1
-    m_s = crossing.total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
-    inertia = theta[KAPPA] * m_s * d_1 * d_2
-    return Truck(
-        theta,
-        (m_s * d_2**2 + inertia) / wheelbase**2,
-        (m_s * d_1**2 + inertia) / wheelbase**2,
-        (m_s * d_1 * d_2 - inertia) / wheelbase**2,
-    )
 
 
 def with_noise_at(problem: Problem, y: FloatArray) -> Problem:
@@ -168,12 +157,12 @@ def with_noise_at(problem: Problem, y: FloatArray) -> Problem:
     at = points(problem, near)
     density = problem.density * (1.0 + at.gain)
     trucks = [
-        _truck(problem.crossing, theta, float(wheelbase))
+        truck_of(theta, problem.crossing.total_mass_kg, float(wheelbase))
         for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
     ]
     count = row_count(problem.rows, problem.crossing.rows)
     noise = whitener(problem.rows, count, trucks[0], density[0])
-    truck = int(problem.estimated[:EI_1].sum())
+    truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
     power = noise_power(problem.rows, trucks, density, changing)
@@ -231,24 +220,20 @@ def _minimised(
     return state, Ending.STEPS_EXHAUSTED, evaluations
 
 
-def _bridge_places(problem: Problem) -> NDArray[np.int64]:
-    """Places in y of what is estimated of the bridge: elements, mass, damping, springs."""
-    place = np.full(problem.estimated.size, -1)
-    place[problem.estimated] = np.arange(int(problem.estimated.sum()))
-    bridge = place[EI_1:]
-    return bridge[bridge >= 0]
-
-
 def _whole_bridge(problem: Problem) -> FloatArray:
     """Directions in which all elements change alike and the supports have no springs."""
-    size = layout(problem).size
-    unit = np.eye(size)
-    bridge = _bridge_places(problem)
-    elements = bridge[: problem.estimated.size - EI_1 - 5]
-    springs = bridge[-2:]
-    single = np.setdiff1d(np.arange(size), [*elements, *springs])
+    where = layout(problem)
+    unit = np.eye(where.size)
+    elements = where.elements
+    single = np.setdiff1d(np.arange(where.size), [*elements, *_springs(problem)])
     together = unit[:, elements].sum(axis=1) / np.sqrt(elements.size)
     return np.column_stack([unit[:, single], together])
+
+
+def _springs(problem: Problem) -> NDArray[np.int64]:
+    """Places in y of the springs at the supports."""
+    where = layout(problem)
+    return where.half_normal[where.half_normal >= where.bridge[0]]
 
 
 class _Place(NamedTuple):
@@ -262,7 +247,7 @@ class _Place(NamedTuple):
 def _walk(problem: Problem, y: FloatArray) -> tuple[list[_Place], int]:
     """Places along the road, best first, and the evaluations that they took."""
     where = layout(problem)
-    places = _bridge_places(problem)
+    places = where.bridge
     free = np.eye(y.size)
     here = levenberg_marquardt.begin(
         _tempered(problem, y, free, _WALK_TEMPERATURE), np.zeros(y.size)
@@ -327,7 +312,7 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
         report(f"freeing the elements, start {len(tried)}", 0.3 + 0.05 * len(tried))
         z = y.copy()
         z[layout(problem).trajectory] += place.shift_m
-        z[_bridge_places(problem)] += place.bridge
+        z[layout(problem).bridge] += place.bridge
         found = _freed(problem, z)
         evaluations += found.evaluations
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
@@ -350,7 +335,7 @@ def _freed(problem: Problem, y: FloatArray) -> Optimum:
     approximation (`normal_approximation`).
     """
     free = np.eye(y.size)
-    springs = np.arange(layout(problem).theta.stop - 2, layout(problem).theta.stop)
+    springs = layout(problem).half_normal
     evaluations = 0
     ending = Ending.STEPS_EXHAUSTED
     problem = with_noise_at(problem, y)
@@ -375,9 +360,9 @@ def bends(problem: Problem) -> FloatArray:
     The deflection of a statically determinate beam is linear in 1/EI; a little less, for the prior
     is normal in ln EI.
     """
-    bend = np.zeros(layout(problem).size)
-    elements = _bridge_places(problem)[: problem.estimated.size - EI_1 - 5]
-    bend[elements] = _BEND * problem.priors.spread[EI_1 : EI_1 + elements.size]
+    where = layout(problem)
+    bend = np.zeros(where.size)
+    bend[where.elements] = _BEND * problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]]
     return bend
 
 

@@ -22,7 +22,7 @@ from pre_core.crossing.residuals import (
     roads_and_deflections,
 )
 from pre_core.crossing.whitening import RowFilter, Whitener
-from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
+from pre_core.unknowns import C_S1, EI_1, FIRST_OF_BRIDGE, K_S1, K_U1, M_U1
 
 FloatArray = NDArray[np.float64]
 
@@ -41,7 +41,9 @@ class Priors(NamedTuple):
     """What is known before the crossing; relative spreads are those of a log-normal."""
 
     theta: FloatArray  # (p,) nominal values
-    spread: FloatArray  # (p,) relative; of the two support springs absolute (half-normal at zero)
+    spread: FloatArray  # (p,) relative; absolute where the prior is half-normal
+    half_normal: NDArray[np.bool_]  # (p,) at zero; log-normal about the nominal value elsewhere
+    estimated: NDArray[np.bool_]  # (p,) which are unknown at all
     wheelbase_m: float
     wheelbase_spread: float
     gain_spread: float
@@ -75,7 +77,6 @@ class Problem(NamedTuple):
     receiver_rows: FloatArray  # (r, b + 1): rows of (coefficients, offset)
     receiver_values: FloatArray  # (r,)
     noise_slope: FloatArray  # (t + 1 + 3,): see `all_rows`
-    estimated: NDArray[np.bool_]  # (p,) which of theta are unknown
     works: tuple[Work, ...]
 
 
@@ -83,6 +84,11 @@ class Layout(NamedTuple):
     """Places of the groups of unknowns in y."""
 
     theta: slice
+    bridge: NDArray[np.int64]
+    """Of theta, what is the bridge's; `elements` are its last."""
+    elements: NDArray[np.int64]
+    half_normal: NDArray[np.int64]
+    """Coordinates that must not be negative."""
     wheelbase: int
     gains: slice
     """Contrasts between the channels."""
@@ -96,13 +102,18 @@ class Layout(NamedTuple):
 
 def layout(problem: Problem) -> Layout:
     """Order: theta (what is estimated), wheelbase, gains, delays, initial states, trajectory."""
-    t = int(problem.estimated.sum())
+    priors = problem.priors
+    kept = np.flatnonzero(priors.estimated)
+    t = kept.size
     gains = slice(t + 1, t + 4)
     delays = slice(gains.stop + 1, gains.stop + 1 + CHANNELS)
     initial = slice(delays.stop, delays.stop + 3 * CHANNELS)
     trajectory = slice(initial.stop, initial.stop + problem.basis_position.shape[1])
     return Layout(
         slice(0, t),
+        np.flatnonzero(kept >= FIRST_OF_BRIDGE),
+        np.flatnonzero(kept >= EI_1),
+        np.flatnonzero(priors.half_normal[kept]),
         t,
         gains,
         gains.stop,
@@ -169,14 +180,12 @@ def points(problem: Problem, y: FloatArray) -> Points:
     k = y.shape[0]
     p = priors.theta.size
     theta = np.repeat(priors.theta[None, :], k, axis=0)
-    springs = np.zeros(p, dtype=bool)
-    springs[-2:] = True
-    logs = np.flatnonzero(problem.estimated & ~springs)
     values = np.zeros((k, p))
-    values[:, problem.estimated] = y[:, where.theta]
+    values[:, priors.estimated] = y[:, where.theta]
+    logs = np.flatnonzero(priors.estimated & ~priors.half_normal)
     theta[:, logs] = priors.theta[logs] * np.exp(priors.spread[logs] * values[:, logs])
-    spring = np.flatnonzero(problem.estimated & springs)
-    theta[:, spring] = priors.spread[spring] * values[:, spring]
+    zero = np.flatnonzero(priors.estimated & priors.half_normal)
+    theta[:, zero] = priors.spread[zero] * values[:, zero]
     coefficients = y[:, where.trajectory]
     return Points(
         theta,

@@ -22,7 +22,8 @@ from pre_core.kernels.lanes import LANES, kernel, summing
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 from pre_core.physics import modal_response
 from pre_core.physics.beam_basis import BeamBasis
-from pre_core.unknowns import C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1
+from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
+from pre_core.unknowns import C_S1, D_1, FIRST_OF_BRIDGE, K_S1, K_U1, KAPPA, M_U1
 
 FloatArray = NDArray[np.float64]
 
@@ -189,21 +190,17 @@ def _wheels(
 
     `gravity` is in the scale of the sensors: one over the common gain.
     """
-    d_1 = theta[D_1]
-    d_2 = wheelbase - d_1
     m_s = crossing.total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
-    inertia = theta[KAPPA] * m_s * d_1 * d_2
-    square = wheelbase * wheelbase
-    m_12 = (m_s * d_1 * d_2 - inertia) / square
+    m_11, m_22, m_12 = masses_above_axles(m_s, theta[D_1], wheelbase, theta[KAPPA])
+    on_axles = masses_on_axles(m_s, theta[D_1], wheelbase, theta[M_U1], theta[M_U1 + 1])
     transfer = crossing.total_mass_kg * crossing.cg_height_m / wheelbase * gravity
     n = work.road.shape[1]
     for w in range(2):
         sign = 1.0 - 2.0 * w
-        d_far = d_2 if w == 0 else d_1
-        m_ii = (m_s * d_far * d_far + inertia) / square
+        m_ii = m_11 if w == 0 else m_22
         m_u = theta[M_U1 + w]
         c, k, k_u = theta[C_S1 + w], theta[K_S1 + w], theta[K_U1 + w]
-        weight = gravity * crossing.gravity_m_per_s2 * (m_s * d_far / wheelbase + m_u)
+        weight = gravity * crossing.gravity_m_per_s2 * on_axles[w]
         z_s, v_s, a_s = work.corrected[w, 0], work.corrected[w, 1], work.corrected[w, 2]
         z_u, v_u, a_u = work.corrected[2 + w, 0], work.corrected[2 + w, 1], work.corrected[2 + w, 2]
         a_other = work.corrected[1 - w, 2]
@@ -247,7 +244,7 @@ def _locate(crossing: Crossing, work: Work, front: FloatArray, wheelbase: float)
 def _bridge(crossing: Crossing, work: Work, theta: FloatArray) -> bool:
     """Modes of this bridge into the work arrays, unless they are there already."""
     same = True
-    for i in range(EI_1, theta.size):
+    for i in range(FIRST_OF_BRIDGE, theta.size):
         if theta[i] != work.modes_of[i]:
             same = False
     if same:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from pre_core.crossing.channels import low_pass
 from pre_core.kernels.lanes import summing
-from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
+from pre_core.physics.vehicle import masses_above_axles
+from pre_core.unknowns import C_S1, D_1, K_S1, K_U1, KAPPA, M_U1
 
 FloatArray = NDArray[np.float64]
 
@@ -55,6 +56,12 @@ class Truck(NamedTuple):
     m_11: float
     m_22: float
     m_12: float
+
+
+def truck_of(theta: FloatArray, total_mass_kg: float, wheelbase_m: float) -> Truck:
+    """The truck of theta (p,) as noise meets it."""
+    m_s = total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
+    return Truck(theta, *masses_above_axles(m_s, theta[D_1], wheelbase_m, theta[KAPPA]))
 
 
 class Whitener(NamedTuple):

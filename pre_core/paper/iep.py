@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.kernels.lanes import kernel
 from pre_core.paper.integrate import Integrated
 from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
 
@@ -41,17 +42,14 @@ def iep_signals(
     )
 
 
+@kernel
+def iep_factors(theta: FloatArray, wheel: int) -> tuple[float, float, float]:
+    """What z''_u, z'_u - z'_s and z_u - z_s are multiplied by: m_u, c_s and k_s over k_u."""
+    k_u = theta[K_U1 + wheel]
+    return theta[M_U1 + wheel] / k_u, theta[C_S1 + wheel] / k_u, theta[K_S1 + wheel] / k_u
+
+
 def input_profiles(signals: FloatArray, theta: FloatArray) -> FloatArray:
     """Input profiles u (2, n) of the two wheels for one vector of parameters."""
-    wheel = np.arange(2)
-    k_u = theta[K_U1 + wheel]
-    factors = np.stack(
-        [
-            np.ones(2),
-            theta[M_U1 + wheel] / k_u,
-            theta[C_S1 + wheel] / k_u,
-            theta[K_S1 + wheel] / k_u,
-        ],
-        axis=1,
-    )
+    factors = np.array([(1.0, *iep_factors(theta, wheel)) for wheel in range(2)])
     return np.asarray(np.einsum("wj,wjn->wn", factors, signals))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
-from pre_core.paper.iep import iep_signals, input_profiles
+from pre_core.paper.iep import iep_factors, iep_signals, input_profiles
 from pre_core.paper.integrate import Integrated
 from pre_core.physics.beam_basis import (
     BeamBasis,
@@ -24,7 +24,8 @@ from pre_core.physics.beam_basis import (
 )
 from pre_core.physics.bridge import locate
 from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2, rear_position_m
-from pre_core.unknowns import C_S1, D_1, K_S1, K_U1, KAPPA, M_U1
+from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
+from pre_core.unknowns import D_1, KAPPA, M_U1
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -236,20 +237,21 @@ def _vehicle_factors(
     m_11, m_22, m_12, m_u1, m_u2."""
     for lane in range(LANES):
         p = theta[lane]
-        d_1 = p[D_1]
-        d_2 = wheelbase - d_1
         m_s = total_mass - p[M_U1] - p[M_U1 + 1]
-        inertia = p[KAPPA] * m_s * d_1 * d_2
         for w in range(2):
-            k_u = p[K_U1 + w]
-            out[3 * w, lane] = -p[M_U1 + w] / k_u
-            out[3 * w + 1, lane] = -p[C_S1 + w] / k_u
-            out[3 * w + 2, lane] = -p[K_S1 + w] / k_u
-        out[6, lane] = gravity * (m_s * d_2 / wheelbase + p[M_U1])
-        out[7, lane] = gravity * (m_s * d_1 / wheelbase + p[M_U1 + 1])
-        out[8, lane] = (m_s * d_2 * d_2 + inertia) / (wheelbase * wheelbase)
-        out[9, lane] = (m_s * d_1 * d_1 + inertia) / (wheelbase * wheelbase)
-        out[10, lane] = (m_s * d_1 * d_2 - inertia) / (wheelbase * wheelbase)
+            mass, damping, stiffness = iep_factors(p, w)
+            out[3 * w, lane], out[3 * w + 1, lane], out[3 * w + 2, lane] = (
+                -mass,
+                -damping,
+                -stiffness,
+            )
+        on_front, on_rear = masses_on_axles(m_s, p[D_1], wheelbase, p[M_U1], p[M_U1 + 1])
+        out[6, lane] = gravity * on_front
+        out[7, lane] = gravity * on_rear
+        m_11, m_22, m_12 = masses_above_axles(m_s, p[D_1], wheelbase, p[KAPPA])
+        out[8, lane] = m_11
+        out[9, lane] = m_22
+        out[10, lane] = m_12
         out[11, lane] = p[M_U1]
         out[12, lane] = p[M_U1 + 1]
 

@@ -25,7 +25,7 @@ from pre_core.physics.bridge import (
     uniform_beam,
     unit_stiffness_matrices,
 )
-from pre_core.unknowns import EI_1
+from pre_core.unknowns import ALPHA, BETA, EI_1, K_ROT, RHO_A
 
 FloatArray = NDArray[np.float64]
 
@@ -69,13 +69,11 @@ def beam_basis(
 
 
 def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
-    """The same beam in coordinates in which the bridge `theta` (n + 15,) is diagonal.
+    """The same beam in coordinates in which the bridge `theta` (p,) is diagonal.
 
     Bridges near it are then nearly diagonal, which makes their modes quick to find.
     """
-    n = basis.stiffness.shape[0] - 2
-    factors = np.concatenate([theta[EI_1 : EI_1 + n], theta[EI_1 + n + 3 : EI_1 + n + 5]])
-    _, shapes = eigh(np.tensordot(factors, basis.stiffness, axes=1))
+    _, shapes = eigh(np.tensordot(stiffness_factors(theta), basis.stiffness, axes=1))
     return BeamBasis(
         np.ascontiguousarray(shapes.T @ basis.stiffness @ shapes),
         np.ascontiguousarray(basis.cubics @ shapes),
@@ -84,12 +82,28 @@ def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
 
 
 def first_frequencies_hz(basis: BeamBasis, theta: FloatArray) -> FloatArray:
-    """First natural frequency (k,) in Hz, undamped, of the bridges `theta` (k, n + 15)."""
-    n = basis.stiffness.shape[0] - 2
-    factors = np.concatenate([theta[:, EI_1 : EI_1 + n], theta[:, EI_1 + n + 3 :]], axis=1)
-    stiffness = np.tensordot(factors, basis.stiffness, axes=1)
+    """First natural frequency (k,) in Hz, undamped, of the bridges `theta` (k, p)."""
+    stiffness = np.tensordot(stiffness_factors(theta), basis.stiffness, axes=1)
     lowest = np.linalg.eigvalsh(stiffness)[:, 0]
-    return np.asarray(np.sqrt(lowest / theta[:, EI_1 + n]) / (2.0 * np.pi))
+    return np.asarray(np.sqrt(lowest / theta[:, RHO_A]) / (2.0 * np.pi))
+
+
+def stiffness_factors(theta: FloatArray) -> FloatArray:
+    """What multiplies the matrices of `BeamBasis.stiffness`: (…, n + 2) for vectors (…, p)."""
+    return np.concatenate([theta[..., EI_1:], theta[..., K_ROT : K_ROT + 2]], axis=-1)
+
+
+@kernel
+def stiffness_factor(theta: FloatArray, i: int) -> float:
+    """The same for one vector (p,) and matrix i, in kernels."""
+    elements = theta.size - EI_1
+    return theta[EI_1 + i] if i < elements else theta[K_ROT + i - elements]
+
+
+@kernel
+def modal_damping(theta: FloatArray, eigenvalue: float) -> float:
+    """Rayleigh damping of a mode of unit mass: alpha + beta omega^2."""
+    return theta[ALPHA] + theta[BETA] * eigenvalue
 
 
 @kernel
@@ -105,31 +119,31 @@ def modal_filters(
 ) -> bool:
     """Modes of four bridges as the coefficients of their recursions; False if not finite.
 
-    `theta` is (4, n + 15). Written: `cubics` (parts, m, 4, 4) [part, mode, power, particle], scaled
+    `theta` is (4, p). Written: `cubics` (parts, m, 4, 4) [part, mode, power, particle], scaled
     by 1/sqrt(b_0), and `feedback` (m, 2, 4): -b_1/b_0 and -b_2/b_0.
     """
     factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
-    elements = factors - 2
-    rho = EI_1 + elements
+    by_lane = np.empty((factors, LANES))
+    for e in range(factors):
+        for lane in range(LANES):
+            by_lane[e, lane] = stiffness_factor(theta[lane], e)
     for i in range(m):
         for j in range(i, m):  # the upper triangle is all that is read
             total = (0.0, 0.0, 0.0, 0.0)
             for e in range(factors):
-                place = EI_1 + e if e < elements else rho + 3 + e - elements
-                factor = (theta[0, place], theta[1, place], theta[2, place], theta[3, place])
-                total = fma_scalar(factor, basis_stiffness[e, i, j], total)
+                total = fma_scalar(load(by_lane, e), basis_stiffness[e, i, j], total)
             store(matrix[i], j, total)
     if not diagonalise(matrix, vectors):
         return False
     a = 2.0 / step_s
     for k in range(m):
         for lane in range(LANES):
-            eigenvalue = matrix[k, k, lane] / theta[lane, rho]
-            damping = theta[lane, rho + 1] + theta[lane, rho + 2] * eigenvalue
+            eigenvalue = matrix[k, k, lane] / theta[lane, RHO_A]
+            damping = modal_damping(theta[lane], eigenvalue)
             b_0 = a * a + a * damping + eigenvalue
             feedback[k, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
             feedback[k, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
-            matrix[k, k, lane] = 1.0 / np.sqrt(theta[lane, rho] * b_0)
+            matrix[k, k, lane] = 1.0 / np.sqrt(theta[lane, RHO_A] * b_0)
     for e in range(basis_cubics.shape[0]):
         for k in range(m):
             size = load(matrix[k], k)
@@ -147,14 +161,12 @@ def diagonalise_bridge(
 ) -> bool:
     """Eigenvalues times rho A on the diagonal of `matrix`, mode shapes in the rows of `vectors`.
 
-    Both are (m, m), of one bridge `theta` (n + 15,). False if not finite.
+    Both are (m, m), of one bridge `theta` (p,). False if not finite.
     """
     factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
-    elements = factors - 2
-    rho = EI_1 + elements
     matrix[:] = 0.0
     for e in range(factors):
-        factor = theta[EI_1 + e] if e < elements else theta[rho + 3 + e - elements]
+        factor = stiffness_factor(theta, e)
         if factor != 0.0:
             for i in range(m):
                 to, unit = matrix[i], basis_stiffness[e, i]
@@ -195,12 +207,11 @@ def modal_filters_one(
     cubics: FloatArray,
     feedback: FloatArray,
 ) -> bool:
-    """The same for one bridge `theta` (n + 15,), its modes in the lanes: g groups of four.
+    """The same for one bridge `theta` (p,), its modes in the lanes: g groups of four.
 
     `matrix` and `vectors` are (m, m). Written: `cubics` (parts, g, 4, 4) [part, group, power, mode]
     and `feedback` (g, 2, 4); lanes beyond the last mode stay zero.
     """
-    rho = EI_1 + basis_stiffness.shape[0] - 2
     if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
         return False
     a = 2.0 / step_s
@@ -208,12 +219,12 @@ def modal_filters_one(
     feedback[:] = 0.0
     for k in range(basis_stiffness.shape[1]):
         group, lane = k // LANES, k % LANES
-        eigenvalue = matrix[k, k] / theta[rho]
-        damping = theta[rho + 1] + theta[rho + 2] * eigenvalue
+        eigenvalue = matrix[k, k] / theta[RHO_A]
+        damping = modal_damping(theta, eigenvalue)
         b_0 = a * a + a * damping + eigenvalue
         feedback[group, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
         feedback[group, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
-        size = 1.0 / np.sqrt(theta[rho] * b_0)
+        size = 1.0 / np.sqrt(theta[RHO_A] * b_0)
         shape_cubics(basis_cubics, vectors[k], size, lane, cubics[:, group])
     return True
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, store
-from pre_core.physics.beam_basis import diagonalise_bridge, shape_cubics
-from pre_core.unknowns import EI_1
+from pre_core.physics.beam_basis import diagonalise_bridge, modal_damping, shape_cubics
+from pre_core.unknowns import RHO_A
 
 FloatArray = NDArray[np.float64]
 
@@ -84,13 +84,12 @@ def modal_filters(
     cubics: FloatArray,
     feedback: FloatArray,
 ) -> bool:
-    """Modes of one bridge `theta` (n + 15,) in the lanes, g groups of four; False: not finite.
+    """Modes of one bridge `theta` (p,) in the lanes, g groups of four; False: not finite.
 
     `matrix` and `vectors` are (m, m). Written: `cubics` (parts, g, 4, 4) [part, group, power, mode]
     times the root of the sum of the b, and `feedback` (g, 5, 4); lanes beyond the last mode stay
     zero.
     """
-    rho = EI_1 + basis_stiffness.shape[0] - 2
     if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
         return False
     cubics[:] = 0.0
@@ -98,13 +97,13 @@ def modal_filters(
     one = np.empty(COEFFICIENTS)
     for k in range(basis_stiffness.shape[1]):
         group, lane = k // LANES, k % LANES
-        eigenvalue = matrix[k, k] / theta[rho]
-        damping = theta[rho + 1] + theta[rho + 2] * eigenvalue
+        eigenvalue = matrix[k, k] / theta[RHO_A]
+        damping = modal_damping(theta, eigenvalue)
         total = mode_coefficients(eigenvalue, damping, step_s, one)
         if not total > 0.0:
             return False
         feedback[group, :, lane] = one
-        size = np.sqrt(total / theta[rho])
+        size = np.sqrt(total / theta[RHO_A])
         shape_cubics(basis_cubics, vectors[k], size, lane, cubics[:, group])
     return True
 

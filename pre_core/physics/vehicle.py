@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from pre_core.kernels.lanes import kernel
+
 FloatArray = NDArray[np.float64]
 Pair = tuple[float, float]
 
@@ -37,29 +39,49 @@ def total_mass_kg(car: HalfCar) -> float:
     return car.body_mass_kg + car.unsprung_mass_kg[0] + car.unsprung_mass_kg[1]
 
 
-def body_masses_kg(car: HalfCar) -> tuple[float, float, float]:
+@kernel
+def masses_above_axles(
+    body_mass: float, d_1: float, wheelbase: float, kappa: float
+) -> tuple[float, float, float]:
     """(m_11, m_22, m_12) of the body in the coordinates above the axles.
 
-    m_11 = (m_s d_2^2 + I)/D^2, m_22 = (m_s d_1^2 + I)/D^2, m_12 = (m_s d_1 d_2 - I)/D^2.
+    m_11 = (m_s d_2^2 + I)/D^2, m_22 = (m_s d_1^2 + I)/D^2, m_12 = (m_s d_1 d_2 - I)/D^2 with
+    I = kappa m_s d_1 d_2.
     """
-    d_1 = car.front_axle_to_cg_m
-    d_2 = car.wheelbase_m - d_1
-    m_s = car.body_mass_kg
-    inertia = car.pitch_inertia_ratio * m_s * d_1 * d_2
-    square = car.wheelbase_m**2
+    d_2 = wheelbase - d_1
+    inertia = kappa * body_mass * d_1 * d_2
+    square = wheelbase * wheelbase
     return (
-        (m_s * d_2**2 + inertia) / square,
-        (m_s * d_1**2 + inertia) / square,
-        (m_s * d_1 * d_2 - inertia) / square,
+        (body_mass * d_2 * d_2 + inertia) / square,
+        (body_mass * d_1 * d_1 + inertia) / square,
+        (body_mass * d_1 * d_2 - inertia) / square,
     )
+
+
+@kernel
+def masses_on_axles(
+    body_mass: float, d_1: float, wheelbase: float, unsprung_1: float, unsprung_2: float
+) -> tuple[float, float]:
+    """What rests on the front and on the rear axle of the standing truck, wheels included."""
+    return (
+        body_mass * (wheelbase - d_1) / wheelbase + unsprung_1,
+        body_mass * d_1 / wheelbase + unsprung_2,
+    )
+
+
+def body_masses_kg(car: HalfCar) -> tuple[float, float, float]:
+    """(m_11, m_22, m_12), see `masses_above_axles`."""
+    m_11, m_22, m_12 = masses_above_axles(
+        car.body_mass_kg, car.front_axle_to_cg_m, car.wheelbase_m, car.pitch_inertia_ratio
+    )
+    return m_11, m_22, m_12
 
 
 def static_axle_loads_n(car: HalfCar, gravity_m_per_s2: float) -> Pair:
     """Weight on the front and on the rear axle of the standing truck."""
-    d_1 = car.front_axle_to_cg_m
-    d_2 = car.wheelbase_m - d_1
-    front = car.body_mass_kg * d_2 / car.wheelbase_m + car.unsprung_mass_kg[0]
-    rear = car.body_mass_kg * d_1 / car.wheelbase_m + car.unsprung_mass_kg[1]
+    front, rear = masses_on_axles(
+        car.body_mass_kg, car.front_axle_to_cg_m, car.wheelbase_m, *car.unsprung_mass_kg
+    )
     return front * gravity_m_per_s2, rear * gravity_m_per_s2
 
 

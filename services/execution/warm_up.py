@@ -20,6 +20,7 @@ from pre_core.crossing import optimum, posterior
 from pre_core.paper import experiment, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.integrate import spline_integrate
+from pre_core.physics.models import from_models
 from pre_core.physics.simulate import constant_speed
 from pre_core.physics.vehicle import total_mass_kg
 from pre_core.search import levenberg_marquardt, loop
@@ -54,7 +55,7 @@ def warm_up() -> None:
 
 def _warm_up_pre() -> None:
     """The kernels of method `pre`, on four seconds of noise at 10 m/s."""
-    nominal = unknowns.from_models(experiment.TRUCK, _SOUND)
+    nominal = from_models(experiment.TRUCK, _SOUND)
     step_s, count = 0.002, 2700
     time_s = step_s * np.arange(0, count, 50, dtype=np.float64)
     fixes = posterior.Fixes(
@@ -75,6 +76,8 @@ def _warm_up_pre() -> None:
         posterior.Priors(
             nominal,
             np.full(nominal.size, 0.1),
+            nominal == 0.0,
+            np.full(nominal.size, True),
             experiment.TRUCK.wheelbase_m,
             0.002,
             0.01,
@@ -105,7 +108,7 @@ def _warm_up_paper() -> None:
         initial_state_known=False,
         bias_known=False,
     )
-    theta = unknowns.from_models(experiment.TRUCK, _SOUND)
+    theta = from_models(experiment.TRUCK, _SOUND)
     free = unknowns.paper_subset(experiment.ELEMENTS)
     problem = levenberg_marquardt.Problem(window, theta, free)
     work = residual.workspace(window)
@@ -122,7 +125,7 @@ def _warm_up_paper() -> None:
 def _warm_up_validation() -> None:
     """What else a simulation and a reproduction of the paper call."""
     window = paper_window(experiment.TRUCK, _SOUND, 0.0, 0)
-    nominal = unknowns.from_models(experiment.TRUCK, _SOUND)
+    nominal = from_models(experiment.TRUCK, _SOUND)
     free = unknowns.paper_subset(experiment.ELEMENTS)
     walk = random_walk.problem(window, nominal, free, 0, threads=1)
     random_walk.step(walk, random_walk.init(walk, particles=1))

@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.physics.bridge import Beam, uniform_beam
+from pre_core import unknowns
+from pre_core.physics.bridge import Beam
+from pre_core.physics.models import beam_from
 from pre_core.physics.road import Profile, iri_m_per_km, iso_8608_class, roughness_coefficient_m3
 from pre_core.physics.simulate import Motion
-from pre_core.unknowns import EI_1
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
@@ -87,21 +88,9 @@ def rejected(
 
 def nominal_parameters(vehicle: Vehicle, bridge: Bridge) -> Floats:
     """The values of the site file in the order of `pre_core.unknowns`."""
+    of = {unknowns.TRUCK: vehicle, unknowns.BRIDGE: bridge}
     return np.array(
-        [
-            vehicle.front_axle_to_cg_m,
-            *vehicle.suspension_damping_ns_per_m,
-            *vehicle.suspension_stiffness_n_per_m,
-            *vehicle.unsprung_mass_kg,
-            *vehicle.tyre_stiffness_n_per_m,
-            vehicle.pitch_inertia_ratio,
-            *bridge.nominal_flexural_rigidity_nm2,
-            bridge.mass_per_length_kg_per_m,
-            bridge.rayleigh_alpha_per_s,
-            bridge.rayleigh_beta_s,
-            0.0,
-            0.0,
-        ]
+        [of[row.part].nominal(row.key)[row.which] for row in unknowns.table(bridge.elements)]
     )
 
 
@@ -130,11 +119,7 @@ def longest_outage_s(times_s: Floats, entry_s: float, exit_s: float) -> float:
 
 def beam_of(data: CrossingData, theta: Floats) -> Beam:
     """The bridge that a vector of parameters (p,) describes."""
-    n = data.bridge.elements
-    rho, alpha, beta, start, end = theta[EI_1 + n : EI_1 + n + 5]
-    return uniform_beam(
-        data.bridge.span_m, theta[EI_1 : EI_1 + n], rho, alpha, beta, (start, end)
-    )._replace(element_lengths_m=np.array(data.bridge.lengths_m))
+    return beam_from(theta, np.array(data.bridge.lengths_m))
 
 
 def gaussian(unit: str, mean: float, std: float) -> results.Parameter:

@@ -18,6 +18,7 @@ from pre_core.paper import random_walk, residual
 from pre_core.paper.integrate import spline_integrate
 from pre_core.paper.residual import Window
 from pre_core.physics.bridge import natural_frequencies_hz
+from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
 from pre_core.search import levenberg_marquardt, loop
 from schemas import results
@@ -467,7 +468,7 @@ def _derived_masses(data: CrossingData, fit: _Fit) -> dict[str, results.Paramete
     """m_s, m_s1, m_s2 and their formal spread to first order."""
     vehicle = data.vehicle
     masses = partial(
-        unknowns.body_masses,
+        body_masses,
         total_mass_kg=vehicle.total_mass_kg,
         wheelbase_m=vehicle.wheelbase_m,
     )

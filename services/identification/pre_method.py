@@ -15,6 +15,7 @@ from pre_core import unknowns
 from pre_core.crossing import optimum, posterior
 from pre_core.crossing.whitening import RESIDUALS
 from pre_core.physics.beam_basis import first_frequencies_hz
+from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
 from pre_core.search import crank_nicolson
 from pre_core.search.loop import Ending
@@ -108,27 +109,21 @@ def inputs_of(
 
 
 def _priors(data: CrossingData) -> posterior.Priors:
+    """What the site file knows of every unknown of the table."""
     vehicle, bridge = data.vehicle, data.bridge
-    pairs = (
-        "suspension_damping_ns_per_m",
-        "suspension_stiffness_n_per_m",
-        "unsprung_mass_kg",
-        "tyre_stiffness_n_per_m",
-    )
-    springs = [bridge.support_spread_nm_per_rad] * 2
+    of = {unknowns.TRUCK: vehicle, unknowns.BRIDGE: bridge}
+    rows = unknowns.table(bridge.elements)
+    nominal = nominal_parameters(vehicle, bridge)
+    at_zero = (nominal == 0.0) & np.array([row.may_be_zero for row in rows])
     spread = [
-        vehicle.spread("front_axle_to_cg_m"),
-        *(vehicle.spread(key) for key in pairs for _ in range(2)),
-        vehicle.spread("pitch_inertia_ratio"),
-        *[bridge.spread("flexural_rigidity_nm2")] * bridge.elements,
-        bridge.spread("mass_per_length_kg_per_m"),
-        bridge.spread("rayleigh_alpha_per_s"),
-        bridge.spread("rayleigh_beta_s"),
-        *springs,
+        of[row.part].scale_at_zero(row.key) if zero else of[row.part].spread(row.key)
+        for row, zero in zip(rows, at_zero, strict=True)
     ]
     return posterior.Priors(
-        nominal_parameters(vehicle, bridge),
+        nominal,
         np.array(spread),
+        at_zero,
+        at_zero | (nominal > 0.0),
         vehicle.wheelbase_m,
         vehicle.spread("wheelbase_m"),
         data.sensor.gain_spread,
@@ -202,12 +197,12 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
     at = posterior.points(problem, y[None, :])
     middle = crossing.first_row + rows.taps.size // 2 + rows.every * np.arange(white.shape[0])
     rear = at.position_m[0] - data.stay.direction * at.wheelbase_m[0]
-    names = unknowns.names(data.bridge.elements)
-    estimated = [name for name, known in zip(names, problem.estimated, strict=True) if known]
-    vehicle = set(unknowns.VEHICLE_NAMES)
-    prior_z = {name: float(y[k]) for k, name in enumerate(estimated) if name in vehicle}
+    rows_of = unknowns.table(data.bridge.elements)
+    estimated = [rows_of[i] for i in np.flatnonzero(problem.priors.estimated)]
+    prior_z = {
+        row.name: float(y[k]) for k, row in enumerate(estimated) if row.part == unknowns.TRUCK
+    }
     _, covariance = optimum.normal_approximation(found)
-    elements = [k for k, name in enumerate(estimated) if name.startswith("EI_")]
     return Fit(
         white,
         rows.every * rows.step_s,
@@ -215,7 +210,7 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
         found.chi2_per_dof,
         prior_z | {"wheelbase": float(y[where.wheelbase])},
         float(problem.receiver_rows[-1, -1] * y[where.offset]),
-        np.sqrt(np.diag(covariance)[elements]),
+        np.sqrt(np.diag(covariance)[where.elements]),
     )
 
 
@@ -228,10 +223,9 @@ def _sample(
     """
     problem = found.problem
     where = posterior.layout(problem)
-    springs = np.arange(where.theta.stop - 2, where.theta.stop)
     centre, covariance = optimum.normal_approximation(found)
     normal = crank_nicolson.approximation(
-        centre, inflation**2 * covariance, springs, optimum.bends(problem), settings.seed
+        centre, inflation**2 * covariance, where.half_normal, optimum.bends(problem), settings.seed
     )
 
     def target(points: Floats) -> Floats:
@@ -286,18 +280,13 @@ def _values(
     mass_spread = data.vehicle.spread("total_mass_kg")
     scale = np.exp(mass_spread * rng.standard_normal(flat.shape[0]))
     names = unknowns.names(data.bridge.elements)
-    theta = at.theta.copy()
-    scaled = [
-        i
-        for i, name in enumerate(names)
-        if name.startswith(("c_", "k_", "m_", "EI_")) or name == "rhoA"
-    ]
-    theta[:, scaled] *= scale[:, None]
-    kept = [i for i in range(len(names)) if problem.estimated[i]]
+    theta = at.theta * scale[:, None] ** unknowns.mass_powers(data.bridge.elements)
+    kept = np.flatnonzero(problem.priors.estimated)
     values = {
-        names[i]: _parameter(unknowns.unit(names[i]), theta[:, i], _prior(problem, i)) for i in kept
+        names[i]: _parameter(unknowns.unit(names[i]), theta[:, i], _prior(problem, int(i)))
+        for i in kept
     }
-    masses = unknowns.body_masses(at.theta, data.vehicle.total_mass_kg, data.vehicle.wheelbase_m)
+    masses = body_masses(at.theta, data.vehicle.total_mass_kg, data.vehicle.wheelbase_m)
     for k, name in enumerate(("m_s", "m_s1", "m_s2")):
         values[name] = _parameter("kg", masses[:, k] * scale, None)
     covariance = np.cov(theta[:, kept].T)
@@ -338,7 +327,7 @@ def _parameter(unit: str, draws: Floats, prior: results.Prior | None) -> results
 
 def _prior(problem: posterior.Problem, i: int) -> results.Prior:
     priors = problem.priors
-    if i >= priors.theta.size - 2:
+    if priors.half_normal[i]:
         return results.Prior(
             distribution="half_normal", location=0.0, scale=float(priors.spread[i])
         )

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from pre_core import unknowns
 from pre_core.physics.bridge import Beam, natural_frequencies_hz
+from pre_core.physics.models import from_models
 from pre_core.physics.road import Profile
 from pre_core.physics.sensors import Accelerometer, Receiver
 from pre_core.physics.simulate import Motion
@@ -161,7 +162,8 @@ def draw_truth(site: Site, seed: int) -> Truth:
     mass_per_length = log_normal(
         bridge.mass_per_length_kg_per_m, bridge.spread("mass_per_length_kg_per_m")
     )
-    start, end = np.abs(bridge.support_spread_nm_per_rad * rng.standard_normal(2))
+    scale = bridge.scale_at_zero("support_rotational_stiffness_nm_per_rad")
+    start, end = np.abs(scale * rng.standard_normal(2))
     beam = beam._replace(
         mass_per_length_kg_per_m=np.full(bridge.elements, mass_per_length),
         rayleigh_alpha_per_s=log_normal(
@@ -315,7 +317,7 @@ def _flat(draws: dict[str, Floats] | None) -> dict[str, Floats] | None:
 def true_values(truth: Truth) -> dict[str, float]:
     """The truth under the names of docs/contract.md."""
     car, beam = truth.car, truth.beam
-    vector = unknowns.from_models(car, beam)
+    vector = from_models(car, beam)
     names = unknowns.names(beam.flexural_rigidity_nm2.size)
     values = dict(zip(names, vector.tolist(), strict=True))
     d_1 = car.front_axle_to_cg_m

@@ -15,21 +15,14 @@ from numpy.typing import NDArray
 
 from pre_core import unknowns
 from pre_core.crossing import optimum, posterior
+from pre_core.crossing.bound import DIFFERENCE, central_jacobian, settle
 from pre_core.diagnostics.calibration import without_negative
 from pre_core.physics.vehicle import total_mass_kg
-from pre_core.unknowns import C_S1, EI_1, KAPPA
 from schemas.signals import CHANNELS
 from services.identification.pre_method import inputs_of
 from services.simulation.drawn import Drawn, Seen, true_values
 
 Floats = NDArray[np.float64]
-
-_STEP = 1e-4
-"""Of a central difference, in the coordinates of the posterior: multiples of a prior's spread, and
-metres of the trajectory. Halving it moves no bound by a thousandth of itself (tests)."""
-_NUISANCE_STEPS = 20
-_ENOUGH = 0.01
-"""Of the sum of squares, whose standard deviation is tens: less is no step."""
 
 
 class Bound(NamedTuple):
@@ -117,22 +110,23 @@ def as_json(bound: Bound) -> dict[str, dict[str, float]]:
 
 
 def bound_of(
-    problem: posterior.Problem, y: Floats, scale_error: float, step: float = _STEP
+    problem: posterior.Problem, y: Floats, scale_error: float, step: float = DIFFERENCE
 ) -> Bound:
     """The bound at y (size,); `scale_error` is of what scales all EI and no residual shows."""
     where = posterior.layout(problem)
     jacobian = central_jacobian(problem, y, np.arange(where.size), step)
     covariance = posterior.covariance(posterior.precision_root(jacobian))
-    springs = np.arange(where.theta.stop - int(problem.estimated[-2:].sum()), where.theta.stop)
-    for spring in springs:
-        covariance = without_negative(covariance, int(spring), float(y[spring]))
+    for zero in where.half_normal:
+        covariance = without_negative(covariance, int(zero), float(y[zero]))
     std = np.sqrt(np.diag(covariance))
-    names = unknowns.names(_elements(problem))
+    rows = unknowns.table(_elements(problem))
     alone, full = {}, {}
-    for place, i in enumerate(np.flatnonzero(problem.estimated)):
-        alone[names[i]] = float(problem.priors.spread[i] * std[place])
-        is_scaled = names[i].startswith(("c_", "k_s", "k_u", "m_", "EI_")) or names[i] == "rhoA"
-        full[names[i]] = float(np.hypot(alone[names[i]], scale_error if is_scaled else 0.0))
+    for at, i in enumerate(np.flatnonzero(problem.priors.estimated)):
+        name, power = rows[i].name, rows[i].mass_power
+        alone[name] = float(problem.priors.spread[i] * std[at])
+        # What is scaled has a relative standard deviation, but for what is nominally zero.
+        is_relative = not problem.priors.half_normal[i]
+        full[name] = float(np.hypot(alone[name], power * scale_error if is_relative else 0.0))
     return Bound(full, alone, _chi2_per_dof(problem, y))
 
 
@@ -144,43 +138,6 @@ def _chi2_per_dof(problem: posterior.Problem, y: Floats) -> float:
     return float(rows @ rows) / max(1, degrees)
 
 
-def central_jacobian(
-    problem: posterior.Problem, y: Floats, columns: NDArray[np.int64], step: float = _STEP
-) -> Floats:
-    """Derivatives (rows, columns) of all rows at y by central differences."""
-    moved = np.repeat(y[None, :], 2 * columns.size, axis=0)
-    moved[np.arange(columns.size), columns] += step
-    moved[columns.size + np.arange(columns.size), columns] -= step
-    values = posterior.all_rows(problem, moved)
-    return np.asarray((values[: columns.size] - values[columns.size :]).T / (2.0 * step))
-
-
-def settle(
-    problem: posterior.Problem,
-    y: Floats,
-    columns: NDArray[np.int64],
-    steps: int = _NUISANCE_STEPS,
-) -> Floats:
-    """The best y in these columns alone, the others held: Gauss-Newton with halved steps."""
-    rows = posterior.all_rows(problem, y[None, :])[0]
-    for _ in range(steps):
-        jacobian = central_jacobian(problem, y, columns)
-        move = np.linalg.lstsq(jacobian, -rows, rcond=None)[0]
-        for share in (1.0, 0.5, 0.25, 0.1, 0.02):
-            tried = y.copy()
-            tried[columns] += share * move
-            new = posterior.all_rows(problem, tried[None, :])[0]
-            if np.all(np.isfinite(new)) and new @ new < rows @ rows:
-                break
-        else:
-            return y
-        is_there = rows @ rows - new @ new < _ENOUGH
-        y, rows = tried, new
-        if is_there:
-            return y
-    return y
-
-
 def equivalent_theta(values: dict[str, float], elements: int, scale: float) -> Floats:
     """The parameters (p,) that the method would find without noise.
 
@@ -188,14 +145,11 @@ def equivalent_theta(values: dict[str, float], elements: int, scale: float) -> F
     over true mass, and so are masses, springs, dampers and rigidities.
     """
     theta = np.array([values[name] for name in unknowns.names(elements)])
-    theta[C_S1:KAPPA] *= scale
-    theta[EI_1 : EI_1 + elements + 1] *= scale
-    theta[-2:] *= scale
-    return theta
+    return np.asarray(theta * scale ** unknowns.mass_powers(elements))
 
 
 def _elements(problem: posterior.Problem) -> int:
-    return int(problem.priors.theta.size) - len(unknowns.names(0))
+    return unknowns.element_count(problem.priors.theta)
 
 
 def problem_of(seen: Seen) -> tuple[posterior.Problem, Floats, Floats]:
@@ -231,8 +185,8 @@ def _set_theta(problem: posterior.Problem, y: Floats, theta: Floats, wheelbase_m
     priors, where = problem.priors, posterior.layout(problem)
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.log(theta / priors.theta) / priors.spread
-        values[-2:] = theta[-2:] / priors.spread[-2:]
-    y[where.theta] = values[problem.estimated]
+        values[priors.half_normal] = (theta / priors.spread)[priors.half_normal]
+    y[where.theta] = values[priors.estimated]
     y[where.wheelbase] = np.log(wheelbase_m / priors.wheelbase_m) / priors.wheelbase_spread
 
 

@@ -175,7 +175,7 @@ class Check(NamedTuple):
 
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "vehicle": unknowns.VEHICLE_NAMES,
+    "vehicle": tuple(row.name for row in unknowns.SCALARS if row.part == unknowns.TRUCK),
     "bridge": ("rhoA", "alpha", "beta"),
     "supports": ("k_rot_start", "k_rot_end"),
     "wheelbase": ("wheelbase",),

@@ -21,6 +21,7 @@ from pre_core.paper import experiment, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.residual import Window
 from pre_core.physics.bridge import Beam
+from pre_core.physics.models import body_masses, from_models
 from pre_core.physics.vehicle import HalfCar
 from pre_core.search import levenberg_marquardt as least_squares
 from pre_core.search import loop
@@ -91,7 +92,7 @@ def run_scenario(
         window = paper_window(car, damaged, noise_ug_per_rthz, seed)
     except ArithmeticError as error:
         raise FailureError(f"{error}: are the site's values possible?") from error
-    nominal = unknowns.from_models(car, sound)
+    nominal = from_models(car, sound)
     free = unknowns.paper_subset(experiment.ELEMENTS)
     free = free[nominal[free] > 0.0]  # a site may say that a damping is exactly zero
     names = _names(free)
@@ -160,7 +161,7 @@ def table_columns(
     theta = np.repeat(nominal[None, :], ratios.shape[0], axis=0)
     theta[:, free] *= ratios
     masses = partial(
-        unknowns.body_masses,
+        body_masses,
         total_mass_kg=window.total_mass_kg,
         wheelbase_m=window.wheelbase_m,
     )

@@ -13,6 +13,7 @@ from pre_core.paper import crossing, experiment, random_walk, residual
 from pre_core.paper.integrate import newmark_integrate
 from pre_core.paper.residual import Window
 from pre_core.physics.bridge import Beam
+from pre_core.physics.models import body_masses, from_models
 from pre_core.physics.road import iso_8608_profile, under_wheels
 from pre_core.physics.simulate import Motion, WheelRoad, constant_speed
 from pre_core.physics.vehicle import total_mass_kg
@@ -21,7 +22,7 @@ Floats = NDArray[np.float64]
 
 SCENARIO = 6
 FREE = unknowns.paper_subset(experiment.ELEMENTS)
-NOMINAL = unknowns.from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
+NOMINAL = from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
 
 
 @cache
@@ -53,7 +54,7 @@ def accuracy(ratios: Floats, scenario: int) -> Floats:
     """S_A (20,) of one vector of ratios (19,): the paper's twenty rows, m_s1 and m_s2 derived."""
     window = paper_window(scenario)
     masses = [
-        unknowns.body_masses(theta, window.total_mass_kg, window.wheelbase_m)[1:]
+        body_masses(theta, window.total_mass_kg, window.wheelbase_m)[1:]
         for theta in (full(ratios[None, :])[0], NOMINAL)
     ]
     truth = np.ones(FREE.size)
@@ -118,7 +119,7 @@ def noise_particles(count: int, elements: int) -> Floats:
         flexural_rigidity_nm2=np.full(elements, experiment.FLEXURAL_RIGIDITY_NM2),
         mass_per_length_kg_per_m=np.full(elements, experiment.MASS_PER_LENGTH_KG_PER_M),
     )
-    nominal = unknowns.from_models(experiment.TRUCK, beam)
+    nominal = from_models(experiment.TRUCK, beam)
     return np.asarray(nominal * np.random.default_rng(0).uniform(0.8, 1.2, (count, nominal.size)))
 
 

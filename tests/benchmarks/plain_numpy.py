@@ -13,7 +13,7 @@ from scipy.linalg import eigh
 from scipy.signal import lfilter
 
 from pre_core.paper.residual import Window
-from pre_core.unknowns import C_S1, D_1, EI_1, K_S1, K_U1, M_U1
+from pre_core.unknowns import ALPHA, BETA, C_S1, D_1, EI_1, K_S1, K_U1, M_U1, RHO_A
 
 Floats = NDArray[np.float64]
 
@@ -151,7 +151,7 @@ def _parts(p: Prepared, theta: Floats) -> tuple[Floats, Floats, Floats, Floats, 
         + p.gravity_m_per_s2 * (m_s + m_u)[:, None]
     )
     elements = p.stiffness.shape[0]
-    rho, alpha, beta = theta[EI_1 + elements : EI_1 + elements + 3]
+    rho, alpha, beta = theta[[RHO_A, ALPHA, BETA]]
     stiffness = np.tensordot(theta[EI_1 : EI_1 + elements], p.stiffness, axes=1)
     mass = rho * p.mass
     return inputs, forces, mass, alpha * mass + beta * stiffness, stiffness

@@ -22,10 +22,11 @@ from pre_core.crossing.residuals import (
 from pre_core.crossing.whitening import Truck, row_count, row_filter, white_rows, whitener
 from pre_core.paper import experiment
 from pre_core.physics.beam_basis import BeamBasis, beam_basis, rebased
+from pre_core.physics.models import from_models
 from pre_core.physics.sensors import MICRO_G_M_PER_S2, resample, white_noise
 from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics.vehicle import body_masses_kg
-from pre_core.unknowns import EI_1, K_U1, KAPPA, from_models
+from pre_core.unknowns import ALPHA, BETA, EI_1, K_ROT, K_U1, KAPPA, RHO_A
 from schemas.signals import CHANNELS
 from schemas.site import Site
 from services.simulation.drive import beam_of, paper_site, simulate_drive, truck_of
@@ -38,7 +39,7 @@ FloatArray = NDArray[np.float64]
 NOISE_UG = 5.0
 BEFORE_S = 3.0  # of driving in a simulated recording before the front axle enters
 PARTS = 2
-RHO_A, ALPHA, BETA, START, END = range(-5, 0)
+START, END = K_ROT, K_ROT + 1
 
 
 class Case(NamedTuple):
@@ -446,7 +447,7 @@ def changes(case: Case, count: int) -> Points:
     """Points that differ in one or another group only, in random order, many of them twice."""
     rng = np.random.default_rng(11)
     at = point(case, count)
-    places = [EI_1, EI_1 + 6, *(case.theta.size + i for i in (RHO_A, ALPHA, BETA)), K_U1, KAPPA]
+    places = [EI_1, EI_1 + 6, RHO_A, ALPHA, BETA, K_U1, KAPPA]
     for k in range(count):
         which = int(rng.integers(0, len(places) + 3))
         if which < len(places):

@@ -23,7 +23,7 @@ from pre_core.crossing.whitening import row_filter
 from pre_core.physics import modal_response as piecewise_exact
 from pre_core.physics.beam_basis import beam_basis
 from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
-from pre_core.unknowns import D_1, EI_1, K_S1, KAPPA, M_U1
+from pre_core.unknowns import ALPHA, C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1, RHO_A
 
 FloatArray = NDArray[np.float64]
 
@@ -115,14 +115,15 @@ MODES = 6
 
 
 def theta_of(beam: Beam) -> FloatArray:
-    theta = np.full(7 + 15, 1.0)
+    theta = np.zeros(EI_1 + 7)
     theta[D_1] = 1.8
     theta[K_S1 : K_S1 + 2] = 4e5
     theta[M_U1 : M_U1 + 2] = 500.0, 800.0
-    theta[M_U1 + 2 : M_U1 + 4] = 2e6
+    theta[C_S1 : C_S1 + 2] = 1.0
+    theta[K_U1 : K_U1 + 2] = 2e6
     theta[KAPPA] = 1.0
     theta[EI_1 : EI_1 + 7] = beam.rigidity_nm2
-    theta[-5:] = beam.rho_a_kg_per_m, beam.alpha_per_s, 0.0, 0.0, 0.0
+    theta[RHO_A], theta[ALPHA] = beam.rho_a_kg_per_m, beam.alpha_per_s
     return theta
 
 

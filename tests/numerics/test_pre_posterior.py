@@ -25,8 +25,9 @@ from pre_core.crossing.posterior import (
     trajectory_basis,
 )
 from pre_core.paper import experiment
+from pre_core.physics.models import from_models
 from pre_core.physics.sensors import MICRO_G_M_PER_S2, white_noise
-from pre_core.unknowns import C_S1, D_1, EI_1, K_S1, K_U1, M_U1, from_models
+from pre_core.unknowns import C_S1, D_1, EI_1, K_ROT, K_S1, K_U1, M_U1
 from schemas.signals import CHANNELS
 from services.simulation.drive import beam_of, paper_site, truck_of
 
@@ -87,8 +88,10 @@ def here(scenario_6: "Drive") -> Case:
     nominal = from_models(truck_of(vehicle), beam_of(bridge, np.ones(7)))
     spread = np.full(nominal.size, 0.15)
     spread[EI_1 : EI_1 + 7] = 0.55
-    spread[-2:] = SPRING_SPREAD
-    priors = Priors(nominal, spread, vehicle.wheelbase_m, 0.002, 0.01, 0.01, 0.0005)
+    spread[K_ROT : K_ROT + 2] = SPRING_SPREAD
+    at_zero = nominal == 0.0
+    known = np.full(nominal.size, True)
+    priors = Priors(nominal, spread, at_zero, known, vehicle.wheelbase_m, 0.002, 0.01, 0.01, 0.0005)
     inputs = Inputs(
         acceleration,
         float(t[kept][0]),
@@ -155,10 +158,10 @@ def test_coordinates_are_standard_normal_under_the_priors(here: Case) -> None:
         assert abs(values.mean()) / spread < mean_error
         assert values.std() / spread == pytest.approx(1.0, abs=spread_error)
 
-    for i in range(at.theta.shape[1] - 2):
+    for i in np.flatnonzero(~here.priors.half_normal):
         standard(np.log(at.theta[:, i] / here.priors.theta[i]), here.priors.spread[i])
-    for i in (-2, -1):
-        standard(at.theta[:, i], SPRING_SPREAD)
+    for i in np.flatnonzero(here.priors.half_normal):
+        standard(at.theta[:, i], here.priors.spread[i])
     standard(np.log(at.wheelbase_m / here.priors.wheelbase_m), here.priors.wheelbase_spread)
     for c in range(4):
         standard(at.delay_s[:, c], here.priors.delay_spread_s)

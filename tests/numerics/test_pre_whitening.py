@@ -27,9 +27,10 @@ from pre_core.crossing.whitening import (
     white_rows,
     whitener,
 )
+from pre_core.physics.models import from_models
 from pre_core.physics.sensors import MICRO_G_M_PER_S2, white_noise
 from pre_core.physics.vehicle import HalfCar, body_masses_kg
-from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1, from_models
+from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
 from services.simulation.drive import beam_of, paper_site, truck_of
 
 FloatArray = NDArray[np.float64]

@@ -50,7 +50,7 @@ def test_what_no_residual_shows_is_drawn_too(truths: list[Truth]) -> None:
 
 
 def test_support_springs_are_half_normal(truths: list[Truth]) -> None:
-    scale = SITE.bridges[0].support_spread_nm_per_rad
+    scale = SITE.bridges[0].support_rotational_stiffness_nm_per_rad_scale_at_zero
     springs = np.array([t.beam.support_rotational_stiffness_nm_per_rad for t in truths]) / scale
     assert springs.min() >= 0.0
     assert np.mean(springs**2) == pytest.approx(1.0, rel=0.15)

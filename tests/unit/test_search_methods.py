@@ -15,11 +15,12 @@ from pre_core import unknowns
 from pre_core.paper import experiment, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.residual import Window
+from pre_core.physics.models import from_models
 from pre_core.search import levenberg_marquardt, loop
 from pre_core.search.loop import Ending
 from services.validation.paper import DERIVED, NAMES, table_columns
 
-NOMINAL = unknowns.from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
+NOMINAL = from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
 FREE = unknowns.paper_subset(experiment.ELEMENTS)
 PARTICLES = 12
 

@@ -64,7 +64,7 @@ def test_defaults_are_those_of_the_contract() -> None:
     assert bridge.spread("rayleigh_beta_s") == 0.5
     assert bridge.nominal_flexural_rigidity_nm2 == (1.2e10,) * 5
     assert bridge.lengths_m == (4.0,) * 5
-    assert bridge.support_spread_nm_per_rad == 1.2e10 / 20
+    assert bridge.support_rotational_stiffness_nm_per_rad_scale_at_zero == 1.2e10 / 20
     assert sensor.rate_hz == (100, 100, 100, 100)
     assert sensor.noise_density_ug_per_rthz == (25, 25, 25, 25)
     assert (sensor.gravity_included, sensor.up) == (False, (1, 1, 1, 1))
@@ -101,7 +101,7 @@ def test_optional_values_are_read() -> None:
     bridge = site.bridges[0]
     assert bridge.nominal_flexural_rigidity_nm2 == (1e10, 2e10, 3e10, 4e10, 5e10)
     assert bridge.lengths_m == (2, 3, 4, 5, 6)
-    assert bridge.support_spread_nm_per_rad == 5e8
+    assert bridge.support_rotational_stiffness_nm_per_rad_scale_at_zero == 5e8
     assert site.sensor.rate_hz == (100, 200, 400, 800)
     assert site.sensor.up == (1, 1, -1, -1)
     assert site.receiver.latency_s == 0.2

@@ -1,0 +1,42 @@
+"""A truck and a bridge as one vector of parameters, and back (unknowns.py)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.physics.bridge import Beam
+from pre_core.physics.vehicle import HalfCar
+from pre_core.unknowns import ALPHA, BETA, BRIDGE, D_1, EI_1, K_ROT, M_U1, RHO_A, TRUCK, table
+
+FloatArray = NDArray[np.float64]
+
+
+def from_models(car: HalfCar, beam: Beam) -> FloatArray:
+    """The vector theta (p,) of this truck and this bridge (of one mass per length throughout).
+
+    ValueError for a beam whose mass per length changes: the unknown rhoA is one number.
+    """
+    if np.ptp(beam.mass_per_length_kg_per_m) > 0.0:
+        raise ValueError("the unknown rhoA is one number: the beam must be of one mass per length")
+    of = {TRUCK: car, BRIDGE: beam}
+    rows = table(beam.flexural_rigidity_nm2.size)
+    return np.array([np.ravel(getattr(of[row.part], row.key))[row.which] for row in rows])
+
+
+def beam_from(theta: FloatArray, element_lengths_m: FloatArray) -> Beam:
+    """The bridge of theta (p,)."""
+    rigidities = theta[EI_1:]
+    return Beam(
+        element_lengths_m,
+        rigidities,
+        np.full(rigidities.size, theta[RHO_A]),
+        float(theta[ALPHA]),
+        float(theta[BETA]),
+        (float(theta[K_ROT]), float(theta[K_ROT + 1])),
+    )
+
+
+def body_masses(theta: FloatArray, total_mass_kg: float, wheelbase_m: float) -> FloatArray:
+    """Derived m_s, m_s1 = m_s d_2/D, m_s2 = m_s d_1/D: (..., 3) for vectors (..., p)."""
+    m_s = total_mass_kg - theta[..., M_U1] - theta[..., M_U1 + 1]
+    rear = m_s * theta[..., D_1] / wheelbase_m
+    return np.stack([m_s, m_s - rear, rear], axis=-1)
