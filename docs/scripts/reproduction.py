@@ -18,14 +18,14 @@ from rich.console import Console
 from rich.table import Table
 
 from pre_core import unknowns
-from pre_core.paper import experiment, random_walk, residual
+from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import ROAD_CLASS, ROAD_SEED, paper_window
 from pre_core.paper.integrate import newmark_integrate, spline_integrate
 from pre_core.paper.residual import Window
 from pre_core.physics.bridge import natural_frequencies_hz
 from pre_core.physics.models import from_models
 from pre_core.physics.vehicle import natural_frequencies_hz as vehicle_frequencies_hz
-from pre_core.search import levenberg_marquardt, loop
+from pre_core.search import loop
 from services.simulation.drive import paper_site, simulate_drive
 from services.validation.paper import (
     NAMES,
@@ -244,14 +244,14 @@ def length(scenarios: tuple[int, ...]) -> None:
 
 def fit(window: Window, start: Floats) -> tuple[Floats, int, loop.Ending]:
     """Least squares from `start` (ratios): the ratios found, steps, ending."""
-    problem = levenberg_marquardt.Problem(window, NOMINAL, FREE)
+    problem = least_squares.Problem(window, NOMINAL, FREE)
     work = residual.workspace(window)
     state, infos, ending = loop.run(
-        partial(levenberg_marquardt.init, problem, work, NOMINAL[FREE] * start),
-        partial(levenberg_marquardt.step, problem, work),
-        levenberg_marquardt.MAX_STEPS,
+        partial(least_squares.init, problem, work, NOMINAL[FREE] * start),
+        partial(least_squares.step, problem, work),
+        least_squares.MAX_STEPS,
     )
-    return levenberg_marquardt.untransform(problem, state.y) / NOMINAL[FREE], len(infos), ending
+    return least_squares.untransform(problem, state.y) / NOMINAL[FREE], len(infos), ending
 
 
 def starts(scenarios: tuple[int, ...], count: int = 20) -> None:

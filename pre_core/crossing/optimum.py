@@ -37,8 +37,8 @@ from pre_core.physics.beam_basis import beam_basis, rebased
 from pre_core.physics.bridge import FloatArray
 from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.search import levenberg_marquardt
-from pre_core.search.levenberg_marquardt import Rows
-from pre_core.search.loop import Ending
+from pre_core.search.levenberg_marquardt import Rows, minimised
+from pre_core.search.loop import Ending, Solution
 from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE
 
 _KNOT_S = 0.4
@@ -198,26 +198,13 @@ def _descend(
     """Least squares along `directions` (f, d) from y; `enough` is a gain not worth a step."""
     rows = _tempered(problem, y, directions, temperature)
     start = np.zeros(directions.shape[1])
-    state, ending, evaluations = _minimised(rows, start, steps, enough)
-    return y + directions @ state.y, state, ending, evaluations
+    found = minimised(rows, start, steps, enough)
+    return y + directions @ found.state.y, found.state, found.ending, _evaluations(found)
 
 
-def _minimised(
-    rows: Rows, start: FloatArray, steps: int, enough: float
-) -> tuple[levenberg_marquardt.State, Ending, int]:
-    state = levenberg_marquardt.begin(rows, start)
-    evaluations = start.size + 1
-    for _ in range(steps):
-        before = state.objective
-        state, info = levenberg_marquardt.descend(rows, state)
-        evaluations += info.evaluations
-        if info.ending is not None:
-            # Where no step helps any more, differences have reached their rounding: the bottom.
-            ending = Ending.CONVERGED if info.ending is Ending.STUCK else info.ending
-            return state, ending, evaluations
-        if before - state.objective < enough:
-            return state, Ending.CONVERGED, evaluations
-    return state, Ending.STEPS_EXHAUSTED, evaluations
+def _evaluations(found: Solution[levenberg_marquardt.State, levenberg_marquardt.Info]) -> int:
+    """Of a search with forward differences, its first Jacobian included."""
+    return found.state.y.size + 1 + sum(info.evaluations for info in found.infos)
 
 
 def _whole_bridge(problem: Problem) -> FloatArray:
@@ -266,8 +253,9 @@ def _walk(problem: Problem, y: FloatArray) -> tuple[list[_Place], int]:
             values = rows(v)
             return np.asarray(values - (values @ others) @ others.T)
 
-        state, _, used = _minimised(projected, start, _WALK_STEPS, _WALK_ENOUGH)
-        evaluations += used
+        found = minimised(projected, start, _WALK_STEPS, _WALK_ENOUGH)
+        state = found.state
+        evaluations += _evaluations(found)
         if np.isfinite(state.objective):
             seen.append(_Place(state.objective, shift, state.y))
 

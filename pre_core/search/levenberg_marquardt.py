@@ -1,8 +1,7 @@
-"""Least squares on the paper's residual: Levenberg-Marquardt in logarithms of the unknowns.
+"""Levenberg-Marquardt for any rows whose squares are to be summed to as little as can be.
 
-Without noise the surface is benign (docs/reproduction.md): from anywhere in the paper's prior about
-ten steps lead to the one minimum. All unknowns are positive, so the search moves in logarithms and
-needs no bounds, except that d_1 must lie between the axles: there it moves in the logit.
+The coordinates are the caller's, and without bounds; a row that is not finite marks a point that is
+impossible, and the damping grows until the step avoids it (Nocedal and Wright, section 10.3).
 """
 
 from collections.abc import Callable
@@ -12,27 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
-from pre_core.paper.residual import Window, Workspace, residual_batch
-from pre_core.search.loop import Ending
-from pre_core.unknowns import D_1
+from pre_core.search.loop import Ending, Solution, run
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
-MAX_STEPS = 60
 _FIRST_DAMPING = 1e-3
 _SMALLEST_DAMPING = 1e-14
 _GIVE_UP_DAMPING = 1e8
 _CONVERGED_STEP = 1e-9  # in logarithms
 _LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
-
-
-class Problem(NamedTuple):
-    """What stays the same during a search: the data, all parameters, and which of them are free."""
-
-    window: Window
-    fixed: FloatArray  # (p,) values of the parameters that are not searched for
-    free: IntArray  # (f,)
 
 
 class Differences(NamedTuple):
@@ -75,39 +62,6 @@ class Info(NamedTuple):
     accepted: bool
     evaluations: int
     ending: Ending | None
-
-
-def transform(problem: Problem, values: FloatArray) -> FloatArray:
-    """Free parameters (…, f) in physical units to search coordinates."""
-    y = np.log(values)
-    at = np.flatnonzero(problem.free == D_1)
-    d_1 = values[..., at]
-    y[..., at] = np.log(d_1 / (problem.window.wheelbase_m - d_1))
-    return np.asarray(y)
-
-
-def untransform(problem: Problem, y: FloatArray) -> FloatArray:
-    """Search coordinates (…, f) to free parameters in physical units."""
-    values = np.exp(y)
-    at = np.flatnonzero(problem.free == D_1)
-    values[..., at] = problem.window.wheelbase_m / (1.0 + np.exp(-y[..., at]))
-    return np.asarray(values)
-
-
-def full_vector(problem: Problem, y: FloatArray) -> FloatArray:
-    """All parameters (…, p) in physical units for search coordinates (…, f)."""
-    theta = np.broadcast_to(problem.fixed, (*y.shape[:-1], problem.fixed.size)).copy()
-    theta[..., problem.free] = untransform(problem, y)
-    return theta
-
-
-def derivative_of_values(problem: Problem, y: FloatArray) -> FloatArray:
-    """d value/d y (f,) at y: for carrying a covariance into physical units."""
-    values = untransform(problem, y)
-    slope = values.copy()
-    at = np.flatnonzero(problem.free == D_1)
-    slope[at] = values[at] * (1.0 - values[at] / problem.window.wheelbase_m)
-    return slope
 
 
 Rows = Callable[[FloatArray], FloatArray]
@@ -187,28 +141,36 @@ def _damped(triangle: FloatArray, projected: FloatArray, damping: float) -> Floa
     return np.asarray(solve_triangular(small, q.T @ np.concatenate([-projected, np.zeros(f)])))
 
 
-def _rows_of(problem: Problem, work: Workspace) -> Rows:
-    return lambda y: residual_batch(problem.window, work, full_vector(problem, y))
-
-
-def init(problem: Problem, work: Workspace, start: FloatArray) -> State:
-    """Begin at the free parameters `start` (f,) in physical units."""
-    return begin(_rows_of(problem, work), transform(problem, start))
-
-
-def step(problem: Problem, work: Workspace, state: State) -> tuple[State, Info]:
-    """One step on the paper's residual; at the bottom forward differences give way to central ones.
+def polish(rows: Rows, state: State, info: Info) -> tuple[State, Info]:
+    """Where a search with forward differences has ended, let it go on with central ones.
 
     So the way costs no more than it must, and where it ends does not depend on the processor.
     """
-    rows = _rows_of(problem, work)
-    state, info = descend(rows, state)
     if state.differences.central or info.ending not in (Ending.CONVERGED, Ending.STUCK):
         return state, info
     jacobian = _jacobian(rows, state.y, state.residual, CENTRAL)
-    polished = state._replace(jacobian=jacobian, differences=CENTRAL)
     evaluations = info.evaluations + _evaluations(CENTRAL, state.y.size)
-    return polished, info._replace(evaluations=evaluations, ending=None)
+    return (
+        state._replace(jacobian=jacobian, differences=CENTRAL),
+        info._replace(evaluations=evaluations, ending=None),
+    )
+
+
+def minimised(rows: Rows, start: FloatArray, steps: int, enough: float) -> Solution[State, Info]:
+    """The bottom below `start` (f,), reached when a step gains less than `enough`.
+
+    Where no step helps any more, forward differences have reached their rounding: the bottom too.
+    """
+
+    def step(state: State) -> tuple[State, Info]:
+        following, info = descend(rows, state)
+        if info.ending is Ending.STUCK or (
+            info.ending is None and state.objective - following.objective < enough
+        ):
+            info = info._replace(ending=Ending.CONVERGED)
+        return following, info
+
+    return run(lambda: begin(rows, start), step, steps)
 
 
 def covariance(state: State) -> FloatArray:

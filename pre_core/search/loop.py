@@ -7,7 +7,7 @@ ended is a value, never an exception.
 
 from collections.abc import Callable
 from enum import Enum
-from typing import Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 
 class Ending(Enum):
@@ -36,6 +36,14 @@ StateT = TypeVar("StateT")
 InfoT = TypeVar("InfoT", bound=StepInfo)
 
 
+class Solution(NamedTuple, Generic[StateT, InfoT]):
+    """What a search gives, whatever its method: where it is, what its steps did, why it stopped."""
+
+    state: StateT
+    infos: list[InfoT]
+    ending: Ending
+
+
 def run(
     init: Callable[[], StateT],
     step: Callable[[StateT], tuple[StateT, InfoT]],
@@ -43,7 +51,7 @@ def run(
     *,
     at_the_end: Ending = Ending.STEPS_EXHAUSTED,
     progress: Callable[[int, InfoT], None] | None = None,
-) -> tuple[StateT, list[InfoT], Ending]:
+) -> Solution[StateT, InfoT]:
     """Step until a method says that it has ended, or `max_steps` are taken (`at_the_end`)."""
     state = init()
     infos: list[InfoT] = []
@@ -53,5 +61,5 @@ def run(
         if progress is not None:
             progress(count, info)
         if info.ending is not None:
-            return state, infos, info.ending
-    return state, infos, at_the_end
+            return Solution(state, infos, info.ending)
+    return Solution(state, infos, at_the_end)

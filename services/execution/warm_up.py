@@ -17,13 +17,13 @@ import numpy as np
 
 from pre_core import unknowns
 from pre_core.crossing import optimum, posterior
-from pre_core.paper import experiment, random_walk, residual
+from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.integrate import spline_integrate
 from pre_core.physics.models import from_models
 from pre_core.physics.simulate import constant_speed
 from pre_core.physics.vehicle import total_mass_kg
-from pre_core.search import levenberg_marquardt, loop
+from pre_core.search import loop
 
 PACKAGE = Path(__file__).parents[2] / "pre_core"
 _SOUND = experiment.beam(np.ones(experiment.ELEMENTS))
@@ -110,11 +110,11 @@ def _warm_up_paper() -> None:
     )
     theta = from_models(experiment.TRUCK, _SOUND)
     free = unknowns.paper_subset(experiment.ELEMENTS)
-    problem = levenberg_marquardt.Problem(window, theta, free)
+    problem = least_squares.Problem(window, theta, free)
     work = residual.workspace(window)
     loop.run(
-        partial(levenberg_marquardt.init, problem, work, theta[free]),
-        partial(levenberg_marquardt.step, problem, work),
+        partial(least_squares.init, problem, work, theta[free]),
+        partial(least_squares.step, problem, work),
         1,
     )
     residual.objective(window, work, theta)

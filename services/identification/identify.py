@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pre_core import unknowns
 from pre_core.crossing.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
-from pre_core.paper import random_walk, residual
+from pre_core.paper import least_squares, random_walk, residual
 from pre_core.paper.integrate import spline_integrate
 from pre_core.paper.residual import Window
 from pre_core.physics.bridge import natural_frequencies_hz
@@ -296,23 +296,23 @@ def _least_squares(
     nominal = nominal_parameters(data.vehicle, data.bridge)
     free = unknowns.paper_subset(data.bridge.elements)
     free = free[nominal[free] > 0.0]  # a site may say that a damping is exactly zero
-    problem = levenberg_marquardt.Problem(window, nominal, free)
+    problem = least_squares.Problem(window, nominal, free)
     work = residual.workspace(window)
     rng = np.random.default_rng(settings.seed)
     best: tuple[levenberg_marquardt.State, loop.Ending] | None = None
     steps = evaluations = 0
 
     def progress(count: int, info: levenberg_marquardt.Info) -> None:
-        report(f"least squares, step {count}", min(0.95, count / levenberg_marquardt.MAX_STEPS))
+        report(f"least squares, step {count}", min(0.95, count / least_squares.MAX_STEPS))
 
     for attempt in range(settings.starts):
         start = nominal[free]
         if attempt > 0:
             start = start * rng.uniform(random_walk.PRIOR_LOW, random_walk.PRIOR_HIGH, free.size)
         state, infos, ending = loop.run(
-            partial(levenberg_marquardt.init, problem, work, start),
-            partial(levenberg_marquardt.step, problem, work),
-            levenberg_marquardt.MAX_STEPS,
+            partial(least_squares.init, problem, work, start),
+            partial(least_squares.step, problem, work),
+            least_squares.MAX_STEPS,
             progress=progress,
         )
         steps += len(infos)
@@ -323,9 +323,9 @@ def _least_squares(
             break
     assert best is not None  # noqa: S101 - `starts` is at least 1
     state, ending = best
-    slope = levenberg_marquardt.derivative_of_values(problem, state.y)
+    slope = least_squares.derivative_of_values(problem, state.y)
     return _Fit(
-        levenberg_marquardt.full_vector(problem, state.y),
+        least_squares.full_vector(problem, state.y),
         free,
         levenberg_marquardt.covariance(state) * np.outer(slope, slope),
         None,

@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
-from pre_core.paper import experiment, random_walk, residual
+from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.residual import Window
 from pre_core.physics.bridge import Beam
 from pre_core.physics.models import body_masses, from_models
 from pre_core.physics.vehicle import HalfCar
-from pre_core.search import levenberg_marquardt as least_squares
 from pre_core.search import loop
 from schemas.site import load_site
 from services.common.errors import FailureError, InputError

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pre_core.paper import experiment, random_walk, residual
+from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.physics.simulate import simulate
-from pre_core.search import levenberg_marquardt, loop
+from pre_core.search import loop
 from tests.benchmarks import cases, plain_numpy
 
 BATCH = 500
@@ -81,7 +81,7 @@ def test_paper_search(benchmark: BenchmarkFixture):
 
 def test_least_squares(benchmark: BenchmarkFixture):
     window = cases.paper_window(cases.SCENARIO)
-    problem = levenberg_marquardt.Problem(window, cases.NOMINAL, cases.FREE)
+    problem = least_squares.Problem(window, cases.NOMINAL, cases.FREE)
     work = residual.workspace(window)
     nominal = cases.NOMINAL[cases.FREE]
     starts = iter(cases.start_ratios(21, seed=2))
@@ -89,11 +89,11 @@ def test_least_squares(benchmark: BenchmarkFixture):
 
     def from_start(start: cases.Floats) -> None:
         state, infos, _ = loop.run(
-            partial(levenberg_marquardt.init, problem, work, nominal * start),
-            partial(levenberg_marquardt.step, problem, work),
-            levenberg_marquardt.MAX_STEPS,
+            partial(least_squares.init, problem, work, nominal * start),
+            partial(least_squares.step, problem, work),
+            least_squares.MAX_STEPS,
         )
-        found = levenberg_marquardt.untransform(problem, state.y) / nominal
+        found = least_squares.untransform(problem, state.y) / nominal
         worst.append(float(cases.accuracy(found, cases.SCENARIO).min()))
         steps.append(len(infos))
         evaluations.append(cases.FREE.size + 1 + sum(info.evaluations for info in infos))

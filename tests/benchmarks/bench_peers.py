@@ -17,8 +17,8 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from scipy.optimize import differential_evolution
 
-from pre_core.paper import random_walk, residual
-from pre_core.search import levenberg_marquardt, loop
+from pre_core.paper import least_squares, random_walk, residual
+from pre_core.search import loop
 from tests.benchmarks import cases
 
 BUDGET = 300_000
@@ -147,20 +147,18 @@ def test_peer(
 def test_least_squares(benchmark: BenchmarkFixture, scenario: int):
     """Ours, one thread, to its own convergence."""
     window = cases.paper_window(scenario)
-    problem = levenberg_marquardt.Problem(window, cases.NOMINAL, cases.FREE)
+    problem = least_squares.Problem(window, cases.NOMINAL, cases.FREE)
     work = residual.workspace(window)
     nominal = cases.NOMINAL[cases.FREE]
 
     def run(seed: int) -> dict[str, float]:
         began = time.perf_counter()
         state, infos, _ = loop.run(
-            partial(
-                levenberg_marquardt.init, problem, work, nominal * cases.start_ratios(1, seed)[0]
-            ),
-            partial(levenberg_marquardt.step, problem, work),
-            levenberg_marquardt.MAX_STEPS,
+            partial(least_squares.init, problem, work, nominal * cases.start_ratios(1, seed)[0]),
+            partial(least_squares.step, problem, work),
+            least_squares.MAX_STEPS,
         )
-        found = levenberg_marquardt.untransform(problem, state.y) / nominal
+        found = least_squares.untransform(problem, state.y) / nominal
         return {
             "evaluations": _FREE + 1 + sum(info.evaluations for info in infos),
             "seconds": time.perf_counter() - began,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pre_core import unknowns
-from pre_core.paper import experiment, random_walk, residual
+from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.residual import Window
 from pre_core.physics.models import from_models
@@ -42,12 +42,12 @@ def bind_random_walk(window: Window, seed: int, threads: int) -> tuple[Callable[
 
 
 def bind_least_squares(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
-    bound = levenberg_marquardt.Problem(window, NOMINAL, FREE)
+    bound = least_squares.Problem(window, NOMINAL, FREE)
     work = residual.workspace(window)
     start = NOMINAL[FREE] * np.random.default_rng(seed).uniform(0.8, 1.2, FREE.size)
     return (
-        partial(levenberg_marquardt.init, bound, work, start),
-        partial(levenberg_marquardt.step, bound, work),
+        partial(least_squares.init, bound, work, start),
+        partial(least_squares.step, bound, work),
     )
 
 
@@ -198,17 +198,17 @@ def test_every_ending_is_a_sentence():
     assert len({ending.value for ending in Ending}) == len(Ending)
 
 
-@pytest.mark.parametrize("differences", [least_squares.FORWARD, least_squares.CENTRAL])
-def test_every_evaluation_of_a_step_is_counted(differences: least_squares.Differences):
+@pytest.mark.parametrize("differences", [levenberg_marquardt.FORWARD, levenberg_marquardt.CENTRAL])
+def test_every_evaluation_of_a_step_is_counted(differences: levenberg_marquardt.Differences):
     evaluated = []
 
     def rows(y: np.ndarray) -> np.ndarray:
         evaluated.append(len(y))
         return np.column_stack([np.exp(y) - 2.0, y[:, :1] * y[:, 1:2], np.ones(len(y))])
 
-    state = least_squares.begin(rows, np.zeros(3), differences)
+    state = levenberg_marquardt.begin(rows, np.zeros(3), differences)
     evaluated.clear()
-    _, info = least_squares.descend(rows, state)
+    _, info = levenberg_marquardt.descend(rows, state)
     assert info.accepted
     assert info.evaluations == sum(evaluated)
 
@@ -216,10 +216,10 @@ def test_every_evaluation_of_a_step_is_counted(differences: least_squares.Differ
 def test_least_squares_ends_with_central_differences(window: Window):
     """The reference estimate shows what for: tests/process_replay/test_reference.py."""
     init, step = bind_least_squares(window, 3, 1)
-    assert init().differences == least_squares.FORWARD
-    state, infos, ending = search.run(init, step, least_squares.MAX_STEPS)
+    assert init().differences == levenberg_marquardt.FORWARD
+    state, infos, ending = loop.run(init, step, least_squares.MAX_STEPS)
     assert ending is Ending.CONVERGED
-    assert state.differences == least_squares.CENTRAL
+    assert state.differences == levenberg_marquardt.CENTRAL
     assert state.objective <= min(info.objective for info in infos) * (1.0 + 1e-8)
 
 
@@ -284,11 +284,11 @@ def test_impossible_particles_are_never_kept(window: Window):
 def worst_accuracy(window: Window, truth: np.ndarray, seed: int) -> float:
     """The smallest S_A of all twenty parameters from a random start in the paper's prior."""
     init, step = bind_least_squares(window, seed, 1)
-    state, _, ending = loop.run(init, step, levenberg_marquardt.MAX_STEPS)
+    state, _, ending = loop.run(init, step, least_squares.MAX_STEPS)
     if ending is not Ending.CONVERGED:
         return -np.inf
-    bound = levenberg_marquardt.Problem(window, NOMINAL, FREE)
-    ratios = levenberg_marquardt.untransform(bound, state.y)[None, :] / NOMINAL[FREE]
+    bound = least_squares.Problem(window, NOMINAL, FREE)
+    ratios = least_squares.untransform(bound, state.y)[None, :] / NOMINAL[FREE]
     found = table_columns(ratios, nominal=NOMINAL, free=FREE, window=window)[0]
     return float(1.0 - np.abs(found - truth).max())
 
