@@ -39,6 +39,7 @@ from services.bus.session import open_session
 from services.logger.writer import Limits
 from services.recordings.recording import read_identities, read_info
 from services.truck.gateway import Gateway
+from tests.parent import die_with_parent, parent_environment
 
 BATCHES_PER_S = 20
 MESSAGES_PER_S = 40
@@ -70,6 +71,8 @@ def main() -> None:
     parser.add_argument("--role", choices=("logger", "plain", "fleet"), help=argparse.SUPPRESS)
     parser.add_argument("--endpoint", help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.role is not None:
+        die_with_parent()
     if options.role == "logger":
         sys.exit(log(options.endpoint, options.folder, options.rotate_minutes))
     if options.role == "plain":
@@ -174,6 +177,7 @@ def start(role: str, *arguments: str, err: object) -> "subprocess.Popen[str]":
         stdout=subprocess.PIPE,
         stderr=err,  # type: ignore[arg-type]
         text=True,
+        env=os.environ | parent_environment(),
     )
 
 

@@ -16,6 +16,7 @@ import pytest
 from services.common.errors import InputError
 from services.recordings.recording import Message, is_closed, read_info, read_messages
 from tests.endpoints import free_endpoint
+from tests.parent import parent_environment
 
 HERE = Path(__file__).parent
 Numbers = dict[tuple[str, str, int], set[int]]
@@ -107,7 +108,7 @@ class Fleet:
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
-            env=os.environ | {"PYTHONPATH": str(HERE.parents[1])} | env,
+            env=os.environ | {"PYTHONPATH": str(HERE.parents[1])} | parent_environment() | env,
         )
         log.close()
         self._processes.append(process)

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from services import logger
+from tests.parent import die_with_parent
 
 
 def main(listen: str, folder: str) -> int:
@@ -20,4 +21,5 @@ def main(listen: str, folder: str) -> int:
 
 
 if __name__ == "__main__":
+    die_with_parent()
     sys.exit(main(*sys.argv[1:]))

@@ -9,6 +9,8 @@ import sys
 
 import zenoh
 
+from tests.parent import die_with_parent
+
 
 def main(listen: str, logger: str) -> None:
     config = zenoh.Config()
@@ -30,4 +32,5 @@ def main(listen: str, logger: str) -> None:
 
 
 if __name__ == "__main__":
+    die_with_parent()
     main(*sys.argv[1:])

@@ -4,6 +4,7 @@ import sys
 
 from schemas.topics import selector
 from services.bus.session import Subscription, open_session
+from tests.parent import die_with_parent
 
 
 def main(endpoint: str) -> None:
@@ -17,4 +18,5 @@ def main(endpoint: str) -> None:
 
 
 if __name__ == "__main__":
+    die_with_parent()
     main(*sys.argv[1:])

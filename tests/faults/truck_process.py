@@ -19,6 +19,7 @@ from services.bus.playback import stopped_by_signals
 from services.bus.session import open_session
 from services.truck.gateway import Gateway
 from services.truck.spool import Spool
+from tests.parent import die_with_parent
 
 STEP_ENV = "DRIVEBY_TEST_CLOCK_STEP"
 """`AFTER_BATCHES:SECONDS`: the wall clock jumps."""
@@ -57,4 +58,5 @@ def main(endpoint: str, realm: str, vehicle: str, spool: str, batches_per_s: str
 
 
 if __name__ == "__main__":
+    die_with_parent()
     main(*sys.argv[1:])

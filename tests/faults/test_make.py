@@ -1,0 +1,93 @@
+"""`make faults` and `make soak`: what they run, and that nothing of it is left behind."""
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.parent import PARENT_ENV
+
+
+def arguments_of(project: Path, target: str) -> list[str]:
+    """What the target gives to pytest."""
+    rule = re.search(
+        rf"^{target}:.*\n((?:\t.*\n)+)", (project / "Makefile").read_text(), re.MULTILINE
+    )
+    assert rule is not None
+    return shlex.split(rule[1].strip().rpartition("-m pytest ")[2])
+
+
+def collected(project: Path, arguments: list[str]) -> set[str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *arguments, "--collect-only", "-q"],
+        cwd=project, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    return {line for line in done.stdout.splitlines() if "::" in line}
+
+
+def test_faults_runs_everything_but_the_soak(project: Path) -> None:
+    faults = collected(project, arguments_of(project, "faults"))
+    soak = collected(project, arguments_of(project, "soak"))
+    every = collected(project, ["tests/faults", "-m", "soak or not soak"])
+    assert {name.partition("::")[2].partition("[")[0] for name in soak} == {
+        "test_killed_fifty_times",
+        "test_an_hour_at_the_rated_load",
+    }
+    assert not faults & soak
+    assert faults | soak == every
+
+
+def session_of(number: int) -> Iterator[tuple[int, str]]:
+    """Process and program of all that live in a session of processes."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+            program = (stat.parent / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+        except OSError:
+            continue
+        if int(fields[3]) == number and fields[0] != "Z":
+            yield int(stat.parent.name), program
+
+
+@pytest.mark.process
+@pytest.mark.faults
+@pytest.mark.parametrize("how", ["Ctrl-C", "kill -9"])
+def test_what_interrupts_the_tests_ends_their_processes(
+    project: Path, tmp_path: Path, how: str
+) -> None:
+    """While one truck is frozen, which hears no signal that asks it to end."""
+    test = "tests/faults/test_nothing_lost.py::test_a_frozen_truck_delays_no_other[False]"
+    environment = {name: text for name, text in os.environ.items() if name != PARENT_ENV}
+    tests = subprocess.Popen(
+        [sys.executable, "-m", "pytest", "-m", "not soak", f"--basetemp={tmp_path / 'run'}", test],
+        cwd=project, env=environment, start_new_session=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 120.0
+        while sum("truck_process.py" in program for _, program in session_of(tests.pid)) < 3:
+            assert tests.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        if how == "Ctrl-C":  # pressed again, because it takes long
+            os.killpg(tests.pid, signal.SIGINT)
+            time.sleep(0.2)
+            os.killpg(tests.pid, signal.SIGINT)
+        else:
+            tests.kill()
+        tests.wait(timeout=60)
+        while left := list(session_of(tests.pid)):
+            assert time.monotonic() < deadline, left
+            time.sleep(0.05)
+    finally:
+        for process, _ in session_of(tests.pid):
+            os.kill(process, signal.SIGKILL)
+        tests.wait()
