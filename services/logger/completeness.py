@@ -57,19 +57,25 @@ def known_on_disk(folder: Path, realm: str | None, now_s: float) -> Iterator[Kno
     """Yield what streams have in the recordings below a folder, one file after the other.
 
     Only of the last two days (`now_s` is the wall clock) and of the realms in which trucks drive.
+    A recording that is recovered meanwhile, by whomever, is found under its new name.
     """
-    for path in sorted(folder.glob(f"{realm or '*'}/*/*.mcap")):
-        try:
-            if now_s - path.stat().st_mtime > KNOWN_AGE_S or path.stat().st_size == 0:
+    looked_at: set[Path] = set()
+    # What had another name when it was its turn is in the folder under that name by then.
+    while found := sorted(set(folder.glob(f"{realm or '*'}/*/[!.]*.mcap")) - looked_at):
+        looked_at.update(found)
+        for path in found:
+            try:
+                if now_s - path.stat().st_mtime > KNOWN_AGE_S or path.stat().st_size == 0:
+                    continue
+                identities = read_identities(path)
+            except (InputError, OSError) as error:
+                if path.exists():
+                    _log.warning("%s: not read: %s", path, error)
                 continue
-            identities = read_identities(path)
-        except (InputError, OSError) as error:
-            _log.warning("%s: not read: %s", path, error)
-            continue
-        for (where, boot_id), numbers in identities.items():
-            if where.owner in _KEPT_BY and not is_replayed(where.realm):
-                for first, last in numbers.ranges():
-                    yield Known(where, boot_id, first, last)
+            for (where, boot_id), numbers in identities.items():
+                if where.owner in _KEPT_BY and not is_replayed(where.realm):
+                    for first, last in numbers.ranges():
+                        yield Known(where, boot_id, first, last)
 
 
 class Completeness:

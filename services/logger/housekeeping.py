@@ -22,6 +22,7 @@ from schemas.events import Event, EventKind
 from schemas.topics import REALM
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError, InputError
+from services.common.leash import EXIT
 from services.recordings.recording import is_being_written, is_closed
 from services.recordings.recovery import ASIDE, put_aside, recovered_path
 
@@ -73,10 +74,11 @@ class Housekeeping:
                 if self._closing.is_set():
                     return
                 try:
-                    if not is_being_written(path) and not is_closed(path):
+                    if path.exists() and not is_being_written(path) and not is_closed(path):
                         self._recover(path)
-                except (InputError, FailureError) as error:  # it has gone, or may not be read
-                    _log.warning("%s", error)
+                except (InputError, FailureError, OSError) as error:
+                    if path.exists():  # it may not be read
+                        _log.warning("%s", error)
             while self._house.budget_bytes is not None:
                 self._keep_budget(self._house.budget_bytes)
                 self.is_busy = False
@@ -94,8 +96,7 @@ class Housekeeping:
             text = f"{path.name} was cut off and stays so: too little room to recover it"
             self._tell(path, EventKind.DISK_LOW, text)
             return
-        command = ["-m", "services", "recover", str(path), "--set-aside", "--json"]
-        done = self._run_gently(command)
+        done = self._run_gently(["services", "recover", str(path), "--set-aside", "--json"])
         if done is None:
             return
         code, out, log = done
@@ -111,7 +112,7 @@ class Housekeeping:
             put_aside(path)
             text = f"{path.name} holds nothing that can be read, and was set aside"
             self._tell(path, EventKind.RECORDING_RECOVERED, text)
-        else:
+        elif path.exists():  # else somebody else has moved, deleted or recovered it meanwhile
             _log.error("%s could not be recovered: %s", path, log.strip()[-300:])
 
     def _keep_budget(self, budget_bytes: int) -> None:
@@ -144,30 +145,37 @@ class Housekeeping:
         realm = path.relative_to(self._house.folder).parts[0]
         results = sorted((self._house.folder / realm).glob("*.mcap"))
         arguments = [str(p) for p in (path, *others, *results)]
-        done = self._run_gently(["-m", "services.history.processed", *arguments])
+        done = self._run_gently(["services.history.processed", *arguments])
         may_go = done is not None and done[0] == 0
         if not may_go:
             self._kept_until[path] = time.monotonic() + _ASK_AGAIN_S
         return may_go
 
     def _run_gently(self, arguments: list[str]) -> tuple[int, str, str] | None:
-        """Run Python with these arguments at low priority; None if it was not let finish."""
-        process = subprocess.Popen(
-            [sys.executable, *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        with process:
+        """Run a module of ours at low priority; None if it was not let finish.
+
+        It ends with this process, even if this one is killed (`services.common.leash`).
+        """
+        its_end, our_end = os.pipe()
+        try:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "services.common.leash", *arguments],
+                stdin=its_end,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        finally:
+            os.close(its_end)
+        with process, os.fdopen(our_end, "wb") as leash:
             os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
             while True:
                 try:
                     out, log = process.communicate(timeout=_POLL_S)
-                    return process.returncode, out, log
+                    return None if process.returncode == EXIT else (process.returncode, out, log)
                 except subprocess.TimeoutExpired:
                     if self._closing.is_set():
-                        process.terminate()
+                        leash.close()
                         process.communicate()
                         return None
 

@@ -4,8 +4,9 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -27,6 +28,7 @@ from services.recordings.recording import (
     read_site,
     write_recording,
 )
+from services.recordings.recovery import put_aside, recover_recording, recovered_path
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "crossing.mcap"
 NOW_NS = 1_700_000_000_000_000_000
@@ -40,13 +42,13 @@ def fixes(number: int, vehicle: str = "truck-1", realm: str = "live") -> Iterato
         yield Message(where, encode_gnss(fix), 1, n, NOW_NS + n * 10**8, NOW_NS)
 
 
-def crashed(path: Path, number: int = 50) -> list[Message]:
+def crashed(path: Path, number: int = 50, *, every: int = 10) -> list[Message]:
     """Leave a recording as a writer does that dies: synced, without an end, torn."""
     writer = RecordingWriter(path, reason="test", realm="live", vehicle="truck-1")
     messages = list(fixes(number))
     for n, message in enumerate(messages):
         writer.write(message)
-        if n % 10 == 9:
+        if n % every == every - 1:
             writer.sync()
     writer.abandon()
     with path.open("ab") as file:
@@ -234,3 +236,61 @@ def test_a_budget_deletes_the_oldest_that_may_go_and_nothing_else(
     assert "0-with-crossing.mcap" in told[0][1].text
     assert results.exists()
     living.abandon()
+
+
+def test_what_somebody_else_has_recovered_meanwhile_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "live" / DAY / "truck-1.mcap"
+    crashed(path)
+    real = Housekeeping._run_gently
+
+    def run(self: Housekeeping, arguments: list[str]) -> tuple[int, str, str] | None:
+        recover_recording(path, recovered_path(path))
+        put_aside(path)
+        return real(self, arguments)
+
+    monkeypatch.setattr(Housekeeping, "_run_gently", run)
+    assert kept(tmp_path) == []
+    assert caplog.records == []
+
+
+def children(process: int) -> list[int]:
+    tasks = Path(f"/proc/{process}/task")
+    return [int(n) for one in tasks.glob("*/children") for n in one.read_text().split()]
+
+
+def is_alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+@pytest.mark.process
+def test_a_killed_logger_leaves_nobody_who_recovers_on(fleet: Callable[..., Any]) -> None:
+    """Its child would rename what the next logger is about to read."""
+    one = fleet()
+    path = one.folder / "recordings" / "live" / DAY / "truck-1-20260101T000000Z.mcap"
+    crashed(path, 100_000, every=10_000)
+    content = path.read_bytes()
+    deadline = time.monotonic() + 60.0
+    one.start_logger()
+    while not list(path.parent.glob(".*.part.mcap")):
+        assert time.monotonic() < deadline, one.logs()
+        time.sleep(0.005)
+    [child] = children(one.logger.pid)
+    one.kill(one.logger)
+    while is_alive(child):
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    assert path.read_bytes() == content
+    one.start_logger()
+    while not path.with_name(path.name + ".crashed").exists():
+        assert time.monotonic() < deadline, one.logs()
+        time.sleep(0.02)
+    assert len(list(read_messages(recovered_path(path)))) > 100_000
+    one.stop_logger()
+    assert "ERROR" not in one.logs()

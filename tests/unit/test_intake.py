@@ -1,5 +1,6 @@
 """What the logger lets in when clocks step, numbers run wild and strangers flood it."""
 
+import shutil
 import time
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from schemas.events import Event, EventKind
 from schemas.signals import GnssFix, Identity, encode_gnss, encode_identity
 from schemas.topics import Key
 from services.bus.session import Received
+from services.logger import completeness
 from services.logger import intake as module
 from services.logger.clocks import TruckClock
 from services.logger.completeness import KNOWN_AGE_S, known_on_disk
@@ -352,3 +354,31 @@ def test_what_is_on_disk_is_known_and_not_written_again(tmp_path: Path) -> None:
     assert intake.take(message(9), NOW_NS) is None
     assert intake.take(message(10), NOW_NS) is not None
     assert intake.counts["duplicates"] == 1
+
+
+def test_what_is_recovered_while_it_is_about_to_be_read_is_known_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the child of a logger that was killed, or by hand."""
+    day = tmp_path / "live" / "2023-11-14"
+    day.mkdir(parents=True)
+    for name, first in (("truck-1-a.mcap", 0), ("truck-1-b.mcap", 10)):
+        made = [message(n) for n in range(first, first + 10)]
+        messages = [Message(GNSS, one.payload, *one.identity(), NOW_NS, NOW_NS) for one in made]
+        write_recording(day / name, messages, site_toml=None, reason="test")
+    real = completeness.read_identities
+    logged: list[str] = []
+
+    def read(path: Path) -> object:
+        cut_off = day / "truck-1-b.mcap"
+        if cut_off.exists():
+            (day / ".truck-1-b.recovered.0.part.mcap").write_bytes(b"another one, half written")
+            shutil.copy(cut_off, day / "truck-1-b.recovered.mcap")
+            cut_off.rename(day / "truck-1-b.mcap.crashed")
+        return real(path)
+
+    monkeypatch.setattr(completeness, "read_identities", read)
+    monkeypatch.setattr(completeness._log, "warning", lambda *what: logged.append(str(what)))
+    found = sorted(known_on_disk(tmp_path, None, time.time()))
+    assert found == [(GNSS, 1, 0, 9), (GNSS, 1, 10, 19)]
+    assert logged == []
