@@ -83,6 +83,7 @@ def _simulate(options: argparse.Namespace) -> int:
         gps_noise=options.gps_noise,
         rate=options.rate,
         output=options.output,
+        force=options.force,
         console=_console(),
     )
 
@@ -95,6 +96,7 @@ def _import(options: argparse.Namespace) -> int:
             sources=options.sources,
             site=options.site,
             output=options.output,
+            force=options.force,
             vehicle=options.vehicle,
             name=options.name,
         )
@@ -155,6 +157,7 @@ def _recover(options: argparse.Namespace) -> int:
         source=options.recording,
         output=options.output,
         set_aside=options.set_aside,
+        force=options.force,
         as_json=options.json,
     )
     print(line)
@@ -446,6 +449,7 @@ def _add_offline(commands: Any) -> None:
         action="store_true",
         help="then rename the damaged one to REC.mcap.crashed",
     )
+    _add_force(p)
     p.add_argument("--json", action="store_true", help="print the counts as JSON")
 
     p = _command(
@@ -661,6 +665,15 @@ def _add_site(p: argparse.ArgumentParser, text: str, *, required: bool = False) 
 def _add_output(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "-o", "--output", type=Path, required=True, metavar="REC.mcap", help="recording to write"
+    )
+    _add_force(p)
+
+
+def _add_force(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--force",
+        action="store_true",
+        help="replace a recording of that name, unless it is being written",
     )
 
 

@@ -16,18 +16,18 @@ EXIT_CLEAN, EXIT_LOSSY = 0, 3
 
 
 def recover_command(
-    *, source: Path, output: Path | None, set_aside: bool, as_json: bool
+    *, source: Path, output: Path | None, set_aside: bool, as_json: bool, force: bool = False
 ) -> tuple[int, str]:
     """Recover one recording; return 0 (nothing was lost) or 3, and a line that says what was found.
 
-    Writes to `output`, or beside the recording. With `set_aside` the damaged file is then renamed
-    to `….mcap.crashed`, so that a folder holds every recording once. InputError and FailureError
-    as of `recover_recording`; then nothing has changed.
+    Writes to `output`, or beside the recording, where `force` replaces a recording. With
+    `set_aside` the damaged file is then renamed to `….mcap.crashed`, so that a folder holds every
+    recording once. InputError and FailureError as of `recover_recording`; then nothing has changed.
     """
     if set_aside and output is not None:
         raise InputError("--set-aside goes with the usual name beside the recording, not with -o")
     target = output or recovered_path(source)
-    recovery = recover_recording(source, target)
+    recovery = recover_recording(source, target, force=force)
     if set_aside:
         put_aside(source)
     plain = f"{target}: {describe(recovery)}"

@@ -1,12 +1,21 @@
-"""Files that are whole or absent: written beside the target, synced, renamed."""
+"""Files that are whole or absent: written beside the target, synced, renamed.
 
+Other files replace what was there. A recording is replaced only if somebody says so, and never
+while it is being written: who writes it would go on into a file without a name.
+"""
+
+import fcntl
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from services.common.errors import FailureError, InputError
+
+_RECORDING_SUFFIX = ".mcap"
+_RECORDING_MAGIC = b"\x89MCAP0\r\n"
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
@@ -19,18 +28,20 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 @contextmanager
-def replaced_atomically(path: Path) -> Iterator[Path]:
+def replaced_atomically(path: Path, *, force: bool = False) -> Iterator[Path]:
     """Give a temporary path beside `path` to write to; rename it when the block ends well.
 
     The temporary name keeps the suffix, because writers choose the format by it. If the block
-    raises, the temporary file is removed and `path` stays as it was.
+    raises, or there is a recording (see `check_writable`), the temporary file is removed and `path`
+    stays as it was.
     """
-    check_writable(path)
+    check_writable(path, force=force)
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
         try:
             yield temporary
             _sync(temporary)
+            check_writable(path, force=force)  # it took a while to get here
             temporary.replace(path)
             _sync(path.parent)
         except OSError as error:
@@ -39,8 +50,12 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def check_writable(path: Path) -> None:
-    """Raise InputError if a file cannot be put at `path`. For use before hours of work."""
+def check_writable(path: Path, *, force: bool = False) -> None:
+    """Raise InputError if a file cannot be put at `path`. For use before hours of work.
+
+    Nor may it be where there is a recording: that is replaced with `force` only, and never while
+    somebody writes it.
+    """
     if path.is_dir():
         raise InputError(f"{path}: is a folder, give the name of a file to write")
     if path.exists() and not path.is_file():
@@ -50,6 +65,38 @@ def check_writable(path: Path) -> None:
         raise InputError(f"{path}: the folder {path.parent} does not exist, make it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise InputError(f"{path}: no permission to write in the folder {path.parent}")
+    if path.exists():
+        _check_replaceable(path, force=force)
+
+
+def is_held(file: BinaryIO) -> bool:
+    """Whether another process, or an earlier opening of this one, has an open file to itself."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    fcntl.flock(file, fcntl.LOCK_UN)
+    return False
+
+
+def _check_replaceable(path: Path, *, force: bool) -> None:
+    try:
+        with path.open("rb") as file:
+            begins_as_one = file.read(len(_RECORDING_MAGIC)) == _RECORDING_MAGIC
+            if not begins_as_one and path.suffix != _RECORDING_SUFFIX:
+                return
+            if is_held(file):
+                raise InputError(
+                    f"{path}: is a recording that is being written at this moment, and never "
+                    "replaced; give another name"
+                )
+    except OSError:  # what may not be read is not lightly replaced
+        if path.suffix != _RECORDING_SUFFIX:
+            return
+    if not force:
+        raise InputError(
+            f"{path}: is a recording, and none is replaced without --force; give another name"
+        )
 
 
 def check_folder_writable(folder: Path) -> None:

@@ -16,13 +16,19 @@ _LARGEST_RATE_ERROR = 0.05
 
 
 def import_command(
-    *, sources: list[Path], site: Path, output: Path, vehicle: str | None, name: str | None
+    *,
+    sources: list[Path],
+    site: Path,
+    output: Path,
+    vehicle: str | None,
+    name: str | None,
+    force: bool = False,
 ) -> str:
     """Write the recording of a folder, or of a pair of CSV files; return a line that says so.
 
     Nothing is written if anything is wrong (InputError).
     """
-    check_writable(output)
+    check_writable(output, force=force)
     text = read_site_text(site)
     parsed = parse_site(text, str(site))
     vehicle_id = _vehicle(parsed, site, vehicle)
@@ -33,6 +39,7 @@ def import_command(
         run_to_messages(runs, parsed, realm, vehicle_id),
         site_toml=text,
         reason="import complete",
+        force=force,
     )
     drives = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     seconds = sum(float(run.accel_time_s[-1] - run.accel_time_s[0]) for run in runs)

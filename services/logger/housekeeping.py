@@ -96,7 +96,9 @@ class Housekeeping:
             text = f"{path.name} was cut off and stays so: too little room to recover it"
             self._tell(path, EventKind.DISK_LOW, text)
             return
-        done = self._run_gently(["services", "recover", str(path), "--set-aside", "--json"])
+        # What an earlier run recovered of it, and did not get to rename it, is replaced.
+        options = ["--set-aside", "--json", "--force"]
+        done = self._run_gently(["services", "recover", str(path), *options])
         if done is None:
             return
         code, out, log = done

@@ -35,7 +35,7 @@ from schemas.messages import descriptors
 from schemas.topics import Key, key, parse_key, topic
 from services.common.disk import DISK, Disk, write_all
 from services.common.errors import InputError
-from services.common.files import replaced_atomically
+from services.common.files import is_held, replaced_atomically
 from services.common.intervals import Intervals
 from services.recordings.mcap_file import McapWriter
 from services.recordings.mcap_scan import Damage, RawMessage, last_metadata, scan
@@ -242,12 +242,14 @@ def write_recording(
     *,
     site_toml: str | None,
     reason: str,
+    force: bool = False,
 ) -> int:
     """Write a whole recording beside `path`, sync it and rename it; return how many messages.
 
     Realm and vehicle are those of the first message. The file depends on nothing but the arguments
-    and this program's version: no clock is read. InputError if `path` cannot be written or there
-    is no message, FailureError if writing fails; then `path` is as it was before.
+    and this program's version: no clock is read. InputError if `path` cannot be written, is a
+    recording (which `force` replaces, unless somebody writes it) or there is no message,
+    FailureError if writing fails; then `path` is as it was before.
     """
     source = iter(messages)
     first = next(source, None)
@@ -257,7 +259,7 @@ def write_recording(
     last_time_ns = first.log_time_ns
     realm = first.key.realm
     vehicle = first.key.identifier if first.key.owner == "vehicle" else None
-    with replaced_atomically(path) as temporary, temporary.open("wb") as file:
+    with replaced_atomically(path, force=force) as temporary, temporary.open("wb") as file:
         mcap = _begin(
             file.write,
             {"reason": reason},
@@ -373,11 +375,7 @@ def is_closed(path: Path) -> bool:
 def is_being_written(path: Path) -> bool:
     """Whether a living process writes to a recording; InputError if it cannot be opened."""
     with _opened(path) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        return False
+        return is_held(file)
 
 
 class _Mcap(NamedTuple):

@@ -12,7 +12,7 @@ from schemas.events import Event, EventKind, encode_event
 from schemas.messages import descriptors
 from schemas.topics import Key, check_realm, key, parse_key, topic
 from services.common.errors import FailureError, InputError
-from services.common.files import replaced_atomically
+from services.common.files import check_writable, replaced_atomically
 from services.common.intervals import Intervals
 from services.recordings.mcap_file import McapWriter
 from services.recordings.mcap_scan import Damage, Indexed, RawMessage, scan
@@ -84,7 +84,9 @@ def is_name_taken(path: Path) -> bool:
     )
 
 
-def recover_recording(source: Path, target: Path, time_ns: int | None = None) -> Recovery:
+def recover_recording(
+    source: Path, target: Path, time_ns: int | None = None, *, force: bool = False
+) -> Recovery:
     """Write what holds in `source` to `target`, beside it first and then renamed.
 
     Messages, channels, metadata and attachments are copied as they are, topics of others too. A
@@ -93,11 +95,13 @@ def recover_recording(source: Path, target: Path, time_ns: int | None = None) ->
     done. Memory is bounded whatever the file holds.
 
     InputError: `source` is missing, is no MCAP file, holds nothing that can be read, is being
-    written, or is `target`. FailureError: reading or writing failed. Never another exception.
+    written, or is `target`; there is a recording at `target`, which only `force` replaces.
+    FailureError: reading or writing failed. Never another exception.
     """
     now_ns = time.time_ns() if time_ns is None else time_ns
     if target.exists() and source.exists() and target.samefile(source):
         raise InputError(f"{target}: is the damaged recording itself; give another name")
+    check_writable(target, force=force)
     try:
         file = source.open("rb")
     except FileNotFoundError:
@@ -113,7 +117,7 @@ def recover_recording(source: Path, target: Path, time_ns: int | None = None) ->
             ) from None
         if not any(not isinstance(item, Damage) for item in _read(source, file)):
             raise InputError(f"{source}: holds nothing of an MCAP recording that can be read")
-        with replaced_atomically(target) as temporary, temporary.open("wb") as out:
+        with replaced_atomically(target, force=force) as temporary, temporary.open("wb") as out:
             library = f"driveby {program_version()}"
             writer = McapWriter(out.write, library=library, chunk_bytes=CHUNK_BYTES)
             copy = _Copy(source, writer)

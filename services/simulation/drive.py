@@ -81,10 +81,11 @@ def simulate_command(
     gps_noise: bool,
     rate: float | None,
     output: Path,
+    force: bool = False,
     console: "Console",
 ) -> int:
     """Write the recording of one simulated crossing."""
-    check_writable(output)
+    check_writable(output, force=force)
     known = paper_site() if site is None else load_site(site)
     ratios = _ratios(known.bridges[0], scenario, ei)
     with console.status("simulating", spinner="dots"):
@@ -99,7 +100,9 @@ def simulate_command(
             receiver_errors=gps_noise,
             rate_hz=rate,
         )
-        messages = write_drive(output, drive, declared(known, noise, drive.run.rate_hz))
+        messages = write_drive(
+            output, drive, declared(known, noise, drive.run.rate_hz), force=force
+        )
     seconds = drive.run.accel_time_s[-1] - drive.run.accel_time_s[0]
     console.print(f"{output}: {seconds:.1f} s, {messages} messages", highlight=False)
     return 0
@@ -116,10 +119,14 @@ def declared(site: Site, noise_ug_per_rthz: float, rate_hz: float) -> Site:
     return site.model_copy(update={"sensor": sensor})
 
 
-def write_drive(path: Path, drive: Drive, site: Site, realm: str = "sim-drive") -> int:
+def write_drive(
+    path: Path, drive: Drive, site: Site, realm: str = "sim-drive", *, force: bool = False
+) -> int:
     """Write the recording that the truck would have made, with the site in it."""
     messages = run_to_messages([drive.run], site, realm, site.vehicles[0].id)
-    return write_recording(path, messages, site_toml=site_toml(site), reason="simulation complete")
+    return write_recording(
+        path, messages, site_toml=site_toml(site), reason="simulation complete", force=force
+    )
 
 
 def simulate_drive(

@@ -251,7 +251,7 @@ def test_a_disk_that_is_full_anywhere_is_told_and_counted(
             assert end["reason"] == writer.failure
             assert EventKind.WRITE_ERROR in events_of(path)
         else:
-            recovery = recover_recording(path, tmp_path / "r.mcap")
+            recovery = recover_recording(path, tmp_path / "r.mcap", force=True)
             assert recovery.damaged_bytes == 0  # what was torn has been cut off
 
 

@@ -191,9 +191,9 @@ def test_what_cannot_be_known_is_not_processed(tmp_path: Path) -> None:
     site = read_site(SAMPLE)
     write_recording(path, fixes(20), site_toml=site, reason="test")
     assert is_processed(path, [])  # far from every bridge
-    write_recording(path, fixes(20), site_toml=None, reason="test")
+    write_recording(path, fixes(20), site_toml=None, reason="test", force=True)
     assert not is_processed(path, [])  # which bridges?
-    write_recording(path, fixes(20, "truck-9"), site_toml=site, reason="test")
+    write_recording(path, fixes(20, "truck-9"), site_toml=site, reason="test", force=True)
     assert not is_processed(path, [])  # which truck?
     path.write_bytes(b"damaged")
     assert not is_processed(path, [])

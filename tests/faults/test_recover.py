@@ -93,7 +93,7 @@ def damaged(tmp_path: Path, content: bytes) -> Path:
 def recovered(path: Path) -> tuple[Recovery, list[Message]]:
     """Recover, check that any MCAP reader opens the result, and return its data."""
     target = recovered_path(path)
-    recovery = recover_recording(path, target, time_ns=NOW_NS)
+    recovery = recover_recording(path, target, time_ns=NOW_NS, force=True)
     with target.open("rb") as file:
         summary = make_reader(file, validate_crcs=True).get_summary()
         assert summary is not None
@@ -367,7 +367,7 @@ def test_a_failed_write_leaves_the_former_result(whole: Whole, tmp_path: Path) -
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limit[1]))
     try:
         with pytest.raises(FailureError, match="could not be written: File too large"):
-            recover_recording(path, recovered_path(path))
+            recover_recording(path, recovered_path(path), force=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert recovered_path(path).read_bytes() == b"as before"
@@ -395,7 +395,7 @@ def test_the_command_says_what_it_found(
     assert out.count("\n") == 1
     assert cli.main(["recover", str(path), "-o", str(tmp_path / "c.mcap")]) == code
     assert (tmp_path / "c.mcap").exists()
-    assert cli.main(["recover", str(path), "--set-aside"]) == code
+    assert cli.main(["recover", str(path), "--set-aside", "--force"]) == code
     assert (tmp_path / "a.mcap.crashed").exists()
     assert not path.exists()
     capsys.readouterr()

@@ -17,7 +17,13 @@ from schemas.topics import Key
 from services.cli import main as cli
 from services.common.errors import FailureError, InputError
 from services.drives import importing
-from services.recordings.recording import Message, read_info, read_site, write_recording
+from services.recordings.recording import (
+    Message,
+    RecordingWriter,
+    read_info,
+    read_site,
+    write_recording,
+)
 
 EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
 COMMANDS = (
@@ -87,9 +93,10 @@ def test_import_writes_a_recording_with_its_site(
     assert sum(read_info(output).messages.values()) == 241
     before = output.read_bytes()
     pair = (drive / "accel_00.csv", drive / "gps_00.csv")
-    code, _, _ = run(capsys, "import", *pair, "--site", drive / "site.toml", "-o", output)
-    assert code == 0
-    assert output.read_bytes() == before  # an existing file is replaced, by the same
+    again = ("import", *pair, "--site", drive / "site.toml", "-o", output)
+    assert "without --force" in refused(capsys, *again)
+    assert run(capsys, *again, "--force")[0] == 0
+    assert output.read_bytes() == before  # replaced by the same
 
 
 def test_import_of_a_real_drive(
@@ -170,7 +177,8 @@ def test_positions_of_another_day_give_one_line_and_leave_nothing(
     before = listing(drive.parent)
     output = drive.parent / "out.mcap"
     output.write_text("kept")
-    line = refused(capsys, "import", drive, "--site", drive / "site.toml", "-o", output)
+    arguments = ("import", drive, "--site", drive / "site.toml", "-o", output)
+    line = refused(capsys, *arguments, "--force")
     assert line.startswith(f"{path}: time_s goes from 1791000000.000 to ")
     assert listing(drive.parent) == {**before, "out.mcap": b"kept"}
 
@@ -203,7 +211,7 @@ def test_the_vehicle_must_be_chosen_where_there_are_several(
         "[vehicle]", "[[vehicle]]"
     )
     site.write_text(table + table.replace("truck-x", "truck-y") + text[text.index("[bridge]") :])
-    arguments = ("import", drive, "--site", site, "-o", output)
+    arguments = ("import", drive, "--site", site, "--force", "-o", output)
     assert refused(capsys, *arguments).endswith("choose with --vehicle one of truck-x, truck-y")
     assert "holds no vehicle z" in refused(capsys, *arguments, "--vehicle", "z")
     code, _, _ = run(capsys, *arguments, "--vehicle", "truck-y", "--name", "second")
@@ -411,3 +419,35 @@ def test_nothing_heavy_is_imported_at_the_start(project: Path) -> None:
         [sys.executable, "-c", code], cwd=project, capture_output=True, text=True, check=True
     )
     assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("command", ["simulate", "import", "recover", "identify"])
+def test_no_command_replaces_a_recording_by_accident_or_while_it_is_written(
+    command: str, csv_example: Path, project: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """The logger wrote on into the unlinked file, said `durable`, and trucks freed their spools."""
+    sample = project / "recordings" / "sample" / "crossing.mcap"
+    target = tmp_path / "live.mcap"
+    arguments = {
+        "simulate": ["--scenario", "6", "-o"],
+        "import": [str(csv_example), "--site", str(csv_example / "site.toml"), "-o"],
+        "recover": [str(sample), "-o"],
+        "identify": [str(sample), "--method", "least-squares", "--json"],
+    }[command]
+    living = RecordingWriter(target, reason="test")
+    content = target.read_bytes()
+    forces = [[], ["--force"]] if command != "identify" else [[]]
+    for force in forces:
+        assert cli.main([command, *arguments, str(target), *force]) == 2
+        assert "is being written at this moment" in (said := capsys.readouterr().err)
+        assert said.count("\n") == 1
+    living.finish("done")
+    content = target.read_bytes()
+    assert cli.main([command, *arguments, str(target)]) == 2
+    assert "is a recording, and none is replaced without --force" in capsys.readouterr().err
+    assert target.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [target]
+    if command != "identify":
+        assert cli.main([command, *arguments, str(target), "--force"]) == 0
+        assert target.read_bytes() != content

@@ -241,7 +241,7 @@ def test_a_failed_source_leaves_nothing_behind(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"as before")
     with pytest.raises(InputError, match="line 7"):
-        write_recording(path, broken(), site_toml=None, reason="import")
+        write_recording(path, broken(), site_toml=None, reason="import", force=True)
     assert path.read_bytes() == b"as before"
     assert [file.name for file in tmp_path.iterdir()] == ["a.mcap"]
 
