@@ -29,6 +29,7 @@ class EventKind(StrEnum):
     DISK_LOW = "disk_low"
     RECORDING_RECOVERED = "recording_recovered"
     RECORDING_DELETED = "recording_deleted"
+    RECORDING_GONE = "recording_gone"
 
 
 EVENT_TEXTS: dict[EventKind, str] = {
@@ -47,6 +48,7 @@ EVENT_TEXTS: dict[EventKind, str] = {
     EventKind.DISK_LOW: "Little room is left on the disk.",
     EventKind.RECORDING_RECOVERED: "A recording that was damaged or cut off was rewritten.",
     EventKind.RECORDING_DELETED: "A recording was deleted to keep within the budget.",
+    EventKind.RECORDING_GONE: "A recording was deleted, cut or moved while it was being written.",
 }
 
 

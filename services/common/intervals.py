@@ -58,6 +58,22 @@ class Intervals:
         self.size += new
         return new
 
+    def remove_range(self, first: int, last: int) -> int:
+        """Take all numbers from first to last out; how many of them were there."""
+        low, high = bisect_left(self._last, first), bisect_right(self._first, last)
+        if last < first or low >= high:
+            return 0
+        left = [(a, b) for a, b in ((self._first[low], first - 1), (last + 1, self._last[high - 1]))
+                if a <= b]  # fmt: skip
+        before = sum(
+            b - a + 1 for a, b in zip(self._first[low:high], self._last[low:high], strict=True)
+        )
+        self._first[low:high] = [a for a, _ in left]
+        self._last[low:high] = [b for _, b in left]
+        removed = before - sum(b - a + 1 for a, b in left)
+        self.size -= removed
+        return removed
+
     def __contains__(self, number: int) -> bool:
         at = bisect_right(self._first, number)
         return at > 0 and number <= self._last[at - 1]

@@ -97,13 +97,13 @@ def run(
             intake = Intake(realm, service_id, own.boot_id)
             logger = _Logger(place, service_id, writer, intake, own)
             with _rotated_by_signal(writer):
-                _record(logger, bus, stop, ready, budget_bytes)
+                gone = _record(logger, bus, stop, ready, budget_bytes)
         except BaseException:
             writer.finish("logger failed", {})
             raise
     if writer.failure is not None:
         raise FailureError(writer.failure)
-    return 1 if writer.dropped else 0
+    return 1 if writer.dropped or gone else 0
 
 
 class _Logger(NamedTuple):
@@ -120,7 +120,8 @@ def _record(
     stop: threading.Event,
     ready: Callable[[], None] | None,
     budget_bytes: int | None,
-) -> None:
+) -> int:
+    """Record until it is over; return how many messages were deleted under the logger for good."""
     place = logger.place
     folder = place.folder if place.file is None else None
     completeness = Completeness(bus, folder, place.realm, logger.intake, logger.writer)
@@ -162,6 +163,8 @@ def _record(
         _report(logger, announcements, closing=True)
         reason = "stopped by a signal"  # after a write error nothing is written any more
         logger.writer.finish(reason, count_all(logger.intake.counts, logger.writer))
+        completeness.report(time.monotonic())  # a file may have been missing only now
+        return completeness.gone()
     finally:
         if housekeeping is not None:
             housekeeping.close()

@@ -19,7 +19,7 @@ from services.common.errors import InputError
 from services.common.intervals import Intervals
 from services.logger.intake import Intake
 from services.logger.spool_recovery import SpoolRecovery
-from services.recordings.recording import read_identities
+from services.recordings.recording import Identities, read_identities
 
 __all__ = ["Completeness", "Known", "known_on_disk"]
 
@@ -44,7 +44,10 @@ class Known(NamedTuple):
 
 
 class Durable(Protocol):
-    """What a writer must be told."""
+    """What a writer must be told, and tells."""
+
+    withdrawn: deque[Identities]
+    """Messages whose files are gone."""
 
     def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
         """Note sequences that need not come: already on disk, or lost for ever."""
@@ -93,11 +96,13 @@ class Completeness:
         self._intake = intake
         self._writer = writer
         self._latched: dict[tuple[Key, int], Intervals] = {}
+        self._gone: Identities = {}
+        self._gone_for_ever = 0
         if folder is not None:
             for known in known_on_disk(folder, realm, time.time()):
                 self._on_disk(*known)
         self._recovery = SpoolRecovery(
-            bus, realm, intake.seen, confirmed=self._on_disk, lost=self._lost
+            bus, realm, intake.seen, gone=self._gone, confirmed=self._on_disk, lost=self._lost
         )
         self._alive: dict[tuple[str, str], bool] = {}
         self._tokens: Any = bus.liveliness().declare_subscriber(
@@ -113,6 +118,8 @@ class Completeness:
     def report(self, now_s: float) -> None:
         """Tell the writer what need not come any more, and count."""
         intake = self._intake
+        while self._writer.withdrawn:
+            self._withdraw(self._writer.withdrawn.popleft())
         for where, boot_id, first, last in intake.settled:
             self._writer.settle(where, boot_id, first, last, on_disk=False)
         intake.settled.clear()
@@ -123,6 +130,15 @@ class Completeness:
             intake.forgotten.clear()
         self._read_tokens()
         self._figures = self._counted(now_s)
+
+    def gone(self) -> int:
+        """Return how many messages were in files that are gone, and have not come again."""
+        seen = self._intake.seen.streams
+        return self._gone_for_ever + sum(
+            last - first + 1
+            for name, numbers in self._gone.items()
+            for first, last in seen.get(name, Intervals()).missing_of(numbers.ranges())
+        )
 
     def figures(self) -> dict[str, float]:
         """Return what `report` counted last; may be called from another thread."""
@@ -141,7 +157,18 @@ class Completeness:
         elif self._intake.adopt(where, boot_id, first, last, time.time_ns()):
             self._writer.settle(where, boot_id, first, last, on_disk=True)
 
+    def _withdraw(self, identities: Identities) -> None:
+        for (where, boot_id), numbers in identities.items():
+            if (where.identifier, boot_id) != (self._intake.own_service, self._intake.own_boot_id):
+                self._intake.unsee(where, boot_id, numbers)
+                gone = self._gone.setdefault((where, boot_id), Intervals())
+                for first, last in numbers.ranges():
+                    gone.add_range(first, last)
+
     def _lost(self, where: Key, boot_id: int, first: int, last: int) -> None:
+        gone = self._gone.get((where, boot_id))
+        if gone is not None:
+            self._gone_for_ever += gone.remove_range(first, last)
         self._intake.lose(where, boot_id, first, last, time.time_ns())
 
     def _read_tokens(self) -> None:
@@ -167,6 +194,7 @@ class Completeness:
             {
                 "rate_per_s": (received - before) / max(1.0, last_s - first_s),
                 "lag_s": max(lag_s for _, _, lag_s in self._history),
+                "gone": float(self.gone()),
                 "to_fetch": float(self._recovery.waiting()),
                 "trucks_alive": sum(alive.values()),
             }

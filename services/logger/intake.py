@@ -136,6 +136,13 @@ class Intake:
         self.seen.numbers(where, boot_id).add_range(first, last)
         return True
 
+    def unsee(self, where: Key, boot_id: int, numbers: Intervals) -> None:
+        """Take messages for new when they come again: what was written of them is gone."""
+        seen = self.seen.streams.get((where, boot_id))
+        if seen is not None:
+            for first, last in numbers.ranges():
+                seen.remove_range(first, last)
+
     def lose(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> None:
         """Give up messages that nobody has any more."""
         try:

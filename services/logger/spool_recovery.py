@@ -10,8 +10,9 @@ Everything runs in the thread that calls `step`; nothing in it waits.
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import zenoh
@@ -60,11 +61,16 @@ class Shortfall(NamedTuple):
     """Nobody has it."""
 
 
-def shortfall(boot: Held, seen: Intervals, ripe: int) -> Shortfall:
-    """Compare what came of a stream and boot with what its truck has, below sequence `ripe`."""
+def shortfall(boot: Held, seen: Intervals, ripe: int, gone: Iterable[Range] = ()) -> Shortfall:
+    """Compare what came of a stream and boot with what its truck has, below sequence `ripe`.
+
+    `gone`: what this logger had on its disk, and said so, and has no more.
+    """
     missing = seen.missing_of([(0, min(ripe, boot.next_sequence) - 1)])
     durable = Intervals()
     durable.add_range(0, boot.durable)
+    for first, last in gone:
+        durable.remove_range(first, last)
     open_ = durable.missing_of(missing)
     held = Intervals()
     for first, last in boot.held:
@@ -103,13 +109,18 @@ class SpoolRecovery:
         realm: str | None,
         seen: Seen,
         *,
+        gone: Mapping[tuple[Key, int], Intervals] = MappingProxyType({}),
         confirmed: Callable[[Key, int, int, int], None],
         lost: Callable[[Key, int, int, int], None],
     ) -> None:
-        """`seen` is read only. The callbacks get (stream's key, boot_id, first, last)."""
+        """`seen` and `gone` are read only. The callbacks get (stream's key, boot_id, first, last).
+
+        `gone` are messages that were on the disk, and that trucks may still have.
+        """
         self._bus = bus
         self._realm = realm
         self._seen = seen
+        self._gone = gone
         self._confirmed = confirmed
         self._lost = lost
         self._trucks: dict[tuple[str, str], _Truck] = {}
@@ -197,7 +208,8 @@ class SpoolRecovery:
             # What was sent in this moment may still be on its way; an earlier boot sends nothing.
             below = truck.ripe.get(entry, 0) if boot.boot_id == newest else boot.next_sequence
             ripe[entry] = boot.next_sequence
-            missing = shortfall(boot, seen, below)
+            gone = self._gone.get((where, boot.boot_id))
+            missing = shortfall(boot, seen, below, () if gone is None else gone.ranges())
             for first, last in missing.confirmed:
                 self._confirmed(where, boot.boot_id, first, last)
             for first, last in missing.lost:

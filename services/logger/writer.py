@@ -25,8 +25,9 @@ from services.common.disk import DISK, Disk
 from services.common.errors import InputError
 from services.common.intervals import Intervals
 from services.logger.backlog import Backlog
+from services.logger.durable import DurableStreams
 from services.logger.own_events import OwnEvents
-from services.recordings.recording import Message, RecordingWriter
+from services.recordings.recording import Identities, Message, Misplaced, RecordingWriter
 from services.recordings.recovery import is_name_taken
 
 _log = logging.getLogger(__name__)
@@ -43,8 +44,6 @@ _SHORTEST_QUIET_S = 10.0
 _DISK_CHECK_S = 1.0
 _STOP_SHARE = 0.125
 """Of the floor of free space: there recording stops, while files can still be closed well."""
-_MAX_DURABLE_STREAMS = 8000
-"""Some 90 bytes each, and the message may have a MiB."""
 _MAX_LATCHED_BYTES = 16 << 20
 _SERVICE_FILE = "_service"  # no vehicle can be called that
 _FileName = tuple[str, str]
@@ -100,6 +99,8 @@ class FileWriter:
         """Room on the disk when it was last looked at."""
         self.is_disk_low = False
         """Whether that is less than the limits want."""
+        self.withdrawn: deque[Identities] = deque()
+        """Messages that were in files which are gone, and may come again; the caller empties it."""
         self.said: deque[Message] = deque()
         """Events that this thread has written down itself and that are to be published."""
         self._place = place
@@ -115,7 +116,7 @@ class FileWriter:
         self._rotation_asked = threading.Event()
         self._backlog = Backlog() if backlog is None else backlog
         self._unsynced: list[tuple[_FileName, Message]] = []
-        self._durable = _Durable()
+        self._durable = DurableStreams()
         self._end: tuple[str, Mapping[str, int]] = ("", {})
         self._syncing = ThreadPoolExecutor(_SYNCS_AT_ONCE, "sync")
         if place.file is not None:
@@ -215,8 +216,7 @@ class FileWriter:
                 self._rotate_on_request()
             if now_s - synced_s >= SYNC_PERIOD_S:
                 synced_s = now_s
-                if self._unsynced:
-                    self._sync()
+                self._sync()
                 self._close_old(now_s)
             if now_s - looked_s >= _DISK_CHECK_S:
                 looked_s = now_s
@@ -244,11 +244,16 @@ class FileWriter:
         # At once, for a disk does many in little more time than one.
         done = [self._syncing.submit(_synced, *item) for item in self._files.items()]
         wait(done)
-        for one in done:
-            one.result()
-        self._durable.add(message for _, message in self._unsynced)
-        self.written += len(self._unsynced)
+        misplaced = {name: one.result() for name, one in zip(self._files, done, strict=True)}
+        gone = {name for name, what in misplaced.items() if what in ("deleted", "cut short")}
+        safe = [message for name, message in self._unsynced if name not in gone]
         self._unsynced.clear()
+        if safe:
+            self._durable.add(safe)
+            self.written += len(safe)
+        for name, what in misplaced.items():
+            if what is not None:
+                self._replace(name, what)
 
     def _name_of(self, message: Message) -> _FileName:
         if self._place.file is not None:
@@ -310,6 +315,11 @@ class FileWriter:
 
     def _close(self, name: _FileName, reason: str, counts: Mapping[str, int] | None = None) -> None:
         opened = self._files[name]
+        with _failing(name):
+            what = opened.file.misplaced()
+        if what in ("deleted", "cut short"):
+            self._replace(name, what)
+            opened = self._files[name]
         if counts is None:
             counts = {"dropped": self._dropped_of[name] - opened.dropped_before}
         with _failing(name):
@@ -317,6 +327,45 @@ class FileWriter:
         del self._files[name]
         self._closed_names[name] = opened.file.path.name
         _log.info("closed %s: %s", opened.file.path, reason)
+
+    def _replace(self, name: _FileName, what: Misplaced) -> None:
+        """Begin a new file for one that somebody has deleted, cut or moved, and say so."""
+        file = self._files.pop(name).file
+        latched = [
+            message
+            for key, message in self._latched.items()
+            if message.sequence in file.identities.get((key, message.boot_id), Intervals())
+        ]
+        text = f"{file.path.name} was {what} by somebody else while it was being written"
+        number = 0
+        if what == "moved":
+            text += f"; it holds {file.messages} messages"
+            with _failing(name):
+                file.finish("moved", {})
+        else:
+            file.abandon()
+            gone = file.identities
+            for message in latched:  # they stand in the next file, too
+                gone[(message.key, message.boot_id)].remove_range(
+                    message.sequence, message.sequence
+                )
+            number = sum(numbers.size for numbers in gone.values())
+            told = self._durable.withdraw(gone)
+            self._unsynced = [(n, m) for n, m in self._unsynced if n != name]
+            self.withdrawn.append(gone)
+            text += f": {number} messages are gone, {told} of them had been told to be durable"
+        with _failing(name):
+            path = _free_path(self._place, *name)
+            self._open(name, path, f"the file before it was {what}", file.path.name, latched)
+        self._durable.add(latched)
+        vehicle = name[1] if name[1] != _SERVICE_FILE else ""
+        event = Event(
+            EventKind.RECORDING_GONE, time.time_ns(), text, vehicle=vehicle, messages=number
+        )
+        _log.error("%s: %s", event.kind, text)
+        said = self._own.message(name[0] or self._place.realm or "live", event)
+        self.said.append(said)
+        self._write(said, time.monotonic())
 
     def _close_old(self, now_s: float) -> None:
         if self._place.file is not None:
@@ -422,9 +471,10 @@ class FileWriter:
         return 0
 
 
-def _synced(name: _FileName, opened: _Open) -> None:
+def _synced(name: _FileName, opened: _Open) -> Misplaced | None:
     with _failing(name):
         opened.file.sync()
+        return opened.file.misplaced()
 
 
 class _WriteFailed(Exception):  # noqa: N818  # says what happened, as OSError does not
@@ -449,73 +499,6 @@ def _failed(name: _FileName, error: OSError | InputError) -> _WriteFailed:
     return _WriteFailed(name, reason, EventKind.WRITE_ERROR)
 
 
-class _Stream(NamedTuple):
-    stored: Intervals
-    """On disk."""
-    settled: Intervals
-    """On disk, or known to be lost or refused."""
-
-
-class _Durable:
-    """What is on disk by stream and boot; the ones that changed last stand last."""
-
-    def __init__(self) -> None:
-        self.version = 0
-        self._streams: dict[tuple[Key, int], _Stream] = {}
-        self._lock = threading.Lock()
-
-    def add(self, messages: Iterable[Message]) -> None:
-        """Note messages that have been synced."""
-        with self._lock:
-            changed: dict[tuple[Key, int], _Stream] = {}
-            for message in messages:
-                name = (message.key, message.boot_id)
-                stream = changed.get(name)
-                if stream is None:
-                    stream = changed[name] = self._stream(name)
-                stream.stored.add(message.sequence)
-                stream.settled.add(message.sequence)
-            self.version += 1
-
-    def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
-        """See `FileWriter.settle`."""
-        with self._lock:
-            stream = self._stream((where, boot_id))
-            stream.settled.add_range(first, last)
-            if on_disk:
-                stream.stored.add_range(first, last)
-            self.version += 1
-
-    def forget(self, names: Iterable[tuple[Key, int]]) -> None:
-        """See `FileWriter.forget`."""
-        with self._lock:
-            for name in names:
-                self._streams.pop(name, None)
-
-    def messages(self) -> tuple[int, dict[str, pb.Durable]]:
-        """See `FileWriter.durable`; of very many streams the ones that changed last."""
-        by_realm: dict[str, pb.Durable] = {}
-        with self._lock:
-            for (where, boot_id), stream in reversed(self._streams.items()):
-                message = by_realm.setdefault(where.realm, pb.Durable(schema_version=1))
-                if len(message.streams) < _MAX_DURABLE_STREAMS:
-                    message.streams.add(
-                        owner=where.owner,
-                        identifier=where.identifier,
-                        stream=where.stream,
-                        boot_id=boot_id,
-                        sequence=stream.settled.contiguous_from_zero,
-                        count=stream.stored.size,
-                    )
-            return self.version, by_realm
-
-    def _stream(self, name: tuple[Key, int]) -> _Stream:
-        """Return a stream and let it stand last."""
-        stream = self._streams.pop(name, None) or _Stream(Intervals(), Intervals())
-        self._streams[name] = stream
-        return stream
-
-
 def _vehicle_of(message: Message) -> str:
     """Return the vehicle that a message concerns; empty if none."""
     if message.key.owner == "vehicle":
@@ -527,8 +510,11 @@ def _vehicle_of(message: Message) -> str:
 
 def _free_path(place: Place, realm: str, name: str) -> Path:
     now = datetime.now(UTC)
-    folder = place.folder / realm / f"{now:%Y-%m-%d}"
-    stem = f"{name}-{now:%Y%m%dT%H%M%SZ}"
+    if place.file is not None:
+        folder, stem = place.file.parent, place.file.stem
+    else:
+        folder = place.folder / realm / f"{now:%Y-%m-%d}"
+        stem = f"{name}-{now:%Y%m%dT%H%M%SZ}"
     path = folder / f"{stem}.mcap"
     number = 2
     while is_name_taken(path):

@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import metadata
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, Literal, NamedTuple
 
 from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
@@ -68,6 +68,10 @@ class Message(NamedTuple):
     """Wall time of the first sample, ns since 1970 UTC."""
     publish_time_ns: int
     """Wall time at which the writer got it, ns since 1970 UTC."""
+
+
+Misplaced = Literal["deleted", "cut short", "moved"]
+"""What can become of a recording that is being written. Moved, it still holds everything."""
 
 
 class RecordingInfo(NamedTuple):
@@ -172,6 +176,20 @@ class RecordingWriter:
                 self._mcap.writer.add_metadata(IDENTITIES, identities_text(self.identities))
             self._sync_file()
             self._is_dirty = False
+
+    def misplaced(self) -> Misplaced | None:
+        """What somebody else has done to the file under its writer, after `sync`; None: nothing."""
+        status = os.fstat(self._file.fileno())
+        if status.st_nlink == 0:
+            return "deleted"
+        if status.st_size < self.tell():
+            return "cut short"
+        try:
+            there = self.path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return "moved"
+        is_same = (there.st_dev, there.st_ino) == (status.st_dev, status.st_ino)
+        return None if is_same else "moved"
 
     def tell(self) -> int:
         """Return the bytes in the file so far, without the open chunk."""

@@ -222,7 +222,7 @@ def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
     is_settled: list[bool] = []
     signal.signal(signal.SIGUSR2, lambda *_: is_settled.append(True))
 
-    class Timed(writer._Durable):
+    class Timed(writer.DurableStreams):
         def add(self, messages):  # type: ignore[no-untyped-def]
             synced = list(messages)
             now_ns = time.time_ns()
@@ -232,7 +232,7 @@ def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
                 took_ms = (now_ns - np.fromiter(times, np.int64)) // 1_000_000
                 np.add.at(delays, np.clip(took_ms, 0, _LONGEST_MS - 1), 1)
 
-    writer._Durable = Timed  # type: ignore[misc]
+    writer.DurableStreams = Timed  # type: ignore[misc]
     code = logger.run(
         listen=endpoint,
         folder=folder,

@@ -25,21 +25,25 @@ def test_as_a_set(numbers: list[int]) -> None:
     assert intervals.contiguous_from_zero == (contiguous if contiguous >= 0 else None)
 
 
-RANGES = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)))
+RANGES = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40), st.booleans()))
 
 
 @given(st.lists(st.integers(0, 40)), RANGES)
-def test_ranges_as_a_set(numbers: list[int], ranges: list[tuple[int, int]]) -> None:
+def test_ranges_as_a_set(numbers: list[int], ranges: list[tuple[int, int, bool]]) -> None:
     intervals, reference = Intervals(), set[int]()
     for number in numbers:
         intervals.add(number)
         reference.add(number)
-    for first, last in ranges:
+    for first, last, is_added in ranges:
         wanted = set(range(first, last + 1))
         missing = [n for a, b in intervals.missing_of([(first, last)]) for n in range(a, b + 1)]
         assert missing == sorted(wanted - reference)
-        assert intervals.add_range(first, last) == len(wanted - reference)
-        reference |= wanted
+        if is_added:
+            assert intervals.add_range(first, last) == len(wanted - reference)
+            reference |= wanted
+        else:
+            assert intervals.remove_range(first, last) == len(wanted & reference)
+            reference -= wanted
         runs = intervals.ranges()
         assert [n for a, b in runs for n in range(a, b + 1)] == sorted(reference)
         assert all(b + 1 < a for (_, b), (a, _) in pairwise(runs))

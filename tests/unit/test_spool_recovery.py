@@ -37,16 +37,18 @@ def flat(ranges: list[tuple[int, int]]) -> set[int]:
     return {n for first, last in ranges for n in range(first, last + 1)}
 
 
-@given(st.sets(small), st.sets(small), st.integers(-1, 30), small)
+@given(st.sets(small), st.sets(small), st.integers(-1, 30), small, st.sets(small))
 def test_every_missing_number_is_fetched_confirmed_or_lost(
-    seen: set[int], held: set[int], durable: int, ripe: int
+    seen: set[int], held: set[int], durable: int, ripe: int, gone: set[int]
 ) -> None:
+    """What is gone from this logger's disk is on none, whatever the truck was told."""
     boot = Held(1, 31, intervals(held).ranges(), durable, 0)
-    found = shortfall(boot, intervals(seen), ripe)
+    found = shortfall(boot, intervals(seen), ripe, intervals(gone).ranges())
     missing = set(range(ripe)) - seen
-    assert flat(found.confirmed) == {n for n in missing if n <= durable}
-    assert flat(found.fetch) == {n for n in missing if n > durable and n in held}
-    assert flat(found.lost) == {n for n in missing if n > durable and n not in held}
+    safe = {n for n in missing if n <= durable} - gone
+    assert flat(found.confirmed) == safe
+    assert flat(found.fetch) == (missing - safe) & held
+    assert flat(found.lost) == missing - safe - held
 
 
 @given(

@@ -1,0 +1,93 @@
+"""What is on disk, as `durable` tells trucks and workers: what they may forget."""
+
+import threading
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.topics import Key
+from services.common.intervals import Intervals
+from services.recordings.recording import Identities, Message
+
+_MAX_DURABLE_STREAMS = 8000
+"""Some 90 bytes each, and the message may have a MiB."""
+
+
+class _Stream(NamedTuple):
+    stored: Intervals
+    """On disk."""
+    settled: Intervals
+    """On disk, or known to be lost or refused."""
+
+
+class DurableStreams:
+    """What is on disk by stream and boot; the ones that changed last stand last."""
+
+    def __init__(self) -> None:
+        self.version = 0
+        self._streams: dict[tuple[Key, int], _Stream] = {}
+        self._lock = threading.Lock()
+
+    def add(self, messages: Iterable[Message]) -> None:
+        """Note messages that have been synced."""
+        with self._lock:
+            changed: dict[tuple[Key, int], _Stream] = {}
+            for message in messages:
+                name = (message.key, message.boot_id)
+                stream = changed.get(name)
+                if stream is None:
+                    stream = changed[name] = self._stream(name)
+                stream.stored.add(message.sequence)
+                stream.settled.add(message.sequence)
+            self.version += 1
+
+    def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
+        """See `FileWriter.settle`."""
+        with self._lock:
+            stream = self._stream((where, boot_id))
+            stream.settled.add_range(first, last)
+            if on_disk:
+                stream.stored.add_range(first, last)
+            self.version += 1
+
+    def withdraw(self, identities: Identities) -> int:
+        """Take back messages that are gone; how many of them had been noted."""
+        with self._lock:
+            self.version += 1
+            number = 0
+            for name, numbers in identities.items():
+                stream = self._streams.get(name)
+                if stream is not None:
+                    for first, last in numbers.ranges():
+                        number += stream.stored.remove_range(first, last)
+                        stream.settled.remove_range(first, last)
+            return number
+
+    def forget(self, names: Iterable[tuple[Key, int]]) -> None:
+        """See `FileWriter.forget`."""
+        with self._lock:
+            for name in names:
+                self._streams.pop(name, None)
+
+    def messages(self) -> tuple[int, dict[str, pb.Durable]]:
+        """See `FileWriter.durable`; of very many streams the ones that changed last."""
+        by_realm: dict[str, pb.Durable] = {}
+        with self._lock:
+            for (where, boot_id), stream in reversed(self._streams.items()):
+                message = by_realm.setdefault(where.realm, pb.Durable(schema_version=1))
+                if len(message.streams) < _MAX_DURABLE_STREAMS:
+                    message.streams.add(
+                        owner=where.owner,
+                        identifier=where.identifier,
+                        stream=where.stream,
+                        boot_id=boot_id,
+                        sequence=stream.settled.contiguous_from_zero,
+                        count=stream.stored.size,
+                    )
+            return self.version, by_realm
+
+    def _stream(self, name: tuple[Key, int]) -> _Stream:
+        """Return a stream and let it stand last."""
+        stream = self._streams.pop(name, None) or _Stream(Intervals(), Intervals())
+        self._streams[name] = stream
+        return stream
