@@ -47,6 +47,9 @@ _SMALLEST_NOISE_UG = 0.1
 _USABLE_CHI2 = 2.0
 """Intervals that are widened by the square root of this are wide; a model that fits worse is wrong,
 unless it is only the noise that is larger than declared."""
+_LARGEST_CHI2 = 25.0
+"""Whatever the pattern: noise five times the declared is another sensor, or a broken one, and how
+far an interval that is widened by so much can be trusted nobody has measured."""
 _LARGEST_R_HAT = 1.05
 _SMALLEST_ESS = 100.0
 _ROAD_DRAWS = 80
@@ -156,7 +159,8 @@ def identify_pre(
     reasons = reasons_after_fit(data, _fit(data, found))
     if found.ending is not Ending.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
-    if found.chi2_per_dof > _USABLE_CHI2 and Reason.NOISE_ABOVE_DECLARED not in reasons:
+    usable = _LARGEST_CHI2 if Reason.NOISE_ABOVE_DECLARED in reasons else _USABLE_CHI2
+    if found.chi2_per_dof > usable:
         diagnostics["seconds"] = elapsed()
         return rejected(
             data,

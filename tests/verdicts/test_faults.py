@@ -10,7 +10,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from pre_core import pre
+from schemas.reasons import Reason
+from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
+from services.worker import pre_method
 from tests.verdicts import faults
 from tests.verdicts.faults import Case, Fault, Truth
 
@@ -85,6 +89,11 @@ TABLE: dict[str, Row] = {
     "span -10 %": Row(Fault(site=faults.span_believed(0.9)), MISFIT),
     "span +10 %, 100 µg/√Hz": Row(Fault(site=faults.span_believed(1.1)), truth=LOUD),
     "noise 3 times the declared": Row(Fault(noise=3.0), frozenset({"noise_above_declared"})),
+    "noise 100 times the declared, 0.25 µg/√Hz": Row(
+        Fault(noise=100.0),
+        MISFIT | {"noise_above_declared"},
+        PAPER._replace(noise_ug_per_rthz=0.25),
+    ),
     "noise half the declared": Row(Fault(noise=0.5), frozenset({"noise_below_declared"})),
     "clock jitter of 50 µs": Row(Fault(jitter_s=5e-5)),
     "an axle's channel at 100 Hz": Row(Fault(slow=U1)),
@@ -135,3 +144,50 @@ def test_a_wrong_mass_is_carried_in_the_interval_and_nowhere_else() -> None:
     for e in range(1, 8):
         ratio = result.parameters[f"EI_{e}"].mean / sound.parameters[f"EI_{e}"].mean
         assert ratio == pytest.approx(1.1, abs=0.03)
+
+
+def test_a_fit_that_explains_nothing_is_given_up_before_the_chains(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Noise declared a hundred times too small: chi2 in the ten thousands, whatever its pattern."""
+
+    def no_chains(*_: object) -> None:
+        raise AssertionError("chains were begun")
+
+    monkeypatch.setattr(pre_method, "_sample", no_chains)
+    truth = PAPER._replace(noise_ug_per_rthz=0.25)
+    result = faults.identified(faults.crossing(truth, Fault(noise=100.0)))
+    assert result.verdict == "rejected"
+    assert "failed" not in result.reasons
+    assert set(result.reasons) & (MISFIT | {"noise_above_declared"})
+    assert result.parameters is None
+    assert result.chi2_per_dof is not None
+    assert result.chi2_per_dof > 1000.0
+    assert result.diagnostics["starts"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("chi2", "pattern", "verdict"),
+    [
+        (24.0, Reason.NOISE_ABOVE_DECLARED, "suspect"),
+        (26.0, Reason.NOISE_ABOVE_DECLARED, "rejected"),
+        (2.1, Reason.MODEL_MISFIT, "rejected"),
+        (1.9, Reason.MODEL_MISFIT, "suspect"),
+    ],
+)
+def test_how_large_chi2_may_be_depends_on_the_pattern_up_to_25(
+    monkeypatch: pytest.MonkeyPatch, chi2: float, pattern: Reason, verdict: str
+) -> None:
+    """The very fit of a sound crossing, said to be as bad as that: only the rule is looked at."""
+
+    def found(*arguments: object) -> pre.Optimum:
+        return optimum(*arguments)._replace(chi2_per_dof=chi2)  # type: ignore[arg-type]
+
+    optimum = pre.find_optimum
+    monkeypatch.setattr(pre, "find_optimum", found)
+    monkeypatch.setattr(pre_method, "reasons_after_fit", lambda *_: [pattern])
+    settings = IdentificationSettings(method="pre", seed=0, draws=300)
+    result = faults.identified(faults.crossing(LOUD), settings)
+    assert result.verdict == verdict
+    assert pattern in result.reasons
+    assert (result.parameters is None) == (verdict == "rejected")
