@@ -17,6 +17,7 @@ from services.common.errors import InputError
 from services.recordings.recording import Message, is_closed, read_info, read_messages
 from tests.endpoints import free_endpoint
 from tests.parent import parent_environment
+from tests.waiting import LONGEST_S
 
 HERE = Path(__file__).parent
 Numbers = dict[tuple[str, str, int], set[int]]
@@ -54,7 +55,7 @@ class Truck:
             if boot_id.isdigit() and line.endswith("\n"):
                 self.said[int(boot_id)] = int(sequence)
 
-    def wait_for(self, batches: int, timeout_s: float = 60.0) -> None:
+    def wait_for(self, batches: int, timeout_s: float = LONGEST_S) -> None:
         deadline = time.monotonic() + timeout_s
         while max(self.said.values(), default=0) < batches:
             assert time.monotonic() < deadline, f"{self.vehicle}: only {self.said}"
@@ -71,7 +72,7 @@ class Truck:
         self.is_driving = False
         self.process.send_signal(signal.SIGTERM)
 
-    def wait(self, timeout_s: float = 90.0) -> None:
+    def wait(self, timeout_s: float = LONGEST_S) -> None:
         """Wait until it has left, which it must do with nothing missing."""
         assert self.process.wait(timeout=timeout_s) == 0
         self._reader.join()
@@ -141,7 +142,7 @@ class Fleet:
     def stop_logger(self) -> None:
         assert self.logger is not None
         self.logger.send_signal(signal.SIGTERM)
-        assert self.logger.wait(timeout=20) == 0, self.logs()
+        assert self.logger.wait(timeout=LONGEST_S) == 0, self.logs()
 
     def logs(self) -> str:
         return "\n".join(path.read_text()[-3000:] for path in sorted(self.folder.glob("*.log")))

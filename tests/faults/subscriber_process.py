@@ -9,7 +9,7 @@ from tests.parent import die_with_parent
 
 def main(endpoint: str) -> None:
     with (
-        open_session(connect=endpoint, timeout_s=10) as session,
+        open_session(connect=endpoint, timeout_s=300) as session,
         Subscription(session, selector("live", "vehicle")) as subscription,
     ):
         print("ready", flush=True)

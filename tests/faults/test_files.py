@@ -34,6 +34,7 @@ from services.logger.backlog import QUEUE_BYTES, Backlog
 from services.logger.writer import FileWriter, Limits, Place
 from services.recordings.recording import Message, is_closed, read_info, read_messages
 from services.recordings.recovery import recover_recording
+from tests.waiting import LONGEST_S
 
 NOW_NS = 1_700_000_000_000_000_000
 
@@ -55,7 +56,7 @@ def info(vehicle: str) -> Message:
     return Message(Key("live", "vehicle", vehicle, "info"), payload, 1, 0, NOW_NS, NOW_NS)
 
 
-def wait_for(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+def wait_for(condition: Callable[[], object], timeout_s: float = LONGEST_S) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline

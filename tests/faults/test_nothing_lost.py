@@ -152,11 +152,9 @@ def test_frozen_for_longer_than_its_time_outs(fleet: MakeFleet, what: str, secon
     process = {"truck": frozen.process, "logger": one.logger, "router": one.router}[what]
     process.send_signal(signal.SIGSTOP)
     before = max(healthy.said.values())
-    began = time.monotonic()
     time.sleep(seconds)
-    # The caller of a gateway is never held up by the network.
-    driven_s = time.monotonic() - began
-    assert max(healthy.said.values()) - before > 0.5 * 20 * driven_s
+    # The caller of a gateway is never held up by the network: it would say nothing any more.
+    healthy.wait_for(before + round(10 * seconds))
     process.send_signal(signal.SIGCONT)
     time.sleep(2.0)
     assert one.finish() == 0

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,6 +28,7 @@ from services.recordings.recording import (
     write_recording,
 )
 from services.recordings.recovery import put_aside, recover_recording, recovered_path
+from tests.waiting import until
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "crossing.mcap"
 NOW_NS = 1_700_000_000_000_000_000
@@ -57,21 +57,17 @@ def crashed(path: Path, number: int = 50, *, every: int = 10) -> list[Message]:
 
 
 def kept(
-    folder: Path, *, budget_bytes: int | None = None, min_free_bytes: int = 0, wait_s: float = 20.0
+    folder: Path, *, budget_bytes: int | None = None, min_free_bytes: int = 0
 ) -> list[tuple[str, Event]]:
     """Keep house until it says no more; return what was told."""
     told: list[tuple[str, Event]] = []
-    idle = threading.Event()
 
     def tell(realm: str, event: Event) -> None:
         told.append((realm, event))
 
     house = House(folder, None, min_free_bytes, budget_bytes, tell)
     keeper = Housekeeping(house)
-    deadline = time.monotonic() + wait_s
-    while keeper.is_busy and time.monotonic() < deadline:
-        idle.wait(0.02)
-    assert not keeper.is_busy
+    until(lambda: not keeper.is_busy, "the end of the housekeeping")
     keeper.close()
     return told
 

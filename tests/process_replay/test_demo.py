@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +20,7 @@ from services.cli import main as cli
 from services.drives.runs import run_to_messages
 from services.recordings.recording import read_info, read_messages
 from services.simulation.drive import paper_site, simulate_drive
+from tests.waiting import LONGEST_S, until
 
 # A group of their own: they share one demo, and depend on no time-out that is short.
 pytestmark = [pytest.mark.process, pytest.mark.xdist_group("demo")]
@@ -66,7 +66,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory, project: Path) -> Demo:
         capture_output=True,
         text=True,
         check=False,
-        timeout=200,
+        timeout=LONGEST_S,
     )
     return Demo(folder, done.returncode, done.stdout, done.stderr)
 
@@ -179,7 +179,12 @@ def test_its_recording_is_identified_again_to_the_same(
 def test_a_folder_that_exists_is_left_alone(tmp_path: Path, project: Path) -> None:
     (tmp_path / "kept").write_text("kept")
     done = subprocess.run(
-        command(tmp_path), cwd=project, capture_output=True, text=True, check=False, timeout=60
+        command(tmp_path),
+        cwd=project,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LONGEST_S,
     )
     assert done.returncode == 2
     assert done.stderr == f"driveby: {tmp_path}: exists, the demo wants a new folder\n"
@@ -194,13 +199,12 @@ def running(tmp_path: Path, project: Path) -> Iterator[subprocess.Popen[str]]:
         command(folder), cwd=project, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
-        for _ in range(600):
-            if any(" services worker " in line for line in processes_of(folder).values()):
-                break
-            time.sleep(0.1)
+
+        def has_a_worker() -> bool:
             assert process.poll() is None, process.communicate()
-        else:
-            pytest.fail("the demo started no worker within 60 s")
+            return any(" services worker " in line for line in processes_of(folder).values())
+
+        until(has_a_worker, "the demo's worker")
         yield process
     finally:
         for pid in (process.pid, *processes_of(folder)):
@@ -213,7 +217,7 @@ def test_a_worker_that_is_killed(running: subprocess.Popen[str], tmp_path: Path)
     folder = tmp_path / "demo"
     (worker,) = [pid for pid, line in processes_of(folder).items() if " services worker " in line]
     os.kill(worker, signal.SIGKILL)
-    _, err = running.communicate(timeout=60)
+    _, err = running.communicate(timeout=LONGEST_S)
     assert running.returncode == 1
     assert re.fullmatch(r"driveby: the worker ended early: [^\n]+\n", err)
     assert processes_of(folder) == {}
@@ -223,6 +227,6 @@ def test_a_worker_that_is_killed(running: subprocess.Popen[str], tmp_path: Path)
 
 def test_a_demo_that_is_told_to_end(running: subprocess.Popen[str], tmp_path: Path) -> None:
     running.terminate()
-    _, err = running.communicate(timeout=30)
+    _, err = running.communicate(timeout=LONGEST_S)
     assert (running.returncode, err) == (130, "driveby: interrupted\n")
     assert processes_of(tmp_path / "demo") == {}

@@ -4,14 +4,16 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from schemas.signals import decode_accel
+from schemas.topics import selector
+from services.bus.session import Subscription, open_session
 from services.recordings.recording import read_messages
+from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process
 
@@ -39,12 +41,20 @@ def test_it_is_recorded(
         text=True,
     )
     try:
-        deadline = time.monotonic() + 30
-        while time.monotonic() < deadline and not list((tmp_path / "spool").glob("*.spool")):
-            time.sleep(0.1)
-        time.sleep(1.5)
+        batches = 0
+
+        def has_driven() -> bool:
+            nonlocal batches
+            batches += heard.receive(0.1) is not None
+            return batches >= 10
+
+        with (
+            open_session(connect=endpoint, timeout_s=LONGEST_S) as session,
+            Subscription(session, selector(None, "vehicle", "accel")) as heard,
+        ):
+            until(has_driven, "ten batches of the driver")
         driver.send_signal(signal.SIGINT)
-        _, log = driver.communicate(timeout=30)
+        _, log = driver.communicate(timeout=LONGEST_S)
     finally:
         driver.kill()
         driver.wait()

@@ -3,15 +3,21 @@
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zenoh
 
+from schemas.proto import driveby_pb2 as pb
 from schemas.signals import decode_accel, decode_gnss
+from schemas.topics import selector
+from services.bus.session import Received, Subscription, get_latest, open_session
 from services.recordings.recording import Message, read_info, read_messages
 from tests.process_replay.starting import End, Start, start_logger
+from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process
 
@@ -21,6 +27,29 @@ def by_stream(messages: list[Message]) -> dict[str, list[Message]]:
     for message in messages:
         streams.setdefault(message.key.stream, []).append(message)
     return streams
+
+
+@contextmanager
+def heard_at(endpoint: str) -> Iterator[Iterator[Received]]:
+    """What trucks say of their acceleration, as it comes."""
+
+    def one_after_the_other() -> Iterator[Received]:
+        for _ in range(round(LONGEST_S / 0.1)):
+            if (one := heard.receive(0.1)) is not None:
+                yield one
+
+    with (
+        open_session(connect=endpoint, timeout_s=LONGEST_S) as session,
+        Subscription(session, selector("live", "vehicle", "accel")) as heard,
+    ):
+        yield one_after_the_other()
+
+
+def on_disk(session: zenoh.Session) -> int:
+    """How many batches the logger says are on its disk."""
+    said = get_latest(session, selector("live", "service", "durable"), LONGEST_S)
+    streams = [one for payload in said for one in pb.Durable.FromString(payload).streams]
+    return sum(one.count for one in streams if one.stream == "accel")
 
 
 def test_a_truck_is_recorded_completely_and_as_a_drive_of_now(
@@ -100,10 +129,11 @@ def test_a_recorded_replay_is_the_recording(
     assert {m.key.realm for m in read_messages(tmp_path / "again.mcap")} == {"replay-x"}
 
 
-def test_replay_keeps_the_spacing(
+def test_replay_is_never_ahead_of_the_spacing(
     start: Start, finish: End, terminate: End, endpoint: str, recording: Path, tmp_path: Path
 ) -> None:
     logger = start_logger(start, endpoint, tmp_path / "again.mcap")
+    began_ns = time.time_ns()
     replay = start(
         "services.replay", recordings=[str(recording)], endpoint=endpoint, speed=5.0, name="x"
     )
@@ -112,10 +142,8 @@ def test_replay_keeps_the_spacing(
     accel = by_stream(list(read_messages(tmp_path / "again.mcap")))["accel"]
     came_s = np.array([message.publish_time_ns for message in accel]) * 1e-9
     due_s = np.array([message.log_time_ns for message in accel]) * 1e-9
-    late_s = (came_s - came_s[0]) - (due_s - due_s[0]) / 5.0
-    # 10 s in 2 s. A loaded machine may be late now and then, but not in the middle of it all.
-    assert abs(np.median(late_s)) < 0.1
-    assert came_s[-1] - came_s[0] == pytest.approx(1.99, abs=0.5)
+    # 10 s in 2 s; how it waits for each is in tests/unit/test_playback.py, with a clock of its own.
+    assert np.all(came_s - began_ns * 1e-9 >= (due_s - due_s[0]) / 5.0)
 
 
 def test_a_subscriber_that_comes_late_gets_everything(
@@ -131,7 +159,8 @@ def test_a_subscriber_that_comes_late_gets_everything(
         speed=2.0,
         vehicle="truck-1",
     )
-    time.sleep(2.0)
+    with heard_at(endpoint) as batches:
+        next(batches)
     router.send_signal(signal.SIGKILL)
     router.wait()
     logger = start_logger(start, endpoint, tmp_path / "live.mcap")
@@ -154,16 +183,17 @@ def test_a_killed_logger_leaves_a_readable_file(
         speed=1.0,
         vehicle=None,
     )
-    time.sleep(4.5)
+    with open_session(connect=endpoint, timeout_s=LONGEST_S) as session:
+        until(lambda: on_disk(session) >= 20, "twenty batches on the disk")
+        promised = on_disk(session)
     logger.send_signal(signal.SIGKILL)
     logger.wait()
-    killed_ns = time.time_ns()
     messages = list(read_messages(tmp_path / "live.mcap"))
-    assert killed_ns - max(message.publish_time_ns for message in messages) < 1_500_000_000
     info = read_info(tmp_path / "live.mcap")
     assert info.end is None
     assert info.truncated
     accel = by_stream(messages)["accel"]
+    assert len(accel) >= promised
     assert [message.sequence for message in accel] == list(range(len(accel)))
 
 
@@ -201,7 +231,7 @@ def test_nobody_there_is_one_line_and_exit_code_1(
         name="x",
         connect_timeout_s=0.5,
     )
-    _, log = replay.communicate(timeout=20)
+    _, log = replay.communicate(timeout=LONGEST_S)
     assert replay.returncode == 1
     assert log.splitlines()[-1].startswith(f"no router answers at {endpoint}")
     assert "Traceback" not in log

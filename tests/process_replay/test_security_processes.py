@@ -21,6 +21,7 @@ from services.common.errors import InputError
 from services.recordings.recording import read_messages, read_site
 from services.truck import Gateway
 from services.truck.spool import Spool
+from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process
 
@@ -54,12 +55,6 @@ def driveby() -> Iterator[Driveby]:
         process.communicate()
 
 
-def until(is_so: Callable[[], bool], timeout_s: float = 60.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not is_so():
-        assert time.monotonic() < deadline, "not in time"
-
-
 def identities(folder: Path) -> list[tuple[Key, int, int]]:
     """Of every message of a vehicle in all recordings of a folder, duplicates included."""
     found = []
@@ -82,14 +77,14 @@ def test_everything_is_recorded_under_access_control(
         *("--folder", tmp_path / "r"),
     )
     truck = driveby("truck", recording, "--speed", 50, *bus, credentials / "truck-1")
-    _, log = truck.communicate(timeout=60)
+    _, log = truck.communicate(timeout=LONGEST_S)
     assert truck.returncode == 0, log  # it knows that all is on disk: it could read `durable`
     assert "401 messages of truck-1 published" in log
     replay = driveby("replay", recording, "--speed", 0, "--name", "x", *bus, credentials / "replay")
-    _, log = replay.communicate(timeout=60)
+    _, log = replay.communicate(timeout=LONGEST_S)
     assert replay.returncode == 0, log
     logger.send_signal(signal.SIGTERM)
-    _, log = logger.communicate(timeout=20)
+    _, log = logger.communicate(timeout=LONGEST_S)
     assert logger.returncode == 0, log
     found = identities(tmp_path / "r")
     assert len(found) == len(set(found)) == 802
@@ -113,7 +108,9 @@ def test_a_crossing_is_identified_under_access_control(
         *("--file", tmp_path / "results.mcap", *bus, credentials / "worker"),
     )
     with (
-        open_session(connect=tls_endpoint, timeout_s=20.0, tls=credentials / "viewer") as session,
+        open_session(
+            connect=tls_endpoint, timeout_s=LONGEST_S, tls=credentials / "viewer"
+        ) as session,
         Subscription(session, selector("live", "service", "health")) as health,
         Subscription(session, selector("live", "bridge")) as results,
     ):
@@ -124,7 +121,7 @@ def test_a_crossing_is_identified_under_access_control(
 
         until(is_listening)
         truck = driveby("truck", crossing, "--speed", 20, *bus, credentials / "truck-1")
-        assert truck.wait(timeout=60) == 0
+        assert truck.wait(timeout=LONGEST_S) == 0
         heard: dict[str, bytes] = {}
 
         def is_told() -> bool:
@@ -135,7 +132,7 @@ def test_a_crossing_is_identified_under_access_control(
 
         until(is_told)
     worker.terminate()
-    assert worker.wait(timeout=30) == 0
+    assert worker.wait(timeout=LONGEST_S) == 0
     found = pb.Estimate.FromString(heard["estimate"]).parameters
     assert found["EI_4"].mean / found["EI_3"].mean == pytest.approx(0.4, rel=0.01)
 
@@ -179,7 +176,10 @@ def test_what_would_be_dropped_without_a_word_is_refused_with_one_line(
     values = {"recording": recording, "certs": credentials}
     command = [argument.format(**values) for argument in arguments]
     ended = subprocess.run(
-        [sys.executable, "-m", "services", *command], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "services", *command],
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
     )
     assert ended.returncode == 2
     assert ended.stderr == f"driveby: {line.format(**values)}\n"
@@ -194,7 +194,9 @@ def test_a_logger_killed_and_started_again_misses_nothing_under_access_control(
         *("--folder", tmp_path / "r"),
     ]
     logger = driveby(*arguments)
-    with open_session(connect=tls_endpoint, timeout_s=10, tls=credentials / "truck-1") as session:
+    with open_session(
+        connect=tls_endpoint, timeout_s=LONGEST_S, tls=credentials / "truck-1"
+    ) as session:
         gateway = Gateway(session, "live", "truck-1")
         for number in range(60):
             if number == 20:
@@ -204,10 +206,10 @@ def test_a_logger_killed_and_started_again_misses_nothing_under_access_control(
                 logger = driveby(*arguments)
             say(gateway)
             time.sleep(0.02)
-        missing = gateway.delivery.wait(30.0)
+        missing = gateway.delivery.wait(LONGEST_S)
         gateway.close()
     logger.send_signal(signal.SIGTERM)
-    _, log = logger.communicate(timeout=20)
+    _, log = logger.communicate(timeout=LONGEST_S)
     assert logger.returncode == 0, log
     assert {sequence for _, _, sequence in identities(tmp_path / "r")} == set(range(60))
     assert missing == 0
@@ -226,21 +228,23 @@ def test_a_real_spool_answers_the_logger_and_no_other_truck(
             spool_selector("live", "truck-1"),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=10.0,
+            timeout=LONGEST_S,
         )
         return sum(reply.ok is not None for reply in replies)
 
     with (
         open_session(listen=tls_endpoint, tls=credentials / "logger") as logger,
-        open_session(connect=tls_endpoint, timeout_s=10, tls=credentials / "truck-1") as session,
-        open_session(connect=tls_endpoint, timeout_s=10, tls=credentials / "truck-2") as other,
+        open_session(
+            connect=tls_endpoint, timeout_s=LONGEST_S, tls=credentials / "truck-1"
+        ) as session,
+        open_session(
+            connect=tls_endpoint, timeout_s=LONGEST_S, tls=credentials / "truck-2"
+        ) as other,
     ):
         gateway = Gateway(session, "live", "truck-1", Spool(tmp_path / "spool"))
         for _ in range(10):
             say(gateway)
-        deadline = time.monotonic() + 10.0
-        while not answers(logger) and time.monotonic() < deadline:
-            time.sleep(0.05)
+        until(lambda: answers(logger), "an answer of the spool")
         assert answers(logger) == 1
         assert answers(other) == 0
         gateway.close()

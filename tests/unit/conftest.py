@@ -6,6 +6,7 @@ import pytest
 import zenoh
 
 from services.bus.session import open_session
+from tests.waiting import LONGEST_S
 
 
 @pytest.fixture
@@ -16,5 +17,5 @@ def router(endpoint: str) -> Iterator[zenoh.Session]:
 
 @pytest.fixture
 def client(router: zenoh.Session, endpoint: str) -> Iterator[zenoh.Session]:
-    with open_session(connect=endpoint, timeout_s=5) as session:
+    with open_session(connect=endpoint, timeout_s=LONGEST_S) as session:
         yield session

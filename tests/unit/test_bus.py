@@ -24,13 +24,14 @@ from services.bus.session import (
     subscribe_latest,
 )
 from services.common.errors import FailureError, InputError
+from tests.waiting import LONGEST_S
 
 ACCEL = Key("live", "vehicle", "truck-1", "accel")
 
 
-def receive(subscription: Subscription, number: int, timeout_s: float = 10.0) -> list[Received]:
+def receive(subscription: Subscription, number: int) -> list[Received]:
     found: list[Received] = []
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + LONGEST_S
     while len(found) < number and time.monotonic() < deadline:
         received = subscription.receive(0.1)
         if received is not None:
@@ -124,7 +125,7 @@ def test_a_live_display_sees_the_newest_and_holds_nobody_up(
     assert next(newest) is None
     publisher = Publisher(client, "live")
     put_all(publisher, [b"%d" % number for number in range(2000)])
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + LONGEST_S
     seen: list[bytes] = []
     while b"1999" not in seen and time.monotonic() < deadline:
         received = next(newest)
@@ -192,11 +193,16 @@ def test_delivery_waits_until_everything_is_on_disk(
 ) -> None:
     logger = Publisher(router, "live")
     durable(logger, 4)
-    timer = threading.Timer(0.5, durable, (logger, 10))
+    said = threading.Event()
+
+    def say_the_rest() -> None:
+        said.set()
+        durable(logger, 10)
+
+    timer = threading.Timer(0.5, say_the_rest)
     timer.start()
-    began = time.monotonic()
-    assert delivery.wait(10.0) == 0
-    assert 0.3 < time.monotonic() - began < 5.0
+    assert delivery.wait(LONGEST_S) == 0
+    assert said.is_set()
     timer.join()
     logger.close()
 
@@ -204,7 +210,7 @@ def test_delivery_waits_until_everything_is_on_disk(
 def test_delivery_says_what_is_missing(router: zenoh.Session, delivery: Delivery) -> None:
     logger = Publisher(router, "live")
     durable(logger, 4)
-    assert delivery.wait(5.0, most_missing=6) == 6
+    assert delivery.wait(LONGEST_S, most_missing=6) == 6
     assert delivery.has_logger
     assert delivery.wait(0.3) == 6
     logger.close()
@@ -212,16 +218,14 @@ def test_delivery_says_what_is_missing(router: zenoh.Session, delivery: Delivery
 
 def test_without_a_logger_delivery_only_lingers(delivery: Delivery) -> None:
     began = time.monotonic()
-    assert delivery.wait(30.0) == 10
-    assert bus.LINGER_S <= time.monotonic() - began < bus.LINGER_S + 2.0
+    assert delivery.wait(LONGEST_S) == 10
+    assert bus.LINGER_S <= time.monotonic() - began < LONGEST_S
     assert not delivery.has_logger
 
 
 def test_nobody_answers(endpoint: str) -> None:
-    began = time.monotonic()
     with pytest.raises(FailureError, match=rf"^no router answers at {endpoint} within 0\.5 s"):
         open_session(connect=endpoint, timeout_s=0.5)
-    assert time.monotonic() - began < 5.0
 
 
 def test_the_address_is_taken(router: zenoh.Session, endpoint: str) -> None:
@@ -239,14 +243,14 @@ def test_malformed_endpoints(endpoint: str) -> None:
 def test_a_client_connects_again_by_itself(endpoint: str) -> None:
     """With a time limit on the first connection, too."""
     first = open_session(listen=endpoint)
-    client = open_session(connect=endpoint, timeout_s=2)
+    client = open_session(connect=endpoint, timeout_s=LONGEST_S)
     publisher = Publisher(client, "live")
     put_all(publisher, [b"0", b"1"])
     first.close()
     put_all(publisher, [b"2"])  # said to nobody
     with open_session(listen=endpoint) as second:
         with Subscription(second, selector("live", "vehicle")) as subscription:
-            found = receive(subscription, 3, timeout_s=20)
+            found = receive(subscription, 3)
             assert [received.payload for received in found] == [b"0", b"1", b"2"]
         publisher.close()
         client.close()

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +50,7 @@ from services.viewer.view import (
     write_views,
 )
 from tests.endpoints import free_port
+from tests.waiting import LONGEST_S, until
 
 START_NS = 1_790_010_000_000_000_000
 RATE_HZ, BATCH = 1000.0, 50
@@ -390,7 +390,7 @@ def test_viewer_ends_with_the_command_that_started_it(tmp_path: Path, monkeypatc
     started = tmp_path / "started"
     program = tmp_path / "viewer"
     program.write_text(
-        f"#!/bin/sh\n[ $1 = analytics ] && exit\necho $$ > {started}\nexec sleep 60\n"
+        f"#!/bin/sh\n[ $1 = analytics ] && exit\necho $$ > {started}\nexec sleep 3600\n"
     )
     program.chmod(0o755)
     recording = tmp_path / "run.rrd"
@@ -403,20 +403,13 @@ def test_viewer_ends_with_the_command_that_started_it(tmp_path: Path, monkeypatc
     )
     with subprocess.Popen([sys.executable, "-c", code]) as command:
         try:
-            wait_until(lambda: started.exists() and started.read_text().endswith("\n"))
+            until(lambda: started.exists() and started.read_text().endswith("\n"))
             command.terminate()
-            assert command.wait(timeout=10) == 0
+            assert command.wait(timeout=LONGEST_S) == 0
         finally:
             command.kill()
     with pytest.raises(ProcessLookupError):
         os.kill(int(started.read_text()), 0)
-
-
-def wait_until(true: Callable[[], bool], seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.05)
 
 
 def see(file: Path, folder: Path) -> tuple[list[View], np.ndarray]:
@@ -442,7 +435,7 @@ def see(file: Path, folder: Path) -> tuple[list[View], np.ndarray]:
 
 
 def _connected(port: int) -> ViewerClient:
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + LONGEST_S
     while True:
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
@@ -456,7 +449,7 @@ def _connected(port: int) -> ViewerClient:
 
 
 def _views(client: ViewerClient) -> list[View]:
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + LONGEST_S
     while time.monotonic() < deadline:
         views = client.get_state().views
         if any(view.view_class == "Map" for view in views):

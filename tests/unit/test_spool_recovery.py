@@ -20,6 +20,7 @@ from services.logger import spool_recovery
 from services.logger.spool_recovery import SpoolRecovery, shortfall
 from services.truck.gateway import Gateway
 from services.truck.spool import Spool
+from tests.waiting import LONGEST_S
 
 ACCEL = Key("live", "vehicle", "truck-1", "accel")
 MIB = 1 << 20
@@ -132,11 +133,11 @@ class Logger:
             router, "live", self.seen, confirmed=settle(self.confirmed), lost=settle(self.lost)
         )
 
-    def run(self, until: Callable[[], bool], timeout_s: float = 20.0) -> None:
-        deadline = time.monotonic() + timeout_s
+    def run(self, until: Callable[[], bool], clock: Callable[[], float] = time.monotonic) -> None:
+        deadline = time.monotonic() + LONGEST_S
         while not until():
             assert time.monotonic() < deadline
-            for one in self.recovery.step(time.monotonic()):
+            for one in self.recovery.step(clock()):
                 assert one.recovered
                 assert one.spooled
                 assert self.seen.add(one.key(), one.identity())
@@ -181,14 +182,17 @@ def test_what_has_just_been_said_is_not_asked_for(
     router: zenoh.Session, client: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It may still be on its way; only what is missing for a round is fetched."""
-    monkeypatch.setattr(spool_recovery, "LIST_PERIOD_S", 1.0)
     gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
     drive(gateway, 10)
     logger = Logger(router)
-    began = time.monotonic()
-    logger.run(lambda: time.monotonic() - began > 0.8)
-    assert logger.received == []
+    now_s = time.monotonic()
+    rounds: list[object] = []
+    compare = logger.recovery._compare
+    monkeypatch.setattr(logger.recovery, "_compare", lambda *of: (compare(*of), rounds.append(of)))
+    logger.run(lambda: bool(rounds), lambda: now_s)
+    assert logger.recovery.waiting() == 0
     logger.run(lambda: len(logger.received) == 10)
+    assert len(rounds) > 1
     gateway.close()
 
 
@@ -249,13 +253,14 @@ def test_a_damaged_record_is_lost_and_not_asked_for_for_ever(
 def test_a_truck_that_does_not_answer_holds_up_no_other(
     router: zenoh.Session, client: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(spool_recovery, "_LIST_TIMEOUT_S", 2 * LONGEST_S)
     mute = client.declare_queryable(
         wire.spool_selector("live", "truck-0"), zenoh.handlers.FifoChannel(100)
     )
     gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
     drive(gateway, 50)
     logger = Logger(router)
-    logger.run(lambda: len(logger.received) == 50, timeout_s=5.0)
+    logger.run(lambda: len(logger.received) == 50)
     gateway.close()
     mute.undeclare()  # type: ignore[no-untyped-call]
 

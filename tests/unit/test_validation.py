@@ -2,8 +2,8 @@
 
 import io
 import json
-import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -165,9 +165,8 @@ def test_a_damping_of_exactly_zero_is_no_unknown(tmp_path: Path):
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    began = time.monotonic()
-    code = cli.main(["validate", *arguments])
-    assert time.monotonic() - began < 5.0
+    with mock.patch("services.validation.paper.run_scenario", side_effect=AssertionError("begun")):
+        code = cli.main(["validate", *arguments])
     out, err = capsys.readouterr()
     assert (code, out) == (2, "")
     assert err.startswith("driveby: ")

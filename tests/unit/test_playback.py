@@ -1,0 +1,62 @@
+"""The spacing of what is published again, by a clock of its own."""
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from schemas.topics import Key
+from services.bus import playback
+from services.recordings.recording import Message
+
+WHERE = Key("live", "vehicle", "truck-1", "gnss")
+
+
+class Clock(threading.Event):
+    """Time goes on only while something waits for the event."""
+
+    now_s = 1000.0
+
+    def wait(self, timeout: float | None = None) -> bool:
+        assert timeout is not None
+        assert timeout > 0.0
+        self.now_s += timeout
+        return self.is_set()
+
+
+class Delivered:
+    has_logger = False
+
+    def missing(self) -> int:
+        return 0
+
+
+def recorded(*times_s: float) -> Iterator[Message]:
+    for number, time_s in enumerate(times_s):
+        yield Message(WHERE, b"", 1, number, round(time_s * 1e9), 0)
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 5.0])
+def test_the_spacing_is_kept(monkeypatch: pytest.MonkeyPatch, speed: float) -> None:
+    clock = Clock()
+    monkeypatch.setattr("services.bus.playback.time.monotonic", lambda: clock.now_s)
+    came_s: list[float] = []
+
+    def put(message: Message) -> None:
+        came_s.append(clock.now_s - 1000.0)
+        if message.sequence == 2:
+            clock.now_s += 0.3 / speed  # is held up, and makes up for it afterwards
+
+    times_s = (50.0, 50.1, 50.2, 50.3, 50.2, 51.0, 53.0)
+    number = playback.play(recorded(*times_s), put, Delivered(), speed=speed, stop=clock)  # type: ignore[arg-type]
+    assert number == len(times_s)
+    due_s = (0.0, 0.1, 0.2, 0.5, 0.5, 1.0, 3.0)  # the fifth stands late in the recording
+    assert came_s == pytest.approx([due / speed for due in due_s])
+
+
+def test_without_a_speed_nothing_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr("services.bus.playback.time.monotonic", lambda: clock.now_s)
+    put: list[Message] = []
+    playback.play(recorded(0.0, 100.0), put.append, Delivered(), speed=0.0, stop=clock)  # type: ignore[arg-type]
+    assert (len(put), clock.now_s) == (2, 1000.0)
