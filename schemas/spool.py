@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import MAX_SEQUENCE, SCHEMA_VERSION, check_version
-from schemas.topics import PREFIX, Key, key, parse_key
+from schemas.topics import PREFIX, Key, key, parse_key, realm_chunk
 
 SUFFIX = "/spool"
 PAGE_MESSAGES = 1000
@@ -60,8 +60,11 @@ class Query(NamedTuple):
 
 
 def spool_selector(realm: str | None, vehicle: str | None = None, stream: str | None = None) -> str:
-    """Return the key expression of spools: of all realms, vehicles or streams where not given."""
-    return f"{PREFIX}/{realm or '*'}/vehicle/{vehicle or '*'}/{stream or '*'}{SUFFIX}"
+    """Return the key expression of spools: of all realms, vehicles or streams where not given.
+
+    `realm` may be a pattern as of `check_realms`.
+    """
+    return f"{PREFIX}/{realm_chunk(realm)}/vehicle/{vehicle or '*'}/{stream or '*'}{SUFFIX}"
 
 
 def spool_key(where: Key) -> str:

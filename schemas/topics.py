@@ -5,6 +5,7 @@ A key is `driveby/v1/{realm}/{owner}/{identifier}/{stream}`, e.g.
 """
 
 import re
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal, NamedTuple
 
@@ -14,6 +15,7 @@ REALM = rf"live|(?:replay|sim|import)-{IDENTIFIER}"
 
 _IDENTIFIER = re.compile(IDENTIFIER)
 _REALM = re.compile(REALM)
+_NAME_BEGIN = re.compile(r"[a-z0-9][a-z0-9_-]*")
 MAX_KEY_CHARACTERS = 255
 """Far above the longest valid key; bounds the work and the memory that hostile ones take."""
 
@@ -138,6 +140,25 @@ def check_realm(text: str) -> str:
     return text
 
 
+def check_realms(text: str) -> str:
+    """Return `text` if it is a realm, or the beginning of some with a `*` behind it.
+
+    `*` is every realm, `sim-*` those of simulations. ValueError if it is neither.
+    """
+    begin = text.removesuffix("*")
+    is_one = begin != text and any(
+        kind.startswith(begin)
+        or (begin.startswith(kind) and _NAME_BEGIN.fullmatch(begin, len(kind)))
+        for kind in ("live", "replay-", "sim-", "import-")
+    )
+    return text if is_one else check_realm(text)
+
+
+def realm_within(realms: Sequence[str]) -> str | None:
+    """Return the realm if there is one only, which no pattern names; else None."""
+    return realms[0] if len(realms) == 1 and "*" not in realms[0] else None
+
+
 def is_replayed(realm: str) -> bool:
     """Whether what travels in a realm was recorded before: who replays it twice wants it twice."""
     return realm.startswith(("replay-", "import-"))
@@ -165,5 +186,13 @@ def parse_key(text: str) -> Key:
 
 
 def selector(realm: str | None, owner: str, stream: str = "*") -> str:
-    """Return the key expression of all streams (or one) of every such owner in a realm (or any)."""
-    return f"{PREFIX}/{realm or '*'}/{owner}/*/{stream}"
+    """Return the key expression of all streams (or one) of every such owner in a realm (or any).
+
+    `realm` may be a pattern as of `check_realms`.
+    """
+    return f"{PREFIX}/{realm_chunk(realm)}/{owner}/*/{stream}"
+
+
+def realm_chunk(realm: str | None) -> str:
+    """Return what stands for a realm, a pattern of realms or (None) any in a key expression."""
+    return "*" if realm in (None, "*") else str(realm).replace("*", "$*")

@@ -197,7 +197,7 @@ def _logger(options: argparse.Namespace) -> int:
         listen=listen,
         folder=options.folder,
         file=options.file,
-        realm=options.realm,
+        realms=options.realm or ("live",),
         site=options.site,
         service_id=options.id,
         ready=lambda: print(f"ready, listening at {listen}", flush=True),
@@ -492,7 +492,13 @@ def _add_live(commands: Any) -> None:
     )
     _add_folder(p, "folder of the recordings")
     _add_file(p, "--file", "REC.mcap", "put everything into this one new file")
-    p.add_argument("--realm", help="record this realm only (default: all)")
+    p.add_argument(
+        "--realm",
+        action="append",
+        metavar="REALM",
+        help="record this realm, or those that begin so, e.g. sim-* (*: all); may be given again "
+        "(default: live)",
+    )
     _add_site(p, "site file to store in the recordings")
     _add_id(p, "logger")
     room = p.add_argument_group("files and room")

@@ -5,8 +5,8 @@ import logging
 import signal
 import threading
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,14 +15,23 @@ import zenoh
 from schemas.events import Event, EventKind
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
-from schemas.topics import PREFIX, check_identifier, check_realm
+from schemas.topics import (
+    PREFIX,
+    check_identifier,
+    check_realms,
+    realm_chunk,
+    realm_within,
+)
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.session import Publisher, Received, Subscription, open_session
 from services.common.disk import DISK
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, read_text
+from services.common.intervals import Intervals
+from services.logger.complaints import Complaints
 from services.logger.completeness import Completeness
+from services.logger.drops import QUEUE_IS_FULL, Drop
 from services.logger.housekeeping import House, Housekeeping
 from services.logger.intake import Intake
 from services.logger.memory import give_back_memory
@@ -47,6 +56,10 @@ _AT_ONCE_S = 0.02
 _FETCH_ROOM = 32 << 20
 """With less room in the writer's queue, bytes, trucks are not asked for what is missing."""
 _GOODBYE_S = 0.2
+_DROPS_PERIOD_S = 60.0
+_MAX_DROPS_TOLD = 1000
+_EVENTS_LOGGED = 20
+"""Of each kind in a minute; all of them are in the recordings and on the bus."""
 
 
 def run(
@@ -54,7 +67,7 @@ def run(
     listen: str,
     folder: Path,
     file: Path | None,
-    realm: str | None,
+    realms: Sequence[str] = ("live",),
     site: Path | None,
     service_id: str = "logger",
     ready: Callable[[], None] | None = None,
@@ -67,12 +80,12 @@ def run(
 
     `listen` is where the Zenoh router that lives in this process listens, e.g.
     `tcp/127.0.0.1:7447`. With `file` everything goes into that one file, else into
-    `folder/REALM/DATE/VEHICLE-TIME.mcap`; no file is ever overwritten. `realm` limits the
-    recording to one realm. The text of the site file `site` is put into every recording.
-    `tls` and `insecure` are those of `open_session`; `limits` says when the next file of a truck is
-    begun (SIGUSR1 asks for it at once) and how much room the disk must have. Recordings that an
-    earlier run left without END are recovered meanwhile; with `budget_bytes` the oldest ones are
-    deleted whose crossings have been identified.
+    `folder/REALM/DATE/VEHICLE-TIME.mcap`; no file is ever overwritten. `realms` are those that are
+    recorded: names, or beginnings with a `*` behind them (`sim-*`; `*`: every one). The text of the
+    site file `site` is put into every recording. `tls` and `insecure` are those of `open_session`;
+    `limits` says when the next file of a truck is begun (SIGUSR1 asks for it at once) and how much
+    room the disk must have. Recordings that an earlier run left without END are recovered
+    meanwhile; with `budget_bytes` the oldest ones are deleted whose crossings have been identified.
     `ready` is called once, when messages can be received. A second signal ends the process at
     once; the files stay readable.
 
@@ -82,7 +95,9 @@ def run(
     limits = limits or Limits()
     if file is not None and budget_bytes is not None:
         raise InputError("--budget needs a folder of recordings, not --file")
-    place = Place(folder, file, _check_realm(realm), _read_site(site))
+    realms = _check_realms(realms)
+    realm = realm_within(realms)
+    place = Place(folder, file, realm, _read_site(site))
     _check_service(service_id)
     check_speaks_for(tls, "logger", service_id)
     check_folder_writable(file.parent if file is not None else folder)
@@ -95,7 +110,7 @@ def run(
         writer = FileWriter(place, limits, own=own)
         try:
             intake = Intake(realm, service_id, own.boot_id)
-            logger = _Logger(place, service_id, writer, intake, own)
+            logger = _Logger(place, realms, service_id, writer, intake, own)
             with _rotated_by_signal(writer):
                 gone = _record(logger, bus, stop, ready, budget_bytes)
         except BaseException:
@@ -108,6 +123,7 @@ def run(
 
 class _Logger(NamedTuple):
     place: Place
+    realms: Sequence[str]
     service_id: str
     writer: FileWriter
     intake: Intake
@@ -124,17 +140,19 @@ def _record(
     """Record until it is over; return how many messages were deleted under the logger for good."""
     place = logger.place
     folder = place.folder if place.file is None else None
-    completeness = Completeness(bus, folder, place.realm, logger.intake, logger.writer)
+    completeness = Completeness(bus, folder, logger.realms, logger.intake, logger.writer)
     announcements = _Announcements(bus, logger, completeness)
     house = House(
         place.folder,
-        place.realm,
+        logger.realms,
         logger.writer.limits.min_free_bytes,
         budget_bytes,
         announcements.event,
     )
     housekeeping = Housekeeping(house) if folder is not None else None
-    subscription = Subscription(bus, f"{PREFIX}/{logger.place.realm or '*'}/**")
+    subscriptions = deque(
+        Subscription(bus, f"{PREFIX}/{realm_chunk(realm)}/**") for realm in logger.realms
+    )
     if place.site_toml is None:
         _log.info("no site file is put into the recordings (--site): `identify` will ask for one")
     try:
@@ -142,14 +160,14 @@ def _record(
             ready()
         next_report_s = time.monotonic()
         while not stop.is_set() and logger.writer.failure is None:
-            received = subscription.receive()
+            received = _receive(subscriptions)
             if received is None:
                 stop.wait(_PAUSE_S)
             began_s = now_s = time.monotonic()
             while received is not None:
                 _take(logger, received)
                 now_s = time.monotonic()
-                received = subscription.receive() if now_s - began_s < _AT_ONCE_S else None
+                received = _receive(subscriptions) if now_s - began_s < _AT_ONCE_S else None
             for fetched in completeness.step(now_s, hold=not logger.writer.has_room(_FETCH_ROOM)):
                 _take(logger, fetched)
             if now_s >= next_report_s:
@@ -158,8 +176,9 @@ def _record(
                 _report(logger, announcements, closing=False)
         if housekeeping is not None:
             housekeeping.close()
-        subscription.close()
-        _drain(logger, subscription)
+        for subscription in subscriptions:
+            subscription.close()
+        _drain(logger, subscriptions)
         _report(logger, announcements, closing=True)
         reason = "stopped by a signal"  # after a write error nothing is written any more
         logger.writer.finish(reason, count_all(logger.intake.counts, logger.writer))
@@ -169,8 +188,19 @@ def _record(
         if housekeeping is not None:
             housekeeping.close()
         completeness.close()
-        subscription.close()
+        for subscription in subscriptions:
+            subscription.close()
         announcements.close()
+
+
+def _receive(subscriptions: deque[Subscription]) -> Received | None:
+    """Return a message that has come, of each subscription in turn; None if there is none."""
+    for _ in subscriptions:
+        subscriptions.rotate(-1)
+        received = subscriptions[-1].receive()
+        if received is not None:
+            return received
+    return None
 
 
 def _take(logger: _Logger, received: Received) -> None:
@@ -179,14 +209,16 @@ def _take(logger: _Logger, received: Received) -> None:
         logger.writer.count_drop(None)
         return
     message = logger.intake.take(received, time.time_ns())
-    if message is not None:
-        logger.writer.put(message)
+    if message is not None and not logger.writer.put(message):
+        numbers = Intervals()
+        numbers.add(message.sequence)
+        logger.intake.unsee(message.key, message.boot_id, numbers)
 
 
-def _drain(logger: _Logger, subscription: Subscription) -> None:
+def _drain(logger: _Logger, subscriptions: deque[Subscription]) -> None:
     """Take what has come already, for as long as a user waits; count what is left then."""
     deadline = time.monotonic() + _DRAIN_S
-    while (received := subscription.receive()) is not None:
+    while (received := _receive(subscriptions)) is not None:
         if time.monotonic() < deadline:
             _take(logger, received)
         elif time.monotonic() < deadline + _COUNT_S:
@@ -199,7 +231,7 @@ def _report(logger: _Logger, announcements: "_Announcements", *, closing: bool) 
     now_ns = time.time_ns()
     for where, event in logger.intake.report(now_ns, time.monotonic(), closing=closing):
         announcements.event(where.realm, event)
-    announcements.report_drops(now_ns)
+    announcements.report_drops(now_ns, closing=closing)
 
 
 class _Announcements:
@@ -216,7 +248,9 @@ class _Announcements:
         self._boot_id = logger.own.boot_id
         self._pending: list[Message] = []
         self._lock = threading.Lock()
-        self._drops_told = 0
+        self._drops: dict[tuple[str, str], Drop] = {}
+        self._drops_told_s: dict[tuple[str, str], float] = {}
+        self._complaints = Complaints(_log, _EVENTS_LOGGED)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="announce", daemon=True)
         self._thread.start()
@@ -224,21 +258,35 @@ class _Announcements:
     def event(self, realm: str, event: Event) -> None:
         """Write an event to the recording of the vehicle concerned, and publish it."""
         about = f"{event.vehicle}: " if event.vehicle else ""
-        _log.warning("%s: %s%s", event.kind, about, event.text)
+        self._complaints.warn(f"event {event.kind}", "%s: %s%s", event.kind, about, event.text)
         message = self._logger.own.message(realm, event)
         self._logger.writer.put(message, always=True)
         with self._lock:
             self._pending.append(message)
 
-    def report_drops(self, now_ns: int) -> None:
-        """Write down how many messages found the queue full since the last call."""
-        dropped = self._logger.writer.dropped
-        if dropped > self._drops_told:
-            number = dropped - self._drops_told
-            text = f"{number} messages found the writer's queue full"
-            realm = self._logger.place.realm or "live"
-            self.event(realm, Event(EventKind.QUEUE_FULL, now_ns, text, messages=number))
-            self._drops_told = dropped
+    def report_drops(self, now_ns: int, *, closing: bool = False) -> None:
+        """Write down how many messages were dropped and why: of each cause once a minute.
+
+        A full queue is told at once.
+        """
+        for drop in self._logger.writer.drops():
+            name = (drop.vehicle, drop.why)
+            before = self._drops.get(name, drop._replace(messages=0))
+            self._drops[name] = before._replace(messages=before.messages + drop.messages)
+        now_s = time.monotonic()
+        for name, drop in list(self._drops.items()):
+            is_queue = drop.why == QUEUE_IS_FULL
+            told_s = self._drops_told_s.get(name, -_DROPS_PERIOD_S)
+            if not (closing or is_queue or now_s - told_s >= _DROPS_PERIOD_S):
+                continue
+            del self._drops[name]
+            if len(self._drops_told_s) >= _MAX_DROPS_TOLD:
+                self._drops_told_s.clear()
+            self._drops_told_s[name] = now_s
+            kind = EventKind.QUEUE_FULL if is_queue else EventKind.DROPPED
+            text = f"{drop.messages} messages {drop.why}"
+            event = Event(kind, now_ns, text, vehicle=drop.vehicle, messages=drop.messages)
+            self.event(drop.realm, event)
 
     def close(self) -> None:
         """Say the last words and stop."""
@@ -247,6 +295,7 @@ class _Announcements:
         time.sleep(_GOODBYE_S)  # a put only hands over; leave the connection time to send
         for publisher in self._publishers.values():
             publisher.close()
+        self._complaints.flush(closing=True)
 
     def _run(self) -> None:
         version = -1
@@ -255,6 +304,7 @@ class _Announcements:
         while True:
             closing = self._closing.wait(_ANNOUNCE_PERIOD_S)
             self._publish_events()
+            self._complaints.flush()
             is_due = closing or time.monotonic() >= next_durable_s
             if is_due and self._logger.writer.durable_version() != version:
                 next_durable_s = time.monotonic() + _DURABLE_PERIOD_S
@@ -329,11 +379,12 @@ def _health_line(figures: Mapping[str, float]) -> str:
     )
 
 
-def _check_realm(realm: str | None) -> str | None:
+def _check_realms(realms: Sequence[str]) -> tuple[str, ...]:
     try:
-        return None if realm is None else check_realm(realm)
+        checked = tuple(dict.fromkeys(check_realms(realm) for realm in realms))
     except ValueError as error:
         raise InputError(str(error)) from None
+    return ("*",) if "*" in checked else checked
 
 
 def _check_service(service_id: str) -> None:

@@ -5,8 +5,9 @@ The thread that receives calls `step` and `report`; nothing in them waits.
 
 import logging
 import time
-from collections import deque
-from collections.abc import Iterable, Iterator
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -17,8 +18,9 @@ from schemas.topics import Key, is_replayed, parse_key, selector, topic
 from services.bus.session import Received
 from services.common.errors import InputError
 from services.common.intervals import Intervals
+from services.logger.complaints import Complaints
 from services.logger.intake import Intake
-from services.logger.spool_recovery import SpoolRecovery
+from services.logger.spool_recovery import REALMS_OF_ONE, SpoolRecovery
 from services.recordings.recording import Identities, read_identities
 
 __all__ = ["Completeness", "Known", "known_on_disk"]
@@ -48,6 +50,8 @@ class Durable(Protocol):
 
     withdrawn: deque[Identities]
     """Messages whose files are gone."""
+    unwritten: deque[Identities]
+    """Messages for which there was no file."""
 
     def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
         """Note sequences that need not come: already on disk, or lost for ever."""
@@ -56,15 +60,18 @@ class Durable(Protocol):
         """Speak of these streams and boots no more."""
 
 
-def known_on_disk(folder: Path, realm: str | None, now_s: float) -> Iterator[Known]:
+def known_on_disk(folder: Path, realms: Sequence[str], now_s: float) -> Iterator[Known]:
     """Yield what streams have in the recordings below a folder, one file after the other.
 
-    Only of the last two days (`now_s` is the wall clock) and of the realms in which trucks drive.
+    Only of the last two days (`now_s` is the wall clock) and, of these realms (or patterns of
+    them), of those in which trucks drive.
     A recording that is recovered meanwhile, by whomever, is found under its new name.
     """
     looked_at: set[Path] = set()
     # What had another name when it was its turn is in the folder under that name by then.
-    while found := sorted(set(folder.glob(f"{realm or '*'}/*/[!.]*.mcap")) - looked_at):
+    while found := sorted(
+        {path for realm in realms for path in folder.glob(f"{realm}/*/[!.]*.mcap")} - looked_at
+    ):
         looked_at.update(found)
         for path in found:
             try:
@@ -88,7 +95,7 @@ class Completeness:
         self,
         bus: zenoh.Session,
         folder: Path | None,
-        realm: str | None,
+        realms: Sequence[str],
         intake: Intake,
         writer: Durable,
     ) -> None:
@@ -99,15 +106,22 @@ class Completeness:
         self._gone: Identities = {}
         self._gone_for_ever = 0
         if folder is not None:
-            for known in known_on_disk(folder, realm, time.time()):
+            for known in known_on_disk(folder, realms, time.time()):
                 self._on_disk(*known)
         self._recovery = SpoolRecovery(
-            bus, realm, intake.seen, gone=self._gone, confirmed=self._on_disk, lost=self._lost
+            bus, realms, intake.seen, gone=self._gone, confirmed=self._on_disk, lost=self._lost
         )
         self._alive: dict[tuple[str, str], bool] = {}
-        self._tokens: Any = bus.liveliness().declare_subscriber(
-            selector(realm, "vehicle", "alive"), handlers.FifoChannel(_TOKENS_WAITING), history=True
-        )
+        self._alive_of: Counter[str] = Counter()
+        self._tokens: list[Any] = [
+            bus.liveliness().declare_subscriber(
+                selector(realm, "vehicle", "alive"),
+                handlers.FifoChannel(_TOKENS_WAITING),
+                history=True,
+            )
+            for realm in realms
+        ]
+        self._complaints = Complaints(_log)
         self._figures: dict[str, float] = {}
         self._history: deque[tuple[float, int, float]] = deque(maxlen=_HISTORY)
 
@@ -128,7 +142,12 @@ class Completeness:
             for name in intake.forgotten:
                 self._latched.pop(name, None)
             intake.forgotten.clear()
+        while self._writer.unwritten:
+            for (where, boot_id), numbers in self._writer.unwritten.popleft().items():
+                intake.unsee(where, boot_id, numbers)
+                self._recovery.pause(where, now_s)
         self._read_tokens()
+        self._complaints.flush()
         self._figures = self._counted(now_s)
 
     def gone(self) -> int:
@@ -146,7 +165,10 @@ class Completeness:
 
     def close(self) -> None:
         """Ask nobody any more."""
-        self._tokens.undeclare()
+        for tokens in self._tokens:
+            tokens.undeclare()
+        self._recovery.close()
+        self._complaints.flush(closing=True)
 
     def _on_disk(self, where: Key, boot_id: int, first: int, last: int) -> None:
         if topic(where.owner, where.stream).latched:
@@ -172,15 +194,19 @@ class Completeness:
         self._intake.lose(where, boot_id, first, last, time.time_ns())
 
     def _read_tokens(self) -> None:
-        while (sample := self._tokens.try_recv()) is not None:
+        waiting = (islice(iter(one.try_recv, None), _TOKENS_WAITING) for one in self._tokens)
+        for sample in chain.from_iterable(waiting):
             try:
                 where = parse_key(str(sample.key_expr))
             except ValueError as error:
-                _log.warning("liveliness: %s", error)
+                self._complaints.warn("liveliness", "liveliness: %s", error)
                 continue
             name = (where.realm, where.identifier)
-            if name not in self._alive and len(self._alive) >= _TRUCKS:
-                continue
+            if name not in self._alive:
+                number = self._alive_of[where.identifier]
+                if number >= REALMS_OF_ONE or len(self._alive) >= _TRUCKS:
+                    continue
+                self._alive_of[where.identifier] += 1
             is_here = sample.kind == zenoh.SampleKind.PUT
             if self._alive.get(name, False) != is_here:
                 _log.info("%s in realm %s %s", name[1], name[0], "came" if is_here else "left")

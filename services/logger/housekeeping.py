@@ -14,12 +14,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from schemas.events import Event, EventKind
-from schemas.topics import REALM
+from schemas.topics import REALM, realm_within
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError, InputError
 from services.common.leash import EXIT
@@ -40,7 +40,7 @@ class House(NamedTuple):
     """Which recordings are kept, and who is told."""
 
     folder: Path
-    realm: str | None
+    realms: Sequence[str]
     min_free_bytes: int
     budget_bytes: int | None
     tell: Callable[[str, Event], None]
@@ -182,7 +182,7 @@ class Housekeeping:
                         return None
 
     def _tell(self, path: Path | None, kind: EventKind, text: str, messages: int = 0) -> None:
-        realm = self._house.realm or "live"
+        realm = realm_within(self._house.realms) or "live"
         if path is not None:
             realm = path.relative_to(self._house.folder).parts[0]
         self._house.tell(realm, Event(kind, time.time_ns(), text, messages=messages))
@@ -190,7 +190,7 @@ class Housekeeping:
 
 def _recordings(house: House, *endings: str) -> Iterator[Path]:
     """Yield what a logger has written below its folder: REALM/DATE/NAME."""
-    for path in house.folder.glob(f"{house.realm or '*'}/*/*"):
+    for path in {path for one in house.realms for path in house.folder.glob(f"{one}/*/*")}:
         realm, date = path.relative_to(house.folder).parts[:2]
         named = _REALM.fullmatch(realm) and _DATE.fullmatch(date)
         if named and path.name.endswith(endings) and path.is_file() and path.name[0] != ".":

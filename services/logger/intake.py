@@ -2,6 +2,8 @@
 
 No I/O and no clock of its own: messages go in, messages and events come out. What strangers send
 takes a bounded amount of memory: so many streams, boots of each, holes, and sources of refusals.
+Nobody can use up what others need: the limits that count are those of one vehicle, which is what
+access control ties to a certificate, in whatever realms it shows itself.
 """
 
 import zlib
@@ -17,18 +19,15 @@ from schemas.topics import Key, Topic, is_replayed, topic
 from services.bus.session import Received, Seen
 from services.common.intervals import Intervals
 from services.logger.clocks import TruckClock, clock_step_ns
+from services.logger.known_streams import KnownStreams, Stream
 from services.recordings.recording import Message
 
 GAP_PATIENCE_S = 5.0
 """How long a missing message may take to be fetched before a gap is written down."""
-MAX_STREAMS = 8000
-MAX_BOOTS = 64
-"""Boots remembered of one stream, and the most new ones in `_BOOTS_PERIOD_NS`."""
 MAX_RUNS = 10_000
 """Runs of sequences of one stream and boot: holes, one more."""
 RATE_FACTOR = 50
 """More than so many times the nominal rate, for longer than a cache lasts, is no sensor."""
-_BOOTS_PERIOD_NS = 3_600_000_000_000
 _RATE_ON_OCCASION_HZ = 100.0
 _LEAST_BURST = 1000
 _MAX_REFUSED_SOURCES = 100
@@ -40,21 +39,10 @@ _NS_PER_S = 1_000_000_000
 class Refusals(NamedTuple):
     """Messages refused since the last report, of one vehicle or of nobody known."""
 
+    realm: str
+    """Of the first."""
     first_reason: str
     number: int
-
-
-@dataclass
-class _Stream:
-    """What is remembered of a key beside the sequences that came."""
-
-    boots: dict[int, int] = field(default_factory=dict)
-    """By boot_id when it was last heard of; the longest silent one first."""
-    recent: dict[tuple[int, int], int] = field(default_factory=dict)
-    """By identity the CRC of the last payloads."""
-    tokens: float = -1.0
-    arrival_ns: int = 0
-    log_time_ns: int = 0
 
 
 @dataclass
@@ -73,18 +61,21 @@ class Intake:
     """Streams and boots of which nothing is remembered any more; the caller empties it."""
     settled: list[tuple[Key, int, int, int]] = field(default_factory=list)
     """Stream, boot, first and last of what will never be written; the caller empties it."""
-    _streams: dict[Key, _Stream] = field(default_factory=dict)
+    _streams: KnownStreams = field(init=False)
     _clocks: dict[tuple[str, str], TruckClock] = field(default_factory=dict)
     _clock_stream: dict[tuple[str, str], tuple[str, int]] = field(default_factory=dict)
     _own_clock_ns: int | None = None
     _lag_ns: int = 0
     _due: list[tuple[Key, Event]] = field(default_factory=list)
-    _refused: dict[tuple[str, str], Refusals] = field(default_factory=dict)
-    _refused_told_s: dict[tuple[str, str], float] = field(default_factory=dict)
+    _refused: dict[str, Refusals] = field(default_factory=dict)
+    _refused_told_s: dict[str, float] = field(default_factory=dict)
     _late: Counter[tuple[Key, int]] = field(default_factory=Counter)
     _lost: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
     _holes: dict[tuple[Key, int], dict[tuple[int, int], float]] = field(default_factory=dict)
     _reported: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._streams = KnownStreams(self._forget)
 
     def take(self, received: Received, now_ns: int) -> Message | None:
         """Return the message to write, or None if it is refused, not logged or a duplicate."""
@@ -105,7 +96,7 @@ class Intake:
                     f"{row.owner}/{row.stream}: the payload says {stamp.identity[0]}, "
                     f"{stamp.identity[1]} where its attachment says {identity[0]}, {identity[1]}"
                 )
-            stream = self._stream(where, identity, now_ns)
+            stream = self._streams.of(where, identity, now_ns)
             if not received.recovered:
                 _check_rate(row, stream, stamp.wall_time_ns, now_ns)
             is_new = self._is_new(where, identity, stream, received.payload)
@@ -129,7 +120,7 @@ class Intake:
         False (and a refusal) if that would be more than can be remembered.
         """
         try:
-            self._stream(where, Identity(boot_id, first), now_ns)
+            self._streams.of(where, Identity(boot_id, first), now_ns)
         except ValueError as error:
             self._refuse(where, str(error))
             return False
@@ -146,7 +137,7 @@ class Intake:
     def lose(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> None:
         """Give up messages that nobody has any more."""
         try:
-            self._stream(where, Identity(boot_id, first), now_ns)
+            self._streams.of(where, Identity(boot_id, first), now_ns)
         except ValueError as error:
             self._refuse(where, str(error))
             return
@@ -201,32 +192,18 @@ class Intake:
                     figures[f"clock_drift_ppm/{vehicle}"] = drift.drift_ppm
         return figures
 
-    def _stream(self, where: Key, identity: Identity, now_ns: int) -> _Stream:
-        """Return what is remembered of a key; ValueError if it would be one too many."""
-        stream = self._streams.get(where)
-        if stream is None:
-            if len(self._streams) >= MAX_STREAMS:
-                raise ValueError(f"more than {MAX_STREAMS} streams")
-            stream = self._streams[where] = _Stream()
-        boots, boot_id = stream.boots, identity.boot_id
-        if boot_id not in boots and len(boots) >= MAX_BOOTS:
-            oldest, heard_ns = next(iter(boots.items()))
-            if abs(now_ns - heard_ns) < _BOOTS_PERIOD_NS:
-                raise ValueError(f"{where.stream}: more than {MAX_BOOTS} boots within an hour")
-            self._forget(where, oldest)
-        if len(boots) > 1:
-            boots.pop(boot_id, None)  # the one heard of last stands last
-        boots[boot_id] = now_ns
-        return stream
-
     def _forget(self, where: Key, boot_id: int) -> None:
         name = (where, boot_id)
-        del self._streams[where].boots[boot_id]
         for memory in (self.seen.streams, self._holes, self._reported):
             memory.pop(name, None)
         self.forgotten.append(name)
+        truck = (where.realm, where.identifier)
+        clock = self._clocks.get(truck)
+        is_its = self._clock_stream.get(truck, ("", 0))[0] == where.stream
+        if clock is not None and clock.boot_id == boot_id and is_its:
+            del self._clocks[truck], self._clock_stream[truck]
 
-    def _is_new(self, where: Key, identity: Identity, stream: _Stream, payload: bytes) -> bool:
+    def _is_new(self, where: Key, identity: Identity, stream: Stream, payload: bytes) -> bool:
         name = (where, identity.boot_id)
         numbers = self.seen.numbers(where, identity.boot_id)
         highest = numbers.highest
@@ -255,11 +232,12 @@ class Intake:
         self.counts["refused"] += 1
         realm = where.realm if where else self.realm or "live"
         vehicle = where.identifier if where and where.owner == "vehicle" else ""
-        name = (realm, vehicle)
+        # In how many realms a vehicle shows itself is nothing to the others.
+        name = vehicle or _nobody(realm)
         if name not in self._refused and len(self._refused) >= _MAX_REFUSED_SOURCES:
-            name = (self.realm or "live", "")
-        first_reason, number = self._refused.get(name, Refusals(reason, 0))
-        self._refused[name] = Refusals(first_reason, number + 1)
+            name = _nobody(self.realm or "live")
+        before = self._refused.get(name, Refusals(realm, reason, 0))
+        self._refused[name] = before._replace(number=before.number + 1)
 
     def _refusals(self, now_ns: int, now_s: float, *, closing: bool) -> list[tuple[Key, Event]]:
         events: list[tuple[Key, Event]] = []
@@ -269,7 +247,7 @@ class Intake:
         for name, refusals in list(self._refused.items()):
             if not closing and (name in told or len(told) >= _MAX_REFUSED_SOURCES):
                 continue
-            realm, vehicle = name
+            vehicle = "" if name == _nobody(refusals.realm) else name
             told[name] = now_s
             del self._refused[name]
             event = Event(
@@ -279,7 +257,7 @@ class Intake:
                 vehicle=vehicle,
                 messages=refusals.number,
             )
-            events.append((Key(realm, "vehicle", vehicle, ""), event))
+            events.append((Key(refusals.realm, "vehicle", vehicle, ""), event))
         return events
 
     def _gaps(self, now_ns: int, now_s: float, patience_s: float) -> list[tuple[Key, Event]]:
@@ -363,7 +341,12 @@ class Intake:
         return events
 
 
-def _check_rate(row: Topic, stream: _Stream, log_time_ns: int, now_ns: int) -> None:
+def _nobody(realm: str) -> str:
+    """Return the name under which refusals are counted that concern no vehicle."""
+    return f"/{realm}"  # no vehicle can be called that
+
+
+def _check_rate(row: Topic, stream: Stream, log_time_ns: int, now_ns: int) -> None:
     """ValueError if a stream comes faster than any sensor, by the clock and by its own times.
 
     By both: a replay is fast by the clock, a truck whose wall clock stands still by its times.

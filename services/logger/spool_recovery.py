@@ -5,13 +5,17 @@ for longer than one such round is asked for, a page at a time, one query per tru
 again and again with growing pauses until the truck answers. Only when a truck says that it has no
 more of it, is it lost.
 
-Everything runs in the thread that calls `step`; nothing in it waits.
+What trucks list is read and decoded by `SpoolListing` in a thread of its own. All else runs in the
+thread that calls `step`; nothing in it waits, and none of its calls takes long whatever a truck
+lists: a step looks at some answers, and of each at so many boots, the rest have their turn later.
 """
 
 import logging
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -24,21 +28,19 @@ from schemas.spool import (
     Held,
     Query,
     Range,
-    decode_contents,
     decode_page,
-    parse_spool_key,
     spool_key,
-    spool_selector,
 )
 from schemas.topics import Key, key
 from services.bus.session import Received, Seen
 from services.common.intervals import Intervals
+from services.logger.complaints import Complaints
+from services.logger.spool_listing import SpoolListing
 
 __all__ = ["Shortfall", "SpoolRecovery", "shortfall"]
 
 _log = logging.getLogger(__name__)
 LIST_PERIOD_S = 2.0
-_LIST_TIMEOUT_S = 1.5
 _PAGE_TIMEOUT_S = 10.0
 _QUERIES_AT_ONCE = 8
 _REPLIES_WAITING = 20_000
@@ -46,6 +48,12 @@ _REPLIES_PER_STEP = 500
 _FIRST_PAUSE_S = 1.0
 _LONGEST_PAUSE_S = 60.0
 _TRUCKS = 1000
+REALMS_OF_ONE = 16
+"""In which one vehicle is asked for what it has, or is noted as being there."""
+_BOOTS_AT_ONCE = 64
+"""Of one answer: the newest, and so many of the earlier ones, which take turns."""
+_COMPARE_S = 0.01
+"""After so long a step leaves further answers to the next one."""
 _NEAR = 200
 """Holes closer to each other than that are asked for at once: few queries rather than few bytes."""
 
@@ -91,8 +99,10 @@ class _Task(NamedTuple):
 
 @dataclass
 class _Truck:
-    ripe: dict[tuple[str, int], int] = field(default_factory=dict)
-    """Of each stream and boot: below which sequence all is at least one round old."""
+    ripe: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Of each stream: the newest boot, and below which sequence all is at least a round old."""
+    turn: Counter[str] = field(default_factory=Counter)
+    """Of each stream: how many earlier boots have had their turn."""
     unlisted: set[tuple[Key, int]] = field(default_factory=set)
     todo: deque[tuple[Key, Query]] = field(default_factory=deque)
     task: _Task | None = None
@@ -106,7 +116,7 @@ class SpoolRecovery:
     def __init__(
         self,
         bus: zenoh.Session,
-        realm: str | None,
+        realms: Sequence[str],
         seen: Seen,
         *,
         gone: Mapping[tuple[Key, int], Intervals] = MappingProxyType({}),
@@ -118,23 +128,28 @@ class SpoolRecovery:
         `gone` are messages that were on the disk, and that trucks may still have.
         """
         self._bus = bus
-        self._realm = realm
         self._seen = seen
         self._gone = gone
         self._confirmed = confirmed
         self._lost = lost
         self._trucks: dict[tuple[str, str], _Truck] = {}
-        self._listing: Any = None
+        self._trucks_of: Counter[str] = Counter()
+        self._complaints = Complaints(_log)
+        self._listing = SpoolListing(bus, realms, self._complaints)
         self._next_list_s = 0.0
+        self._with_holes: dict[Key, set[int]] | None = None
         self._busy = False
 
     def step(self, now_s: float, *, hold: bool = False) -> list[Received]:
         """Do what can be done without waiting; return what was fetched. `hold`: no new queries."""
         if now_s >= self._next_list_s:
             self._next_list_s = now_s + LIST_PERIOD_S
-            self._ask_all()
-        if self._listing is not None:
-            self._read_listing()
+            self._listing.ask()
+            self._with_holes = None
+            self._complaints.flush()
+        began_s = time.monotonic()
+        while time.monotonic() - began_s < _COMPARE_S and (answer := self._listing.next_answer()):
+            self._compare(*answer)
         if not self._busy:
             return []
         received: list[Received] = []
@@ -160,54 +175,37 @@ class SpoolRecovery:
             for _, query in [*truck.todo, *([truck.task[:2]] if truck.task is not None else [])]
         )
 
-    def _ask_all(self) -> None:
-        try:
-            self._listing = self._bus.get(
-                spool_selector(self._realm),
-                handlers.FifoChannel(_REPLIES_WAITING),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=_LIST_TIMEOUT_S,
-            )
-        except zenoh.ZError as error:  # the session is closing
-            _log.debug("spool query: %s", error)
+    def pause(self, where: Key, now_s: float) -> None:
+        """Ask a truck for nothing for a while, longer each time: what it gave had no room."""
+        truck = self._trucks.get((where.realm, where.identifier))
+        if truck is not None and now_s >= truck.not_before_s:
+            self._pause(truck, now_s)
 
-    def _read_listing(self) -> None:
-        for _ in range(_REPLIES_PER_STEP):
-            try:
-                reply = self._listing.try_recv()
-            except zenoh.ZError:  # all have answered, or the time is over
-                self._listing = None
-                return
-            if reply is None:
-                return
-            if reply.ok is None:
-                continue
-            try:
-                where = parse_spool_key(str(reply.ok.key_expr))
-                boots = decode_contents(reply.ok.payload.to_bytes())
-            except ValueError as error:
-                _log.warning("spool contents: %s", error)
-                continue
-            self._compare(where, boots)
+    def close(self) -> None:
+        """Ask nobody any more."""
+        self._listing.close()
+        self._complaints.flush(closing=True)
 
     def _compare(self, where: Key, boots: list[Held]) -> None:
-        name = (where.realm, where.identifier)
-        truck = self._trucks.get(name)
-        if truck is None:
-            if len(self._trucks) >= _TRUCKS:
-                _log.warning("%s: more than %d trucks, its spool is not read", name[1], _TRUCKS)
-                return
-            truck = self._trucks[name] = _Truck()
-        todo = deque(entry for entry in truck.todo if entry[0] != where)
-        ripe = {entry: below for entry, below in truck.ripe.items() if entry[0] != where.stream}
-        newest = max((boot.boot_id for boot in boots), default=0)
-        for boot in boots:
-            entry = (where.stream, boot.boot_id)
+        truck = self._truck(where)
+        if truck is None or not boots:
+            return
+        listed = {boot.boot_id for boot in boots}
+        newest = boots[-1].boot_id
+        turn = self._turn(truck, where.stream, boots)
+        taken = {boot.boot_id for boot in turn}
+        todo = deque(
+            (key_, query)
+            for key_, query in truck.todo
+            if key_ != where or (query.boot_id in listed and query.boot_id not in taken)
+        )
+        ripe_boot, ripe = truck.ripe.get(where.stream, (newest, 0))
+        for boot in turn:
             seen = self._seen.streams.get((where, boot.boot_id), Intervals())
             # What was sent in this moment may still be on its way; an earlier boot sends nothing.
-            below = truck.ripe.get(entry, 0) if boot.boot_id == newest else boot.next_sequence
-            ripe[entry] = boot.next_sequence
+            below = boot.next_sequence
+            if boot.boot_id == newest:
+                below = ripe if ripe_boot == newest else 0
             gone = self._gone.get((where, boot.boot_id))
             missing = shortfall(boot, seen, below, () if gone is None else gone.ranges())
             for first, last in missing.confirmed:
@@ -217,19 +215,59 @@ class SpoolRecovery:
             for first, last in _joined(missing.fetch):
                 if truck.task is None or truck.task[:2] != (where, (boot.boot_id, first, last)):
                     todo.append((where, Query(boot.boot_id, first, last)))
-        truck.ripe, truck.todo = ripe, deque(list(todo)[:MAX_RANGES])
+        truck.ripe[where.stream] = (newest, boots[-1].next_sequence)
+        truck.todo = deque(islice(todo, MAX_RANGES))
         self._busy = self._busy or bool(todo)
-        self._forgotten(truck, where, {boot.boot_id for boot in boots}, newest)
+        self._forgotten(truck, where, listed, newest)
+
+    def _truck(self, where: Key) -> _Truck | None:
+        name = (where.realm, where.identifier)
+        truck = self._trucks.get(name)
+        if truck is None:
+            if self._trucks_of[where.identifier] >= REALMS_OF_ONE:
+                self._complaints.warn(
+                    "a truck in many realms",
+                    "%s: is in more than %d realms, its spool is not read in %s",
+                    where.identifier, REALMS_OF_ONE, where.realm,
+                )  # fmt: skip
+                return None
+            if len(self._trucks) >= _TRUCKS:
+                self._complaints.warn(
+                    "many trucks", "%s: more than %d trucks, its spool is not read",
+                    where.identifier, _TRUCKS,
+                )  # fmt: skip
+                return None
+            truck = self._trucks[name] = _Truck()
+            self._trucks_of[where.identifier] += 1
+        return truck
+
+    def _turn(self, truck: _Truck, stream: str, boots: list[Held]) -> list[Held]:
+        """Return the boots that are looked at this time: the newest one, and others in turn."""
+        earlier = boots[:-1]
+        if len(earlier) > _BOOTS_AT_ONCE:
+            first = truck.turn[stream] % len(earlier)
+            truck.turn[stream] = first + _BOOTS_AT_ONCE
+            earlier = (earlier + earlier)[first : first + _BOOTS_AT_ONCE]
+        return [*earlier, boots[-1]]
 
     def _forgotten(self, truck: _Truck, where: Key, listed: set[int], newest: int) -> None:
         """Give up the holes of earlier boots of which the truck has not spoken for two rounds."""
+        if self._with_holes is None:
+            self._with_holes = {}
+            for (one, boot_id), numbers in self._seen.streams.items():
+                if numbers.runs > 1:
+                    self._with_holes.setdefault(one, set()).add(boot_id)
+            for one, boot_id in self._gone:
+                self._with_holes.setdefault(one, set()).add(boot_id)
         unlisted = {
-            name
-            for name, numbers in self._seen.streams.items()
-            if name[0] == where and name[1] < newest and name[1] not in listed and numbers.runs > 1
+            (where, boot_id)
+            for boot_id in self._with_holes.get(where, ())
+            if boot_id < newest and boot_id not in listed
         }
         for name in unlisted & truck.unlisted:
-            for first, last in self._seen.streams[name].holes():
+            seen = self._seen.streams.get(name, Intervals())
+            gone = self._gone.get(name, Intervals())
+            for first, last in [*seen.holes(), *seen.missing_of(gone.ranges())]:
                 self._lost(*name, first, last)
         truck.unlisted = {name for name in truck.unlisted if name[0] != where} | unlisted
 
@@ -278,7 +316,7 @@ class SpoolRecovery:
                     return
                 identity = decode_identity(attachment)
             except ValueError as error:
-                _log.warning("%s: spool: %s", task.where.identifier, error)
+                self._complaints.warn("spool", "%s: spool: %s", task.where.identifier, error)
                 continue
             boot_id, first, last = task.query
             if identity.boot_id == boot_id and first <= identity.sequence <= last:

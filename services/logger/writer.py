@@ -25,6 +25,7 @@ from services.common.disk import DISK, Disk
 from services.common.errors import InputError
 from services.common.intervals import Intervals
 from services.logger.backlog import Backlog
+from services.logger.drops import FAILED, QUEUE_IS_FULL, Drop, Drops
 from services.logger.durable import DurableStreams
 from services.logger.own_events import OwnEvents
 from services.recordings.recording import Identities, Message, Misplaced, RecordingWriter
@@ -37,6 +38,10 @@ _SYNCS_AT_ONCE = 8
 _LOOK_S = 0.05
 """How often the writer looks for messages when there were none."""
 MAX_OPEN_FILES = 256
+MAX_FILES_OF_ONE = 4
+"""Of one vehicle, which drives in one realm as a rule, and can show itself in any number."""
+MAX_SERVICE_FILES = 32
+"""Of what concerns no vehicle; each realm has one."""
 QUIET_S = 300.0
 """A truck that has said nothing for so long gets a new file when it comes back."""
 _SHORTEST_QUIET_S = 10.0
@@ -92,8 +97,6 @@ class FileWriter:
         """Open the single file, if one is asked for; InputError if that cannot be done."""
         self.failure: str | None = None
         """Set once when writing failed; nothing is written after that."""
-        self.dropped = 0
-        """Messages that found the queue full, came after a failure or from one truck too many."""
         self.written = 0
         self.free_bytes: int | None = None
         """Room on the disk when it was last looked at."""
@@ -101,6 +104,10 @@ class FileWriter:
         """Whether that is less than the limits want."""
         self.withdrawn: deque[Identities] = deque()
         """Messages that were in files which are gone, and may come again; the caller empties it."""
+        self.unwritten: deque[Identities] = deque()
+        """Messages for which there was no file: they may come again. The caller empties it."""
+        self._without_file: Identities = {}
+        self._drops = Drops(place.realm or "live")
         self.said: deque[Message] = deque()
         """Events that this thread has written down itself and that are to be published."""
         self._place = place
@@ -111,8 +118,6 @@ class FileWriter:
         self._closed_names: dict[_FileName, str] = {}
         self._latched: OrderedDict[Key, Message] = OrderedDict()
         self._latched_bytes = 0
-        self._dropped_of: Counter[_FileName] = Counter()
-        self._drop_lock = threading.Lock()
         self._rotation_asked = threading.Event()
         self._backlog = Backlog() if backlog is None else backlog
         self._unsynced: list[tuple[_FileName, Message]] = []
@@ -135,15 +140,21 @@ class FileWriter:
         """
         if self.failure is None and self._backlog.put(message, always=always):
             return True
-        self.count_drop(message.key)
+        self.count_drop(message.key, QUEUE_IS_FULL if self.failure is None else FAILED)
         return False
 
-    def count_drop(self, where: Key | None) -> None:
-        """Count a message that was not handed over because there was no room for it."""
-        with self._drop_lock:
-            self.dropped += 1
-            if where is not None:
-                self._dropped_of[(where.realm, where.identifier)] += 1
+    @property
+    def dropped(self) -> int:
+        """Messages that found the queue full, came after a failure or had no file (`drops`)."""
+        return self._drops.total
+
+    def count_drop(self, where: Key | None, why: str = QUEUE_IS_FULL) -> None:
+        """Count a message that is not written, and why."""
+        self._drops.count(where, why)
+
+    def drops(self) -> list[Drop]:
+        """Return how many were dropped since the last call, by whom it concerns and why."""
+        return self._drops.untold()
 
     def waiting(self) -> int:
         """Return how many messages wait in the queue."""
@@ -225,10 +236,15 @@ class FileWriter:
 
     def _write(self, message: Message, now_s: float) -> None:
         name = self._name_of(message)
-        opened = self._files.get(name) or self._begin(name, message.key, now_s)
+        opened = self._files.get(name)
         if opened is None:
-            self.count_drop(message.key)
-            return
+            full = self._why_no_file(name, now_s)
+            if full is not None:
+                self.count_drop(message.key, full)
+                identity = (message.key, message.boot_id)
+                self._without_file.setdefault(identity, Intervals()).add(message.sequence)
+                return
+            opened = self._begin(name, message.key)
         opened.last_s = now_s
         self._unsynced.append((name, message))
         try:
@@ -248,6 +264,9 @@ class FileWriter:
         gone = {name for name, what in misplaced.items() if what in ("deleted", "cut short")}
         safe = [message for name, message in self._unsynced if name not in gone]
         self._unsynced.clear()
+        if self._without_file:
+            self.unwritten.append(self._without_file)
+            self._without_file = {}
         if safe:
             self._durable.add(safe)
             self.written += len(safe)
@@ -263,14 +282,26 @@ class FileWriter:
             return (realm, _SERVICE_FILE)
         return (realm, vehicle)
 
-    def _begin(self, name: _FileName, where: Key, now_s: float) -> _Open | None:
-        """Open the next file of a truck; None if it would be one more than can be open."""
-        if len(self._files) >= MAX_OPEN_FILES:
-            quietest = min(self._files, key=lambda n: self._files[n].last_s)
-            if now_s - self._files[quietest].last_s < _SHORTEST_QUIET_S:
-                _log.error("%s: more than %d files, not recorded", name[1], MAX_OPEN_FILES)
+    def _why_no_file(self, name: _FileName, now_s: float) -> str | None:
+        """Make room for one more file; where none can be made, return what there is too much of."""
+        is_service = name[1] == _SERVICE_FILE
+        limit = MAX_SERVICE_FILES if is_service else MAX_FILES_OF_ONE
+        closable = [one for one in self._files if one[1] == name[1]]
+        owner = "of services" if is_service else "of this vehicle"
+        why = f"had no file: {limit} {owner} are open, in as many realms"
+        if len(closable) < limit:
+            if len(self._files) < MAX_OPEN_FILES:
                 return None
-            self._close(quietest, "quiet, and too many files are open")
+            closable = list(self._files)
+            why = f"had no file: {MAX_OPEN_FILES} of all vehicles are open"
+        quietest = min(closable, key=lambda n: self._files[n].last_s)
+        if now_s - self._files[quietest].last_s < _SHORTEST_QUIET_S:
+            return why
+        self._close(quietest, "quiet, and too many files are open")
+        return None
+
+    def _begin(self, name: _FileName, where: Key) -> _Open:
+        """Open the next file of a truck."""
         previous = self._closed_names.get(name)
         with _failing(name):
             return self._open(
@@ -310,7 +341,7 @@ class FileWriter:
         )
         _log.info("recording to %s", path)
         now_s = time.monotonic()
-        opened = self._files[name] = _Open(writer, now_s, now_s, self._dropped_of[name])
+        opened = self._files[name] = _Open(writer, now_s, now_s, self._drops.of(*name))
         return opened
 
     def _close(self, name: _FileName, reason: str, counts: Mapping[str, int] | None = None) -> None:
@@ -321,7 +352,7 @@ class FileWriter:
             self._replace(name, what)
             opened = self._files[name]
         if counts is None:
-            counts = {"dropped": self._dropped_of[name] - opened.dropped_before}
+            counts = {"dropped": self._drops.of(*name) - opened.dropped_before}
         with _failing(name):
             opened.file.finish(reason, counts)
         del self._files[name]
@@ -426,7 +457,7 @@ class FileWriter:
         while not self._backlog.is_over:
             waited = self._backlog.take()
             if waited is not None:
-                self.count_drop(waited.key)
+                self.count_drop(waited.key, FAILED)
             else:
                 self._backlog.wait(SYNC_PERIOD_S)
 
@@ -448,13 +479,13 @@ class FileWriter:
         self._durable.add(saved)
         self.written += len(saved)
         for dropped in lost:
-            self.count_drop(dropped.key)
+            self.count_drop(dropped.key, FAILED)
 
     def _close_badly(
         self, name: _FileName, opened: _Open, failure: str, event: Message, *, is_failed: bool
     ) -> int | None:
         """Close a file with an event; how many messages it lost, None if that is not known."""
-        counts = {"dropped": self._dropped_of[name] - opened.dropped_before}
+        counts = {"dropped": self._drops.of(*name) - opened.dropped_before}
         try:
             if is_failed:
                 return opened.file.fail(failure, counts, [event])

@@ -59,8 +59,9 @@ def run(
         try:
             if not settle(publisher, keys, subscriber_timeout_s):
                 raise FailureError(
-                    f"nobody subscribes to realm {realm} at {endpoint}; start `driveby logger` "
-                    f"or another subscriber of driveby/v1/{realm}/** first"
+                    f"nobody subscribes to realm {realm} at {endpoint}; start "
+                    f"`driveby logger --realm {realm}` or another subscriber of "
+                    f"driveby/v1/{realm}/** first"
                 )
 
             def put(message: Message) -> None:

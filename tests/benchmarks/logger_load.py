@@ -237,7 +237,7 @@ def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
         listen=endpoint,
         folder=folder,
         file=None,
-        realm=None,
+        realms=("*",),
         site=None,
         ready=lambda: print("ready", flush=True),
         limits=writer.Limits(age_s=rotate_minutes * 60.0),

@@ -1,6 +1,7 @@
 """The topic table: what it says of keys, messages and identifiers, whatever it is asked."""
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -10,6 +11,7 @@ from schemas.topics import (
     Key,
     check_identifier,
     check_realm,
+    check_realms,
     key,
     parse_key,
     selector,
@@ -150,3 +152,28 @@ def test_selector() -> None:
 def test_unknown_topic_says_which_there_are() -> None:
     with pytest.raises(ValueError, match=r"vehicle/speed.*vehicle/accel"):
         topic("vehicle", "speed")
+
+
+@pytest.mark.parametrize(
+    ("pattern", "within", "without"),
+    [
+        ("live", ["live"], ["sim-a", "replay-live"]),
+        ("sim-a", ["sim-a"], ["sim-ab", "live"]),
+        ("sim-*", ["sim-a", "sim-night-1"], ["live", "import-sim-a"]),
+        ("replay-night*", ["replay-night", "replay-night-2"], ["replay-day", "live"]),
+        ("*", ["live", "sim-a", "import-x", "replay-y"], []),
+    ],
+)
+def test_a_pattern_of_realms_is_a_key_expression(
+    pattern: str, within: list[str], without: list[str]
+) -> None:
+    expression = zenoh.KeyExpr(selector(check_realms(pattern), "vehicle"))
+    for realm in within + without:
+        where = zenoh.KeyExpr(key(realm, "vehicle", "truck-1", "accel"))
+        assert expression.includes(where) == (realm in within), realm
+
+
+@pytest.mark.parametrize("text", ["", "**", "x*", "sim-A*", "sim-*-a", "*live", "live-*", "si"])
+def test_what_is_no_pattern_of_realms(text: str) -> None:
+    with pytest.raises(ValueError, match="must be live, replay-NAME, sim-NAME or import-NAME"):
+        check_realms(text)

@@ -14,7 +14,7 @@ def main(listen: str, folder: str) -> int:
         listen=listen,
         folder=Path(folder),
         file=None,
-        realm=None,
+        realms=("*",),
         site=None,
         ready=lambda: print("ready", flush=True),
     )

@@ -339,7 +339,7 @@ def test_the_logger_does_not_start_without_room(tmp_path: Path) -> None:
             listen="tcp/127.0.0.1:1",
             folder=tmp_path / "new",
             file=None,
-            realm=None,
+            realms=("*",),
             site=None,
             limits=Limits(min_free_bytes=1 << 60),
         )

@@ -65,7 +65,7 @@ def kept(
     def tell(realm: str, event: Event) -> None:
         told.append((realm, event))
 
-    house = House(folder, None, min_free_bytes, budget_bytes, tell)
+    house = House(folder, ["*"], min_free_bytes, budget_bytes, tell)
     keeper = Housekeeping(house)
     until(lambda: not keeper.is_busy, "the end of the housekeeping")
     keeper.close()

@@ -13,5 +13,5 @@ End = Callable[[Process], None]
 def start_logger(start: Start, endpoint: str, file: Path | None, **arguments: object) -> Process:
     """A logger of every realm that writes one file, unless the arguments say otherwise."""
     folder = None if file is None else file.parent
-    settings = {"realm": None, "site": None, "folder": folder} | arguments
+    settings = {"realms": ["*"], "site": None, "folder": folder} | arguments
     return start("services.logger", listen=endpoint, file=file, **settings)

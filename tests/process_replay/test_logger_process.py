@@ -86,7 +86,7 @@ def test_bad_messages_are_refused_reported_and_never_written(
 def test_a_realm_keeps_out_the_others(
     start: Start, finish: End, terminate: End, endpoint: str, recording: Path, tmp_path: Path
 ) -> None:
-    logger = start_logger(start, endpoint, tmp_path / "live.mcap", realm="replay-y")
+    logger = start_logger(start, endpoint, tmp_path / "live.mcap", realms=["replay-y"])
     for name in ("x", "y"):
         arguments = {"endpoint": endpoint, "speed": 0.0, "name": name}
         arguments["subscriber_timeout_s"] = 1 if name == "x" else LONGEST_S

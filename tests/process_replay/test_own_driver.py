@@ -27,7 +27,7 @@ def test_it_is_recorded(
 ) -> None:
     file = tmp_path / "live.mcap"
     logger = start(
-        "services.logger", listen=endpoint, folder=tmp_path, file=file, realm=None, site=None
+        "services.logger", listen=endpoint, folder=tmp_path, file=file, realms=("*",), site=None
     )
     driver = subprocess.Popen(
         [

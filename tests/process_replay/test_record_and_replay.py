@@ -150,7 +150,7 @@ def test_a_subscriber_that_comes_late_gets_everything(
     start: Start, finish: End, terminate: End, endpoint: str, recording: Path, tmp_path: Path
 ) -> None:
     """The truck drives while there is no logger: its publisher keeps what the logger missed."""
-    router = start_logger(start, endpoint, tmp_path / "router.mcap", realm="sim-other")
+    router = start_logger(start, endpoint, tmp_path / "router.mcap", realms=["sim-other"])
     truck = start(
         "services.truck",
         recording=recording,

@@ -74,7 +74,7 @@ def test_everything_is_recorded_under_access_control(
     bus = ["--endpoint", tls_endpoint, "--tls"]
     logger = driveby(
         *("logger", "--listen", tls_endpoint, "--tls", credentials / "logger"),
-        *("--folder", tmp_path / "r"),
+        *("--folder", tmp_path / "r", "--realm", "live", "--realm", "replay-*"),
     )
     truck = driveby("truck", recording, "--speed", 50, *bus, credentials / "truck-1")
     _, log = truck.communicate(timeout=LONGEST_S)

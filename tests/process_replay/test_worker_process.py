@@ -80,7 +80,7 @@ def bus(start: Start, endpoint: str, tmp_path: Path) -> Iterator[zenoh.Session]:
         listen=endpoint,
         folder=tmp_path,
         file=tmp_path / "recorded.mcap",
-        realm=None,
+        realms=("*",),
         site=None,
     )
     with open_session(connect=endpoint, timeout_s=LONGEST_S) as session:

@@ -451,3 +451,17 @@ def test_no_command_replaces_a_recording_by_accident_or_while_it_is_written(
     if command != "identify":
         assert cli.main([command, *arguments, str(target), "--force"]) == 0
         assert target.read_bytes() != content
+
+
+@pytest.mark.parametrize(
+    ("given", "realms"),
+    [([], ("live",)), (["--realm", "sim-a", "--realm", "replay-*"], ["sim-a", "replay-*"])],
+)
+def test_a_logger_records_the_realms_it_is_told_to(
+    monkeypatch: pytest.MonkeyPatch, given: list[str], realms: object
+) -> None:
+    """And only live without: what appears in other realms is nobody's drive."""
+    told: dict[str, object] = {}
+    monkeypatch.setattr("services.logger.run", lambda **arguments: told.update(arguments) or 0)
+    assert cli.main(["logger", *given]) == 0
+    assert told["realms"] == realms

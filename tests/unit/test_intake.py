@@ -1,5 +1,6 @@
 """What the logger lets in when clocks step, numbers run wild and strangers flood it."""
 
+import contextlib
 import shutil
 import time
 from pathlib import Path
@@ -12,11 +13,12 @@ from schemas.events import Event, EventKind
 from schemas.signals import GnssFix, Identity, encode_gnss, encode_identity
 from schemas.topics import Key
 from services.bus.session import Received
-from services.logger import completeness
+from services.logger import completeness, known_streams
 from services.logger import intake as module
 from services.logger.clocks import TruckClock
 from services.logger.completeness import KNOWN_AGE_S, known_on_disk
-from services.logger.intake import GAP_PATIENCE_S, MAX_BOOTS, Intake
+from services.logger.intake import GAP_PATIENCE_S, Intake
+from services.logger.known_streams import MAX_BOOTS, MAX_STREAMS_OF_ONE
 from services.recordings.recording import Message, write_recording
 
 NOW_NS = 1_700_000_000_000_000_000
@@ -218,7 +220,7 @@ def test_a_flood_of_boots_takes_bounded_memory_and_harms_its_own_stream_only() -
 
 
 def test_a_flood_of_vehicles_takes_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAX_STREAMS", 20)
+    monkeypatch.setattr(known_streams, "MAX_STREAMS", 20)
     intake = make()
     for number in range(100):
         intake.take(message(0, vehicle=f"truck-{number}"), NOW_NS)
@@ -230,6 +232,61 @@ def test_a_flood_of_vehicles_takes_bounded_memory(monkeypatch: pytest.MonkeyPatc
             intake.take(message(0, vehicle=f"v-{number}"), NOW_NS)
     assert len(intake._refused) <= module._MAX_REFUSED_SOURCES
     assert len(intake._refused_told_s) <= module._MAX_REFUSED_SOURCES
+
+
+def test_a_vehicle_that_shows_itself_in_8400_realms_locks_out_no_other() -> None:
+    """Its certificate gives it its own name in every realm."""
+    intake = make()
+    assert intake.take(message(0, vehicle="truck-2"), NOW_NS) is not None
+    for number in range(8400):
+        intake.take(message(0, vehicle="truck-evil", realm=f"sim-{number}"), NOW_NS)
+    assert len(intake.seen.streams) == MAX_STREAMS_OF_ONE + 1
+    later = NOW_NS + S
+    assert intake.take(message(1, vehicle="truck-2"), later) is not None
+    assert intake.take(message(0, vehicle="truck-3"), later) is not None
+    for number in range(200):  # as many sources of refusals as are told apart
+        intake.take(message(0, vehicle="truck-evil", realm=f"sim-{number + 9000}"), later)
+    intake.take(message(5, vehicle="truck-3")._replace(attachment=None), later)
+    evil, honest = intake.report(*at(1.0))
+    assert (evil[1].vehicle, evil[1].messages) == ("truck-evil", 8400 - MAX_STREAMS_OF_ONE + 200)
+    assert f"more than {MAX_STREAMS_OF_ONE} streams of vehicle truck-evil" in evil[1].text
+    assert (honest[1].vehicle, honest[1].messages) == ("truck-3", 1)
+
+
+def test_streams_age_out_where_room_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(known_streams, "MAX_STREAMS", 20)
+    intake = make()
+    for number in range(21):
+        intake.take(message(0, vehicle=f"truck-{number}"), NOW_NS)
+    assert intake.counts["refused"] == 1
+    [(_, event)] = intake.report(*at(0.0))
+    assert "more than 20 streams of all vehicles" in event.text
+    later = NOW_NS + HOUR_NS + S
+    for number in range(1, 20):  # all but truck-0 go on
+        assert intake.take(message(1, vehicle=f"truck-{number}"), later) is not None
+    assert intake.take(message(0, vehicle="truck-20"), later) is not None
+    assert intake.forgotten == [(GNSS._replace(identifier="truck-0"), 1)]
+    assert len(intake._streams) == 20
+    assert intake.take(message(0, vehicle="truck-21"), later) is None
+    assert "clock_offset_s/truck-0" not in intake.clock_figures()
+    # The same within one vehicle, where the newest realm counts.
+    for number in range(MAX_STREAMS_OF_ONE + 1):
+        realm = f"sim-{number}"
+        then = NOW_NS + (2 if number == MAX_STREAMS_OF_ONE else 0) * HOUR_NS
+        monkeypatch.setattr(known_streams, "MAX_STREAMS", 8000)
+        assert intake.take(message(0, vehicle="truck-x", realm=realm), then) is not None
+    assert intake.forgotten[-1][0].realm == "sim-0"
+
+
+def test_a_flood_of_bridges_locks_out_no_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(known_streams, "MAX_STREAMS", 20)
+    intake = make()
+    for number in range(100):
+        where = Key("live", "bridge", f"bridge-{number}", "state")
+        with contextlib.suppress(ValueError):
+            intake._streams.of(where, Identity(1, 0), NOW_NS)
+    assert len(intake._streams) == 20
+    assert intake.take(message(0), NOW_NS) is not None
 
 
 def test_a_flood_of_holes_takes_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -340,14 +397,14 @@ def test_what_is_on_disk_is_known_and_not_written_again(tmp_path: Path) -> None:
     broken.write_bytes(broken.read_bytes()[:-100])
     (tmp_path / "live" / "2023-11-14" / "no.mcap").write_bytes(b"nonsense")
     now_s = time.time()
-    found = sorted(known_on_disk(tmp_path, None, now_s))
+    found = sorted(known_on_disk(tmp_path, ["*"], now_s))
     assert found == [
         (GNSS, 1, 0, 9),
         (GNSS, 1, 15, 19),
         (GNSS._replace(realm="sim-a"), 2, 0, 4),
     ]
-    assert list(known_on_disk(tmp_path, "live", now_s)) == found[:2]
-    assert list(known_on_disk(tmp_path, None, now_s + KNOWN_AGE_S + 60)) == []
+    assert list(known_on_disk(tmp_path, ["live"], now_s)) == found[:2]
+    assert list(known_on_disk(tmp_path, ["*"], now_s + KNOWN_AGE_S + 60)) == []
     intake = make()
     for known in found:
         assert intake.adopt(*known, NOW_NS)
@@ -379,6 +436,6 @@ def test_what_is_recovered_while_it_is_about_to_be_read_is_known_too(
 
     monkeypatch.setattr(completeness, "read_identities", read)
     monkeypatch.setattr(completeness._log, "warning", lambda *what: logged.append(str(what)))
-    found = sorted(known_on_disk(tmp_path, None, time.time()))
+    found = sorted(known_on_disk(tmp_path, ["*"], time.time()))
     assert found == [(GNSS, 1, 0, 9), (GNSS, 1, 10, 19)]
     assert logged == []

@@ -266,7 +266,7 @@ def test_what_has_come_is_written_or_counted_before_the_file_is_closed(
     )
     file = tmp_path / "a.mcap"
     monkeypatch.setattr("services.logger._DRAIN_S", drain_s)
-    code = logger.run(listen=endpoint, folder=tmp_path, file=file, realm=None, site=None)
+    code = logger.run(listen=endpoint, folder=tmp_path, file=file, realms=("*",), site=None)
     found = list(read_messages(file))
     assert [m.sequence for m in found if m.key.owner == "vehicle"] == list(range(written))
     assert code == (0 if written == 50 else 1)

@@ -1,8 +1,11 @@
 """What is fetched from trucks' disks, what is given up, and what they answer: real sessions."""
 
+import contextlib
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +19,7 @@ from schemas.spool import Held, Query
 from schemas.topics import Key
 from services.bus.session import Received, Seen
 from services.common.intervals import Intervals
-from services.logger import spool_recovery
+from services.logger import spool_listing, spool_recovery
 from services.logger.spool_recovery import SpoolRecovery, shortfall
 from services.truck.gateway import Gateway
 from services.truck.spool import Spool
@@ -130,7 +133,7 @@ class Logger:
             return call
 
         self.recovery = SpoolRecovery(
-            router, "live", self.seen, confirmed=settle(self.confirmed), lost=settle(self.lost)
+            router, ["live"], self.seen, confirmed=settle(self.confirmed), lost=settle(self.lost)
         )
 
     def run(self, until: Callable[[], bool], clock: Callable[[], float] = time.monotonic) -> None:
@@ -302,3 +305,135 @@ def test_a_full_disk_on_the_truck_stops_nothing(
         assert None not in found
         assert gateway.unspooled == 30
         gateway.close()
+
+
+def answering(client: zenoh.Session, answer: Callable[[zenoh.Query], None]) -> Callable[[], None]:
+    """A truck that answers every question for contents as it likes; return what ends it."""
+    queryable = client.declare_queryable(
+        wire.spool_selector("live", "truck-1"), zenoh.handlers.FifoChannel(100)
+    )
+
+    def run() -> None:
+        while True:
+            try:
+                query = queryable.handler.recv()
+            except zenoh.ZError:  # undeclared
+                return
+            with query, contextlib.suppress(zenoh.ZError):
+                if not dict(query.parameters):
+                    answer(query)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+
+    def end() -> None:
+        queryable.undeclare()  # type: ignore[no-untyped-call]
+        thread.join()
+
+    return end
+
+
+def test_a_thousand_boots_take_turns(
+    router: zenoh.Session, client: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step that compared 9,000 at once held up everything else for 10.6 s."""
+    boots = [Held(boot_id, 10, [(0, 9)], -1, 0) for boot_id in range(1, 1001)]
+    contents = wire.encode_contents(1, boots)
+    compared: set[int] = set()
+    in_step: list[int] = []
+    real = shortfall
+
+    def counted(boot: Held, *arguments: Any) -> Any:
+        compared.add(boot.boot_id)
+        in_step[-1] += 1
+        return real(boot, *arguments)
+
+    monkeypatch.setattr(spool_recovery, "shortfall", counted)
+    end = answering(client, lambda query: query.reply(wire.spool_key(ACCEL), contents))
+    logger = Logger(router)
+    deadline = time.monotonic() + 60.0
+    while len(compared) < len(boots):
+        assert time.monotonic() < deadline, len(compared)
+        in_step.append(0)
+        logger.recovery.step(time.monotonic())
+        time.sleep(0.005)
+    assert max(in_step) <= spool_recovery._BOOTS_AT_ONCE + 1
+    assert logger.recovery.waiting() > 9000 - spool_recovery._QUERIES_AT_ONCE * 10
+    logger.recovery.close()
+    end()
+
+
+def test_endless_answers_are_read_once_and_complained_of_a_few_times(
+    router: zenoh.Session, client: zenoh.Session, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture, tmp_path: Path,
+) -> None:  # fmt: skip
+    contents = wire.encode_contents(1, [Held(1, 10, [(0, 9)], -1, 0)])
+    decoded: list[bytes] = []
+    rounds: list[int] = []
+    real = wire.decode_contents
+
+    def decode(payload: bytes) -> list[Held]:
+        decoded.append(payload)
+        return real(payload)
+
+    def answer(query: zenoh.Query) -> None:
+        rounds.append(0)
+        for _ in range(2000):
+            query.reply(wire.spool_key(ACCEL), contents)
+            rounds[-1] += 1
+
+    monkeypatch.setattr(spool_listing, "decode_contents", decode)
+    end = answering(client, answer)
+    gateway = Gateway(client, "live", "truck-2", Spool(tmp_path))
+    drive(gateway, 50)
+    logger = Logger(router)
+    truck_2 = ACCEL._replace(identifier="truck-2")
+    logger.run(lambda: len(rounds) >= 3 and sum(o.key() == truck_2 for o in logger.received) == 50)
+    assert sum(rounds) > 2000
+    assert decoded.count(contents) <= len(rounds)
+    logger.recovery.close()
+    said = [r.getMessage() for r in caplog.records if "spool contents" in r.getMessage()]
+    assert 0 < len(said) <= 6
+    assert "truck-1 answers more than once for accel" in said[0]
+    assert "more warnings of this kind" in said[-1]
+    gateway.close()
+    end()
+
+
+def test_a_listing_of_endless_length_is_not_taken_apart(
+    router: zenoh.Session, client: zenoh.Session, caplog: pytest.LogCaptureFixture
+) -> None:
+    end = answering(client, lambda query: query.reply(wire.spool_key(ACCEL), bytes(2 << 20)))
+    logger = Logger(router)
+    logger.run(lambda: bool(caplog.records))
+    assert "truck-1 lists more than 1048576 bytes" in caplog.records[0].getMessage()
+    logger.recovery.close()
+    end()
+
+
+def test_a_truck_in_many_realms_leaves_room_for_the_others(router: zenoh.Session) -> None:
+    logger = Logger(router)
+    boots = [Held(1, 10, [(0, 9)], 9, 0)]
+    for number in range(2000):
+        where = ACCEL._replace(realm=f"sim-{number}", identifier="truck-evil")
+        logger.recovery._compare(where, boots)
+    for _ in range(2):  # what is new is compared in the second round
+        logger.recovery._compare(ACCEL, boots)
+    assert len(logger.recovery._trucks) == spool_recovery.REALMS_OF_ONE + 1
+    assert logger.confirmed == set(range(10))
+
+
+def test_a_boot_that_is_gone_from_disk_and_truck_is_lost(router: zenoh.Session) -> None:
+    """And what the truck still has of it is asked for, though it had been told that it is safe."""
+    logger = Logger(router)
+    logger.recovery._gone = {(ACCEL, 1): intervals({0, 1, 2}), (ACCEL, 2): intervals({5, 6})}
+    logger.seen.numbers(ACCEL, 2).add_range(0, 4)
+    boots = [Held(2, 7, [(6, 6)], 6, 0), Held(3, 1, [(0, 0)], 0, 0)]
+    for _ in range(2):
+        logger.recovery._with_holes = None
+        logger.recovery._compare(ACCEL, boots)
+    assert logger.seen.streams[(ACCEL, 1)].ranges() == [(0, 2)]
+    assert logger.lost == {0, 1, 2, 5}
+    assert [query for _, query in logger.recovery._trucks[("live", "truck-1")].todo] == [
+        Query(2, 6, 6)
+    ]

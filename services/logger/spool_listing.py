@@ -1,0 +1,111 @@
+"""What trucks say that their spools hold, asked of all of them at once.
+
+Answers are read and decoded in a thread of their own, for a truck may list thousands of boots, and
+answer a query as often as it likes: of one round each stream's first answer counts, a vehicle has
+so many bytes, and what lies in the queue is bounded.
+"""
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import zenoh
+from zenoh import handlers
+
+from schemas.spool import Held, decode_contents, parse_spool_key, spool_selector
+from schemas.topics import Key
+from services.logger.complaints import Complaints
+
+_log = logging.getLogger(__name__)
+_TIMEOUT_S = 1.5
+_GRACE_S = 0.5
+_PAUSE_S = 0.005
+_REPLIES_WAITING = 200
+_MAX_BYTES = 1 << 20
+"""Of one vehicle in one round; 10,000 ranges take a sixth of it."""
+
+
+class SpoolListing:
+    """One round after the other; each ends within two seconds."""
+
+    def __init__(self, bus: zenoh.Session, realms: Sequence[str], complaints: Complaints) -> None:
+        self._bus = bus
+        self._realms = realms
+        self._complaints = complaints
+        self._answers: dict[Key, list[Held]] = {}
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def ask(self) -> None:
+        """Begin a round, unless the one before is still going on."""
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._ask_all, name="spools", daemon=True)
+            self._thread.start()
+
+    def next_answer(self) -> tuple[Key, list[Held]] | None:
+        """Return what a truck has of a stream, oldest boot first; None: nothing new now."""
+        with self._lock:
+            if not self._answers:
+                return None
+            where = next(iter(self._answers))
+            return where, self._answers.pop(where)
+
+    def close(self) -> None:
+        """Ask nobody any more."""
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _ask_all(self) -> None:
+        try:
+            listings = [self._query(realm) for realm in self._realms]
+        except zenoh.ZError as error:  # the session is closing
+            _log.debug("spool query: %s", error)
+            return
+        read: set[Key] = set()
+        sizes: Counter[str] = Counter()
+        deadline = time.monotonic() + _TIMEOUT_S + _GRACE_S
+        while listings and time.monotonic() < deadline and not self._closing.is_set():
+            is_idle = True
+            for listing in list(listings):
+                try:
+                    reply = listing.try_recv()
+                except zenoh.ZError:  # all have answered, or the time is over
+                    listings.remove(listing)
+                    continue
+                if reply is not None:
+                    is_idle = False
+                    if reply.ok is not None:
+                        self._read(reply.ok, read, sizes)
+            if is_idle:
+                self._closing.wait(_PAUSE_S)
+
+    def _query(self, realm: str) -> Any:
+        return self._bus.get(
+            spool_selector(realm),
+            handlers.FifoChannel(_REPLIES_WAITING),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=_TIMEOUT_S,
+        )
+
+    def _read(self, sample: zenoh.Sample, read: set[Key], sizes: Counter[str]) -> None:
+        try:
+            where = parse_spool_key(str(sample.key_expr))
+            if where in read:
+                raise ValueError(f"{where.identifier} answers more than once for {where.stream}")
+            read.add(where)
+            size = len(sample.payload)
+            sizes[where.identifier] += size
+            if sizes[where.identifier] > _MAX_BYTES:
+                raise ValueError(f"{where.identifier} lists more than {_MAX_BYTES} bytes")
+            boots = decode_contents(sample.payload.to_bytes())
+        except ValueError as error:
+            self._complaints.warn("spool contents", "spool contents: %s", error)
+            return
+        with self._lock:
+            self._answers[where] = boots
