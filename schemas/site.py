@@ -8,8 +8,6 @@ import difflib
 import hashlib
 import json
 import math
-import re
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -27,9 +25,15 @@ from pydantic import (
 )
 
 from schemas.errors import InputError
+from schemas.signals import MAX_RATE_HZ
+from schemas.toml_text import parse_toml, read_toml_text
 from schemas.topics import IDENTIFIER
 
 MAX_ELEMENTS: Final = 30
+MAX_TABLES: Final = 20_000
+"""Vehicles or bridges of a site file."""
+_MOST_FIELDS: Final = 100
+"""In a table, and values in a list: more than there can be."""
 MAX_SPAN_DISAGREEMENT: Final = 0.2
 """Beyond this relative difference between `span_m` and the distance of the ends one of them is a
 slip of the pen. Ends read off a hand-held receiver are metres off, so less is not refused."""
@@ -52,7 +56,7 @@ def _four(value: object) -> object:
     return [value] * 4 if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-Rate = Annotated[Number, Field(ge=1, le=100_000)]
+Rate = Annotated[Number, Field(ge=1, le=MAX_RATE_HZ)]
 Density = Annotated[Number, Field(ge=0, le=1e6)]
 Rates = Annotated[tuple[Rate, Rate, Rate, Rate], BeforeValidator(_four)]
 Densities = Annotated[tuple[Density, Density, Density, Density], BeforeValidator(_four)]
@@ -307,31 +311,40 @@ def load_site(path: Path) -> Site:
 
 
 def read_site_text(path: Path) -> str:
-    """Return the text of a site file; raise InputError if it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file, a site file (TOML) is expected") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not UTF-8 text, a site file (TOML) is expected") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    """Return the text of a site file; raise InputError if it cannot be read or is too large."""
+    return read_toml_text(path, "a site file")
 
 
 def parse_site(toml_text: str, source_name: str) -> Site:
     """Return the site that the text describes; raise InputError that begins with `source_name`."""
-    try:
-        # TOML has no carriage return of its own; files from Windows do.
-        table = tomllib.loads(toml_text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"{source_name}: {_syntax(str(error), toml_text)}") from error
+    table = parse_toml(toml_text, source_name)
     single = {name for name in ("vehicle", "bridge") if isinstance(table.get(name), dict)}
     for name in single:
         table[name] = [table[name]]
+    too_many = _too_many(table)
+    if too_many:
+        raise InputError(f"{source_name}: {too_many}")
     try:
         return Site.model_validate(table)
     except ValidationError as error:
         raise InputError(f"{source_name}: {_first_line(error, single)}") from error
+
+
+def _too_many(table: dict[str, Any]) -> str | None:
+    """Say which table or list is longer than any site file's: Pydantic tells of all its errors."""
+    parts = [("the file", table)]
+    for name, value in table.items():
+        tables = value if isinstance(value, list) else [value]
+        if len(tables) > MAX_TABLES:
+            return f"has {len(tables)} [[{name}]], at most {MAX_TABLES} are expected"
+        parts += [(f"[{name}]", part) for part in tables if isinstance(part, dict)]
+    for name, part in parts:
+        if len(part) > _MOST_FIELDS:
+            return f"{name} has {len(part)} fields, most of them unknown"
+        for key, value in part.items() if name != "the file" else ():
+            if isinstance(value, list) and len(value) > _MOST_FIELDS:
+                return f"{name} {key} has {len(value)} values, at most {MAX_ELEMENTS} are expected"
+    return None
 
 
 def site_hash(site: Site) -> str:
@@ -361,14 +374,21 @@ def vehicle_toml(site: Site, vehicle_id: str) -> str:
 
 
 def _toml(tables: list[tuple[str, BaseModel]]) -> str:
-    lines: list[str] = []
-    for heading, table in tables:
-        lines.append(heading)
-        for key, value in table.model_dump().items():
-            if value is not None:
-                # JSON's numbers, strings, booleans and lists are TOML's; DEL alone must be escaped.
-                text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-                lines.append(f"{key} = {text}")
+    return "".join(_table_text(heading, table.model_dump()) for heading, table in tables)
+
+
+def toml_of(tables: dict[str, dict[str, Any]]) -> str:
+    """Return the text of tables of numbers, texts, booleans and lists of them."""
+    return "".join(_table_text(f"[{name}]", table) for name, table in tables.items())
+
+
+def _table_text(heading: str, table: dict[str, Any]) -> str:
+    lines = [heading]
+    for key, value in table.items():
+        if value is not None:
+            # JSON's numbers, strings, booleans and lists are TOML's; DEL alone must be escaped.
+            text = json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
+            lines.append(f"{key} = {text}")
     return "\n".join(lines) + "\n"
 
 
@@ -382,16 +402,6 @@ class _FieldError(ValueError):
 
 def _at(path: str, message: str) -> _FieldError:
     return _FieldError(path, message)
-
-
-def _syntax(message: str, text: str) -> str:
-    """Turn tomllib's message into ours: the line first."""
-    match = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|(end of document))\)", message)
-    if match is None:
-        return f"is not TOML: {message}"
-    if match[4]:
-        return f"line {len(text.splitlines())}: is not TOML: {match[1]} before the end of the file"
-    return f"line {match[2]}, column {match[3]}: is not TOML: {match[1]}"
 
 
 # The noun and the unit of a field, by the end of its name; longer endings first.

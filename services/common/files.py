@@ -110,6 +110,15 @@ def check_folder_writable(folder: Path) -> None:
         raise InputError(f"{folder}: no permission to write in the folder {there}")
 
 
+def check_ordinary(path: Path) -> None:
+    """Raise InputError if there is something at `path` that is neither a file nor a folder.
+
+    A pipe to which nobody writes would be waited for without end.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise InputError(f"{path}: is no ordinary file (a pipe or a device), give one that is")
+
+
 def read_text(path: Path) -> str:
     """Return the text of a UTF-8 file; raise InputError if that is not possible."""
     return decode_text(path, read_bytes(path))
@@ -126,6 +135,7 @@ def decode_text(path: Path, content: bytes) -> str:
 
 def read_bytes(path: Path) -> bytes:
     """Return the bytes of a file; raise InputError if it is missing or unreadable."""
+    check_ordinary(path)
     try:
         return path.read_bytes()
     except FileNotFoundError as error:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.common.errors import InputError
+from services.common.files import check_ordinary
 from services.drives.runs import (
     STANDARD_GRAVITY_M_PER_S2,
     GnssTrack,
@@ -88,6 +89,7 @@ def _clock_offset_s(folder: Path, logged_s: Floats, utc_s: Floats) -> float:
 
 def _array(folder: Path, name: str, columns: int) -> Floats:
     path = folder / f"{name}.npy"
+    check_ordinary(path)
     try:
         values = np.load(path, allow_pickle=False)
     except FileNotFoundError as error:

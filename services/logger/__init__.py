@@ -397,9 +397,9 @@ def _check_service(service_id: str) -> None:
 def _read_site(site: Path | None) -> str | None:
     if site is None:
         return None
-    from schemas.site import parse_site
+    from schemas.site import parse_site, read_site_text
 
-    text = read_text(site)
+    text = read_site_text(site)
     parse_site(text, str(site))
     return text
 

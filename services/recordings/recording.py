@@ -35,7 +35,7 @@ from schemas.messages import descriptors
 from schemas.topics import Key, key, parse_key, topic
 from services.common.disk import DISK, Disk, write_all
 from services.common.errors import InputError
-from services.common.files import is_held, replaced_atomically
+from services.common.files import check_ordinary, is_held, replaced_atomically
 from services.common.intervals import Intervals
 from services.recordings.mcap_file import McapWriter
 from services.recordings.mcap_scan import Damage, RawMessage, last_metadata, scan
@@ -481,6 +481,7 @@ def _parsed_identities(stored: Mapping[str, str]) -> Identities:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[BinaryIO]:
+    check_ordinary(path)
     try:
         with path.open("rb") as file:
             yield file

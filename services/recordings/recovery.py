@@ -12,7 +12,7 @@ from schemas.events import Event, EventKind, encode_event
 from schemas.messages import descriptors
 from schemas.topics import Key, check_realm, key, parse_key, topic
 from services.common.errors import FailureError, InputError
-from services.common.files import check_writable, replaced_atomically
+from services.common.files import check_ordinary, check_writable, replaced_atomically
 from services.common.intervals import Intervals
 from services.recordings.mcap_file import McapWriter
 from services.recordings.mcap_scan import Damage, Indexed, RawMessage, scan
@@ -101,6 +101,7 @@ def recover_recording(
     now_ns = time.time_ns() if time_ns is None else time_ns
     if target.exists() and source.exists() and target.samefile(source):
         raise InputError(f"{target}: is the damaged recording itself; give another name")
+    check_ordinary(source)
     check_writable(target, force=force)
     try:
         file = source.open("rb")

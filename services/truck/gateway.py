@@ -52,6 +52,7 @@ from schemas.spool import (
     spool_selector,
 )
 from schemas.topics import Key, check_identifier, check_realm, key, topic
+from schemas.vehicle_info import own_part
 from services.bus.session import Delivery, Publisher
 from services.common.errors import FailureError
 from services.truck.spool import Spool
@@ -127,9 +128,14 @@ class Gateway:
         return self.publisher.boot_id
 
     def info(self, site_toml: str, *, device_time_ns: int, wall_time_ns: int) -> None:
-        """Say what the truck is: its parts of the site file. Late subscribers get it too."""
+        """Say what the truck is. Late subscribers get it too.
+
+        `site_toml` is a site file, or the truck's own part of one; only that part is sent.
+        InputError: it has no such vehicle, or its part is longer than a message may be.
+        """
+        own = own_part(site_toml, self.vehicle)
         identity = self._identity("info")
-        info = VehicleInfo(*identity, device_time_ns, wall_time_ns, self.vehicle, site_toml)
+        info = VehicleInfo(*identity, device_time_ns, wall_time_ns, self.vehicle, own)
         self.put("info", encode_info(info), identity)
 
     def accel(

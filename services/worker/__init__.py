@@ -24,13 +24,13 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.results import Header
 from schemas.settings import IdentificationSettings
 from schemas.signals import Identity
-from schemas.site import parse_site, site_hash
+from schemas.site import parse_site, read_site_text, site_hash
 from schemas.topics import check_identifier, check_realm, is_replayed, parse_key, selector
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.session import Publisher, Seen, Subscription, open_session
 from services.common.errors import FailureError, InputError
-from services.common.files import check_folder_writable, read_text
+from services.common.files import check_folder_writable
 from services.execution.warm_up import warm_up
 from services.history.result_files import Earlier, ResultFiles, read_earlier
 from services.identification.engine import Engine, Output
@@ -69,7 +69,7 @@ def run(
     """
     _check_names(realm, service_id)
     check_speaks_for(tls, "worker", service_id)
-    text = read_text(site)
+    text = read_site_text(site)
     known = parse_site(text, str(site))
     settings = IdentificationSettings.model_validate({"method": method})
     header = Header(

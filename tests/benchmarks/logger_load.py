@@ -321,8 +321,9 @@ def drive(endpoint: str, trucks: int, seconds: float) -> None:
     batches = [made_up(rng) for _ in range(50)]
     sessions = [open_session(connect=endpoint, timeout_s=60) for _ in range(trucks)]
     gateways = [Gateway(session, "live", f"truck-{n}") for n, session in enumerate(sessions)]
-    for gateway in gateways:
-        gateway.info("", device_time_ns=time.monotonic_ns(), wall_time_ns=time.time_ns())
+    for n, gateway in enumerate(gateways):
+        own = f'[vehicle]\nid = "truck-{n}"\n'
+        gateway.info(own, device_time_ns=time.monotonic_ns(), wall_time_ns=time.time_ns())
         for stream in _STREAMS:
             gateway.publisher.declare("vehicle", gateway.vehicle, stream)
     time.sleep(2.0)

@@ -1,6 +1,7 @@
 """CSV files of a drive: read exactly, or refused with file, line and field."""
 
 import importlib.util
+import os
 from pathlib import Path
 
 import numpy as np
@@ -258,3 +259,11 @@ def test_any_field_is_accepted_or_named(
         check(tmp_path, outcome(tmp_path, accel, with_field(GPS, line, column, field)))
     else:
         check(tmp_path, outcome(tmp_path, with_field(accel, line, column, field), GPS))
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    """Nobody writes to it: reading would never end."""
+    (tmp_path / "accel_00.csv").write_text(ACCEL)
+    os.mkfifo(tmp_path / "gps_00.csv")
+    with pytest.raises(InputError, match=r"gps_00\.csv: is no ordinary file"):
+        read_folder(tmp_path)

@@ -8,6 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from schemas.errors import InputError
+from schemas.signals import MAX_RATE_HZ
 from schemas.site import (
     Site,
     load_site,
@@ -339,3 +340,10 @@ def test_any_value_of_any_field_is_accepted_or_named(key: str, value: str) -> No
             if isinstance(number, float)
         ]
         assert all(map(math.isfinite, numbers))
+
+
+def test_what_the_site_allows_can_be_sent() -> None:
+    """The wire takes 50 kHz: a site file that says more would promise what no message can hold."""
+    assert complaint(with_line("rate_hz", "50001")).startswith("sensor.rate_hz")
+    rates = parse_site(with_line("rate_hz", "50000"), "a").sensor.rate_hz
+    assert rates[0] == MAX_RATE_HZ

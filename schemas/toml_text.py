@@ -1,0 +1,124 @@
+"""TOML text from anybody: looked at before it is parsed, for tomllib's cost has no bound.
+
+tomllib keeps a namespace for every prefix of every key, so that 60 KB of one dotted key take
+gigabytes. What is said here is counted in one pass over the text, with strings and comments left
+out; up to where a text is TOML the pass takes it apart as tomllib does, and what is behind is never
+parsed.
+"""
+
+import re
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any, Final
+
+from schemas.errors import InputError
+
+MAX_BYTES: Final = 16 << 20
+"""Of a site file: some 20,000 bridges."""
+MAX_DEPTH: Final = 8
+"""Of a key or heading in dots, and of tables and lists in each other; a site file needs two."""
+MAX_DEEP: Final = 1000
+"""Keys in three parts or more, each of which costs tomllib as much as its depth squared."""
+MAX_KEYS: Final = 500_000
+MAX_BRACKETS: Final = 150_000
+"""Tables and lists, together; `[[bridge]]` counts twice."""
+
+_PART = r'(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]++|\\.)*+"|\'[^\'\n]*+\')'
+_SCAN: Final = re.compile(
+    r"#[^\n]*+"
+    r'|"""(?:[^"\\]++|\\[\s\S]|"(?!""))*+"""(?:"{0,2}+)'
+    r"|'''(?:[^']++|'(?!''))*+'''(?:'{0,2}+)"
+    rf"|(?P<deep>{_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{2,}}+)"
+    rf"|{_PART}(?:[ \t]*+\.[ \t]*+{_PART})?+"
+    r"|(?P<open>[\[{])|(?P<close>[\]}])|(?P<key>=)|(?P<end>[\"'])"
+)
+_DOT: Final = re.compile(rf"{_PART}(?P<dot>[ \t]*+\.)?+")
+
+
+def read_toml_text(path: Path, what: str) -> str:
+    """Return the text of a file; InputError if it cannot be read or is longer than `MAX_BYTES`.
+
+    `what` is what is expected there, as "a site file".
+    """
+    expected = f"{what} (TOML) is expected"
+    try:
+        # A pipe or a device may never end, or never begin: looked at before it is opened.
+        if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():
+            raise InputError(f"{path}: is no ordinary file, {expected}")
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file, {expected}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(content) > MAX_BYTES:
+        raise InputError(f"{path}: is larger than {MAX_BYTES >> 20} MiB, {expected}")
+    try:
+        return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8 text, {expected}") from error
+
+
+def parse_toml(text: str, source_name: str) -> dict[str, Any]:
+    """Return what TOML text says; InputError that begins with `source_name` if it is none.
+
+    Text that would take more time and memory than any site file is refused unparsed.
+    """
+    too_much = _too_much(text)
+    if too_much:
+        raise InputError(f"{source_name}: {too_much}")
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # a number of 5,000 digits is a plain ValueError
+        raise InputError(f"{source_name}: {_syntax(str(error), text)}") from error
+
+
+def _too_much(text: str) -> str | None:
+    """Say what makes a text no site file, whatever it says; None if nothing does."""
+    # A character takes up to four bytes: counting them is only worth it where it can matter.
+    if len(text) > MAX_BYTES or (
+        len(text) > MAX_BYTES // 4 and len(text.encode(errors="replace")) > MAX_BYTES
+    ):
+        return f"is larger than {MAX_BYTES >> 20} MiB"
+    depth = brackets = deep = keys = 0
+    for token in _SCAN.finditer(text):
+        match token.lastgroup:
+            case "open":
+                depth, brackets = depth + 1, brackets + 1
+                if depth > MAX_DEPTH:
+                    return f"{_line(text, token)}: is more than {MAX_DEPTH} deep in brackets"
+            case "close":
+                depth = max(0, depth - 1)
+            case "key":
+                keys += 1
+            case "end":  # of a string that does not end: tomllib gives up here as well
+                return None
+            case "deep":
+                deep += 1
+                if sum(part["dot"] is not None for part in _DOT.finditer(token[0])) >= MAX_DEPTH:
+                    return f"{_line(text, token)}: a key is more than {MAX_DEPTH} deep"
+            case _:
+                continue
+        for count, most, name in (
+            (deep, MAX_DEEP, "keys of three parts or more"),
+            (keys, MAX_KEYS, "keys"),
+            (brackets, MAX_BRACKETS, "tables and lists"),
+        ):
+            if count > most:
+                return f"has more than {most} {name}"
+    return None
+
+
+def _line(text: str, token: re.Match[str]) -> str:
+    return f"line {text.count(chr(10), 0, token.start()) + 1}"
+
+
+def _syntax(message: str, text: str) -> str:
+    """Turn tomllib's message into ours: the line first."""
+    match = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|(end of document))\)", message)
+    if match is None:
+        return f"is not TOML: {message}"
+    if match[4]:
+        return f"line {len(text.splitlines())}: is not TOML: {match[1]} before the end of the file"
+    return f"line {match[2]}, column {match[3]}: is not TOML: {match[1]}"
