@@ -14,7 +14,7 @@ from pre_core import pre
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
-from services.worker import pre_method
+from services.identification import pre_method
 from tests.verdicts import faults
 from tests.verdicts.faults import Case, Fault, Truth
 
