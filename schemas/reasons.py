@@ -21,6 +21,9 @@ class Reason(StrEnum):
     CHANNEL_BIASED = "channel_biased"
     SIGNAL_SPIKES = "signal_spikes"
     INCOMPLETE_CROSSING = "incomplete_crossing"
+    # What is known beside its own signals.
+    VEHICLE_DIFFERS_FROM_SITE = "vehicle_differs_from_site"
+    OTHER_TRUCK_ON_BRIDGE = "other_truck_on_bridge"
     # How the truck was driven.
     SPEED_TOO_LOW = "speed_too_low"
     STOPPED_ON_BRIDGE = "stopped_on_bridge"
@@ -54,6 +57,10 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.CHANNEL_BIASED: "A channel has an offset as large as a part of gravity.",
     Reason.SIGNAL_SPIKES: "Single samples of a channel stand out of their neighbours.",
     Reason.INCOMPLETE_CROSSING: "The recording begins or ends while the truck is on the bridge.",
+    Reason.VEHICLE_DIFFERS_FROM_SITE: (
+        "What the truck says of itself is not what the site file says of it."
+    ),
+    Reason.OTHER_TRUCK_ON_BRIDGE: "Another truck was on the bridge at the same time.",
     Reason.SPEED_TOO_LOW: "The truck was too slow for its axles to feel the bridge's stiffness.",
     Reason.STOPPED_ON_BRIDGE: "The truck stopped or turned back on the bridge.",
     Reason.ACCELERATING_CG_UNKNOWN: (

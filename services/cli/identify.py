@@ -116,7 +116,7 @@ def identify_recordings(
         identify=partial(identify, keep=keep),
     )
     found: list[Crossing] = []
-    messages: dict[str, list[Message]] = {"accel": [], "gnss": []}
+    messages: dict[str, list[Message]] = {"accel": [], "gnss": [], "info": []}
     for message in _all_messages(recordings):
         if message.key.owner == "vehicle" and message.key.stream in messages:
             messages[message.key.stream].append(message)
@@ -124,7 +124,9 @@ def identify_recordings(
         if not messages[stream]:
             raise InputError(f"{_names(recordings)}: no {what}, a recording of a truck is expected")
     _check_vehicles(recordings, site, [*messages["accel"], *messages["gnss"]])
-    for message in _as_it_happened(recordings, [*messages["accel"], *messages["gnss"]]):
+    for message in messages["gnss"]:
+        engine.expect(message.key, message.payload)
+    for message in _as_it_happened(recordings, [m for one in messages.values() for m in one]):
         found += [
             output.result
             for output in _fed(recordings, engine, message)
@@ -153,7 +155,9 @@ def _as_it_happened(recordings: list[Path], messages: list[Message]) -> list[Mes
 
     def moment(message: Message) -> tuple[int, str, str, int]:
         try:
-            time_ns = device_time_ns(message.key.stream, message.payload)
+            time_ns = -1  # what a truck says of itself holds for all of a boot
+            if message.key.stream != "info":
+                time_ns = device_time_ns(message.key.stream, message.payload)
         except ValueError as error:
             raise _malformed(recordings, message, error) from error
         return message.boot_id, message.key.realm, message.key.identifier, time_ns
@@ -165,7 +169,11 @@ def _fed(recordings: list[Path], engine: Engine, message: Message) -> list[Outpu
     try:
         return list(engine.feed(message.key, message.payload))
     except ValueError as error:
-        raise _malformed(recordings, message, error) from error
+        wrong = _malformed(recordings, message, error)
+        if message.key.stream == "info":  # nothing that it could say is needed
+            _log.warning("%s", wrong)
+            return []
+        raise wrong from error
 
 
 def _malformed(recordings: list[Path], message: Message, error: ValueError) -> InputError:

@@ -42,6 +42,8 @@ class CrossingData(NamedTuple):
     samples: Samples | None  # around the crossing, with a margin
     wall_offset_s: float
     """What to add to a time on the truck's clock to get seconds since 1970 UTC."""
+    against: tuple[Reason, ...] = ()
+    """What is known against it beside its own signals: each forbids an estimate."""
 
 
 class Passing(NamedTuple):

@@ -5,6 +5,7 @@ and says so. It opens nothing, reads no clock and asks nobody, so that a recordi
 through it gives the same bytes every time.
 """
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from schemas.proto import driveby_pb2 as pb
+from schemas.reasons import Reason
 from schemas.results import (
     BridgeResult,
     Crossing,
@@ -25,15 +27,25 @@ from schemas.results import (
     direction_to_protobuf,
 )
 from schemas.settings import IdentificationSettings
-from schemas.signals import MAX_BATCH_S, AccelBatch, GnssFix, decode_accel, decode_gnss
+from schemas.signals import (
+    MAX_BATCH_S,
+    AccelBatch,
+    GnssFix,
+    VehicleInfo,
+    decode_accel,
+    decode_gnss,
+    decode_info,
+)
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
+from schemas.vehicle_info import Difference, differences
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
 from services.identification.crossing_data import CrossingData
 from services.identification.identify import MARGIN_S, Identify, Report, Stopwatch, identify
 from services.identification.stays import MARGIN_M, MERGE_S, Passage, Stay, find_stays
 from services.identification.streams import PATIENCE_S, Boot
 from services.identification.told import Told, told_of
+from services.identification.traffic import Traffic
 
 _log = logging.getLogger(__name__)
 _KEEP_S = 300.0
@@ -79,6 +91,8 @@ class _Truck:
         """By crossing id: states that an earlier run of the worker has told."""
         self.side: dict[str, int] = {}
         """By bridge: far before its start (-1), far behind its end (1), or near (0)."""
+        self.differences: list[Difference] = []
+        """Where it says of itself what the site file does not say of it."""
 
     def is_busy_at(self, bridge: Bridge) -> bool:
         """Whether a crossing of this bridge has begun and is not decided yet."""
@@ -88,6 +102,11 @@ class _Truck:
         )
 
 
+_DECODERS: dict[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]] = {
+    "accel": decode_accel,
+    "gnss": decode_gnss,
+    "info": decode_info,
+}
 Name = TypeVar("Name")
 _Wait = Callable[[_Truck, Stay, float], bool]
 """Whether a crossing that is over, at the truck's time of now (s), waits for more of its data."""
@@ -122,6 +141,7 @@ class Engine:
         ]
         self._margin_m = max(MARGIN_M, 5.0 * site.receiver.position_noise_m)
         self._vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
+        self._traffic = Traffic(self._frames, self._vehicles, self._margin_m)
         self._trucks: dict[tuple[str, str, int], _Truck] = {}
         self._newest_boot: dict[tuple[str, str], int] = {}
         self._usable: dict[tuple[str, str], list[Crossing]] = {}
@@ -156,26 +176,44 @@ class Engine:
                 usable = self._usable[told.realm, told.bridge]
                 yield _state_message(told.realm, told.bridge, told.result, latest_state(usable))
 
+    def expect(self, key: Key, payload: bytes) -> None:
+        """Take a position into account before its turn: that another truck was there then.
+
+        For recordings, which are fed truck by truck. What is malformed is left to `feed`.
+        """
+        if key.owner == "vehicle" and key.stream == "gnss":
+            with contextlib.suppress(ValueError):
+                self._traffic.note(key.realm, key.identifier, decode_gnss(payload), for_ever=True)
+
     def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
         """Take one message of a vehicle; other streams are ignored.
 
         ValueError, at once: malformed. What follows from the message comes from the iterator, as
         things happen, so that a state can be published before the long work begins.
         """
-        if key.owner != "vehicle" or key.stream not in ("accel", "gnss"):
+        if key.owner != "vehicle" or key.stream not in _DECODERS:
             return iter(())
         vehicle = self._vehicles.get(key.identifier)
         if vehicle is None:
             self.unknown_vehicles.add(key.identifier)
+            if key.stream == "gnss":  # it may cross a bridge together with one that is known
+                with contextlib.suppress(ValueError):
+                    self._traffic.note(key.realm, key.identifier, decode_gnss(payload))
             return iter(())
-        decoded = decode_accel(payload) if key.stream == "accel" else decode_gnss(payload)
+        decoded = _DECODERS[key.stream](payload)
+        if isinstance(decoded, GnssFix):
+            self._traffic.note(key.realm, key.identifier, decoded)
         return self._take(key, vehicle, decoded)
 
-    def _take(self, key: Key, vehicle: Vehicle, message: AccelBatch | GnssFix) -> Iterator[Output]:
+    def _take(
+        self, key: Key, vehicle: Vehicle, message: AccelBatch | GnssFix | VehicleInfo
+    ) -> Iterator[Output]:
         if message.boot_id < self._newest_boot.get((key.realm, key.identifier), 0):
             return  # its crossings have been decided
         truck = self._truck(key, message.boot_id, vehicle)
-        if isinstance(message, AccelBatch):
+        if isinstance(message, VehicleInfo):
+            truck.differences = truck.differences or differences(message.site_toml, vehicle)
+        elif isinstance(message, AccelBatch):
             truck.boot.add_accel(message)
             self._forget(truck, message.device_time_ns * 1e-9)
         else:
@@ -402,9 +440,30 @@ class Engine:
             chainage,
             truck.boot.samples(stay.entry_s - MARGIN_S, stay.exit_s + MARGIN_S),
             wall_offset_s,
+            self._against(realm, truck, bridge, stay, crossing_id),
         )
         report: Report = lambda stage, fraction: self._report(crossing_id, stage, fraction)  # noqa: E731
         return self._identify(data, self._settings, stopwatch=self._stopwatch, report=report)
+
+    def _against(
+        self, realm: str, truck: _Truck, bridge: Bridge, stay: Stay, crossing_id: str
+    ) -> tuple[Reason, ...]:
+        """What is known against a crossing that its own signals do not tell."""
+        reasons = []
+        for field, said, known in truck.differences[:1]:
+            _log.warning(
+                "%s: the truck says that its %s is %g, the site file %g",
+                *(crossing_id, field, said, known),
+            )
+            reasons.append(Reason.VEHICLE_DIFFERS_FROM_SITE)
+        wall_ns = truck.boot.wall_time_ns
+        others = self._traffic.others(
+            realm, bridge, truck.vehicle.id, wall_ns(stay.entry_s), wall_ns(stay.exit_s)
+        )
+        if others:
+            _log.warning("%s: %s was on the bridge as well", crossing_id, ", ".join(others))
+            reasons.append(Reason.OTHER_TRUCK_ON_BRIDGE)
+        return tuple(reasons)
 
     def _bridge_state(self, realm: str, bridge: Bridge, result: Crossing) -> BridgeResult | None:
         """The bridge as the latest usable crossing sees it; crossings are not fused yet."""

@@ -222,7 +222,7 @@ def _unusable(
     exit_s: float,
 ) -> list[Reason]:
     """Everything that forbids a fit before its samples are looked at."""
-    reasons: list[Reason] = []
+    reasons = list(data.against)
     match data.stay.passage:
         case Passage.TURNED_BACK:
             reasons.append(Reason.STOPPED_ON_BRIDGE)

@@ -209,8 +209,16 @@ class Boot:
 
 
 def device_time_ns(stream: str, payload: bytes) -> int:
-    """The time on the truck's clock of a message of `accel` or `gnss`; ValueError: malformed."""
-    message = pb.AccelBatch() if stream == "accel" else pb.GnssFix()
+    """The time on the truck's clock of a message of `accel`, `gnss` or `info`.
+
+    ValueError: malformed.
+    """
+    kinds: dict[str, type[pb.AccelBatch | pb.GnssFix | pb.VehicleInfo]] = {
+        "accel": pb.AccelBatch,
+        "gnss": pb.GnssFix,
+        "info": pb.VehicleInfo,
+    }
+    message = kinds[stream]()
     try:
         message.ParseFromString(payload)
     except DecodeError as error:

@@ -199,7 +199,7 @@ def _take_all(
             except ValueError as error:
                 _log.warning("refused: %.200s", error)
                 continue
-            if key.stream in ("accel", "gnss") and seen.add(key, identity):
+            if key.stream in ("accel", "gnss", "info") and seen.add(key, identity):
                 arrived = Arrived(key, identity.boot_id, received.payload, now_s)
                 _put(arrivals, arrived, closing)
     alive.undeclare()  # type: ignore[no-untyped-call]

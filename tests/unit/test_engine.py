@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, Header
 from schemas.settings import IdentificationSettings
-from schemas.signals import CHANNELS, decode_accel, encode_accel
-from schemas.site import Site, site_hash
+from schemas.signals import CHANNELS, VehicleInfo, decode_accel, encode_accel, encode_info
+from schemas.site import Site, site_hash, vehicle_toml
 from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
@@ -423,10 +423,21 @@ def test_several_crossings_of_one_drive() -> None:
     assert all(a.exit_time < b.entry_time for a, b in pairwise(found))
 
 
-def test_two_trucks_and_two_realms_do_not_mix(crossing_messages: list[Message]) -> None:
+def later(run: Run, seconds: float) -> Run:
+    gnss = run.gnss._replace(time_s=run.gnss.time_s + seconds)
+    return run._replace(accel_time_s=run.accel_time_s + seconds, gnss=gnss)
+
+
+def with_second_truck() -> Site:
     other = SITE.vehicles[0].model_copy(update={"id": "truck-2"})
-    site = SITE.model_copy(update={"vehicles": (*SITE.vehicles, other)})
-    second = [m._replace(key=m.key._replace(identifier="truck-2")) for m in crossing_messages]
+    return SITE.model_copy(update={"vehicles": (*SITE.vehicles, other)})
+
+
+def test_two_trucks_and_two_realms_do_not_mix(
+    crossing_messages: list[Message], scenario_6: Drive
+) -> None:
+    site = with_second_truck()
+    second = messages_of(later(scenario_6.run, 60.0), site=site, vehicle="truck-2")
     third = [m._replace(key=m.key._replace(realm="live")) for m in crossing_messages]
     mixed = [m for three in zip(crossing_messages, second, third, strict=True) for m in three]
     found = results_in(fed(mixed, site))
@@ -438,6 +449,113 @@ def test_two_trucks_and_two_realms_do_not_mix(crossing_messages: list[Message]) 
     assert len(found) == 3
     values = [c.parameters["EI_4"].mean for c in found if c.parameters is not None]
     assert values == [values[0]] * 3
+
+
+ACROSS = legs((0.0, -60.0), (15.0, 90.0))
+"""On the bridge from 6 s to 9.4 s, with both axles."""
+
+
+def reasons_of_two(
+    other: Run, *, name: str = "truck-2", known: bool = True, realm: str = "sim-test"
+) -> dict[str, tuple[str, ...]]:
+    """The reasons of every crossing where a truck crosses and another one does something else."""
+    site = with_second_truck() if known else SITE
+    first = messages_of(drive(ACROSS, 15.0), site=site)
+    second = list(run_to_messages([other], with_second_truck(), realm, "truck-2"))
+    second = [m._replace(key=m.key._replace(identifier=name)) for m in second]
+    together = sorted([*first, *second], key=lambda m: m.log_time_ns)
+    return {c.vehicle: c.reasons for c in results_in(fed(together, site)) if c.realm == "sim-test"}
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        drive(ACROSS, 15.0),
+        drive(legs((0.0, 90.0), (15.0, -60.0)), 15.0),  # they meet
+        drive(legs((0.0, -80.0), (17.0, 90.0)), 17.0),  # follows 20 m behind
+        later(drive(legs((0.0, 60.0), (9.0, -30.0)), 9.0), 2.5),
+    ],
+)
+def test_two_trucks_on_one_bridge_are_both_rejected_by_name(other: Run) -> None:
+    found = reasons_of_two(other)
+    assert found.keys() == {"truck-1", "truck-2"}
+    for reasons in found.values():
+        assert "other_truck_on_bridge" in reasons
+
+
+def test_a_truck_that_the_site_does_not_know_counts() -> None:
+    found = reasons_of_two(drive(ACROSS, 15.0), name="stranger", known=False)
+    assert "other_truck_on_bridge" in found["truck-1"]
+
+
+def test_a_truck_that_stands_on_the_bridge_counts() -> None:
+    standing = drive(legs((0.0, 15.0), (20.0, 15.0)), 20.0)
+    assert "other_truck_on_bridge" in reasons_of_two(standing)["truck-1"]
+
+
+@pytest.mark.parametrize(
+    ("other", "realm"),
+    [
+        (later(drive(ACROSS, 15.0), 10.0), "sim-test"),  # comes when the first one has left
+        (later(drive(ACROSS, 15.0), -10.0), "sim-test"),
+        (drive(ACROSS, 15.0, lateral_m=60.0), "sim-test"),  # on the road beside
+        (drive(legs((0.0, -60.0), (15.0, -20.0)), 15.0), "sim-test"),  # waits before the bridge
+        (drive(ACROSS, 15.0), "live"),
+        # Has gone round and comes again from where it was half a minute before.
+        (
+            drive(
+                legs((0.0, 40.0), (2.0, 240.0), (60.0, 240.0), (60.1, -300.0), (70.0, -200.0)),
+                70.0,
+                gnss_kept=lambda t: (t <= 2.0) | (t >= 60.5),
+            ),
+            "sim-test",
+        ),
+    ],
+)
+def test_a_truck_that_was_not_there_at_the_same_time_does_not_count(other: Run, realm: str) -> None:
+    found = reasons_of_two(other, realm=realm)
+    for reasons in found.values():
+        assert "other_truck_on_bridge" not in reasons
+    assert "truck-1" in found
+
+
+def test_a_recording_is_fed_truck_by_truck_and_counts_both_all_the_same() -> None:
+    """The first is decided before a position of the second is fed: it is told beforehand."""
+    site = with_second_truck()
+    first = messages_of(drive(ACROSS, 15.0), site=site)
+    second = messages_of(drive(ACROSS, 15.0), site=site, vehicle="truck-2")
+    one = engine(site)
+    for message in [*first, *second]:
+        one.expect(message.key, message.payload)
+    found = results_in(list(feed_all(one, ((m.key, m.payload) for m in [*first, *second]))))
+    assert ["other_truck_on_bridge" in c.reasons for c in found] == [True, True]
+
+
+def info_of(text: str, message: Message) -> Message:
+    info = VehicleInfo(message.boot_id, 0, 0, message.log_time_ns, "truck-1", text)
+    return message._replace(key=message.key._replace(stream="info"), payload=encode_info(info))
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('[vehicle]\nid = "truck-1"\ntotal_mass_kg = 30000\nwheelbase_m = 7.0\n', True),
+        ('[vehicle]\nid = "truck-1"\nwheelbase_m = 7.0\n', True),
+        (vehicle_toml(SITE, "truck-1"), False),
+        ('[vehicle]\nid = "truck-1"\n', False),
+        ("a." * 5000 + "a = 1", False),
+    ],
+)
+def test_a_truck_that_says_it_is_another_is_rejected_by_name(text: str, named: bool) -> None:
+    messages = messages_of(drive(ACROSS, 15.0))
+    others = [m for m in messages if m.key.stream != "info"]
+    (crossing,) = results_in(fed([info_of(text, others[0]), *others]))
+    assert ("vehicle_differs_from_site" in crossing.reasons) == named
+    assert not named or (crossing.verdict, crossing.parameters) == ("rejected", None)
+    # What another boot of it says is of no concern.
+    earlier = info_of(text, others[0]._replace(boot_id=others[0].boot_id - 1))
+    (crossing,) = results_in(fed([earlier, *others]))
+    assert "vehicle_differs_from_site" not in crossing.reasons
 
 
 def test_a_restart_of_the_truck_decides_what_was_before() -> None:

@@ -154,16 +154,35 @@ def test_accelerating_with_an_unknown_centre_of_gravity_is_said(tmp_path: Path) 
     assert "accelerating_cg_unknown" in only(identified(tmp_path / "drive.mcap")).reasons
 
 
-def test_a_strange_truck_gets_no_number(recording: Path) -> None:
-    """The same recording with a truck of another wheelbase: the roads do not match."""
+def test_a_strange_truck_gets_no_number(recording: Path, tmp_path: Path) -> None:
+    """The same recording with a truck of another wheelbase: it says so, and the roads show it."""
     site = paper_site()
     truck = site.vehicles[0].model_copy(update={"wheelbase_m": 4.9})
     wrong = site.model_copy(update={"vehicles": (truck,)})
-    found = identify_recordings([recording], wrong, LEAST_SQUARES.model_copy(update={"starts": 1}))
-    crossing = only(found)
+    quick = LEAST_SQUARES.model_copy(update={"starts": 1})
+    crossing = only(identify_recordings([recording], wrong, quick))
+    assert (crossing.verdict, crossing.reasons) == ("rejected", ("vehicle_differs_from_site",))
+    silent = tmp_path / "silent.mcap"
+    messages = (m for m in read_messages(recording) if m.key.stream != "info")
+    write_recording(silent, messages, site_toml=site_toml(site), reason="test")
+    crossing = only(identify_recordings([silent], wrong, quick))
     assert {"model_misfit", "not_converged"} & set(crossing.reasons)
     assert crossing.verdict == "rejected"
     assert crossing.diagnostics["relative_misfit"] > 0.1
+
+
+def test_a_truck_that_comes_later_in_the_file_was_there_all_the_same(
+    recording: Path, tmp_path: Path
+) -> None:
+    """A recording of two that were on the bridge at once, one of them unknown to the site."""
+    both = [
+        message._replace(key=message.key._replace(identifier=name))
+        for name in ("truck-1", "z-stranger")
+        for message in read_messages(recording)
+    ]
+    path = tmp_path / "both.mcap"
+    write_recording(path, both, site_toml=site_toml(paper_site()), reason="test")
+    assert only(identified(path)).reasons == ("other_truck_on_bridge",)
 
 
 def test_files_of_another_simulator(shared: Path, tmp_path: Path) -> None:

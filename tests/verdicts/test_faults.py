@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from pre_core import pre
+from pre_core.crossing import optimum
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
@@ -180,11 +180,11 @@ def test_how_large_chi2_may_be_depends_on_the_pattern_up_to_25(
 ) -> None:
     """The very fit of a sound crossing, said to be as bad as that: only the rule is looked at."""
 
-    def found(*arguments: object) -> pre.Optimum:
-        return optimum(*arguments)._replace(chi2_per_dof=chi2)  # type: ignore[arg-type]
+    def found(*arguments: object) -> optimum.Optimum:
+        return real(*arguments)._replace(chi2_per_dof=chi2)  # type: ignore[arg-type]
 
-    optimum = pre.find_optimum
-    monkeypatch.setattr(pre, "find_optimum", found)
+    real = optimum.find_optimum
+    monkeypatch.setattr(optimum, "find_optimum", found)
     monkeypatch.setattr(pre_method, "reasons_after_fit", lambda *_: [pattern])
     settings = IdentificationSettings(method="pre", seed=0, draws=300)
     result = faults.identified(faults.crossing(LOUD), settings)
