@@ -31,7 +31,8 @@ from typing import BinaryIO, Literal, NamedTuple
 from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
 
-from schemas.messages import descriptors
+from schemas.messages import check_stamp, descriptors
+from schemas.signals import check_wall_time, encode_identity
 from schemas.topics import Key, key, parse_key, topic
 from services.common.disk import DISK, Disk, write_all
 from services.common.errors import InputError
@@ -50,6 +51,8 @@ SITE = "site.toml"
 
 _log = logging.getLogger(__name__)
 CHUNK_BYTES = 64 * 1024
+_BOOT_DIGITS = 20
+"""Of a number of 64 bits."""
 _IDENTITIES_PERIOD_S = 60.0
 """What is newer must be read message by message after a crash, before recording goes on."""
 
@@ -298,18 +301,34 @@ def read_messages(path: Path) -> Iterator[Message]:
     """Yield the messages in the order of the file.
 
     A file that was cut off is read up to its last whole chunk, damaged places are left out; both
-    are logged (and counted by `read_info`). InputError if the file is missing, is no MCAP file or
-    holds no message of ours.
+    are logged (and counted by `read_info`). InputError if the file is missing, is no MCAP file,
+    holds no message of ours, or one of a truck that is larger than its topic allows: taking apart
+    what fits the name of a message and nothing else can cost gigabytes.
     """
     found = False
     for item in _scan(path):
         if isinstance(item, Message):
             found = True
+            owner, stream = item.key.owner, item.key.stream
+            if owner == "vehicle" and len(item.payload) > topic(owner, stream).max_bytes:
+                check_message(path, item)
             yield item
         elif isinstance(item, Damage):
             _log.warning("%s: %s", path, item.text)
     if not found:
         raise InputError(f"{path}: holds no driveby message; a recording of a truck is expected")
+
+
+def check_message(path: Path, message: Message) -> None:
+    """InputError if the bus would not take a message, or no logger: what is wrong, in one line."""
+    _, owner, identifier, stream = message.key
+    try:
+        check_stamp(topic(owner, stream), message.payload)
+        check_wall_time(message.log_time_ns)
+        encode_identity(message.boot_id, message.sequence)
+    except ValueError as error:
+        where = f"message {message.sequence} of {identifier}"
+        raise InputError(f"{path}: {where}: {error}") from None
 
 
 def read_site(path: Path) -> str | None:
@@ -325,8 +344,13 @@ def read_site(path: Path) -> str | None:
     return None
 
 
-def read_info(path: Path) -> RecordingInfo:
-    """Read the whole file and say what is in it; InputError if it is missing or not MCAP."""
+def read_info(
+    path: Path, look: Callable[[Message], object] = lambda message: None
+) -> RecordingInfo:
+    """Read the whole file and say what is in it; InputError if it is missing or not MCAP.
+
+    `look` is given every message of a topic that is logged.
+    """
     sentinels: dict[str, dict[str, str]] = {}
     site_toml: str | None = None
     counts: Counter[str] = Counter()
@@ -335,6 +359,8 @@ def read_info(path: Path) -> RecordingInfo:
     for item in _scan(path):
         match item:
             case Message():
+                if topic(item.key.owner, item.key.stream).logged:
+                    look(item)
                 counts[key(*item.key)] += 1
                 first_time_ns = min(first_time_ns or item.log_time_ns, item.log_time_ns)
                 last_time_ns = max(last_time_ns, item.log_time_ns)
@@ -535,7 +561,8 @@ def _our_channel(path: Path, channel: Channel) -> tuple[Key, int] | None:
     except ValueError:
         _log.warning("%s: topic %.80r is not ours and is left out", path, channel.topic)
         return None
-    return where, int(boot_id) if boot_id.isascii() and boot_id.isdecimal() else 0
+    is_number = boot_id.isascii() and boot_id.isdecimal() and len(boot_id) <= _BOOT_DIGITS
+    return where, int(boot_id) if is_number else 0
 
 
 def program_version() -> str:

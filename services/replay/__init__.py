@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from schemas.signals import Identity
@@ -10,7 +11,7 @@ from services.bus.credentials import check_speaks_for
 from services.bus.playback import check_speed, confirm, play, settle, stopped_by_signals
 from services.bus.session import Delivery, Publisher, open_session
 from services.common.errors import FailureError, InputError
-from services.recordings.recording import Message, read_info, read_messages
+from services.recordings.recording import Message, check_message, read_info, read_messages
 
 __all__ = ["run"]
 
@@ -39,7 +40,8 @@ def run(
 
     `tls` is a folder of credentials, see `open_session`.
 
-    InputError: no such file, not a recording, a name that is no identifier. FailureError: nobody
+    InputError: no such file, not a recording, a message that no logger would take, a name that is
+    no identifier. FailureError: nobody
     answers at the endpoint within `connect_timeout_s` (None: wait for ever), nobody subscribes
     within `subscriber_timeout_s`, or the logger did not confirm everything.
     """
@@ -80,12 +82,16 @@ def run(
 
 
 def _keys(recordings: list[Path]) -> list[Key]:
-    """Return the keys in all recordings, in the order of their first message; checks the files."""
+    """Return the keys in all recordings, in the order of their first message.
+
+    Every message is looked at before anybody is connected to: what no logger would take could not
+    be confirmed, and the logger is not to blame.
+    """
     if not recordings:
         raise InputError("no recording: give one or more .mcap files")
     keys: dict[Key, None] = {}
     for path in recordings:
-        info = read_info(path)
+        info = read_info(path, partial(check_message, path))
         if not info.messages:
             raise InputError(f"{path}: holds no driveby message; a recording is expected")
         if info.truncated or info.damaged_chunks:

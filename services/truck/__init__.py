@@ -35,7 +35,7 @@ from services.bus.playback import (
 )
 from services.bus.session import open_session
 from services.common.errors import InputError
-from services.recordings.recording import Message, read_messages
+from services.recordings.recording import Message, check_message, read_messages
 from services.truck.gateway import Connect, Gateway
 from services.truck.spool import DEFAULT_BUDGET_BYTES, Spool
 
@@ -95,7 +95,7 @@ def run(
             bus = partial(open_session, connect=endpoint, timeout_s=0.0, tls=tls)
         gateway = Gateway(bus, realm, vehicle, _open_spool(spool, spool_budget_bytes))
         stack.callback(gateway.close)
-        messages = _driven_now(streams, realm, gateway.boot_id, speed)
+        messages = _driven_now(recording, streams, realm, gateway.boot_id, speed)
         keys = [queue[0].key for queue in streams.values()]
         if gateway.is_online and not settle(gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S):
             # A real truck drives on as well; its cache serves those who come late.
@@ -143,20 +143,28 @@ def _read_vehicle(
     return streams
 
 
-def _messages(source: Path, vehicle: str | None, site: Path | None) -> Iterable[Message]:
+def _messages(source: Path, vehicle: str | None, site: Path | None) -> Iterator[Message]:
+    """Yield what the truck will measure; InputError at the first message that is not right."""
     if not source.is_dir():
-        return read_messages(source)
+        for message in read_messages(source):
+            if message.key.owner == "vehicle":
+                check_message(source, message)
+            yield message
+        return
     if site is None:
         raise InputError(f"{source}: a folder of CSV files needs --site")
     from services.drives.importing import messages_of
 
-    return messages_of(source, site, vehicle)
+    yield from messages_of(source, site, vehicle)
 
 
 def _driven_now(
-    streams: dict[str, list[Message]], realm: str, boot_id: int, speed: float
+    recording: Path, streams: dict[str, list[Message]], realm: str, boot_id: int, speed: float
 ) -> Iterator[Message]:
-    """Yield all streams merged by time, with the times and identities of a drive that is now."""
+    """Yield all streams merged by time, with the times and identities of a drive that is now.
+
+    InputError: the times of the recording lie so far apart that some would not be of this century.
+    """
     first_ns = min(message.log_time_ns for queue in streams.values() for message in queue)
     last_ns = max(message.log_time_ns for queue in streams.values() for message in queue)
     duration_ns = last_ns - first_ns
@@ -167,14 +175,19 @@ def _driven_now(
     device_start_ns = max(0, time.monotonic_ns() - ahead_ns)
     device_shifts: dict[int, int] = {}
     for index, message in _merged(streams.values()):
-        yield _restamped(
-            message,
-            Identity(boot_id, index),
-            realm,
-            wall_shift_ns,
-            device_start_ns + message.log_time_ns - first_ns,
-            device_shifts,
-        )
+        try:
+            restamped = _restamped(
+                message,
+                Identity(boot_id, index),
+                realm,
+                wall_shift_ns,
+                device_start_ns + message.log_time_ns - first_ns,
+                device_shifts,
+            )
+        except ValueError as error:
+            where = f"{message.key.stream} {message.sequence}"
+            raise InputError(f"{recording}: {where} cannot be driven now: {error}") from None
+        yield restamped
 
 
 def _merged(streams: Iterable[list[Message]]) -> Iterator[tuple[int, Message]]:
