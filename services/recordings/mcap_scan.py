@@ -41,8 +41,17 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from services.common.errors import InputError
+
 MAX_RECORD_BYTES = 64 << 20
 """Of one record, and of what one chunk decompresses to; ours are a thousand times smaller."""
+
+_SURE_BYTES = 64 << 20
+_LARGEST_RATIO = 1000
+"""All chunks together may decompress to the first and so many times the file: constant signals in
+chunks of 64 KiB give a tenth of it. More is a bomb."""
+_MOST_OTHERS = 200_000
+"""Records of a chunk that are no messages: there are 65,536 channels and schemas at most."""
 
 _HEADER = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -58,8 +67,13 @@ _FRAME_AT = _ZSTD_AT + len(_ZSTD) + _LENGTH.size
 _CANDIDATE = re.compile(
     rb"(?=(?:([\x01-\x0f].{5}\x00{3})|(%b)|(%b)))" % (re.escape(_ZSTD), re.escape(_FRAME)), re.S
 )
+_LZ4_BYTES = _ZSTD_AT + len(_LZ4) + _LENGTH.size + len(_LZ4_FRAME)
+"""From the beginning of a chunk to the end of the mark of an lz4 frame."""
 _CANDIDATE_BYTES = 9
 _WINDOW_BYTES = 1 << 20
+_ZEROS = bytes(_WINDOW_BYTES)
+_LZ4 = b"\x03\x00\x00\x00lz4"
+_LZ4_FRAME = b"\x04\x22\x4d\x18"
 _READABLE: dict[int, type[McapRecord]] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
@@ -113,14 +127,16 @@ def scan(file: BinaryIO, start: int = 0) -> Iterator[Item]:
     """Yield what holds in the file, in its order, and the damage between; from a record's start.
 
     Of the summary come its schemas and channels, and the footer. A file that ends without a footer
-    ends with a `Damage` that is cut off, of size 0 if not even a record was torn. OSError if
-    reading fails.
+    ends with a `Damage` that is cut off, of size 0 if not even a record was torn; so does one
+    whose chunks decompress to more than any recording's. OSError if reading fails, InputError if
+    the file is compressed in a way that this program does not read.
     """
     size = os.fstat(file.fileno()).st_size
     at = start or len(MCAP0_MAGIC)
     if not start and _read(file, 0, at) != MCAP0_MAGIC:
         at = 0
     is_whole = is_chunked = False
+    left = _SURE_BYTES + _LARGEST_RATIO * size
     while at < size:
         if size - at == len(MCAP0_MAGIC) and _read(file, at, len(MCAP0_MAGIC)) == MCAP0_MAGIC:
             break
@@ -138,6 +154,11 @@ def scan(file: BinaryIO, start: int = 0) -> Iterator[Item]:
             record = _strong_record_at(file, at, size)
             if record is None:  # it was one a moment ago: somebody else writes to the file
                 return
+        left -= record.unpacked_bytes
+        if left < 0:
+            text = f"decompresses to more than any recording, from byte {at} of {size} on"
+            yield Damage(at, size - at, text, is_chunk=False, is_cut_off=True)
+            return
         is_chunked = is_chunked or record.is_chunk
         for item in record.items():
             is_whole = is_whole or isinstance(item, Footer)
@@ -157,7 +178,7 @@ def last_metadata(file: BinaryIO, name: str) -> tuple[Metadata, int] | None:
     while end > 0:
         begin = max(0, end - _WINDOW_BYTES)
         window = _read(file, begin, end - begin + len(mark))
-        found = window.rfind(mark)
+        found = -1 if window.startswith(_ZEROS) else window.rfind(mark)
         while found >= 0:
             record = _strong_record_at(file, max(0, begin + found - _HEADER.size), size)
             item = next(record.items(), None) if record is not None else None
@@ -172,6 +193,8 @@ class _Record(NamedTuple):
     end: int
     items: Callable[[], Iterator[Item]]
     is_chunk: bool = False
+    unpacked_bytes: int = 0
+    """Of a chunk."""
 
 
 def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Record | None:
@@ -181,6 +204,12 @@ def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Reco
         return record
     opcode, length = _header_at(file, at, size) or (0, 0)
     end = at + _HEADER.size + length
+    if opcode == Opcode.CHUNK and _is_lz4(_read(file, at, _LZ4_BYTES)):
+        # Not a dependency for what our own files never are; every MCAP tool can change it.
+        raise InputError(
+            f"{file.name}: is compressed with lz4, which is not read; compress it with zstd, as "
+            "`mcap compress` does"
+        )
     if opcode not in (Opcode.CHUNK, Opcode.MESSAGE) or not _is_followed(file, end, size):
         return None
     if opcode == Opcode.CHUNK:
@@ -192,6 +221,12 @@ def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Reco
     if is_chunked or length < _MESSAGE.size:
         return None
     return _found(end, _raw_message(_read(file, at + _HEADER.size, length), 0, length))
+
+
+def _is_lz4(head: bytes) -> bool:
+    """Whether this is how a chunk begins that is compressed with lz4."""
+    name, frame = _ZSTD_AT, _ZSTD_AT + len(_LZ4) + _LENGTH.size
+    return head[name : name + len(_LZ4)] == _LZ4 and head[frame:] == _LZ4_FRAME
 
 
 def _strong_record_at(file: BinaryIO, at: int, size: int) -> _Record | None:
@@ -285,7 +320,8 @@ def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Rec
         data = _read(file, begin, end - begin)
         content = _decompressed(data) if is_compressed else data
         if content is not None and _holds(content, crc, is_certain=end == outer_end):
-            return _Record(end, partial(_records_of, content), is_chunk=True)
+            records = partial(_records_of, content, at)
+            return _Record(end, records, is_chunk=True, unpacked_bytes=len(content))
     return None
 
 
@@ -310,11 +346,16 @@ def _holds(content: bytes, crc: int, *, is_certain: bool) -> bool:
     return is_certain and at == len(content)
 
 
-def _records_of(content: bytes) -> Iterator[Item]:
-    """Yield what a chunk holds, as far as it goes."""
-    at = 0
+def _records_of(content: bytes, offset: int) -> Iterator[Item]:
+    """Yield what the chunk at a byte of the file holds, as far as it goes."""
+    at = others = 0
     while at + _HEADER.size <= len(content):
         opcode, length = _HEADER.unpack_from(content, at)
+        others += opcode != Opcode.MESSAGE
+        if opcode == 0 or others > _MOST_OTHERS:  # no record has the opcode 0
+            text = f"damaged chunk at byte {offset}: no more messages {at} bytes into it"
+            yield Damage(offset, 0, text, is_chunk=True, is_cut_off=False)
+            return
         begin = at + _HEADER.size
         at = begin + length
         if at > len(content):
@@ -356,7 +397,7 @@ def _torn_messages(file: BinaryIO, at: int, size: int) -> Iterator[Item]:
                 content += piece
     except zstandard.ZstdError:
         pass
-    yield from _records_of(bytes(content))
+    yield from _records_of(bytes(content), at)
 
 
 def _next_record(file: BinaryIO, at: int, size: int) -> int:
@@ -364,7 +405,8 @@ def _next_record(file: BinaryIO, at: int, size: int) -> int:
     begin = at
     while begin < size:
         window = _read(file, begin, _WINDOW_BYTES)
-        for match in _CANDIDATE.finditer(window):
+        # Room that was reserved and not written: no candidate, and compared at memory's speed.
+        for match in () if window == _ZEROS else _CANDIDATE.finditer(window):
             behind = (0, _ZSTD_AT, _FRAME_AT)[(match.lastindex or 1) - 1]
             start = begin + match.start() - behind
             if start >= at and _strong_record_at(file, start, size) is not None:

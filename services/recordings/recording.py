@@ -526,12 +526,17 @@ def _scan(path: Path, start: int = 0) -> Iterator[Message | Metadata | Attachmen
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise InputError(f"{path}: is not an MCAP file; a recording (.mcap) is expected")
         channels: dict[int, tuple[Key, int] | None] = {}
+        has_looked = False
         for item in scan(file, start):
             if isinstance(item, RawMessage):
-                if item.channel_id not in channels:
+                if item.channel_id not in channels and not has_looked:
+                    has_looked = True
                     # The chunk that said it is lost. Ours say it again in every chunk; of older
                     # files only the summary does.
-                    channels |= {n: _our_channel(path, c) for n, c in find_channels(path).items()}
+                    everywhere = find_channels(path).items()
+                    channels |= {
+                        n: _our_channel(path, c) for n, c in everywhere if n not in channels
+                    }
                 known = channels.setdefault(item.channel_id, None)
                 if known is not None:
                     where, boot_id = known

@@ -1,15 +1,24 @@
-"""Recordings that the bus would not take: one line before anybody is connected to."""
+"""Recordings that the bus would not take, that are compressed otherwise, or that unpack to more
+than the machine has: one line, and done with.
+"""
 
 import os
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zstandard
+from mcap.writer import MCAP0_MAGIC
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.topics import Key, topic
 from services.common.errors import InputError
-from services.recordings.recording import Message, read_messages, write_recording
+from services.recordings import mcap_scan
+from services.recordings import recording as recording_module
+from services.recordings.recording import Message, read_info, read_messages, write_recording
+from services.recordings.recovery import recover_recording
 from services.replay import run as replay
 from services.truck import run as truck
 
@@ -115,3 +124,136 @@ def test_a_pipe_is_refused_and_not_waited_for(
     os.mkfifo(pipe)
     with pytest.raises(InputError, match="is no ordinary file"):
         command(pipe)
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def chunk(content: bytes, compression: bytes = b"zstd", compressed: bytes | None = None) -> bytes:
+    body = zstandard.compress(content) if compressed is None else compressed
+    head = struct.pack("<QQQI", 0, 0, len(content), zlib.crc32(content))
+    name = struct.pack("<I", len(compression)) + compression
+    return record(6, head + name + struct.pack("<Q", len(body)) + body)
+
+
+@pytest.fixture
+def sound(tmp_path: Path) -> bytes:
+    return recording(tmp_path / "sound.mcap", a_batch(1).SerializeToString()).read_bytes()
+
+
+@pytest.mark.parametrize("command", [replayed, driven, read_info, lambda p: list(read_messages(p))])
+def test_another_compression_is_named_and_not_called_damage(
+    tmp_path: Path, sound: bytes, command: Callable[[Path], None]
+) -> None:
+    path = tmp_path / "lz4.mcap"
+    frame = b"\x04\x22\x4d\x18" + bytes(50)
+    path.write_bytes(MCAP0_MAGIC + chunk(bytes(1000), b"lz4", frame) + sound[len(MCAP0_MAGIC) :])
+    with pytest.raises(InputError, match=r"lz4\.mcap: is compressed with lz4, which is not read"):
+        command(path)
+
+
+def test_recovery_names_another_compression_too(tmp_path: Path, sound: bytes) -> None:
+    path = tmp_path / "lz4.mcap"
+    frame = b"\x04\x22\x4d\x18" + bytes(50)
+    path.write_bytes(sound[: len(MCAP0_MAGIC)] + chunk(bytes(1000), b"lz4", frame))
+    with pytest.raises(InputError, match="is compressed with lz4"):
+        recover_recording(path, tmp_path / "out.mcap")
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def counted_records(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Count what is taken apart: time depends on the machine."""
+    seen = [0]
+    unpack = mcap_scan._HEADER.unpack_from
+
+    class Counting:
+        size = mcap_scan._HEADER.size
+        unpack = mcap_scan._HEADER.unpack
+
+        @staticmethod
+        def unpack_from(*arguments: object) -> tuple[int, int]:
+            seen[0] += 1
+            return unpack(*arguments)  # type: ignore[arg-type, return-value]
+
+    monkeypatch.setattr(mcap_scan, "_HEADER", Counting)
+    return seen
+
+
+@pytest.mark.parametrize("filling", [b"\0" * 9, struct.pack("<BQ", 0x90, 0)])
+def test_what_unpacks_to_gigabytes_is_not_gone_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filling: bytes
+) -> None:
+    """200 KB that decompress to 6 GB, of zeros or of records without content."""
+    one = chunk(filling * (mcap_scan.MAX_RECORD_BYTES // 9))
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(MCAP0_MAGIC + one * 100)
+    seen = counted_records(monkeypatch)
+    info = read_info(path)
+    assert seen[0] < 3_000_000
+    assert info.truncated
+    assert info.damaged_chunks >= 1
+    with pytest.raises(InputError, match="holds nothing of an MCAP recording"):
+        recover_recording(path, tmp_path / "out.mcap")
+
+
+def test_a_chunk_of_zeros_costs_nothing_of_the_rest(tmp_path: Path, sound: bytes) -> None:
+    path = tmp_path / "zeros.mcap"
+    path.write_bytes(sound[: len(MCAP0_MAGIC)] + chunk(bytes(MIB)) + sound[len(MCAP0_MAGIC) :])
+    info = read_info(path)
+    assert sum(info.messages.values()) == 2
+    assert info.damaged_chunks == 1
+
+
+def test_signals_that_never_change_are_no_bomb(tmp_path: Path) -> None:
+    """Nothing compresses better, and its ratio must not come near the largest that is taken."""
+    payloads = [a_batch(n, 1000, 10_000.0).SerializeToString() for n in range(3000)]
+    path = tmp_path / "constant.mcap"
+    messages = (
+        Message(ACCEL, payload, 7, n, WALL_NS + n * 10**8, WALL_NS)
+        for n, payload in enumerate(payloads)
+    )
+    write_recording(path, messages, site_toml=None, reason="test")
+    assert sum(map(len, payloads)) < mcap_scan._LARGEST_RATIO * path.stat().st_size / 3
+    assert sum(read_info(path).messages.values()) == 3000
+
+
+def test_zeros_behind_a_recording_are_not_searched_byte_by_byte(
+    tmp_path: Path, sound: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two gigabytes that were reserved and never written; on the disk they take no room."""
+    path = tmp_path / "reserved.mcap"
+    with path.open("wb") as file:
+        file.write(sound)
+        file.truncate(len(sound) + (2 << 30))
+    searched = [0]
+    candidates = mcap_scan._CANDIDATE
+
+    class Counting:
+        @staticmethod
+        def finditer(window: bytes) -> object:
+            searched[0] += len(window)
+            return candidates.finditer(window)
+
+    monkeypatch.setattr(mcap_scan, "_CANDIDATE", Counting)
+    info = read_info(path)
+    assert sum(info.messages.values()) == 2
+    assert info.truncated
+    assert searched[0] < 8 * MIB
+
+
+def test_channels_that_nobody_names_are_looked_for_once(
+    tmp_path: Path, sound: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each unknown number made the whole file be read again."""
+    message = struct.pack("<HIQQ", 0, 0, WALL_NS, WALL_NS)
+    strangers = b"".join(record(5, struct.pack("<H", n) + message[2:]) for n in range(1000, 1200))
+    path = tmp_path / "strangers.mcap"
+    path.write_bytes(sound[: len(MCAP0_MAGIC)] + chunk(strangers) + sound[len(MCAP0_MAGIC) :])
+    looked = []
+    real = recording_module.find_channels
+    monkeypatch.setattr(
+        recording_module, "find_channels", lambda path: looked.append(path) or real(path)
+    )
+    assert sum(read_info(path).messages.values()) == 2
+    assert len(looked) == 1
