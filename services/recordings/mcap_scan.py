@@ -63,17 +63,17 @@ _ZSTD = b"\x04\x00\x00\x00zstd"
 _ZSTD_AT = _HEADER.size + _CHUNK.size
 _FRAME = b"\x28\xb5\x2f\xfd"
 _FRAME_AT = _ZSTD_AT + len(_ZSTD) + _LENGTH.size
+_LZ4 = b"\x03\x00\x00\x00lz4"
+_LZ4_FRAME = b"\x04\x22\x4d\x18"
+_LZ4_BYTES = _ZSTD_AT + len(_LZ4) + _LENGTH.size + len(_LZ4_FRAME)
+"""From the beginning of a chunk to the end of the mark of an lz4 frame."""
 # A record's header with a length below 2**40, or what marks a chunk whose header is damaged.
 _CANDIDATE = re.compile(
     rb"(?=(?:([\x01-\x0f].{5}\x00{3})|(%b)|(%b)))" % (re.escape(_ZSTD), re.escape(_FRAME)), re.S
 )
-_LZ4_BYTES = _ZSTD_AT + len(_LZ4) + _LENGTH.size + len(_LZ4_FRAME)
-"""From the beginning of a chunk to the end of the mark of an lz4 frame."""
 _CANDIDATE_BYTES = 9
 _WINDOW_BYTES = 1 << 20
 _ZEROS = bytes(_WINDOW_BYTES)
-_LZ4 = b"\x03\x00\x00\x00lz4"
-_LZ4_FRAME = b"\x04\x22\x4d\x18"
 _READABLE: dict[int, type[McapRecord]] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
