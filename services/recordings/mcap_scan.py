@@ -205,7 +205,7 @@ def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Reco
     opcode, length = _header_at(file, at, size) or (0, 0)
     end = at + _HEADER.size + length
     if opcode == Opcode.CHUNK and _is_lz4(_read(file, at, _LZ4_BYTES)):
-        # Not a dependency for what our own files never are; every MCAP tool can change it.
+        # No file of ours is, and to find such a chunk among damage would take a second search.
         raise InputError(
             f"{file.name}: is compressed with lz4, which is not read; compress it with zstd, as "
             "`mcap compress` does"
