@@ -27,7 +27,7 @@ from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.session import Publisher, Received, Subscription, open_session
 from services.common.disk import DISK
 from services.common.errors import FailureError, InputError
-from services.common.files import check_folder_writable, read_text
+from services.common.files import check_folder_writable
 from services.common.intervals import Intervals
 from services.logger.complaints import Complaints
 from services.logger.completeness import Completeness
