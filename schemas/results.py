@@ -162,6 +162,16 @@ class BridgeResult(BaseModel):
     between_crossing_std: Finite | None = None
     crossings_used: tuple[str, ...] = ()
     crossings_left_out: tuple[LeftOut, ...] = ()
+    """The newest of them, if there are many."""
+    crossings_left_out_count: Annotated[int, Field(ge=0)] = 0
+    """How many there are; filled in where an older program did not say it, and listed all."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _counted(cls, values: object) -> object:
+        if isinstance(values, Mapping) and values.get("crossings_left_out_count") is None:
+            return {**values, "crossings_left_out_count": len(values.get("crossings_left_out", ()))}
+        return values
 
     @property
     def elements(self) -> dict[str, ElementState]:
@@ -304,6 +314,7 @@ def bridge_to_protobuf(name: str, time_ns: int, bridge: BridgeResult) -> pb.Brid
         between_crossing_std=bridge.between_crossing_std,
         crossings_used=bridge.crossings_used,
         crossings_left_out=[pb.LeftOut(**out.model_dump()) for out in bridge.crossings_left_out],
+        crossings_left_out_count=bridge.crossings_left_out_count,
     )
     for element, state in bridge.elements.items():
         message.flexural_rigidity_nm2[element].CopyFrom(pb.ElementState(**state.model_dump()))
@@ -328,6 +339,11 @@ def state_to_bridge(message: pb.BridgeState) -> tuple[str, int, BridgeResult]:
             {"crossing_id": out.crossing_id, "reason": out.reason}
             for out in message.crossings_left_out
         ],
+        "crossings_left_out_count": (
+            message.crossings_left_out_count
+            if message.HasField("crossings_left_out_count")
+            else None
+        ),
     }
     return message.bridge, message.time_ns, BridgeResult.model_validate(values)
 

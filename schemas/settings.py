@@ -6,6 +6,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from schemas.results import Method
 
+NOT_OF_THE_RESULT = frozenset({"threads"})
+"""Settings that change how long an identification takes, and nothing of its result."""
+
 
 class IdentificationSettings(BaseModel):
     """Settings of one identification."""

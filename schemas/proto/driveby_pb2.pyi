@@ -316,7 +316,7 @@ class LeftOut(_message.Message):
     def __init__(self, crossing_id: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
 
 class BridgeState(_message.Message):
-    __slots__ = ("schema_version", "bridge", "time_ns", "flexural_rigidity_nm2", "between_crossing_std", "crossings_used", "crossings_left_out")
+    __slots__ = ("schema_version", "bridge", "time_ns", "flexural_rigidity_nm2", "between_crossing_std", "crossings_used", "crossings_left_out", "crossings_left_out_count")
     class FlexuralRigidityNm2Entry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -331,6 +331,7 @@ class BridgeState(_message.Message):
     BETWEEN_CROSSING_STD_FIELD_NUMBER: _ClassVar[int]
     CROSSINGS_USED_FIELD_NUMBER: _ClassVar[int]
     CROSSINGS_LEFT_OUT_FIELD_NUMBER: _ClassVar[int]
+    CROSSINGS_LEFT_OUT_COUNT_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     bridge: str
     time_ns: int
@@ -338,7 +339,8 @@ class BridgeState(_message.Message):
     between_crossing_std: float
     crossings_used: _containers.RepeatedScalarFieldContainer[str]
     crossings_left_out: _containers.RepeatedCompositeFieldContainer[LeftOut]
-    def __init__(self, schema_version: _Optional[int] = ..., bridge: _Optional[str] = ..., time_ns: _Optional[int] = ..., flexural_rigidity_nm2: _Optional[_Mapping[str, ElementState]] = ..., between_crossing_std: _Optional[float] = ..., crossings_used: _Optional[_Iterable[str]] = ..., crossings_left_out: _Optional[_Iterable[_Union[LeftOut, _Mapping]]] = ...) -> None: ...
+    crossings_left_out_count: int
+    def __init__(self, schema_version: _Optional[int] = ..., bridge: _Optional[str] = ..., time_ns: _Optional[int] = ..., flexural_rigidity_nm2: _Optional[_Mapping[str, ElementState]] = ..., between_crossing_std: _Optional[float] = ..., crossings_used: _Optional[_Iterable[str]] = ..., crossings_left_out: _Optional[_Iterable[_Union[LeftOut, _Mapping]]] = ..., crossings_left_out_count: _Optional[int] = ...) -> None: ...
 
 class Health(_message.Message):
     __slots__ = ("schema_version", "time_ns", "service", "ok", "figures", "note")

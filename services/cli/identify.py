@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,9 +12,12 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site, load_site, parse_site, site_hash
 from services.common.errors import FailureError, InputError
 from services.common.files import check_writable, replaced_atomically, write_atomically
+from services.execution.dispatch import awaited, dispatched
+from services.execution.here import Here
 from services.history.draws import Draws, check_draws, write_draws
-from services.identification.engine import Engine, Output
-from services.identification.identify import Keep, identify
+from services.identification.engine import Engine
+from services.identification.identify import Keep
+from services.identification.outputs import Output, Work
 from services.identification.streams import device_time_ns
 from services.recordings.recording import Message, program_version, read_messages, read_site
 
@@ -107,15 +110,10 @@ def identify_recordings(
         settings=settings.model_dump(mode="json"),
         seed=settings.seed,
     )
-    engine = Engine(
-        site,
-        settings,
-        header,
-        stopwatch=time.perf_counter,
-        report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"),
-        identify=partial(identify, keep=keep),
+    engine = Engine(site, settings, header)
+    execution = Here(
+        report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"), keep=keep
     )
-    found: list[Crossing] = []
     messages: dict[str, list[Message]] = {"accel": [], "gnss": [], "info": []}
     for message in _all_messages(recordings):
         if message.key.owner == "vehicle" and message.key.stream in messages:
@@ -126,13 +124,17 @@ def identify_recordings(
     _check_vehicles(recordings, site, [*messages["accel"], *messages["gnss"]])
     for message in messages["gnss"]:
         engine.expect(message.key, message.payload)
-    for message in _as_it_happened(recordings, [m for one in messages.values() for m in one]):
-        found += [
-            output.result
-            for output in _fed(recordings, engine, message)
-            if output.result is not None
-        ]
-    found += [output.result for output in engine.finish() if output.result is not None]
+    outputs = chain(
+        chain.from_iterable(
+            dispatched(engine, execution, _said(recordings, engine, message))
+            for message in _as_it_happened(
+                recordings, [m for one in messages.values() for m in one]
+            )
+        ),
+        dispatched(engine, execution, engine.finish()),
+        awaited(engine, execution),
+    )
+    found = [output.result for output in outputs if output.result is not None]
     found.sort(key=lambda crossing: crossing.entry_time)
     return results(header, found, engine.bridges())
 
@@ -165,14 +167,14 @@ def _as_it_happened(recordings: list[Path], messages: list[Message]) -> list[Mes
     return sorted(messages, key=moment)
 
 
-def _fed(recordings: list[Path], engine: Engine, message: Message) -> list[Output]:
+def _said(recordings: list[Path], engine: Engine, message: Message) -> Iterator[Output | Work]:
     try:
-        return list(engine.feed(message.key, message.payload))
+        return engine.feed(message.key, message.payload)
     except ValueError as error:
         wrong = _malformed(recordings, message, error)
         if message.key.stream == "info":  # nothing that it could say is needed
             _log.warning("%s", wrong)
-            return []
+            return iter(())
         raise wrong from error
 
 

@@ -5,28 +5,21 @@ results of that file as JSON beside it. Together the files of a folder hold each
 """
 
 import logging
-from collections import Counter
-from collections.abc import Iterable
+from collections import Counter, defaultdict, deque
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from schemas.errors import InputError
-from schemas.messages import decode
-from schemas.proto import driveby_pb2 as pb
-from schemas.results import (
-    BridgeResult,
-    Crossing,
-    Header,
-    estimate_to_crossing,
-    load_results,
-    results,
-    results_json,
-)
+from schemas.results import BridgeResult, Crossing, Header, load_results
 from schemas.signals import Identity
 from schemas.topics import Key
 from services.common.errors import FailureError
-from services.common.files import write_atomically
-from services.identification.engine import latest_state, usable_of
+from services.common.files import replaced_atomically
+from services.history.results_json import GrowingJson
+from services.history.store import Store, Told
+from services.identification.bridge_state import Counted, count_in, latest_state, usable
+from services.identification.known import Known, search_hash
 from services.recordings.recording import (
     Message,
     RecordingWriter,
@@ -50,11 +43,11 @@ class ResultFiles:
         """`previous` is the name of the file of the run before, if any."""
         self.path = path
         self._site_toml = site_toml
-        self._header = header
+        self._json = GrowingJson(path.with_suffix(".json"), header)
         self._previous = previous
         self._writer: RecordingWriter | None = None
         self._sequences: Counter[Key] = Counter()
-        self._crossings: list[Crossing] = []
+        self._crossings = 0
 
     def next_identity(self, key: Key, boot_id: int) -> Identity:
         """The identity of the next message of a key."""
@@ -87,16 +80,15 @@ class ResultFiles:
         self._writer.sync()
         self._sequences[message.key] += 1
         if result is not None:
-            self._crossings.append(result)
-            content = results(self._header, self._crossings, bridges)
-            write_atomically(self.path.with_suffix(".json"), results_json(content))
+            self._crossings += 1
+            self._json.add(result, bridges)
 
     def finish(self) -> None:
         """Close the recording of a run that ended well. FailureError if that is not possible."""
         if self._writer is None:
             return
         try:
-            self._writer.finish("stopped by a signal", {"crossings": len(self._crossings)})
+            self._writer.finish("stopped by a signal", {"crossings": self._crossings})
         except OSError as error:
             self._writer.abandon()
             raise FailureError(f"{self.path}: cannot be ended: {error.strerror}") from error
@@ -109,10 +101,20 @@ class ResultFiles:
             self._writer.abandon()
 
 
+class MessageName(NamedTuple):
+    """What tells a message from all others."""
+
+    key: Key
+    boot_id: int
+    sequence: int
+
+
 class Earlier(NamedTuple):
     """What earlier runs left."""
 
-    said: tuple[Message, ...] = ()
+    crossings: tuple[Known, ...] = ()
+    """All of which something was told, in order of their entries."""
+    said: tuple[MessageName, ...] = ()
     """All messages, each once, in the order of the runs."""
     unsure: tuple[Message, ...] = ()
     """Those that may not have reached the bus: the last ones of runs that none went on with."""
@@ -126,95 +128,137 @@ class _Run(NamedTuple):
     """One file."""
 
     path: Path
-    messages: list[Message]
     previous: str | None
     began_s: float
     goes_on: bool
     """Another worker writes it."""
     was_killed: bool
 
-    def last_ns(self) -> int:
-        return max(message.publish_time_ns for message in self.messages)
+
+class _Read:
+    """What has been read of the files so far; of the messages only those that are needed."""
+
+    def __init__(self, search: str) -> None:
+        self.store = Store(search)
+        self.said: dict[MessageName, None] = {}
+        self.states: dict[Key, Message] = {}
+        self.counted: defaultdict[str, dict[str, Counted]] = defaultdict(dict)
+        """By search and bridge."""
+
+    def take(self, message: Message) -> Told | None:
+        """Take a message in; its result, if it is one that was not known."""
+        name = MessageName(message.key, message.boot_id, message.sequence)
+        if name in self.said:
+            return None
+        self.said[name] = None
+        if message.key.stream == "state":
+            self.states[message.key] = message
+        told = self.store.add(message.key, message.payload)
+        counts = None if told is None else usable(told.result)
+        if told is not None and counts is not None:
+            bridges = self.counted[search_hash(told.header)]
+            before = bridges.get(told.result.bridge, Counted())
+            bridges[told.result.bridge] = count_in(before, [counts])
+        return told
+
+    def bridges(self, search: str) -> dict[str, BridgeResult]:
+        """The states of all bridges after what has been read, by a search."""
+        states = {name: latest_state(counted) for name, counted in self.counted[search].items()}
+        return {name: state for name, state in states.items() if state is not None}
 
 
-def read_earlier(folder: Path, realm: str, now_s: float) -> Earlier:
+def read_earlier(folder: Path, realm: str, now_s: float, search: str) -> Earlier:
     """What earlier runs left of a realm in a folder, in the last two days.
 
-    `now_s` is the wall clock. A file that cannot be read is a warning; one that was cut off is
-    read as far as it goes, and its JSON file is made to hold all that it holds.
+    `now_s` is the wall clock, `search` tells which results are ours (`search_hash`). A file that
+    cannot be read is a warning; one that was cut off is read as far as it goes, and its JSON file
+    is made to hold all that it holds.
     """
-    runs = list(_runs(folder, realm, now_s))
-    said: dict[tuple[Key, int, int], Message] = {}
-    unsure: list[Message] = []
-    # Who names it as the one before has published its last messages again, if it had the time.
-    continued = {run.previous for run in runs if not run.was_killed or _lived_long(run)}
-    for run in runs:
-        said |= {(m.key, m.boot_id, m.sequence): m for m in run.messages}
-        if run.was_killed:
-            _complete_json(run, list(said.values()))
-        if not run.goes_on and run.path.name not in continued:
-            since_ns = run.last_ns() - _UNSURE_NS
-            unsure += [m for m in run.messages if m.publish_time_ns >= since_ns]
-    states = {message.key: message for message in said.values() if message.key.stream == "state"}
-    previous = runs[-1].path.name if runs else None
-    return Earlier(tuple(said.values()), tuple(unsure), tuple(states.values()), previous)
+    read = _Read(search)
+    continued: set[str | None] = set()
+    tails: list[tuple[_Run, list[Message]]] = []
+    for run in _runs(folder, now_s):
+        tail = _read_run(run, realm, read)
+        if tail is None:
+            continue
+        # Who names it as the one before has published its last messages again, if it had the time.
+        if not run.was_killed or tail[-1].publish_time_ns - run.began_s * 1e9 > _UNSURE_NS:
+            continued.add(run.previous)
+        tails.append((run, tail))
+    unsure = [
+        message
+        for run, tail in tails
+        if not run.goes_on and run.path.name not in continued
+        for message in tail
+    ]
+    return Earlier(
+        tuple(read.store.crossings()),
+        tuple(read.said),
+        tuple(unsure),
+        tuple(read.states.values()),
+        tails[-1][0].path.name if tails else None,
+    )
 
 
-def _lived_long(run: _Run) -> bool:
-    return run.last_ns() - run.began_s * 1e9 > _UNSURE_NS
-
-
-def _runs(folder: Path, realm: str, now_s: float) -> Iterable[_Run]:
+def _runs(folder: Path, now_s: float) -> Iterator[_Run]:
     for path in sorted(folder.glob("results-*.mcap")):
         try:
             if now_s - path.stat().st_mtime > _KNOWN_AGE_S:
                 continue
             goes_on = is_being_written(path)
             info = read_info(path)
-            messages = [m for m in read_messages(path) if m.key.realm == realm]
             began_s = int(info.start.get("time_ns", "0")) * 1e-9
         except (ValueError, OSError) as error:  # any field may be damaged
             _log.warning("results of an earlier run are left out: %s", error)
             continue
-        if messages:
-            was_killed = info.end is None and not goes_on
-            yield _Run(path, messages, info.start.get("previous"), began_s, goes_on, was_killed)
+        was_killed = info.end is None and not goes_on
+        yield _Run(path, info.start.get("previous"), began_s, goes_on, was_killed)
 
 
-def _complete_json(run: _Run, said: list[Message]) -> None:
-    """Write results that a run that was killed had no time for into its JSON file."""
-    path = run.path.with_suffix(".json")
-    found = _crossings_in(run.messages)
-    if not found:
-        return
+def _read_run(run: _Run, realm: str, read: _Read) -> list[Message] | None:
+    """Read a file; return its last minute, None if it holds nothing of the realm."""
+    tail: deque[Message] = deque()
+    latest_ns = 0
+    found: dict[str, Header] = {}
     try:
-        written = load_results(path) if path.exists() else None
-        known = {crossing.crossing_id for crossing in written.crossings} if written else set()
-        if all(crossing.crossing_id in known for crossing, _ in found):
+        for message in read_messages(run.path):
+            if message.key.realm != realm:
+                continue
+            told = read.take(message)
+            if told is not None:
+                found[told.result.crossing_id] = told.header
+            tail.append(message)
+            latest_ns = max(latest_ns, message.publish_time_ns)
+            while tail[0].publish_time_ns < latest_ns - _UNSURE_NS:
+                tail.popleft()
+    except (ValueError, OSError) as error:
+        _log.warning("results of an earlier run are left out: %s", error)
+    if not tail:
+        return None
+    if run.was_killed and found:
+        _complete_json(run, found, read)
+    return list(tail)
+
+
+def _complete_json(run: _Run, found: dict[str, Header], read: _Read) -> None:
+    """Write the JSON file of a run that was killed anew, if it lacks one of its results."""
+    path = run.path.with_suffix(".json")
+    created_s = run.began_s
+    try:
+        written = load_results(path)
+        created_s = written.created
+        if {crossing.crossing_id for crossing in written.crossings}.issuperset(found):
             return
-        created_s = written.created if written else run.began_s
-        header = found[-1][1]._replace(created=created_s)
-        bridges = _bridges(c for c, h in _crossings_in(said) if h.site_hash == header.site_hash)
-        content = results(header, [crossing for crossing, _ in found], bridges)
-        write_atomically(path, results_json(content))
+    except InputError:
+        pass  # there is none, or the run was killed while it wrote it
+    last = list(found.values())[-1]
+    try:
+        with replaced_atomically(path) as temporary:
+            content = GrowingJson(temporary, last._replace(created=created_s))
+            once = Store(None)
+            for message in read_messages(run.path):
+                told = once.add(message.key, message.payload)
+                if told is not None and told.result.crossing_id in found:
+                    content.add(told.result, read.bridges(search_hash(last)))
     except (InputError, FailureError) as error:
         _log.warning("results of an earlier run are in its recording only: %s", error)
-
-
-def _crossings_in(messages: Iterable[Message]) -> list[tuple[Crossing, Header]]:
-    found = []
-    for message in messages:
-        if message.key.stream != "estimate":
-            continue
-        try:
-            estimate = decode("driveby.v1.Estimate", message.payload)
-            if isinstance(estimate, pb.Estimate):
-                found.append(estimate_to_crossing(estimate))
-        except ValueError as error:
-            _log.warning("an estimate of an earlier run is left out: %s", error)
-    return found
-
-
-def _bridges(crossings: Iterable[Crossing]) -> dict[str, BridgeResult]:
-    usable = usable_of((crossing.bridge, crossing) for crossing in crossings)
-    return {bridge: latest_state(of_bridge) for bridge, of_bridge in usable.items()}

@@ -19,6 +19,8 @@ from services.identification.streams import Fixes, Samples
 
 Floats = NDArray[np.float64]
 
+MARGIN_S = 1.0
+"""Samples are needed this long before the entry and after the exit."""
 NORMAL_975 = 1.959963984540054
 _ROAD_SPACING_M = 0.05
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3

@@ -7,25 +7,17 @@ through it gives the same bytes every time.
 
 import contextlib
 import logging
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.reasons import Reason
-from schemas.results import (
-    BridgeResult,
-    Crossing,
-    Direction,
-    ElementState,
-    Header,
-    LeftOut,
-    bridge_to_protobuf,
-    crossing_to_protobuf,
-    direction_to_protobuf,
-)
+from schemas.results import BridgeResult, Crossing, Header, crossing_to_protobuf
 from schemas.settings import IdentificationSettings
 from schemas.signals import (
     MAX_BATCH_S,
@@ -40,33 +32,27 @@ from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
 from schemas.vehicle_info import Difference, differences
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
-from services.identification.crossing_data import CrossingData
-from services.identification.identify import MARGIN_S, Identify, Report, Stopwatch, identify
-from services.identification.stays import MARGIN_M, MERGE_S, Passage, Stay, find_stays
+from services.identification.bridge_state import Counted, count_in, latest_state, usable
+from services.identification.crossing_data import MARGIN_S, CrossingData
+from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
+from services.identification.outputs import Output, Work, crossing_output, state_output
+from services.identification.stays import MERGE_S, Passage, Stay, least_depth_m, stays_on
 from services.identification.streams import PATIENCE_S, Boot
-from services.identification.told import Told, told_of
 from services.identification.traffic import Traffic
 
 _log = logging.getLogger(__name__)
 _KEEP_S = 300.0
 """Samples older than this are forgotten."""
-_LONGEST_STAY_S = 270.0
-"""Who is on a short bridge for so long does not cross it."""
 _SILENCE_S = 120.0
 """So long may positions come without accelerations, as when both are fetched after an outage."""
 _FORGET_EVERY_S = 10.0
+"""To forget takes time, which is spent this often."""
 _ROUNDING_S = 1e-6
 """More than is lost when a time in nanoseconds becomes one in seconds."""
 _REACH_M = 50.0
 """Further away than this from the ends of a bridge no fix changes what happened on it."""
-
-
-class Output(NamedTuple):
-    """A message to publish, and the result itself where it is one."""
-
-    key: Key
-    payload: bytes
-    result: Crossing | None = None
+_Name = tuple[str, str]
+"""Realm and bridge."""
 
 
 class _Truck:
@@ -86,7 +72,7 @@ class _Truck:
         """Crossing ids by bridge and about the time of entry."""
         self.done: set[str] = set()
         self.decided: list[tuple[str, float, float, str]] = []
-        """Of what has been identified: bridge, times of the fixes around it, and crossing id."""
+        """Bridge, times of the fixes around it, and id of each crossing that is decided."""
         self.said: dict[str, set[pb.CrossingState]] = {}
         """By crossing id: states that an earlier run of the worker has told."""
         self.side: dict[str, int] = {}
@@ -101,13 +87,46 @@ class _Truck:
             for (known_bridge, _), crossing_id in self.detected.items()
         )
 
+    def forget_before(self, time_s: float) -> None:
+        """Forget samples, fixes and crossings that are decided: no stay is found there again."""
+        self.forgotten_s = time_s
+        self.boot.forget_before(time_s)
+        self.decided = [one for one in self.decided if one[2] >= time_s]
+        kept = {crossing_id for *_, crossing_id in self.decided}
+        self.detected = {
+            (bridge, entry_s): crossing_id
+            for (bridge, entry_s), crossing_id in self.detected.items()
+            if entry_s >= time_s - MERGE_S or crossing_id in kept or crossing_id not in self.done
+        }
+        kept.update(self.detected.values())
+        self.done &= kept
+        self.said = {name: states for name, states in self.said.items() if name in kept}
+
+
+class _UnderWay(NamedTuple):
+    """A crossing that is being identified."""
+
+    work: Work
+    done: Output
+    """What is told when it is: the truck's clock may have been forgotten by then."""
+
+
+@dataclass
+class _OfBridge:
+    """What has been found on one bridge, in one realm."""
+
+    counted: Counted = field(default_factory=Counted)
+    under_way: deque[_UnderWay] = field(default_factory=deque)
+    """In the order in which they were found: so their results are told."""
+    results: dict[int, Crossing] = field(default_factory=dict)
+    """Those that have come before one that was found earlier, by number of the work."""
+
 
 _DECODERS: dict[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]] = {
     "accel": decode_accel,
     "gnss": decode_gnss,
     "info": decode_info,
 }
-Name = TypeVar("Name")
 _Wait = Callable[[_Truck, Stay, float], bool]
 """Whether a crossing that is over, at the truck's time of now (s), waits for more of its data."""
 
@@ -115,66 +134,57 @@ _Wait = Callable[[_Truck, Stay, float], bool]
 class Engine:
     """Takes the messages of a realm's trucks and returns what is to be published.
 
-    `header` says what goes into every estimate; `stopwatch` measures the seconds of an
-    identification and is the only thing that may differ between two runs; `report` is told how far
-    an identification is. Who wants more of a crossing than its result wraps `identify`.
+    It identifies nothing itself: what it yields holds a `Work` for each crossing, whose result is
+    to be given to `done`, at any later time and in any order. `services.execution` does that.
+    `header` says what goes into every estimate.
     """
 
-    def __init__(
-        self,
-        site: Site,
-        settings: IdentificationSettings,
-        header: Header,
-        *,
-        stopwatch: Stopwatch = lambda: 0.0,
-        report: Callable[[str, str, float], None] = lambda crossing, stage, fraction: None,
-        identify: Identify = identify,
-    ) -> None:
+    def __init__(self, site: Site, settings: IdentificationSettings, header: Header) -> None:
         self._site = site
-        self._identify = identify
         self._settings = settings
         self._header = header
-        self._stopwatch = stopwatch
-        self._report = report
         self._frames: list[tuple[Bridge, BridgeFrame]] = [
             (bridge, bridge_frame(bridge)) for bridge in site.bridges
         ]
-        self._margin_m = max(MARGIN_M, 5.0 * site.receiver.position_noise_m)
         self._vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
-        self._traffic = Traffic(self._frames, self._vehicles, self._margin_m)
+        self._traffic = Traffic(self._frames, self._vehicles, least_depth_m(site.receiver))
         self._trucks: dict[tuple[str, str, int], _Truck] = {}
         self._newest_boot: dict[tuple[str, str], int] = {}
-        self._usable: dict[tuple[str, str], list[Crossing]] = {}
-        self._told: dict[tuple[str, str, str], list[Told]] = {}
+        self._of_bridge: dict[_Name, _OfBridge] = {}
+        self._works = 0
+        """How many there have been."""
+        self._known: dict[tuple[str, str, str], list[Known]] = {}
         """By realm, vehicle and bridge: what earlier runs told."""
         self.unknown_vehicles: set[str] = set()
         """Trucks that the site file does not know; nothing of theirs can be identified."""
 
-    def resume(self, said: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
-        """Go on from what earlier runs said, in its order; yield what they did not come to say.
+    def resume(self, crossings: Iterable[Known]) -> Iterator[Output]:
+        """Go on from what is known of crossings; yield what earlier runs did not come to say.
 
         To be called before the first message. A crossing that has a result by these settings and
         this site file gets no other one, and counts in the states of its bridge; of one that has
         none only those states are told that have not been told.
         """
-        crossings = told_of(said, self._header)
-        for told in crossings:
-            self._told.setdefault((told.realm, told.vehicle, told.bridge), []).append(told)
-        self._usable = usable_of(
-            ((told.realm, told.bridge), told.result) for told in crossings if told.result
-        )
-        for told in crossings:
-            if told.result is None:
+        crossings = sorted(crossings, key=lambda known: known.entry_ns)
+        for known in crossings:
+            self._known.setdefault((known.realm, known.vehicle, known.bridge), []).append(known)
+            if known.usable is not None:
+                bridge = self._bridge(known.realm, known.bridge)
+                bridge.counted = count_in(bridge.counted, [known.usable])
+        for known in crossings:
+            if not known.has_result:
                 continue
-            if told.last is not None and pb.DONE not in told.states:
-                told.last.state = pb.DONE  # all else is as when it was told to be identified
+            if known.last is not None and pb.DONE not in known.states:
+                known.last.state = pb.DONE  # all else is as when it was told to be identified
                 yield Output(
-                    Key(told.realm, "bridge", told.bridge, "crossing"),
-                    told.last.SerializeToString(deterministic=True),
+                    Key(known.realm, "bridge", known.bridge, "crossing"),
+                    known.last.SerializeToString(deterministic=True),
                 )
-            if told.result.parameters is not None and not told.is_in_state:
-                usable = self._usable[told.realm, told.bridge]
-                yield _state_message(told.realm, told.bridge, told.result, latest_state(usable))
+            if known.usable is not None and not known.is_in_state:
+                latest = latest_state(self._bridge(known.realm, known.bridge).counted)
+                if latest is not None:
+                    exit_time = known.usable.exit_time
+                    yield state_output(known.realm, known.bridge, exit_time, latest)
 
     def expect(self, key: Key, payload: bytes) -> None:
         """Take a position into account before its turn: that another truck was there then.
@@ -185,7 +195,7 @@ class Engine:
             with contextlib.suppress(ValueError):
                 self._traffic.note(key.realm, key.identifier, decode_gnss(payload), for_ever=True)
 
-    def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
+    def feed(self, key: Key, payload: bytes) -> Iterator[Output | Work]:
         """Take one message of a vehicle; other streams are ignored.
 
         ValueError, at once: malformed. What follows from the message comes from the iterator, as
@@ -207,7 +217,7 @@ class Engine:
 
     def _take(
         self, key: Key, vehicle: Vehicle, message: AccelBatch | GnssFix | VehicleInfo
-    ) -> Iterator[Output]:
+    ) -> Iterator[Output | Work]:
         if message.boot_id < self._newest_boot.get((key.realm, key.identifier), 0):
             return  # its crossings have been decided
         truck = self._truck(key, message.boot_id, vehicle)
@@ -221,12 +231,12 @@ class Engine:
             truck.boot.add_fix(message)
             yield from self._settle(key.realm, truck)
 
-    def finish(self) -> Iterator[Output]:
+    def finish(self) -> Iterator[Output | Work]:
         """No more messages will come: decide all crossings with what there is."""
         for (realm, _, _), truck in list(self._trucks.items()):
             yield from self._finish(realm, truck)
 
-    def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Output]:
+    def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Output | Work]:
         """A truck has gone silent: decide the crossings that it has finished.
 
         It may only have lost its connection, and bring what is missing when it has it again. So
@@ -252,7 +262,9 @@ class Engine:
     def _boots_of(self, realm: str, vehicle: str) -> list[_Truck]:
         return [t for name, t in self._trucks.items() if name[:2] == (realm, vehicle)]
 
-    def _settle(self, realm: str, truck: _Truck, *, all_there_is: bool = False) -> Iterator[Output]:
+    def _settle(
+        self, realm: str, truck: _Truck, *, all_there_is: bool = False
+    ) -> Iterator[Output | Work]:
         """Look once at every fix: what is found does not depend on which came together."""
         for fix in truck.boot.settle(all_there_is=all_there_is):
             truck.latest_s = max(truck.latest_s, fix.device_time_ns * 1e-9)
@@ -260,7 +272,7 @@ class Engine:
             yield from self._look(realm, truck, bridges, truck.latest_s)
             self._forget(truck, truck.latest_s)
 
-    def _finish(self, realm: str, truck: _Truck) -> Iterator[Output]:
+    def _finish(self, realm: str, truck: _Truck) -> Iterator[Output | Work]:
         yield from self._settle(realm, truck, all_there_is=True)
         yield from self._look(realm, truck, self._frames, np.inf)
 
@@ -276,8 +288,7 @@ class Engine:
             return
         truck.clock_s = max(truck.clock_s, now_s)
         if now_s - _KEEP_S > max(truck.began_s, truck.forgotten_s) + _FORGET_EVERY_S:
-            truck.forgotten_s = now_s - _KEEP_S
-            truck.boot.forget_before(truck.forgotten_s)
+            truck.forget_before(now_s - _KEEP_S)
 
     def _truck(self, key: Key, boot_id: int, vehicle: Vehicle) -> _Truck:
         name = (key.realm, key.identifier, boot_id)
@@ -286,7 +297,7 @@ class Engine:
             truck = self._trucks[name] = _Truck(vehicle)
         return truck
 
-    def _finish_older_boots(self, key: Key, boot_id: int) -> Iterator[Output]:
+    def _finish_older_boots(self, key: Key, boot_id: int) -> Iterator[Output | Work]:
         """A truck that has started anew says nothing more of its boots before."""
         for name in [n for n in self._trucks if n[:2] == (key.realm, key.identifier)]:
             if name[2] < boot_id:
@@ -296,7 +307,7 @@ class Engine:
     def _may_change(self, truck: _Truck, bridge: Bridge, frame: BridgeFrame, fix: GnssFix) -> bool:
         """Whether a fix can begin, change or end a stay on a bridge: most are far from it."""
         here_m, _ = to_chainage(frame, fix.latitude_deg, fix.longitude_deg)
-        reach_m = _REACH_M + 2.0 * self._margin_m
+        reach_m = _REACH_M + 2.0 * least_depth_m(self._site.receiver)
         side = -1 if here_m < -reach_m else 1 if here_m > bridge.span_m + reach_m else 0
         before = truck.side.get(bridge.id, side)
         truck.side[bridge.id] = side
@@ -309,7 +320,7 @@ class Engine:
         bridges: list[tuple[Bridge, BridgeFrame]],
         now_s: float,
         wait: _Wait | None = None,
-    ) -> Iterator[Output]:
+    ) -> Iterator[Output | Work]:
         """Find crossings in the fixes that are known, and identify those that are complete.
 
         A crossing that is over waits while `wait` says so.
@@ -319,17 +330,7 @@ class Engine:
         wait = wait or self._may_still_come
         fixes = truck.boot.fixes()
         for bridge, frame in bridges:
-            chainage, lateral = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
-            stays = find_stays(
-                fixes.time_s,
-                chainage,
-                lateral,
-                fixes.speed_m_per_s,
-                span_m=bridge.span_m,
-                wheelbase_m=truck.vehicle.wheelbase_m,
-                antenna_to_front_axle_m=truck.vehicle.gps_antenna_to_front_axle_m,
-                margin_m=self._margin_m,
-            )
+            stays = stays_on(bridge, frame, truck.vehicle, self._site.receiver, fixes)
             for stay in stays:
                 yield from self._advance(realm, truck, bridge, stay, now_s, wait)
 
@@ -341,19 +342,25 @@ class Engine:
         stay: Stay,
         now_s: float,
         wait: _Wait,
-    ) -> Iterator[Output]:
+    ) -> Iterator[Output | Work]:
         begins = stay.passage is Passage.BEGINS_ON_BRIDGE
         if begins and stay.entry_s < truck.forgotten_s + _FORGET_EVERY_S:
             return  # what was before has been forgotten; this had been decided before that
         crossing_id, is_new = self._identity(realm, truck, bridge, stay)
         if crossing_id in truck.done:
             return
-        state = _StateMessages(realm, bridge, truck, stay, crossing_id)
+        found = stay  # what is told of its end does not change when it lasts too long
+
+        def told(state: pb.CrossingState, time_s: float) -> Output:
+            return crossing_output(
+                realm, truck.vehicle.id, bridge.id, truck.boot, found, crossing_id, state, time_s
+            )
+
         said = truck.said.get(crossing_id, set())
         if is_new and pb.DETECTED not in said:
-            yield state.message(pb.DETECTED, stay.entry_s)
+            yield told(pb.DETECTED, stay.entry_s)
         if np.isfinite(now_s):
-            if not stay.is_over and now_s - stay.entry_s < _LONGEST_STAY_S:
+            if not stay.is_over and now_s - stay.entry_s < LONGEST_STAY_S:
                 return
             if not stay.is_over:
                 stay = stay._replace(passage=Passage.TURNED_BACK)
@@ -363,20 +370,45 @@ class Engine:
         truck.decided.append((bridge.id, *_fixes_around(truck, stay), crossing_id))
         for begun in (pb.COMPLETE, pb.IDENTIFYING):
             if begun not in said:
-                yield state.message(begun, stay.exit_s)
-        result = self._identified(realm, truck, bridge, stay, crossing_id)
-        latest = self._bridge_state(realm, bridge, result)  # who asks for it with the result has it
+                yield told(begun, stay.exit_s)
+        self._works += 1
+        data = self._data(realm, truck, bridge, stay, crossing_id)
+        work = Work(self._works, data, self._settings)
+        done = told(pb.DONE, stay.exit_s)
+        self._bridge(realm, bridge.id).under_way.append(_UnderWay(work, done))
+        yield work
+
+    def done(self, work: Work, result: Crossing) -> Iterator[Output]:
+        """Take the result of a crossing, and yield what there is to say of it.
+
+        Results of one bridge are told in the order in which their crossings were found, whichever
+        comes first: so nothing depends on how long an identification took. KeyError if the work is
+        none of this engine's, or its result is here already.
+        """
+        bridge = self._of_bridge[work.data.realm, work.data.bridge.id]
+        if all(one.work.number != work.number for one in bridge.under_way):
+            raise KeyError(f"{work.crossing_id} is not under way")
+        bridge.results[work.number] = result
+        while bridge.under_way and bridge.under_way[0].work.number in bridge.results:
+            first = bridge.under_way.popleft()
+            yield from self._result_told(bridge, first, bridge.results.pop(first.work.number))
+
+    def _result_told(
+        self, bridge: _OfBridge, found: _UnderWay, result: Crossing
+    ) -> Iterator[Output]:
+        realm, name = found.work.data.realm, found.work.data.bridge.id
+        counts = usable(result)
+        if counts is not None:  # who asks for the state together with the result has it
+            bridge.counted = count_in(bridge.counted, [counts])
         # A result is dated by the data that made it: the engine has no clock.
         header = self._header._replace(created=result.exit_time)
         estimate = crossing_to_protobuf(result, header)
-        yield Output(
-            Key(realm, "bridge", bridge.id, "estimate"),
-            estimate.SerializeToString(deterministic=True),
-            result,
-        )
-        yield state.message(pb.DONE, stay.exit_s)
-        if latest is not None:
-            yield _state_message(realm, bridge.id, result, latest)
+        payload = estimate.SerializeToString(deterministic=True)
+        yield Output(Key(realm, "bridge", name, "estimate"), payload, result)
+        yield found.done
+        latest = latest_state(bridge.counted)
+        if counts is not None and latest is not None:
+            yield state_output(realm, name, result.exit_time, latest)
 
     def _may_still_come(self, truck: _Truck, stay: Stay, now_s: float) -> bool:
         """Whether something of a crossing is missing that a little patience may bring."""
@@ -405,30 +437,30 @@ class Engine:
         for known_bridge, begin_s, end_s, crossing_id in truck.decided:
             # Fixes that came after all may move an entry far, but not to before the fixes that
             # were known, and nobody is on a bridge twice at once.
-            if known_bridge == bridge.id and _overlap(begin_s, end_s, stay.entry_s, stay.exit_s):
+            if known_bridge == bridge.id and overlap(begin_s, end_s, stay.entry_s, stay.exit_s):
                 return crossing_id, False
         wall_ns = truck.boot.wall_time_ns(stay.entry_s)
-        for told in self._told.get((realm, truck.vehicle.id, bridge.id), ()):
-            if _is_told(told, stay, wall_ns):
-                truck.detected[bridge.id, stay.entry_s] = told.crossing_id
-                truck.said[told.crossing_id] = told.states
-                if told.result is not None:
-                    truck.done.add(told.crossing_id)
-                return told.crossing_id, True
+        for known in self._known.get((realm, truck.vehicle.id, bridge.id), ()):
+            if is_stay_of(known, stay, wall_ns):
+                truck.detected[bridge.id, stay.entry_s] = known.crossing_id
+                truck.said[known.crossing_id] = known.states
+                if known.is_identified:
+                    truck.done.add(known.crossing_id)
+                return known.crossing_id, True
         moment = datetime.fromtimestamp(wall_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]
         crossing_id = f"{truck.vehicle.id}.{bridge.id}.{moment}Z"
         truck.detected[bridge.id, stay.entry_s] = crossing_id
         return crossing_id, True
 
-    def _identified(
+    def _data(
         self, realm: str, truck: _Truck, bridge: Bridge, stay: Stay, crossing_id: str
-    ) -> Crossing:
+    ) -> CrossingData:
         frame = {b.id: f for b, f in self._frames}[bridge.id]
         fixes = truck.boot.fixes()
         chainage, _ = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
         entry_ns = round(stay.entry_s * 1e9)
         wall_offset_s = (truck.boot.wall_time_ns(stay.entry_s) - entry_ns) / 1e9
-        data = CrossingData(
+        return CrossingData(
             crossing_id,
             realm,
             truck.vehicle,
@@ -442,18 +474,16 @@ class Engine:
             wall_offset_s,
             self._against(realm, truck, bridge, stay, crossing_id),
         )
-        report: Report = lambda stage, fraction: self._report(crossing_id, stage, fraction)  # noqa: E731
-        return self._identify(data, self._settings, stopwatch=self._stopwatch, report=report)
 
     def _against(
         self, realm: str, truck: _Truck, bridge: Bridge, stay: Stay, crossing_id: str
     ) -> tuple[Reason, ...]:
         """What is known against a crossing that its own signals do not tell."""
         reasons = []
-        for field, said, known in truck.differences[:1]:
+        for name, said, known in truck.differences[:1]:
             _log.warning(
                 "%s: the truck says that its %s is %g, the site file %g",
-                *(crossing_id, field, said, known),
+                *(crossing_id, name, said, known),
             )
             reasons.append(Reason.VEHICLE_DIFFERS_FROM_SITE)
         wall_ns = truck.boot.wall_time_ns
@@ -465,22 +495,13 @@ class Engine:
             reasons.append(Reason.OTHER_TRUCK_ON_BRIDGE)
         return tuple(reasons)
 
-    def _bridge_state(self, realm: str, bridge: Bridge, result: Crossing) -> BridgeResult | None:
-        """The bridge as the latest usable crossing sees it; crossings are not fused yet."""
-        usable = self._usable.setdefault((realm, bridge.id), [])
-        if result.parameters is None:
-            return None
-        usable.append(result)
-        usable.sort(key=lambda crossing: crossing.entry_time)
-        return latest_state(usable)
+    def _bridge(self, realm: str, bridge: str) -> _OfBridge:
+        return self._of_bridge.setdefault((realm, bridge), _OfBridge())
 
     def bridges(self) -> dict[str, BridgeResult]:
         """The latest state of every bridge that has one, for the results file."""
-        return {
-            bridge: latest_state(crossings)
-            for (_, bridge), crossings in self._usable.items()
-            if crossings
-        }
+        states = {name: latest_state(one.counted) for (_, name), one in self._of_bridge.items()}
+        return {name: state for name, state in states.items() if state is not None}
 
 
 def _fixes_around(truck: _Truck, stay: Stay) -> tuple[float, float]:
@@ -489,92 +510,3 @@ def _fixes_around(truck: _Truck, stay: Stay) -> tuple[float, float]:
     first = int(np.searchsorted(time_s, stay.entry_s, "right")) - 1
     last = int(np.searchsorted(time_s, stay.exit_s, "left"))
     return float(time_s[max(first, 0)]), float(time_s[min(last, time_s.size - 1)])
-
-
-def _overlap(begin: float, end: float, other_begin: float, other_end: float) -> bool:
-    return begin < other_end and other_begin < end
-
-
-def _is_told(told: Told, stay: Stay, entry_ns: int) -> bool:
-    """Whether a stay is a crossing that an earlier run has told of."""
-    if abs(told.entry_ns - entry_ns) < MERGE_S * 1e9:
-        return True
-    if not told.exit_ns:
-        # Of a history that begins on the bridge the entry is not known, only that it is earlier.
-        longest_ns = _LONGEST_STAY_S * 1e9
-        begins = stay.passage is Passage.BEGINS_ON_BRIDGE
-        return begins and 0 < entry_ns - told.entry_ns < longest_ns
-    exit_ns = entry_ns + round((stay.exit_s - stay.entry_s) * 1e9)
-    return _overlap(told.entry_ns, told.exit_ns, entry_ns, exit_ns)
-
-
-def _state_message(realm: str, bridge: str, result: Crossing, latest: BridgeResult) -> Output:
-    message = bridge_to_protobuf(bridge, round(result.exit_time * 1e9), latest)
-    payload = message.SerializeToString(deterministic=True)
-    return Output(Key(realm, "bridge", bridge, "state"), payload)
-
-
-def usable_of(named: Iterable[tuple[Name, Crossing]]) -> dict[Name, list[Crossing]]:
-    """Those of the crossings that gave parameters, by name (of a bridge) in order of entry."""
-    usable: dict[Name, list[Crossing]] = {}
-    for name, crossing in sorted(named, key=lambda one: one[1].entry_time):
-        if crossing.parameters is not None:
-            usable.setdefault(name, []).append(crossing)
-    return usable
-
-
-def latest_state(usable: list[Crossing]) -> BridgeResult:
-    """The latest of a bridge's usable crossings; the others are named as left out."""
-    last = usable[-1]
-    parameters = last.parameters or {}
-    elements: dict[str, Any] = {
-        name: ElementState(mean=p.mean, std=p.std, q025=p.q025, q975=p.q975)
-        for name, p in parameters.items()
-        if name.startswith("EI_")
-    }
-    return BridgeResult(
-        between_crossing_std=None,
-        crossings_used=(last.crossing_id,),
-        crossings_left_out=tuple(
-            LeftOut(crossing_id=crossing.crossing_id, reason="not_fused")
-            for crossing in usable[:-1]
-        ),
-        **elements,
-    )
-
-
-class _StateMessages(NamedTuple):
-    """Makes the messages that tell the states of one crossing."""
-
-    realm: str
-    bridge: Bridge
-    truck: _Truck
-    stay: Stay
-    crossing_id: str
-
-    def message(self, state: pb.CrossingState, time_s: float) -> Output:
-        direction: Direction = "start_to_end" if self.stay.direction > 0 else "end_to_start"
-        wall_time_ns = self.truck.boot.wall_time_ns
-        left = self.stay.passage is not Passage.ENDS_ON_BRIDGE
-        crossing = pb.Crossing(
-            schema_version=1,
-            crossing_id=self.crossing_id,
-            vehicle=self.truck.vehicle.id,
-            bridge=self.bridge.id,
-            direction=direction_to_protobuf(direction),
-            state=state,
-            time_ns=wall_time_ns(time_s),
-            entry_time_ns=wall_time_ns(self.stay.entry_s),
-            exit_time_ns=wall_time_ns(self.stay.exit_s) if left else 0,
-        )
-        return Output(
-            Key(self.realm, "bridge", self.bridge.id, "crossing"),
-            crossing.SerializeToString(deterministic=True),
-        )
-
-
-def feed_all(engine: Engine, messages: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
-    """Feed a whole recording and finish."""
-    for key, payload in messages:
-        yield from engine.feed(key, payload)
-    yield from engine.finish()

@@ -28,6 +28,7 @@ from schemas.signals import CHANNELS
 from services.identification.checks import reasons_before_fit
 from services.identification.crossing_data import (
     LONGEST_SURE_OUTAGE_S,
+    MARGIN_S,
     NORMAL_975,
     CrossingData,
     Floats,
@@ -62,11 +63,10 @@ class Identify(Protocol):
         *,
         stopwatch: Stopwatch,
         report: Report = ...,
+        keep: Keep = ...,
     ) -> results.Crossing: ...
 
 
-MARGIN_S = 1.0
-"""Samples are needed this long before the entry and after the exit."""
 _SLOWEST_M_PER_S = 3.0
 """Below this the wheels feel next to nothing of the bridge's stiffness."""
 _STANDING_M_PER_S = 0.5

@@ -14,6 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.site import Bridge, Receiver, Vehicle
+from services.common.geodesy import BridgeFrame, to_chainage
+from services.identification.streams import Fixes
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -55,6 +59,28 @@ class _Places(NamedTuple):
     depth: Floats  # how far the truck must drive to leave the bridge; negative: how far away it is
     side: Ints  # -1 before the start, 1 behind the end, 0 on the bridge
     sense: Floats  # 1: towards the end, -1: towards the start
+
+
+def least_depth_m(receiver: Receiver) -> float:
+    """How far onto a bridge a truck must come to have been on it, with this receiver."""
+    return max(MARGIN_M, 5.0 * receiver.position_noise_m)
+
+
+def stays_on(
+    bridge: Bridge, frame: BridgeFrame, vehicle: Vehicle, receiver: Receiver, fixes: Fixes
+) -> list[Stay]:
+    """All stays of a truck on a bridge of the site file: the one way from fixes to stays."""
+    chainage_m, lateral_m = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
+    return find_stays(
+        fixes.time_s,
+        chainage_m,
+        lateral_m,
+        fixes.speed_m_per_s,
+        span_m=bridge.span_m,
+        wheelbase_m=vehicle.wheelbase_m,
+        antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
+        margin_m=least_depth_m(receiver),
+    )
 
 
 def find_stays(

@@ -12,7 +12,6 @@ element, 40 modes, steps of at most 0.1 ms), measured, put into messages and fed
 engine: the identification gets what it would get from a recording.
 """
 
-import time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +28,8 @@ from schemas.results import Crossing, Header
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site, Vehicle, site_hash
 from services.drives.runs import Run, run_to_messages
+from services.execution.dispatch import feed_all
+from services.execution.here import Here
 from services.identification.crossing_data import CrossingData
 from services.identification.engine import Engine
 from services.identification.identify import identify
@@ -284,7 +285,7 @@ def see(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[S
 
     def keeping(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
         kept[data.crossing_id] = data
-        return identify(data, settings, keep=draws.__setitem__, **others)
+        return identify(data, settings, **others)
 
     header = Header(
         version=program_version(),
@@ -293,11 +294,13 @@ def see(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[S
         settings=settings.model_dump(mode="json"),
         seed=settings.seed,
     )
-    engine = Engine(site, settings, header, stopwatch=time.perf_counter, identify=keeping)
-    found = []
-    for message in run_to_messages(runs, site, REALM, site.vehicles[0].id):
-        found += [out.result for out in engine.feed(message.key, message.payload)]
-    found += [out.result for out in engine.finish()]
+    messages = run_to_messages(runs, site, REALM, site.vehicles[0].id)
+    outputs = feed_all(
+        Engine(site, settings, header),
+        Here(identify=keeping, keep=draws.__setitem__),
+        ((message.key, message.payload) for message in messages),
+    )
+    found = [output.result for output in outputs]
     return [
         Seen(
             result,

@@ -31,9 +31,13 @@ from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.session import Publisher, Seen, Subscription, open_session
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
+from services.execution.dispatch import Execution, awaited, collected, dispatched
+from services.execution.here import Here
 from services.execution.warm_up import warm_up
 from services.history.result_files import Earlier, ResultFiles, read_earlier
-from services.identification.engine import Engine, Output
+from services.identification.engine import Engine
+from services.identification.known import search_hash
+from services.identification.outputs import Output
 from services.recordings.recording import Message, program_version
 from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
 
@@ -84,7 +88,7 @@ def run(
         moment = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         file = folder / realm / f"results-{moment}.mcap"
         if not is_replayed(realm):
-            earlier = read_earlier(folder / realm, realm, time.time())
+            earlier = read_earlier(folder / realm, realm, time.time(), search_hash(header))
     check_folder_writable(file.parent)
     if file.exists():
         raise InputError(f"{file}: exists, and results are never overwritten; give another name")
@@ -101,7 +105,8 @@ def run(
         def report(crossing_id: str, stage: str, fraction: float) -> None:
             _say_progress(publisher, service_id, crossing_id, stage, fraction)
 
-        engine = Engine(known, settings, header, stopwatch=time.perf_counter, report=report)
+        engine = Engine(known, settings, header)
+        execution = Here(report=report)
         arrivals: _Queue = queue.Queue(_LONGEST_QUEUE)
         closing, failed = threading.Event(), threading.Event()
 
@@ -115,7 +120,7 @@ def run(
         try:
             _resume(engine, earlier, publisher, files)
             receiver.start()
-            _serve(engine, arrivals, publisher, service_id, files, stop, ready)
+            _serve(engine, execution, arrivals, publisher, service_id, files, stop, ready)
         except BaseException:
             files.abandon()
             raise
@@ -223,7 +228,7 @@ def _resume(engine: Engine, earlier: Earlier, publisher: Publisher, files: Resul
             publisher.put(owner, identifier, stream, message.payload, identity)
         except ValueError as error:
             _log.warning("not published again: %s", error)
-    finished = list(engine.resume((m.key, m.payload) for m in earlier.said))
+    finished = list(engine.resume(earlier.crossings))
     _publish(finished, engine, publisher, files)
     if earlier.previous is not None:
         _log.info(
@@ -234,6 +239,7 @@ def _resume(engine: Engine, earlier: Earlier, publisher: Publisher, files: Resul
 
 def _serve(
     engine: Engine,
+    execution: Execution,
     queued: _Queue,
     publisher: Publisher,
     service_id: str,
@@ -278,16 +284,18 @@ def _serve(
             except ValueError as error:
                 _log.warning("refused %s: %s", name, error)
                 continue
-            _publish(outputs, engine, publisher, files)
+            _publish(dispatched(engine, execution, outputs), engine, publisher, files)
         if stop.is_set():
             leave_at_s = min(leave_at_s, time.monotonic() + GONE_AFTER_S)
             arrivals.hurry()
         for gone in arrivals.gone(now_s):
             said = engine.gone(gone.realm, gone.vehicle, for_good=gone.for_good)
-            _publish(said, engine, publisher, files)
+            _publish(dispatched(engine, execution, said), engine, publisher, files)
+        _publish(collected(engine, execution), engine, publisher, files)
         for vehicle in engine.unknown_vehicles - told:
             told.add(vehicle)
             _log.warning("%s drives, but the site file has no such vehicle", vehicle)
+    _publish(awaited(engine, execution), engine, publisher, files)
 
 
 def _next(queued: _Queue) -> Arrived | Token | None:

@@ -18,8 +18,10 @@ from schemas.topics import Key
 from services import worker
 from services.bus.session import Publisher
 from services.common.errors import FailureError
+from services.execution.here import Here
 from services.history.result_files import ResultFiles
-from services.identification.engine import Engine, Output
+from services.identification.engine import Engine
+from services.identification.outputs import Output
 from services.simulation.drive import paper_site
 from services.worker.arrivals import Arrivals, Arrived, Gone, Token
 
@@ -149,7 +151,7 @@ def test_who_is_back_in_the_queue_has_not_gone(
         queued.put(one)
     stop = threading.Event()
     engine = Watched(stop, message(0.0, 3).payload)
-    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
+    worker._serve(engine, Here(), queued, Publisher(None, REALM), "w", files, stop, None)
     assert engine.seen == [message(0.0, number).payload for number in (1, 2, 3)]
 
 
@@ -171,7 +173,7 @@ def test_a_truck_without_token_that_goes_on_talking_does_not_hold_up_the_end(
         queued.put(message(0.1 * number, number))
     stop = threading.Event()
     engine = Undecided(stop, message(0.0, 100).payload)
-    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
+    worker._serve(engine, Here(), queued, Publisher(None, REALM), "w", files, stop, None)
     assert engine.seen == [message(0.0, number).payload for number in range(131)]
 
 
@@ -187,7 +189,7 @@ def test_who_fell_silent_just_before_a_stop_is_decided_before_the_end(
     queued.put(message(10.0, 2))
     stop = threading.Event()
     engine = Undecided(stop, message(0.0, 2).payload)
-    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
+    worker._serve(engine, Here(), queued, Publisher(None, REALM), "w", files, stop, None)
     assert engine.seen == [message(0.0, 1).payload, message(0.0, 2).payload, gone()]
 
 
@@ -223,7 +225,7 @@ def test_an_error_of_the_program_is_not_blamed_on_a_message(
     stop = threading.Event()
     engine = Broken(stop, message(0.0, 1).payload)
     with pytest.raises(FailureError, match="could not be worked out: singular"):
-        worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, None)
+        worker._serve(engine, Here(), queued, Publisher(None, REALM), "w", files, stop, None)
     assert "refused" not in caplog.text
 
 
@@ -237,5 +239,5 @@ def test_a_malformed_message_is_refused_and_named(
     engine = Engine(paper_site(), SETTINGS, HEADER)
     stop = threading.Event()
     ready = threading.Timer(0.5, stop.set)
-    worker._serve(engine, queued, Publisher(None, REALM), "w", files, stop, ready.start)
+    worker._serve(engine, Here(), queued, Publisher(None, REALM), "w", files, stop, ready.start)
     assert caplog.text.count("refused accel of truck-1") == 2

@@ -18,9 +18,10 @@ from schemas.site import Site, site_hash, vehicle_toml
 from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.identification.engine import Engine, Output, feed_all
+from services.identification.outputs import Output
 from services.recordings.recording import Message
 from services.simulation.drive import Drive, paper_site
+from tests.working_engine import WorkingEngine
 
 Floats = NDArray[np.float64]
 START_S = 1_767_225_600.0
@@ -33,9 +34,9 @@ HASTY = IdentificationSettings(method="random_walk", particles=4, steps=1)
 """For drives whose accelerations mean nothing: others would look for long."""
 
 
-def engine(site: Site = SITE, chosen: IdentificationSettings = HASTY) -> Engine:
+def engine(site: Site = SITE, chosen: IdentificationSettings = HASTY) -> WorkingEngine:
     header = Header("0", 0.0, site_hash(site), chosen.model_dump(mode="json"), chosen.seed)
-    return Engine(site, chosen, header)
+    return WorkingEngine(site, chosen, header)
 
 
 def drive(
@@ -77,7 +78,8 @@ def messages_of(*runs: Run, site: Site = SITE, vehicle: str = "truck-1") -> list
 def fed(
     messages: Iterable[Message], site: Site = SITE, chosen: IdentificationSettings = HASTY
 ) -> list[Output]:
-    return list(feed_all(engine(site, chosen), ((m.key, m.payload) for m in messages)))
+    one = engine(site, chosen)
+    return [*(o for m in messages for o in one.feed(m.key, m.payload)), *one.finish()]
 
 
 def results_in(outputs: list[Output]) -> list[Crossing]:
@@ -527,7 +529,8 @@ def test_a_recording_is_fed_truck_by_truck_and_counts_both_all_the_same() -> Non
     one = engine(site)
     for message in [*first, *second]:
         one.expect(message.key, message.payload)
-    found = results_in(list(feed_all(one, ((m.key, m.payload) for m in [*first, *second]))))
+    outputs = [o for m in [*first, *second] for o in one.feed(m.key, m.payload)]
+    found = results_in([*outputs, *one.finish()])
     assert ["other_truck_on_bridge" in c.reasons for c in found] == [True, True]
 
 
@@ -645,9 +648,7 @@ def test_channels_of_different_rates_are_identified(scenario_6: Drive) -> None:
 
 def test_the_random_walk_says_what_it_is(crossing_messages: list[Message]) -> None:
     chosen = IdentificationSettings(method="random_walk", particles=16, steps=10, seed=4)
-    header = Header("0", 0.0, site_hash(SITE), chosen.model_dump(mode="json"), chosen.seed)
-    pairs = [(m.key, m.payload) for m in crossing_messages]
-    (crossing,) = results_in(list(feed_all(Engine(SITE, chosen, header), pairs)))
+    (crossing,) = results_in(fed(crossing_messages, chosen=chosen))
     assert crossing.method == "random_walk"
     assert "no_noise_model" in crossing.reasons
     assert crossing.diagnostics["iterations"] == 10

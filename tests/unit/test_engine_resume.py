@@ -14,11 +14,13 @@ from schemas.site import site_hash
 from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.execution.here import Here
 from services.identification.crossing_data import CrossingData, Passing, rejected
-from services.identification.engine import Engine, Output
 from services.identification.identify import Stopwatch
+from services.identification.outputs import Output
 from services.recordings.recording import Message
 from services.simulation.drive import paper_site
+from tests.working_engine import WorkingEngine
 
 REALM = "sim-test"
 START_S = 1_767_225_600.0
@@ -41,6 +43,7 @@ class Identifications:
         *,
         stopwatch: Stopwatch,
         report: object = None,
+        keep: object = None,
     ) -> Crossing:
         self.made += 1
         stay = data.stay
@@ -58,8 +61,8 @@ class Identifications:
         )
 
 
-def engine(counted: Identifications | None = None, header: Header = HEADER) -> Engine:
-    return Engine(SITE, SETTINGS, header, identify=counted or Identifications())
+def engine(counted: Identifications | None = None, header: Header = HEADER) -> WorkingEngine:
+    return WorkingEngine(SITE, SETTINGS, header, Here(identify=counted or Identifications()))
 
 
 def messages_of(
@@ -91,7 +94,7 @@ def messages_of(
     ]
 
 
-def fed(one: Engine, messages: Iterable[Message]) -> list[Output]:
+def fed(one: WorkingEngine, messages: Iterable[Message]) -> list[Output]:
     return [output for m in messages for output in one.feed(m.key, m.payload)]
 
 

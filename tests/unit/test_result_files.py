@@ -3,6 +3,7 @@
 import os
 import resource
 import signal
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -10,12 +11,14 @@ import pytest
 from schemas.results import Crossing, Header, crossing_to_protobuf, load_results
 from schemas.topics import Key
 from services.common.errors import FailureError
-from services.history.result_files import Earlier, ResultFiles, read_earlier
+from services.history.result_files import Earlier, MessageName, ResultFiles, read_earlier
+from services.identification.known import search_hash
 from services.recordings.recording import Message, RecordingWriter
 
 REALM = "live"
 NOW_S = 1_800_000_000.0
 HEADER = Header("0.1", NOW_S, "abc", {"method": "pre"}, 1)
+SEARCH = search_hash(HEADER)
 WHERE = Key(REALM, "bridge", "b", "estimate")
 
 
@@ -65,18 +68,18 @@ def written(
     return path
 
 
-def sequences(messages: tuple[Message, ...]) -> list[tuple[int, int]]:
+def sequences(messages: Iterable[Message | MessageName]) -> list[tuple[int, int]]:
     return [(message.boot_id, message.sequence) for message in messages]
 
 
 def test_a_folder_that_is_not_there_holds_nothing(tmp_path: Path) -> None:
-    assert read_earlier(tmp_path / "none", REALM, NOW_S) == Earlier()
+    assert read_earlier(tmp_path / "none", REALM, NOW_S, SEARCH) == Earlier()
 
 
 def test_the_last_minute_of_a_run_that_ended_well_is_unsure_too(tmp_path: Path) -> None:
     """The router may have been away when it was stopped: to put a message tells nothing."""
     path = written(tmp_path / "results-1.mcap", estimate(0), estimate(1), end=True)
-    found = read_earlier(tmp_path, REALM, NOW_S)
+    found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     assert sequences(found.said) == [(1, 0), (1, 1)]
     assert sequences(found.unsure) == [(1, 1)]  # the other is 100 s older
     assert found.previous == path.name
@@ -90,7 +93,7 @@ def test_the_last_minute_of_a_run_that_was_killed_is_unsure(tmp_path: Path) -> N
         estimate(1, time_s=NOW_S + 45.0),
         estimate(2, time_s=NOW_S + 100.0),
     )
-    found = read_earlier(tmp_path, REALM, NOW_S)
+    found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     assert sequences(found.said) == [(1, 0), (1, 1), (1, 2)]
     assert sequences(found.unsure) == [(1, 1), (1, 2)]
 
@@ -109,7 +112,7 @@ def test_a_run_that_was_continued_long_enough_has_been_published_again(
         previous=first.name,
         began_s=NOW_S,
     )
-    found = read_earlier(tmp_path, REALM, NOW_S)
+    found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     assert sequences(found.said) == [(1, 0), (2, 1)]
     is_continued = end or lived_s > 60.0
     assert sequences(found.unsure) == ([] if is_continued else [(1, 0)]) + [(2, 1)]
@@ -122,7 +125,7 @@ def test_a_run_that_goes_on_is_known_and_left_alone(tmp_path: Path) -> None:
     writer.write(estimate(0))
     writer.sync()
     os.utime(writer.path, (NOW_S, NOW_S))
-    found = read_earlier(tmp_path, REALM, NOW_S)
+    found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     assert (sequences(found.said), found.unsure) == ([(1, 0)], ())
     assert not (tmp_path / "results-1.json").exists()
     writer.finish("test")
@@ -133,13 +136,13 @@ def test_other_realms_and_old_files_are_left_out(tmp_path: Path) -> None:
     written(tmp_path / "results-1.mcap", other)
     old = written(tmp_path / "results-2.mcap", estimate(0))
     os.utime(old, (NOW_S - 3 * 86_400.0, NOW_S - 3 * 86_400.0))
-    assert read_earlier(tmp_path, REALM, NOW_S) == Earlier()
+    assert read_earlier(tmp_path, REALM, NOW_S, SEARCH) == Earlier()
 
 
 def test_a_recovered_copy_adds_nothing(tmp_path: Path) -> None:
     written(tmp_path / "results-1.mcap", estimate(0), estimate(1))
     written(tmp_path / "results-1.recovered.mcap", estimate(0), estimate(1), end=True)
-    found = read_earlier(tmp_path, REALM, NOW_S)
+    found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     assert sequences(found.said) == [(1, 0), (1, 1)]
 
 
@@ -152,7 +155,7 @@ def test_a_file_that_is_cut_off_is_read_as_far_as_it_goes(
     whole.write_bytes(content[: round(share * len(content))])
     os.utime(whole, (NOW_S, NOW_S))
     written(tmp_path / "results-2.mcap", estimate(8), end=True)
-    said = sequences(read_earlier(tmp_path, REALM, NOW_S).said)
+    said = sequences(read_earlier(tmp_path, REALM, NOW_S, SEARCH).said)
     known = len(said) - 1
     assert said == [*((1, n) for n in range(known)), (1, 8)]
     assert (known > 0) == (share >= 0.75)
@@ -168,7 +171,7 @@ def test_no_damage_is_a_failure(tmp_path: Path, position: int) -> None:
     path.write_bytes(content)
     os.utime(path, (NOW_S, NOW_S))
     written(tmp_path / "results-2.mcap", estimate(4), end=True)
-    assert (1, 4) in sequences(read_earlier(tmp_path, REALM, NOW_S).said)
+    assert (1, 4) in sequences(read_earlier(tmp_path, REALM, NOW_S, SEARCH).said)
 
 
 def test_a_damaged_time_of_the_start_is_a_warning(
@@ -183,7 +186,7 @@ def test_a_damaged_time_of_the_start_is_a_warning(
     path.write_bytes(content)
     os.utime(path, (NOW_S, NOW_S))
     written(tmp_path / "results-2.mcap", estimate(1), end=True)
-    assert sequences(read_earlier(tmp_path, REALM, NOW_S).said) == [(1, 1)]
+    assert sequences(read_earlier(tmp_path, REALM, NOW_S, SEARCH).said) == [(1, 1)]
     assert "are left out" in caplog.text
 
 
@@ -200,7 +203,7 @@ def test_results_that_stand_in_the_recording_only_get_into_the_json_file(
         files.finish()
         path.unlink()
     written(path, estimate(1), estimate(2))
-    read_earlier(tmp_path, REALM, NOW_S)
+    read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     found = load_results(path.with_suffix(".json"))
     assert [crossing.crossing_id for crossing in found.crossings] == ["t.b.1", "t.b.2"]
     assert (found.site_hash, found.settings, found.seed) == ("abc", {"method": "pre"}, 1)
@@ -210,7 +213,7 @@ def test_results_that_stand_in_the_recording_only_get_into_the_json_file(
     assert bridge.crossings_used == ("t.b.2",)
     assert [out.crossing_id for out in bridge.crossings_left_out] == ["t.b.0", "t.b.1"]
     before = path.with_suffix(".json").read_bytes()
-    read_earlier(tmp_path, REALM, NOW_S)
+    read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     assert path.with_suffix(".json").read_bytes() == before
 
 
@@ -220,7 +223,7 @@ def test_the_latest_state_of_each_bridge_is_latched(tmp_path: Path) -> None:
 
     written(tmp_path / "results-1.mcap", state("a", 0), state("b", 1), state("b", 2), end=True)
     written(tmp_path / "results-2.mcap", state("b", 3), estimate(4), end=True)
-    found = read_earlier(tmp_path, REALM, NOW_S)
+    found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     assert [(m.key.identifier, m.sequence) for m in found.latched] == [("a", 0), ("b", 3)]
 
 
@@ -232,7 +235,7 @@ def test_a_run_whose_results_could_not_be_written_has_no_end(tmp_path: Path) -> 
         files.write(estimate(0), result(0), {})
     files.abandon()
     os.utime(files.path, (NOW_S, NOW_S))
-    assert sequences(read_earlier(tmp_path, REALM, NOW_S).unsure) == [(1, 0)]
+    assert sequences(read_earlier(tmp_path, REALM, NOW_S, SEARCH).unsure) == [(1, 0)]
 
 
 def test_a_disk_that_is_full_at_the_end_is_a_failure_in_one_line(tmp_path: Path) -> None:
@@ -249,4 +252,4 @@ def test_a_disk_that_is_full_at_the_end_is_a_failure_in_one_line(tmp_path: Path)
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
     os.utime(files.path, (NOW_S, NOW_S))
-    assert sequences(read_earlier(tmp_path, REALM, NOW_S).unsure) == [(1, 0)]
+    assert sequences(read_earlier(tmp_path, REALM, NOW_S, SEARCH).unsure) == [(1, 0)]

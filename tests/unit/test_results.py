@@ -178,6 +178,7 @@ def test_the_file_has_the_fields_of_the_contract() -> None:
     assert set(content["bridges"]["bridge-1"]) == {
         "EI_1", "EI_2", "EI_9", "EI_10",
         "between_crossing_std", "crossings_used", "crossings_left_out",
+        "crossings_left_out_count",
     }  # fmt: skip
 
 

@@ -27,9 +27,11 @@ from schemas.signals import CHANNELS, Channel, decode_accel, encode_accel
 from schemas.site import Bridge, Site, Vehicle, site_hash
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.identification.engine import Engine, feed_all
+from services.execution.dispatch import feed_all
+from services.identification.engine import Engine
 from services.recordings.recording import Message
 from services.simulation.drive import START_TIME_S, beam_of, declared, paper_site, truck_of
+from tests.working_engine import unhurried
 
 Floats = NDArray[np.float64]
 Channels = dict[str, Floats]
@@ -97,7 +99,7 @@ def identified(case: Case, settings: IdentificationSettings | None = None) -> Cr
     chosen = settings or IdentificationSettings(method="pre", seed=0)
     header = Header("0", 0.0, site_hash(case.site), chosen.model_dump(mode="json"), chosen.seed)
     pairs = ((m.key, m.payload) for m in case.messages)
-    outputs = list(feed_all(Engine(case.site, chosen, header), pairs))
+    outputs = list(feed_all(Engine(case.site, chosen, header), unhurried(), pairs))
     (result,) = [output.result for output in outputs if output.result is not None]
     return result
 

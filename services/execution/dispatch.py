@@ -1,0 +1,91 @@
+"""Between the engine, which says what is to be identified, and where that is done.
+
+The engine's messages come through in their order; a crossing is handed to an `Execution`, and what
+the engine says of its result follows when it has come.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple, Protocol
+
+from schemas.reasons import Reason
+from schemas.results import Crossing
+from schemas.topics import Key
+from services.identification.crossing_data import Passing, rejected
+from services.identification.engine import Engine
+from services.identification.outputs import Output, Work
+
+_LOOK_AGAIN_S = 0.1
+
+
+class Finished(NamedTuple):
+    """A crossing with its result."""
+
+    work: Work
+    result: Crossing
+
+
+class Execution(Protocol):
+    """Where crossings are identified. To be used from one thread."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether there are works that `finished` has not given back yet."""
+
+    @property
+    def is_full(self) -> bool:
+        """Whether more works should wait until some have been given back."""
+
+    def start(self, work: Work) -> None:
+        """Take a work; it is done now, later or elsewhere."""
+
+    def finished(self, timeout_s: float = 0.0) -> list[Finished]:
+        """What has been done since the last call, each work once, in any order.
+
+        If there is nothing yet, what has been done as soon as something has, or `timeout_s` is
+        over.
+        """
+
+
+def dispatched(
+    engine: Engine, execution: Execution, said: Iterable[Output | Work]
+) -> Iterator[Output]:
+    """What the engine says, its works executed; what comes back meanwhile is told, too."""
+    for one in said:
+        if isinstance(one, Output):
+            yield one
+            continue
+        execution.start(one)
+        yield from collected(engine, execution)
+        while execution.is_full:
+            yield from collected(engine, execution, _LOOK_AGAIN_S)
+
+
+def collected(engine: Engine, execution: Execution, timeout_s: float = 0.0) -> Iterator[Output]:
+    """What the engine says of the results that have come."""
+    for work, result in execution.finished(timeout_s):
+        yield from engine.done(work, result)
+
+
+def awaited(engine: Engine, execution: Execution) -> Iterator[Output]:
+    """What the engine says of everything that is still being identified."""
+    while execution.is_busy:
+        yield from collected(engine, execution, _LOOK_AGAIN_S)
+
+
+def feed_all(
+    engine: Engine, execution: Execution, messages: Iterable[tuple[Key, bytes]]
+) -> Iterator[Output]:
+    """Feed a whole recording, and finish."""
+    for key, payload in messages:
+        yield from dispatched(engine, execution, engine.feed(key, payload))
+    yield from dispatched(engine, execution, engine.finish())
+    yield from awaited(engine, execution)
+
+
+def failed(work: Work) -> Crossing:
+    """The result of a crossing whose identification failed in a way that nobody foresaw."""
+    data = work.data
+    stay, way_m = data.stay, data.bridge.span_m + data.vehicle.wheelbase_m
+    speed_m_per_s = way_m / (stay.exit_s - stay.entry_s) if stay.exit_s > stay.entry_s else 0.0
+    passing = Passing(stay.entry_s, stay.exit_s, speed_m_per_s)
+    return rejected(data, work.settings, passing, [Reason.FAILED])

@@ -1,0 +1,119 @@
+"""What is known of crossings, read from messages that were recorded: the one place for it.
+
+A worker that starts again reads its results files (`result_files`), a logger that makes room the
+recordings (`processed`). Both ask what is made here: `Known`, in `services.identification.known`.
+"""
+
+import logging
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from schemas.messages import decode
+from schemas.proto import driveby_pb2 as pb
+from schemas.results import Crossing, Header, estimate_to_crossing
+from schemas.topics import Key, topic
+from services.identification.bridge_state import usable
+from services.identification.known import Known, search_hash
+
+_log = logging.getLogger(__name__)
+_Name = tuple[str, str]
+"""Realm and crossing id."""
+
+
+class Told(NamedTuple):
+    """A result that was told."""
+
+    result: Crossing
+    header: Header
+
+
+class Store:
+    """Takes messages in the order in which they were told, and keeps what they say of crossings.
+
+    It keeps no message: its memory grows by some hundred bytes with each crossing. With a `search`
+    (`search_hash`) only results of that search are results: what another search or another site
+    file gave does not count, and its states are told anew.
+    """
+
+    def __init__(self, search: str | None) -> None:
+        self._search = search
+        self._found: dict[_Name, Known] = {}
+        self._of_others: set[_Name] = set()
+        self._open: dict[tuple[str, str], Known] = {}
+        """By realm and bridge: the latest usable result of which no state has taken account."""
+
+    def add(self, key: Key, payload: bytes) -> Told | None:
+        """Take a message in, and return the result that it tells, if any.
+
+        What is none of a bridge's messages is ignored, what is malformed a warning.
+        """
+        if key.owner != "bridge":
+            return None
+        try:
+            message = decode(topic(key.owner, key.stream).message, payload)
+            bridge = getattr(message, "bridge", key.identifier)
+            if bridge != key.identifier:
+                raise ValueError(f"it is about {bridge}, on the topic of {key.identifier}")
+            if isinstance(message, pb.Crossing):
+                self._add_state(key, message)
+            elif isinstance(message, pb.Estimate):
+                told = Told(*estimate_to_crossing(message))
+                self._add_result(key, told)
+                return told
+            elif isinstance(message, pb.BridgeState):
+                # Told right behind the result that it takes account of (`Engine.done`).
+                known = self._open.pop((key.realm, key.identifier), None)
+                if known is not None:
+                    known.is_in_state = True
+        except ValueError as error:
+            _log.warning("%s of an earlier run left out: %s", key.stream, error)
+        return None
+
+    def crossings(self) -> list[Known]:
+        """All crossings in order of their entries."""
+        for name, known in self._found.items():
+            if not known.has_result and name in self._of_others:
+                known.states.clear()
+        return sorted(self._found.values(), key=lambda known: known.entry_ns)
+
+    def _add_state(self, key: Key, message: pb.Crossing) -> None:
+        known = self._found.setdefault(
+            (key.realm, message.crossing_id),
+            Known(key.realm, message.vehicle, key.identifier, message.crossing_id, 0),
+        )
+        known.entry_ns = message.entry_time_ns
+        known.exit_ns = max(known.exit_ns, message.exit_time_ns)
+        known.states.add(message.state)
+        known.last = message
+
+    def _add_result(self, key: Key, told: Told) -> None:
+        result = told.result
+        name = (key.realm, result.crossing_id)
+        known = self._found.get(name)
+        if known is not None:
+            # What was told before it was told of another search's result.
+            known.states.discard(pb.DONE)
+            known.is_in_state = False
+        if self._search not in (None, search_hash(told.header)):
+            self._of_others.add(name)
+            return
+        if known is None:
+            entry_ns = round(result.entry_time * 1e9)
+            known = self._found[name] = Known(
+                key.realm, result.vehicle, key.identifier, result.crossing_id, entry_ns
+            )
+        known.exit_ns = max(known.exit_ns, round(result.exit_time * 1e9))
+        known.has_result = True
+        known.usable = usable(result)
+        if known.usable is not None:
+            self._open[key.realm, key.identifier] = known
+
+
+def known_crossings(
+    messages: Iterable[tuple[Key, bytes]], search: str | None = None
+) -> list[Known]:
+    """What messages, in the order in which they were told, say of crossings."""
+    store = Store(search)
+    for key, payload in messages:
+        store.add(key, payload)
+    return store.crossings()

@@ -1,0 +1,58 @@
+"""An engine whose works are done at once: messages in, messages out."""
+
+from collections.abc import Iterable, Iterator
+
+from schemas.results import BridgeResult, Header
+from schemas.settings import IdentificationSettings
+from schemas.site import Site
+from schemas.topics import Key
+from services.execution.dispatch import Execution, dispatched
+from services.execution.here import Here
+from services.history.store import known_crossings
+from services.identification.engine import Engine
+from services.identification.known import search_hash
+from services.identification.outputs import Output
+
+
+def unhurried() -> Here:
+    """Identifies here, in no time: the seconds that it took are the only thing that varies."""
+    return Here(stopwatch=lambda: 0.0)
+
+
+class WorkingEngine:
+    def __init__(
+        self,
+        site: Site,
+        settings: IdentificationSettings,
+        header: Header,
+        execution: Execution | None = None,
+    ) -> None:
+        self.inner = Engine(site, settings, header)
+        self._execution = execution or unhurried()
+        self._header = header
+
+    def resume(self, said: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
+        return self.inner.resume(known_crossings(said, search_hash(self._header)))
+
+    def expect(self, key: Key, payload: bytes) -> None:
+        self.inner.expect(key, payload)
+
+    def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
+        return dispatched(self.inner, self._execution, self.inner.feed(key, payload))
+
+    def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Output]:
+        said = self.inner.gone(realm, vehicle, for_good=for_good)
+        return dispatched(self.inner, self._execution, said)
+
+    def finish(self) -> Iterator[Output]:
+        return dispatched(self.inner, self._execution, self.inner.finish())
+
+    def has_undecided(self, realm: str, vehicle: str) -> bool:
+        return self.inner.has_undecided(realm, vehicle)
+
+    def bridges(self) -> dict[str, BridgeResult]:
+        return self.inner.bridges()
+
+    @property
+    def unknown_vehicles(self) -> set[str]:
+        return self.inner.unknown_vehicles
