@@ -225,6 +225,7 @@ def _worker(options: argparse.Namespace) -> int:
         service_id=options.id,
         ready=lambda: print(f"ready, waiting for crossings in realm {options.realm}", flush=True),
         tls=options.tls,
+        processes=options.processes,
     )
 
 
@@ -544,6 +545,13 @@ def _add_live(commands: Any) -> None:
     _add_folder(p, "folder of the results")
     _add_file(p, "--file", "RESULTS.mcap", "put the results into this one new file (and .json)")
     _add_method(p)
+    p.add_argument(
+        "--processes",
+        type=_whole("processes", 1, 256),
+        default=1,
+        metavar="N",
+        help="identify so many crossings at once, beside the process that listens (default: 1)",
+    )
     _add_id(p, "worker")
 
     p = _command(

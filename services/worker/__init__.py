@@ -32,8 +32,7 @@ from services.bus.session import Publisher, Seen, Subscription, open_session
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
 from services.execution.dispatch import Execution, awaited, collected, dispatched
-from services.execution.here import Here
-from services.execution.warm_up import warm_up
+from services.execution.processes import Processes
 from services.history.result_files import Earlier, ResultFiles, read_earlier
 from services.identification.engine import Engine
 from services.identification.known import search_hash
@@ -62,13 +61,15 @@ def run(
     service_id: str,
     ready: Callable[[], None] | None = None,
     tls: Path | None = None,
+    processes: int = 1,
 ) -> int:
     """Identify all crossings of a realm until SIGINT or SIGTERM; return 0.
 
     Results are written to `folder/REALM/results-TIME.mcap` and `.json` beside it, and published.
     What earlier runs left in that folder is taken up, unless this run has a `file` of its own or
     the realm is one of replays. Waits for the router for ever. `ready` is called once, when the
-    worker listens. `tls` is a folder of credentials, see `open_session`.
+    worker listens. `tls` is a folder of credentials, see `open_session`. Crossings are identified
+    in so many `processes` beside this one.
     InputError: a bad site file, realm or id. FailureError: a result cannot be written.
     """
     _check_names(realm, service_id)
@@ -95,18 +96,18 @@ def run(
     files = ResultFiles(file, text, header, earlier.previous)
     # A second signal: what was published is on the disk, and the next run takes it up.
     with stopped_by_signals(leave_at_once) as stop, contextlib.ExitStack() as stack:
-        warm_up()
+
+        def report(crossing_id: str, stage: str, fraction: float) -> None:
+            _say_progress(publisher, service_id, crossing_id, stage, fraction)
+
+        execution = stack.enter_context(Processes(processes, report=report))
         bus = _connected(endpoint, tls, stop)
         if bus is None:
             return 0
         stack.enter_context(bus)
         publisher = Publisher(bus, realm)
-
-        def report(crossing_id: str, stage: str, fraction: float) -> None:
-            _say_progress(publisher, service_id, crossing_id, stage, fraction)
-
         engine = Engine(known, settings, header)
-        execution = Here(report=report)
+        execution.wait_until_warm()
         arrivals: _Queue = queue.Queue(_LONGEST_QUEUE)
         closing, failed = threading.Event(), threading.Event()
 

@@ -1,0 +1,231 @@
+"""Crossings in processes of their own: the same results, whatever becomes of a process."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from schemas.results import Crossing
+from schemas.settings import IdentificationSettings
+from services.common.errors import FailureError
+from services.execution.dispatch import Finished, feed_all
+from services.execution.processes import Processes
+from services.identification.crossing_data import CrossingData
+from services.identification.engine import Engine
+from services.identification.outputs import Work
+from tests.unit.test_engine_resume import (
+    HEADER,
+    SETTINGS,
+    SITE,
+    THERE_AND_BACK,
+    TWO,
+    WHOLE,
+    Identifications,
+    messages_of,
+)
+
+LONGEST_S = 100.0
+
+
+def nothing() -> None:
+    """These searches have no kernels."""
+
+
+def quick(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+    others["report"]("half", 0.5)
+    return Identifications()(data, settings, stopwatch=others["stopwatch"])
+
+
+def deadly(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+    """The way back kills its process, always."""
+    if data.stay.direction < 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return quick(data, settings, **others)
+
+
+def deadly_once(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+    """Each crossing kills the first process that tries it."""
+    mark = Path(os.environ["DEADLY_ONCE"]) / data.crossing_id
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return quick(data, settings, **others)
+
+
+def broken(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+    raise np.linalg.LinAlgError("singular")
+
+
+def slow(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+    """For ever."""
+    while True:
+        time.sleep(1.0)
+
+
+def works() -> list[Work]:
+    engine = Engine(SITE, SETTINGS, HEADER)
+    said = [one for m in TWO for one in engine.feed(m.key, m.payload)]
+    return [one for one in said if isinstance(one, Work)]
+
+
+def all_of(processes: Processes) -> list[Finished]:
+    found: list[Finished] = []
+    deadline = time.monotonic() + LONGEST_S
+    while processes.is_busy and time.monotonic() < deadline:
+        found += processes.finished(0.1)
+    assert not processes.is_busy
+    return found
+
+
+def pairs() -> Iterator[Any]:
+    return ((m.key, m.payload) for m in TWO)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_bytes_are_those_of_one_process(number: int) -> None:
+    told: list[tuple[str, str, float]] = []
+    with Processes(
+        number, identify=quick, prepare=nothing, report=lambda *how: told.append(how)
+    ) as processes:
+        processes.wait_until_warm()
+        outputs = list(feed_all(Engine(SITE, SETTINGS, HEADER), processes, pairs()))
+    assert [(o.key, o.payload) for o in by_stream(outputs)] == [
+        (o.key, o.payload) for o in by_stream(WHOLE)
+    ]
+    assert [o.key.stream for o in outputs if o.key.stream != "crossing"] == [
+        "estimate",
+        "state",
+        "estimate",
+        "state",
+    ]
+    deadline = time.monotonic() + LONGEST_S
+    while len(told) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert {(name, *how) for name, *how in told} == {
+        (o.result.crossing_id, "half", 0.5) for o in WHOLE if o.result
+    }
+
+
+def by_stream(outputs: list[Any]) -> list[Any]:
+    """States of crossings may be told while another crossing is identified."""
+    return sorted(outputs, key=lambda o: (o.key.stream, o.payload * (o.key.stream == "crossing")))
+
+
+def test_a_process_that_dies_twice_costs_its_own_crossing_only() -> None:
+    first, second = works()
+    with Processes(1, identify=deadly, prepare=nothing) as processes:
+        for work in (second, first):
+            processes.start(work)
+        results = {work.number: result for work, result in all_of(processes)}
+    assert results[first.number].verdict == "good"
+    assert results[second.number].reasons == ("failed",)
+    assert results[second.number].speed_m_per_s == pytest.approx(10.0, rel=0.01)
+
+
+def test_a_process_that_dies_once_costs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
+    with Processes(2, identify=deadly_once, prepare=nothing) as processes:
+        for work in works():
+            processes.start(work)
+        results = [result for _, result in all_of(processes)]
+    assert [result.verdict for result in results] == ["good", "good"]
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_an_error_in_a_process_is_a_verdict(caplog: pytest.LogCaptureFixture) -> None:
+    (work, _) = works()
+    with Processes(1, identify=broken, prepare=nothing) as processes:
+        processes.start(work)
+        (finished,) = all_of(processes)
+    assert finished.work.number == work.number
+    assert finished.result.reasons == ("failed",)
+    assert "singular" in caplog.text
+
+
+def die() -> None:
+    os._exit(3)
+
+
+def test_a_process_that_cannot_begin_is_a_failure() -> None:
+    with (
+        Processes(1, identify=quick, prepare=die) as processes,
+        pytest.raises(FailureError, match="died while it was started"),
+    ):
+        processes.wait_until_warm()
+
+
+def test_more_than_a_few_wait_elsewhere() -> None:
+    (work, _) = works()
+    with Processes(1, identify=slow, prepare=nothing) as processes:
+        full = []
+        for _ in range(3):
+            processes.start(work)
+            full.append(processes.is_full)
+        assert full == [False, False, True]
+        assert processes.is_busy
+        assert processes.finished() == []
+
+
+STARTER = """
+import sys, time
+from services.execution.processes import Processes
+from tests.unit.execution.test_processes import nothing, slow, works
+processes = Processes(1, identify=slow, prepare=nothing)
+processes.wait_until_warm()
+processes.start(works()[0])
+import multiprocessing
+print(multiprocessing.active_children()[0].pid, flush=True)
+if sys.argv[1] == "close":
+    processes.close()
+else:
+    time.sleep(1000.0)
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("end", ["close", "kill"])
+def test_no_process_outlives_who_started_it(end: str) -> None:
+    """Neither one that is closed in the middle of an identification, nor one that is killed."""
+    command = [sys.executable, "-c", STARTER, end]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as starter:
+        assert starter.stdout is not None
+        pid = int(starter.stdout.readline())
+        if end == "kill":
+            starter.kill()
+        starter.wait(LONGEST_S)
+    deadline = time.monotonic() + LONGEST_S
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{pid}").exists()
+
+
+def test_results_may_come_back_in_any_order() -> None:
+    """What is told of a bridge is the same; the second waits for the first."""
+    more = messages_of(*THERE_AND_BACK, (60.0, -60.0), (80.0, 140.0))
+    orders = {}
+    for order in ((0, 1, 2), (2, 1, 0), (1, 0, 2)):
+        engine = Engine(SITE, SETTINGS, HEADER)
+        said = [one for m in more for one in engine.feed(m.key, m.payload)]
+        said += list(engine.finish())
+        found = [one for one in said if isinstance(one, Work)]
+        assert len(found) == 3
+        told = []
+        for n in order:
+            result = Identifications()(found[n].data, SETTINGS, stopwatch=lambda: 0.0)
+            told.append([*engine.done(found[n], result)])
+        orders[order] = [output for outputs in told for output in outputs]
+        if order == (2, 1, 0):
+            assert [len(outputs) for outputs in told] == [0, 0, 9]
+        with pytest.raises(KeyError):
+            list(engine.done(found[0], result))
+    first, *others = orders.values()
+    assert all(other == first for other in others)
