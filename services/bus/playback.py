@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from types import FrameType
 
 from schemas.topics import Key
-from services.bus.session import Delivery, Publisher
+from services.bus.delivery import Delivery
+from services.bus.publisher import Publisher
 from services.common.errors import FailureError, InputError
 from services.recordings.recording import Message
 

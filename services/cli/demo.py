@@ -27,7 +27,8 @@ from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, estimate_to_crossing
 from schemas.site import Site, site_toml
-from services.bus.session import Received, Subscription, open_session
+from services.bus.session import open_session
+from services.bus.subscription import Received, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import write_atomically
 from services.recordings.recording import read_info, read_messages

@@ -34,6 +34,9 @@ _TRIES = 2
 _WAITING_PER_PROCESS = 2
 """What waits here is finished even after a signal, and a service has a minute to end."""
 
+_LONGEST_END_S = 5.0
+"""A process ends as soon as its interpreter has a turn, which a kernel may hold up for a while."""
+
 
 class _Job(NamedTuple):
     work: Work
@@ -165,6 +168,8 @@ class _Place:
         self._executor.shutdown(wait=False, cancel_futures=True)
         self._lifeline.close()
         self._send.close()
+        # A thread that is still publishing when the interpreter ends would abort the process.
+        self._reader.join(_LONGEST_END_S)
 
     def _open(self) -> None:
         receive, self._send = _SPAWN.Pipe(duplex=False)
@@ -174,8 +179,10 @@ class _Place:
         )
         self.is_warm = self._executor.submit(_nothing)
         its_end.close()
-        reader = threading.Thread(target=self._read, args=(receive,), name="progress", daemon=True)
-        reader.start()
+        self._reader = threading.Thread(
+            target=self._read, args=(receive,), name="progress", daemon=True
+        )
+        self._reader.start()
 
     def _read(self, receive: "Connection") -> None:
         """Pass on how far an identification is, until the process and this place have ended."""

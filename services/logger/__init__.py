@@ -24,7 +24,9 @@ from schemas.topics import (
 )
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import leave_at_once, stopped_by_signals
-from services.bus.session import Publisher, Received, Subscription, open_session
+from services.bus.publisher import Publisher
+from services.bus.session import open_session
+from services.bus.subscription import Received, Subscription
 from services.common.disk import DISK
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable

@@ -15,7 +15,7 @@ import zenoh
 from zenoh import handlers
 
 from schemas.topics import Key, is_replayed, parse_key, selector, topic
-from services.bus.session import Received
+from services.bus.subscription import Received
 from services.common.errors import InputError
 from services.common.intervals import Intervals
 from services.logger.complaints import Complaints

@@ -16,7 +16,7 @@ from schemas.events import Event, EventKind
 from schemas.messages import check_stamp
 from schemas.signals import Identity, Stamp
 from schemas.topics import Key, Topic, is_replayed, topic
-from services.bus.session import Received, Seen
+from services.bus.subscription import Received, Seen
 from services.common.intervals import Intervals
 from services.logger.clocks import TruckClock, clock_step_ns
 from services.logger.known_streams import KnownStreams, Stream

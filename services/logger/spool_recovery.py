@@ -32,7 +32,7 @@ from schemas.spool import (
     spool_key,
 )
 from schemas.topics import Key, key
-from services.bus.session import Received, Seen
+from services.bus.subscription import Received, Seen
 from services.common.intervals import Intervals
 from services.logger.complaints import Complaints
 from services.logger.spool_listing import SpoolListing

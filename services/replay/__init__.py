@@ -8,8 +8,10 @@ from pathlib import Path
 from schemas.signals import Identity
 from schemas.topics import Key, check_realm, parse_key, topic
 from services.bus.credentials import check_speaks_for
+from services.bus.delivery import Delivery
 from services.bus.playback import check_speed, confirm, play, settle, stopped_by_signals
-from services.bus.session import Delivery, Publisher, open_session
+from services.bus.publisher import Publisher
+from services.bus.session import open_session
 from services.common.errors import FailureError, InputError
 from services.recordings.recording import Message, check_message, read_info, read_messages
 

@@ -72,7 +72,7 @@ def run(
     With a folder `spool` every message goes to disk there first and stays until a logger has it
     (see `services.truck.spool`); what an earlier drive left there is offered, too, and there need
     be no router yet: it drives at once and connects when it can. Returns when a logger has
-    everything on disk (see `services.bus.session`).
+    everything on disk (see `services.bus.delivery`).
 
     InputError: the recording is missing, is none, or holds no such vehicle, or another truck uses
     the spool. FailureError: nobody answers at the endpoint within `connect_timeout_s` (None: wait

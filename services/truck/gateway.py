@@ -53,7 +53,8 @@ from schemas.spool import (
 )
 from schemas.topics import Key, check_identifier, check_realm, key, topic
 from schemas.vehicle_info import own_part
-from services.bus.session import Delivery, Publisher
+from services.bus.delivery import Delivery
+from services.bus.publisher import Publisher
 from services.common.errors import FailureError
 from services.truck.spool import Spool
 

@@ -28,7 +28,9 @@ from schemas.site import parse_site, read_site_text, site_hash
 from schemas.topics import check_identifier, check_realm, is_replayed, parse_key, selector
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import leave_at_once, stopped_by_signals
-from services.bus.session import Publisher, Seen, Subscription, open_session
+from services.bus.publisher import Publisher
+from services.bus.session import open_session
+from services.bus.subscription import Seen, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
 from services.execution.dispatch import Execution, awaited, collected, dispatched

@@ -3,7 +3,8 @@
 import sys
 
 from schemas.topics import selector
-from services.bus.session import Subscription, open_session
+from services.bus.session import open_session
+from services.bus.subscription import Subscription
 from tests.parent import die_with_parent
 
 

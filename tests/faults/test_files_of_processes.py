@@ -13,7 +13,9 @@ import zenoh
 from schemas.events import EventKind, decode_event
 from schemas.proto import driveby_pb2 as pb
 from schemas.topics import selector
-from services.bus.session import Publisher, get_latest, open_session
+from services.bus.publisher import Publisher
+from services.bus.session import open_session
+from services.bus.subscription import get_latest
 from services.common.errors import InputError
 from services.recordings.recording import is_closed, read_info, read_messages
 from tests.waiting import LONGEST_S, until

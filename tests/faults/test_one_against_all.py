@@ -11,7 +11,8 @@ import pytest
 from schemas.events import EventKind, decode_event
 from schemas.signals import GnssFix, Identity, encode_gnss
 from schemas.topics import Key
-from services.bus.session import Publisher, open_session
+from services.bus.publisher import Publisher
+from services.bus.session import open_session
 from services.logger.complaints import Complaints
 from services.logger.drops import Drop
 from services.logger.writer import MAX_FILES_OF_ONE, FileWriter, Place

@@ -18,7 +18,9 @@ import zenoh
 
 from schemas.topics import selector
 from services.bus.credentials import CONFIGURATION, Subject, link_settings
-from services.bus.session import Publisher, Received, Subscription, get_latest, open_session
+from services.bus.publisher import Publisher
+from services.bus.session import open_session
+from services.bus.subscription import Received, Subscription, get_latest
 from services.common.errors import FailureError
 from services.security import certs
 from services.security.certs import certs_command

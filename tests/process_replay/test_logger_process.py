@@ -17,7 +17,9 @@ from schemas.events import EventKind, decode_event
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import GnssFix, encode_gnss, encode_identity
 from schemas.topics import selector
-from services.bus.session import Publisher, Received, Subscription, get_latest, open_session
+from services.bus.publisher import Publisher
+from services.bus.session import open_session
+from services.bus.subscription import Received, Subscription, get_latest
 from services.recordings.recording import read_info, read_messages
 from tests.process_replay.starting import End, Start, start_logger
 from tests.waiting import LONGEST_S, until

@@ -11,7 +11,8 @@ import pytest
 
 from schemas.signals import decode_accel
 from schemas.topics import selector
-from services.bus.session import Subscription, open_session
+from services.bus.session import open_session
+from services.bus.subscription import Subscription
 from services.recordings.recording import read_messages
 from tests.waiting import LONGEST_S, until
 

@@ -14,7 +14,8 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import decode_accel, decode_gnss
 from schemas.topics import selector
-from services.bus.session import Received, Subscription, get_latest, open_session
+from services.bus.session import open_session
+from services.bus.subscription import Received, Subscription, get_latest
 from services.recordings.recording import Message, read_info, read_messages
 from tests.process_replay.starting import End, Start, start_logger
 from tests.waiting import LONGEST_S, until

@@ -16,7 +16,8 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Channel
 from schemas.spool import spool_selector
 from schemas.topics import Key, selector
-from services.bus.session import Subscription, open_session
+from services.bus.session import open_session
+from services.bus.subscription import Subscription
 from services.common.errors import InputError
 from services.recordings.recording import read_messages, read_site
 from services.truck import Gateway

@@ -18,7 +18,9 @@ from schemas.results import load_results
 from schemas.signals import Identity
 from schemas.site import site_toml
 from schemas.topics import selector
-from services.bus.session import Publisher, Received, Subscription, get_latest, open_session
+from services.bus.publisher import Publisher
+from services.bus.session import open_session
+from services.bus.subscription import Received, Subscription, get_latest
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, run_to_messages
 from services.recordings.recording import Message, read_info, read_messages, read_site

@@ -16,7 +16,7 @@ from schemas.results import Header
 from schemas.settings import IdentificationSettings
 from schemas.topics import Key
 from services import worker
-from services.bus.session import Publisher
+from services.bus.publisher import Publisher
 from services.common.errors import FailureError
 from services.execution.here import Here
 from services.history.result_files import ResultFiles

@@ -12,17 +12,11 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import Key, selector
-from services.bus import session as bus
-from services.bus.session import (
-    Delivery,
-    Publisher,
-    Received,
-    Seen,
-    Subscription,
-    get_latest,
-    open_session,
-    subscribe_latest,
-)
+from services.bus import subscription as subscription_module
+from services.bus.delivery import LINGER_S, Delivery
+from services.bus.publisher import Publisher
+from services.bus.session import open_session
+from services.bus.subscription import Received, Seen, Subscription, get_latest, subscribe_latest
 from services.common.errors import FailureError, InputError
 from tests.waiting import LONGEST_S
 
@@ -219,7 +213,7 @@ def test_delivery_says_what_is_missing(router: zenoh.Session, delivery: Delivery
 def test_without_a_logger_delivery_only_lingers(delivery: Delivery) -> None:
     began = time.monotonic()
     assert delivery.wait(LONGEST_S) == 10
-    assert bus.LINGER_S <= time.monotonic() - began < LONGEST_S
+    assert LINGER_S <= time.monotonic() - began < LONGEST_S
     assert not delivery.has_logger
 
 
@@ -268,7 +262,7 @@ def test_seen_tells_duplicates_by_identity() -> None:
 def test_made_up_publishers_take_bounded_memory(
     router: zenoh.Session, client: zenoh.Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bus, "_MAX_SOURCES", 5)
+    monkeypatch.setattr(subscription_module, "_MAX_SOURCES", 5)
     with Subscription(router, "driveby/v1/**") as subscription:
         for number in range(20):
             publisher = Publisher(client, "live")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from schemas.events import Event, EventKind
 from schemas.signals import GnssFix, Identity, encode_gnss, encode_identity
 from schemas.topics import Key
-from services.bus.session import Received
+from services.bus.subscription import Received
 from services.logger import completeness, known_streams
 from services.logger import intake as module
 from services.logger.clocks import TruckClock

@@ -10,7 +10,7 @@ from schemas.events import EventKind, decode_event
 from schemas.signals import GnssFix, encode_gnss, encode_identity
 from schemas.topics import Key
 from services import logger
-from services.bus.session import Received
+from services.bus.subscription import Received
 from services.common.disk import DISK
 from services.common.errors import InputError
 from services.logger.backlog import Backlog

@@ -17,7 +17,7 @@ from schemas import spool as wire
 from schemas.signals import Channel, GnssFix, Identity, decode_accel
 from schemas.spool import Held, Query
 from schemas.topics import Key
-from services.bus.session import Received, Seen
+from services.bus.subscription import Received, Seen
 from services.common.intervals import Intervals
 from services.logger import spool_listing, spool_recovery
 from services.logger.spool_recovery import SpoolRecovery, shortfall
@@ -292,7 +292,7 @@ def test_a_full_disk_on_the_truck_stops_nothing(
     router: zenoh.Session, client: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from schemas.topics import selector
-    from services.bus.session import Subscription
+    from services.bus.subscription import Subscription
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")

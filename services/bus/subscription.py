@@ -1,0 +1,270 @@
+"""Subscribers that fetch again what they missed.
+
+A subscriber asks for the history of every publisher that it meets and for every number that it
+misses. That alone loses a gap now and then when router and subscriber die together, so a thread
+asks once more for every gap that has lasted. What comes twice that way is told by its identity; a
+subscriber that must not see anything twice uses `Seen`.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Iterator
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import zenoh
+from zenoh import ext, handlers
+
+from schemas.signals import Identity, decode_identity
+from schemas.topics import MAX_KEY_CHARACTERS, TOPICS, Key, parse_key
+from services.common.intervals import Intervals
+
+_log = logging.getLogger(__name__)
+_IDLE_POLL_S = 0.005
+"""Zenoh wakes nobody who also waits for something else: so long a message may lie."""
+_GAP_PATIENCE_S = 0.5
+"""A gap that has lasted for so long is asked for again."""
+_GAP_TRIES = 3
+"""What does not come then is no longer in the publisher's cache."""
+_GAP_QUERY_TIMEOUT_S = 5.0
+"""For a publisher that answers over a mobile network."""
+_MAX_HOLES_PER_ROUND = 100
+"""The others have their turn in the next round."""
+_MAX_HOLES_PER_SOURCE = 10_000
+"""More are noted of no publisher: a stranger could make up as many as it likes."""
+_MAX_SOURCES = 10_000
+"""The same for publishers."""
+_SourceName = tuple[str, zenoh.ZenohId, int]
+"""A key, and a publisher of Zenoh: session and number in it."""
+
+
+class Received(NamedTuple):
+    """A message as it came from the bus; nothing of it has been checked yet.
+
+    `key_text` may be any key, `attachment` may be missing: see `checked`.
+    """
+
+    key_text: str
+    payload: bytes
+    attachment: bytes | None
+    recovered: bool
+    """It was missing and has been asked for."""
+    spooled: bool = False
+    """It came from the truck's own disk: there is no better copy of it."""
+
+    def identity(self) -> Identity:
+        """Return (boot_id, sequence); ValueError if the attachment is missing or malformed."""
+        return decode_identity(self.attachment)
+
+    def key(self) -> Key:
+        """Return the key taken apart; ValueError if it is not in the topic table."""
+        return parse_key(self.key_text)
+
+
+class Subscription:
+    """Receives all messages under a key expression, old ones of living publishers first.
+
+    A message may come twice (after a reconnection) and recovered ones come late: `Seen` tells
+    duplicates, and the sequence orders a stream. One thread receives.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key_expression: str,
+        *,
+        capacity: int | None = None,
+    ) -> None:
+        """Subscribe; `capacity` messages may wait (default: the largest of the topic table).
+
+        More would make the publishers wait, and after a second the router cuts the connection:
+        receive quickly and do long work in another thread.
+        """
+        self._session = session
+        self._fetched: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        self._sources: dict[_SourceName, _Source] = {}
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self.fetched = 0
+        """Messages that the gap query brought."""
+        self._subscriber = ext.declare_advanced_subscriber(
+            session,
+            key_expression,
+            handlers.FifoChannel(capacity or max(row.queue for row in TOPICS)),
+            history=ext.HistoryConfig(detect_late_publishers=True),
+            recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )
+        self._handler = self._subscriber.handler
+        self._filler = threading.Thread(target=self._fill_gaps, name="gap-fill", daemon=True)
+        self._filler.start()
+
+    def receive(self, timeout_s: float = 0.0) -> Received | None:
+        """Return the next message, or None if none came within `timeout_s`."""
+        received = self._next()
+        if received is not None or timeout_s <= 0:
+            return received
+        deadline = time.monotonic() + timeout_s
+        while received is None and (left_s := deadline - time.monotonic()) > 0:
+            time.sleep(min(_IDLE_POLL_S, left_s))
+            received = self._next()
+        return received
+
+    def close(self) -> None:
+        """Stop receiving; what has already come can still be had from `receive`."""
+        if not self._closing.is_set():
+            self._closing.set()
+            self._filler.join()
+            self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _next(self) -> Received | None:
+        try:
+            sample = self._handler.try_recv()
+        except zenoh.ZError:  # closed and empty
+            sample = None
+        recovered = False
+        if sample is None:
+            if self._fetched.empty():
+                return None
+            sample, recovered = self._fetched.get(), True
+            self.fetched += 1
+        where = str(sample.key_expr)
+        self._note(where, sample)
+        attachment = sample.attachment
+        return Received(
+            where,
+            sample.payload.to_bytes(),
+            None if attachment is None else attachment.to_bytes(),
+            recovered,
+        )
+
+    def _note(self, where: str, sample: zenoh.Sample) -> None:
+        """Remember the publisher's own numbering of the sample, which shows what is missing."""
+        source = sample.source_info
+        if source is None:
+            return
+        name = (where, source.source_id.zid, source.source_id.eid)
+        with self._lock:
+            found = self._sources.get(name)
+            if found is None:
+                if len(where) > MAX_KEY_CHARACTERS:
+                    return
+                if len(self._sources) >= _MAX_SOURCES:
+                    # The oldest: a publisher that has gone, or a stranger who makes up names.
+                    del self._sources[next(iter(self._sources))]
+                found = self._sources[name] = _Source()
+            if found.numbers.runs < _MAX_HOLES_PER_SOURCE:
+                found.numbers.add(source.source_sn)
+
+    def _fill_gaps(self) -> None:
+        while not self._closing.wait(_GAP_PATIENCE_S):
+            for name, hole in self._due_holes():
+                if self._closing.is_set():
+                    return
+                try:
+                    self._fetch(name, hole)
+                except zenoh.ZError as error:  # the session is closing or the router away
+                    _log.debug("gap query for %s: %s", name[0], error)
+
+    def _due_holes(self) -> list[tuple[_SourceName, tuple[int, int]]]:
+        """Return holes that have lasted a round and were not asked for too often."""
+        due = []
+        with self._lock:
+            for name, source in self._sources.items():
+                holes = source.numbers.holes_from_zero()
+                tries = {hole: source.tries.get(hole, -1) + 1 for hole in holes}
+                source.tries = tries
+                due += [(name, hole) for hole, n in tries.items() if 0 < n <= _GAP_TRIES]
+        return due[:_MAX_HOLES_PER_ROUND]
+
+    def _fetch(self, name: _SourceName, hole: tuple[int, int]) -> None:
+        where, zid, eid = name
+        replies = self._session.get(
+            f"{where}/@adv/pub/{zid}/{eid}/**?_sn={hole[0]}..{hole[1]}",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=_GAP_QUERY_TIMEOUT_S,
+        )
+        for reply in replies:
+            sample = reply.ok
+            if sample is not None:
+                self._fetched.put(sample)
+
+
+class Seen:
+    """Which messages have been seen, by identity; its memory grows with gaps, not with time."""
+
+    def __init__(self) -> None:
+        self.streams: dict[tuple[Key, int], Intervals] = {}
+        """By (key, boot_id)."""
+
+    def add(self, where: Key, identity: Identity) -> bool:
+        """Note a message; False if it had been seen before."""
+        return self.numbers(where, identity.boot_id).add(identity.sequence)
+
+    def numbers(self, where: Key, boot_id: int) -> Intervals:
+        """Return the sequences that have been seen of a key and boot, to be added to."""
+        name = (where, boot_id)
+        numbers = self.streams.get(name)
+        if numbers is None:
+            numbers = self.streams[name] = Intervals()
+        return numbers
+
+
+def subscribe_latest(
+    session: zenoh.Session, key_expression: str, capacity: int = 100
+) -> Iterator[Received | None]:
+    """Yield the newest messages for a live display, and None whenever there is none at the time.
+
+    It never holds anybody up: of more than `capacity` waiting messages the oldest are dropped.
+    The consumer decides how long to sleep on None; closing the generator ends the subscription.
+    """
+    subscriber = ext.declare_advanced_subscriber(
+        session,
+        key_expression,
+        handlers.RingChannel(capacity),
+        history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+    )
+    try:
+        while True:
+            sample = subscriber.try_recv()
+            if sample is None:
+                yield None
+                continue
+            attachment = sample.attachment
+            yield Received(
+                str(sample.key_expr),
+                sample.payload.to_bytes(),
+                None if attachment is None else attachment.to_bytes(),
+                False,
+            )
+    finally:
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def get_latest(session: zenoh.Session, key_expression: str, timeout_s: float = 5.0) -> list[bytes]:
+    """Ask for the last message of every latched topic under a key expression; their payloads."""
+    replies = session.get(key_expression, target=zenoh.QueryTarget.ALL, timeout=timeout_s)
+    samples = [reply.ok for reply in replies]
+    return [sample.payload.to_bytes() for sample in samples if sample is not None]
+
+
+class _Source:
+    """One publisher of Zenoh: its own numbers that came, and how often holes were asked for."""
+
+    def __init__(self) -> None:
+        self.numbers = Intervals()
+        self.tries: dict[tuple[int, int], int] = {}
