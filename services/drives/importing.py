@@ -10,7 +10,8 @@ from services.common.naming import checked_identifier, identifier_from
 from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_import import read_folder, read_pair
 from services.drives.runs import Run, normalised, run_to_messages
-from services.recordings.recording import Message, write_recording
+from services.recordings.recording import Message
+from services.recordings.writer import write_recording
 
 _LARGEST_RATE_ERROR = 0.05
 

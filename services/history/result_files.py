@@ -20,13 +20,8 @@ from services.history.results_json import GrowingJson
 from services.history.store import Store, Told
 from services.identification.bridge_state import Counted, count_in, latest_state, usable
 from services.identification.known import Known, search_hash
-from services.recordings.recording import (
-    Message,
-    RecordingWriter,
-    is_being_written,
-    read_info,
-    read_messages,
-)
+from services.recordings.recording import Message, is_being_written, read_info, read_messages
+from services.recordings.writer import RecordingWriter
 
 _log = logging.getLogger(__name__)
 _KNOWN_AGE_S = 2 * 86_400.0

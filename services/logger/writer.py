@@ -28,8 +28,9 @@ from services.logger.backlog import Backlog
 from services.logger.drops import FAILED, QUEUE_IS_FULL, Drop, Drops
 from services.logger.durable import DurableStreams
 from services.logger.own_events import OwnEvents
-from services.recordings.recording import Identities, Message, Misplaced, RecordingWriter
+from services.recordings.recording import Identities, Message
 from services.recordings.recovery import is_name_taken
+from services.recordings.writer import Misplaced, RecordingWriter
 
 _log = logging.getLogger(__name__)
 SYNC_PERIOD_S = 0.5

@@ -18,14 +18,13 @@ from services.recordings.mcap_file import McapWriter
 from services.recordings.mcap_scan import Damage, Indexed, RawMessage, scan
 from services.recordings.recording import (
     ABOUT,
-    CHUNK_BYTES,
     END,
     IDENTITIES,
     RECOVERED,
     find_channels,
-    identities_text,
     program_version,
 )
+from services.recordings.writer import CHUNK_BYTES, identities_text
 
 SUFFIX = ".recovered.mcap"
 ASIDE = ".crashed"

@@ -29,7 +29,7 @@ from services.common.errors import FailureError, InputError
 from services.common.files import check_writable
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.recordings.recording import write_recording
+from services.recordings.writer import write_recording
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -21,8 +21,9 @@ from schemas.signals import (
     encode_gnss,
 )
 from schemas.topics import Key
-from services.recordings.recording import Message, RecordingWriter, read_identities, read_messages
+from services.recordings.recording import Message, read_identities, read_messages
 from services.recordings.recovery import describe, recover_recording
+from services.recordings.writer import RecordingWriter
 
 HOUR_BATCHES = 3600 * 20
 NOW_NS = 1_700_000_000_000_000_000

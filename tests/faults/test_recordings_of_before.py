@@ -18,16 +18,9 @@ from services.history.processed import is_processed
 from services.logger import housekeeping
 from services.logger.housekeeping import House, Housekeeping
 from services.logger.writer import FileWriter, Place
-from services.recordings.recording import (
-    Message,
-    RecordingWriter,
-    is_closed,
-    read_info,
-    read_messages,
-    read_site,
-    write_recording,
-)
+from services.recordings.recording import Message, is_closed, read_info, read_messages, read_site
 from services.recordings.recovery import put_aside, recover_recording, recovered_path
+from services.recordings.writer import RecordingWriter, write_recording
 from tests.waiting import LONGEST_S, until
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "crossing.mcap"

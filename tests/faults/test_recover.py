@@ -21,14 +21,9 @@ from schemas.topics import Key
 from services.cli import main as cli
 from services.common.errors import FailureError, InputError
 from services.recordings.mcap_scan import MAX_RECORD_BYTES
-from services.recordings.recording import (
-    Message,
-    RecordingWriter,
-    read_info,
-    read_messages,
-    read_site,
-)
+from services.recordings.recording import Message, read_info, read_messages, read_site
 from services.recordings.recovery import Recovery, recover_recording, recovered_path
+from services.recordings.writer import RecordingWriter
 
 NOW_NS = 1_700_000_000_000_000_000
 CHUNKS = 60

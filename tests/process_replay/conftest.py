@@ -24,7 +24,8 @@ from schemas.signals import (
     encode_location,
 )
 from schemas.topics import Key
-from services.recordings.recording import Message, write_recording
+from services.recordings.recording import Message
+from services.recordings.writer import write_recording
 from tests.process_replay.starting import End, Process, Start
 from tests.waiting import LONGEST_S
 

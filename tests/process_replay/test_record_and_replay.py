@@ -207,7 +207,7 @@ def test_one_file_per_vehicle_below_the_folder(
     recording: Path,
     drive_messages: Callable[..., Iterator[Message]],
 ) -> None:
-    from services.recordings.recording import write_recording
+    from services.recordings.writer import write_recording
 
     second = tmp_path / "second.mcap"
     write_recording(second, drive_messages(20, "truck-2", 78), site_toml=None, reason="test")

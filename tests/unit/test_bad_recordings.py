@@ -17,8 +17,9 @@ from schemas.topics import Key, topic
 from services.common.errors import InputError
 from services.recordings import mcap_scan
 from services.recordings import recording as recording_module
-from services.recordings.recording import Message, read_info, read_messages, write_recording
+from services.recordings.recording import Message, read_info, read_messages
 from services.recordings.recovery import recover_recording
+from services.recordings.writer import write_recording
 from services.replay import run as replay
 from services.truck import run as truck
 

@@ -17,13 +17,8 @@ from schemas.topics import Key
 from services.cli import main as cli
 from services.common.errors import FailureError, InputError
 from services.drives import importing
-from services.recordings.recording import (
-    Message,
-    RecordingWriter,
-    read_info,
-    read_site,
-    write_recording,
-)
+from services.recordings.recording import Message, read_info, read_site
+from services.recordings.writer import RecordingWriter, write_recording
 
 EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
 COMMANDS = (

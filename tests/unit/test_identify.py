@@ -27,7 +27,8 @@ from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.importing import import_command
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.recordings.recording import Message, read_messages, read_site, write_recording
+from services.recordings.recording import Message, read_messages, read_site
+from services.recordings.writer import write_recording
 from services.simulation.drive import Drive, paper_site, simulate_drive, write_drive
 
 SOUND_NM2 = 1.56e10

@@ -19,7 +19,8 @@ from services.logger.clocks import TruckClock
 from services.logger.completeness import KNOWN_AGE_S, known_on_disk
 from services.logger.intake import GAP_PATIENCE_S, Intake
 from services.logger.known_streams import MAX_BOOTS, MAX_STREAMS_OF_ONE
-from services.recordings.recording import Message, write_recording
+from services.recordings.recording import Message
+from services.recordings.writer import write_recording
 
 NOW_NS = 1_700_000_000_000_000_000
 S = 1_000_000_000

@@ -16,7 +16,8 @@ from services.common.errors import InputError
 from services.logger.backlog import Backlog
 from services.logger.intake import GAP_PATIENCE_S, Intake
 from services.logger.writer import FileWriter, Place
-from services.recordings.recording import Message, RecordingWriter, read_info, read_messages
+from services.recordings.recording import Message, read_info, read_messages
+from services.recordings.writer import RecordingWriter
 from tests.waiting import LONGEST_S, until
 
 NOW_NS = 1_700_000_000_000_000_000

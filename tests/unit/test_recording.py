@@ -19,13 +19,12 @@ from services.common.errors import InputError
 from services.recordings.mcap_file import McapWriter
 from services.recordings.recording import (
     Message,
-    RecordingWriter,
     read_identities,
     read_info,
     read_messages,
     read_site,
-    write_recording,
 )
+from services.recordings.writer import RecordingWriter, write_recording
 
 START_NS = 1_700_000_000_000_000_000
 SITE = '[vehicle]\nid = "truck-1"  # ü\n'
@@ -183,7 +182,7 @@ def test_which_messages_are_in_a_recording(
     tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if ending != "closed":
-        monkeypatch.setattr("services.recordings.recording._IDENTITIES_PERIOD_S", 0.0)
+        monkeypatch.setattr("services.recordings.writer._IDENTITIES_PERIOD_S", 0.0)
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path, reason="test")
     messages = [m for m in fixes(1000) if m.sequence not in (5, 6, 500)]

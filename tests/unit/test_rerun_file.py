@@ -27,7 +27,8 @@ from schemas.signals import (
 from schemas.site import Site, parse_site
 from schemas.topics import Key
 from services.common.errors import InputError
-from services.recordings.recording import Message, write_recording
+from services.recordings.recording import Message
+from services.recordings.writer import write_recording
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.rerun_file import (
     STRIP_HEIGHT,

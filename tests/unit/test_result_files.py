@@ -13,7 +13,8 @@ from schemas.topics import Key
 from services.common.errors import FailureError
 from services.history.result_files import Earlier, MessageName, ResultFiles, read_earlier
 from services.identification.known import search_hash
-from services.recordings.recording import Message, RecordingWriter
+from services.recordings.recording import Message
+from services.recordings.writer import RecordingWriter
 
 REALM = "live"
 NOW_S = 1_800_000_000.0

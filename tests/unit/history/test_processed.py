@@ -15,7 +15,8 @@ from services.execution.here import Here
 from services.history.processed import is_processed
 from services.history.store import known_crossings
 from services.identification.known import search_hash
-from services.recordings.recording import Message, write_recording
+from services.recordings.recording import Message
+from services.recordings.writer import write_recording
 from services.simulation.drive import paper_site
 from tests.unit.test_engine_resume import Identifications
 from tests.working_engine import WorkingEngine
