@@ -1,0 +1,259 @@
+"""Commands on the bus: demo, logger, worker, truck, replay."""
+
+import argparse
+from pathlib import Path
+from typing import Any, Final
+
+from services.cli.parsing import (
+    ENDPOINT,
+    a_console,
+    add_endpoint,
+    add_file,
+    add_folder,
+    add_id,
+    add_method,
+    add_noise,
+    add_realm,
+    add_site,
+    add_speed,
+    add_tls,
+    command,
+    default_endpoint,
+    number,
+    whole,
+)
+
+
+def add_demo(commands: Any) -> None:
+    """`driveby demo`: a truck crosses a bridge: simulated, recorded, identified, drawn."""
+    p = command(
+        commands,
+        "demo",
+        _demo,
+        "a truck crosses a bridge: simulated, recorded, identified, drawn",
+        "driveby demo --speed 4",
+    )
+    p.add_argument("--out", type=Path, metavar="DIR", help="new folder for what it leaves behind")
+    add_speed(p, 4.0)
+    text = "accelerometers' noise density in µg/√Hz; 0: all exact, least squares (default: 25)"
+    add_noise(p, text, 25.0)
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from services.cli.demo import demo_command
+
+    return demo_command(
+        out=options.out, speed=options.speed, noise=options.noise, console=a_console()
+    )
+
+
+def add_logger(commands: Any) -> None:
+    """`driveby logger`: record all that travels; hosts the router that the others connect to."""
+    p = command(
+        commands,
+        "logger",
+        _logger,
+        "record all that travels; hosts the router that the others connect to",
+        f"driveby logger --listen {ENDPOINT} --folder recordings --site site.toml",
+    )
+    p.add_argument("--listen", help=f"where to listen (default: {ENDPOINT})")
+    add_tls(p)
+    p.add_argument(
+        "--insecure",
+        action="store_true",
+        help="listen to other machines without --tls: whoever reaches the address is believed",
+    )
+    add_folder(p, "folder of the recordings")
+    add_file(p, "--file", "REC.mcap", "put everything into this one new file")
+    p.add_argument(
+        "--realm",
+        action="append",
+        metavar="REALM",
+        help="record this realm, or those that begin so, e.g. sim-* (*: all); may be given again "
+        "(default: live)",
+    )
+    add_site(p, "site file to store in the recordings")
+    add_id(p, "logger")
+    room = p.add_argument_group("files and room")
+    room.add_argument(
+        "--rotate-minutes",
+        type=number("minutes", low=0.01, high=1e6),
+        default=15.0,
+        metavar="MIN",
+        help="begin a truck's next file after so long (default: 15; SIGUSR1: at once)",
+    )
+    room.add_argument(
+        "--rotate-mb",
+        type=number("a size in MB", low=0.1, high=1e6),
+        default=1000.0,
+        metavar="MB",
+        help="or when it is so large (default: 1000)",
+    )
+    room.add_argument(
+        "--min-free",
+        type=number("a size in MB", low=0, high=1e9),
+        default=500.0,
+        metavar="MB",
+        help="room the disk must have; at an eighth of it recording ends (default: 500)",
+    )
+    room.add_argument(
+        "--budget",
+        type=number("a size in MB", low=1, high=1e9),
+        metavar="MB",
+        help="delete the oldest recordings beyond it, if all of their crossings are identified "
+        "(default: delete nothing)",
+    )
+
+
+def _logger(options: argparse.Namespace) -> int:
+    from services import logger
+    from services.logger.writer import Limits
+
+    listen = options.listen or default_endpoint(options)
+    return logger.run(
+        listen=listen,
+        folder=options.folder,
+        file=options.file,
+        realms=options.realm or ("live",),
+        site=options.site,
+        service_id=options.id,
+        ready=lambda: print(f"ready, listening at {listen}", flush=True),
+        tls=options.tls,
+        insecure=options.insecure,
+        limits=Limits(
+            age_s=options.rotate_minutes * 60.0,
+            bytes=round(options.rotate_mb * 1e6),
+            min_free_bytes=round(options.min_free * 1e6),
+        ),
+        budget_bytes=None if options.budget is None else round(options.budget * 1e6),
+    )
+
+
+def add_worker(commands: Any) -> None:
+    """`driveby worker`: identify crossings as they happen and publish the results."""
+    p = command(
+        commands,
+        "worker",
+        _worker,
+        "identify crossings as they happen and publish the results",
+        "driveby worker --site site.toml",
+    )
+    add_endpoint(p)
+    add_realm(p)
+    add_site(p, "trucks and bridges", required=True)
+    add_folder(p, "folder of the results")
+    add_file(p, "--file", "RESULTS.mcap", "put the results into this one new file (and .json)")
+    add_method(p)
+    p.add_argument(
+        "--processes",
+        type=whole("processes", 1, 256),
+        default=1,
+        metavar="N",
+        help="identify so many crossings at once, beside the process that listens (default: 1)",
+    )
+    add_id(p, "worker")
+
+
+def _worker(options: argparse.Namespace) -> int:
+    from services import worker
+
+    return worker.run(
+        endpoint=options.endpoint or default_endpoint(options),
+        realm=options.realm,
+        site=options.site,
+        folder=options.folder,
+        file=options.file,
+        method=options.method.replace("-", "_"),
+        service_id=options.id,
+        ready=lambda: print(f"ready, waiting for crossings in realm {options.realm}", flush=True),
+        tls=options.tls,
+        processes=options.processes,
+    )
+
+
+def add_truck(commands: Any) -> None:
+    """`driveby truck`: publish a recording as a truck that drives now."""
+    p = command(
+        commands,
+        "truck",
+        _truck,
+        "publish a recording as a truck that drives now",
+        "driveby truck run.mcap --speed 4",
+    )
+    p.add_argument(
+        "recording",
+        type=Path,
+        metavar="REC.mcap | DIR",
+        help="what the truck will measure: a recording, or a folder of CSV files with --site",
+    )
+    add_site(p, "of a folder of CSV files (a recording carries its own)")
+    p.add_argument(
+        "--spool",
+        type=Path,
+        metavar="DIR",
+        help="keep every message here, too, until a logger has it; one folder for each truck",
+    )
+    p.add_argument(
+        "--spool-budget",
+        type=whole("MiB", 1, 1 << 30),
+        default=4096,
+        metavar="MIB",
+        help="room for the spool; over it the oldest is given up (default: 4096)",
+    )
+    add_endpoint(p)
+    add_realm(p)
+    add_speed(p, 1.0)
+    p.add_argument("--vehicle", metavar="ID", help="which one drives, if there are several")
+
+
+def _truck(options: argparse.Namespace) -> int:
+    from services import truck
+
+    return truck.run(
+        recording=options.recording,
+        endpoint=options.endpoint or default_endpoint(options),
+        realm=options.realm,
+        speed=options.speed,
+        vehicle=options.vehicle,
+        tls=options.tls,
+        spool=options.spool,
+        spool_budget_bytes=options.spool_budget << 20,
+        site=options.site,
+    )
+
+
+def add_replay(commands: Any) -> None:
+    """`driveby replay`: publish recorded messages again, unchanged, in a realm of their own."""
+    p = command(
+        commands,
+        "replay",
+        _replay,
+        "publish recorded messages again, unchanged, in a realm of their own",
+        "driveby replay run.mcap --speed 10",
+    )
+    p.add_argument("recordings", type=Path, nargs="+", metavar="REC.mcap", help="recordings")
+    add_endpoint(p)
+    add_speed(p, 1.0, zero="0 for as fast as possible")
+    p.add_argument("--name", help="realm replay-NAME (default: name of the first recording)")
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from services import replay
+    from services.common.naming import checked_identifier, identifier_from
+
+    name = options.name
+    return replay.run(
+        recordings=options.recordings,
+        endpoint=options.endpoint or default_endpoint(options),
+        speed=options.speed,
+        name=(
+            identifier_from(options.recordings[0].stem)
+            if name is None
+            else checked_identifier(name, "--name")
+        ),
+        tls=options.tls,
+    )
+
+
+SERVICES: Final = (_logger, _worker, _truck, _replay)
+"""Run until they are stopped, and have nothing else to show for themselves than what they say."""

@@ -1,0 +1,240 @@
+"""Commands that work on files: simulate, import, identify, recover, view."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from services.cli.parsing import (
+    a_console,
+    add_file,
+    add_force,
+    add_method,
+    add_noise,
+    add_output,
+    add_seed,
+    add_site,
+    command,
+    number,
+    scenario,
+)
+
+
+def _ratios(text: str) -> tuple[float, ...]:
+    ratio = number("ratios", low=1e-3, high=1e3)
+    return tuple(ratio(part) for part in text.split(","))
+
+
+def _speed_range(text: str) -> tuple[float, float]:
+    speed = number("a speed in m/s (or START:END)", low=0.1, high=60)
+    start, _, end = text.partition(":")
+    return speed(start), speed(end if ":" in text else start)
+
+
+def add_simulate(commands: Any) -> None:
+    """`driveby simulate`: write the recording of a simulated crossing."""
+    p = command(
+        commands,
+        "simulate",
+        _simulate,
+        "write the recording of a simulated crossing",
+        "driveby simulate --scenario 6 --noise 25 -o run.mcap",
+    )
+    damage = p.add_mutually_exclusive_group(required=True)
+    damage.add_argument(
+        "--scenario", type=scenario, metavar="N", help="damage scenario of the paper, 1 to 12"
+    )
+    damage.add_argument(
+        "--ei",
+        type=_ratios,
+        metavar="1,1,.4,…",
+        help="flexural rigidity of each element as a ratio to the sound value",
+    )
+    add_site(p, "truck and bridge (default: those of the paper)")
+    p.add_argument(
+        "--road", choices=tuple("ABCDE"), default="A", help="ISO 8608 class (default: A)"
+    )
+    add_seed(p)
+    add_noise(p, "accelerometers' noise density in µg/√Hz (default: 0)")
+    p.add_argument(
+        "--speed",
+        type=_speed_range,
+        default=(10.0, 10.0),
+        metavar="M_PER_S",
+        help="a speed, or START:END for a change along the way (default: 10)",
+    )
+    p.add_argument(
+        "--direction",
+        choices=("start_to_end", "end_to_start"),
+        default="start_to_end",
+        help="(default: start_to_end)",
+    )
+    receiver = p.add_mutually_exclusive_group()
+    receiver.add_argument(
+        "--gps-noise", dest="gps_noise", action="store_true", help="errors of a real receiver"
+    )
+    receiver.add_argument(
+        "--perfect-gps",
+        dest="gps_noise",
+        action="store_false",
+        help="exact positions and speeds (default)",
+    )
+    p.set_defaults(gps_noise=False)
+    p.add_argument(
+        "--rate",
+        type=number("a rate in Hz", low=50, high=50_000),
+        metavar="HZ",
+        help="sampling rate (default: the site's, or 1000)",
+    )
+    add_output(p)
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    from services.simulation.drive import simulate_command
+
+    return simulate_command(
+        site=options.site,
+        scenario=options.scenario,
+        ei=options.ei,
+        road=options.road,
+        seed=options.seed,
+        noise=options.noise,
+        speed=options.speed,
+        direction=options.direction,
+        gps_noise=options.gps_noise,
+        rate=options.rate,
+        output=options.output,
+        force=options.force,
+        console=a_console(),
+    )
+
+
+def add_import(commands: Any) -> None:
+    """`driveby import`: turn files of a drive into a recording."""
+    p = command(
+        commands,
+        "import",
+        _import,
+        "turn files of a drive into a recording",
+        "driveby import crossings/d1 --site crossings/d1/site.toml -o d1.mcap",
+    )
+    p.add_argument(
+        "sources",
+        type=Path,
+        nargs="+",
+        metavar="DIR | ACCEL.csv GPS.csv",
+        help="a folder with accel_NN.csv and gps_NN.csv, one such pair, or a comma2k19 segment",
+    )
+    add_site(p, "what was driven, over which bridges; is stored in the recording", required=True)
+    p.add_argument("--vehicle", metavar="ID", help="which of the site's vehicles drove")
+    p.add_argument("--name", help="realm import-NAME (default: name of the folder)")
+    add_output(p)
+
+
+def _import(options: argparse.Namespace) -> int:
+    from services.drives.importing import import_command
+
+    print(
+        import_command(
+            sources=options.sources,
+            site=options.site,
+            output=options.output,
+            force=options.force,
+            vehicle=options.vehicle,
+            name=options.name,
+        )
+    )
+    return 0
+
+
+def add_identify(commands: Any) -> None:
+    """`driveby identify`: find the flexural rigidity of each element from recordings."""
+    p = command(
+        commands,
+        "identify",
+        _identify,
+        "find the flexural rigidity of each element from recordings",
+        "driveby identify run.mcap --json result.json --rrd result.rrd",
+    )
+    p.add_argument("recordings", type=Path, nargs="+", metavar="REC.mcap", help="recordings")
+    add_site(p, "(default: the site stored in the recording)")
+    add_method(p)
+    add_file(p, "--json", "OUT.json", "write the results here")
+    add_file(p, "--rrd", "OUT.rrd", "write a Rerun recording here")
+    add_file(
+        p, "--draws", "OUT.npz|OUT.nc", "write the Markov chains of method pre here, for ArviZ"
+    )
+    add_seed(p)
+
+
+def _identify(options: argparse.Namespace) -> int:
+    from services.cli.identify import identify_command
+
+    return identify_command(
+        recordings=options.recordings,
+        site=options.site,
+        method=options.method.replace("-", "_"),
+        json_path=options.json,
+        rrd_path=options.rrd,
+        draws_path=options.draws,
+        seed=options.seed,
+        console=a_console(),
+    )
+
+
+def add_recover(commands: Any) -> None:
+    """`driveby recover`: rewrite a recording that is damaged or was cut off."""
+    p = command(
+        commands,
+        "recover",
+        _recover,
+        "rewrite a recording that is damaged or was cut off",
+        "driveby recover run.mcap -o whole.mcap",
+    )
+    p.add_argument("recording", type=Path, metavar="REC.mcap", help="recording, stays as it is")
+    p.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="OUT.mcap",
+        help="(default: REC.recovered.mcap beside it)",
+    )
+    p.add_argument(
+        "--set-aside",
+        action="store_true",
+        help="then rename the damaged one to REC.mcap.crashed",
+    )
+    add_force(p)
+    p.add_argument("--json", action="store_true", help="print the counts as JSON")
+
+
+def _recover(options: argparse.Namespace) -> int:
+    from services.cli.recover import recover_command
+
+    code, line = recover_command(
+        source=options.recording,
+        output=options.output,
+        set_aside=options.set_aside,
+        force=options.force,
+        as_json=options.json,
+    )
+    print(line)
+    return code
+
+
+def add_view(commands: Any) -> None:
+    """`driveby view`: look at a recording or a result."""
+    p = command(
+        commands,
+        "view",
+        _view,
+        "look at a recording or a result",
+        "driveby view run.mcap --web",
+    )
+    p.add_argument("target", metavar="REC|RESULT|RRD", help="a .mcap, .json or .rrd file")
+    p.add_argument("--web", action="store_true", help="in the browser")
+
+
+def _view(options: argparse.Namespace) -> int:
+    from services.viewer.view import view_command
+
+    return view_command(target=options.target, web=options.web, console=a_console())

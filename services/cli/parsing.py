@@ -1,0 +1,224 @@
+"""What the commands' options have in common: how they are named, explained, parsed and refused.
+
+Nothing heavy is imported here: `driveby --help` does not wait for compilers and viewers.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+from services.common.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+ENDPOINT: Final = "tcp/127.0.0.1:7447"
+TLS_ENDPOINT: Final = "tls/127.0.0.1:7447"
+RECORDINGS: Final = Path("recordings")
+SCENARIOS: Final = range(1, 13)
+METHODS: Final = ("pre", "least-squares", "random-walk")
+
+Handler = Callable[[argparse.Namespace], int]
+"""Does what a command says; returns the exit code."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as every other error does."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise InputError."""
+        raise InputError(f"{message} (see {self.prog} --help)")
+
+
+def command(
+    commands: Any, name: str, handler: Handler, summary: str, example: str
+) -> argparse.ArgumentParser:
+    """A command: what it is in a word and a sentence, and an example of its use."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.",
+        epilog=f"example: {example}",
+        allow_abbrev=False,
+    )
+    parser.set_defaults(handler=handler)
+    add_common(parser, suppressed=True)
+    return parser
+
+
+def add_common(parser: argparse.ArgumentParser, *, suppressed: bool) -> None:
+    """Options that may stand before or after the sub-command."""
+
+    def default(value: object) -> Any:
+        # A sub-command's default would overwrite what stood before the sub-command.
+        return argparse.SUPPRESS if suppressed else value
+
+    group = parser.add_argument_group("messages")
+    group.add_argument("--verbose", action="store_true", default=default(False), help="say more")
+    group.add_argument(
+        "--log-format",
+        choices=("text", "json"),
+        default=default("text"),
+        help="of the messages on standard error (default: text)",
+    )
+    group.add_argument(
+        "--debug", action="store_true", default=default(False), help="tracebacks of internal errors"
+    )
+
+
+def add_site(p: argparse.ArgumentParser, text: str, *, required: bool = False) -> None:
+    """`--site`: a site file."""
+    p.add_argument("--site", type=Path, required=required, metavar="SITE.toml", help=text)
+
+
+def add_output(p: argparse.ArgumentParser) -> None:
+    """`-o`: the recording to write, which is replaced with `--force` only."""
+    p.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="REC.mcap", help="recording to write"
+    )
+    add_force(p)
+
+
+def add_force(p: argparse.ArgumentParser) -> None:
+    """`--force`: replace what is there."""
+    p.add_argument(
+        "--force",
+        action="store_true",
+        help="replace a recording of that name, unless it is being written",
+    )
+
+
+def add_file(p: argparse.ArgumentParser, option: str, metavar: str, text: str) -> None:
+    """An option that names a file."""
+    p.add_argument(option, type=Path, metavar=metavar, help=text)
+
+
+def add_folder(p: argparse.ArgumentParser, text: str) -> None:
+    """`--folder`: where a service keeps what it writes."""
+    p.add_argument(
+        "--folder",
+        type=Path,
+        default=RECORDINGS,
+        metavar="DIR",
+        help=f"{text} (default: recordings)",
+    )
+
+
+def add_seed(p: argparse.ArgumentParser) -> None:
+    """`--seed` of everything that is drawn."""
+    p.add_argument("--seed", type=whole("a seed", 0), default=1, help="(default: 1)")
+
+
+def add_noise(p: argparse.ArgumentParser, text: str, default: float = 0.0) -> None:
+    """`--noise` of the accelerometers."""
+    p.add_argument(
+        "--noise", type=number("a noise density", low=0, high=1e6), default=default, help=text
+    )
+
+
+def add_speed(p: argparse.ArgumentParser, default: float, zero: str = "") -> None:
+    """`--speed` in times of what it really was; `zero` says what 0 would mean."""
+    p.add_argument(
+        "--speed",
+        type=number("a factor", low=0 if zero else 1e-3, high=1e6),
+        default=default,
+        metavar="FACTOR",
+        help=f"times real speed{', ' + zero if zero else ''} (default: {default:g})",
+    )
+
+
+def add_method(p: argparse.ArgumentParser) -> None:
+    """`--method`: how to identify."""
+    p.add_argument(
+        "--method",
+        choices=METHODS,
+        default=METHODS[0],
+        help="pre: with intervals, for real sensors; least-squares: for simulations without noise; "
+        f"random-walk: the paper's search (default: {METHODS[0]})",
+    )
+
+
+def add_endpoint(p: argparse.ArgumentParser) -> None:
+    """`--endpoint` and `--tls`: where the bus is, and who one is there."""
+    p.add_argument("--endpoint", help=f"where the logger listens (default: {ENDPOINT})")
+    add_tls(p)
+
+
+def add_tls(p: argparse.ArgumentParser) -> None:
+    """`--tls`: a folder of credentials."""
+    p.add_argument(
+        "--tls",
+        type=Path,
+        metavar="FOLDER",
+        help=f"credentials made by `driveby certs`; the default address is {TLS_ENDPOINT} then",
+    )
+
+
+def default_endpoint(options: argparse.Namespace) -> str:
+    """Where the logger is unless told otherwise, with and without credentials."""
+    return ENDPOINT if options.tls is None else TLS_ENDPOINT
+
+
+def add_realm(p: argparse.ArgumentParser) -> None:
+    """`--realm`."""
+    p.add_argument("--realm", default="live", help="(default: live)")
+
+
+def add_id(p: argparse.ArgumentParser, default: str) -> None:
+    """`--id` of a service."""
+    p.add_argument("--id", default=default, help=f"name of this service (default: {default})")
+
+
+def number(what: str, *, low: float, high: float) -> Callable[[str], float]:
+    """Parse a number between two limits; `what` it must be stands in the error."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(
+                f'is "{text}", it must be {what} from {low:g} to {high:g}'
+            )
+        return value
+
+    return parse
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Parse names between commas."""
+    return tuple(name.strip() for name in text.split(","))
+
+
+def whole(what: str, low: int, high: int = (1 << 63) - 1) -> Callable[[str], int]:
+    """Parse a whole number between two limits; `what` it must be stands in the error."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if not low <= value <= high:
+            limits = f"of at least {low}" if high >= (1 << 63) - 1 else f"from {low} to {high}"
+            raise argparse.ArgumentTypeError(
+                f'is "{text}", it must be {what}, a whole number {limits}'
+            )
+        return value
+
+    return parse
+
+
+def scenario(text: str) -> int:
+    """Parse the number of a damage scenario of the paper."""
+    if not text.isascii() or not text.isdigit() or int(text[:9]) not in SCENARIOS:
+        raise argparse.ArgumentTypeError(f'is "{text}", it must be 1 to 12')
+    return int(text)
+
+
+def a_console() -> "Console":
+    """A console for what commands print."""
+    from rich.console import Console
+
+    return Console()
