@@ -269,7 +269,7 @@ def _check_recording(path: Path, sent: int) -> None:
 def _draw(folder: Path, crossing: Crossing, drive: Drive, site: Site) -> None:
     from services.viewer.crossing_view import view_of_crossing
     from services.viewer.figure import crossing_figure
-    from services.viewer.rerun_file import signals_of_messages
+    from services.viewer.vehicle_signals import signals_of_messages
     from services.viewer.view import write_views
 
     write_views(

@@ -65,7 +65,8 @@ def identify_command(
         write_atomically(json_path, results_json(found))
     if rrd_path is not None:
         from services.viewer.crossing_view import view_of_crossing
-        from services.viewer.rerun_file import bridges_of_site, signals_of_messages, write_rrd
+        from services.viewer.rerun_file import bridges_of_site, write_rrd
+        from services.viewer.vehicle_signals import signals_of_messages
 
         try:
             with replaced_atomically(rrd_path) as temporary:

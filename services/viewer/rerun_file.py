@@ -13,22 +13,22 @@ from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from schemas.signals import CHANNELS, AccelBatch, GnssFix, decode_accel, decode_gnss
+from schemas.signals import CHANNELS, AccelBatch, GnssFix
 from schemas.site import Site
 from services.common.files import replaced_atomically
-from services.recordings.recording import Message
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,
     FloatArray,
     summary_line,
 )
+from services.viewer.layout import CHAINAGE, TIME, blueprint, crossing_root
+from services.viewer.strip import STRIP_HEIGHT, STRIP_TOP_RATIO, STRIP_WIDTH, rigidity_strip
+from services.viewer.vehicle_signals import VehicleSignals
 
 APPLICATION = "driveby"
-TIME, CHAINAGE = "time", "chainage_mm"
 
 IntArray = NDArray[np.int64]
 
@@ -38,19 +38,9 @@ CHANNEL_COLOURS = {
     "unsprung_front": VEHICLE_COLOURS["front"],
     "unsprung_rear": VEHICLE_COLOURS["rear"],
 }
-STRIP_WIDTH, STRIP_HEIGHT = 1200, 600  # pixels of the strip of rigidity along the span
-STRIP_TOP_RATIO = 1.5  # of the nominal rigidity, at the strip's upper edge
-STRIP_PAPER, STRIP_INK = (17, 21, 26), (86, 180, 233)  # red, green, blue
 MUTED = "#9AA5B1"
 NEAR_M, M_PER_DEGREE = 20_000.0, 111_000.0  # a bridge and a track that one map can show
 WINDOW_S = 1.0  # of accelerations before the entry and after the exit that a crossing shows
-
-
-class VehicleSignals(NamedTuple):
-    """What one truck recorded, in the order of its sequence numbers."""
-
-    accel: Sequence[AccelBatch]
-    gnss: Sequence[GnssFix]
 
 
 class BridgeOnMap(NamedTuple):
@@ -73,12 +63,12 @@ def write_rrd(
     `vehicles` are the signals by vehicle identifier. A crossing's accelerations are looked up in
     the signals of its vehicle; one without any, or with fewer channels, is drawn with what it has.
     """
-    blueprint = _blueprint(vehicles, crossings)
+    default = blueprint(vehicles, crossings)
     with (
         replaced_atomically(path) as temporary,
         rr.RecordingStream(APPLICATION, recording_id=_recording_id(crossings)) as recording,
     ):
-        recording.save(temporary, default_blueprint=blueprint)
+        recording.save(temporary, default_blueprint=default)
         for bridge in bridges_near_tracks(bridges, vehicles.values()):
             _log_bridge(recording, bridge)
         for vehicle, signals in vehicles.items():
@@ -102,31 +92,6 @@ def bridges_of_site(site: Site) -> list[BridgeOnMap]:
         )
         for bridge in site.bridges
     ]
-
-
-def signals_of_messages(messages: Iterable[Message]) -> dict[str, VehicleSignals]:
-    """Decode the sensor messages of a recording, by vehicle, in the order of time.
-
-    Repeated messages are taken once, those that cannot be decoded are left out.
-    """
-    accel: dict[str, dict[tuple[int, int], AccelBatch]] = {}
-    gnss: dict[str, dict[tuple[int, int], GnssFix]] = {}
-    for message in messages:
-        vehicle, identity = message.key.identifier, (message.boot_id, message.sequence)
-        try:
-            if message.key.stream == "accel":
-                accel.setdefault(vehicle, {})[identity] = decode_accel(message.payload)
-            elif message.key.stream == "gnss":
-                gnss.setdefault(vehicle, {})[identity] = decode_gnss(message.payload)
-        except ValueError:
-            continue  # a picture shows what can be read; the logger has counted what cannot
-    return {
-        vehicle: VehicleSignals(
-            sorted(accel.get(vehicle, {}).values(), key=lambda batch: batch.wall_time_ns),
-            sorted(gnss.get(vehicle, {}).values(), key=lambda fix: fix.wall_time_ns),
-        )
-        for vehicle in sorted(accel.keys() | gnss.keys())
-    }
 
 
 def bridges_near_tracks(
@@ -298,35 +263,6 @@ def _log_labels(
     )
 
 
-def rigidity_strip(crossing: CrossingView) -> NDArray[np.uint8]:
-    """Picture of what is known of the rigidity along the span; (height, width, 3).
-
-    A column belongs to a chainage, a row to a ratio to the nominal rigidity, from 1.5 at the top to
-    0 at the bottom. Brightness is the probability density, as a normal distribution with the width
-    of the interval, relative to its peak; below the estimate the element is filled faintly.
-    """
-    estimate = crossing.rigidity_nm2
-    if estimate is None:
-        raise ValueError("a rejected crossing has no rigidity to draw")
-    ratio = estimate / crossing.nominal_nm2
-    thinnest = 1.5 * STRIP_TOP_RATIO / STRIP_HEIGHT  # a line that can still be seen
-    if crossing.interval_nm2 is None:
-        spread = np.full_like(ratio, thinnest)
-    else:
-        width = np.diff(crossing.interval_nm2, axis=1)[:, 0] / crossing.nominal_nm2
-        spread = np.maximum(width / (2.0 * 1.96), thinnest)
-    rows = STRIP_TOP_RATIO * (1.0 - (np.arange(STRIP_HEIGHT) + 0.5) / STRIP_HEIGHT)
-    chainage = crossing.span_m * (np.arange(STRIP_WIDTH) + 0.5) / STRIP_WIDTH
-    element = np.searchsorted(crossing.element_edges_m, chainage) - 1
-    density = np.exp(-0.5 * ((rows[:, None] - ratio) / spread) ** 2)
-    shade = np.maximum(density, np.where(rows[:, None] < ratio, 0.3, 0.0))[:, element]
-    boundary = np.diff(element, prepend=element[0]) != 0
-    shade[:, boundary] = 0.0
-    paper, ink = np.array(STRIP_PAPER), np.array(STRIP_INK)
-    picture: NDArray[np.uint8] = np.rint(paper + shade[:, :, None] * (ink - paper)).astype(np.uint8)
-    return picture
-
-
 def _log_acceleration_on_bridge(
     recording: rr.RecordingStream, root: str, crossing: CrossingView, signals: VehicleSignals
 ) -> None:
@@ -442,11 +378,6 @@ def _time_column(time_ns: IntArray) -> rr.TimeColumn:
     return rr.TimeColumn(TIME, timestamp=time_ns.astype("datetime64[ns]"))
 
 
-def crossing_root(crossing: CrossingView) -> str:
-    """Entity path under which everything of one crossing stands."""
-    return f"crossing/{rr.escape_entity_path_part(crossing.crossing_id)}/{crossing.method}"
-
-
 def verdict_markdown(crossing: CrossingView) -> str:
     """The verdict with its reasons and a table of all parameters, as Markdown."""
     lines = [f"# {crossing.verdict.capitalize()}", "", summary_line(crossing), ""]
@@ -468,109 +399,3 @@ def verdict_markdown(crossing: CrossingView) -> str:
         interval = f"{row.low:.4g} … {row.high:.4g}" if crossing.interval_has_meaning else "–"
         lines.append(f"| {row.name} | {row.mean:.4g} {row.unit} | {interval} | |")
     return "\n".join(lines)
-
-
-def _blueprint(
-    vehicles: Mapping[str, VehicleSignals], crossings: Sequence[CrossingView]
-) -> rrb.Blueprint:
-    drive = _drive_layout(vehicles)
-    layouts = [_crossing_layout(crossing, vehicles.get(crossing.vehicle)) for crossing in crossings]
-    content = rrb.Tabs(*layouts, drive, active_tab=0) if layouts else drive
-    return rrb.Blueprint(
-        content,
-        rrb.TimePanel(state="collapsed", timeline=CHAINAGE if layouts else TIME),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        auto_views=False,
-    )
-
-
-def _crossing_layout(crossing: CrossingView, signals: VehicleSignals | None) -> rrb.Container:
-    """What was found at the left, what it was found from in the middle; only what there is."""
-    root = crossing_root(crossing)
-    plots = _acceleration_plots(f"{root}/acceleration", signals)
-    if crossing.road is not None:
-        plots = [
-            _plot(f"{root}/road", "Road profile (mm)"),
-            _plot(f"{root}/road_difference", "Front minus rear (mm)"),
-            *plots,
-        ]
-    side = rrb.Vertical(
-        _map(more=f"{root}/position", zoom=18.0),
-        rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict"),
-        row_shares=[2, 5],
-    )
-    columns = [(side, 4)]
-    if plots:
-        columns.insert(0, (rrb.Vertical(*plots), 6))
-    if crossing.rigidity_nm2 is not None:
-        columns.insert(0, (_rigidity_layout(root), 5))
-    return rrb.Horizontal(
-        *(column for column, _ in columns),
-        column_shares=[share for _, share in columns],
-        name=f"Crossing of {crossing.bridge}",
-    )
-
-
-def _rigidity_layout(root: str) -> rrb.Vertical:
-    return rrb.Vertical(
-        rrb.BarChartView(
-            origin=f"{root}/rigidity",
-            name="EI of each element (GN·m²) over chainage (m)",
-            plot_legend=rrb.PlotLegend(visible=False),
-        ),
-        rrb.Spatial2DView(
-            origin=f"{root}/strip",
-            name="EI along the span, ratio to nominal (line)",
-            background=STRIP_PAPER,
-            visual_bounds=rrb.VisualBounds2D(
-                x_range=(-20.0, STRIP_WIDTH + 20.0), y_range=(-20.0, STRIP_HEIGHT + 150.0)
-            ),
-        ),
-        row_shares=[5, 6],
-    )
-
-
-def _drive_layout(vehicles: Mapping[str, VehicleSignals]) -> rrb.Container:
-    plots: list[rrb.View] = []
-    for vehicle, signals in vehicles.items():
-        plots += _acceleration_plots(f"vehicle/{vehicle}/acceleration", signals, f"{vehicle}:")
-        plots.append(_plot(f"vehicle/{vehicle}/speed", f"{vehicle}: Speed (m/s)"))
-    return rrb.Horizontal(_map(), rrb.Vertical(*plots), column_shares=[2, 3], name="Whole drive")
-
-
-def _acceleration_plots(
-    origin: str, signals: VehicleSignals | None, vehicle: str = ""
-) -> list[rrb.View]:
-    """Body and axles apart: those of the axles are ten times larger. Only what the truck has."""
-    channels = {channel for batch in signals.accel for channel in batch.channels} if signals else ()
-    return [
-        _plot(origin, f"{vehicle} {name} accelerations (m/s²)".strip(), part)
-        for part, name in (("sprung", "Body"), ("unsprung", "Axle"))
-        if f"{part}_front" in channels or f"{part}_rear" in channels
-    ]
-
-
-def _plot(origin: str, name: str, only: str | None = None) -> rrb.View:
-    """A plot of all of a series, not only of what lies before the time cursor."""
-    infinite = rrb.TimeRangeBoundary.infinite()
-    whole = [
-        rrb.VisibleTimeRange(timeline, start=infinite, end=infinite)
-        for timeline in (TIME, CHAINAGE)
-    ]
-    contents = (
-        "$origin/**" if only is None else [f"$origin/{only}_{axle}" for axle in ("front", "rear")]
-    )
-    return rrb.TimeSeriesView(
-        origin=origin,
-        contents=contents,
-        name=name,
-        time_ranges=whole,
-        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=infinite, end=infinite)),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
-    )
-
-
-def _map(*, more: str | None = None, zoom: float | None = None) -> rrb.View:
-    contents = ["/map/**"] if more is None else ["/map/**", f"/{more}"]
-    return rrb.MapView(origin="/", contents=contents, name="Map", zoom=zoom)

@@ -22,12 +22,8 @@ from schemas.site import Site, load_site, parse_site
 from services.common.errors import FailureError, InputError
 from services.recordings.recording import Message, read_messages, read_site
 from services.viewer.crossing_view import CrossingView, view_of_crossing
-from services.viewer.rerun_file import (
-    VehicleSignals,
-    bridges_of_site,
-    signals_of_messages,
-    write_rrd,
-)
+from services.viewer.rerun_file import bridges_of_site, write_rrd
+from services.viewer.vehicle_signals import VehicleSignals, signals_of_messages
 
 SUFFIXES = (".rrd", ".mcap", ".json")
 

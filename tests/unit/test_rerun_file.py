@@ -30,19 +30,16 @@ from services.common.errors import InputError
 from services.recordings.recording import Message
 from services.recordings.writer import write_recording
 from services.viewer.crossing_view import CrossingView, view_of_crossing
+from services.viewer.layout import crossing_root
 from services.viewer.rerun_file import (
-    STRIP_HEIGHT,
-    STRIP_WIDTH,
-    VehicleSignals,
     acceleration_series,
     bridges_near_tracks,
     bridges_of_site,
-    crossing_root,
     front_axle_chainage,
-    rigidity_strip,
-    signals_of_messages,
     verdict_markdown,
 )
+from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH, rigidity_strip
+from services.viewer.vehicle_signals import VehicleSignals, signals_of_messages
 from services.viewer.view import (
     convert,
     view_command,
