@@ -7,11 +7,8 @@ through it gives the same bytes every time.
 
 import contextlib
 import logging
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import NamedTuple
 
 import numpy as np
 
@@ -30,14 +27,15 @@ from schemas.signals import (
 )
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
-from schemas.vehicle_info import Difference, differences
+from schemas.vehicle_info import differences
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
-from services.identification.bridge_state import Counted, count_in, latest_state, usable
+from services.identification.bridge_state import count_in, latest_state, usable
 from services.identification.crossing_data import MARGIN_S, CrossingData
 from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
 from services.identification.outputs import Output, Work, crossing_output, state_output
+from services.identification.remembered import BridgeCrossings, TruckBoot, UnderWay
 from services.identification.stays import MERGE_S, Passage, Stay, least_depth_m, stays_on
-from services.identification.streams import PATIENCE_S, Boot
+from services.identification.streams import PATIENCE_S
 from services.identification.traffic import Traffic
 
 _log = logging.getLogger(__name__)
@@ -53,81 +51,12 @@ _REACH_M = 50.0
 """Further away than this from the ends of a bridge no fix changes what happened on it."""
 _Name = tuple[str, str]
 """Realm and bridge."""
-
-
-class _Truck:
-    """One boot of one truck: its messages, and what has been said of its crossings."""
-
-    def __init__(self, vehicle: Vehicle) -> None:
-        self.vehicle = vehicle
-        self.boot = Boot()
-        self.latest_s = -np.inf
-        self.began_s = np.inf
-        self.forgotten_s = -np.inf
-        self.clock_s = -np.inf
-        """The latest time that more than one message has told."""
-        self.doubtful_s = -np.inf
-        """One far ahead of it, which only one message has told yet."""
-        self.detected: dict[tuple[str, float], str] = {}
-        """Crossing ids by bridge and about the time of entry."""
-        self.done: set[str] = set()
-        self.decided: list[tuple[str, float, float, str]] = []
-        """Bridge, times of the fixes around it, and id of each crossing that is decided."""
-        self.said: dict[str, set[pb.CrossingState]] = {}
-        """By crossing id: states that an earlier run of the worker has told."""
-        self.side: dict[str, int] = {}
-        """By bridge: far before its start (-1), far behind its end (1), or near (0)."""
-        self.differences: list[Difference] = []
-        """Where it says of itself what the site file does not say of it."""
-
-    def is_busy_at(self, bridge: Bridge) -> bool:
-        """Whether a crossing of this bridge has begun and is not decided yet."""
-        return any(
-            known_bridge == bridge.id and crossing_id not in self.done
-            for (known_bridge, _), crossing_id in self.detected.items()
-        )
-
-    def forget_before(self, time_s: float) -> None:
-        """Forget samples, fixes and crossings that are decided: no stay is found there again."""
-        self.forgotten_s = time_s
-        self.boot.forget_before(time_s)
-        self.decided = [one for one in self.decided if one[2] >= time_s]
-        kept = {crossing_id for *_, crossing_id in self.decided}
-        self.detected = {
-            (bridge, entry_s): crossing_id
-            for (bridge, entry_s), crossing_id in self.detected.items()
-            if entry_s >= time_s - MERGE_S or crossing_id in kept or crossing_id not in self.done
-        }
-        kept.update(self.detected.values())
-        self.done &= kept
-        self.said = {name: states for name, states in self.said.items() if name in kept}
-
-
-class _UnderWay(NamedTuple):
-    """A crossing that is being identified."""
-
-    work: Work
-    done: Output
-    """What is told when it is: the truck's clock may have been forgotten by then."""
-
-
-@dataclass
-class _OfBridge:
-    """What has been found on one bridge, in one realm."""
-
-    counted: Counted = field(default_factory=Counted)
-    under_way: deque[_UnderWay] = field(default_factory=deque)
-    """In the order in which they were found: so their results are told."""
-    results: dict[int, Crossing] = field(default_factory=dict)
-    """Those that have come before one that was found earlier, by number of the work."""
-
-
 _DECODERS: dict[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]] = {
     "accel": decode_accel,
     "gnss": decode_gnss,
     "info": decode_info,
 }
-_Wait = Callable[[_Truck, Stay, float], bool]
+_Wait = Callable[[TruckBoot, Stay, float], bool]
 """Whether a crossing that is over, at the truck's time of now (s), waits for more of its data."""
 
 
@@ -148,9 +77,9 @@ class Engine:
         ]
         self._vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
         self._traffic = Traffic(self._frames, self._vehicles, least_depth_m(site.receiver))
-        self._trucks: dict[tuple[str, str, int], _Truck] = {}
+        self._trucks: dict[tuple[str, str, int], TruckBoot] = {}
         self._newest_boot: dict[tuple[str, str], int] = {}
-        self._of_bridge: dict[_Name, _OfBridge] = {}
+        self._of_bridge: dict[_Name, BridgeCrossings] = {}
         self._works = 0
         """How many there have been."""
         self._known: dict[tuple[str, str, str], list[Known]] = {}
@@ -259,11 +188,11 @@ class Engine:
             for truck in self._boots_of(realm, vehicle)
         )
 
-    def _boots_of(self, realm: str, vehicle: str) -> list[_Truck]:
+    def _boots_of(self, realm: str, vehicle: str) -> list[TruckBoot]:
         return [t for name, t in self._trucks.items() if name[:2] == (realm, vehicle)]
 
     def _settle(
-        self, realm: str, truck: _Truck, *, all_there_is: bool = False
+        self, realm: str, truck: TruckBoot, *, all_there_is: bool = False
     ) -> Iterator[Output | Work]:
         """Look once at every fix: what is found does not depend on which came together."""
         for fix in truck.boot.settle(all_there_is=all_there_is):
@@ -272,11 +201,11 @@ class Engine:
             yield from self._look(realm, truck, bridges, truck.latest_s)
             self._forget(truck, truck.latest_s)
 
-    def _finish(self, realm: str, truck: _Truck) -> Iterator[Output | Work]:
+    def _finish(self, realm: str, truck: TruckBoot) -> Iterator[Output | Work]:
         yield from self._settle(realm, truck, all_there_is=True)
         yield from self._look(realm, truck, self._frames, np.inf)
 
-    def _forget(self, truck: _Truck, now_s: float) -> None:
+    def _forget(self, truck: TruckBoot, now_s: float) -> None:
         truck.began_s = min(truck.began_s, now_s)
         if now_s > truck.clock_s + _KEEP_S and abs(now_s - truck.doubtful_s) > _KEEP_S:
             # A single wrong time must not make the truck forget, and never take in again, all that
@@ -290,11 +219,11 @@ class Engine:
         if now_s - _KEEP_S > max(truck.began_s, truck.forgotten_s) + _FORGET_EVERY_S:
             truck.forget_before(now_s - _KEEP_S)
 
-    def _truck(self, key: Key, boot_id: int, vehicle: Vehicle) -> _Truck:
+    def _truck(self, key: Key, boot_id: int, vehicle: Vehicle) -> TruckBoot:
         name = (key.realm, key.identifier, boot_id)
         truck = self._trucks.get(name)
         if truck is None:
-            truck = self._trucks[name] = _Truck(vehicle)
+            truck = self._trucks[name] = TruckBoot(vehicle)
         return truck
 
     def _finish_older_boots(self, key: Key, boot_id: int) -> Iterator[Output | Work]:
@@ -304,7 +233,9 @@ class Engine:
                 yield from self._finish(key.realm, self._trucks.pop(name))
         self._newest_boot[key.realm, key.identifier] = boot_id
 
-    def _may_change(self, truck: _Truck, bridge: Bridge, frame: BridgeFrame, fix: GnssFix) -> bool:
+    def _may_change(
+        self, truck: TruckBoot, bridge: Bridge, frame: BridgeFrame, fix: GnssFix
+    ) -> bool:
         """Whether a fix can begin, change or end a stay on a bridge: most are far from it."""
         here_m, _ = to_chainage(frame, fix.latitude_deg, fix.longitude_deg)
         reach_m = _REACH_M + 2.0 * least_depth_m(self._site.receiver)
@@ -316,7 +247,7 @@ class Engine:
     def _look(
         self,
         realm: str,
-        truck: _Truck,
+        truck: TruckBoot,
         bridges: list[tuple[Bridge, BridgeFrame]],
         now_s: float,
         wait: _Wait | None = None,
@@ -337,7 +268,7 @@ class Engine:
     def _advance(
         self,
         realm: str,
-        truck: _Truck,
+        truck: TruckBoot,
         bridge: Bridge,
         stay: Stay,
         now_s: float,
@@ -375,7 +306,7 @@ class Engine:
         data = self._data(realm, truck, bridge, stay, crossing_id)
         work = Work(self._works, data, self._settings)
         done = told(pb.DONE, stay.exit_s)
-        self._bridge(realm, bridge.id).under_way.append(_UnderWay(work, done))
+        self._bridge(realm, bridge.id).under_way.append(UnderWay(work, done))
         yield work
 
     def done(self, work: Work, result: Crossing) -> Iterator[Output]:
@@ -394,7 +325,7 @@ class Engine:
             yield from self._result_told(bridge, first, bridge.results.pop(first.work.number))
 
     def _result_told(
-        self, bridge: _OfBridge, found: _UnderWay, result: Crossing
+        self, bridge: BridgeCrossings, found: UnderWay, result: Crossing
     ) -> Iterator[Output]:
         realm, name = found.work.data.realm, found.work.data.bridge.id
         counts = usable(result)
@@ -410,7 +341,7 @@ class Engine:
         if counts is not None and latest is not None:
             yield state_output(realm, name, result.exit_time, latest)
 
-    def _may_still_come(self, truck: _Truck, stay: Stay, now_s: float) -> bool:
+    def _may_still_come(self, truck: TruckBoot, stay: Stay, now_s: float) -> bool:
         """Whether something of a crossing is missing that a little patience may bring."""
         begin_s, end_s = stay.entry_s - MARGIN_S, stay.exit_s + MARGIN_S
         if now_s < end_s:
@@ -421,7 +352,7 @@ class Engine:
             return False  # newer ones have come long ago: it is lost
         return now_s < end_s + _SILENCE_S
 
-    def _has_hole(self, truck: _Truck, stay: Stay, now_s: float) -> bool:
+    def _has_hole(self, truck: TruckBoot, stay: Stay, now_s: float) -> bool:
         """Whether a crossing lacks what is older than something that has come."""
         latest_s = truck.boot.latest_accel_s()
         if latest_s < stay.exit_s:
@@ -429,7 +360,9 @@ class Engine:
         end_s = min(stay.exit_s + MARGIN_S, latest_s - _ROUNDING_S)
         return truck.boot.lacks_accel(stay.entry_s - MARGIN_S - MAX_BATCH_S, end_s)
 
-    def _identity(self, realm: str, truck: _Truck, bridge: Bridge, stay: Stay) -> tuple[str, bool]:
+    def _identity(
+        self, realm: str, truck: TruckBoot, bridge: Bridge, stay: Stay
+    ) -> tuple[str, bool]:
         """The id of a stay: the same although its entry moves a little with every new fix."""
         for (known_bridge, entry_s), crossing_id in truck.detected.items():
             if known_bridge == bridge.id and abs(entry_s - stay.entry_s) < MERGE_S:
@@ -453,7 +386,7 @@ class Engine:
         return crossing_id, True
 
     def _data(
-        self, realm: str, truck: _Truck, bridge: Bridge, stay: Stay, crossing_id: str
+        self, realm: str, truck: TruckBoot, bridge: Bridge, stay: Stay, crossing_id: str
     ) -> CrossingData:
         frame = {b.id: f for b, f in self._frames}[bridge.id]
         fixes = truck.boot.fixes()
@@ -476,7 +409,7 @@ class Engine:
         )
 
     def _against(
-        self, realm: str, truck: _Truck, bridge: Bridge, stay: Stay, crossing_id: str
+        self, realm: str, truck: TruckBoot, bridge: Bridge, stay: Stay, crossing_id: str
     ) -> tuple[Reason, ...]:
         """What is known against a crossing that its own signals do not tell."""
         reasons = []
@@ -495,8 +428,8 @@ class Engine:
             reasons.append(Reason.OTHER_TRUCK_ON_BRIDGE)
         return tuple(reasons)
 
-    def _bridge(self, realm: str, bridge: str) -> _OfBridge:
-        return self._of_bridge.setdefault((realm, bridge), _OfBridge())
+    def _bridge(self, realm: str, bridge: str) -> BridgeCrossings:
+        return self._of_bridge.setdefault((realm, bridge), BridgeCrossings())
 
     def bridges(self) -> dict[str, BridgeResult]:
         """The latest state of every bridge that has one, for the results file."""
@@ -504,7 +437,7 @@ class Engine:
         return {name: state for name, state in states.items() if state is not None}
 
 
-def _fixes_around(truck: _Truck, stay: Stay) -> tuple[float, float]:
+def _fixes_around(truck: TruckBoot, stay: Stay) -> tuple[float, float]:
     """The time of the last fix before a stay and of the first one behind it."""
     time_s = truck.boot.fixes().time_s
     first = int(np.searchsorted(time_s, stay.entry_s, "right")) - 1
