@@ -288,7 +288,9 @@ class Restartable(NamedTuple):
 
     def stored(self) -> list[Message]:
         """All messages of all results files."""
-        return [m for path in self.paths() for m in read_messages(path)]
+        # Who is killed right after it made its file leaves one without a message.
+        whole = [path for path in self.paths() if read_info(path).messages]
+        return [m for path in whole for m in read_messages(path)]
 
     def paths(self) -> list[Path]:
         return sorted((self.folder / REALM).glob("results-2*.mcap"))
