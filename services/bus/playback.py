@@ -19,7 +19,9 @@ _log = logging.getLogger(__name__)
 _MAX_IN_FLIGHT = 20_000
 """Far fewer than a logger's queue holds, so that even `--speed 0` cannot overrun it."""
 _CHECK_EVERY = 1000
+"""So many messages are sent between two looks at what has arrived."""
 DELIVERY_TIMEOUT_S = 30.0
+"""A logger may have a slow disk; one that is silent for longer has gone."""
 _EXIT_AT_ONCE = 130
 """What a shell reports of a program that was interrupted."""
 SETTLE_S = 0.3

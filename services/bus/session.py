@@ -49,7 +49,7 @@ _CONNECT_TRY_MS = 500
 _PATIENCE_WITH_SUBSCRIBER_US = 1_000_000
 """Zenoh's own is 5 s; who is cut off connects again and gets what it missed."""
 _RUNTIME = "(rx: (handover: acc), acc: (worker_threads: 2))"
-"""Of a router: what comes is read by the threads that wait for it. Zenoh's own pool of receiving
+"""A router has what comes read by the threads that wait for it. Zenoh's own pool of receiving
 threads has to be woken for every message, which costs more than all that it does with one. There
 are two, as new connections wait for them too and one may be held up by a frozen subscriber."""
 

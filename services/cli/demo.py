@@ -43,10 +43,13 @@ SCENARIO = 6
 REALM = "sim-demo"
 ROAD_CLASS = "A"
 SEED = 1
+"""Any other shows a crossing as well."""
 _READY_S = 60.0
 """The worker may have to compile its kernels first."""
 _RESULT_S = 60.0
+"""From the last message of the truck on; an identification takes seconds."""
 _STOP_S = 10.0
+"""A service that is stopped finishes what it has begun; here nothing is under way."""
 _RECORDING, _RESULTS, _VIEWS, _FIGURE = "recording.mcap", "results.mcap", "demo.rrd", "demo.png"
 
 

@@ -15,6 +15,7 @@ from services.identification.engine import Engine
 from services.identification.outputs import Output, Work
 
 _LOOK_AGAIN_S = 0.1
+"""A wait is cut into pieces, so that Python hears signals between them."""
 
 
 class Finished(NamedTuple):

@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 _NONE = '"crossings": []'
 """How a results file without crossings says so; in a string the quotes would be escaped."""
 _INDENT = "  "
-"""Of a crossing, within the list that is within the file."""
+"""A crossing stands in a list that stands in the file."""
 
 
 class GrowingJson:

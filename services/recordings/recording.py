@@ -46,7 +46,7 @@ SITE = "site.toml"
 
 _log = logging.getLogger(__name__)
 _BOOT_DIGITS = 20
-"""Of a number of 64 bits."""
+"""A number of 64 bits has no more."""
 
 Identities = dict[tuple[Key, int], Intervals]
 """By key and boot_id: the sequence numbers of the messages."""

@@ -42,8 +42,11 @@ REALM = "sim-calibration"
 _SETTLE_S = 3.0
 """The truck drives this long before its recording begins: it starts at rest on a rough road."""
 _BEFORE_S, _AFTER_S = 4.0, 3.5
+"""A recording begins so long before the entry and ends so long after the exit."""
 _LONGEST_STEP_S = 1e-4
+"""The truth must be far more exact than what is to be tested by it."""
 _SLOW_ERROR_S = 300.0
+"""A receiver's slow error is forgotten within minutes."""
 
 _ROADS = ("A", "B")
 _SPEED_M_PER_S = (5.0, 25.0)
@@ -53,14 +56,16 @@ _RATE_SHARES = (0.6, 0.15, 0.15, 0.1)
 _FIX_RATES_HZ = (10.0, 1.0)
 _FIX_RATE_SHARES = (0.7, 0.3)
 _BIAS_M_PER_S2 = 0.03
+"""Standard deviation of a channel's offset, 3 mg: a MEMS sensor after a change of temperature."""
 _CHANGING_SHARE = 0.4
-"""Of the crossings with acceleration and braking up to 1 m/s²; the others drive as steadily as a
-driver does. Where the height of the centre of gravity is unknown, all do."""
+"""This share accelerates and brakes by up to 1 m/s²; the others drive as steadily as a driver
+does. Where the height of the centre of gravity is unknown, all do."""
 _STEADY_M_PER_S2, _CHANGING_M_PER_S2 = (0.0, 0.1), (0.1, 1.0)
 _PERIOD_S = (6.0, 16.0)
 _CG_HEIGHT_M = 1.1
+"""A loaded truck's, above the road."""
 _LARGEST_CHANGE = 0.3
-"""Of the speed, to either side."""
+"""The speed changes by no larger share of itself, to either side."""
 
 
 class Conditions(NamedTuple):
@@ -120,7 +125,7 @@ class Seen(NamedTuple):
     data: CrossingData
     settings: IdentificationSettings
     draws: dict[str, Floats] | None = None
-    """Of the posterior by the names of `true_values`, (n,) each; None where a method keeps none."""
+    """By the names of `true_values`, (n,) draws of each; None where a method keeps none."""
 
 
 def default_site() -> Site:

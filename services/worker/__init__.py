@@ -47,9 +47,13 @@ __all__ = ["run"]
 _log = logging.getLogger(__name__)
 _Queue = queue.Queue[Arrived | Token]
 _POLL_S = 0.1
+"""So late a stop, a token or a result is seen where no message comes."""
 _HEALTH_PERIOD_S = 60.0
+"""As docs/topics.md says of `health`."""
 _LONGEST_QUEUE = 200_000
+"""Messages: two hours of one truck, or a minute of a hundred. Then publishers wait."""
 _CONNECT_S = 1.0
+"""An attempt is so short that a signal is heard between two."""
 
 
 def run(
