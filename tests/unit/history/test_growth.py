@@ -137,6 +137,18 @@ def test_the_file_is_as_if_it_had_been_written_at_once(tmp_path: Path, number: i
     assert load_results(path).crossings == tuple(crossings)
 
 
+def test_an_end_that_is_much_shorter_leaves_nothing_behind(tmp_path: Path) -> None:
+    """More goes with the bridges than comes with the crossing."""
+    path = tmp_path / "results.json"
+    file = GrowingJson(path, HEADER)
+    state = latest_state(next(counted_bridges()))
+    assert state is not None
+    short = [result(n).model_copy(update={"road": None}) for n in range(2)]
+    file.add(short[0], {f"bridge-{n}": state for n in range(100)})
+    file.add(short[1], {})
+    assert path.read_text() == results_json(results(HEADER, short, {}))
+
+
 def test_a_file_that_somebody_took_away_or_changed_is_not_written_into(tmp_path: Path) -> None:
     path = tmp_path / "results.json"
     file = GrowingJson(path, HEADER)
