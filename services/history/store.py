@@ -30,7 +30,7 @@ class Told(NamedTuple):
 class Store:
     """Takes messages in the order in which they were told, and keeps what they say of crossings.
 
-    It keeps no message: its memory grows by some hundred bytes with each crossing. With a `search`
+    It keeps no message: of a result only what counts in the state of a bridge. With a `search`
     (`search_hash`) only results of that search are results: what another search or another site
     file gave does not count, and its states are told anew.
     """

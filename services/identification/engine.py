@@ -114,6 +114,8 @@ class Engine:
                 if latest is not None:
                     exit_time = known.usable.exit_time
                     yield state_output(known.realm, known.bridge, exit_time, latest)
+        for known in crossings:
+            known.last = known.usable = None  # nobody asks for them again, and they are large
 
     def expect(self, key: Key, payload: bytes) -> None:
         """Take a position into account before its turn: that another truck was there then.

@@ -126,6 +126,7 @@ def run(
         receiver = threading.Thread(target=receive, name="receive", daemon=True)
         try:
             _resume(engine, earlier, publisher, files)
+            del earlier  # of two days
             receiver.start()
             _serve(engine, execution, arrivals, publisher, service_id, files, stop, ready)
         except BaseException:
