@@ -11,7 +11,7 @@ from schemas.site import Site
 from services.common.errors import FailureError
 from services.common.files import check_writable, replaced_atomically, write_atomically
 from services.execution.offline import identify_recordings, site_of
-from services.history.draws import Draws, check_draws, write_draws
+from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.recordings.recording import read_messages
 
 if TYPE_CHECKING:
@@ -74,8 +74,12 @@ def identify_command(
                 )
         except RuntimeError as error:  # so Rerun says that its file could not be written
             raise FailureError(f"{rrd_path}: could not be written: {error}") from error
-    if draws_path is not None:  # last: several crossings do not fit into every kind of file
-        write_draws(draws_path, draws)
+    if draws_path is not None:
+        kept = (
+            DrawsOfCrossing(c.crossing_id, c.vehicle, c.bridge, draws.get(c.crossing_id, {}))
+            for c in found.crossings
+        )
+        write_draws(draws_path, kept)
     return 0
 
 
