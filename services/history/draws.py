@@ -36,10 +36,15 @@ class DrawsOfCrossing(NamedTuple):
 
 def check_draws(path: Path, method: str) -> None:
     """Refuse what cannot be written, before the work is done."""
-    if path.suffix not in _SUFFIXES:
-        raise InputError(f"{path}: draws are written as {' or '.join(_SUFFIXES)}")
+    check_draws_file(path)
     if method != "pre":
         raise InputError(f"--draws: method {method} has no draws, pre has")
+
+
+def check_draws_file(path: Path) -> None:
+    """Refuse a kind of file that is not known, or for which something is not installed."""
+    if path.suffix not in _SUFFIXES:
+        raise InputError(f"{path}: draws are written as {' or '.join(_SUFFIXES)}")
     if path.suffix == ".nc":
         otherwise = "or name a file .npz"
         check_installed(f"{path}: NetCDF", "xarray", "h5netcdf", otherwise=otherwise)
