@@ -54,9 +54,12 @@ class Simulation(NamedTuple):
         """What the truck would have sent."""
         return run_to_messages([self.drive.run], self.site, _REALM, self.site.vehicles[0].id)
 
-    def write(self, path: str | Path) -> None:
-        """Write the recording (.mcap) that the truck would have made; replaces an existing file."""
-        write_drive(Path(path), self.drive, self.site)
+    def write(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the recording (.mcap) that the truck would have made.
+
+        InputError if there is a recording, which only `force` replaces, or it cannot be written.
+        """
+        write_drive(Path(path), self.drive, self.site, force=force)
 
 
 def simulate(
