@@ -4,7 +4,8 @@ ENV PYTHONUNBUFFERED=1
 WORKDIR /app
 COPY requirements/runtime.txt requirements/
 RUN pip install --no-cache-dir --require-hashes -r requirements/runtime.txt
-COPY LICENSE README.md pyproject.toml ./
+COPY LICENSE README.md pyproject.toml setup.py ./
+COPY driveby driveby
 COPY pre_core pre_core
 COPY schemas schemas
 COPY services services

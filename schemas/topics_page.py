@@ -78,7 +78,8 @@ was cut off: ask again. A truck frees what `durable` confirms.
 
 ## A subscriber
 
-Run it with the endpoint of the logger, e.g. `python subscriber.py tcp/127.0.0.1:7447`.
+Run it with the endpoint of the logger, e.g. `.venv/bin/python subscriber.py tcp/127.0.0.1:7447`.
+Where a wheel is installed instead of the checkout, `schemas` is `driveby.schemas`.
 
 ```python
 {SUBSCRIBER}```

@@ -1,25 +1,18 @@
-"""`driveby identify`: recordings become results, offline, through the worker's own engine."""
+"""`driveby identify`: identifies the crossings of recordings, prints and writes what was found."""
 
 import logging
-import time
-from collections.abc import Callable, Iterator
-from itertools import chain
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.results import Crossing, Header, Results, results, results_json
+from schemas.results import Crossing, Results, results_json
 from schemas.settings import IdentificationSettings
-from schemas.site import Site, load_site, parse_site, site_hash
-from services.common.errors import FailureError, InputError
+from schemas.site import Site
+from services.common.errors import FailureError
 from services.common.files import check_writable, replaced_atomically, write_atomically
-from services.execution.dispatch import awaited, dispatched
-from services.execution.here import Here
-from services.history.draws import Draws, check_draws, write_draws
-from services.identification.engine import Engine
-from services.identification.identify import Keep
-from services.identification.outputs import Output, Work
-from services.identification.streams import device_time_ns
-from services.recordings.recording import Message, program_version, read_messages, read_site
+from services.execution.offline import identify_recordings, site_of
+from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
+from services.recordings.recording import read_messages
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -72,7 +65,9 @@ def identify_command(
             with replaced_atomically(rrd_path) as temporary:
                 write_rrd(
                     temporary,
-                    vehicles=signals_of_messages(_all_messages(recordings)),
+                    vehicles=signals_of_messages(
+                        message for path in recordings for message in read_messages(path)
+                    ),
                     bridges=bridges_of_site(known),
                     crossings=[
                         view_of_crossing(c, known.bridge(c.bridge)) for c in found.crossings
@@ -80,117 +75,13 @@ def identify_command(
                 )
         except RuntimeError as error:  # so Rerun says that its file could not be written
             raise FailureError(f"{rrd_path}: could not be written: {error}") from error
-    if draws_path is not None:  # last: several crossings do not fit into every kind of file
-        write_draws(draws_path, draws)
-    return 0
-
-
-def site_of(recordings: list[Path], site: Path | None) -> Site:
-    """The site file given, or else the one stored in the first recording that has one."""
-    if site is not None:
-        return load_site(site)
-    for path in recordings:
-        text = read_site(path)
-        if text is not None:
-            return parse_site(text, f"{path}: site.toml")
-    raise InputError(f"{recordings[0]}: no site file is stored in it, give one with --site")
-
-
-def identify_recordings(
-    recordings: list[Path],
-    site: Site,
-    settings: IdentificationSettings,
-    say: Callable[[str], None] = lambda text: None,
-    keep: Keep = lambda crossing_id, draws: None,
-) -> Results:
-    """Results of all crossings in the recordings, in order of time; `keep` is given their draws."""
-    header = Header(
-        version=program_version(),
-        created=time.time(),
-        site_hash=site_hash(site),
-        settings=settings.model_dump(mode="json"),
-        seed=settings.seed,
-    )
-    engine = Engine(site, settings, header)
-    execution = Here(
-        report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"), keep=keep
-    )
-    messages: dict[str, list[Message]] = {"accel": [], "gnss": [], "info": []}
-    for message in _all_messages(recordings):
-        if message.key.owner == "vehicle" and message.key.stream in messages:
-            messages[message.key.stream].append(message)
-    for stream, what in (("accel", "accelerations (accel)"), ("gnss", "positions (gnss)")):
-        if not messages[stream]:
-            raise InputError(f"{_names(recordings)}: no {what}, a recording of a truck is expected")
-    _check_vehicles(recordings, site, [*messages["accel"], *messages["gnss"]])
-    for message in messages["gnss"]:
-        engine.expect(message.key, message.payload)
-    outputs = chain(
-        chain.from_iterable(
-            dispatched(engine, execution, _said(recordings, engine, message))
-            for message in _as_it_happened(
-                recordings, [m for one in messages.values() for m in one]
-            )
-        ),
-        dispatched(engine, execution, engine.finish()),
-        awaited(engine, execution),
-    )
-    found = [output.result for output in outputs if output.result is not None]
-    found.sort(key=lambda crossing: crossing.entry_time)
-    return results(header, found, engine.bridges())
-
-
-def _check_vehicles(recordings: list[Path], site: Site, messages: list[Message]) -> None:
-    """InputError if the site knows none of the trucks; a warning for each that it does not know."""
-    known = {vehicle.id for vehicle in site.vehicles}
-    drove = {message.key.identifier for message in messages}
-    strangers = ", ".join(sorted(drove - known))
-    if drove and not drove & known:
-        raise InputError(
-            f"{_names(recordings)}: {strangers} drove, but the site has no such vehicle"
+    if draws_path is not None:
+        kept = (
+            DrawsOfCrossing(c.crossing_id, c.vehicle, c.bridge, draws.get(c.crossing_id, {}))
+            for c in found.crossings
         )
-    if strangers:
-        _log.warning("%s drove too, but the site has no such vehicle", strangers)
-
-
-def _as_it_happened(recordings: list[Path], messages: list[Message]) -> list[Message]:
-    """Boot by boot, by the truck's clock: a recording keeps the order in which messages came."""
-
-    def moment(message: Message) -> tuple[int, str, str, int]:
-        try:
-            time_ns = -1  # what a truck says of itself holds for all of a boot
-            if message.key.stream != "info":
-                time_ns = device_time_ns(message.key.stream, message.payload)
-        except ValueError as error:
-            raise _malformed(recordings, message, error) from error
-        return message.boot_id, message.key.realm, message.key.identifier, time_ns
-
-    return sorted(messages, key=moment)
-
-
-def _said(recordings: list[Path], engine: Engine, message: Message) -> Iterator[Output | Work]:
-    try:
-        return engine.feed(message.key, message.payload)
-    except ValueError as error:
-        wrong = _malformed(recordings, message, error)
-        if message.key.stream == "info":  # nothing that it could say is needed
-            _log.warning("%s", wrong)
-            return iter(())
-        raise wrong from error
-
-
-def _malformed(recordings: list[Path], message: Message, error: ValueError) -> InputError:
-    where = f"{_names(recordings)}: {message.key.stream} {message.sequence}"
-    return InputError(f"{where}: {error}")
-
-
-def _all_messages(recordings: list[Path]) -> Iterator[Message]:
-    for path in recordings:
-        yield from read_messages(path)
-
-
-def _names(recordings: list[Path]) -> str:
-    return ", ".join(str(path) for path in recordings)
+        write_draws(draws_path, kept)
+    return 0
 
 
 def _print(console: "Console", found: Results, site: Site) -> None:

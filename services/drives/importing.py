@@ -32,9 +32,9 @@ def import_command(
     check_writable(output, force=force)
     text = read_site_text(site)
     parsed = parse_site(text, str(site))
-    vehicle_id = _vehicle(parsed, site, vehicle)
+    vehicle_id = vehicle_of(parsed, str(site), vehicle)
     realm = _realm(sources, name)
-    runs = _read(sources, parsed, site)
+    runs = normalised_runs(sources, parsed, str(site))
     messages = write_recording(
         output,
         run_to_messages(runs, parsed, realm, vehicle_id),
@@ -51,14 +51,25 @@ def import_command(
 
 def messages_of(folder: Path, site: Path, vehicle: str | None) -> Iterator[Message]:
     """Return what `import_command` would write of a folder of CSV files or of comma2k19."""
-    parsed = parse_site(read_site_text(site), str(site))
-    vehicle_id = _vehicle(parsed, site, vehicle)
-    return run_to_messages(
-        _read([folder], parsed, site), parsed, _realm([folder], None), vehicle_id
+    return messages_of_folder(
+        folder, parse_site(read_site_text(site), str(site)), str(site), vehicle
     )
 
 
-def _read(sources: list[Path], site: Site, site_path: Path) -> list[Run]:
+def messages_of_folder(
+    folder: Path, site: Site, site_name: str, vehicle: str | None
+) -> Iterator[Message]:
+    """The same of a site that was read already; errors call it `site_name`."""
+    vehicle_id = vehicle_of(site, site_name, vehicle)
+    runs = normalised_runs([folder], site, site_name)
+    return run_to_messages(runs, site, _realm([folder], None), vehicle_id)
+
+
+def normalised_runs(sources: list[Path], site: Site | None, site_name: str) -> list[Run]:
+    """The runs of a folder or of a pair of CSV files, upward and without gravity.
+
+    Without a site nobody knows how a CSV file was measured: then it is as in the file.
+    """
     if len(sources) == 1 and sources[0].suffix == ".csv":
         raise InputError(f"{sources[0]}: the positions are missing, give accel.csv and gps.csv")
     if len(sources) == 1 and is_comma2k19(sources[0]):
@@ -69,29 +80,32 @@ def _read(sources: list[Path], site: Site, site_path: Path) -> list[Run]:
         runs = [read_pair(*sources)]
     else:
         raise InputError(f"{len(sources)} files given, a folder or accel.csv gps.csv expected")
+    if site is None:
+        return runs
     for run in runs:
-        _check_rate(run, site, site_path)
+        _check_rate(run, site, site_name)
     return [normalised(run, site.sensor) for run in runs]
 
 
-def _check_rate(run: Run, site: Site, site_path: Path) -> None:
+def _check_rate(run: Run, site: Site, site_name: str) -> None:
     """Times in the wrong unit and the wrong site file show in the rate."""
     declared = site.sensor.rate_hz
     if not any(abs(run.rate_hz / rate - 1) <= _LARGEST_RATE_ERROR for rate in declared):
         raise InputError(
             f"{run.source}: time_s gives a rate of {run.rate_hz:g} Hz, but sensor.rate_hz of "
-            f"{site_path} is {declared[0]:g} Hz, one of them must be mended"
+            f"{site_name} is {declared[0]:g} Hz, one of them must be mended"
         )
 
 
-def _vehicle(site: Site, path: Path, wanted: str | None) -> str:
+def vehicle_of(site: Site, site_name: str, wanted: str | None) -> str:
+    """The identifier of the truck meant; InputError if the site leaves it open or lacks it."""
     known = [vehicle.id for vehicle in site.vehicles]
     if wanted is None and len(known) == 1:
         return known[0]
     if wanted in known:
         return wanted
     problem = "holds several vehicles" if wanted is None else f"holds no vehicle {wanted}"
-    raise InputError(f"{path}: {problem}, choose with --vehicle one of {', '.join(known)}")
+    raise InputError(f"{site_name}: {problem}, choose with --vehicle one of {', '.join(known)}")
 
 
 def _realm(sources: list[Path], name: str | None) -> str:

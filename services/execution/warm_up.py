@@ -25,7 +25,7 @@ from pre_core.physics.simulate import constant_speed
 from pre_core.physics.vehicle import total_mass_kg
 from pre_core.search import loop
 
-PACKAGE = Path(__file__).parents[2] / "pre_core"
+PACKAGE = Path(unknowns.__file__).parent
 _SOUND = experiment.beam(np.ones(experiment.ELEMENTS))
 
 

@@ -1,58 +1,115 @@
-"""The Markov chains of an identification as a file: `driveby identify --draws`.
+"""The Markov chains of identifications as a file: `driveby identify --draws`.
 
-Both kinds hold, for every unknown, an array (chain, draw). ArviZ reads them:
-
-    arviz.convert_to_inference_data(dict(numpy.load("OUT.npz")))
-    arviz.convert_to_inference_data(xarray.open_dataset("OUT.nc"))
-
-An archive of several crossings names its arrays CROSSING/NAME.
+OUT.nc is NetCDF-4 in the convention of ArviZ's InferenceData, for `arviz.from_netcdf("OUT.nc")`: a
+group `posterior` in which every unknown is an array (chain, draw, crossing). It needs the extra
+`driveby[notebook]`. OUT.npz needs nothing but numpy and holds arrays (chain, draw) called NAME, or
+CROSSING/NAME where there are several crossings.
 """
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.common.errors import InputError
+from services.common.extras import check_installed
 from services.common.files import replaced_atomically
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 Draws = dict[str, NDArray[np.float64]]
+"""(chains, draws) of every unknown, by name."""
 _SUFFIXES = (".npz", ".nc")
+
+
+class DrawsOfCrossing(NamedTuple):
+    """The draws of one crossing, and whose they are."""
+
+    crossing_id: str
+    vehicle: str
+    bridge: str
+    draws: Draws
 
 
 def check_draws(path: Path, method: str) -> None:
     """Refuse what cannot be written, before the work is done."""
-    if path.suffix not in _SUFFIXES:
-        raise InputError(f"{path}: draws are written as {' or '.join(_SUFFIXES)}")
+    check_draws_file(path)
     if method != "pre":
         raise InputError(f"--draws: method {method} has no draws, pre has")
 
 
-def write_draws(path: Path, crossings: dict[str, Draws]) -> None:
-    """Write the draws of every crossing that has some."""
-    if len(crossings) == 1:
-        (arrays,) = crossings.values()
-    else:
-        arrays = {
-            f"{name}/{key}": x for name, draws in crossings.items() for key, x in draws.items()
-        }
+def check_draws_file(path: Path) -> None:
+    """Refuse a kind of file that is not known, or for which something is not installed."""
+    if path.suffix not in _SUFFIXES:
+        raise InputError(f"{path}: draws are written as {' or '.join(_SUFFIXES)}")
     if path.suffix == ".nc":
-        if len(crossings) > 1:
-            raise InputError(
-                f"{path}: a netCDF file holds one crossing, these are {len(crossings)}; use .npz"
-            )
-        _write_netcdf(path, arrays)
+        otherwise = "or name a file .npz"
+        check_installed(f"{path}: NetCDF", "xarray", "h5netcdf", otherwise=otherwise)
+
+
+def write_draws(path: Path, crossings: Iterable[DrawsOfCrossing]) -> None:
+    """Write the draws of every crossing that has some; an existing file is replaced."""
+    some = [crossing for crossing in crossings if crossing.draws]
+    if path.suffix == ".nc":
+        _write_netcdf(path, some)
         return
+    if len(some) == 1:
+        arrays: Mapping[str, NDArray[np.float64]] = some[0].draws
+    else:
+        arrays = {f"{c.crossing_id}/{name}": x for c in some for name, x in c.draws.items()}
     with replaced_atomically(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
-def _write_netcdf(path: Path, arrays: Draws) -> None:
-    from scipy.io import netcdf_file  # slow to import, seldom needed
+def posterior(crossings: Iterable[DrawsOfCrossing]) -> "xr.Dataset":
+    """The draws of several crossings in one dataset: arrays (chain, draw, crossing).
 
-    with replaced_atomically(path) as temporary, netcdf_file(temporary, "w") as file:
-        for key, values in arrays.items():
-            if "chain" not in file.dimensions:
-                file.createDimension("chain", values.shape[0])
-                file.createDimension("draw", values.shape[1])
-            file.createVariable(key, "f8", ("chain", "draw"))[:] = values
+    Chains that were run longer than the shortest are thinned evenly to its length: `draws_sampled`
+    says how many draws they had. Where the crossings have not all the same unknowns, as on bridges
+    of 5 and of 7 elements, the arrays of each vehicle on each bridge are called
+    VEHICLE.BRIDGE.NAME and have a dimension VEHICLE.BRIDGE.crossing of their own.
+
+    InputError if xarray is not installed.
+    """
+    check_installed("a dataset of draws", "xarray")
+    import xarray as xr
+
+    some = [crossing for crossing in crossings if crossing.draws]
+    length = min((_length(c.draws) for c in some), default=0)
+    are_alike = len({frozenset(c.draws) for c in some}) == 1
+    pairs: dict[str, list[DrawsOfCrossing]] = {}
+    for c in some:
+        pairs.setdefault("" if are_alike else f"{c.vehicle}.{c.bridge}.", []).append(c)
+    arrays: dict[str, xr.DataArray] = {}
+    for prefix, alike in pairs.items():
+        dimension = f"{prefix}crossing"
+        of_each = {
+            dimension: [c.crossing_id for c in alike],
+            f"{prefix}vehicle": (dimension, [c.vehicle for c in alike]),
+            f"{prefix}bridge": (dimension, [c.bridge for c in alike]),
+            f"{prefix}draws_sampled": (dimension, [_length(c.draws) for c in alike]),
+        }
+        for name in alike[0].draws:
+            values = np.stack([_thinned(c.draws[name], length) for c in alike], axis=-1)
+            chains = {"chain": np.arange(values.shape[0]), "draw": np.arange(length)}
+            arrays[f"{prefix}{name}"] = xr.DataArray(
+                values, dims=("chain", "draw", dimension), coords={**chains, **of_each}
+            )
+    return xr.Dataset(arrays, attrs={"inference_library": "driveby"})
+
+
+def _length(draws: Draws) -> int:
+    return int(next(iter(draws.values())).shape[1])
+
+
+def _thinned(values: NDArray[np.float64], length: int) -> NDArray[np.float64]:
+    return values[:, np.arange(length) * values.shape[1] // length]
+
+
+def _write_netcdf(path: Path, crossings: list[DrawsOfCrossing]) -> None:
+    dataset = posterior(crossings)
+    with replaced_atomically(path) as temporary:
+        dataset.to_netcdf(temporary, group="posterior", engine="h5netcdf")

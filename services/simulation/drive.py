@@ -87,7 +87,7 @@ def simulate_command(
     """Write the recording of one simulated crossing."""
     check_writable(output, force=force)
     known = paper_site() if site is None else load_site(site)
-    ratios = _ratios(known.bridges[0], scenario, ei)
+    ratios = ratios_of(known.bridges[0], scenario, ei)
     with console.status("simulating", spinner="dots"):
         drive = simulate_drive(
             known,
@@ -252,7 +252,8 @@ def beam_of(bridge: Bridge, rigidity_ratios: Floats) -> Beam:
     )._replace(element_lengths_m=np.array(bridge.lengths_m))
 
 
-def _ratios(bridge: Bridge, scenario: int | None, ei: Sequence[float] | None) -> Floats:
+def ratios_of(bridge: Bridge, scenario: int | None, ei: Sequence[float] | None) -> Floats:
+    """EI over nominal of each element, by scenario or one by one; InputError if too few or many."""
     if scenario is not None:
         ratios = experiment.scenario_ratios(scenario)
         option = "--scenario"

@@ -15,9 +15,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from schemas.signals import CHANNELS, AccelBatch, GnssFix
+from schemas.signals import AccelBatch, GnssFix
 from schemas.site import Site
 from services.common.files import replaced_atomically
+from services.drives.signals import series_of_batches
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,
@@ -120,29 +121,16 @@ def acceleration_series(batches: Sequence[AccelBatch]) -> dict[str, tuple[IntArr
     A NaN stands in every gap longer than one and a half samples: a plot then breaks its line there
     instead of drawing an acceleration that nobody measured.
     """
-    series = {}
-    for name in CHANNELS:
-        parts = [
-            (batch.wall_time_ns, batch.channels[name])
-            for batch in batches
-            if name in batch.channels
-        ]
-        if not parts:
-            continue
-        times = np.concatenate(
-            [
-                start + np.rint(np.arange(len(c.samples)) * (1e9 / c.rate_hz)).astype(np.int64)
-                for start, c in parts
-            ]
-        )
-        samples = np.concatenate([channel.samples for _, channel in parts])
-        period_ns = 1e9 / min(channel.rate_hz for _, channel in parts)
+    marked = {}
+    for name, (times, samples) in series_of_batches(batches).items():
+        rates = (batch.channels[name].rate_hz for batch in batches if name in batch.channels)
+        period_ns = 1e9 / min(rates)
         gaps = np.flatnonzero(np.diff(times) > 1.5 * period_ns) + 1
-        series[name] = (
+        marked[name] = (
             np.insert(times, gaps, times[gaps - 1] + int(period_ns / 2)),
             np.insert(samples, gaps, np.nan),
         )
-    return series
+    return marked
 
 
 def front_axle_chainage(crossing: CrossingView, time_s: FloatArray) -> FloatArray:

@@ -49,7 +49,7 @@ import cProfile, json, pstats, sys, time
 from pathlib import Path
 began = time.perf_counter()
 from schemas.settings import IdentificationSettings
-from services.cli.identify import identify_recordings, site_of
+from services.execution.offline import identify_recordings, site_of
 imported = time.perf_counter()
 recordings = [Path(sys.argv[1])]
 settings = IdentificationSettings.model_validate({"method": "least_squares", "seed": 0})
@@ -77,7 +77,7 @@ import json, resource, sys, time
 from pathlib import Path
 began = time.perf_counter()
 from schemas.settings import IdentificationSettings
-from services.cli.identify import identify_recordings, site_of
+from services.execution.offline import identify_recordings, site_of
 imported = time.perf_counter()
 recordings = [Path(sys.argv[1])]
 settings = IdentificationSettings.model_validate({"seed": 0})

@@ -75,10 +75,20 @@ def test_compose_publishes_ports_on_loopback_only():
 
 
 def test_help_does_not_import_the_heavy_libraries():
-    heavy = {"numba", "zenoh", "rerun", "matplotlib", "scipy", "pydantic"}
+    heavy = {
+        "numba",
+        "zenoh",
+        "rerun",
+        "matplotlib",
+        "scipy",
+        "pydantic",
+        "numpy",
+        "pandas",
+        "xarray",
+    }
     code = (
-        "import sys\nfrom services.cli import main as cli\n"
-        "try:\n    cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "import sys\nfrom driveby.__main__ import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
         f"print('LOADED', sorted({heavy!r} & sys.modules.keys()))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

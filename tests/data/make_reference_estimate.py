@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from schemas.results import Crossing, Method
 from schemas.settings import IdentificationSettings
-from services.cli.identify import identify_recordings, site_of
+from services.execution.offline import identify_recordings, site_of
 
 PROJECT = Path(__file__).parents[2]
 REFERENCE = Path(__file__).with_name("reference_estimate.json")

@@ -17,8 +17,8 @@ from pre_core.physics.road import Profile
 from pre_core.physics.simulate import Simulation
 from schemas.results import Crossing, Results, results_json
 from schemas.settings import IdentificationSettings
-from services.cli.identify import identify_recordings
 from services.drives.runs import Run
+from services.execution.offline import identify_recordings
 from services.simulation import drive as simulation
 from services.simulation.drive import (
     beam_of,

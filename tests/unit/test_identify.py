@@ -22,11 +22,12 @@ from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.site import Site, parse_site, site_hash, site_toml
 from services.cli import main as cli
-from services.cli.identify import identify_command, identify_recordings, site_of
+from services.cli.identify import identify_command
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.importing import import_command
 from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.execution.offline import identify_recordings, site_of
 from services.recordings.recording import Message, read_messages, read_site
 from services.recordings.writer import write_recording
 from services.simulation.drive import Drive, paper_site, simulate_drive, write_drive

@@ -1,0 +1,189 @@
+"""What trucks measured, as arrays: of recordings and of folders of CSV files."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.signals import CHANNELS, AccelBatch, Channel, GnssFix, decode_accel, decode_gnss
+from schemas.site import Site
+from services.common.extras import check_installed
+from services.drives.importing import normalised_runs
+from services.drives.runs import Run
+from services.recordings.recording import read_messages
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Floats = NDArray[np.float64]
+Nanoseconds = NDArray[np.int64]
+
+T = TypeVar("T")
+
+
+class Series(NamedTuple):
+    """Samples of one accelerometer, both arrays (n,); a jump in the time is a gap."""
+
+    time_ns: Nanoseconds  # since 1970 UTC
+    acceleration_m_per_s2: Floats  # up positive, gravity removed
+
+
+class Track(NamedTuple):
+    """Fixes of a receiver in the order of time, all arrays (m,)."""
+
+    time_ns: Nanoseconds  # since 1970 UTC
+    latitude_deg: Floats
+    longitude_deg: Floats
+    altitude_m: Floats
+    speed_m_per_s: Floats
+    heading_deg: Floats  # clockwise from north, NaN where it is not known
+
+
+class Signals(NamedTuple):
+    """What one truck measured from one start of its computer to the next, or in one CSV run."""
+
+    source: str
+    """The file it was read from."""
+    vehicle: str
+    """Its identifier; empty for CSV files without a site file."""
+    run: int
+    """Number of the run in its file, from 0, by time."""
+    channels: dict[str, Series]
+    """By name, as in `driveby.CHANNELS`; a channel that the truck lacks is absent."""
+    fixes: Track
+
+    def accelerations(self) -> "pd.DataFrame":
+        """One column for each channel in m/s², over the UTC time; needs pandas.
+
+        NaN stands where a channel has no sample at a time at which another one has.
+        """
+        check_installed("a table of accelerations", "pandas")
+        import pandas as pd
+
+        columns = {
+            name: pd.Series(series.acceleration_m_per_s2, index=_utc(series.time_ns))
+            for name, series in self.channels.items()
+        }
+        return pd.DataFrame(columns).rename_axis(index="time")
+
+    def positions(self) -> "pd.DataFrame":
+        """One row for each fix, over the UTC time: degrees, m and m/s; needs pandas."""
+        check_installed("a table of positions", "pandas")
+        import pandas as pd
+
+        time_ns, *values = self.fixes
+        columns = dict(zip(Track._fields[1:], values, strict=True))
+        return pd.DataFrame(columns, index=_utc(time_ns)).rename_axis(index="time")
+
+
+def signals_of_recording(path: Path) -> list[Signals]:
+    """All runs of all trucks in a recording; InputError if it is none.
+
+    Messages that came twice are taken once, those that cannot be decoded are left out.
+    """
+    accel: dict[tuple[str, str, int], dict[int, AccelBatch]] = {}
+    gnss: dict[tuple[str, str, int], dict[int, GnssFix]] = {}
+    for message in read_messages(path):
+        whose = (message.key.realm, message.key.identifier, message.boot_id)
+        try:
+            if message.key.stream == "accel":
+                accel.setdefault(whose, {})[message.sequence] = decode_accel(message.payload)
+            elif message.key.stream == "gnss":
+                gnss.setdefault(whose, {})[message.sequence] = decode_gnss(message.payload)
+        except ValueError:
+            continue  # the logger has counted what cannot be read
+    found = [
+        Signals(
+            str(path),
+            whose[1],
+            0,
+            series_of_batches(_in_order(accel.get(whose, {}))),
+            _track_of_fixes(_in_order(gnss.get(whose, {}))),
+        )
+        for whose in accel.keys() | gnss.keys()
+    ]
+    return _numbered(found)
+
+
+def signals_of_folder(
+    folder: Path, site: Site | None, site_name: str, vehicle: str
+) -> list[Signals]:
+    """All runs in a folder of CSV files (or of comma2k19), as upward accelerations without gravity.
+
+    Without a site file nobody knows how they were measured: then they are as in the files.
+    """
+    runs = normalised_runs([folder], site, site_name)
+    return _numbered([signals_of_run(run, vehicle) for run in runs])
+
+
+def signals_of_run(run: Run, vehicle: str) -> Signals:
+    """One run as signals."""
+    time_ns = _nanoseconds(run.accel_time_s)
+    channels = {name: Series(time_ns, values) for name, values in run.channels.items()}
+    gnss = run.gnss
+    heading = np.full(gnss.time_s.size, np.nan) if gnss.heading_deg is None else gnss.heading_deg
+    track = Track(
+        _nanoseconds(gnss.time_s),
+        gnss.latitude_deg,
+        gnss.longitude_deg,
+        gnss.altitude_m,
+        gnss.speed_m_per_s,
+        heading,
+    )
+    return Signals(run.source, vehicle, 0, channels, track)
+
+
+def series_of_batches(batches: Sequence[AccelBatch]) -> dict[str, Series]:
+    """Join batches, in their order, into one series for each channel that there is."""
+    series = {}
+    for name in CHANNELS:
+        parts = [(b.wall_time_ns, b.channels[name]) for b in batches if name in b.channels]
+        if parts:
+            series[name] = Series(
+                np.concatenate([_sample_times_ns(start_ns, c) for start_ns, c in parts]),
+                np.concatenate([c.samples for _, c in parts]),
+            )
+    return series
+
+
+def _sample_times_ns(start_ns: int, channel: Channel) -> Nanoseconds:
+    offsets = np.rint(np.arange(len(channel.samples)) * (1e9 / channel.rate_hz))
+    return np.asarray(start_ns + offsets.astype(np.int64))
+
+
+def _in_order(by_sequence: dict[int, T]) -> list[T]:
+    return [by_sequence[sequence] for sequence in sorted(by_sequence)]
+
+
+def _track_of_fixes(fixes: Sequence[GnssFix]) -> Track:
+    rows = [
+        (f.latitude_deg, f.longitude_deg, f.altitude_m, f.speed_m_per_s, f.heading_deg)
+        for f in fixes
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+    return Track(np.array([f.wall_time_ns for f in fixes], dtype=np.int64), *table)
+
+
+def _numbered(found: Iterable[Signals]) -> list[Signals]:
+    """By time, numbered."""
+    in_order = sorted(found, key=lambda signals: (min(_starts(signals)), signals.vehicle))
+    return [signals._replace(run=number) for number, signals in enumerate(in_order)]
+
+
+def _starts(signals: Signals) -> Iterator[int]:
+    for time_ns in (*(s.time_ns for s in signals.channels.values()), signals.fixes.time_ns):
+        if time_ns.size:
+            yield int(time_ns[0])
+
+
+def _nanoseconds(time_s: Floats) -> Nanoseconds:
+    # Seconds since 1970 carry a quarter of a microsecond: whole microseconds are what is known.
+    return np.rint(time_s * 1e6).astype(np.int64) * 1000
+
+
+def _utc(time_ns: Nanoseconds) -> "pd.DatetimeIndex":
+    import pandas as pd
+
+    return pd.DatetimeIndex(pd.to_datetime(time_ns, unit="ns", utc=True))

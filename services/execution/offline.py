@@ -1,0 +1,134 @@
+"""Recordings become results, offline, through the worker's own engine."""
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
+from pathlib import Path
+
+from schemas.results import Header, Results, results
+from schemas.settings import IdentificationSettings
+from schemas.site import Site, load_site, parse_site, site_hash
+from services.common.errors import InputError
+from services.execution.blas import one_blas_thread
+from services.execution.dispatch import awaited, dispatched
+from services.execution.here import Here
+from services.identification.engine import Engine
+from services.identification.identify import Keep
+from services.identification.outputs import Output, Work
+from services.identification.streams import device_time_ns
+from services.recordings.recording import Message, program_version, read_messages, read_site
+
+_log = logging.getLogger(__name__)
+
+
+def site_of(recordings: list[Path], site: Path | None) -> Site:
+    """The site file given, or else the one stored in the first recording that has one."""
+    if site is not None:
+        return load_site(site)
+    for path in recordings:
+        text = read_site(path)
+        if text is not None:
+            return parse_site(text, f"{path}: site.toml")
+    raise InputError(f"{recordings[0]}: no site file is stored in it, give one with --site")
+
+
+def identify_recordings(
+    recordings: list[Path],
+    site: Site,
+    settings: IdentificationSettings,
+    say: Callable[[str], None] = lambda text: None,
+    keep: Keep = lambda crossing_id, draws: None,
+) -> Results:
+    """Results of all crossings in the recordings, in order of time; `keep` is given their draws."""
+    messages = (message for path in recordings for message in read_messages(path))
+    name = ", ".join(str(path) for path in recordings)
+    return identify_messages(messages, name, site, settings, say, keep)
+
+
+def identify_messages(
+    messages: Iterable[Message],
+    name: str,
+    site: Site,
+    settings: IdentificationSettings,
+    say: Callable[[str], None] = lambda text: None,
+    keep: Keep = lambda crossing_id, draws: None,
+) -> Results:
+    """Results of all crossings in the messages, which errors call `name`; they may be unordered.
+
+    InputError without accelerations or positions, or if the site knows none of the trucks.
+    """
+    header = Header(
+        version=program_version(),
+        created=time.time(),
+        site_hash=site_hash(site),
+        settings=settings.model_dump(mode="json"),
+        seed=settings.seed,
+    )
+    engine = Engine(site, settings, header)
+    execution = Here(
+        report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"), keep=keep
+    )
+    streams: dict[str, list[Message]] = {"accel": [], "gnss": [], "info": []}
+    for message in messages:
+        if message.key.owner == "vehicle" and message.key.stream in streams:
+            streams[message.key.stream].append(message)
+    for stream, what in (("accel", "accelerations (accel)"), ("gnss", "positions (gnss)")):
+        if not streams[stream]:
+            raise InputError(f"{name}: no {what}, a recording of a truck is expected")
+    _check_vehicles(name, site, [*streams["accel"], *streams["gnss"]])
+    for message in streams["gnss"]:
+        engine.expect(message.key, message.payload)
+    with one_blas_thread():
+        outputs = chain(
+            chain.from_iterable(
+                dispatched(engine, execution, _said(name, engine, message))
+                for message in _as_it_happened(name, [m for one in streams.values() for m in one])
+            ),
+            dispatched(engine, execution, engine.finish()),
+            awaited(engine, execution),
+        )
+        found = [output.result for output in outputs if output.result is not None]
+    found.sort(key=lambda crossing: crossing.entry_time)
+    return results(header, found, engine.bridges())
+
+
+def _check_vehicles(name: str, site: Site, messages: list[Message]) -> None:
+    """InputError if the site knows none of the trucks; a warning for each that it does not know."""
+    known = {vehicle.id for vehicle in site.vehicles}
+    drove = {message.key.identifier for message in messages}
+    strangers = ", ".join(sorted(drove - known))
+    if drove and not drove & known:
+        raise InputError(f"{name}: {strangers} drove, but the site has no such vehicle")
+    if strangers:
+        _log.warning("%s drove too, but the site has no such vehicle", strangers)
+
+
+def _as_it_happened(name: str, messages: list[Message]) -> list[Message]:
+    """Boot by boot, by the truck's clock: a recording keeps the order in which messages came."""
+
+    def moment(message: Message) -> tuple[int, str, str, int]:
+        try:
+            time_ns = -1  # what a truck says of itself holds for all of a boot
+            if message.key.stream != "info":
+                time_ns = device_time_ns(message.key.stream, message.payload)
+        except ValueError as error:
+            raise _malformed(name, message, error) from error
+        return message.boot_id, message.key.realm, message.key.identifier, time_ns
+
+    return sorted(messages, key=moment)
+
+
+def _said(name: str, engine: Engine, message: Message) -> Iterator[Output | Work]:
+    try:
+        return engine.feed(message.key, message.payload)
+    except ValueError as error:
+        wrong = _malformed(name, message, error)
+        if message.key.stream == "info":  # nothing that it could say is needed
+            _log.warning("%s", wrong)
+            return iter(())
+        raise wrong from error
+
+
+def _malformed(name: str, message: Message, error: ValueError) -> InputError:
+    return InputError(f"{name}: {message.key.stream} {message.sequence}: {error}")

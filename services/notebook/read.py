@@ -1,0 +1,96 @@
+"""Recordings and folders of CSV files to arrays, and to the messages that an engine takes."""
+
+from collections.abc import Iterator, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TypeAlias
+
+from schemas.site import Site, load_site, parse_site
+from services.common.errors import InputError
+from services.drives.importing import messages_of_folder, vehicle_of
+from services.drives.signals import Signals, signals_of_folder, signals_of_recording
+from services.recordings.recording import Message, read_messages, read_site
+
+Name: TypeAlias = str | PathLike[str]
+
+
+def read(
+    *sources: Name, site: Name | Site | None = None, vehicle: str | None = None
+) -> list[Signals]:
+    """Read recordings (.mcap) and folders of CSV files, one `Signals` for each run of each truck.
+
+    Accelerations are upward and without gravity. How those of a CSV file were measured its site
+    file says: `site`, or `site.toml` in the folder; without one they are as in the file. Of a site
+    of several trucks `vehicle` says which one a CSV folder is of. InputError, in one line, if
+    something cannot be read.
+    """
+    found: list[Signals] = []
+    for path in paths_of(sources):
+        if not path.is_dir():
+            found += signals_of_recording(path)
+            continue
+        known = site_of_folder(path, site)
+        if known is None:
+            found += signals_of_folder(path, None, "", "")
+        else:
+            name = _site_name(path, site)
+            found += signals_of_folder(path, known, name, vehicle_of(known, name, vehicle))
+    return found
+
+
+def paths_of(sources: Sequence[Name]) -> list[Path]:
+    """The sources as paths; InputError if there is none or one is not there."""
+    if not sources:
+        raise InputError("no source given, a recording (.mcap) or a folder of CSV files expected")
+    paths = [Path(source) for source in sources]
+    for path in paths:
+        if not path.exists():
+            raise InputError(
+                f"{path}: no such file, a recording (.mcap) or a folder of CSV files expected"
+            )
+    return paths
+
+
+def site_of_paths(paths: Sequence[Path], site: Name | Site | None) -> Site:
+    """The site given, or that of the first source that has one; InputError if there is none."""
+    for path in paths:
+        if site is not None:
+            return given_site(site)
+        if path.is_dir():
+            known = site_of_folder(path, None)
+        else:
+            text = read_site(path)
+            known = None if text is None else parse_site(text, f"{path}: site.toml")
+        if known is not None:
+            return known
+    raise InputError(f"{paths[0]}: no site file is stored with it, give one with site=")
+
+
+def messages_of_paths(
+    paths: Sequence[Path], site: Site, given: Name | Site | None, vehicle: str | None
+) -> Iterator[Message]:
+    """All messages of the sources; of a CSV folder those that its truck would have sent."""
+    for path in paths:
+        if path.is_dir():
+            yield from messages_of_folder(path, site, _site_name(path, given), vehicle)
+        else:
+            yield from read_messages(path)
+
+
+def given_site(site: Name | Site) -> Site:
+    """The site, read if it is the name of a file."""
+    return site if isinstance(site, Site) else load_site(Path(site))
+
+
+def site_of_folder(folder: Path, site: Name | Site | None) -> Site | None:
+    """The site given, or `site.toml` in the folder; None if there is neither."""
+    if site is not None:
+        return given_site(site)
+    beside = folder / "site.toml"
+    return load_site(beside) if beside.is_file() else None
+
+
+def _site_name(folder: Path, site: Name | Site | None) -> str:
+    if isinstance(site, Site):
+        return "site"
+    return str(folder / "site.toml" if site is None else site)

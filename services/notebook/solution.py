@@ -1,0 +1,179 @@
+"""What an identification gives back: one shape for every method, as arrays and as tables.
+
+pandas and xarray are needed by what returns their types and by nothing else.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from schemas.reasons import Reason
+from schemas.results import Crossing, Parameter, Results, Verdict, results_json
+from schemas.site import Bridge, Site
+from services.common.errors import InputError
+from services.common.extras import check_installed
+from services.common.files import write_atomically
+from services.history.draws import (
+    Draws,
+    DrawsOfCrossing,
+    check_draws_file,
+    posterior,
+    write_draws,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+_STATISTICS = ("mean", "std", "q025", "q50", "q975")
+_SPREAD = ("std", "q025", "q975")
+
+
+class Solution(NamedTuple):
+    """What was found of one crossing, by whichever method."""
+
+    crossing: Crossing
+    """All of it, with the fields of results.json (docs/contract.md)."""
+    bridge: Bridge
+    """What the site file says of the bridge: lengths and nominal values."""
+    draws: Draws
+    """By unknown, arrays (chain, draw); empty for a rejected crossing, without `draws=True`, and
+    for methods that have none (`least_squares`, `random_walk`)."""
+
+    @property
+    def value(self) -> dict[str, Parameter]:
+        """The estimate of each unknown, by name; empty for a rejected crossing."""
+        return dict(self.crossing.parameters or {})
+
+    @property
+    def verdict(self) -> Verdict:
+        """`good`, `suspect` or `rejected`."""
+        return self.crossing.verdict
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Why the verdict is not `good`; `crossing.reason_texts` are sentences."""
+        return self.crossing.reasons
+
+    @property
+    def stats(self) -> dict[str, float]:
+        """How the search went: evaluations, convergence, seconds."""
+        return dict(self.crossing.diagnostics)
+
+    def elements(self) -> "pd.DataFrame":
+        """One row for each element of the bridge; see `Identification.elements`."""
+        return _elements_of([self])
+
+    def parameters(self) -> "pd.DataFrame":
+        """One row for each unknown; see `Identification.parameters`."""
+        return _parameters_of([self])
+
+    def posterior(self) -> "xr.Dataset":
+        """The draws as arrays (chain, draw)."""
+        whole = posterior([_draws_of(self)])
+        return whole.isel(crossing=0) if whole.data_vars else whole
+
+
+class Identification(NamedTuple):
+    """What was found of all crossings, in order of time."""
+
+    solutions: tuple[Solution, ...]
+    results: Results
+    """The same with the fused estimate of each bridge, as in results.json."""
+    site: Site
+
+    def elements(self) -> "pd.DataFrame":
+        """One row for each element of each crossing; needs pandas.
+
+        Columns: crossing, bridge, vehicle, method, verdict, element; from_m and to_m; mean, std,
+        q025, q50 and q975 of EI in N·m²; nominal in N·m²; ratio (mean over nominal). Numbers are
+        NaN for a rejected crossing, and std, q025 and q975 where the method has no noise model:
+        what it calls an interval would say nothing.
+        """
+        return _elements_of(self.solutions)
+
+    def parameters(self) -> "pd.DataFrame":
+        """One row for each unknown of each crossing, in the units of its column `unit`."""
+        return _parameters_of(self.solutions)
+
+    def posterior(self) -> "xr.Dataset":
+        """The draws as arrays (chain, draw, crossing); needs xarray.
+
+        Longer chains are thinned to the shortest. For ArviZ:
+        `arviz.InferenceData(posterior=found.posterior())`.
+        """
+        return posterior(_draws_of(solution) for solution in self.solutions)
+
+    def to_netcdf(self, path: str | Path) -> None:
+        """Write the draws, as `driveby identify --draws` does; `arviz.from_netcdf` reads `.nc`.
+
+        InputError if there are none, or xarray and h5netcdf are not installed and it is no `.npz`.
+        """
+        check_draws_file(Path(path))
+        if not any(solution.draws for solution in self.solutions):
+            raise InputError(f"{path}: no crossing has draws; method pre has, with draws=True")
+        write_draws(Path(path), (_draws_of(solution) for solution in self.solutions))
+
+    def to_json(self, path: str | Path) -> None:
+        """Write results.json, as `driveby identify --json` does."""
+        write_atomically(Path(path), results_json(self.results))
+
+
+def _draws_of(solution: Solution) -> DrawsOfCrossing:
+    crossing = solution.crossing
+    return DrawsOfCrossing(crossing.crossing_id, crossing.vehicle, crossing.bridge, solution.draws)
+
+
+def _elements_of(solutions: "list[Solution] | tuple[Solution, ...]") -> "pd.DataFrame":
+    check_installed("a table of elements", "pandas")
+    import pandas as pd
+
+    rows: list[dict[str, object]] = []
+    for solution in solutions:
+        bridge, start_m = solution.bridge, 0.0
+        nominal = bridge.nominal_flexural_rigidity_nm2
+        for number, (length_m, sound) in enumerate(zip(bridge.lengths_m, nominal, strict=True)):
+            name = f"EI_{number + 1}"
+            found = _statistics(solution, solution.value.get(name))
+            rows.append(
+                _whose(solution)
+                | {"element": name, "from_m": start_m, "to_m": start_m + length_m}
+                | found
+                | {"nominal": sound, "ratio": found["mean"] / sound}
+            )
+            start_m += length_m
+    whose = ("crossing", "bridge", "vehicle", "method", "verdict")
+    columns = [*whose, "element", "from_m", "to_m", *_STATISTICS, "nominal", "ratio"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _parameters_of(solutions: "list[Solution] | tuple[Solution, ...]") -> "pd.DataFrame":
+    check_installed("a table of unknowns", "pandas")
+    import pandas as pd
+
+    rows = [
+        _whose(solution) | {"name": name, "unit": value.unit} | _statistics(solution, value)
+        for solution in solutions
+        for name, value in solution.value.items()
+    ]
+    whose = ("crossing", "bridge", "vehicle", "method", "verdict")
+    return pd.DataFrame(rows, columns=[*whose, "name", "unit", *_STATISTICS])
+
+
+def _whose(solution: Solution) -> dict[str, object]:
+    crossing = solution.crossing
+    return {
+        "crossing": crossing.crossing_id,
+        "bridge": crossing.bridge,
+        "vehicle": crossing.vehicle,
+        "method": crossing.method,
+        "verdict": crossing.verdict,
+    }
+
+
+def _statistics(solution: Solution, value: Parameter | None) -> dict[str, float]:
+    if value is None:
+        return dict.fromkeys(_STATISTICS, float("nan"))
+    found = {name: float(getattr(value, name)) for name in _STATISTICS}
+    if Reason.NO_NOISE_MODEL in solution.reasons:
+        found |= dict.fromkeys(_SPREAD, float("nan"))
+    return found

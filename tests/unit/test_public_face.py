@@ -1,0 +1,464 @@
+"""`import driveby`: what a notebook gets, and that it gets the same numbers as the command line."""
+
+import ast
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import driveby
+from schemas.settings import IdentificationSettings
+from schemas.signals import CHANNELS
+from services.cli import main as cli
+from services.common import extras
+from services.notebook import identify as identifying
+from services.notebook import simulate as simulating
+from services.recordings.recording import Message, read_messages
+from services.recordings.writer import write_recording
+from services.simulation.drive import Drive, paper_site
+
+
+@pytest.fixture(scope="module")
+def simulation(scenario_6: Drive) -> driveby.Simulation:
+    """Without noise: least squares find what was put in."""
+    return driveby.Simulation(scenario_6, paper_site())
+
+
+@pytest.fixture(scope="module")
+def sample(request: pytest.FixtureRequest) -> Path:
+    project: Path = request.getfixturevalue("project")
+    return project / "recordings" / "sample" / "crossing.mcap"
+
+
+@pytest.fixture(scope="module")
+def found(sample: Path) -> driveby.Identification:
+    return driveby.identify(sample)
+
+
+@pytest.fixture(scope="module")
+def exact(simulation: driveby.Simulation) -> driveby.Identification:
+    return driveby.identify(simulation, method="least-squares")
+
+
+def without(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
+    """As if these had not been installed."""
+    find = extras.find_spec
+    monkeypatch.setattr(extras, "find_spec", lambda m: None if m in modules else find(m))
+
+
+def test_import_waits_for_nothing() -> None:
+    code = (
+        "import sys, driveby\n"
+        "print(sorted({'numpy', 'numba', 'scipy', 'pandas', 'xarray', 'matplotlib', 'pydantic'}"
+        " & sys.modules.keys()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_every_name_is_there_and_typed_as_what_it_is() -> None:
+    """A type checker reads the imports, Python the table of places: both must say the same."""
+    source = ast.parse(Path(driveby.__file__).read_text())
+    (block,) = (node for node in source.body if isinstance(node, ast.If))
+    typed = {
+        alias.name: statement.module
+        for statement in block.body
+        if isinstance(statement, ast.ImportFrom)
+        for alias in statement.names
+    }
+    assert typed == driveby._PLACES
+    assert sorted(typed) == sorted(driveby.__all__)
+    for name in driveby.__all__:
+        assert getattr(driveby, name) is not None
+        assert name in dir(driveby)
+    assert driveby.__version__
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = driveby.nothing  # type: ignore[attr-defined]
+
+
+# -- read
+
+
+def test_a_recording_reads_as_what_was_measured(
+    simulation: driveby.Simulation, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    simulation.write(path)
+    (read,) = driveby.read(path)
+    measured = simulation.signals
+    assert (read.source, read.vehicle, read.run) == (str(path), "truck-1", 0)
+    assert tuple(read.channels) == CHANNELS == driveby.CHANNELS
+    for name, series in read.channels.items():
+        np.testing.assert_array_equal(
+            series.acceleration_m_per_s2, measured.channels[name].acceleration_m_per_s2
+        )
+        np.testing.assert_array_equal(series.time_ns, measured.channels[name].time_ns)
+    for mine, theirs in zip(read.fixes, measured.fixes, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_tables_of_a_recording(sample: Path) -> None:
+    (read,) = driveby.read(str(sample))
+    table = read.accelerations()
+    assert list(table.columns) == list(CHANNELS)
+    assert str(table.index.dtype) == "datetime64[ns, UTC]"
+    assert table.index[0].isoformat() == "2026-01-01T00:00:00+00:00"
+    assert (table.index[1] - table.index[0]).total_seconds() == 0.001
+    assert not table.isna().any().any()
+    positions = read.positions()
+    assert len(positions) == read.fixes.time_ns.size
+    assert positions["latitude_deg"].iloc[0] == read.fixes.latitude_deg[0]
+    assert positions["speed_m_per_s"].mean() == pytest.approx(11, abs=2)
+
+
+@pytest.fixture
+def two_boots(sample: Path, tmp_path: Path) -> Path:
+    """The sample's messages, out of order, some twice, and a later boot of the same truck."""
+    messages = [m for m in read_messages(sample) if m.key.stream in ("accel", "gnss")]
+    later = [again(m) for m in messages]
+    path = tmp_path / "two.mcap"
+    write_recording(path, [*later, *messages[::-1], *messages[:40]], site_toml=None, reason="test")
+    return path
+
+
+def again(message: Message) -> Message:
+    from schemas.signals import decode_accel, decode_gnss, encode_accel, encode_gnss
+
+    hour = 3_600_000_000_000
+    boot = message.boot_id + hour
+    if message.key.stream == "accel":
+        batch = decode_accel(message.payload)
+        moved = batch._replace(boot_id=boot, wall_time_ns=batch.wall_time_ns + hour)
+        payload = encode_accel(moved)
+    else:
+        fix = decode_gnss(message.payload)
+        payload = encode_gnss(fix._replace(boot_id=boot, wall_time_ns=fix.wall_time_ns + hour))
+    return message._replace(payload=payload, boot_id=boot, log_time_ns=message.log_time_ns + hour)
+
+
+def test_each_boot_is_a_run_in_order_and_without_repetitions(sample: Path, two_boots: Path) -> None:
+    (only,) = driveby.read(sample)
+    first, second = driveby.read(two_boots)
+    assert (first.run, second.run) == (0, 1)
+    for read, hours in ((first, 0), (second, 1)):
+        for name, series in read.channels.items():
+            expected = only.channels[name]
+            np.testing.assert_array_equal(
+                series.time_ns, expected.time_ns + hours * 3_600_000_000_000
+            )
+            np.testing.assert_array_equal(
+                series.acceleration_m_per_s2, expected.acceleration_m_per_s2
+            )
+        np.testing.assert_array_equal(read.fixes.latitude_deg, only.fixes.latitude_deg)
+
+
+def test_channels_of_two_rates_stand_in_one_table(simulation: driveby.Simulation) -> None:
+    signals = simulation.signals
+    slow = signals.channels["unsprung_rear"]
+    slow = slow._replace(
+        time_ns=slow.time_ns[::2], acceleration_m_per_s2=slow.acceleration_m_per_s2[::2]
+    )
+    mixed = signals._replace(channels={**signals.channels, "unsprung_rear": slow})
+    table = mixed.accelerations()
+    assert len(table) == signals.channels["sprung_front"].time_ns.size
+    assert table["unsprung_rear"].isna().to_numpy().tolist()[:4] == [False, True, False, True]
+    assert not table["sprung_front"].isna().any()
+
+
+def test_a_folder_is_read_as_its_site_file_says(csv_example: Path, tmp_path: Path) -> None:
+    (plain,) = driveby.read(csv_example)
+    assert plain.vehicle != ""
+    folder = shutil.copytree(csv_example, tmp_path / "folder")
+    site = folder / "site.toml"
+    text = site.read_text().replace(
+        "[sensor]", "[sensor]\nup = [1, 1, -1, -1]\ngravity_included = true"
+    )
+    site.write_text(text)
+    (turned,) = driveby.read(folder)
+    measured = plain.channels["unsprung_front"].acceleration_m_per_s2
+    np.testing.assert_allclose(
+        turned.channels["unsprung_front"].acceleration_m_per_s2, -measured - 9.80665
+    )
+    elsewhere = site.rename(tmp_path / "elsewhere.toml")
+    (raw,) = driveby.read(folder)
+    assert raw.vehicle == ""
+    np.testing.assert_array_equal(raw.channels["unsprung_front"].acceleration_m_per_s2, measured)
+    for site_given in (elsewhere, str(elsewhere), driveby.load_site(elsewhere)):
+        (given,) = driveby.read(folder, site=site_given)
+        np.testing.assert_array_equal(
+            given.channels["unsprung_front"].acceleration_m_per_s2,
+            turned.channels["unsprung_front"].acceleration_m_per_s2,
+        )
+
+
+def test_the_independent_crossings_are_read(shared: Path) -> None:
+    runs = driveby.read(shared / "crossings" / "d3_edge_damage_4_runs")
+    assert [run.run for run in runs] == [0, 1, 2, 3]
+    assert {run.vehicle for run in runs} == {"truck-3"}
+    assert all(np.diff(run.fixes.time_ns).min() > 0 for run in runs)
+
+
+# -- identify
+
+
+def test_draws_results_and_tables_say_the_same(
+    found: driveby.Identification, sample: Path, tmp_path: Path
+) -> None:
+    (solution,) = found.solutions
+    assert (solution.verdict, solution.reasons) == ("good", ())
+    assert solution.stats["r_hat"] < 1.05
+    table = found.elements()
+    assert list(table.columns) == [
+        *("crossing", "bridge", "vehicle", "method", "verdict", "element", "from_m", "to_m"),
+        *("mean", "std", "q025", "q50", "q975", "nominal", "ratio"),
+    ]
+    assert list(table["element"]) == [f"EI_{n}" for n in range(1, 8)]
+    assert table["to_m"].iloc[-1] == pytest.approx(30.0)
+    assert list(table["from_m"].iloc[1:]) == pytest.approx(list(table["to_m"].iloc[:-1]))
+    fourth = table.iloc[3]
+    assert fourth["ratio"] == pytest.approx(0.4, abs=0.05)
+    draws = solution.draws["EI_4"]
+    assert fourth["mean"] == pytest.approx(draws.mean(), rel=1e-12)
+    assert fourth["std"] == pytest.approx(draws.std(), rel=1e-12)
+    for column, share in (("q025", 0.025), ("q50", 0.5), ("q975", 0.975)):
+        assert fourth[column] == pytest.approx(np.quantile(draws, share), rel=1e-12)
+    unknowns = found.parameters().set_index("name")
+    assert unknowns["mean"]["EI_4"] == fourth["mean"]
+    assert unknowns["unit"]["k_s1"] == "N/m"
+    one = solution.posterior()
+    assert one["EI_4"].dims == ("chain", "draw")
+    np.testing.assert_array_equal(one["EI_4"], draws)
+    whole = found.posterior()
+    assert whole["EI_4"].dims == ("chain", "draw", "crossing")
+    assert list(whole["crossing"].values) == [solution.crossing.crossing_id]
+    assert table.equals(solution.elements())
+
+
+def test_the_command_line_says_the_same(
+    found: driveby.Identification, sample: Path, tmp_path: Path
+) -> None:
+    paths = [tmp_path / name for name in ("a.json", "b.json", "a.nc", "b.nc")]
+    assert (
+        cli.main(["identify", str(sample), "--json", str(paths[0]), "--draws", str(paths[2])]) == 0
+    )
+    found.to_json(paths[1])
+    found.to_netcdf(paths[3])
+    mine, theirs = (json.loads(path.read_text()) for path in paths[:2])
+    for result in (mine, theirs):
+        del result["created"]
+        del result["crossings"][0]["diagnostics"]["seconds"]
+    assert mine == theirs
+    import arviz
+
+    first, second = (arviz.from_netcdf(path).posterior for path in paths[2:])
+    assert first.equals(second)
+    assert first.equals(found.posterior())
+
+
+def test_draws_may_be_forgotten(
+    exact: driveby.Identification,
+    simulation: driveby.Simulation,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    chains = {"EI_1": np.ones((2, 3))}
+
+    def found_at_once(*arguments: Any) -> Any:
+        keep = arguments[-1]
+        keep(exact.results.crossings[0].crossing_id, chains)
+        return exact.results
+
+    monkeypatch.setattr(identifying, "identify_messages", found_at_once)
+    assert driveby.identify(simulation).solutions[0].draws == chains
+    forgetful = driveby.identify(simulation, draws=False)
+    assert forgetful.solutions[0].draws == {}
+    with pytest.raises(driveby.InputError, match="no crossing has draws"):
+        forgetful.to_netcdf(tmp_path / "draws.npz")
+
+
+def test_every_method_gives_the_same_type(
+    found: driveby.Identification,
+    exact: driveby.Identification,
+    simulation: driveby.Simulation,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    quick = IdentificationSettings(method="random_walk", particles=8, steps=3)
+    monkeypatch.setattr(identifying, "_settings", lambda method, seed: quick)
+    walked = driveby.identify(simulation, method="random_walk")
+    columns = list(found.elements().columns)
+    for one in (found, exact, walked):
+        (solution,) = one.solutions
+        assert isinstance(solution, driveby.Solution)
+        assert solution.value["EI_4"].mean == one.elements()["mean"][3]
+        assert solution.stats["iterations"] >= 3
+        assert list(one.elements().columns) == columns
+        assert set(one.posterior().data_vars) == set(solution.draws)
+        assert set(solution.posterior().data_vars) == set(solution.draws)
+    assert exact.elements()["ratio"].to_list() == pytest.approx([1, 1, 1, 0.4, 1, 1, 1], rel=0.01)
+
+
+def test_an_interval_without_meaning_is_no_number(exact: driveby.Identification) -> None:
+    (solution,) = exact.solutions
+    assert solution.value["EI_4"].std > 0  # as in results.json
+    table = exact.elements()
+    assert table[["std", "q025", "q975"]].isna().all().all()
+    assert not table[["mean", "q50", "ratio"]].isna().any().any()
+
+
+def test_a_rejected_crossing_has_rows_without_numbers(sample: Path) -> None:
+    rejected = driveby.identify(sample, method="least_squares")
+    (solution,) = rejected.solutions
+    assert (solution.verdict, solution.value, solution.draws) == ("rejected", {}, {})
+    table = rejected.elements()
+    assert list(table["verdict"]) == ["rejected"] * 7
+    assert table[["mean", "std", "q025", "q50", "q975", "ratio"]].isna().all().all()
+    assert rejected.parameters().empty
+
+
+def test_a_folder_with_its_site_is_identified(
+    simulation: driveby.Simulation, exact: driveby.Identification, tmp_path: Path
+) -> None:
+    from schemas.site import site_toml
+
+    signals = simulation.signals
+    time = next(iter(signals.channels.values())).time_ns / 1e9
+    columns = np.stack([time, *(c.acceleration_m_per_s2 for c in signals.channels.values())])
+    header = ",".join(["time_s", *signals.channels])
+    write = {"delimiter": ",", "comments": "", "fmt": "%.17g"}
+    np.savetxt(tmp_path / "accel_00.csv", columns.T, header=header, **write)
+    fixes = np.stack([signals.fixes.time_ns / 1e9, *signals.fixes[1:5]])
+    header = "time_s,latitude_deg,longitude_deg,altitude_m,speed_mps"
+    np.savetxt(tmp_path / "gps_00.csv", fixes.T, header=header, **write)
+    with pytest.raises(driveby.InputError, match="no site file is stored with it"):
+        driveby.identify(tmp_path, method="least_squares")
+    (tmp_path / "site.toml").write_text(site_toml(simulation.site))
+    same = driveby.identify([tmp_path], method="least_squares")
+    assert same.elements()["mean"].to_list() == pytest.approx(
+        exact.elements()["mean"].to_list(), rel=1e-9
+    )
+
+
+# -- simulate and plot
+
+
+def test_simulate_is_the_command(tmp_path: Path) -> None:
+    mine, theirs = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    options = ["--noise", "25", "--gps-noise", "--speed", "12:14", "--seed", "3", "--rate", "200"]
+    options += ["--direction", "end_to_start", "--road", "B"]
+    ratios = [1.0, 1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
+    ei = ["--ei", ",".join(str(ratio) for ratio in ratios)]
+    assert cli.main(["simulate", *ei, *options, "-o", str(theirs)]) == 0
+    simulation = driveby.simulate(
+        ei=ratios,
+        noise=25.0,
+        gps_noise=True,
+        speed=(12.0, 14.0),
+        seed=3,
+        rate=200.0,
+        direction="end_to_start",
+        road="B",
+    )
+    simulation.write(mine)
+    assert mine.read_bytes() == theirs.read_bytes()
+    assert simulation.ei_ratios.tolist() == ratios
+    with pytest.raises(driveby.InputError, match="is a recording, and none is replaced"):
+        simulation.write(mine)
+    simulation.write(mine, force=True)
+    assert mine.read_bytes() == theirs.read_bytes()
+
+
+def test_simulate_computes_with_one_thread_of_blas(
+    scenario_6: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inside: list[int] = []
+
+    def spy(*_: object, **__: object) -> Drive:
+        inside.extend(x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas")
+        return scenario_6
+
+    monkeypatch.setattr(simulating, "simulate_drive", spy)
+    with threadpool_limits(limits=2, user_api="blas"):
+        driveby.simulate(scenario=6)
+    assert set(inside) == {1}
+
+
+def test_plot_draws_estimate_and_truth(
+    exact: driveby.Identification, simulation: driveby.Simulation
+) -> None:
+    def labels(figure: Any) -> set[str]:
+        legend = figure.axes[0].get_legend()
+        return {text.get_text() for text in legend.get_texts()}
+
+    assert "truth" in labels(driveby.plot(exact, truth=simulation))
+    figure = driveby.plot(exact.solutions[0])
+    assert "estimate" in labels(figure)
+    assert "truth" not in labels(figure)
+    assert (
+        "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
+    )
+    twice = exact._replace(solutions=exact.solutions * 2)
+    with pytest.raises(driveby.InputError, match="plot draws one crossing, these are 2"):
+        driveby.plot(twice)
+
+
+# -- what is wrong is said in one line
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: driveby.read(), "no source given"),
+        (lambda: driveby.read("nowhere.mcap"), "nowhere.mcap: no such file"),
+        (lambda: driveby.identify("nowhere"), "nowhere: no such file"),
+        (lambda: driveby.identify("x", method="magic"), 'method is "magic", one of pre'),
+        (lambda: driveby.identify("x", seed=-1), "seed is -1"),
+        (lambda: driveby.simulate(), "give either scenario= or ei="),
+        (lambda: driveby.simulate(scenario=6, ei=[1.0]), "give either scenario= or ei="),
+        (lambda: driveby.simulate(scenario=13), "scenario is 13, it must be 1 to 12"),
+        (lambda: driveby.simulate(ei=[1.0, 0.5]), "gives 2 elements"),
+        (lambda: driveby.simulate(ei=[0.0] * 7), "ei is 0, it must be from 0.001 to 1000"),
+        (lambda: driveby.simulate(scenario=6, road="F"), 'road is "F"'),
+        (lambda: driveby.simulate(scenario=6, speed=0.0), "speed is 0, it must be from 0.1 to 60"),
+        (lambda: driveby.simulate(scenario=6, rate=0.0), "rate is 0, it must be from 50"),
+        (lambda: driveby.simulate(scenario=6, noise=-1.0), "noise is -1"),
+        (lambda: driveby.simulate(scenario=6, direction="up"), 'direction is "up"'),
+        (lambda: driveby.simulate(scenario=6, site="no.toml"), "no.toml: no such file"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(call: Callable[[], object], words: str) -> None:
+    with pytest.raises(driveby.InputError) as caught:
+        call()
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("module", "call"),
+    [
+        ("pandas", lambda found, signals: found.elements()),
+        ("pandas", lambda found, signals: found.parameters()),
+        ("pandas", lambda found, signals: signals.accelerations()),
+        ("pandas", lambda found, signals: signals.positions()),
+        ("xarray", lambda found, signals: found.posterior()),
+        ("h5netcdf", lambda found, signals: found.to_netcdf("draws.nc")),
+    ],
+)
+def test_what_is_not_installed_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+    exact: driveby.Identification,
+    simulation: driveby.Simulation,
+    module: str,
+    call: Callable[[driveby.Identification, driveby.Signals], object],
+) -> None:
+    without(monkeypatch, module)
+    with pytest.raises(driveby.InputError) as caught:
+        call(exact, simulation.signals)
+    line = f'needs {module}, which is not installed: pip install "driveby[notebook]"'
+    assert line in str(caught.value)
