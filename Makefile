@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo test test-all faults soak validate lint bench lock clean
+.PHONY: help install demo up test test-all faults soak validate lint bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -28,6 +28,13 @@ $(STAMP): $(PACKAGES) $(wildcard pre_core/*.py pre_core/*/*.py)
 
 demo: $(STAMP) ## a truck crosses a bridge: simulated, recorded, identified, drawn
 	$(BIN)/driveby demo
+
+up: ## the demo's services as containers (Docker Engine 26.0, Compose 2.26; not yet run)
+	@$(PYTHON) docs/scripts/container_versions.py
+	docker compose build
+	docker volume inspect driveby_certs >/dev/null 2>&1 || docker compose run --rm certs
+	docker compose up --detach --wait worker
+	docker compose up --detach truck
 
 # One worker computes while the other waits for processes (tests/conftest.py); more would only wait.
 BESIDE := -n 2 --dist loadgroup
@@ -62,6 +69,7 @@ bench: $(STAMP) ## time everything, with its peers, into docs/benchmarks.md (12 
 lock: ## write the pinned requirements anew (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate pyproject.toml -o requirements/runtime.txt
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --extra dev pyproject.toml -o requirements/dev.txt
+	echo 'setuptools>=77' | uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate - -o requirements/build.txt
 
 clean: ## remove the environment and every cache
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks

@@ -1,4 +1,4 @@
-"""Commands on the bus: demo, logger, worker, truck, replay."""
+"""Commands on the bus: demo, logger, worker, truck, replay, health."""
 
 import argparse
 from pathlib import Path
@@ -253,6 +253,34 @@ def _replay(options: argparse.Namespace) -> int:
         ),
         tls=options.tls,
     )
+
+
+def add_health(commands: Any) -> None:
+    """`driveby health`: ask a logger or a worker over the bus whether it does its work."""
+    p = command(
+        commands,
+        "health",
+        _health,
+        "ask a logger or a worker over the bus whether it does its work",
+        "driveby health logger",
+    )
+    p.add_argument("service", metavar="ID", help="its --id, as logger or worker")
+    add_endpoint(p)
+    add_realm(p)
+
+
+def _health(options: argparse.Namespace) -> int:
+    from services.cli.health import health_command
+
+    print(
+        health_command(
+            service=options.service,
+            endpoint=options.endpoint or default_endpoint(options),
+            tls=options.tls,
+            realm=options.realm,
+        )
+    )
+    return 0
 
 
 SERVICES: Final = (_logger, _worker, _truck, _replay)

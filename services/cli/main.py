@@ -15,7 +15,15 @@ from collections.abc import Sequence
 from typing import Final, NoReturn
 
 from services.cli.access import add_certs
-from services.cli.live import SERVICES, add_demo, add_logger, add_replay, add_truck, add_worker
+from services.cli.live import (
+    SERVICES,
+    add_demo,
+    add_health,
+    add_logger,
+    add_replay,
+    add_truck,
+    add_worker,
+)
 from services.cli.offline import add_identify, add_import, add_recover, add_simulate, add_view
 from services.cli.parsing import Handler, Parser, add_common
 from services.cli.validation import add_validate
@@ -33,6 +41,7 @@ _COMMANDS: Final = (
     add_worker,
     add_truck,
     add_replay,
+    add_health,
     add_certs,
 )
 """In the order in which `driveby --help` lists them."""

@@ -302,7 +302,7 @@ class _Announcements:
     def _run(self) -> None:
         version = -1
         next_durable_s = 0.0
-        next_health_s = time.monotonic() + _HEALTH_PERIOD_S
+        next_health_s = time.monotonic()  # at once: who starts it waits for that
         while True:
             closing = self._closing.wait(_ANNOUNCE_PERIOD_S)
             self._publish_events()

@@ -33,7 +33,8 @@ def access_control(subjects: Iterable[Subject]) -> dict[str, Any]:
 
     A truck publishes its own keys and reads `durable`, for that tells it what it may forget. A
     logger publishes about itself and reads everything; a worker publishes results and reads
-    trucks and results; a viewer reads results. A replay publishes in realms of replays only.
+    trucks, results and its own health; a viewer reads results. A replay publishes in realms of
+    replays only.
     Routers trust each other: each filters what its own clients say.
     """
     rules: list[dict[str, Any]] = []
@@ -73,7 +74,8 @@ def published_by(subject: Subject) -> list[str]:
 
 def read_by(subject: Subject) -> list[str]:
     """Return the key expressions to which a subject may subscribe and for which it may ask."""
-    match subject.role:
+    role, name = subject
+    match role:
         case "truck" | "replay":
             return _keys("service", streams=("durable",))
         case "logger" | "router":
@@ -83,6 +85,7 @@ def read_by(subject: Subject) -> list[str]:
                 f"{PREFIX}/*/vehicle/**",
                 f"{PREFIX}/*/bridge/**",
                 *_keys("service", streams=("durable",)),
+                *_keys("service", name, ("health",)),
             ]
         case "viewer":
             return [f"{PREFIX}/*/bridge/**", *_keys("service", streams=("health", "progress"))]

@@ -67,13 +67,6 @@ def test_version_is_the_same_everywhere():
     assert f"\nlicense: {project['license']}\n" in citation
 
 
-def test_compose_publishes_ports_on_loopback_only():
-    text = (ROOT / "compose.yaml").read_text()
-    published = re.findall(r'^\s*- "([\d.:]+)"$', text, re.MULTILINE)
-    assert published
-    assert all(port.startswith("127.0.0.1:") for port in published)
-
-
 def test_help_does_not_import_the_heavy_libraries():
     heavy = {
         "numba",

@@ -1,0 +1,199 @@
+"""compose.yaml is what the Compose specification allows and keeps its own promises.
+
+No container engine is needed: what the services do is in tests/process_replay/test_compose.py.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+
+from services.cli import main as cli
+
+ROOT = Path(__file__).parents[2]
+COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
+SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+DOCKERFILE = (ROOT / "Dockerfile").read_text()
+LASTING = ("router", "logger", "worker")
+VERSIONS = ROOT / "docs" / "scripts" / "container_versions.py"
+
+
+def schema() -> dict[str, Any]:
+    text = (ROOT / "tests" / "data" / "compose" / "compose-spec.json").read_text()
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def test_the_file_is_what_the_specification_allows() -> None:
+    jsonschema.Draft7Validator(schema()).validate(COMPOSE)
+
+
+@pytest.mark.parametrize(
+    ("service", "key", "value"),
+    [("worker", "stop_grace", "60s"), ("logger", "read_only", "maybe"), ("truck", "cap_drop", 3)],
+)
+def test_the_specification_refuses_what_is_wrong(service: str, key: str, value: object) -> None:
+    wrong = json.loads(json.dumps(COMPOSE))
+    wrong["services"][service][key] = value
+    if key == "read_only":
+        wrong["services"][service][key] = [value]
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.Draft7Validator(schema()).validate(wrong)
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_every_container_is_confined(name: str) -> None:
+    service = SERVICES[name]
+    assert service["read_only"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert re.fullmatch(r"\d+[mg]", service["mem_limit"])
+    assert service.get("privileged") is None
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_everything_waits_for_health_and_not_for_a_start(name: str) -> None:
+    waits = SERVICES[name].get("depends_on", {})
+    assert isinstance(waits, dict)
+    for other, how in waits.items():
+        if other in LASTING:
+            assert how == {"condition": "service_healthy"}
+            assert "healthcheck" in SERVICES[other]
+        else:
+            assert how == {"condition": "service_completed_successfully"}
+            assert SERVICES[other]["restart"] == "no"
+    if name == "truck":
+        assert set(waits) == {*LASTING, "simulation"}
+
+
+def test_what_is_stopped_has_the_time_to_finish() -> None:
+    def seconds(name: str) -> int:
+        return int(SERVICES[name]["stop_grace_period"].removesuffix("s"))
+
+    assert seconds("worker") >= 60
+    assert seconds("logger") >= 30
+    assert seconds("truck") > 30  # so long it waits for the logger
+
+
+@pytest.mark.parametrize("name", ["logger", "worker"])
+def test_checks_ask_the_service_itself_in_its_own_realm(name: str) -> None:
+    check = SERVICES[name]["healthcheck"]["test"]
+    assert check[:3] == ["CMD", "driveby", "health"]
+    options = cli._parser().parse_args(check[2:])
+    assert options.service == name
+    said = cli._parser().parse_args(SERVICES[name]["command"])
+    assert options.realm == said.realm
+    assert options.tls == said.tls
+
+
+@pytest.mark.parametrize("name", [n for n in SERVICES if n != "router"])
+def test_every_command_is_one_of_ours(name: str) -> None:
+    cli._parser().parse_args(SERVICES[name]["command"])
+
+
+def test_only_loopback_is_published() -> None:
+    ports = [port for service in SERVICES.values() for port in service.get("ports", [])]
+    assert ports == ["127.0.0.1:7447:7447"]
+
+
+def test_the_image_is_built_of_what_is_pinned_by_hash() -> None:
+    installs = [line for line in DOCKERFILE.splitlines() if "pip install" in line]
+    assert len(installs) == 2
+    assert "--require-hashes" in installs[0]
+    assert "-r requirements/build.txt" in installs[0]
+    assert "--no-index" in installs[1]
+    assert "--no-build-isolation" in installs[1]
+    build = (ROOT / "requirements" / "build.txt").read_text()
+    assert re.match(r"setuptools==[\d.]+ \\\n    --hash=sha256:", build)
+    copies = [line.split()[1:-1] for line in DOCKERFILE.splitlines() if line.startswith("COPY")]
+    copied = {source for sources in copies for source in sources}
+    assert {"setup.py", "driveby", "entrypoint.sh"} <= copied
+    allowed = set(re.findall(r"^!(\S+)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE))
+    assert copied <= allowed
+
+
+def test_the_image_compiles_its_kernels_where_the_entrypoint_looks() -> None:
+    step = "RUN NUMBA_CACHE_DIR=/app/kernels python -m driveby.services.execution.warm_up --strict"
+    assert step in DOCKERFILE
+    entrypoint = (ROOT / "entrypoint.sh").read_text()
+    assert "${KERNELS:-/app/kernels}" in entrypoint
+    cache = re.search(r"NUMBA_CACHE_DIR=(/tmp/\S+)", DOCKERFILE)
+    assert cache is not None  # on the tmpfs, for the rest cannot be written
+    assert all(
+        any(place.startswith(cache[1].split("kernels")[0][:-1]) for place in service["tmpfs"])
+        for service in SERVICES.values()
+    )
+    assert os.access(ROOT / "entrypoint.sh", os.X_OK)
+
+
+def a_docker(folder: Path, engine: str, compose: str, code: int = 0) -> Path:
+    program = folder / "docker"
+    program.write_text(
+        f'#!/bin/sh\n[ "$1" = compose ] && echo "{compose}" || echo "{engine}"\nexit {code}\n'
+    )
+    program.chmod(0o755)
+    return folder
+
+
+def checked(path: Path) -> tuple[int, str]:
+    done = subprocess.run(
+        [sys.executable, VERSIONS],
+        env={"PATH": f"{path}:/bin:/usr/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("engine", "compose", "said"),
+    [
+        ("26.0.0", "2.26.0", ""),
+        ("27.3.1+1", "v2.30.3-desktop.1", ""),
+        ("100.0", "10.1", ""),
+        ("25.0.5", "2.26.0", "Docker Engine 26.0 or newer is needed, this is 25.0.5\n"),
+        ("26.0.0", "2.9.1", "Docker Compose 2.26 or newer is needed, this is 2.9.1\n"),
+        ("26.0.0", "1.29.2", "Docker Compose 2.26 or newer is needed, this is 1.29.2\n"),
+        ("", "2.26.0", "says: nothing\n"),
+    ],
+)
+def test_what_is_too_old_is_said_in_one_line(
+    tmp_path: Path, engine: str, compose: str, said: str
+) -> None:
+    code, line = checked(a_docker(tmp_path, engine, compose))
+    assert code == (1 if said else 0)
+    assert line.endswith(said)
+    assert line.count("\n") == bool(said)
+
+
+def test_an_engine_that_does_not_run_or_is_not_there_is_one_line(tmp_path: Path) -> None:
+    code, line = checked(a_docker(tmp_path, "Cannot connect to the Docker daemon", "2.26.0", 1))
+    assert (code, line.count("\n")) == (1, 1)
+    assert "Cannot connect to the Docker daemon" in line
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    done = subprocess.run(
+        [sys.executable, VERSIONS], env={"PATH": str(empty)}, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "there is no program docker" in done.stderr
+
+
+def test_make_up_looks_at_the_versions_first() -> None:
+    recipe = (ROOT / "Makefile").read_text().split("\nup:")[1].split("\n\n")[0].splitlines()[1:]
+    assert "container_versions.py" in recipe[0]
+    needed = re.search(
+        r"Engine (\d+\.\d+) and Compose (\d+\.\d+)", (ROOT / "compose.yaml").read_text()
+    )
+    assert needed is not None
+    assert f"({needed[1].replace('.', ', ')})" in VERSIONS.read_text()
+    assert f"({needed[2].replace('.', ', ')})" in VERSIONS.read_text()
