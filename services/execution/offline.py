@@ -78,7 +78,7 @@ def identify_messages(
             raise InputError(f"{name}: no {what}, a recording of a truck is expected")
     _check_vehicles(name, site, [*streams["accel"], *streams["gnss"]])
     for message in streams["gnss"]:
-        engine.expect(message.key, message.payload)
+        engine.expect(message.key, message.payload, for_ever=True)
     with one_blas_thread():
         outputs = chain(
             chain.from_iterable(

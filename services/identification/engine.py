@@ -117,14 +117,16 @@ class Engine:
         for known in crossings:
             known.last = known.usable = None  # nobody asks for them again, and they are large
 
-    def expect(self, key: Key, payload: bytes) -> None:
+    def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
         """Take a position into account before its turn: that another truck was there then.
 
-        For recordings, which are fed truck by truck. What is malformed is left to `feed`.
+        For who feeds truck by truck; `for_ever` for a recording, in which nothing is too old. What
+        is malformed is left to `feed`.
         """
         if key.owner == "vehicle" and key.stream == "gnss":
             with contextlib.suppress(ValueError):
-                self._traffic.note(key.realm, key.identifier, decode_gnss(payload), for_ever=True)
+                fix = decode_gnss(payload)
+                self._traffic.note(key.realm, key.identifier, fix, for_ever=for_ever)
 
     def feed(self, key: Key, payload: bytes) -> Iterator[Output | Work]:
         """Take one message of a vehicle; other streams are ignored.

@@ -281,6 +281,7 @@ def _serve(
         if isinstance(one, Token):
             arrivals.note(one)
         elif one is not None:
+            engine.expect(one.key, one.payload)  # its own turn may come after another truck's
             batch += arrivals.add(one)
         # In this order: what has come in the queue is newer than a history that is due.
         for arrived in arrivals.due(now_s) + batch:

@@ -16,7 +16,7 @@ import zenoh
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import load_results
-from schemas.signals import Identity
+from schemas.signals import Identity, decode_info, encode_info
 from schemas.site import site_toml
 from schemas.topics import selector
 from services.bus.publisher import Publisher
@@ -189,6 +189,43 @@ def test_a_worker_that_comes_late_gives_the_result_once(
     assert stored == [received.payload for received in told]
 
 
+@pytest.mark.parametrize(
+    ("who", "reason"),
+    [("itself", "vehicle_differs_from_site"), ("a-stranger", "other_truck_on_bridge")],
+)
+def test_what_a_truck_says_of_itself_and_who_else_is_there_count_live(
+    bus: zenoh.Session,
+    worker: Begin,
+    terminate: End,
+    drive_on: list[Message],
+    who: str,
+    reason: str,
+) -> None:
+    """30 t and 7 m, said before the worker came; a truck unknown to the site, at the same place."""
+    sent = drive_on
+    if who == "itself":
+        heavy = '[vehicle]\nid = "truck-1"\ntotal_mass_kg = 30000.0\nwheelbase_m = 7.0\n'
+        said = decode_info(drive_on[0].payload)._replace(site_toml=heavy)
+        sent = [drive_on[0]._replace(payload=encode_info(said)), *drive_on[1:]]
+    else:
+        theirs = [
+            message._replace(key=message.key._replace(identifier=who))
+            for message in drive_on
+            if message.key.stream == "gnss"
+        ]
+        sent = [*theirs, *drive_on]
+    with Subscription(bus, selector(REALM, "bridge")) as results:
+        publisher = Publisher(bus, REALM)
+        publish(publisher, sent)
+        process = worker()
+        told = up_to(results, "estimate")[-1]
+        publisher.close()
+        terminate(process)
+    estimate = pb.Estimate.FromString(told.payload)
+    assert list(estimate.reasons) == [reason]
+    assert not estimate.parameters
+
+
 def test_a_worker_outlives_what_strangers_send(
     bus: zenoh.Session,
     worker: Begin,
@@ -218,7 +255,8 @@ def test_a_worker_outlives_what_strangers_send(
                 payload,
                 Identity(drive_on[0].boot_id, 70_000 + number),
             )
-        stranger = [m._replace(key=m.key._replace(identifier="stranger")) for m in drive_on[:200]]
+        # Before the bridge: on it, it would count.
+        stranger = [m._replace(key=m.key._replace(identifier="stranger")) for m in drive_on[:half]]
         publish(publisher, stranger)
         token.undeclare()  # type: ignore[no-untyped-call]
         publish(publisher, drive_on[half:])
@@ -235,7 +273,10 @@ def test_a_second_truck_does_not_keep_the_first_from_leaving(
     terminate: End,
     drive_on: list[Message],
 ) -> None:
-    """The first recording ends right after its exit; a busy stranger drives all the while."""
+    """The first recording ends right after its exit; a busy stranger drives all the while.
+
+    Elsewhere: it says nothing of where.
+    """
     began_ns = drive_on[0].log_time_ns
     short = [m for m in drive_on if m.log_time_ns - began_ns < 7_200_000_000]
     with (
@@ -250,7 +291,7 @@ def test_a_second_truck_does_not_keep_the_first_from_leaving(
         token.undeclare()  # type: ignore[no-untyped-call]
         estimates: list[Received] = []
         deadline = time.monotonic() + LONGEST_S
-        stranger = itertools.cycle(  # without positions, by which it would be on the bridge as well
+        stranger = itertools.cycle(
             m._replace(key=m.key._replace(identifier="stranger"))
             for m in drive_on
             if m.key.stream == "accel"
