@@ -67,7 +67,7 @@ def test_comma2k19_is_published_recorded_and_replayed(
         vehicle=None,
         name="comma",
     )
-    settings = {"listen": endpoint, "folder": tmp_path, "realm": None, "site": None}
+    settings = {"listen": endpoint, "folder": tmp_path, "realms": ["*"], "site": None}
 
     logger = start("services.logger", file=tmp_path / "driven.mcap", **settings)
     drive = {"endpoint": endpoint, "realm": "live", "speed": 30.0, "vehicle": None}
