@@ -197,7 +197,7 @@ def _record(
 
 def _receive(subscriptions: deque[Subscription]) -> Received | None:
     """Return a message that has come, of each subscription in turn; None if there is none."""
-    for _ in subscriptions:
+    for _ in range(len(subscriptions)):
         subscriptions.rotate(-1)
         received = subscriptions[-1].receive()
         if received is not None:
