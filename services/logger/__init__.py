@@ -38,7 +38,8 @@ from services.logger.housekeeping import House, Housekeeping
 from services.logger.intake import Intake
 from services.logger.memory import give_back_memory
 from services.logger.own_events import OwnEvents
-from services.logger.writer import FileWriter, Limits, Place, count_all
+from services.logger.places import Place
+from services.logger.writer import FileWriter, Limits, count_all
 from services.recordings.recording import Message
 
 __all__ = ["run"]

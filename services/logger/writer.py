@@ -13,12 +13,10 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
 from schemas.events import Event, EventKind
-from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
 from schemas.topics import Key, topic
 from services.common.disk import DISK, Disk
@@ -28,8 +26,16 @@ from services.logger.backlog import Backlog
 from services.logger.drops import FAILED, QUEUE_IS_FULL, Drop, Drops
 from services.logger.durable import DurableStreams
 from services.logger.own_events import OwnEvents
+from services.logger.places import (
+    SERVICE_FILE,
+    FileName,
+    Place,
+    belongs_to,
+    file_of,
+    free_path,
+    room_for,
+)
 from services.recordings.recording import Identities, Message
-from services.recordings.recovery import is_name_taken
 from services.recordings.writer import Misplaced, RecordingWriter
 
 _log = logging.getLogger(__name__)
@@ -38,30 +44,12 @@ SYNC_PERIOD_S = 0.5
 _SYNCS_AT_ONCE = 8
 _LOOK_S = 0.05
 """How often the writer looks for messages when there were none."""
-MAX_OPEN_FILES = 256
-MAX_FILES_OF_ONE = 4
-"""Of one vehicle, which drives in one realm as a rule, and can show itself in any number."""
-MAX_SERVICE_FILES = 32
-"""Of what concerns no vehicle; each realm has one."""
 QUIET_S = 300.0
 """A truck that has said nothing for so long gets a new file when it comes back."""
-_SHORTEST_QUIET_S = 10.0
-"""Where too many files are open, the quietest is closed sooner, but no sooner than this."""
 _DISK_CHECK_S = 1.0
 _STOP_SHARE = 0.125
 """Of the floor of free space: there recording stops, while files can still be closed well."""
 _MAX_LATCHED_BYTES = 16 << 20
-_SERVICE_FILE = "_service"  # no vehicle can be called that
-_FileName = tuple[str, str]
-
-
-class Place(NamedTuple):
-    """Where recordings go: one file, or below a folder one file per realm and vehicle."""
-
-    folder: Path
-    file: Path | None
-    realm: str | None
-    site_toml: str | None
 
 
 class Limits(NamedTuple):
@@ -115,13 +103,13 @@ class FileWriter:
         self.limits = limits
         self._disk = disk
         self._own = own or OwnEvents("logger", time.time_ns())
-        self._files: dict[_FileName, _Open] = {}
-        self._closed_names: dict[_FileName, str] = {}
+        self._files: dict[FileName, _Open] = {}
+        self._closed_names: dict[FileName, str] = {}
         self._latched: OrderedDict[Key, Message] = OrderedDict()
         self._latched_bytes = 0
         self._rotation_asked = threading.Event()
         self._backlog = Backlog() if backlog is None else backlog
-        self._unsynced: list[tuple[_FileName, Message]] = []
+        self._unsynced: list[tuple[FileName, Message]] = []
         self._durable = DurableStreams()
         self._end: tuple[str, Mapping[str, int]] = ("", {})
         self._syncing = ThreadPoolExecutor(_SYNCS_AT_ONCE, "sync")
@@ -236,15 +224,17 @@ class FileWriter:
         self._sync()
 
     def _write(self, message: Message, now_s: float) -> None:
-        name = self._name_of(message)
+        name = file_of(self._place, message, self._files)
         opened = self._files.get(name)
         if opened is None:
-            full = self._why_no_file(name, now_s)
-            if full is not None:
-                self.count_drop(message.key, full)
+            room = room_for(name, {one: self._files[one].last_s for one in self._files}, now_s)
+            if room.why_not:
+                self.count_drop(message.key, room.why_not)
                 identity = (message.key, message.boot_id)
                 self._without_file.setdefault(identity, Intervals()).add(message.sequence)
                 return
+            if room.close is not None:
+                self._close(room.close, "quiet, and too many files are open")
             opened = self._begin(name, message.key)
         opened.last_s = now_s
         self._unsynced.append((name, message))
@@ -275,55 +265,22 @@ class FileWriter:
             if what is not None:
                 self._replace(name, what)
 
-    def _name_of(self, message: Message) -> _FileName:
-        if self._place.file is not None:
-            return ("", "")
-        realm, vehicle = message.key.realm, _vehicle_of(message)
-        if message.key.owner != "vehicle" and (realm, vehicle) not in self._files:
-            return (realm, _SERVICE_FILE)
-        return (realm, vehicle)
-
-    def _why_no_file(self, name: _FileName, now_s: float) -> str | None:
-        """Make room for one more file; where none can be made, return what there is too much of."""
-        is_service = name[1] == _SERVICE_FILE
-        limit = MAX_SERVICE_FILES if is_service else MAX_FILES_OF_ONE
-        closable = [one for one in self._files if one[1] == name[1]]
-        owner = "of services" if is_service else "of this vehicle"
-        why = f"had no file: {limit} {owner} are open, in as many realms"
-        if len(closable) < limit:
-            if len(self._files) < MAX_OPEN_FILES:
-                return None
-            closable = list(self._files)
-            why = f"had no file: {MAX_OPEN_FILES} of all vehicles are open"
-        quietest = min(closable, key=lambda n: self._files[n].last_s)
-        if now_s - self._files[quietest].last_s < _SHORTEST_QUIET_S:
-            return why
-        self._close(quietest, "quiet, and too many files are open")
-        return None
-
-    def _begin(self, name: _FileName, where: Key) -> _Open:
+    def _begin(self, name: FileName, where: Key) -> _Open:
         """Open the next file of a truck."""
         previous = self._closed_names.get(name)
         with _failing(name):
             return self._open(
                 name,
-                _free_path(self._place, *name),
+                free_path(self._place, *name),
                 "logger started" if previous is None else "rotated",
                 previous,
-                [m for key, m in self._latched.items() if self._belongs(key, name, where)],
+                # The one that the file is begun for comes by itself.
+                [m for k, m in self._latched.items() if k != where and belongs_to(k, name)],
             )
-
-    def _belongs(self, latched: Key, name: _FileName, where: Key) -> bool:
-        if latched == where:  # it comes by itself
-            return False
-        is_vehicle = latched.owner == "vehicle"
-        return latched.realm == name[0] and (
-            latched.identifier == name[1] if is_vehicle else name[1] == _SERVICE_FILE
-        )
 
     def _open(
         self,
-        name: _FileName,
+        name: FileName,
         path: Path,
         reason: str,
         previous: str | None = None,
@@ -334,7 +291,7 @@ class FileWriter:
             path,
             reason=reason,
             realm=realm,
-            vehicle=None if vehicle == _SERVICE_FILE else vehicle,
+            vehicle=None if vehicle == SERVICE_FILE else vehicle,
             site_toml=self._place.site_toml,
             previous=previous,
             latched=latched or (),
@@ -345,7 +302,7 @@ class FileWriter:
         opened = self._files[name] = _Open(writer, now_s, now_s, self._drops.of(*name))
         return opened
 
-    def _close(self, name: _FileName, reason: str, counts: Mapping[str, int] | None = None) -> None:
+    def _close(self, name: FileName, reason: str, counts: Mapping[str, int] | None = None) -> None:
         opened = self._files[name]
         with _failing(name):
             what = opened.file.misplaced()
@@ -360,7 +317,7 @@ class FileWriter:
         self._closed_names[name] = opened.file.path.name
         _log.info("closed %s: %s", opened.file.path, reason)
 
-    def _replace(self, name: _FileName, what: Misplaced) -> None:
+    def _replace(self, name: FileName, what: Misplaced) -> None:
         """Begin a new file for one that somebody has deleted, cut or moved, and say so."""
         file = self._files.pop(name).file
         latched = [
@@ -387,10 +344,10 @@ class FileWriter:
             self.withdrawn.append(gone)
             text += f": {number} messages are gone, {told} of them had been told to be durable"
         with _failing(name):
-            path = _free_path(self._place, *name)
+            path = free_path(self._place, *name)
             self._open(name, path, f"the file before it was {what}", file.path.name, latched)
         self._durable.add(latched)
-        vehicle = name[1] if name[1] != _SERVICE_FILE else ""
+        vehicle = name[1] if name[1] != SERVICE_FILE else ""
         event = Event(
             EventKind.RECORDING_GONE, time.time_ns(), text, vehicle=vehicle, messages=number
         )
@@ -405,7 +362,7 @@ class FileWriter:
         for name, opened in list(self._files.items()):
             if now_s - opened.since_s >= self.limits.age_s:
                 self._close(name, "rotated: age")
-            elif name[1] != _SERVICE_FILE and now_s - opened.last_s >= QUIET_S:
+            elif name[1] != SERVICE_FILE and now_s - opened.last_s >= QUIET_S:
                 self._close(name, "the truck is quiet")
 
     def _rotate_on_request(self) -> None:
@@ -448,7 +405,7 @@ class FileWriter:
             self.said.append(message)
             self._write(message, time.monotonic())
 
-    def _stop(self, failed: _FileName | None, failure: str, kind: EventKind) -> None:
+    def _stop(self, failed: FileName | None, failure: str, kind: EventKind) -> None:
         """Close every file as well as can be, count what is lost and take nothing any more."""
         _log.error("%s", failure)
         try:
@@ -462,7 +419,7 @@ class FileWriter:
             else:
                 self._backlog.wait(SYNC_PERIOD_S)
 
-    def _close_all_badly(self, failed: _FileName | None, failure: str, event: Event) -> None:
+    def _close_all_badly(self, failed: FileName | None, failure: str, event: Event) -> None:
         saved: list[Message] = []
         lost: list[Message] = []
         for name, opened in self._files.items():
@@ -483,7 +440,7 @@ class FileWriter:
             self.count_drop(dropped.key, FAILED)
 
     def _close_badly(
-        self, name: _FileName, opened: _Open, failure: str, event: Message, *, is_failed: bool
+        self, name: FileName, opened: _Open, failure: str, event: Message, *, is_failed: bool
     ) -> int | None:
         """Close a file with an event; how many messages it lost, None if that is not known."""
         counts = {"dropped": self._drops.of(*name) - opened.dropped_before}
@@ -503,14 +460,14 @@ class FileWriter:
         return 0
 
 
-def _synced(name: _FileName, opened: _Open) -> Misplaced | None:
+def _synced(name: FileName, opened: _Open) -> Misplaced | None:
     with _failing(name):
         opened.file.sync()
         return opened.file.misplaced()
 
 
 class _WriteFailed(Exception):  # noqa: N818  # says what happened, as OSError does not
-    def __init__(self, name: _FileName | None, reason: str, kind: EventKind) -> None:
+    def __init__(self, name: FileName | None, reason: str, kind: EventKind) -> None:
         super().__init__(reason)
         self.name = name
         self.reason = reason
@@ -518,7 +475,7 @@ class _WriteFailed(Exception):  # noqa: N818  # says what happened, as OSError d
 
 
 @contextlib.contextmanager
-def _failing(name: _FileName) -> Iterator[None]:
+def _failing(name: FileName) -> Iterator[None]:
     """Name the file that an error came from."""
     try:
         yield
@@ -526,33 +483,9 @@ def _failing(name: _FileName) -> Iterator[None]:
         raise _failed(name, error) from error
 
 
-def _failed(name: _FileName, error: OSError | InputError) -> _WriteFailed:
+def _failed(name: FileName, error: OSError | InputError) -> _WriteFailed:
     reason = getattr(error, "strerror", None) or str(error)
     return _WriteFailed(name, reason, EventKind.WRITE_ERROR)
-
-
-def _vehicle_of(message: Message) -> str:
-    """Return the vehicle that a message concerns; empty if none."""
-    if message.key.owner == "vehicle":
-        return message.key.identifier
-    name = topic(message.key.owner, message.key.stream).message
-    vehicle: str = getattr(decode(name, message.payload), "vehicle", "")
-    return vehicle
-
-
-def _free_path(place: Place, realm: str, name: str) -> Path:
-    now = datetime.now(UTC)
-    if place.file is not None:
-        folder, stem = place.file.parent, place.file.stem
-    else:
-        folder = place.folder / realm / f"{now:%Y-%m-%d}"
-        stem = f"{name}-{now:%Y%m%dT%H%M%SZ}"
-    path = folder / f"{stem}.mcap"
-    number = 2
-    while is_name_taken(path):
-        path = folder / f"{stem}-{number}.mcap"
-        number += 1
-    return path
 
 
 def count_all(intake: Counter[str], writer: FileWriter) -> dict[str, int]:

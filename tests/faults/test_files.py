@@ -29,9 +29,11 @@ from schemas.topics import Key
 from services import logger
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError
+from services.logger import places
 from services.logger import writer as writer_module
 from services.logger.backlog import QUEUE_BYTES, Backlog
-from services.logger.writer import FileWriter, Limits, Place
+from services.logger.places import Place
+from services.logger.writer import FileWriter, Limits
 from services.recordings.recording import Message, is_closed, read_info, read_messages
 from services.recordings.recovery import recover_recording
 from tests.waiting import LONGEST_S
@@ -396,8 +398,8 @@ def test_rotation_neither_loses_nor_repeats(
 def test_more_trucks_in_a_day_than_files_can_be_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(writer_module, "_SHORTEST_QUIET_S", 0.0)
-    monkeypatch.setattr(writer_module, "MAX_OPEN_FILES", 5)
+    monkeypatch.setattr(places, "_SHORTEST_QUIET_S", 0.0)
+    monkeypatch.setattr(places, "MAX_OPEN_FILES", 5)
     writer = FileWriter(place(tmp_path))
     for n in range(12):
         writer.put(next(fixes(1, f"truck-{n}")))

@@ -12,7 +12,8 @@ from schemas.events import Event, EventKind, decode_event
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import GnssFix, VehicleInfo, encode_gnss, encode_info
 from schemas.topics import Key
-from services.logger.writer import FileWriter, Place
+from services.logger.places import Place
+from services.logger.writer import FileWriter
 from services.recordings.recording import Message, read_info, read_messages
 
 NOW_NS = 1_700_000_000_000_000_000

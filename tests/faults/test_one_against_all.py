@@ -15,7 +15,8 @@ from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.logger.complaints import Complaints
 from services.logger.drops import Drop
-from services.logger.writer import MAX_FILES_OF_ONE, FileWriter, Place
+from services.logger.places import MAX_FILES_OF_ONE, Place
+from services.logger.writer import FileWriter
 from services.recordings.recording import Message, read_messages
 
 NOW_NS = 1_700_000_000_000_000_000
@@ -55,7 +56,7 @@ def test_files_of_one_vehicle_in_many_realms_leave_room_for_the_others(tmp_path:
 def test_too_many_vehicles_are_told_as_such(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.logger.writer.MAX_OPEN_FILES", 5)
+    monkeypatch.setattr("services.logger.places.MAX_OPEN_FILES", 5)
     writer = FileWriter(Place(tmp_path, None, None, None))
     for number in range(6):
         writer.put(fix(f"truck-{number}", "live", 0))

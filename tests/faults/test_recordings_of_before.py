@@ -17,7 +17,8 @@ from services.common.disk import DISK
 from services.history.processed import is_processed
 from services.logger import housekeeping
 from services.logger.housekeeping import House, Housekeeping
-from services.logger.writer import FileWriter, Place
+from services.logger.places import Place
+from services.logger.writer import FileWriter
 from services.recordings.recording import Message, is_closed, read_info, read_messages, read_site
 from services.recordings.recovery import put_aside, recover_recording, recovered_path
 from services.recordings.writer import RecordingWriter, write_recording
@@ -117,7 +118,7 @@ def test_the_name_of_what_was_set_aside_is_not_used_again(
         taken.append(path.name)
         return len(taken) < 3
 
-    monkeypatch.setattr("services.logger.writer.is_name_taken", is_taken)
+    monkeypatch.setattr("services.logger.places.is_name_taken", is_taken)
     writer = FileWriter(Place(tmp_path, None, None, None))
     writer.put(next(fixes(1)))
     writer.finish("done", {})

@@ -15,7 +15,8 @@ from services.common.disk import DISK
 from services.common.errors import InputError
 from services.logger.backlog import Backlog
 from services.logger.intake import GAP_PATIENCE_S, Intake
-from services.logger.writer import FileWriter, Place
+from services.logger.places import Place
+from services.logger.writer import FileWriter
 from services.recordings.recording import Message, read_info, read_messages
 from services.recordings.writer import RecordingWriter
 from tests.waiting import LONGEST_S, until
