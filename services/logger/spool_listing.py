@@ -7,7 +7,6 @@ so many bytes, and what lies in the queue is bounded.
 
 import logging
 import threading
-import time
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +20,6 @@ from services.logger.complaints import Complaints
 
 _log = logging.getLogger(__name__)
 _TIMEOUT_S = 1.5
-_GRACE_S = 0.5
 _PAUSE_S = 0.005
 _REPLIES_WAITING = 200
 _MAX_BYTES = 1 << 20
@@ -29,7 +27,7 @@ _MAX_BYTES = 1 << 20
 
 
 class SpoolListing:
-    """One round after the other; each ends within two seconds."""
+    """One round after the other; each ends when the next one begins."""
 
     def __init__(self, bus: zenoh.Session, realms: Sequence[str], complaints: Complaints) -> None:
         self._bus = bus
@@ -37,14 +35,18 @@ class SpoolListing:
         self._complaints = complaints
         self._answers: dict[Key, list[Held]] = {}
         self._lock = threading.Lock()
-        self._closing = threading.Event()
+        self._is_over = threading.Event()
+        """Of the round that is going on."""
         self._thread: threading.Thread | None = None
 
     def ask(self) -> None:
-        """Begin a round, unless the one before is still going on."""
-        if self._thread is None or not self._thread.is_alive():
-            self._thread = threading.Thread(target=self._ask_all, name="spools", daemon=True)
-            self._thread.start()
+        """Begin a round; who has not answered in the one before is asked again."""
+        self._is_over.set()
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(
+            target=self._ask_all, args=(self._is_over,), name="spools", daemon=True
+        )
+        self._thread.start()
 
     def next_answer(self) -> tuple[Key, list[Held]] | None:
         """Return what a truck has of a stream, oldest boot first; None: nothing new now."""
@@ -56,11 +58,11 @@ class SpoolListing:
 
     def close(self) -> None:
         """Ask nobody any more."""
-        self._closing.set()
+        self._is_over.set()
         if self._thread is not None:
             self._thread.join()
 
-    def _ask_all(self) -> None:
+    def _ask_all(self, is_over: threading.Event) -> None:
         try:
             listings = [self._query(realm) for realm in self._realms]
         except zenoh.ZError as error:  # the session is closing
@@ -68,8 +70,7 @@ class SpoolListing:
             return
         read: set[Key] = set()
         sizes: Counter[str] = Counter()
-        deadline = time.monotonic() + _TIMEOUT_S + _GRACE_S
-        while listings and time.monotonic() < deadline and not self._closing.is_set():
+        while listings and not is_over.is_set():
             is_idle = True
             for listing in list(listings):
                 try:
@@ -82,7 +83,7 @@ class SpoolListing:
                     if reply.ok is not None:
                         self._read(reply.ok, read, sizes)
             if is_idle:
-                self._closing.wait(_PAUSE_S)
+                is_over.wait(_PAUSE_S)
 
     def _query(self, realm: str) -> Any:
         return self._bus.get(

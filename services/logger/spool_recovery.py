@@ -25,6 +25,8 @@ from zenoh import handlers
 from schemas.signals import decode_identity
 from schemas.spool import (
     MAX_RANGES,
+    PAGE_BYTES,
+    PAGE_MESSAGES,
     Held,
     Query,
     Range,
@@ -43,7 +45,9 @@ _log = logging.getLogger(__name__)
 LIST_PERIOD_S = 2.0
 _PAGE_TIMEOUT_S = 10.0
 _QUERIES_AT_ONCE = 8
-_REPLIES_WAITING = 20_000
+_MAX_REPLIES = 2 * PAGE_MESSAGES
+_MAX_BYTES = 2 * PAGE_BYTES
+"""Of one answer: a page and its end, or one message that is larger, and as much again."""
 _REPLIES_PER_STEP = 500
 _FIRST_PAUSE_S = 1.0
 _LONGEST_PAUSE_S = 60.0
@@ -87,14 +91,17 @@ def shortfall(boot: Held, seen: Intervals, ripe: int, gone: Iterable[Range] = ()
     return Shortfall(_without(open_, lost), _without(missing, open_), lost)
 
 
-class _Task(NamedTuple):
+@dataclass
+class _Task:
     """A query under way."""
 
     where: Key
     query: Query
     handler: Any
     deadline_s: float
-    got: Intervals
+    got: Intervals = field(default_factory=Intervals)
+    replies: int = 0
+    bytes: int = 0
 
 
 @dataclass
@@ -172,7 +179,7 @@ class SpoolRecovery:
         return sum(
             query.last - query.first + 1
             for truck in self._trucks.values()
-            for _, query in [*truck.todo, *([truck.task[:2]] if truck.task is not None else [])]
+            for _, query in [*truck.todo, *_under_way(truck)]
         )
 
     def pause(self, where: Key, now_s: float) -> None:
@@ -213,8 +220,9 @@ class SpoolRecovery:
             for first, last in missing.lost:
                 self._lost(where, boot.boot_id, first, last)
             for first, last in _joined(missing.fetch):
-                if truck.task is None or truck.task[:2] != (where, (boot.boot_id, first, last)):
-                    todo.append((where, Query(boot.boot_id, first, last)))
+                query = (where, Query(boot.boot_id, first, last))
+                if query not in _under_way(truck):
+                    todo.append(query)
         truck.ripe[where.stream] = (newest, boots[-1].next_sequence)
         truck.todo = deque(islice(todo, MAX_RANGES))
         self._busy = self._busy or bool(todo)
@@ -281,7 +289,7 @@ class SpoolRecovery:
         try:
             handler = self._bus.get(
                 f"{spool_key(where)}?{query.parameters()}",
-                handlers.FifoChannel(_REPLIES_WAITING),
+                handlers.FifoChannel(_MAX_REPLIES),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_PAGE_TIMEOUT_S,
@@ -292,7 +300,7 @@ class SpoolRecovery:
             _log.debug("spool query: %s", error)
             self._pause(truck, now_s)
             return
-        truck.task = _Task(where, query, handler, now_s + 2 * _PAGE_TIMEOUT_S, Intervals())
+        truck.task = _Task(where, query, handler, now_s + 2 * _PAGE_TIMEOUT_S)
 
     def _read(self, truck: _Truck, task: _Task, now_s: float, received: list[Received]) -> None:
         for _ in range(_REPLIES_PER_STEP):
@@ -304,6 +312,14 @@ class SpoolRecovery:
             if reply is None:
                 if now_s >= task.deadline_s:
                     self._failed(truck, task, now_s)
+                return
+            task.replies += 1
+            task.bytes += 0 if reply.ok is None else len(reply.ok.payload)
+            if task.replies > _MAX_REPLIES or task.bytes > _MAX_BYTES:
+                self._complaints.warn(
+                    "long pages", "%s: spool: a page without end", task.where.identifier
+                )
+                self._failed(truck, task, now_s)  # what waits is dropped with the handler
                 return
             if reply.ok is None:
                 continue
@@ -347,6 +363,10 @@ class SpoolRecovery:
         pause_s = min(_LONGEST_PAUSE_S, _FIRST_PAUSE_S * 2.0**truck.failures)
         truck.failures = min(truck.failures + 1, 10)
         truck.not_before_s = now_s + pause_s
+
+
+def _under_way(truck: _Truck) -> list[tuple[Key, Query]]:
+    return [] if truck.task is None else [(truck.task.where, truck.task.query)]
 
 
 def _without(ranges: Iterable[Range], others: Iterable[Range]) -> list[Range]:

@@ -3,6 +3,9 @@
 A file is closed, with END and the reason, when it is old or large enough, when asked, and when its
 truck has been quiet for long; the next message of that truck begins a new one. Only this thread
 writes, between two messages, so that none is lost or repeated by it.
+
+Longer than other modules, because what that thread holds does not come apart: whoever closes a
+file, for age, room, a failure or because it is gone, must know what of it was not yet synced.
 """
 
 import contextlib

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas import spool as wire
-from schemas.signals import Channel, GnssFix, Identity, decode_accel
+from schemas.signals import Channel, GnssFix, Identity, decode_accel, encode_identity
 from schemas.spool import Held, Query
 from schemas.topics import Key
 from services.bus.subscription import Received, Seen
@@ -256,7 +256,7 @@ def test_a_damaged_record_is_lost_and_not_asked_for_for_ever(
 def test_a_truck_that_does_not_answer_holds_up_no_other(
     router: zenoh.Session, client: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(spool_recovery, "_LIST_TIMEOUT_S", 2 * LONGEST_S)
+    monkeypatch.setattr(spool_listing, "_TIMEOUT_S", 2 * LONGEST_S)
     mute = client.declare_queryable(
         wire.spool_selector("live", "truck-0"), zenoh.handlers.FifoChannel(100)
     )
@@ -308,7 +308,7 @@ def test_a_full_disk_on_the_truck_stops_nothing(
 
 
 def answering(client: zenoh.Session, answer: Callable[[zenoh.Query], None]) -> Callable[[], None]:
-    """A truck that answers every question for contents as it likes; return what ends it."""
+    """A truck that answers every question as it likes; return what ends it."""
     queryable = client.declare_queryable(
         wire.spool_selector("live", "truck-1"), zenoh.handlers.FifoChannel(100)
     )
@@ -320,8 +320,7 @@ def answering(client: zenoh.Session, answer: Callable[[zenoh.Query], None]) -> C
             except zenoh.ZError:  # undeclared
                 return
             with query, contextlib.suppress(zenoh.ZError):
-                if not dict(query.parameters):
-                    answer(query)
+                answer(query)
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
@@ -349,7 +348,12 @@ def test_a_thousand_boots_take_turns(
         return real(boot, *arguments)
 
     monkeypatch.setattr(spool_recovery, "shortfall", counted)
-    end = answering(client, lambda query: query.reply(wire.spool_key(ACCEL), contents))
+
+    def answer(query: zenoh.Query) -> None:
+        if not dict(query.parameters):  # pages it does not give
+            query.reply(wire.spool_key(ACCEL), contents)
+
+    end = answering(client, answer)
     logger = Logger(router)
     deadline = time.monotonic() + 60.0
     while len(compared) < len(boots):
@@ -377,6 +381,8 @@ def test_endless_answers_are_read_once_and_complained_of_a_few_times(
         return real(payload)
 
     def answer(query: zenoh.Query) -> None:
+        if dict(query.parameters):
+            return
         rounds.append(0)
         for _ in range(2000):
             query.reply(wire.spool_key(ACCEL), contents)
@@ -407,6 +413,34 @@ def test_a_listing_of_endless_length_is_not_taken_apart(
     logger = Logger(router)
     logger.run(lambda: bool(caplog.records))
     assert "truck-1 lists more than 1048576 bytes" in caplog.records[0].getMessage()
+    logger.recovery.close()
+    end()
+
+
+@pytest.mark.parametrize("size", [10, 250_000])
+def test_a_page_without_end_is_given_up(
+    router: zenoh.Session, client: zenoh.Session, size: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It filled 1.4 GB, for its deadline was looked at only when nothing waited."""
+    contents = wire.encode_contents(1, [Held(1, 10, [(0, 9)], -1, 0), Held(2, 1, [], 0, 0)])
+    sent: list[int] = []
+
+    def answer(query: zenoh.Query) -> None:
+        if not dict(query.parameters):
+            query.reply(wire.spool_key(ACCEL), contents)
+            return
+        sent.append(0)
+        while sent[-1] < 20_000:
+            query.reply(wire.spool_key(ACCEL), bytes(size), attachment=encode_identity(1, 100))
+            sent[-1] += 1
+
+    end = answering(client, answer)
+    logger = Logger(router)
+    logger.run(lambda: any("a page without end" in r.getMessage() for r in caplog.records))
+    assert logger.received == []
+    [truck] = logger.recovery._trucks.values()
+    assert truck.task is None
+    assert (truck.failures, len(truck.todo)) == (1, 1)  # it is asked again, later and later
     logger.recovery.close()
     end()
 
