@@ -146,7 +146,7 @@ class Completeness:
             for (where, boot_id), numbers in self._writer.unwritten.popleft().items():
                 intake.unsee(where, boot_id, numbers)
                 self._recovery.pause(where, now_s)
-        self._read_tokens()
+        self._read_tokens(now_s)
         self._complaints.flush()
         self._figures = self._counted(now_s)
 
@@ -193,7 +193,7 @@ class Completeness:
             self._gone_for_ever += gone.remove_range(first, last)
         self._intake.lose(where, boot_id, first, last, time.time_ns())
 
-    def _read_tokens(self) -> None:
+    def _read_tokens(self, now_s: float) -> None:
         waiting = (islice(iter(one.try_recv, None), _TOKENS_WAITING) for one in self._tokens)
         for sample in chain.from_iterable(waiting):
             try:
@@ -209,6 +209,8 @@ class Completeness:
                 self._alive_of[where.identifier] += 1
             is_here = sample.kind == zenoh.SampleKind.PUT
             if self._alive.get(name, False) != is_here:
+                if is_here:
+                    self._recovery.hurry(now_s)
                 _log.info("%s in realm %s %s", name[1], name[0], "came" if is_here else "left")
             self._alive[name] = is_here
 

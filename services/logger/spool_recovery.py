@@ -43,6 +43,8 @@ __all__ = ["Shortfall", "SpoolRecovery", "shortfall"]
 
 _log = logging.getLogger(__name__)
 LIST_PERIOD_S = 2.0
+_HURRY_S = 0.3
+"""Its token is there a moment before it answers."""
 _PAGE_TIMEOUT_S = 10.0
 _QUERIES_AT_ONCE = 8
 _MAX_REPLIES = 2 * PAGE_MESSAGES
@@ -181,6 +183,10 @@ class SpoolRecovery:
             for truck in self._trucks.values()
             for _, query in [*truck.todo, *_under_way(truck)]
         )
+
+    def hurry(self, now_s: float) -> None:
+        """Ask soon what spools hold: a truck has come, and may not stay long."""
+        self._next_list_s = min(self._next_list_s, now_s + _HURRY_S)
 
     def pause(self, where: Key, now_s: float) -> None:
         """Ask a truck for nothing for a while, longer each time: what it gave had no room."""
