@@ -93,6 +93,17 @@ def test_checks_ask_the_service_itself_in_its_own_realm(name: str) -> None:
     assert options.tls == said.tls
 
 
+def test_what_the_truck_says_is_recorded_and_identified() -> None:
+    said = {n: cli._parser().parse_args(SERVICES[n]["command"]) for n in ("truck", "worker")}
+    logger = cli._parser().parse_args(SERVICES["logger"]["command"])
+    assert logger.realm == [said["truck"].realm] == [said["worker"].realm]
+
+
+def test_it_comes_up_a_second_time() -> None:
+    """The volume keeps the recording of the first; without --force that is bad input."""
+    assert cli._parser().parse_args(SERVICES["simulation"]["command"]).force
+
+
 @pytest.mark.parametrize("name", [n for n in SERVICES if n != "router"])
 def test_every_command_is_one_of_ours(name: str) -> None:
     cli._parser().parse_args(SERVICES[name]["command"])

@@ -173,6 +173,7 @@ def test_everything_comes_up_in_its_order_and_identifies_the_crossing(host: Host
     try:
         host.run("certs")
         host.run("simulation")
+        host.run("simulation")  # `up` a second time: the volume keeps what the first wrote
         logger = host.start("logger")
         started.append(logger)
         host.wait_until_healthy("logger", logger)
