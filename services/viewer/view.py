@@ -9,6 +9,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import tempfile
+import threading
 from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
@@ -133,16 +134,22 @@ def _run_viewer(shown: Path, *, web: bool) -> int:
     if not program.is_file():
         raise FailureError(f"{program}: the Rerun viewer is not installed for this platform")
     subprocess.run([program, "analytics", "disable"], check=False, capture_output=True)
-    with subprocess.Popen(viewer_arguments(shown, web=web)) as viewer:
-        # Without this the viewer would go on alone when this program is told to stop.
-        previous = signal.signal(signal.SIGTERM, lambda *_: viewer.terminate())
-        try:
-            code = viewer.wait()
-        except KeyboardInterrupt:
-            viewer.terminate()
-            code = 0
-        finally:
-            signal.signal(signal.SIGTERM, previous)
+    # The viewer would go on alone if this program were told to stop and only itself did, be it
+    # while the viewer is being started.
+    told_to_stop = threading.Event()
+    previous = signal.signal(signal.SIGTERM, lambda *_: told_to_stop.set())
+    try:
+        with subprocess.Popen(viewer_arguments(shown, web=web)) as viewer:
+            signal.signal(signal.SIGTERM, lambda *_: viewer.terminate())
+            if told_to_stop.is_set():
+                viewer.terminate()
+            try:
+                code = viewer.wait()
+            except KeyboardInterrupt:
+                viewer.terminate()
+                code = 0
+    finally:
+        signal.signal(signal.SIGTERM, previous)
     if code not in (0, -signal.SIGTERM):
         raise FailureError(f"the Rerun viewer ended with code {code}; without a screen, try --web")
     return 0

@@ -382,8 +382,23 @@ def test_viewer_is_told_to_listen_on_loopback_only(web: bool):
     assert ("--web-viewer" in arguments) == web
 
 
+SIGNAL_ITSELF = """
+import os, signal, subprocess, time
+begin = subprocess.Popen
+def told_to_stop_meanwhile(arguments, **options):
+    process = begin(arguments, **options)
+    if "analytics" not in arguments:
+        while not (started.exists() and started.read_text().endswith("\\n")):
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGTERM)
+    return process
+subprocess.Popen = told_to_stop_meanwhile
+"""
+
+
 @pytest.mark.process
-def test_viewer_ends_with_the_command_that_started_it(tmp_path: Path, monkeypatch):
+@pytest.mark.parametrize("while_it_starts", [False, True])
+def test_viewer_ends_with_the_command_that_started_it(tmp_path: Path, while_it_starts: bool):
     """A stand-in for the viewer: the real one needs a screen."""
     started = tmp_path / "started"
     program = tmp_path / "viewer"
@@ -397,12 +412,15 @@ def test_viewer_ends_with_the_command_that_started_it(tmp_path: Path, monkeypatc
         "import sys; from pathlib import Path; from rich.console import Console\n"
         "from services.viewer import view\n"
         f"view.viewer_program = lambda: Path({str(program)!r})\n"
+        f"started = Path({str(started)!r})\n"
+        f"{SIGNAL_ITSELF if while_it_starts else ''}"
         f"sys.exit(view.view_command(target={str(recording)!r}, web=False, console=Console()))"
     )
     with subprocess.Popen([sys.executable, "-c", code]) as command:
         try:
             until(lambda: started.exists() and started.read_text().endswith("\n"))
-            command.terminate()
+            if not while_it_starts:
+                command.terminate()
             assert command.wait(timeout=LONGEST_S) == 0
         finally:
             command.kill()
