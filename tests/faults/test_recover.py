@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from schemas.events import EventKind, decode_event
+from schemas.messages import descriptors
 from schemas.signals import GnssFix, encode_gnss
 from schemas.topics import Key
 from services.cli import main as cli
@@ -290,6 +291,41 @@ def test_an_older_recording_without_its_first_chunk_is_read_by_its_summary(
     assert recovery.lost is not None
     assert recovery.lost == 200 - len(data)
     assert [m for m in read_messages(path) if m.key.owner == "vehicle"] == data
+
+
+def test_a_schema_without_content_is_filled_in_where_its_message_is_known(
+    tmp_path: Path,
+) -> None:
+    """One of a topic of ours by our own; what somebody else recorded beside it stays his."""
+    from mcap.writer import Writer
+
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        ours = writer.register_schema("driveby.v1.GnssFix", "protobuf", b"")
+        theirs = writer.register_schema("their.Text", "jsonschema", b"")
+        fix = next(fixes(1))
+        topic = "driveby/v1/live/vehicle/t/gnss"
+        for name, encoding, schema, payload in (
+            (topic, "protobuf", ours, fix.payload),
+            ("/their/text", "json", theirs, b"{}"),
+        ):
+            channel = writer.register_channel(name, encoding, schema)
+            writer.add_message(channel, NOW_NS, payload, NOW_NS)
+        writer.finish()
+    target = recovered_path(path)
+    assert recover_recording(path, target, time_ns=NOW_NS).messages == 2
+    with target.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    found = {
+        channel.topic: summary.schemas[channel.schema_id] for channel in summary.channels.values()
+    }
+    assert found[topic].name == "driveby.v1.GnssFix"
+    assert found[topic].data == descriptors("driveby.v1.GnssFix")
+    kept = found["/their/text"]
+    assert (kept.name, kept.encoding, kept.data) == ("their.Text", "jsonschema", b"")
 
 
 def test_a_large_torn_chunk_gives_back_its_first_blocks(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+import zlib
 from pathlib import Path
 
 import pytest
@@ -159,6 +160,26 @@ def test_a_flipped_bit_costs_its_record_and_never_gives_wrong_bytes(
         assert [m.sequence for m in messages] == [n for n in range(20) if n != hit]
     else:  # the header, or a length: what stands behind cannot be found
         assert [m.sequence for m in messages][: max(0, hit)] == list(range(max(0, hit)))
+    spool.close()
+
+
+@pytest.mark.parametrize("length", [0, 4, 8])
+def test_a_record_shorter_than_its_own_head_is_no_record(tmp_path: Path, length: int) -> None:
+    """Its checksum may be right: what it would be read from are bytes that it does not cover."""
+    spool = Spool(tmp_path)
+    boot = spool.boot_id
+    fill(spool, 0, 2)
+    spool.close()
+    [segment] = tmp_path.glob("*.spool")
+    whole = segment.read_bytes()
+    last = bytearray(whole[20 : 20 + (len(whole) - 20) // 3])
+    last[4:8] = length.to_bytes(4, "big")
+    last[0:4] = zlib.crc32(last[4 : 8 + length]).to_bytes(4, "big")
+    segment.write_bytes(whole + last)
+    spool = Spool(tmp_path)
+    assert sequences(spool, boot) == [0, 1, 2]
+    assert spool.torn_bytes == len(last)
+    assert segment.read_bytes() == whole
     spool.close()
 
 

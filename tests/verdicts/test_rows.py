@@ -112,6 +112,24 @@ def test_axles_alike_say_nothing() -> None:
     assert reasons_after_fit(crossing(), uninformed) == []
 
 
+@pytest.mark.parametrize(
+    ("unsprung_mass_kg", "alike"),
+    [((1000.0, 1000.0), True), ((300.0, 2000.0), False), ((2000.0, 300.0), False)],
+)
+def test_an_axle_load_is_what_stands_on_it_and_the_axle_itself(
+    unsprung_mass_kg: tuple[float, float], *, alike: bool
+) -> None:
+    """10 t in the middle: 6 t and 6 t, or 5.3 t and 7 t, where a tenth of the sum is the limit."""
+    wheelbase_m = crossing().vehicle.wheelbase_m
+    truck = crossing(
+        sprung_mass_kg=10_000.0,
+        front_axle_to_cg_m=wheelbase_m / 2.0,
+        unsprung_mass_kg=unsprung_mass_kg,
+    )
+    uninformed = fit(normals(), rigidity_spread=np.full(7, 0.95))
+    assert (Reason.AXLES_ALIKE in reasons_after_fit(truck, uninformed)) is alike
+
+
 def test_cells_hold_all_the_power() -> None:
     """The cosine transform is orthogonal: cells, weighted by their sizes, add up to the rows."""
     white = normals()
