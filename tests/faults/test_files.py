@@ -258,6 +258,29 @@ def test_a_disk_that_is_full_anywhere_is_told_and_counted(
             assert recovery.damaged_bytes == 0  # what was torn has been cut off
 
 
+def test_where_one_file_fails_the_others_keep_what_they_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing was synced before; closing the file of the other truck makes all of it safe."""
+    monkeypatch.setattr(writer_module, "SYNC_PERIOD_S", LONGEST_S)
+
+    def create(path: Path) -> Faulty:
+        def write(file: BinaryIO, data: memoryview) -> int:
+            if "truck-0" in str(path) and file.tell() > 20_000:
+                raise OSError(5, "Input/output error")
+            return file.write(data)
+
+        return Faulty(path, write)
+
+    writer, sent = write_until_it_fails(tmp_path, DISK._replace(create=create), 2)
+    assert writer.failure == "recording stopped: Input/output error"
+    assert writer.written + writer.dropped == sent
+    safe = data_of(tmp_path.glob("live/*/truck-1-*.mcap"))
+    assert len(safe) > 10
+    [claimed] = [s for s in writer.durable()[1]["live"].streams if s.identifier == "truck-1"]
+    assert claimed.count == len(safe)
+
+
 @pytest.mark.parametrize("call", [3, 4, 9])
 def test_a_failing_fsync_ends_the_recording_and_claims_nothing(
     tmp_path: Path, call: int, monkeypatch: pytest.MonkeyPatch

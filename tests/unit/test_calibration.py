@@ -11,6 +11,7 @@ from rich.console import Console
 from scipy.special import ndtr
 
 from pre_core.diagnostics.calibration import NORMAL_975
+from services.cli import validate_pre
 from services.cli.validate_pre import print_outcome
 from services.validation.calibration import (
     GROUPS,
@@ -199,6 +200,9 @@ def test_judged_crossings_have_a_tolerance_a_width_and_a_verdict() -> None:
     wide = _judged()
     wide["elements"]["EI_2"]["bound"] *= 0.7
     assert missed(judged_checks(wide)) == {"d1 run 0: std over bound"}
+    one_off = _judged()
+    one_off["elements"]["EI_2"]["mean"] *= 1.05
+    assert missed(judged_checks(one_off)) == {"d1 run 0: error over allowed"}
     rejected = _judged(verdict="rejected", chi2_per_dof=None)
     assert len(missed(judged_checks(rejected))) == 4
 
@@ -237,3 +241,28 @@ def test_a_missed_aim_stands_out_on_page_and_screen() -> None:
     assert "d1 run 0: is good" in text
     assert "MISSED" in text
     assert max(len(line) for line in text.splitlines()) <= 80
+
+
+@pytest.mark.parametrize(("verdict", "code"), [("good", 0), ("suspect", 1)])
+def test_the_command_ends_with_1_where_an_aim_is_missed(
+    monkeypatch: pytest.MonkeyPatch, verdict: str, code: int
+) -> None:
+    """The hours of computing are left out: what they gave is made up."""
+    outcome = _outcome()._replace(drawn=made_up(200), judged=[_judged(verdict=verdict)])
+    monkeypatch.setattr(validate_pre, "run_parts", lambda *_, **__: outcome)
+    ended = validate_pre.validate_pre_command(
+        crossings=40,
+        control=5,
+        scenarios=(12,),
+        worlds=0,
+        effects=(),
+        records=Path("unused"),
+        folder=Path("unused"),
+        site=None,
+        processes=1,
+        json_path=None,
+        figures=None,
+        page=None,
+        console=Console(file=io.StringIO(), width=80),
+    )
+    assert ended == code

@@ -83,6 +83,7 @@ def test_bars_stand_on_their_elements_with_their_rigidity():
     assert middles == pytest.approx((edges[:-1] + edges[1:]) / 2)
     for bar, left, right in zip(drawn, edges, edges[1:], strict=False):
         assert left < bar.get_x() < bar.get_x() + bar.get_width() < right
+        assert bar.get_width() > (right - left) / 2
 
 
 def test_interval_truth_and_nominal_are_drawn_where_they_are():
