@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo up test test-all faults soak validate lint bench lock clean
+.PHONY: help install demo up test test-all faults soak mutants validate lint bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -52,6 +52,11 @@ KILLS ?= 50
 MINUTES ?= 60
 soak: $(STAMP) ## 50 kills of each kind and an hour of 100 trucks (KILLS=50 MINUTES=60)
 	DRIVEBY_SOAK_KILLS=$(KILLS) DRIVEBY_SOAK_MINUTES=$(MINUTES) $(BIN)/python -m pytest tests/faults -m soak -s
+
+MUTANTS ?= 40
+SEED ?= 1
+mutants: $(STAMP) ## do the tests see a wrong token? (MUTANTS=40 SEED=1, hours; goes on where it ended)
+	$(BIN)/python -m tests.mutants.run --mutants $(MUTANTS) --seed $(SEED)
 
 validate: $(STAMP) ## is the uncertainty true: tables, figure, docs/validation.md (long)
 	mkdir -p build
