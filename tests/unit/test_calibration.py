@@ -11,19 +11,25 @@ from rich.console import Console
 from scipy.special import ndtr
 
 from pre_core.diagnostics.calibration import NORMAL_975
+from schemas.settings import IdentificationSettings
+from schemas.site import Site
 from services.cli import validate_pre
 from services.cli.validate_pre import print_outcome
+from services.simulation.drawn import Seen, default_site, draw_truth, drive
+from services.validation import calibration
 from services.validation.calibration import (
     GROUPS,
     Check,
     by_condition,
     checks,
     distribution,
+    one_crossing,
     rank_tests,
     scores,
 )
 from services.validation.page import validation_page
 from services.validation.uncertainty import (
+    HALF,
     Outcome,
     aims,
     control_checks,
@@ -134,6 +140,23 @@ def test_few_good_ones_miss_an_aim_and_rejected_ones_count() -> None:
 def test_nothing_to_measure_is_a_missed_aim() -> None:
     records = [line | {"estimates": {}, "verdict": "rejected"} for line in made_up(5)]
     assert missed(checks(records)) == {"crossings with numbers"}
+
+
+def test_what_is_declared_reaches_the_site_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The control's owner believes in half the noise; the sensors have all of it."""
+    drawn = drive(default_site(), draw_truth(default_site(), 3), 3)
+    told: list[Site] = []
+
+    def see(runs: object, site: Site, settings: object) -> list[Seen]:
+        told.append(site)
+        return []
+
+    monkeypatch.setattr(calibration, "drive", lambda *_: drawn)
+    monkeypatch.setattr(calibration, "see", see)
+    one_crossing(default_site(), 3, IdentificationSettings(), HALF)
+    [site] = told
+    density = np.array(drawn.site.sensor.noise_density_ug_per_rthz)
+    np.testing.assert_allclose(site.sensor.noise_density_ug_per_rthz, 0.5 * density, rtol=1e-12)
 
 
 def test_a_control_that_nobody_notices_is_a_missed_aim() -> None:

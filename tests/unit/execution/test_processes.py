@@ -118,7 +118,9 @@ def by_stream(outputs: list[Any]) -> list[Any]:
     return sorted(outputs, key=lambda o: (o.key.stream, o.payload * (o.key.stream == "crossing")))
 
 
-def test_a_process_that_dies_twice_costs_its_own_crossing_only() -> None:
+def test_a_process_that_dies_twice_costs_its_own_crossing_only(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     first, second = works()
     with Processes(1, identify=deadly, prepare=nothing) as processes:
         for work in (second, first):
@@ -127,6 +129,8 @@ def test_a_process_that_dies_twice_costs_its_own_crossing_only() -> None:
     assert results[first.number].verdict == "good"
     assert results[second.number].reasons == ("failed",)
     assert results[second.number].speed_m_per_s == pytest.approx(10.0, rel=0.01)
+    said = [record.getMessage() for record in caplog.records]
+    assert sum("tried once more" in text for text in said) == 1
 
 
 def test_a_process_that_dies_once_costs_nothing(
