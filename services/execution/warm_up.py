@@ -94,7 +94,6 @@ def _warm_up_pre() -> None:
     )
     problem, y = optimum.prepare(inputs)
     posterior.all_rows(problem, y[None, :])
-    posterior.filtered_rows(problem, y)
     posterior.roads(problem, y)
 
 

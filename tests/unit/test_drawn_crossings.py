@@ -124,12 +124,3 @@ def test_a_crossing_is_measured_with_the_errors_that_were_drawn() -> None:
     assert erring.site.sensor.noise_density_ug_per_rthz == (0.0,) * 4
     names = unknowns.names(7)
     assert set(names) < set(true_values(truth))
-
-
-def test_axles_have_tyres_of_their_own() -> None:
-    """Where the site file says nothing of their damping, each is drawn from the prior at zero."""
-    for seed in range(3):
-        front, rear = draw_truth(default_site(), seed).car.tyre_damping_ns_per_m
-        assert front > 0.0
-        assert rear > 0.0
-        assert front != rear
