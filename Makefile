@@ -58,9 +58,10 @@ SEED ?= 1
 mutants: $(STAMP) ## do the tests see a wrong token? (MUTANTS=40 SEED=1, hours; goes on where it ended)
 	$(BIN)/python -m tests.mutants.run --mutants $(MUTANTS) --seed $(SEED)
 
+WORLDS ?= 64
 validate: $(STAMP) ## is the uncertainty true: tables, figure, docs/validation.md (long)
 	mkdir -p build
-	$(BIN)/driveby validate --method pre --json build/validation.json --figures docs/images --page docs/validation.md
+	$(BIN)/driveby validate --method pre --worlds $(WORLDS) --records build/worlds.jsonl --json build/validation.json --figures docs/images --page docs/validation.md
 
 lint: $(STAMP) ## format, lint, types and import contracts
 	$(BIN)/ruff format --check .

@@ -50,6 +50,12 @@ SCALARS: Final = (
     Unknown("m_u2", "kg", TRUCK, "unsprung_mass_kg", 1, 1),
     Unknown("k_u1", "N/m", TRUCK, "tyre_stiffness_n_per_m", 0, 1),
     Unknown("k_u2", "N/m", TRUCK, "tyre_stiffness_n_per_m", 1, 1),
+    Unknown(
+        "c_u1", "N·s/m", TRUCK, "tyre_damping_ns_per_m", 0, 1, may_be_zero=True, in_paper=False
+    ),
+    Unknown(
+        "c_u2", "N·s/m", TRUCK, "tyre_damping_ns_per_m", 1, 1, may_be_zero=True, in_paper=False
+    ),
     Unknown("kappa", "1", TRUCK, "pitch_inertia_ratio", in_paper=False),
     Unknown("rhoA", "kg/m", BRIDGE, "mass_per_length_kg_per_m", 0, 1),
     Unknown("alpha", "1/s", BRIDGE, "rayleigh_alpha_per_s"),
@@ -62,6 +68,7 @@ SCALARS: Final = (
         0,
         1,
         may_be_zero=True,
+        may_be_absent=True,
         in_paper=False,
     ),
     Unknown(
@@ -72,6 +79,29 @@ SCALARS: Final = (
         1,
         1,
         may_be_zero=True,
+        may_be_absent=True,
+        in_paper=False,
+    ),
+    Unknown(
+        "f_start",
+        "m/N",
+        BRIDGE,
+        "support_compliance_m_per_n",
+        0,
+        -1,
+        may_be_zero=True,
+        may_be_absent=True,
+        in_paper=False,
+    ),
+    Unknown(
+        "f_end",
+        "m/N",
+        BRIDGE,
+        "support_compliance_m_per_n",
+        1,
+        -1,
+        may_be_zero=True,
+        may_be_absent=True,
         in_paper=False,
     ),
 )
@@ -95,11 +125,13 @@ C_S1: Final = place("c_s1")
 K_S1: Final = place("k_s1")
 M_U1: Final = place("m_u1")
 K_U1: Final = place("k_u1")
+C_U1: Final = place("c_u1")
 KAPPA: Final = place("kappa")
 RHO_A: Final = place("rhoA")
 ALPHA: Final = place("alpha")
 BETA: Final = place("beta")
 K_ROT: Final = place("k_rot_start")
+F: Final = place("f_start")
 FIRST_OF_BRIDGE: Final = RHO_A
 EI_1: Final = len(SCALARS)
 

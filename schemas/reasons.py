@@ -42,6 +42,7 @@ class Reason(StrEnum):
     SAMPLER_DIAGNOSTICS = "sampler_diagnostics"
     FAILED = "failed"
     TYRE_DAMPING_IGNORED = "tyre_damping_ignored"
+    CONTINUOUS_BRIDGE = "continuous_bridge"
 
 
 REASON_TEXTS: Final[dict[Reason, str]] = {
@@ -83,6 +84,9 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.FAILED: "The identification failed.",
     Reason.TYRE_DAMPING_IGNORED: (
         "The site file gives the tyres a damping, which the method does not model."
+    ),
+    Reason.CONTINUOUS_BRIDGE: (
+        "The bridge has supports between its ends, and the method is for a single span."
     ),
 }
 

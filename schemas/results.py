@@ -65,11 +65,25 @@ class Covariance(_Fields):
         return self
 
 
+class AtEnds(_Fields):
+    """A probability for each end of the bridge."""
+
+    start: Annotated[Finite, Field(ge=0, le=1)]
+    end: Annotated[Finite, Field(ge=0, le=1)]
+
+
 class Derived(_Fields):
     """What follows from the parameters."""
 
     f1_hz: Parameter
     max_deflection_m: Parameter
+    probability_sprung: AtEnds | None = None
+    """That a rotational spring is at the support at all; None from methods that know of none."""
+    probability_giving: AtEnds | None = None
+    """That the bearing gives under load at all."""
+    springs_believed: Annotated[Finite, Field(ge=0, le=1)] | None = None
+    """How much of what the body's motion says through the truck's springs was believed: 1 if they
+    are as linear as the sensors can tell, near 0 where they rub."""
     probability_below_90_percent_of_baseline: dict[str, Finite] | None = None
     """By element; None without a stored baseline."""
 
@@ -266,6 +280,13 @@ def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:
         message.derived.max_deflection_m.CopyFrom(
             _parameter_to_protobuf(crossing.derived.max_deflection_m)
         )
+        for name in ("probability_sprung", "probability_giving"):
+            ends = getattr(crossing.derived, name)
+            if ends is not None:
+                getattr(message.derived, name).start = ends.start
+                getattr(message.derived, name).end = ends.end
+        if crossing.derived.springs_believed is not None:
+            message.derived.springs_believed = crossing.derived.springs_believed
         message.derived.probability_below_90_percent_of_baseline.update(
             crossing.derived.probability_below_90_percent_of_baseline or {}
         )
@@ -437,10 +458,24 @@ def _covariance(message: pb.Covariance) -> dict[str, object]:
     return {"names": tuple(message.names), "matrix": rows}
 
 
+def _ends(
+    message: pb.Derived, name: Literal["probability_sprung", "probability_giving"]
+) -> dict[str, float] | None:
+    if not message.HasField(name):
+        return None
+    ends: pb.AtEnds = getattr(message, name)
+    return {"start": ends.start, "end": ends.end}
+
+
 def _derived(message: pb.Derived) -> dict[str, object]:
     return {
         "f1_hz": _parameter(message.f1_hz),
         "max_deflection_m": _parameter(message.max_deflection_m),
+        "probability_sprung": _ends(message, "probability_sprung"),
+        "probability_giving": _ends(message, "probability_giving"),
+        "springs_believed": (
+            message.springs_believed if message.HasField("springs_believed") else None
+        ),
         "probability_below_90_percent_of_baseline": (
             dict(message.probability_below_90_percent_of_baseline) or None
         ),

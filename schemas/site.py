@@ -8,7 +8,8 @@ import difflib
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -38,6 +39,12 @@ MAX_SPAN_DISAGREEMENT: Final = 0.2
 """Beyond this relative difference between `span_m` and the distance of the ends one of them is a
 slip of the pen. Ends read off a hand-held receiver are metres off, so less is not refused."""
 
+_SMALLEST_SLIP: Final = 1e-3
+"""Of the span: lengths of elements are rounded."""
+
+_TYRE_DAMPING_NS_PER_M: Final = 1000.0
+_BEARING_COMPLIANCE_M_PER_N: Final = 1e-9
+
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0, le=1e15)]
 NotNegative = Annotated[Number, Field(ge=0, le=1e15)]
@@ -45,6 +52,7 @@ PositivePair = tuple[Positive, Positive]
 NotNegativePair = tuple[NotNegative, NotNegative]
 Spread = Annotated[Number, Field(ge=0, le=3)]
 Latitude = Annotated[Number, Field(ge=-89, le=89)]
+Altitude = Annotated[Number, Field(ge=-500, le=9000)]
 Longitude = Annotated[Number, Field(ge=-180, le=180)]
 Identifier = Annotated[str, StringConstraints(pattern=f"^{IDENTIFIER}$")]
 Text = Annotated[str, StringConstraints(min_length=1, max_length=1000)]
@@ -54,6 +62,14 @@ Sign = Annotated[Literal[1, -1], BeforeValidator(lambda v: int(v) if v in (1.0, 
 def _four(value: object) -> object:
     """Spell one value for all channels out as four."""
     return [value] * 4 if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+Bearing = Literal["unknown", "free", "sprung"]
+
+
+def _both_ends(value: object) -> object:
+    """Spell what is true of both ends out as a pair."""
+    return [value] * 2 if value in ("unknown", "free", "sprung") else value
 
 
 Rate = Annotated[Number, Field(ge=1, le=MAX_RATE_HZ)]
@@ -101,6 +117,7 @@ class Vehicle(_Spreadable):
     pitch_inertia_ratio: Annotated[Number, Field(gt=0, le=10)] = 1.0
     """κ: the pitch inertia is κ·m_s·d_1·d_2."""
     tyre_damping_ns_per_m: NotNegativePair = (0.0, 0.0)
+    """Zero: not known (see `scale_at_zero`)."""
 
     total_mass_kg_spread: Spread = 0.01
     wheelbase_m_spread: Spread = 0.002
@@ -112,6 +129,11 @@ class Vehicle(_Spreadable):
     cg_height_m_spread: Spread = 0.15
     pitch_inertia_ratio_spread: Spread = 0.15
     tyre_damping_ns_per_m_spread: Spread = 0.15
+
+    @property
+    def tyre_damping_ns_per_m_scale_at_zero(self) -> float:
+        """Scale of the half-normal prior of the damping of a tyre of which nothing is known."""
+        return _TYRE_DAMPING_NS_PER_M
 
     @property
     def sprung_mass_kg(self) -> float:
@@ -141,7 +163,9 @@ class Vehicle(_Spreadable):
 
 
 class Bridge(_Spreadable):
-    """A single span. Its ends are where the bearings are; elements are numbered from its start.
+    """One or more spans. Its ends are where the bearings are; elements are numbered from its start.
+
+    Over interior supports the bridge is continuous: their deflection is held and they turn freely.
 
     `flexural_rigidity_nm2` is the nominal (sound) value of every element;
     `flexural_rigidity_per_element_nm2` takes its place where elements are not alike. If both are
@@ -161,6 +185,24 @@ class Bridge(_Spreadable):
     flexural_rigidity_per_element_nm2: tuple[Positive, ...] | None = None
     element_lengths_m: tuple[Positive, ...] | None = None
     support_rotational_stiffness_spread_nm_per_rad: Positive | None = None
+    support_compliance_spread_m_per_n: Annotated[Number, Field(gt=0, le=1e-6)] = (
+        _BEARING_COMPLIANCE_M_PER_N
+    )
+    """Scale of the half-normal prior of the vertical compliance of the bearings at the ends."""
+    interior_supports_m: tuple[Positive, ...] = ()
+    """Chainages of the supports between the ends, ascending."""
+    bearings: Annotated[tuple[Bearing, Bearing], BeforeValidator(_both_ends)] = (
+        "unknown",
+        "unknown",
+    )
+    """Whether start and end turn freely or against a spring; unknown: the data decide."""
+    start_altitude_m: Altitude | None = None
+    end_altitude_m: Altitude | None = None
+    owner_id: Text | None = None
+    """The owner's name of the bridge."""
+    road_class: Literal["A", "B", "C", "D", "E"] | None = None
+    """ISO 8608."""
+    survey_speed_m_per_s: Annotated[Number, Field(gt=0, le=100)] | None = None
     baseline: Text | None = None
     """Path of a results file, relative to the site file."""
 
@@ -182,21 +224,49 @@ class Bridge(_Spreadable):
         """Return what is known of a quantity before: of bearings, that nothing need be there."""
         if key == "flexural_rigidity_nm2":
             return self.nominal_flexural_rigidity_nm2
-        if key == "support_rotational_stiffness_nm_per_rad":
+        if key in ("support_rotational_stiffness_nm_per_rad", "support_compliance_m_per_n"):
             return (0.0, 0.0)
         return super().nominal(key)
 
     @property
     def lengths_m(self) -> tuple[float, ...]:
-        """Length of each element; they add up to the span."""
-        return self.element_lengths_m or (self.span_m / self.elements,) * self.elements
+        """Length of each element; they add up to the span. One ends at every support."""
+        if self.element_lengths_m is not None:
+            return self.element_lengths_m
+        shares = _shared(self.elements, self.lengths_of_spans_m)
+        return tuple(
+            length / share
+            for length, share in zip(self.lengths_of_spans_m, shares, strict=True)
+            for _ in range(share)
+        )
+
+    @property
+    def lengths_of_spans_m(self) -> tuple[float, ...]:
+        """Distances between neighbouring supports, from the start."""
+        supports = (0.0, *self.interior_supports_m, self.span_m)
+        return tuple(after - before for before, after in pairwise(supports))
+
+    @property
+    def interior_support_nodes(self) -> tuple[int, ...]:
+        """After how many elements each interior support stands."""
+        ends = tuple(accumulate(self.lengths_m))
+        return tuple(
+            1 + min(range(len(ends)), key=lambda e: abs(ends[e] - support))
+            for support in self.interior_supports_m
+        )
 
     @property
     def support_rotational_stiffness_nm_per_rad_scale_at_zero(self) -> float:
         """Scale of the half-normal prior of the supports' rotational stiffness."""
         if self.support_rotational_stiffness_spread_nm_per_rad is not None:
             return self.support_rotational_stiffness_spread_nm_per_rad
-        return sum(self.nominal_flexural_rigidity_nm2) / self.elements / self.span_m
+        mean_span_m = self.span_m / len(self.lengths_of_spans_m)
+        return sum(self.nominal_flexural_rigidity_nm2) / self.elements / mean_span_m
+
+    @property
+    def support_compliance_m_per_n_scale_at_zero(self) -> float:
+        """Scale of the half-normal prior of the bearings' vertical compliance."""
+        return self.support_compliance_spread_m_per_n
 
     @property
     def ends_distance_m(self) -> float:
@@ -210,6 +280,7 @@ class Bridge(_Spreadable):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Bridge":
+        self._supports_fit()
         per_element = self.flexural_rigidity_per_element_nm2
         if per_element is None and self.flexural_rigidity_nm2 is None:
             raise _at(
@@ -229,11 +300,21 @@ class Bridge(_Spreadable):
                 )
         if self.element_lengths_m is not None:
             total = math.fsum(self.element_lengths_m)
-            if not math.isclose(total, self.span_m, rel_tol=1e-3):
+            if not math.isclose(total, self.span_m, rel_tol=_SMALLEST_SLIP):
                 raise _at(
                     "element_lengths_m",
                     f"adds up to {total:g} m, it must add up to span_m, {self.span_m:g} m",
                 )
+            for support, node in zip(
+                self.interior_supports_m, self.interior_support_nodes, strict=True
+            ):
+                end = math.fsum(self.element_lengths_m[:node])
+                if abs(end - support) > _SMALLEST_SLIP * self.span_m:
+                    raise _at(
+                        "element_lengths_m",
+                        f"has no element that ends at {support:g} m, one must end at every "
+                        f"interior support; the nearest ends at {end:g} m",
+                    )
         distance = self.ends_distance_m
         if distance < 0.01:
             raise _at(
@@ -247,6 +328,41 @@ class Bridge(_Spreadable):
                 "the span and the coordinates of the bearings must agree",
             )
         return self
+
+    def _supports_fit(self) -> None:
+        """Raise if interior supports are not between the ends, ascending, an element apart."""
+        supports = (0.0, *self.interior_supports_m, self.span_m)
+        for number, (before, after) in enumerate(pairwise(supports)):
+            if after <= before and number < len(self.interior_supports_m):
+                raise _at(
+                    f"interior_supports_m.{number}",
+                    f"is {after:g}, it must be a chainage beyond {before:g} m: supports between "
+                    "the ends are given from the start on",
+                )
+            if after <= before:
+                raise _at(
+                    f"interior_supports_m.{number - 1}",
+                    f"is {before:g}, it must be a chainage between 0 and span_m, {self.span_m:g} m",
+                )
+        if self.elements < len(self.lengths_of_spans_m):
+            raise _at(
+                "elements",
+                f"is {self.elements}, it must be at least {len(self.lengths_of_spans_m)}, "
+                "one for each span",
+            )
+
+
+def _shared(count: int, lengths: Sequence[float]) -> list[int]:
+    """Share so many elements among spans by length: largest remainder first, at least one each."""
+    total = math.fsum(lengths)
+    wanted = [count * length / total for length in lengths]
+    shares = [max(1, math.floor(quota)) for quota in wanted]
+    while sum(shares) < count:
+        shares[max(range(len(shares)), key=lambda k: wanted[k] - shares[k])] += 1
+    while sum(shares) > count:  # short spans were given an element each
+        longer = [k for k, share in enumerate(shares) if share > 1]
+        shares[min(longer, key=lambda k: wanted[k] - shares[k])] -= 1
+    return shares
 
 
 class Sensor(_Table):
@@ -517,7 +633,7 @@ def _expected(problem: Any, key: str) -> str:
     messages = {
         "bool_type": "true or false",
         "string_type": "a text in quotation marks",
-        "literal_error": "1 or -1",
+        "literal_error": _CHOICES.get(key, "1 or -1"),
         "model_type": "a table",
         "model_attributes_type": "a table",
     }
@@ -525,11 +641,21 @@ def _expected(problem: Any, key: str) -> str:
     return messages.get(kind, message[:1].lower() + message[1:])
 
 
+_CHOICES: Final = {
+    "bearings": '"unknown", "free" or "sprung"',
+    "road_class": 'an ISO 8608 class, "A" to "E"',
+}
+
+
 def _list_expected(problem: Any, key: str) -> str:
     if key in ("vehicle", "bridge"):
         return f"a table [{key}] or several [[{key}]]"
     if key in ("flexural_rigidity_per_element_nm2", "element_lengths_m"):
         return "a list with one number for each element"
+    if key == "interior_supports_m":
+        return "a list of chainages in m"
+    if key == "bearings":
+        return f"{_CHOICES[key]}, or a pair [start, end] of these"
     if key in Sensor.model_fields:
         return "a list of four, in the order sprung front, sprung rear, unsprung front, rear"
     return "a pair [front, rear]"

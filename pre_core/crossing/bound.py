@@ -22,10 +22,17 @@ _ENOUGH = 0.01
 def central_jacobian(
     problem: posterior.Problem, y: FloatArray, columns: NDArray[np.int64], step: float = DIFFERENCE
 ) -> FloatArray:
-    """Derivatives (rows, columns) of all rows at y by central differences."""
+    """Derivatives (rows, columns) of all rows at y by central differences.
+
+    What must not be negative, and for which there may be no model then, is not made so: at zero
+    both points of the difference lie above.
+    """
+    begin = y[columns] - step
+    bounded = np.isin(columns, posterior.layout(problem).half_normal)
+    begin[bounded] = np.maximum(begin[bounded], 0.0)
     moved = np.repeat(y[None, :], 2 * columns.size, axis=0)
-    moved[np.arange(columns.size), columns] += step
-    moved[columns.size + np.arange(columns.size), columns] -= step
+    moved[np.arange(columns.size), columns] = begin + 2.0 * step
+    moved[columns.size + np.arange(columns.size), columns] = begin
     values = posterior.all_rows(problem, moved)
     return np.asarray((values[: columns.size] - values[columns.size :]).T / (2.0 * step))
 

@@ -21,7 +21,7 @@ Z, V, A, A_1, A_2, A_3 = range(6)
 """Places of displacement, velocity, acceleration and its three derivatives."""
 
 MODEL_RATE_HZ = 340.0
-"""Highest rate of the model. Rows up to 42 Hz tell within 1 % as much of EI as rows up to 100 Hz
+"""Highest rate of the model. Rows up to 42 Hz tell within 3 % as much of EI as rows up to 125 Hz
 (docs/method-pre.md)."""
 _RATE_SHARE = 2.0
 """The model is no quicker than this many times the slowest sensor (`PASS`, `_SENSOR_PASS`)."""

@@ -24,31 +24,48 @@ from pre_core.crossing.posterior import (
     Priors,
     Problem,
     all_rows,
+    belief_in_springs,
     covariance,
     data_rows,
+    filtered_rows,
     layout,
     points,
     precision_root,
     start,
     trajectory_basis,
 )
-from pre_core.crossing.residuals import Crossing, sinc_table, workspace
-from pre_core.crossing.whitening import noise_power, row_count, row_filter, truck_of, whitener
+from pre_core.crossing.residuals import Crossing, sinc_table, step_table, workspace
+from pre_core.crossing.whitening import (
+    force_noise,
+    linear_springs,
+    noise_power,
+    row_count,
+    row_filter,
+    truck_of,
+    whitener,
+)
 from pre_core.physics.beam_basis import beam_basis, rebased
 from pre_core.physics.bridge import FloatArray
 from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import Rows, minimised
 from pre_core.search.loop import Ending, Solution
-from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE
+from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE, K_ROT, F
 
 _KNOT_S = 0.4
 _SLOPE_STEP = 1e-3
+_SWING_BEFORE_S = 0.1
+"""The bridge's swing is told at this time before the truck comes, to leave the search room."""
 _MARGIN_M = 3.0  # of road before the first row, for the trajectory to move
 _COARSE = ((300.0, 4), (100.0, 4), (30.0, 4))
-_FREE = ((5.0, 8, 0.2), (1.0, 25, 0.02))
+_FREE = ((5.0, 8, 0.2), (1.0, 25, 0.1))
 """Temperatures (noise is taken for this many times what it is), the steps at each, and the gain in
 the sum of squares that is not worth another step."""
+_PLAINLY_RUBS = 0.05
+"""Of what the sensors could tell by the body equations; a truck that leaves less is not tried."""
+_MOST_ROUNDS = 4
+_SAME_FORCE = 0.1
+"""A level of force noise that changes by less than this part is settled."""
 _WALK_TEMPERATURE = 3.0
 _WALK_STEPS = 6
 _WALK_ENOUGH = 0.5
@@ -80,6 +97,8 @@ class Inputs(NamedTuple):
     direction: int
     span_m: float
     element_lengths_m: FloatArray
+    interior_supports: tuple[int, ...]
+    """Between which elements the bridge is held up: after so many of them."""
     total_mass_kg: float
     cg_height_m: float
     density_m_per_s2_per_rthz: FloatArray  # (4,) one-sided
@@ -106,7 +125,12 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
     """The problem and the coordinates of its nominal start."""
     model = channel_signals(inputs.acceleration_m_per_s2, inputs.step_s, inputs.slowest_rate_hz)
     n = model.signals.shape[2]
-    basis = beam_basis(inputs.element_lengths_m, inputs.parts)
+    basis = beam_basis(
+        inputs.element_lengths_m,
+        inputs.parts,
+        interior_supports=inputs.interior_supports,
+        bearings_give=True,
+    )
     position, speeding, rows, values, best = trajectory_basis(
         inputs.fixes, inputs.start_s + model.start_s, model.step_s, n, inputs.direction, _KNOT_S
     )
@@ -127,15 +151,20 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         first,
         n - first,
         sinc_table(),
+        step_table(),
+        False,
+        0,
     )
+    crossing = crossing._replace(swing_sample=_swing_sample(crossing, front))
     row = row_filter(model.step_s)
     theta = inputs.priors.theta
     count = row_count(row, crossing.rows)
     noise = whitener(
         row,
         count,
-        truck_of(theta, crossing.total_mass_kg, wheelbase),
+        truck_of(theta, crossing.total_mass_kg, wheelbase, False),
         inputs.density_m_per_s2_per_rthz,
+        linear_springs(),
     )
     problem = Problem(
         crossing,
@@ -143,6 +172,7 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         row,
         noise,
         inputs.density_m_per_s2_per_rthz,
+        linear_springs(),
         position,
         speeding,
         rows,
@@ -153,32 +183,48 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
     return problem, start(problem, best)
 
 
-def with_noise_at(problem: Problem, y: FloatArray) -> Problem:
-    """The problem with the noise as it is for the truck at y, and coordinates for its bridge."""
+def _swing_sample(crossing: Crossing, front: FloatArray) -> int:
+    """The sample a little before the front axle, at front (n,), comes to the bridge."""
+    begin, sign = (0.0, 1.0) if crossing.direction > 0 else (crossing.span_m, -1.0)
+    entry = int(np.searchsorted(sign * front, sign * begin))
+    return max(0, entry - round(_SWING_BEFORE_S / crossing.step_s))
+
+
+def with_noise_at(problem: Problem, y: FloatArray, force: FloatArray | None = None) -> Problem:
+    """The problem with the noise as it is for the truck at y, and coordinates for its bridge.
+
+    The noise of springs and dampers is `force`, by default what the body equations leave at y.
+    """
     where = layout(problem)
     unknowns = where.gains.stop
     near = np.repeat(y[None, :], 1 + unknowns, axis=0)
     near[np.arange(1, 1 + unknowns), np.arange(unknowns)] += _SLOPE_STEP
     at = points(problem, near)
     density = problem.density * (1.0 + at.gain)
+    total = problem.crossing.total_mass_kg
+    if force is None:
+        one = truck_of(at.theta[0], total, float(at.wheelbase_m[0]), problem.crossing.is_inertial)
+        force = force_noise(problem.rows, one, density[0], filtered_rows(problem, y)[1:])
+    is_inertial = bool(force.any())
     trucks = [
-        truck_of(theta, problem.crossing.total_mass_kg, float(wheelbase))
+        truck_of(theta, total, float(wheelbase), is_inertial)
         for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
     ]
     count = row_count(problem.rows, problem.crossing.rows)
-    noise = whitener(problem.rows, count, trucks[0], density[0])
+    noise = whitener(problem.rows, count, trucks[0], density[0], force)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
-    power = noise_power(problem.rows, trucks, density, changing)
+    power = noise_power(problem.rows, trucks, density, force, changing)
     slope[changing] = 0.5 * count * power / _SLOPE_STEP
     basis = rebased(problem.crossing.basis, at.theta[0])
     for work in problem.works:
         work.modes_of[:] = np.nan
     return problem._replace(
         noise=noise,
+        force=force,
         noise_slope=slope,
-        crossing=problem.crossing._replace(basis=basis),
+        crossing=problem.crossing._replace(basis=basis, is_inertial=is_inertial),
     )
 
 
@@ -199,12 +245,31 @@ def _descend(
     temperature: float,
     steps: int,
     enough: float,
+    is_free: bool = False,
 ) -> tuple[FloatArray, levenberg_marquardt.State, Ending, int]:
     """Least squares along `directions` (f, d) from y; `enough` is a gain not worth a step."""
     rows = _tempered(problem, y, directions, temperature)
     start = np.zeros(directions.shape[1])
-    found = minimised(rows, start, steps, enough)
+    lower = _lower(problem, y, directions, is_free=is_free)
+    found = minimised(rows, start, steps, enough, lower)
     return y + directions @ found.state.y, found.state, found.ending, _evaluations(found)
+
+
+def _lower(problem: Problem, y: FloatArray, directions: FloatArray, *, is_free: bool) -> FloatArray:
+    """How far back along each of the directions (f, d) nothing becomes negative that must not.
+
+    What must not changes along one direction each. On the way (`is_free`) springs may push and
+    dampers drive, which leads through where they would be stuck at nothing; a bearing may not rise.
+    """
+    lower = np.full(directions.shape[1], -np.inf)
+    held = layout(problem).half_normal
+    if is_free:
+        kept = np.flatnonzero(problem.priors.estimated)
+        held = np.flatnonzero(np.isin(kept, (F, F + 1)))
+    for place in held:
+        for along in np.flatnonzero(directions[place]):
+            lower[along] = -y[place] / directions[place, along]
+    return lower
 
 
 def _evaluations(found: Solution[levenberg_marquardt.State, levenberg_marquardt.Info]) -> int:
@@ -212,12 +277,16 @@ def _evaluations(found: Solution[levenberg_marquardt.State, levenberg_marquardt.
     return found.state.y.size + 1 + sum(info.evaluations for info in found.infos)
 
 
-def _whole_bridge(problem: Problem) -> FloatArray:
-    """Directions in which all elements change alike and the supports have no springs."""
+def _whole_bridge(problem: Problem, *, is_simple: bool) -> FloatArray:
+    """Directions in which all elements change alike and the supports have no springs.
+
+    With `is_simple` without `_extras`.
+    """
     where = layout(problem)
     unit = np.eye(where.size)
     elements = where.elements
-    single = np.setdiff1d(np.arange(where.size), [*elements, *_springs(problem)])
+    held = [*elements, *_springs(problem), *(_extras(problem) if is_simple else ())]
+    single = np.setdiff1d(np.arange(where.size), held)
     together = unit[:, elements].sum(axis=1) / np.sqrt(elements.size)
     return np.column_stack([unit[:, single], together])
 
@@ -228,23 +297,50 @@ def _springs(problem: Problem) -> NDArray[np.int64]:
     return where.half_normal[where.half_normal >= where.bridge[0]]
 
 
+def _extras(problem: Problem) -> NDArray[np.int64]:
+    """Places in y of what most bridges and trucks do not have.
+
+    The bridge's own motion, bearings that give, tyres of unknown damping.
+    """
+    where = layout(problem)
+    kept = np.flatnonzero(problem.priors.estimated)
+    springs = np.isin(kept, (K_ROT, K_ROT + 1))
+    seldom = np.flatnonzero(problem.priors.half_normal[kept] & ~springs)
+    return np.concatenate([seldom, np.arange(where.swing.start, where.swing.stop)])
+
+
+def _not_negative(problem: Problem, y: FloatArray) -> FloatArray:
+    """y with what must not be negative at nothing at least."""
+    zero = layout(problem).half_normal
+    y = y.copy()
+    y[zero] = np.maximum(y[zero], 0.0)
+    return y
+
+
 class _Place(NamedTuple):
     """How well the bridge, put `shift_m` further along the road, fits; its unknowns there."""
 
     objective: float
     shift_m: float
     bridge: FloatArray
+    places: NDArray[np.int64]
+    """Where in y these unknowns are."""
 
 
-def _walk(problem: Problem, y: FloatArray) -> tuple[list[_Place], int]:
-    """Places along the road, best first, and the evaluations that they took."""
+def _walk(problem: Problem, y: FloatArray, *, is_simple: bool) -> tuple[list[_Place], int]:
+    """Places along the road, best first, and the evaluations that they took.
+
+    With `is_simple` no place may change `_extras`.
+    """
     where = layout(problem)
-    places = where.bridge
+    extras = _extras(problem) if is_simple else np.zeros(0, dtype=np.int64)
+    places = np.setdiff1d(where.bridge, extras)
     free = np.eye(y.size)
     here = levenberg_marquardt.begin(
         _tempered(problem, y, free, _WALK_TEMPERATURE), np.zeros(y.size)
     ).jacobian
-    others, _ = np.linalg.qr(np.delete(here, places, axis=1))
+    held = np.union1d(places, extras)
+    others, _ = np.linalg.qr(np.delete(here, held, axis=1))
     evaluations = y.size + 1
     seen: list[_Place] = []
 
@@ -258,11 +354,12 @@ def _walk(problem: Problem, y: FloatArray) -> tuple[list[_Place], int]:
             values = rows(v)
             return np.asarray(values - (values @ others) @ others.T)
 
-        found = minimised(projected, start, _WALK_STEPS, _WALK_ENOUGH)
+        lower = _lower(problem, moved, free[:, places], is_free=True)
+        found = minimised(projected, start, _WALK_STEPS, _WALK_ENOUGH, lower)
         state = found.state
         evaluations += _evaluations(found)
         if np.isfinite(state.objective):
-            seen.append(_Place(state.objective, shift, state.y))
+            seen.append(_Place(state.objective, shift, state.y, places))
 
     def best() -> _Place:
         return min(seen, key=lambda place: place.objective)
@@ -284,17 +381,40 @@ def _walk(problem: Problem, y: FloatArray) -> tuple[list[_Place], int]:
 
 
 def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) -> Optimum:
-    """The optimum of the posterior. Its `ending` is NOT_FINITE if no place gave finite rows."""
+    """The optimum of the posterior. Its `ending` is NOT_FINITE if no place gave finite rows.
+
+    The way there is sought with a bridge at rest and springs that are believed: so many freedoms
+    lead astray where they are not needed. If that way does not end at a fit, it is sought with all.
+    """
     problem, y = prepare(inputs)
-    whole = _whole_bridge(problem)
+    found = _from_places(problem, y, report, is_simple=True)
+    if found.chi2_per_dof < _acceptable(found):
+        return found
+    again = _from_places(problem, y, report, is_simple=False)
+    best = found if found.chi2_per_dof < again.chi2_per_dof else again
+    return best._replace(
+        evaluations=found.evaluations + again.evaluations, starts=found.starts + again.starts
+    )
+
+
+def _acceptable(found: Optimum) -> float:
+    """The chi2 up to which a minimum is taken for the right one."""
+    rows = found.problem.noise.reciprocal.size
+    return 1.0 + _ACCEPTED_EXCESS + _ACCEPTED_Z * float(np.sqrt(2.0 / rows))
+
+
+def _from_places(problem: Problem, y: FloatArray, report: Report, *, is_simple: bool) -> Optimum:
+    """The best optimum of those that are reached from the likeliest places along the road."""
+    force = linear_springs() if is_simple else None
+    whole = _whole_bridge(problem, is_simple=is_simple)
     evaluations = 0
     for temperature, steps in _COARSE:
         report("finding the truck", 0.05)
-        y, _, _, used = _descend(problem, y, whole, temperature, steps, 0.5)
+        y, _, _, used = _descend(problem, y, whole, temperature, steps, 0.5, is_free=True)
         evaluations += used
-        problem = with_noise_at(problem, y)
+        problem = with_noise_at(problem, y, force)
     report("finding the bridge", 0.2)
-    places, used = _walk(problem, y)
+    places, used = _walk(problem, y, is_simple=is_simple)
     evaluations += used
     best: Optimum | None = None
     tried: list[float] = []
@@ -305,14 +425,12 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
         report(f"freeing the elements, start {len(tried)}", 0.3 + 0.05 * len(tried))
         z = y.copy()
         z[layout(problem).trajectory] += place.shift_m
-        z[layout(problem).bridge] += place.bridge
-        found = _freed(problem, z)
+        z[place.places] += place.bridge
+        found = _freed(problem, z, is_simple=is_simple)
         evaluations += found.evaluations
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
             best = found
-        rows = best.problem.noise.reciprocal.size
-        chance = _ACCEPTED_Z * np.sqrt(2.0 / rows)
-        if best.chi2_per_dof < 1.0 + _ACCEPTED_EXCESS + chance or len(tried) == _MOST_PLACES:
+        if best.chi2_per_dof < _acceptable(best) or len(tried) == _MOST_PLACES:
             break
         if best.chi2_per_dof > _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]:
             break
@@ -322,29 +440,57 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
     return best._replace(evaluations=evaluations, starts=len(tried))
 
 
-def _freed(problem: Problem, y: FloatArray) -> Optimum:
-    """Least squares in all unknowns; supports do not push.
+def _freed(problem: Problem, y: FloatArray, *, is_simple: bool) -> Optimum:
+    """Least squares in all unknowns; supports do not push, and no damping drives.
 
-    Where it leaves a support spring below zero, where no posterior is, that is held at zero and the
-    rest is brought to the optimum beside it. The slope that is left belongs to the normal
-    approximation (`normal_approximation`).
+    What would be negative is held at zero, and the rest brought to the optimum beside it. The slope
+    that is left there belongs to the normal approximation (`normal_approximation`).
+
+    What the springs leave over and how much they are believed depend on each other: a truck that is
+    not believed need not fit. So it is believed at first, and doubted only where the body equations
+    then leave more than the sensors' noise. With `is_simple` what most bridges and trucks do not
+    have (`_extras`) is left out until the rest is right: together it can imitate much.
     """
-    free = np.eye(y.size)
-    springs = layout(problem).half_normal
-    evaluations = 0
-    ending = Ending.STEPS_EXHAUSTED
-    problem = with_noise_at(problem, y)
-    for temperature, steps, enough in _FREE:
-        y, state, ending, used = _descend(problem, y, free, temperature, steps, enough)
-        evaluations += used
+    front = points(problem, y[None, :]).position_m[0]
+    crossing = problem.crossing
+    problem = problem._replace(
+        crossing=crossing._replace(swing_sample=_swing_sample(crossing, front))
+    )
+    start = y.copy()
+    start[layout(problem).swing] = 0.0
+    free = np.eye(start.size)
+    first = np.delete(free, _extras(problem), axis=1) if is_simple else free
+    (temperature, few, little), (_, steps, enough) = _FREE
+    believing = with_noise_at(problem, start, linear_springs())
+    y, _, ending, evaluations = _descend(
+        believing, start, first, temperature, few, little, is_free=True
+    )
+    problem = with_noise_at(believing, y)
+    if problem.force.any() and belief_in_springs(problem, y) < _PLAINLY_RUBS:
+        problem = with_noise_at(believing, start)
+        y, _, ending, used = _descend(problem, start, free, temperature, few, little, is_free=True)
         problem = with_noise_at(problem, y)
-    held = springs[y[springs] < 0.0]
-    if held.size:
-        y[held] = 0.0
-        directions = np.delete(free, held, axis=1)
-        y, _, ending, used = _descend(problem, y, directions, 1.0, 15, 0.02)
-        y[springs] = np.maximum(y[springs], 0.0)
+    else:
+        used = 0
+        for is_free in (True, False):
+            directions = first if is_free else free
+            y = y if is_free else _not_negative(problem, y)
+            problem = with_noise_at(problem, y, linear_springs())
+            y, _, ending, more = _descend(
+                problem, y, directions, 1.0, steps, enough, is_free=is_free
+            )
+            used += more
+        problem = with_noise_at(problem, y)
+    evaluations += used
+    y = _not_negative(problem, y)
+    for _ in range(_MOST_ROUNDS if problem.force.any() else 0):
+        y, _, ending, used = _descend(problem, y, free, 1.0, steps, enough)
         evaluations += used
+        after = with_noise_at(problem, y)
+        is_settled = abs(after.force.sum() - problem.force.sum()) < _SAME_FORCE * after.force.sum()
+        if is_settled or not after.force.any():
+            break
+        problem = after
     state = levenberg_marquardt.begin(lambda at: all_rows(problem, at), y)
     return Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations + y.size + 1, 1)
 

@@ -14,15 +14,25 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import qr, solve_triangular
 
+from pre_core.crossing import whitening
 from pre_core.crossing.residuals import (
+    SWING_MODES,
     Crossing,
     Points,
     Work,
+    evaluate,
     evaluate_white,
     roads_and_deflections,
 )
-from pre_core.crossing.whitening import RowFilter, Whitener
-from pre_core.unknowns import C_S1, EI_1, FIRST_OF_BRIDGE, K_S1, K_U1, M_U1
+from pre_core.crossing.whitening import (
+    RESIDUALS,
+    RowFilter,
+    Whitener,
+    filter_rows,
+    row_count,
+    truck_of,
+)
+from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE, K_U1, M_U1
 
 FloatArray = NDArray[np.float64]
 
@@ -32,6 +42,10 @@ _CONTRASTS = np.array(
     [[0.5, 0.5, -0.5, -0.5], [0.5, -0.5, 0.5, -0.5], [0.5, -0.5, -0.5, 0.5]], dtype=np.float64
 )
 _INITIAL_SPREAD = np.array([0.1, 0.1, 0.1])  # m, m/s, m/s²: wide; they are nuisances
+_SWING_M = 1e-3
+"""Scale of the first mode's displacement, and velocity over omega, at its largest point: a 30 t
+lorry that has left a tenth of a second ago leaves a bridge of 30 m swinging by a millimetre. Of the
+second it is a quarter, of the third a ninth: a load bends a beam into its j-th mode by 1/j^4."""
 _JERK_M_PER_S3 = 1.0
 _DEGREE = 5
 """Of the trajectory: load moves with its second derivative, which must not have kinks."""
@@ -44,6 +58,8 @@ class Priors(NamedTuple):
     spread: FloatArray  # (p,) relative; absolute where the prior is half-normal
     half_normal: NDArray[np.bool_]  # (p,) at zero; log-normal about the nominal value elsewhere
     estimated: NDArray[np.bool_]  # (p,) which are unknown at all
+    absence: FloatArray
+    """(p,) probability before the crossing that an unknown with a half-normal prior is nothing."""
     wheelbase_m: float
     wheelbase_spread: float
     gain_spread: float
@@ -72,6 +88,8 @@ class Problem(NamedTuple):
     rows: RowFilter
     noise: Whitener
     density: FloatArray  # (4,) one-sided, m/s²/√Hz
+    force: FloatArray
+    """(2, shapes) noise of springs and dampers, N²/Hz; see whitening.py."""
     basis_position: FloatArray  # (n, b): trajectory = basis @ coefficients
     basis_acceleration: FloatArray  # (n, b), positive when speeding up
     receiver_rows: FloatArray  # (r, b + 1): rows of (coefficients, offset)
@@ -95,20 +113,23 @@ class Layout(NamedTuple):
     common_gain: int
     delays: slice
     initial: slice
+    swing: slice
+    """The bridge's own motion when the truck comes."""
     trajectory: slice
     offset: int
     size: int
 
 
 def layout(problem: Problem) -> Layout:
-    """Order: theta (what is estimated), wheelbase, gains, delays, initial states, trajectory."""
+    """Theta (what is estimated), wheelbase, gains, delays, initial states, swing, trajectory."""
     priors = problem.priors
     kept = np.flatnonzero(priors.estimated)
     t = kept.size
     gains = slice(t + 1, t + 4)
     delays = slice(gains.stop + 1, gains.stop + 1 + CHANNELS)
     initial = slice(delays.stop, delays.stop + 3 * CHANNELS)
-    trajectory = slice(initial.stop, initial.stop + problem.basis_position.shape[1])
+    swing = slice(initial.stop, initial.stop + 2 * SWING_MODES)
+    trajectory = slice(swing.stop, swing.stop + problem.basis_position.shape[1])
     return Layout(
         slice(0, t),
         np.flatnonzero(kept >= FIRST_OF_BRIDGE),
@@ -119,6 +140,7 @@ def layout(problem: Problem) -> Layout:
         gains.stop,
         delays,
         initial,
+        swing,
         trajectory,
         trajectory.stop,
         trajectory.stop + 1,
@@ -196,6 +218,7 @@ def points(problem: Problem, y: FloatArray) -> Points:
         np.exp(common_gain_spread(priors) * y[:, where.common_gain]),
         priors.delay_spread_s * y[:, where.delays],
         (y[:, where.initial].reshape(k, CHANNELS, 3) * _INITIAL_SPREAD),
+        y[:, where.swing] * np.repeat(_SWING_M / np.arange(1, SWING_MODES + 1) ** 2, 2),
     )
 
 
@@ -206,6 +229,25 @@ def data_rows(problem: Problem, y: FloatArray) -> FloatArray:
         problem.crossing, problem.rows, problem.noise, problem.works, points(problem, y), out
     )
     return out
+
+
+def filtered_rows(problem: Problem, y: FloatArray) -> FloatArray:
+    """Rows (3, m) of the data of one point y (size,), filtered and not whitened."""
+    (residual,) = evaluate(problem.crossing, problem.works, points(problem, y[None, :]))
+    out = np.empty((RESIDUALS, row_count(problem.rows, problem.crossing.rows)))
+    for kind in range(RESIDUALS):
+        filter_rows(problem.rows.taps, problem.rows.every, residual[kind], out[kind])
+    return out
+
+
+def belief_in_springs(problem: Problem, y: FloatArray) -> float:
+    """0 to 1, of the truck at y (size,): how much its springs leave of what the sensors tell."""
+    at = points(problem, y[None, :])
+    crossing = problem.crossing
+    wheelbase = float(at.wheelbase_m[0])
+    truck = truck_of(at.theta[0], crossing.total_mass_kg, wheelbase, crossing.is_inertial)
+    density = problem.density * (1.0 + at.gain[0])
+    return whitening.belief_in_springs(problem.rows, truck, density, problem.force)
 
 
 def all_rows(problem: Problem, y: FloatArray, temperature: float = 1.0) -> FloatArray:
@@ -234,6 +276,22 @@ def all_rows(problem: Problem, y: FloatArray, temperature: float = 1.0) -> Float
     if temperature != 1.0:
         out[:, :data] /= temperature
     return out
+
+
+def log_odds_of_absence(problem: Problem, inflation: float = 1.0) -> FloatArray:
+    """For each coordinate of y (size,): what its density at exactly zero is against per unit.
+
+    ln[P / ((1 - P) 2 phi(0))], of noise `inflation` times as large, with a prior as much wider; P
+    is the probability of absence. Minus infinity where there is none.
+    """
+    where, priors = layout(problem), problem.priors
+    odds = np.full(where.size, -np.inf)
+    share = priors.absence[priors.estimated]
+    with np.errstate(divide="ignore"):
+        odds[where.theta] = (
+            np.log(share) - np.log1p(-share) + 0.5 * np.log(0.5 * np.pi * inflation**2)
+        )
+    return odds
 
 
 def start(problem: Problem, trajectory: FloatArray) -> FloatArray:
@@ -307,14 +365,12 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
     step = crossing.step_s
     spread = problem.density * np.sqrt(0.5 / step)
     a = spread[:, None] * rng.standard_normal((count, CHANNELS, n))
-    v = step * np.cumsum(a, axis=2)
-    z = step * np.cumsum(v, axis=2)
+    z = step * np.cumsum(step * np.cumsum(a, axis=2), axis=2)
+    truck = truck_of(theta, crossing.total_mass_kg, float(at.wheelbase_m[0]), True)
     errors = []
-    for w in range(2):
-        spring = theta[C_S1 + w] * (v[:, 2 + w] - v[:, w]) + theta[K_S1 + w] * (
-            z[:, 2 + w] - z[:, w]
-        )
-        errors.append(z[:, 2 + w] + (theta[M_U1 + w] * a[:, 2 + w] + spring) / theta[K_U1 + w])
+    for w, m_ii in enumerate((truck.m_11, truck.m_22)):
+        force = m_ii * a[:, w] + truck.m_12 * a[:, 1 - w] + theta[M_U1 + w] * a[:, 2 + w]
+        errors.append(z[:, 2 + w] + force / theta[K_U1 + w])
     drawn = []
     for front_error, rear_error in zip(*errors, strict=True):
         x, at_front, at_rear = _at_same_places(crossing, at, front_error, rear_error)

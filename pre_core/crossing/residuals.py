@@ -23,13 +23,26 @@ from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 from pre_core.physics import modal_response
 from pre_core.physics.beam_basis import BeamBasis
 from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
-from pre_core.unknowns import C_S1, D_1, FIRST_OF_BRIDGE, K_S1, K_U1, KAPPA, M_U1
+from pre_core.unknowns import (
+    C_S1,
+    C_U1,
+    D_1,
+    EI_1,
+    FIRST_OF_BRIDGE,
+    K_S1,
+    K_U1,
+    KAPPA,
+    M_U1,
+    RHO_A,
+)
 
 FloatArray = NDArray[np.float64]
 
 _LONGEST_STRETCH = 128
 _PHASES = 64
 _SINC_TAPS = 16
+_STEP_REACH = 8
+SWING_MODES = 3
 _FEW = 4  # points that are not worth starting a thread
 
 
@@ -49,6 +62,13 @@ class Crossing(NamedTuple):
     rows: int
     """Samples first_row … first_row + rows - 1 of the rear wheel are compared."""
     sinc: FloatArray  # (phases + 1, 2, taps): see `sinc_table`
+    step: FloatArray  # (phases + 1, 2 reach): see `step_table`
+    is_inertial: bool
+    """Whether the force on a tyre is taken from the masses above it, or, where springs and dampers
+    are believed, from these and the axle: the same, but for what the body equations leave over."""
+    swing_sample: int
+    """At which the bridge's swing is what `Points.swing` says; more than the reach of a step
+    (`step_table`) before a wheel is on it."""
 
 
 class Points(NamedTuple):
@@ -67,6 +87,7 @@ class Points(NamedTuple):
     common_gain: FloatArray  # (k,): factor by which all four sensors read too little
     delay_s: FloatArray  # (k, 4): corrections, read from Taylor's series
     initial: FloatArray  # (k, 4, 3): displacement, velocity, bias to be added
+    swing: FloatArray  # (k, 2 modes): see `_set_swinging`
 
 
 class Work(NamedTuple):
@@ -89,6 +110,10 @@ class Work(NamedTuple):
     residual: FloatArray  # (3, rows)
     row: FloatArray  # (filtered rows,)
     modes_of: FloatArray  # (p,) the bridge whose modes are in `cubics`
+    modes: FloatArray  # (m, 3): see `modal_filters`
+    end_force: FloatArray  # (2 ends, n)
+    end_share: FloatArray  # (2 wheels, 2 ends, n)
+    at_end: NDArray[np.bool_]  # (n,) whether one of these is not zero
 
 
 def workspace(crossing: Crossing, parameters: int, rows: RowFilter) -> Work:
@@ -114,7 +139,27 @@ def workspace(crossing: Crossing, parameters: int, rows: RowFilter) -> Work:
         np.zeros((RESIDUALS, crossing.rows)),
         np.zeros(row_count(rows, crossing.rows)),
         np.full(parameters, np.nan),
+        np.zeros((m, 3)),
+        np.zeros((2, n)),
+        np.zeros((2, 2, n)),
+        np.full(n, False),
     )
+
+
+def step_table() -> FloatArray:
+    """A step of the band that the model sees, (phases + 1, 2 reach), between two samples.
+
+    Row p is the step that happens p/phases of a sample before sample `reach`. It is the integral of
+    the sinc of `sinc_table`: a wheel comes on to a bearing that gives, and both its force on the
+    end and the end's deflection under it begin at once.
+    """
+    fine = np.arange(2 * _STEP_REACH * _PHASES + 1) / _PHASES - _STEP_REACH
+    impulse = windowed_sinc(fine, *_sinc_design(_STEP_REACH), pedestal=1.0)
+    rising = np.concatenate([[0.0], np.cumsum(0.5 * (impulse[1:] + impulse[:-1]))])
+    rising /= rising[-1]
+    phases = np.arange(_PHASES + 1)
+    samples = _PHASES * np.arange(2 * _STEP_REACH)
+    return np.ascontiguousarray(rising[samples[None, :] + phases[:, None]])
 
 
 def sinc_table() -> FloatArray:
@@ -132,13 +177,17 @@ def sinc_table() -> FloatArray:
     return np.ascontiguousarray(np.stack([at, slope], axis=1))
 
 
-def _sinc_weights(phase: FloatArray) -> FloatArray:
-    cutoff = 0.5 * (PASS + 1.0 - STOP)
+def _sinc_design(half: int) -> tuple[float, int, float]:
+    """Cutoff, half length and Kaiser's beta of the sinc that tells the band from its images."""
     width = 1.0 - STOP - PASS
+    attenuation = 14.36 * width * (2 * half - 1) + 7.95
+    return 0.5 * (PASS + 1.0 - STOP), half, kaiser_beta(attenuation)
+
+
+def _sinc_weights(phase: FloatArray) -> FloatArray:
     half = _SINC_TAPS // 2
-    attenuation = 14.36 * width * (_SINC_TAPS - 1) + 7.95
     distance = np.arange(_SINC_TAPS) - (half - 1) - phase[:, None]
-    weight = windowed_sinc(distance, cutoff, half, kaiser_beta(attenuation), pedestal=1.0)
+    weight = windowed_sinc(distance, *_sinc_design(half), pedestal=1.0)
     # Integrated accelerations drift far; parabolas are read exactly, wherever the taps begin.
     powers = distance[:, None, :] ** np.arange(3)[:, None]
     moments = np.einsum("pit,pjt,pt->pij", powers, powers, weight)
@@ -195,11 +244,15 @@ def _wheels(
     on_axles = masses_on_axles(m_s, theta[D_1], wheelbase, theta[M_U1], theta[M_U1 + 1])
     transfer = crossing.total_mass_kg * crossing.cg_height_m / wheelbase * gravity
     n = work.road.shape[1]
+    step = crossing.step_s
     for w in range(2):
         sign = 1.0 - 2.0 * w
         m_ii = m_11 if w == 0 else m_22
         m_u = theta[M_U1 + w]
         c, k, k_u = theta[C_S1 + w], theta[K_S1 + w], theta[K_U1 + w]
+        # delta = (F - tau F' + tau^2 F'')/k_u solves k_u delta + c_u delta' = F for small tau.
+        tau = theta[C_U1 + w] / k_u
+        slope, bend = tau / (12.0 * step), (tau / step) ** 2
         weight = gravity * crossing.gravity_m_per_s2 * on_axles[w]
         z_s, v_s, a_s = work.corrected[w, 0], work.corrected[w, 1], work.corrected[w, 2]
         z_u, v_u, a_u = work.corrected[2 + w, 0], work.corrected[2 + w, 1], work.corrected[2 + w, 2]
@@ -207,11 +260,28 @@ def _wheels(
         road, load, body = work.road[w], work.load[w], work.body[w]
         soft, hard = 1.0 / k_u, 1.0 / k
         for i in range(n):
-            spring = c * (v_u[i] - v_s[i]) + k * (z_u[i] - z_s[i])
-            road[i] = -z_u[i] - (m_u * a_u[i] + spring) * soft
-        for i in range(n):
             inertial = m_ii * a_s[i] + m_12 * a_other[i]
             load[i] = sign * transfer * speeding[i] - weight - inertial - m_u * a_u[i]
+        # The tyre carries what moves the masses above it, whatever springs are between; believed
+        # springs tell the same with far less noise of the body's sensors.
+        force = work.sharp[w]  # not in use yet
+        if crossing.is_inertial:
+            for i in range(n):
+                force[i] = -load[i] - weight
+        else:
+            for i in range(n):
+                force[i] = m_u * a_u[i] + c * (v_u[i] - v_s[i]) + k * (z_u[i] - z_s[i])
+        for i in range(n):
+            road[i] = -z_u[i] - force[i] * soft
+        if tau != 0.0:
+            for i in range(2, n - 2):
+                rate = 8.0 * (force[i + 1] - force[i - 1]) - (force[i + 2] - force[i - 2])
+                second = force[i + 1] - 2.0 * force[i] + force[i - 1]
+                road[i] += (slope * rate - bend * second) * soft
+            for i in range(2):
+                road[i] += slope * soft * 12.0 * (force[i + 1] - force[i])
+                last = n - 1 - i
+                road[last] += slope * soft * 12.0 * (force[last] - force[last - 1])
         for i in range(n):
             spring = c * (v_u[i] - v_s[i]) + k * (z_u[i] - z_s[i])
             inertial = m_ii * a_s[i] + m_12 * a_other[i]
@@ -259,6 +329,7 @@ def _bridge(crossing: Crossing, work: Work, theta: FloatArray) -> bool:
         work.vectors,
         work.cubics,
         work.feedback,
+        work.modes,
     ):
         work.modes_of[:] = np.nan
         return False
@@ -293,18 +364,95 @@ def _soften_ends(
 
 
 @kernel
-def _deflect(crossing: Crossing, work: Work, front: FloatArray) -> None:
+def _step_onto_ends(
+    crossing: Crossing, work: Work, front: FloatArray, offset: float, w: int
+) -> None:
+    """What wheel w's coming on to the bridge and leaving it mean where its ends give way.
+
+    With Theta_n the samples at which the wheel is on the bridge and S_n the step of the model's
+    band, the end of the bridge feels P S, of which the samples on the bridge have P Theta: the rest
+    is a force at the end (`end_force`). The wheel feels S of the end's deflection, not Theta
+    (`end_share`). To be called when the wheel's force has been sharpened and softened.
+    """
+    n = work.part.shape[1]
+    load, sharp, part = work.load[w], work.sharp[w], work.part[w]
+    length = crossing.edges_m[crossing.edges_m.size - 1]
+    values = np.empty(2 * _STEP_REACH + 2)
+    for i in range(_STEP_REACH + 1, n - _STEP_REACH):
+        is_on, was_on = part[i] >= 0, part[i - 1] >= 0
+        if is_on == was_on:
+            continue
+        near_start = 2.0 * (front[i] + offset) < length
+        end = 0 if near_start else 1
+        bearing = 0.0 if near_start else length
+        since = (front[i] + offset - bearing) / (front[i] - front[i - 1])
+        place = min(max(since, 0.0), 1.0) * _PHASES
+        phase = min(int(place), _PHASES - 1)
+        share = place - phase
+        low, high = crossing.step[phase], crossing.step[phase + 1]
+        begin = i - _STEP_REACH
+        # P S at the samples of the window and one to each side.
+        for m in range(2 * _STEP_REACH + 2):
+            rising = 0.0
+            if m > 2 * _STEP_REACH:
+                rising = 1.0
+            elif m > 0:
+                rising = low[m - 1] + share * (high[m - 1] - low[m - 1])
+            values[m] = (rising if is_on else 1.0 - rising) * load[begin + m - 1]
+        for m in range(2 * _STEP_REACH):
+            j = begin + m
+            before, at, after = values[m], values[m + 1], values[m + 2]
+            there = sharp[j] if part[j] >= 0 else 0.0
+            work.end_force[end, j] += at - (before - 2.0 * at + after) / 12.0 - there
+            rising = low[m] + share * (high[m] - low[m])
+            present = rising if is_on else 1.0 - rising
+            work.end_share[w, end, j] += present - (1.0 if part[j] >= 0 else 0.0)
+            work.at_end[j] = True
+
+
+@kernel
+def _set_swinging(crossing: Crossing, work: Work, rho_a: float, amplitude: FloatArray) -> None:
+    """The bridge's lowest modes as they swing before the truck comes.
+
+    `amplitude` (2 modes) in m: displacement and velocity over omega of each mode, at the largest
+    point of that of a uniform beam.
+    """
+    length = crossing.edges_m[crossing.edges_m.size - 1]
+    size = np.sqrt(0.5 * rho_a * length)
+    for k in range(min(SWING_MODES, work.modes.shape[0])):
+        q = size * amplitude[2 * k]
+        v = size * amplitude[2 * k + 1] * np.sqrt(max(work.modes[k, 0], 0.0))
+        modal_response.swing(work.feedback, work.state, work.modes[k], k, q, v)
+
+
+@kernel
+def _deflect(crossing: Crossing, work: Work, points: Points, k: int) -> None:
     """Add the bridge's deflection to `road` (which is minus the input profile)."""
-    work.state[:] = 0.0
+    front = points.position_m[k]
     n = work.road.shape[1]
+    gives = crossing.basis.stiffness.shape[0] - (points.theta.shape[1] - EI_1) > 2
+    if gives:
+        work.end_force[:] = 0.0
+        work.end_share[:] = 0.0
+        work.at_end[:] = False
     for w in range(2):
         modal_response.sharpened(work.load[w], work.sharp[w])
         _soften_ends(crossing, front, work.part[w], work.place[w], work.sharp[w])
+        if gives:
+            offset = 0.0 if w == 0 else -crossing.direction * points.wheelbase_m[k]
+            _step_onto_ends(crossing, work, front, offset, w)
+    work.state[:] = 0.0
+    _set_swinging(crossing, work, points.theta[k, RHO_A], points.swing[k])
     last = n  # behind the last sample at which a wheel is on the bridge nothing is asked for
-    while last > 0 and work.part[0, last - 1] < 0 and work.part[1, last - 1] < 0:
+    while last > 0 and not (
+        work.part[0, last - 1] >= 0 or work.part[1, last - 1] >= 0 or work.at_end[last - 1]
+    ):
         last -= 1
     begin = 0
-    arrived = False
+    while begin < last and begin < crossing.swing_sample and not work.at_end[begin]:
+        if work.part[0, begin] >= 0 or work.part[1, begin] >= 0:
+            break
+        begin += 1
     while begin < last:
         e1, e2 = work.part[0, begin], work.part[1, begin]
         stop = begin + 1
@@ -313,16 +461,29 @@ def _deflect(crossing: Crossing, work: Work, front: FloatArray) -> None:
             and stop - begin < _LONGEST_STRETCH
             and work.part[0, stop] == e1
             and work.part[1, stop] == e2
+            and work.at_end[stop] == work.at_end[begin]
         ):
             stop += 1
-        arrived = arrived or e1 >= 0 or e2 >= 0
-        if arrived:
-            for w in range(2):
-                for i in range(begin, stop):
-                    p = work.sharp[w, i]
-                    for lane in range(LANES):
-                        work.force[w, i - begin, lane] = p
-                        work.lanes[w, i - begin, lane] = 0.0
+        for w in range(2):
+            for i in range(begin, stop):
+                p = work.sharp[w, i]
+                for lane in range(LANES):
+                    work.force[w, i - begin, lane] = p
+                    work.lanes[w, i - begin, lane] = 0.0
+        if work.at_end[begin]:
+            modal_response.advance_with_ends(
+                work.cubics,
+                e1,
+                e2,
+                work.feedback,
+                work.state,
+                work.place[:, begin:stop],
+                work.force,
+                work.end_force[:, begin:stop],
+                work.end_share[:, :, begin:stop],
+                work.lanes,
+            )
+        else:
             modal_response.advance(
                 work.cubics,
                 e1,
@@ -333,10 +494,10 @@ def _deflect(crossing: Crossing, work: Work, front: FloatArray) -> None:
                 work.force,
                 work.lanes,
             )
-            for w in range(2):
-                for i in range(begin, stop):
-                    y = work.lanes[w, i - begin]
-                    work.road[w, i] += (y[0] + y[1]) + (y[2] + y[3])
+        for w in range(2):
+            for i in range(begin, stop):
+                y = work.lanes[w, i - begin]
+                work.road[w, i] += (y[0] + y[1]) + (y[2] + y[3])
         begin = stop
 
 
@@ -412,7 +573,7 @@ def _residuals(crossing: Crossing, work: Work, points: Points, k: int, out: Floa
             return False
     if not _roads(crossing, work, points, k):
         return False
-    _deflect(crossing, work, points.position_m[k])
+    _deflect(crossing, work, points, k)
     return _compare(crossing, work, points.position_m[k], points.wheelbase_m[k], out)
 
 
@@ -519,7 +680,7 @@ def _one(crossing: Crossing, work: Work, points: Points, k: int, deflection: Flo
     if not _roads(crossing, work, points, k):
         return False
     deflection[:] = work.road
-    _deflect(crossing, work, points.position_m[k])
+    _deflect(crossing, work, points, k)
     for w in range(2):
         for i in range(deflection.shape[1]):
             deflection[w, i] = work.road[w, i] - deflection[w, i]

@@ -3,7 +3,7 @@
 Three residuals are taken at every row, all as displacements: the mismatch of the two roads and the
 two body equations divided by k_s. White acceleration noise of densities n_s, n_u enters them as
 
-    s^2 R_i   : [1 + (m_u s^2 + c_s s + k_s)/k_u] n_u - [(c_s s + k_s)/k_u] n_s
+    s^2 R_i   : [1 + (m_u s^2 + c_s s + k_s)/K] n_u - [(c_s s + k_s)/K] n_s,  K = k_u + c_u s
     s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
 
 (front less rear in the mismatch; n_s' is the noise of the other body sensor). Rows are low-passed,
@@ -11,6 +11,14 @@ decimated and differenced twice by one FIR filter; the noise is then stationary 
 that vanishes beyond the filter's length, so that a banded Cholesky factor whitens it exactly, ends
 included. The front's residuals of a row are taken when the front wheel was where the rear wheel is
 now, so that a sensor which speaks in both is taken for two.
+
+Springs that rub and dampers that are not linear put a force into the body equations that is noise
+of its own, of a level that the rows themselves tell (`force_noise`). The mismatch is then taken
+from inertia alone, s^2 R_i: [1 + m_u s^2/K] n_u + [m_ii s^2/K] n_s + [m_12 s^2/K] n_s'. Both forms
+differ by (k_s/K) b_i and tell the same; but which combination of rows is quiet depends on the
+truck, and each form has it in a row of its own where it is needed. Friction remembers for a tenth
+of a second; a window that keeps its covariance positive (Bohman's) ends that memory altogether, so
+that the rows' covariance vanishes beyond it and the filter's length.
 """
 
 from typing import NamedTuple
@@ -21,7 +29,7 @@ from numpy.typing import NDArray
 from pre_core.crossing.channels import low_pass
 from pre_core.kernels.lanes import summing
 from pre_core.physics.vehicle import masses_above_axles
-from pre_core.unknowns import C_S1, D_1, K_S1, K_U1, KAPPA, M_U1
+from pre_core.unknowns import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1
 
 FloatArray = NDArray[np.float64]
 
@@ -35,6 +43,17 @@ _STOP_BAND_DB = 70.0
 _TABLE = 1024  # frequencies of the numerical integral over the noise spectrum
 _FEW_FREQUENCIES = 48
 _SETTLED = 1e-12
+_FORCE_CENTRES_HZ = np.arange(0.0, 60.0, 4.0)
+FORCE_SHAPES = _FORCE_CENTRES_HZ.size
+"""The spectrum of the force noise is a sum of bumps about these frequencies, a few hertz wide: that
+of dry friction falls by six decades from the body's bounce to the rows' highest frequency."""
+_FORCE_MEMORY_S = 0.3
+"""Its covariance ends here, which is what makes the bumps as wide as they are."""
+_FORCE_PASSES = 200
+_BELIEVED_HZ = 30.0
+"""Up to which springs are asked whether they are believed."""
+_FORCE_GAIN = 60.0
+"""So much must twice the log-likelihood of an axle's rows gain for its springs to be doubted."""
 
 
 class RowFilter(NamedTuple):
@@ -56,12 +75,40 @@ class Truck(NamedTuple):
     m_11: float
     m_22: float
     m_12: float
+    is_inertial: bool
+    """How the force on a tyre is found, see `residuals.Crossing`."""
 
 
-def truck_of(theta: FloatArray, total_mass_kg: float, wheelbase_m: float) -> Truck:
+def truck_of(
+    theta: FloatArray, total_mass_kg: float, wheelbase_m: float, is_inertial: bool
+) -> Truck:
     """The truck of theta (p,) as noise meets it."""
     m_s = total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
-    return Truck(theta, *masses_above_axles(m_s, theta[D_1], wheelbase_m, theta[KAPPA]))
+    masses = masses_above_axles(m_s, theta[D_1], wheelbase_m, theta[KAPPA])
+    return Truck(theta, *masses, is_inertial)
+
+
+def linear_springs() -> FloatArray:
+    """Levels (2, shapes) of force noise where springs and dampers are believed."""
+    return np.zeros((2, FORCE_SHAPES))
+
+
+def _force_shapes(omega: FloatArray) -> FloatArray:
+    """(shapes, f): spectra of B(t) cos(omega_k t) with Bohman's window B, a half at their tops.
+
+    B is the half wave cos(pi t/T) convolved with itself, so that its spectrum is a square.
+    """
+    centre = 2.0 * np.pi * _FORCE_CENTRES_HZ[:, None]
+    return _bohman(omega - centre) + _bohman(omega + centre)
+
+
+def _bohman(omega: FloatArray) -> FloatArray:
+    """Spectrum of Bohman's window that ends at +-`_FORCE_MEMORY_S`, a half at frequency zero."""
+    turn = omega * _FORCE_MEMORY_S
+    apart = 1.0 - (turn / np.pi) ** 2
+    near = np.abs(apart) < 1e-6
+    wave = np.where(near, 0.25 * np.pi, np.cos(0.5 * turn) / np.where(near, 1.0, apart))
+    return np.asarray(0.5 * wave**2)
 
 
 class Whitener(NamedTuple):
@@ -114,30 +161,56 @@ def _responses(truck: Truck, omega: FloatArray) -> NDArray[np.complex128]:
     out = np.zeros((RESIDUALS, _SOURCES, omega.size), dtype=np.complex128)
     for w, sign, m_ii in ((0, 1.0, truck.m_11), (1, -1.0, truck.m_22)):
         c, k = theta[C_S1 + w], theta[K_S1 + w]
-        k_u, m_u = theta[K_U1 + w], theta[M_U1 + w]
-        out[0, 2 + w] = sign * (1.0 + (m_u * s**2 + c * s + k) / k_u)
-        out[0, w] = -sign * (c * s + k) / k_u
+        tyre, m_u = theta[K_U1 + w] + theta[C_U1 + w] * s, theta[M_U1 + w]
+        if truck.is_inertial:
+            out[0, 2 + w] = sign * (1.0 + m_u * s**2 / tyre)
+            out[0, w] = sign * m_ii * s**2 / tyre
+            out[0, 4 + w] = sign * truck.m_12 * s**2 / tyre
+        else:
+            out[0, 2 + w] = sign * (1.0 + (m_u * s**2 + c * s + k) / tyre)
+            out[0, w] = -sign * (c * s + k) / tyre
         out[1 + w, w] = (m_ii * s**2 + c * s) / k + 1.0
         out[1 + w, 2 + w] = -(c * s / k + 1.0)
         out[1 + w, 4 + w] = truck.m_12 * s**2 / k
     return out
 
 
-def _spectrum(truck: Truck, density: FloatArray, omega: FloatArray) -> NDArray[np.complex128]:
-    """One-sided spectra of the residuals' noise as accelerations: (3, 3, f)."""
+def _spectrum(
+    truck: Truck, density: FloatArray, force: FloatArray, omega: FloatArray
+) -> NDArray[np.complex128]:
+    """One-sided spectra of the residuals' noise as accelerations: (3, 3, f).
+
+    `force` (2, shapes) in N²/Hz is that of what springs and dampers do besides their linear part.
+    """
     responses = _responses(truck, omega)
     sources = np.concatenate([density, density[[1, 0]]])
     weighted = responses * (sources**2)[None, :, None]
-    return np.asarray(np.einsum("icf,jcf->ijf", weighted, responses.conj()))
+    spectrum = np.asarray(np.einsum("icf,jcf->ijf", weighted, responses.conj()))
+    spectrum[[1, 2], [1, 2]] += _of_force(truck, force, omega)
+    return spectrum
 
 
-def whitener(rows: RowFilter, count: int, truck: Truck, density: FloatArray) -> Whitener:
+def _of_force(truck: Truck, force: FloatArray, omega: FloatArray) -> FloatArray:
+    """What the force noise adds to the spectra of the body equations: (2, f)."""
+    stiffness = truck.theta[K_S1 : K_S1 + 2, None]
+    return np.asarray((force @ _force_shapes(omega)) * omega**4 / stiffness**2)
+
+
+def whitener(
+    rows: RowFilter, count: int, truck: Truck, density: FloatArray, force: FloatArray
+) -> Whitener:
     """Factor for `count` filtered rows; `density` (4,) is one-sided, in m/s²/√Hz.
 
+    `force` (2, shapes) is the springs' noise in N²/Hz (`linear_springs` where there is none).
     Raises ValueError where the densities leave some row without noise.
     """
-    spectrum = _spectrum(truck, density, rows.omega) * rows.power
-    covariance = np.real(spectrum @ rows.turn)  # of a one-sided density: E[e_i(t + lag) e_j(t)]
+    spectrum = _spectrum(truck, density, force, rows.omega) * rows.power
+    turn = rows.turn
+    if force.any():
+        apart = rows.every * rows.step_s
+        more = np.arange(turn.shape[1], turn.shape[1] + int(np.ceil(_FORCE_MEMORY_S / apart)))
+        turn = np.concatenate([turn, np.exp(1j * np.outer(rows.omega * apart, more))], axis=1)
+    covariance = np.real(spectrum @ turn)  # of a one-sided density: E[e_i(t + lag) e_j(t)]
     lags = covariance.shape[2]
     band = RESIDUALS * lags - 1
     one = np.zeros((RESIDUALS, band + 1))
@@ -155,7 +228,11 @@ def whitener(rows: RowFilter, count: int, truck: Truck, density: FloatArray) -> 
 
 
 def noise_power(
-    rows: RowFilter, trucks: list[Truck], density: FloatArray, which: list[int]
+    rows: RowFilter,
+    trucks: list[Truck],
+    density: FloatArray,
+    force: FloatArray,
+    which: list[int],
 ) -> FloatArray:
     """What tr(C_0^-1 C) per row becomes for other trucks, less what it is for the first: (w,).
 
@@ -171,13 +248,61 @@ def noise_power(
     )
 
     def folded(truck: int) -> NDArray[np.complex128]:
-        low = _spectrum(trucks[truck], density[truck], below) * power_below
-        high = _spectrum(trucks[truck], density[truck], above) * power_above
+        low = _spectrum(trucks[truck], density[truck], force, below) * power_below
+        high = _spectrum(trucks[truck], density[truck], force, above) * power_above
         return np.moveaxis(low + high.conj(), 2, 0)
 
     first = np.linalg.inv(folded(0))
     traces = [np.einsum("fij,fji->", first, folded(1 + k)).real for k in which]
     return np.asarray(traces) / _FEW_FREQUENCIES - RESIDUALS
+
+
+def force_noise(rows: RowFilter, truck: Truck, density: FloatArray, body: FloatArray) -> FloatArray:
+    """Levels (2, shapes) of the springs' noise in N²/Hz that the body equations' rows (2, m) show.
+
+    The most likely ones beside the sensors' noise, by the periodogram (Whittle 1953): each level is
+    multiplied by the root of what it explains over what it claims until nothing changes. An axle
+    whose springs are as linear as its sensors can tell has none.
+    """
+    m = body.shape[1]
+    window = np.hanning(m)
+    apart = rows.every * rows.step_s
+    shown = np.abs(np.fft.rfft(body * window, axis=1)[:, 1:]) ** 2
+    shown *= 2.0 * apart / np.sum(window**2)
+    omega = np.asarray(2.0 * np.pi * np.fft.rfftfreq(m, apart)[1:], dtype=np.float64)
+    shapes = np.zeros((FORCE_SHAPES, omega.size))
+    sensors = np.zeros((2, omega.size))
+    interval = (rows.omega[1] - rows.omega[0]) / (2.0 * np.pi)
+    for at in (omega, 4.0 * np.pi * (0.5 / apart) - omega):  # what is above half the rate folds
+        power = np.interp(at, rows.omega, rows.power) / interval
+        diagonal = _spectrum(truck, density, linear_springs(), at)[[1, 2], [1, 2]].real
+        sensors += diagonal * power
+        shapes += _force_shapes(at) * at**4 * power
+    k = truck.theta[K_S1 : K_S1 + 2]
+    levels = linear_springs()
+    for axle in range(2):
+        shape = shapes / k[axle] ** 2
+        seen, known = shown[axle], sensors[axle]
+        level = np.full(FORCE_SHAPES, seen.mean()) / shape.mean(axis=1)
+        for _ in range(_FORCE_PASSES):
+            expected = known + level @ shape
+            level *= np.sqrt((shape @ (seen / expected**2)) / (shape @ (1.0 / expected)))
+        expected = known + level @ shape
+        gain = 2.0 * np.sum(np.log(known / expected) + seen / known - seen / expected)
+        # Hann's window makes neighbours alike: half of the frequencies tell something new.
+        if 0.5 * gain > _FORCE_GAIN:
+            levels[axle] = level
+    return levels
+
+
+def belief_in_springs(
+    rows: RowFilter, truck: Truck, density: FloatArray, force: FloatArray
+) -> float:
+    """0 to 1: which part of what the sensors could tell by the body equations the springs leave."""
+    low = rows.omega < 2.0 * np.pi * _BELIEVED_HZ
+    sensors = _spectrum(truck, density, linear_springs(), rows.omega[low])[[1, 2], [1, 2]].real
+    all_noise = _spectrum(truck, density, force, rows.omega[low])[[1, 2], [1, 2]].real
+    return float((sensors / all_noise).mean())
 
 
 @summing

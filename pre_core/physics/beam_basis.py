@@ -21,21 +21,28 @@ from pre_core.kernels.jacobi import diagonalise, diagonalise_one
 from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store
 from pre_core.physics.bridge import (
     element_cubics,
+    held_nodes,
     mass_matrix,
     uniform_beam,
     unit_stiffness_matrices,
 )
-from pre_core.unknowns import ALPHA, BETA, EI_1, K_ROT, RHO_A
+from pre_core.unknowns import ALPHA, BETA, EI_1, K_ROT, RHO_A, F
 
 FloatArray = NDArray[np.float64]
+
+
+RIGID_M_PER_N = 2e-12
+"""Compliance that every bearing has besides its own, a hundredth of a micrometre under a heavy
+axle: a spring of no compliance at all would be infinitely stiff."""
 
 
 class BeamBasis(NamedTuple):
     """What every evaluation shares: the beam in coordinates in which the sound one is diagonal.
 
-    `stiffness` (n + 2, m, m): dK/dEI_e and dK/dk_rot of the n elements and two supports, in
-    coordinates that make the mass matrix of 1 kg/m the identity. `cubics` (n parts, 4, m):
-    deflection in each part of an element for each coordinate. `lengths_m` (n parts,).
+    `stiffness` (n + 2 or n + 4, m, m): dK/ds of the n elements' EI, of the rotational and, where
+    bearings may give, of the vertical springs at the ends, in coordinates that make the mass matrix
+    of 1 kg/m the identity. `cubics` (n parts, 4, m): deflection in each part of an element for each
+    coordinate. `lengths_m` (n parts,).
     """
 
     stiffness: FloatArray
@@ -44,26 +51,40 @@ class BeamBasis(NamedTuple):
 
 
 def beam_basis(
-    element_lengths_m: FloatArray, parts: int = 1, coordinates: int | None = None
+    element_lengths_m: FloatArray,
+    parts: int = 1,
+    coordinates: int | None = None,
+    *,
+    interior_supports: tuple[int, ...] = (),
+    bearings_give: bool = False,
 ) -> BeamBasis:
     """Coordinates: the lowest modes of the uniform beam whose elements are cut into `parts`.
 
-    All 2 n parts of them by default, which is the finite-element model itself. Fewer are quicker
-    but poor for a beam that is not uniform or has springs at its supports, whose kinked curvature
-    smooth modes do not span: f_1 of the paper's scenario 6 is 1 % off with 14 of 28.
+    All of them by default, which is the finite-element model itself. Fewer are quicker but poor for
+    a beam that is not uniform or has springs at its supports, whose kinked curvature smooth modes
+    do not span: f_1 of the paper's scenario 6 is 1 % off with 14 of 28. `interior_supports` are
+    nodes between elements. With `bearings_give` the ends have a vertical spring each.
     """
     n = element_lengths_m.size
     lengths = np.repeat(element_lengths_m / parts, parts)
-    unit = uniform_beam(1.0, np.ones(n * parts), 1.0, 0.0, 0.0)._replace(element_lengths_m=lengths)
-    fine = unit_stiffness_matrices(lengths)
+    give = (1.0, 1.0) if bearings_give else (0.0, 0.0)
+    unit = uniform_beam(1.0, np.ones(n * parts), 1.0, 0.0, 0.0)._replace(
+        element_lengths_m=lengths,
+        support_compliance_m_per_n=give,
+        interior_supports=tuple(node * parts for node in interior_supports),
+    )
+    held = held_nodes(unit)
+    fine = unit_stiffness_matrices(lengths, held)
     count = fine.shape[1] if coordinates is None else min(coordinates, fine.shape[1])
     units = np.concatenate(
         [fine[: n * parts].reshape(n, parts, *fine.shape[1:]).sum(axis=1), fine[n * parts :]]
-    )
-    _, shapes = eigh(units[:n].sum(axis=0), mass_matrix(unit), subset_by_index=(0, count - 1))
+    )[: n + 4 if bearings_give else n + 2]
+    # The springs, as stiff as an element of this length, only keep the beam from floating away.
+    reference = units[:n].sum(axis=0) + units[n + 2 :].sum(axis=0) * 12.0 / lengths[0] ** 3
+    _, shapes = eigh(reference, mass_matrix(unit), subset_by_index=(0, count - 1))
     return BeamBasis(
         np.ascontiguousarray(shapes.T @ units @ shapes),
-        np.ascontiguousarray(element_cubics(lengths, shapes)),
+        np.ascontiguousarray(element_cubics(lengths, held, shapes)),
         lengths,
     )
 
@@ -73,7 +94,8 @@ def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
 
     Bridges near it are then nearly diagonal, which makes their modes quick to find.
     """
-    _, shapes = eigh(np.tensordot(stiffness_factors(theta), basis.stiffness, axes=1))
+    factors = stiffness_factors(theta, basis.stiffness.shape[0])
+    _, shapes = eigh(np.tensordot(factors, basis.stiffness, axes=1))
     return BeamBasis(
         np.ascontiguousarray(shapes.T @ basis.stiffness @ shapes),
         np.ascontiguousarray(basis.cubics @ shapes),
@@ -83,21 +105,28 @@ def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
 
 def first_frequencies_hz(basis: BeamBasis, theta: FloatArray) -> FloatArray:
     """First natural frequency (k,) in Hz, undamped, of the bridges `theta` (k, p)."""
-    stiffness = np.tensordot(stiffness_factors(theta), basis.stiffness, axes=1)
+    factors = stiffness_factors(theta, basis.stiffness.shape[0])
+    stiffness = np.tensordot(factors, basis.stiffness, axes=1)
     lowest = np.linalg.eigvalsh(stiffness)[:, 0]
     return np.asarray(np.sqrt(lowest / theta[:, RHO_A]) / (2.0 * np.pi))
 
 
-def stiffness_factors(theta: FloatArray) -> FloatArray:
-    """What multiplies the matrices of `BeamBasis.stiffness`: (…, n + 2) for vectors (…, p)."""
-    return np.concatenate([theta[..., EI_1:], theta[..., K_ROT : K_ROT + 2]], axis=-1)
+def stiffness_factors(theta: FloatArray, count: int) -> FloatArray:
+    """What multiplies the `count` matrices of `BeamBasis.stiffness`: (…, count) for (…, p)."""
+    vertical = 1.0 / (theta[..., F : F + 2] + RIGID_M_PER_N)
+    factors = [theta[..., EI_1:], theta[..., K_ROT : K_ROT + 2], vertical]
+    return np.concatenate(factors, axis=-1)[..., :count]
 
 
 @kernel
 def stiffness_factor(theta: FloatArray, i: int) -> float:
     """The same for one vector (p,) and matrix i, in kernels."""
-    elements = theta.size - EI_1
-    return theta[EI_1 + i] if i < elements else theta[K_ROT + i - elements]
+    spring = i - (theta.size - EI_1)
+    if spring < 0:
+        return theta[EI_1 + i]
+    if spring < 2:
+        return theta[K_ROT + spring]
+    return 1.0 / (theta[F + spring - 2] + RIGID_M_PER_N)
 
 
 @kernel

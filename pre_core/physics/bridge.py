@@ -1,8 +1,8 @@
-"""The bridge: a simply supported Euler-Bernoulli beam of Hermite elements (paper section 2.1).
+"""The bridge: an Euler-Bernoulli beam of Hermite elements (paper section 2.1) on its supports.
 
-Degrees of freedom are deflection and rotation at every node, less the deflection at the two ends:
-with n elements there are 2n, ordered rotation at the start, then (deflection, rotation) of each
-inner node, then rotation at the end.
+Degrees of freedom are deflection and rotation at every node in order, less the deflections that are
+held: those of interior supports, and of the ends unless their bearings give. With n elements on two
+rigid bearings there are 2n.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Beam(NamedTuple):
-    """A single span with Rayleigh damping C = alpha M + beta K; one entry per element."""
+    """One or more spans with Rayleigh damping C = alpha M + beta K; one entry per element."""
 
     element_lengths_m: FloatArray
     flexural_rigidity_nm2: FloatArray
@@ -23,10 +23,14 @@ class Beam(NamedTuple):
     rayleigh_alpha_per_s: float
     rayleigh_beta_s: float
     support_rotational_stiffness_nm_per_rad: tuple[float, float] = (0.0, 0.0)
+    support_compliance_m_per_n: tuple[float, float] = (0.0, 0.0)
+    """How far the bearings at the ends give under load; 0 is rigid."""
+    interior_supports: tuple[int, ...] = ()
+    """Nodes, 1 to n - 1, whose deflection is held; they turn freely."""
 
 
 class Modes(NamedTuple):
-    """Mass-normalised modes, ascending: shapes (2n, k), eigenvalues omega^2 (k,), damping (k,)."""
+    """Mass-normalised modes, ascending: shapes (d, k), eigenvalues omega^2 (k,), damping (k,)."""
 
     shapes: FloatArray
     eigenvalues_per_s2: FloatArray
@@ -60,11 +64,23 @@ def refine(beam: Beam, parts: int) -> Beam:
         element_lengths_m=np.repeat(beam.element_lengths_m / parts, parts),
         flexural_rigidity_nm2=np.repeat(beam.flexural_rigidity_nm2, parts),
         mass_per_length_kg_per_m=np.repeat(beam.mass_per_length_kg_per_m, parts),
+        interior_supports=tuple(node * parts for node in beam.interior_supports),
     )
 
 
+def held_nodes(beam: Beam) -> tuple[int, ...]:
+    """Nodes whose deflection is held."""
+    ends = (0, beam.element_lengths_m.size)
+    rigid = [
+        node
+        for node, compliance in zip(ends, beam.support_compliance_m_per_n, strict=True)
+        if compliance == 0.0
+    ]
+    return tuple(sorted({*rigid, *beam.interior_supports}))
+
+
 def span_m(beam: Beam) -> float:
-    """Distance between the bearings."""
+    """Distance between the bearings at the ends."""
     return float(beam.element_lengths_m.sum())
 
 
@@ -99,21 +115,22 @@ def element_stiffness(length_m: float) -> FloatArray:
     ) / (s**3)
 
 
-def element_dofs(elements: int) -> NDArray[np.int64]:
+def node_dofs(elements: int, held: tuple[int, ...]) -> NDArray[np.int64]:
+    """Degrees of freedom (n + 1, 2) of every node: deflection (-1 where it is held), rotation."""
+    is_free = np.full((elements + 1, 2), True)
+    is_free[list(held), 0] = False
+    return np.where(is_free, np.cumsum(is_free).reshape(is_free.shape) - 1, -1)
+
+
+def element_dofs(elements: int, held: tuple[int, ...]) -> NDArray[np.int64]:
     """Degrees of freedom (n, 4) of each element, node by node: deflection, rotation; -1 is held."""
-    free = np.full(2 * (elements + 1), -1, dtype=np.int64)
-    held = {0, 2 * elements}
-    count = 0
-    for i in range(free.size):
-        if i not in held:
-            free[i] = count
-            count += 1
-    return np.array([free[2 * e : 2 * e + 4] for e in range(elements)])
+    nodes = node_dofs(elements, held)
+    return np.concatenate([nodes[:-1], nodes[1:]], axis=1)
 
 
-def _assemble(blocks: list[FloatArray]) -> FloatArray:
-    dofs = element_dofs(len(blocks))
-    total = np.zeros((2 * len(blocks), 2 * len(blocks)))
+def _assemble(blocks: list[FloatArray], held: tuple[int, ...]) -> FloatArray:
+    dofs = element_dofs(len(blocks), held)
+    total = np.zeros((int(dofs.max()) + 1, int(dofs.max()) + 1))
     for block, dof in zip(blocks, dofs, strict=True):
         kept = dof >= 0
         total[np.ix_(dof[kept], dof[kept])] += block[np.ix_(kept, kept)]
@@ -121,46 +138,56 @@ def _assemble(blocks: list[FloatArray]) -> FloatArray:
 
 
 def mass_matrix(beam: Beam, coupling_sign: float = 1.0) -> FloatArray:
-    """Consistent mass matrix (2n, 2n), kg."""
+    """Consistent mass matrix (d, d), kg."""
     return _assemble(
         [
             rho * element_mass(length, coupling_sign)
             for rho, length in zip(
                 beam.mass_per_length_kg_per_m, beam.element_lengths_m, strict=True
             )
-        ]
+        ],
+        held_nodes(beam),
     )
 
 
-def unit_stiffness_matrices(element_lengths_m: FloatArray) -> FloatArray:
-    """dK/ds_j (n + 2, 2n, 2n) for s = the n flexural rigidities and the two support springs.
+def unit_stiffness_matrices(element_lengths_m: FloatArray, held: tuple[int, ...]) -> FloatArray:
+    """dK/ds_j (n + 4, d, d): the n flexural rigidities, then the springs at start and end.
 
+    First the two rotational springs, then the two vertical ones (zero where the end is held).
     K = sum over j of s_j times these, exactly.
     """
     n = element_lengths_m.size
-    units = np.zeros((n + 2, 2 * n, 2 * n))
+    nodes = node_dofs(n, held)
+    size = int(nodes.max()) + 1
+    units = np.zeros((n + 4, size, size))
     for e in range(n):
         blocks = [np.zeros((4, 4)) for _ in range(n)]
         blocks[e] = element_stiffness(element_lengths_m[e])
-        units[e] = _assemble(blocks)
-    units[n, 0, 0] = 1.0
-    units[n + 1, -1, -1] = 1.0
+        units[e] = _assemble(blocks, held)
+    for end, node in enumerate((0, n)):
+        deflection, rotation = nodes[node]
+        units[n + end, rotation, rotation] = 1.0
+        if deflection >= 0:
+            units[n + 2 + end, deflection, deflection] = 1.0
     return units
 
 
 def stiffness_matrix(beam: Beam) -> FloatArray:
-    """Stiffness matrix (2n, 2n) with the support springs."""
+    """Stiffness matrix (d, d) with the support springs."""
+    vertical = [1.0 / f if f > 0.0 else 0.0 for f in beam.support_compliance_m_per_n]
     factors = np.concatenate(
-        [beam.flexural_rigidity_nm2, beam.support_rotational_stiffness_nm_per_rad]
+        [beam.flexural_rigidity_nm2, beam.support_rotational_stiffness_nm_per_rad, vertical]
     )
-    return np.tensordot(factors, unit_stiffness_matrices(beam.element_lengths_m), axes=1)
+    units = unit_stiffness_matrices(beam.element_lengths_m, held_nodes(beam))
+    return np.tensordot(factors, units, axes=1)
 
 
 def modes(beam: Beam, count: int | None = None, coupling_sign: float = 1.0) -> Modes:
-    """The lowest `count` modes (all 2n by default)."""
-    last = 2 * beam.element_lengths_m.size - 1 if count is None else count - 1
+    """The lowest `count` modes (all by default)."""
+    stiffness = stiffness_matrix(beam)
+    last = (stiffness.shape[0] if count is None else count) - 1
     eigenvalues, shapes = eigh(
-        stiffness_matrix(beam), mass_matrix(beam, coupling_sign), subset_by_index=(0, last)
+        stiffness, mass_matrix(beam, coupling_sign), subset_by_index=(0, last)
     )
     damping = beam.rayleigh_alpha_per_s + beam.rayleigh_beta_s * eigenvalues
     return Modes(shapes, eigenvalues, damping)
@@ -195,10 +222,12 @@ def cubic_from_nodes(length_m: float) -> FloatArray:
     )
 
 
-def element_cubics(element_lengths_m: FloatArray, nodal: FloatArray) -> FloatArray:
-    """Cubics (n, 4, k) in the element's place 0..1 of k nodal vectors (2n, k)."""
-    dofs = element_dofs(element_lengths_m.size)
-    padded = np.vstack([nodal, np.zeros((1, nodal.shape[1]))])  # row -1: the held ends
+def element_cubics(
+    element_lengths_m: FloatArray, held: tuple[int, ...], nodal: FloatArray
+) -> FloatArray:
+    """Cubics (n, 4, k) in the element's place 0..1 of k nodal vectors (d, k)."""
+    dofs = element_dofs(element_lengths_m.size, held)
+    padded = np.vstack([nodal, np.zeros((1, nodal.shape[1]))])  # row -1: what is held
     return np.stack(
         [
             cubic_from_nodes(length) @ padded[dof]
@@ -208,9 +237,11 @@ def element_cubics(element_lengths_m: FloatArray, nodal: FloatArray) -> FloatArr
 
 
 def interpolation_matrix(beam: Beam, x_m: FloatArray) -> FloatArray:
-    """N (m, 2n): deflection at m chainages is N @ nodal; rows of zeros off the bridge."""
+    """N (m, d): deflection at m chainages is N @ nodal; rows of zeros off the bridge."""
     element, place = locate(beam.element_lengths_m, np.asarray(x_m, dtype=np.float64))
-    cubics = element_cubics(beam.element_lengths_m, np.eye(2 * beam.element_lengths_m.size))
+    held = held_nodes(beam)
+    free = int(node_dofs(beam.element_lengths_m.size, held).max()) + 1
+    cubics = element_cubics(beam.element_lengths_m, held, np.eye(free))
     powers = place[:, None] ** np.arange(4)
     rows = np.einsum("mp,mpk->mk", powers, cubics[np.maximum(element, 0)])
     rows[element < 0] = 0.0

@@ -83,12 +83,15 @@ def modal_filters(
     vectors: FloatArray,
     cubics: FloatArray,
     feedback: FloatArray,
+    modes: FloatArray,
 ) -> bool:
     """Modes of one bridge `theta` (p,) in the lanes, g groups of four; False: not finite.
 
     `matrix` and `vectors` are (m, m). Written: `cubics` (parts, g, 4, 4) [part, group, power, mode]
-    times the root of the sum of the b, and `feedback` (g, 5, 4); lanes beyond the last mode stay
-    zero.
+    times the root of the sum of the b, `feedback` (g, 5, 4), whose lanes beyond the last mode stay
+    zero, and `modes` (m, 3): omega^2, damping, and what the recursion's q is to be multiplied by
+    for the coordinate of the mass-normalised mode, with the sign that keeps a mode's direction from
+    one bridge to a similar one.
     """
     if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
         return False
@@ -104,6 +107,9 @@ def modal_filters(
             return False
         feedback[group, :, lane] = one
         size = np.sqrt(total / theta[RHO_A])
+        modes[k, 0], modes[k, 1] = eigenvalue, damping
+        # In coordinates in which a bridge near by is diagonal a mode is nearly a unit vector.
+        modes[k, 2] = np.sqrt(total) if vectors[k, k] >= 0.0 else -np.sqrt(total)
         shape_cubics(basis_cubics, vectors[k], size, lane, cubics[:, group])
     return True
 
@@ -225,3 +231,119 @@ def advance(
             )
         else:  # a span shorter than the wheelbase swings on between the axles
             _no_wheel(feedback[g], state[g], place.shape[1])
+
+
+@kernel
+def swing(
+    feedback: FloatArray, state: FloatArray, mode: FloatArray, k: int, q: float, v: float
+) -> None:
+    """Let mode k swing freely: before the next sample it is at q and moves with v; adds to `state`.
+
+    `mode` (3,) is its row of `modal_filters`. The recursion's w is B z^n, z = exp((-s + i w) step),
+    where q[n] = B (n_0 + n_1/z + n_2/z^2) z^n. A mode that is damped beyond swinging stays at rest.
+    """
+    half = 0.5 * mode[1]
+    square = mode[0] - half * half
+    if not square > 0.0:
+        return
+    root = np.sqrt(square)
+    group, lane = k // LANES, k % LANES
+    f1, f2 = feedback[group, 0, lane], feedback[group, 1, lane]
+    n0, n1, n2 = feedback[group, 2, lane], feedback[group, 3, lane], feedback[group, 4, lane]
+    # z = exp(-s h) (cos + i sin), of which f1 = 2 Re z and f2 = -|z|^2.
+    size = np.sqrt(-f2)
+    real = 0.5 * f1
+    imaginary = np.sqrt(max(size * size - real * real, 0.0))
+    back_r, back_i = real / (size * size), -imaginary / (size * size)  # 1/z
+    square_r, square_i = back_r * back_r - back_i * back_i, 2.0 * back_r * back_i
+    filter_r, filter_i = n0 + n1 * back_r + n2 * square_r, n1 * back_i + n2 * square_i
+    # A of q(t) = Re A exp((-s + i w) t); then B = A/filter.
+    a_r, a_i = q / mode[2], -(v + half * q) / (root * mode[2])
+    norm = filter_r * filter_r + filter_i * filter_i
+    b_r = (a_r * filter_r + a_i * filter_i) / norm
+    b_i = (a_i * filter_r - a_r * filter_i) / norm
+    state[group, 0, lane] += b_r * back_r - b_i * back_i
+    state[group, 1, lane] += b_r * square_r - b_i * square_i
+
+
+@kernel
+def _group_with_ends(
+    front: FloatArray,
+    rear: FloatArray,
+    first: FloatArray,
+    last: FloatArray,
+    front_on: bool,
+    rear_on: bool,
+    feedback: FloatArray,
+    state: FloatArray,
+    place: FloatArray,
+    force: FloatArray,
+    end_force: FloatArray,
+    end_share: FloatArray,
+    deflection: FloatArray,
+) -> None:
+    for lane in range(LANES):
+        f1, f2 = feedback[0, lane], feedback[1, lane]
+        n0, n1, n2 = feedback[2, lane], feedback[3, lane], feedback[4, lane]
+        w1, w2 = state[0, lane], state[1, lane]
+        start = first[0, lane]
+        end = last[0, lane] + last[1, lane] + last[2, lane] + last[3, lane]
+        for n in range(place.shape[1]):
+            x, z = place[0, n], place[1, n]
+            a = b = 0.0
+            if front_on:
+                a = ((front[3, lane] * x + front[2, lane]) * x + front[1, lane]) * x + front[
+                    0, lane
+                ]
+            if rear_on:
+                b = ((rear[3, lane] * z + rear[2, lane]) * z + rear[1, lane]) * z + rear[0, lane]
+            p = a * force[0, n, lane] + b * force[1, n, lane]
+            p += start * end_force[0, n] + end * end_force[1, n]
+            w = f1 * w1 + f2 * w2 + p
+            q = n0 * w + n1 * w1 + n2 * w2
+            w2 = w1
+            w1 = w
+            at_start, at_end = start * q, end * q
+            deflection[0, n, lane] += (
+                a * q + end_share[0, 0, n] * at_start + end_share[0, 1, n] * at_end
+            )
+            deflection[1, n, lane] += (
+                b * q + end_share[1, 0, n] * at_start + end_share[1, 1, n] * at_end
+            )
+        state[0, lane], state[1, lane] = w1, w2
+
+
+@kernel
+def advance_with_ends(
+    cubics: FloatArray,
+    part_front: int,
+    part_rear: int,
+    feedback: FloatArray,
+    state: FloatArray,
+    place: FloatArray,
+    force: FloatArray,
+    end_force: FloatArray,
+    end_share: FloatArray,
+    deflection: FloatArray,
+) -> None:
+    """As `advance`, with forces at both ends of the bridge, and its ends felt by the wheels.
+
+    `end_force` (2 ends, steps) acts besides the wheels' forces; `end_share` (2 wheels, 2 ends,
+    steps) of an end's deflection is felt by a wheel besides that of its own place.
+    """
+    for g in range(feedback.shape[0]):
+        _group_with_ends(
+            cubics[max(part_front, 0), g],
+            cubics[max(part_rear, 0), g],
+            cubics[0, g],
+            cubics[cubics.shape[0] - 1, g],
+            part_front >= 0,
+            part_rear >= 0,
+            feedback[g],
+            state[g],
+            place,
+            force,
+            end_force,
+            end_share,
+            deflection,
+        )

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from pre_core.physics.bridge import Beam
 from pre_core.physics.vehicle import HalfCar
-from pre_core.unknowns import ALPHA, BETA, BRIDGE, D_1, EI_1, K_ROT, M_U1, RHO_A, TRUCK, table
+from pre_core.unknowns import ALPHA, BETA, BRIDGE, D_1, EI_1, K_ROT, M_U1, RHO_A, TRUCK, F, table
 
 FloatArray = NDArray[np.float64]
 
@@ -22,8 +22,10 @@ def from_models(car: HalfCar, beam: Beam) -> FloatArray:
     return np.array([np.ravel(getattr(of[row.part], row.key))[row.which] for row in rows])
 
 
-def beam_from(theta: FloatArray, element_lengths_m: FloatArray) -> Beam:
-    """The bridge of theta (p,)."""
+def beam_from(
+    theta: FloatArray, element_lengths_m: FloatArray, interior_supports: tuple[int, ...] = ()
+) -> Beam:
+    """The bridge of theta (p,) over supports at its ends and at the nodes given."""
     rigidities = theta[EI_1:]
     return Beam(
         element_lengths_m,
@@ -32,6 +34,8 @@ def beam_from(theta: FloatArray, element_lengths_m: FloatArray) -> Beam:
         float(theta[ALPHA]),
         float(theta[BETA]),
         (float(theta[K_ROT]), float(theta[K_ROT + 1])),
+        (float(theta[F]), float(theta[F + 1])),
+        interior_supports,
     )
 
 

@@ -48,6 +48,7 @@ class Simulation(NamedTuple):
     wheel_deflection_m: FloatArray  # (steps, 2): the bridge under each wheel
     modal_displacement: FloatArray  # (steps, modes)
     modal_velocity: FloatArray  # (steps, modes)
+    friction_n: FloatArray  # (steps, 2) of the springs, positive where it resists lengthening
     modes: _bridge.Modes
     converged: bool
     iterations: int
@@ -87,6 +88,11 @@ def _march(
     damping: FloatArray,
     stiffness: FloatArray,
     bilinear_n_s_per_m: FloatArray,
+    friction_level: FloatArray,
+    friction_length: float,
+    friction_growth: float,
+    air_exponent: float,
+    spring_load: FloatArray,
     tyre_stiffness: FloatArray,
     tyre_damping: FloatArray,
     static_load: FloatArray,
@@ -100,6 +106,8 @@ def _march(
     wheel_speed: FloatArray,
     road: FloatArray,
     road_rate: FloatArray,
+    swing: FloatArray,
+    swing_step: int,
     tolerance: float,
     max_iterations: int,
     z: FloatArray,
@@ -109,6 +117,7 @@ def _march(
     deflection: FloatArray,
     q: FloatArray,
     qd: FloatArray,
+    friction: FloatArray,
 ) -> int:
     steps = road.shape[0]
     count = eigenvalues.size
@@ -132,8 +141,11 @@ def _march(
     p = np.zeros(2)
     y = np.zeros(2)
     yd = np.zeros(2)
+    step_rate = np.zeros(2)
+    rubbing = np.zeros(2)
     worst = 0
     # At time 0 displacement and velocity are given (zero) and only the accelerations are unknown.
+    # So they are of the modes when the bridge is found swinging; before, it rests.
     quarter = 0.0
     half = 0.0
     inverse = inverse_mass
@@ -142,13 +154,20 @@ def _march(
             quarter = 0.25 * step_s**2
             half = 0.5 * step_s
             inverse = inverse_effective
-            effective = modal_effective
+        is_given = n in (0, swing_step)
+        modal_quarter = 0.0 if is_given else quarter
+        modal_half = 0.0 if is_given else half
+        for k in range(count):
+            effective[k] = 1.0 if is_given else modal_effective[k]
         for i in range(4):
             if n > 0:
                 z_guess[i] = z[n - 1, i] + step_s * zd[n - 1, i] + quarter * zdd[n - 1, i]
                 zd_guess[i] = zd[n - 1, i] + half * zdd[n - 1, i]
         for k in range(count):
-            if n > 0:
+            if n == swing_step:
+                q_guess[k] = swing[0, k]
+                qd_guess[k] = swing[1, k]
+            elif n > 0:
                 q_guess[k] = q[n - 1, k] + step_s * qd[n - 1, k] + quarter * qdd[k]
                 qd_guess[k] = qd[n - 1, k] + half * qdd[k]
         on_bridge = False
@@ -170,6 +189,20 @@ def _march(
             else:
                 shape[w, :] = 0.0
                 slope[w, :] = 0.0
+            step_rate[w] = 0.0
+            was = element[n - 1, w] if n > 0 else e
+            if (e >= 0) != (was >= 0):
+                # The bridge's end gives: the wheel goes up or down a step, which its tyre's damper
+                # feels. A rate that is there at one sample has the impulse of a step's length.
+                near = max(e, was)
+                end = 0.0
+                for k in range(count):
+                    at_end = cubics[near, 0, k]
+                    if near > 0:
+                        at_end += cubics[near, 1, k] + cubics[near, 2, k] + cubics[near, 3, k]
+                    # A bridge that swings is not where it rested before.
+                    end += at_end * (q_guess[k] if n == swing_step else q[n - 1, k])
+                step_rate[w] = end / step_s if e >= 0 else -end / step_s
         for i in range(4):
             free[i] = 0.0
             for j in range(4):
@@ -183,13 +216,14 @@ def _march(
             for w in range(2):
                 p[w] = -static_load[w]
         zd_new[:] = zd_guess
+        z_new[:] = z_guess
         iterations = 0
         while True:
             iterations += 1
             # The bridge under the latest contact forces.
             for w in range(2):
                 y[w] = 0.0
-                yd[w] = 0.0
+                yd[w] = step_rate[w]
             if on_bridge:
                 for k in range(count):
                     load = shape[0, k] * p[0] + shape[1, k] * p[1]
@@ -197,8 +231,8 @@ def _march(
                         load - modal_damping[k] * qd_guess[k] - eigenvalues[k] * q_guess[k]
                     ) / effective[k]
                     qdd_new[k] = acceleration
-                    q_new[k] = q_guess[k] + quarter * acceleration
-                    qd_new[k] = qd_guess[k] + half * acceleration
+                    q_new[k] = q_guess[k] + modal_quarter * acceleration
+                    qd_new[k] = qd_guess[k] + modal_half * acceleration
                     for w in range(2):
                         y[w] += shape[w, k] * q_new[k]
                         yd[w] += shape[w, k] * qd_new[k] + slope[w, k] * wheel_speed[n] * q_new[k]
@@ -208,8 +242,8 @@ def _march(
                         -modal_damping[k] * qd_guess[k] - eigenvalues[k] * q_guess[k]
                     ) / effective[k]
                     qdd_new[k] = acceleration
-                    q_new[k] = q_guess[k] + quarter * acceleration
-                    qd_new[k] = qd_guess[k] + half * acceleration
+                    q_new[k] = q_guess[k] + modal_quarter * acceleration
+                    qd_new[k] = qd_guess[k] + modal_half * acceleration
             # The truck on the road and the deflected bridge.
             for i in range(4):
                 force[i] = free[i]
@@ -217,10 +251,28 @@ def _march(
                 force[2 + w] += tyre_stiffness[w] * (road[n, w] + y[w]) + tyre_damping[w] * (
                     road_rate[n, w] + yd[w]
                 )
+                # What damper and spring pull beyond their linear parts, positive in extension.
                 stroke_rate = zd_new[w] - zd_new[2 + w]
-                damper = bilinear_n_s_per_m[w] * abs(stroke_rate)
-                force[w] -= damper
-                force[2 + w] += damper
+                strut = bilinear_n_s_per_m[w] * abs(stroke_rate)
+                stroke = z_new[w] - z_new[2 + w]
+                spring = -stiffness[w, w] * stroke
+                if air_exponent > 0.0:
+                    excess = _vehicle.air_spring_excess_n(
+                        -stroke, stiffness[w, w], spring_load[w], air_exponent
+                    )
+                    spring += excess
+                    strut -= excess
+                if friction_level[w] > 0.0:
+                    load = max(1.0 + friction_growth * spring / spring_load[w], 0.0)
+                    rubbing[w] = _vehicle.dahl_friction_n(
+                        friction[n - 1, w] if n > 0 else 0.0,
+                        stroke - (z[n - 1, w] - z[n - 1, 2 + w]) if n > 0 else 0.0,
+                        friction_level[w] * load,
+                        friction_length,
+                    )
+                    strut += rubbing[w]
+                force[w] -= strut
+                force[2 + w] += strut
             for i in range(4):
                 acceleration = 0.0
                 for j in range(4):
@@ -255,6 +307,7 @@ def _march(
         for w in range(2):
             contact[n, w] = p[w]
             deflection[n, w] = y[w]
+            friction[n, w] = rubbing[w]
     return worst
 
 
@@ -266,22 +319,29 @@ def simulate(
     step_s: float,
     *,
     modes: int | None = None,
+    swing: FloatArray | None = None,
     tolerance: float = 1e-12,
     max_iterations: int = 50,
     gravity_m_per_s2: float = STANDARD_GRAVITY_M_PER_S2,
+    swing_step: int | None = None,
 ) -> Simulation:
     """Drive the truck along `motion` and return accelerations, forces and deflections.
 
-    The truck starts at rest in its static equilibrium on a flat road at height zero and the bridge
-    at rest, unloaded. All `modes` of the mesh are kept unless fewer are asked for. `tolerance` is
-    the largest change of a contact force between two iterations, relative to the static axle load;
-    the paper uses 1e-3.
+    The truck starts at rest in its static equilibrium on a flat road at height zero, its springs
+    without friction, and the bridge at rest, unloaded. Where something has left before, `swing`
+    (2, modes) is displacement and velocity of the modes of the bridge (`bridge.modes` of this beam
+    and number) at `swing_step`, by default that at which the first wheel comes on, or time 0 if
+    none does (`passing.state_after`); until then no wheel feels the bridge and it is left at rest.
+
+    All `modes` of the mesh are kept unless fewer are asked for. `tolerance` is the largest change
+    of a contact force between two iterations, relative to the static axle load; the paper uses
+    1e-3.
 
     Because the scheme is that of average acceleration, integrating the accelerations with the same
     scheme from zero (paper.integrate.newmark_integrate) gives the displacements to rounding.
     """
     basis = _bridge.modes(beam, modes)
-    cubics = _bridge.element_cubics(beam.element_lengths_m, basis.shapes)
+    cubics = _bridge.element_cubics(beam.element_lengths_m, _bridge.held_nodes(beam), basis.shapes)
     direction = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
     wheels = np.stack(
         [
@@ -302,7 +362,9 @@ def simulate(
     steps = motion.position_m.size
     count = basis.eigenvalues_per_s2.size
     z, zd, zdd = (np.zeros((steps, 4)) for _ in range(3))
-    contact, deflection = np.zeros((steps, 2)), np.zeros((steps, 2))
+    contact, deflection, friction = (np.zeros((steps, 2)) for _ in range(3))
+    static_load = np.array(_vehicle.static_axle_loads_n(car, gravity_m_per_s2))
+    is_on = (element >= 0).any(axis=1)
     q, qd = np.zeros((steps, count)), np.zeros((steps, count))
     iterations = _march(
         step_s,
@@ -311,9 +373,14 @@ def simulate(
         damping,
         stiffness,
         car.bilinear_damping * np.array(car.suspension_damping_ns_per_m),
+        np.array(car.dry_friction_n),
+        car.friction_length_m,
+        car.friction_load_growth,
+        car.air_spring_exponent,
+        static_load - gravity_m_per_s2 * np.array(car.unsprung_mass_kg),
         np.array(car.tyre_stiffness_n_per_m),
         np.array(car.tyre_damping_ns_per_m),
-        np.array(_vehicle.static_axle_loads_n(car, gravity_m_per_s2)),
+        static_load,
         transfer,
         basis.eigenvalues_per_s2,
         basis.damping_per_s,
@@ -324,6 +391,8 @@ def simulate(
         motion.speed_m_per_s,
         np.ascontiguousarray(road.height_m),
         np.ascontiguousarray(road.rate_m_per_s),
+        np.zeros((2, count)) if swing is None else np.ascontiguousarray(swing),
+        -1 if swing is None else int(is_on.argmax()) if swing_step is None else swing_step,
         tolerance,
         max_iterations,
         z,
@@ -333,9 +402,10 @@ def simulate(
         deflection,
         q,
         qd,
+        friction,
     )
     return Simulation(
-        z, zd, zdd, contact, deflection, q, qd, basis, iterations > 0, max(iterations, 0)
+        z, zd, zdd, contact, deflection, q, qd, friction, basis, iterations > 0, max(iterations, 0)
     )
 
 

@@ -15,6 +15,9 @@ from pre_core.kernels.lanes import kernel
 FloatArray = NDArray[np.float64]
 Pair = tuple[float, float]
 
+_LEAST_HEIGHT = 0.05
+"""Of an air spring at rest; real ones have a bump stop before."""
+
 
 class HalfCar(NamedTuple):
     """Mechanical parameters; pairs are (front, rear)."""
@@ -32,11 +35,44 @@ class HalfCar(NamedTuple):
     bilinear_damping: float = 0.0
     """b: dampers act with c (1 + b) in rebound and c (1 - b) in compression."""
     cg_height_m: float = 0.0
+    dry_friction_n: Pair = (0.0, 0.0)
+    """F_c of each axle's springs: the friction F tends to it, see `dahl_friction_n`."""
+    friction_length_m: float = 0.002
+    friction_load_growth: float = 0.0
+    """g: F_c is multiplied by 1 + g (load/static load - 1) of the spring; 1 makes it proportional
+    to the load that the spring carries."""
+    air_spring_exponent: float = 0.0
+    """n of air springs, 0 for steel ones. Air under the static load L obeys L (1 - k c/(n L))^-n at
+    the compression c: of stiffness k at rest, stiffer the further it is compressed."""
 
 
 def total_mass_kg(car: HalfCar) -> float:
     """M = m_s + m_u1 + m_u2."""
     return car.body_mass_kg + car.unsprung_mass_kg[0] + car.unsprung_mass_kg[1]
+
+
+@kernel
+def dahl_friction_n(friction: float, stroke: float, level: float, length: float) -> float:
+    """Friction after the spring has lengthened by `stroke` (m) from where it was `friction` (N).
+
+    Dahl's law dF/du = (F_c/length) (1 - sign(du) F/F_c), exact for a stroke in one direction; a
+    positive F resists lengthening. Swept between -a and a it encloses
+    4 F_c (a - length tanh(a/length)).
+    """
+    towards = level if stroke >= 0.0 else -level
+    return towards + (friction - towards) * np.exp(-abs(stroke) / length)
+
+
+@kernel
+def air_spring_excess_n(
+    compression: float, stiffness: float, load: float, exponent: float
+) -> float:
+    """What an air spring under the static `load` carries beyond load + stiffness * compression.
+
+    L ((1 - k c/(n L))^-n - 1) - k c; where hardly any height is left it stays as it is.
+    """
+    height = max(1.0 - stiffness * compression / (exponent * load), _LEAST_HEIGHT)
+    return load * (height**-exponent - 1.0) - stiffness * compression
 
 
 @kernel
@@ -88,8 +124,8 @@ def static_axle_loads_n(car: HalfCar, gravity_m_per_s2: float) -> Pair:
 def matrices(car: HalfCar) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mass, damping and stiffness matrices (4, 4) in z = [z_s1, z_s2, z_u1, z_u2].
 
-    The bilinear part of the damping is not linear and is left out; it enters the simulation as a
-    force.
+    What is not linear is left out and enters the simulation as forces: the bilinear part of the
+    damping, friction, and what air springs carry beyond linear ones.
     """
     m_11, m_22, m_12 = body_masses_kg(car)
     mass = np.diag([m_11, m_22, *car.unsprung_mass_kg])

@@ -75,38 +75,49 @@ def begin(rows: Rows, y: FloatArray, differences: Differences = FORWARD) -> Stat
     return State(y, residual, jacobian, _square(residual), _FIRST_DAMPING, differences)
 
 
-def descend(rows: Rows, state: State) -> tuple[State, Info]:
-    """One Levenberg-Marquardt step of any problem: damping grows until the objective falls."""
+def descend(rows: Rows, state: State, lower: FloatArray | None = None) -> tuple[State, Info]:
+    """One Levenberg-Marquardt step of any problem: damping grows until the objective falls.
+
+    No coordinate goes below `lower` (f,); one that lies there and would is held for this step.
+    """
     if not (np.isfinite(state.objective) and np.all(np.isfinite(state.jacobian))):
         return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.NOT_FINITE)
-    scale = np.linalg.norm(state.jacobian, axis=0)
-    scale[scale == 0.0] = 1.0
-    (r,) = qr(np.column_stack([state.jacobian / scale, state.residual]), mode="r")
     f = state.y.size
-    triangle, projected = r[:f, :f], r[:f, f]
+    free = np.full(f, True)
+    if lower is not None:
+        free = (state.y > lower) | (state.jacobian.T @ state.residual <= 0.0)
+    count = int(free.sum())
+    jacobian = state.jacobian[:, free]
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale[scale == 0.0] = 1.0
+    (r,) = qr(np.column_stack([jacobian / scale, state.residual]), mode="r")
+    triangle, projected = r[:count, :count], r[:count, count]
     # Where even the full linear step promises next to nothing, the search is at the bottom.
     if _square(projected) <= state.differences.converged_gain * state.objective:
         return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.CONVERGED)
     damping = state.damping
     evaluations = 0
     while damping < _GIVE_UP_DAMPING:
-        change = _damped(triangle, projected, damping) / scale
+        change = np.zeros(f)
+        change[free] = _damped(triangle, projected, damping) / scale
         size = float(np.abs(change).max())
         if size > _LARGEST_STEP:
             change *= _LARGEST_STEP / size
             size = _LARGEST_STEP
         trial = state.y + change
+        if lower is not None:
+            trial = np.maximum(trial, lower)
         residual = rows(trial[None, :])[0]
         objective = _square(residual)
         evaluations += 1
         # False for NaN too.
         if objective < state.objective * (1.0 + state.differences.rounding):
             eased = max(damping * 0.1, _SMALLEST_DAMPING)
-            jacobian = _jacobian(rows, trial, residual, state.differences)
+            slopes = _jacobian(rows, trial, residual, state.differences)
             evaluations += _evaluations(state.differences, f)
             ending = Ending.CONVERGED if size < _CONVERGED_STEP else None
             return (
-                State(trial, residual, jacobian, objective, eased, state.differences),
+                State(trial, residual, slopes, objective, eased, state.differences),
                 Info(objective, size, damping, True, evaluations, ending),
             )
         if size < _CONVERGED_STEP:
@@ -156,14 +167,20 @@ def polish(rows: Rows, state: State, info: Info) -> tuple[State, Info]:
     )
 
 
-def minimised(rows: Rows, start: FloatArray, steps: int, enough: float) -> Solution[State, Info]:
+def minimised(
+    rows: Rows,
+    start: FloatArray,
+    steps: int,
+    enough: float,
+    lower: FloatArray | None = None,
+) -> Solution[State, Info]:
     """The bottom below `start` (f,), reached when a step gains less than `enough`.
 
     Where no step helps any more, forward differences have reached their rounding: the bottom too.
     """
 
     def step(state: State) -> tuple[State, Info]:
-        following, info = descend(rows, state)
+        following, info = descend(rows, state, lower)
         if info.ending is Ending.STUCK or (
             info.ending is None and state.objective - following.objective < enough
         ):

@@ -206,8 +206,16 @@ class RoadResult(_message.Message):
     iso_class: str
     def __init__(self, x_m: _Optional[_Iterable[float]] = ..., front_m: _Optional[_Iterable[float]] = ..., rear_m: _Optional[_Iterable[float]] = ..., mean_m: _Optional[_Iterable[float]] = ..., std_m: _Optional[_Iterable[float]] = ..., iri_m_per_km: _Optional[float] = ..., iso_class: _Optional[str] = ...) -> None: ...
 
+class AtEnds(_message.Message):
+    __slots__ = ("start", "end")
+    START_FIELD_NUMBER: _ClassVar[int]
+    END_FIELD_NUMBER: _ClassVar[int]
+    start: float
+    end: float
+    def __init__(self, start: _Optional[float] = ..., end: _Optional[float] = ...) -> None: ...
+
 class Derived(_message.Message):
-    __slots__ = ("f1_hz", "max_deflection_m", "probability_below_90_percent_of_baseline")
+    __slots__ = ("f1_hz", "max_deflection_m", "probability_below_90_percent_of_baseline", "probability_sprung", "probability_giving", "springs_believed")
     class ProbabilityBelow90PercentOfBaselineEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -218,10 +226,16 @@ class Derived(_message.Message):
     F1_HZ_FIELD_NUMBER: _ClassVar[int]
     MAX_DEFLECTION_M_FIELD_NUMBER: _ClassVar[int]
     PROBABILITY_BELOW_90_PERCENT_OF_BASELINE_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_SPRUNG_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_GIVING_FIELD_NUMBER: _ClassVar[int]
+    SPRINGS_BELIEVED_FIELD_NUMBER: _ClassVar[int]
     f1_hz: Parameter
     max_deflection_m: Parameter
     probability_below_90_percent_of_baseline: _containers.ScalarMap[str, float]
-    def __init__(self, f1_hz: _Optional[_Union[Parameter, _Mapping]] = ..., max_deflection_m: _Optional[_Union[Parameter, _Mapping]] = ..., probability_below_90_percent_of_baseline: _Optional[_Mapping[str, float]] = ...) -> None: ...
+    probability_sprung: AtEnds
+    probability_giving: AtEnds
+    springs_believed: float
+    def __init__(self, f1_hz: _Optional[_Union[Parameter, _Mapping]] = ..., max_deflection_m: _Optional[_Union[Parameter, _Mapping]] = ..., probability_below_90_percent_of_baseline: _Optional[_Mapping[str, float]] = ..., probability_sprung: _Optional[_Union[AtEnds, _Mapping]] = ..., probability_giving: _Optional[_Union[AtEnds, _Mapping]] = ..., springs_believed: _Optional[float] = ...) -> None: ...
 
 class Estimate(_message.Message):
     __slots__ = ("schema_version", "program", "version", "created_ns", "site_hash", "settings_json", "seed", "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time_ns", "exit_time_ns", "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts", "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road")

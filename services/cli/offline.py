@@ -15,6 +15,7 @@ from services.cli.parsing import (
     add_site,
     command,
     number,
+    numbers,
     scenario,
 )
 
@@ -85,12 +86,69 @@ def add_simulate(commands: Any) -> None:
         metavar="HZ",
         help="sampling rate (default: the site's, or 1000)",
     )
+    _add_beyond(p.add_argument_group("beyond what a site file tells (default: nothing)"))
     add_output(p)
 
 
-def _simulate(options: argparse.Namespace) -> int:
-    from services.simulation.drive import simulate_command
+def _add_beyond(p: Any) -> None:
+    p.add_argument(
+        "--support-springs",
+        type=numbers("rotational stiffnesses in N·m/rad (START:END)", (0, 1e13), (0, 1e13)),
+        default=(0.0, 0.0),
+        metavar="START:END",
+        help="the ends turn against springs of so many N·m/rad",
+    )
+    p.add_argument(
+        "--bearing-stiffness",
+        type=numbers("vertical stiffnesses in N/m (START:END)", (1e7, 1e15), (1e7, 1e15)),
+        metavar="START:END",
+        help="the ends sink on bearings of so many N/m",
+    )
+    p.add_argument(
+        "--left",
+        type=numbers(
+            "a weight in N, a speed in m/s and seconds before (N:M_PER_S:S)",
+            (0, 1e7),
+            (0.5, 60),
+            (0, 1000),
+        ),
+        metavar="N:M_PER_S:S",
+        help="a lorry of this weight and speed left so long before the truck comes on",
+    )
+    p.add_argument(
+        "--friction",
+        type=number("a share of the springs' load", low=0, high=0.5),
+        default=0.0,
+        metavar="SHARE",
+        help="dry friction of the springs over their static load",
+    )
+    p.add_argument(
+        "--friction-growth",
+        type=number("a growth with the load", low=0, high=1),
+        default=0.0,
+        metavar="SHARE",
+        help="of the friction with the load: 1 is proportional",
+    )
+    p.add_argument(
+        "--bilinear",
+        type=number("a share", low=0, high=0.9),
+        default=0.0,
+        metavar="SHARE",
+        help="dampers act so much more in rebound, and less in compression",
+    )
+    p.add_argument(
+        "--air-springs",
+        type=number("a polytropic exponent", low=1, high=2),
+        default=0.0,
+        metavar="EXPONENT",
+        help="of the air in the springs: 1.38 is usual",
+    )
 
+
+def _simulate(options: argparse.Namespace) -> int:
+    from services.simulation.drive import Beyond, Left, simulate_command
+
+    stiffness = options.bearing_stiffness
     return simulate_command(
         site=options.site,
         scenario=options.scenario,
@@ -102,6 +160,15 @@ def _simulate(options: argparse.Namespace) -> int:
         direction=options.direction,
         gps_noise=options.gps_noise,
         rate=options.rate,
+        beyond=Beyond(
+            options.support_springs,
+            (1.0 / stiffness[0], 1.0 / stiffness[1]) if stiffness else (0.0, 0.0),
+            Left(*options.left) if options.left else None,
+            options.friction,
+            options.friction_growth,
+            options.bilinear,
+            options.air_springs,
+        ),
         output=options.output,
         force=options.force,
         console=a_console(),

@@ -187,6 +187,21 @@ def number(what: str, *, low: float, high: float) -> Callable[[str], float]:
     return parse
 
 
+def numbers(what: str, *limits: tuple[float, float]) -> Callable[[str], tuple[float, ...]]:
+    """As many numbers, with colons between, as there are limits."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        parts = text.split(":")
+        if len(parts) != len(limits):
+            raise argparse.ArgumentTypeError(f'is "{text}", it must be {what}')
+        return tuple(
+            number(what, low=low, high=high)(part)
+            for part, (low, high) in zip(parts, limits, strict=True)
+        )
+
+    return parse
+
+
 def names(text: str) -> tuple[str, ...]:
     """Parse names between commas."""
     return tuple(name.strip() for name in text.split(","))

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from schemas.settings import IdentificationSettings
 from schemas.site import load_site
 from services.cli.progress import progress_bar
 from services.cli.validate_paper import make_folder
@@ -22,6 +23,7 @@ from services.validation.uncertainty import (
     run_parts,
     scenario_rows,
 )
+from services.validation.worlds import HEADINGS, cells, lines_of, read_records, run_worlds
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,6 +34,9 @@ def validate_pre_command(
     crossings: int,
     control: int,
     scenarios: tuple[int, ...],
+    worlds: int,
+    effects: tuple[str, ...],
+    records: Path,
     folder: Path,
     site: Path | None,
     processes: int,
@@ -44,6 +49,9 @@ def validate_pre_command(
     for path in (json_path, page):
         if path is not None:
             check_writable(path)
+    if worlds:
+        read_records(records)
+        make_folder(records.parent)
     if figures is not None:
         make_folder(figures)
     known = default_site() if site is None else load_site(site)
@@ -58,6 +66,19 @@ def validate_pre_command(
             processes=processes,
             progress=lambda done, jobs: bar.update(task, completed=done, total=jobs),
         )
+        if worlds:
+            task = bar.add_task("crossings with more physics", total=None)
+            outcome = outcome._replace(
+                worlds=run_worlds(
+                    known,
+                    effects,
+                    worlds,
+                    records,
+                    IdentificationSettings(method="pre", threads=1),
+                    processes,
+                    lambda done, jobs: bar.update(task, completed=done, total=jobs),
+                )
+            )
     if json_path is not None:
         write_atomically(json_path, json.dumps(as_json(outcome), indent=1) + "\n")
     if figures is not None and len(outcome.drawn) > 1:
@@ -103,6 +124,12 @@ def print_outcome(console: "Console", outcome: Outcome, all_checks: list[Check])
         )
         for row in scenario_rows(outcome):
             shown.add_row(*row)
+        console.print(shown)
+    if outcome.worlds:
+        console.print("[bold]more physics than the method has[/]", highlight=False)
+        shown = table(*HEADINGS[:-1])
+        for world in lines_of(outcome.worlds):
+            shown.add_row(*(cell.replace(" %", "%") for cell in cells(world)[:-1]))
         console.print(shown)
     for line in outcome.judged:
         worst = largest_z(line)

@@ -2,7 +2,7 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from services.cli.parsing import (
     SCENARIOS,
@@ -12,6 +12,7 @@ from services.cli.parsing import (
     add_seed,
     add_site,
     command,
+    names,
     scenario,
     whole,
 )
@@ -21,6 +22,32 @@ def _scenarios(text: str) -> tuple[int, ...]:
     if text == "all":
         return tuple(SCENARIOS)
     return tuple(dict.fromkeys(scenario(part.strip()) for part in text.split(",")))
+
+
+EFFECTS: Final = (
+    "free",
+    "sprung",
+    "sinking",
+    "swing",
+    "tyres",
+    "friction",
+    "bilinear",
+    "air",
+    "spans",
+    "everything",
+)
+"""As in `simulation.worlds`, which is not imported for a line of help."""
+
+
+def _effects(text: str) -> tuple[str, ...]:
+    if text == "all":
+        return EFFECTS
+    for name in names(text):
+        if name not in EFFECTS:
+            raise argparse.ArgumentTypeError(
+                f'is "{text}", it must be all or some of {", ".join(EFFECTS)}'
+            )
+    return tuple(dict.fromkeys(names(text)))
 
 
 def add_validate(commands: Any) -> None:
@@ -66,6 +93,26 @@ def add_validate(commands: Any) -> None:
         help="of these again with half the noise declared (default: 20)",
     )
     p.add_argument(
+        "--worlds",
+        type=whole("a number of crossings", 0),
+        default=0,
+        help="with more physics than the method has, for each effect (default: 0)",
+    )
+    p.add_argument(
+        "--effects",
+        type=_effects,
+        default=EFFECTS,
+        metavar="all|swing,friction,…",
+        help=f"of {', '.join(EFFECTS)} (default: all)",
+    )
+    p.add_argument(
+        "--records",
+        type=Path,
+        default=Path("build/worlds.jsonl"),
+        metavar="FILE.jsonl",
+        help="what --worlds has run is kept here and not run again (default: build/worlds.jsonl)",
+    )
+    p.add_argument(
         "--truth",
         type=Path,
         default=Path("../shared/crossings"),
@@ -84,6 +131,9 @@ def _validate(options: argparse.Namespace) -> int:
             crossings=options.crossings,
             control=options.control,
             scenarios=options.scenarios,
+            worlds=options.worlds,
+            effects=options.effects,
+            records=options.records,
             folder=options.truth,
             site=options.site,
             processes=options.processes,

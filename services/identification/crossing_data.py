@@ -104,8 +104,6 @@ def caveats(data: CrossingData, motion: Motion) -> list[Reason]:
     changing = np.abs(motion.acceleration_m_per_s2).max() > _LARGEST_ACCELERATION_M_PER_S2
     if changing and data.vehicle.cg_height_m is None:
         reasons.append(Reason.ACCELERATING_CG_UNKNOWN)
-    if any(data.vehicle.tyre_damping_ns_per_m):
-        reasons.append(Reason.TYRE_DAMPING_IGNORED)
     stay = data.stay
     if longest_outage_s(data.fixes.time_s, stay.entry_s, stay.exit_s) > LONGEST_SURE_OUTAGE_S:
         reasons.append(Reason.POSITION_OUTAGE)
@@ -123,7 +121,8 @@ def longest_outage_s(times_s: Floats, entry_s: float, exit_s: float) -> float:
 
 def beam_of(data: CrossingData, theta: Floats) -> Beam:
     """The bridge that a vector of parameters (p,) describes."""
-    return beam_from(theta, np.array(data.bridge.lengths_m))
+    bridge = data.bridge
+    return beam_from(theta, np.array(bridge.lengths_m), bridge.interior_support_nodes)
 
 
 def gaussian(unit: str, mean: float, std: float) -> results.Parameter:

@@ -2,10 +2,11 @@
 
 If a method's intervals are true, then over many such crossings they cover the truth as often as
 they say (simulation-based calibration). So everything that the method calls unknown is drawn from
-what it is told of it: truck, rigidity of every element, mass per length, damping, support springs,
-wheelbase, gains and delays of the channels, the receiver's errors, and also the total mass and the
-gain common to all channels, which no residual shows. Nothing is cut off: what a prior allows may
-come. The rest is varied as drives vary: road, speed, direction, rates, noise density.
+what it is told of it: truck and tyres, rigidity of every element, mass per length, damping, support
+springs and how far bearings give (both may be absent), wheelbase, gains and delays of the channels,
+the receiver's errors, and also the total mass and the gain common to all channels, which no
+residual shows. Nothing is cut off: what a prior allows may come. The bridge rests before the
+crossing. The rest is varied as drives vary: road, speed, direction, rates, noise density.
 
 The truth is computed by the simulation of `services.simulation.drive` (ten finite elements in each
 element, 40 modes, steps of at most 0.1 ms), measured, put into messages and fed to the worker's
@@ -33,8 +34,9 @@ from services.execution.here import Here
 from services.identification.crossing_data import CrossingData
 from services.identification.engine import Engine
 from services.identification.identify import identify
+from services.identification.pre_method import absence
 from services.recordings.recording import program_version
-from services.simulation.drive import beam_of, declared, measured_run, paper_site
+from services.simulation.drive import Left, beam_of, declared, measured_run, paper_site
 
 Floats = NDArray[np.float64]
 
@@ -82,6 +84,8 @@ class Conditions(NamedTuple):
     rate_hz: float
     fix_rate_hz: float
     noise_ug_per_rthz: float
+    body_noise_ug_per_rthz: float | None = None
+    """Of the two sensors on the body, where they are of another kind than those of the axles."""
 
 
 class Channels(NamedTuple):
@@ -101,6 +105,8 @@ class Truth(NamedTuple):
     channels: Channels
     latency_s: float
     conditions: Conditions
+    left: Left | None = None
+    """What was on the bridge before."""
 
 
 class Drawn(NamedTuple):
@@ -168,15 +174,13 @@ def draw_truth(site: Site, seed: int) -> Truth:
     mass_per_length = log_normal(
         bridge.mass_per_length_kg_per_m, bridge.spread("mass_per_length_kg_per_m")
     )
-    scale = bridge.scale_at_zero("support_rotational_stiffness_nm_per_rad")
-    start, end = np.abs(scale * rng.standard_normal(2))
+    springs = np.abs(rng.standard_normal(2))
     beam = beam._replace(
         mass_per_length_kg_per_m=np.full(bridge.elements, mass_per_length),
         rayleigh_alpha_per_s=log_normal(
             bridge.rayleigh_alpha_per_s, bridge.spread("rayleigh_alpha_per_s")
         ),
         rayleigh_beta_s=log_normal(bridge.rayleigh_beta_s, bridge.spread("rayleigh_beta_s")),
-        support_rotational_stiffness_nm_per_rad=(float(start), float(end)),
     )
     channels = Channels(
         float(sensor.common_gain_spread * rng.standard_normal()),
@@ -186,7 +190,35 @@ def draw_truth(site: Site, seed: int) -> Truth:
     )
     receiver = site.receiver
     latency = receiver.latency_s + receiver.latency_spread_s * float(rng.standard_normal())
-    return Truth(car, beam, channels, latency, _draw_conditions(vehicle, rng))
+    conditions = _draw_conditions(vehicle, rng)
+    compliances = np.abs(rng.standard_normal(2))
+    of_axle = np.abs(rng.standard_normal(2))
+
+    def at_end(place: int, size: float) -> float:
+        row = unknowns.SCALARS[place]
+        is_absent = rng.uniform() < absence(bridge, row)
+        return 0.0 if is_absent else float(size * bridge.scale_at_zero(row.key))
+
+    beam = beam._replace(
+        support_rotational_stiffness_nm_per_rad=(
+            at_end(unknowns.K_ROT, springs[0]),
+            at_end(unknowns.K_ROT + 1, springs[1]),
+        ),
+        support_compliance_m_per_n=(
+            at_end(unknowns.F, compliances[0]),
+            at_end(unknowns.F + 1, compliances[1]),
+        ),
+    )
+    tyres = "tyre_damping_ns_per_m"
+    scale = vehicle.scale_at_zero(tyres)
+    front, rear = vehicle.tyre_damping_ns_per_m
+    car = car._replace(
+        tyre_damping_ns_per_m=(
+            log_normal(front, vehicle.spread(tyres)) if front else float(scale * of_axle[0]),
+            log_normal(rear, vehicle.spread(tyres)) if rear else float(scale * of_axle[1]),
+        )
+    )
+    return Truth(car, beam, channels, latency, conditions)
 
 
 def _draw_conditions(vehicle: Vehicle, rng: np.random.Generator) -> Conditions:
@@ -216,10 +248,13 @@ def drive(site: Site, truth: Truth, seed: int) -> Drawn:
     settling = round(_SETTLE_S * how.rate_hz) * every
     motion = _motion(truth, bridge, step_s, every)
     errors = truth.channels
+    axles = how.noise_ug_per_rthz
+    body = axles if how.body_noise_ug_per_rthz is None else how.body_noise_ug_per_rthz
+    densities = (body, body, axles, axles)
     sensors = [
         Accelerometer(
             how.rate_hz,
-            noise_density_ug_per_rthz=how.noise_ug_per_rthz,
+            noise_density_ug_per_rthz=densities[c],
             bias_m_per_s2=float(errors.bias_m_per_s2[c]),
             gain_error=float((1.0 + errors.common_gain) * (1.0 + errors.gain[c]) - 1.0),
             delay_s=float(errors.delay_s[c]),
@@ -246,11 +281,12 @@ def drive(site: Site, truth: Truth, seed: int) -> Drawn:
         receiver,
         np.random.default_rng(np.random.SeedSequence([seed, 0x6E])),
         antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
+        left=truth.left,
     )
     return Drawn(
         truth,
         run,
-        declared(site, how.noise_ug_per_rthz, how.rate_hz),
+        declared(site, densities, how.rate_hz),
         motion,
         float(run.accel_time_s[0]) - settling * step_s,
         step_s,

@@ -1,7 +1,7 @@
 """Simulated crossings: the truth of a site file or of the paper's scenarios, driven and measured.
 
-The truth is computed on a mesh ten times finer than the elements, with 40 modes and steps of at
-most 0.1 ms, so that no identification shares its discretisation.
+The truth is computed on a mesh ten times finer than the elements, with 40 modes for each span and
+steps of at most 0.1 ms, so that no identification shares its discretisation.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.paper import experiment
-from pre_core.physics.bridge import Beam, refine, uniform_beam
+from pre_core.physics.bridge import (
+    Beam,
+    held_nodes,
+    modes,
+    node_dofs,
+    refine,
+    uniform_beam,
+)
+from pre_core.physics.passing import state_after
 from pre_core.physics.road import Profile, contact_patch_average, iso_8608_profile, under_wheels
 from pre_core.physics.sensors import (
     Accelerometer,
@@ -21,8 +29,14 @@ from pre_core.physics.sensors import (
     measure_acceleration,
     measure_position,
 )
-from pre_core.physics.simulate import Motion, Simulation, constant_acceleration, simulate
-from pre_core.physics.vehicle import HalfCar
+from pre_core.physics.simulate import (
+    STANDARD_GRAVITY_M_PER_S2,
+    Motion,
+    Simulation,
+    constant_acceleration,
+    simulate,
+)
+from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle, load_site, parse_site, site_toml
 from services.common.errors import FailureError, InputError
@@ -40,6 +54,7 @@ START_TIME_S = 1_767_225_600.0
 """2026-01-01 00:00 UTC: simulated drives begin then, so that the same call gives the same file."""
 _PARTS = 10
 _MODES = 40
+"""For each span."""
 _LONGEST_STEP_S = 1e-4
 _SETTLE_S = 3.0
 """The truck drives this long before its recording begins: it starts at rest on a rough road."""
@@ -50,6 +65,32 @@ _FIX_RATE_HZ = 10.0
 _SLOW_ERROR_S = 300.0
 """A receiver's slow error is forgotten within minutes: a crossing sees it as almost constant."""
 _ALTITUDE_M = 25.0
+
+
+class Left(NamedTuple):
+    """A lorry that has left the bridge, as a constant force."""
+
+    weight_n: float
+    speed_m_per_s: float
+    """Negative from the bridge's end to its start."""
+    seconds: float
+    """Between its leaving and the first wheel's coming on."""
+
+
+class Beyond(NamedTuple):
+    """What truck and bridge have that a site file does not tell."""
+
+    support_rotational_stiffness_nm_per_rad: tuple[float, float] = (0.0, 0.0)
+    support_compliance_m_per_n: tuple[float, float] = (0.0, 0.0)
+    left: Left | None = None
+    friction_share: float = 0.0
+    """Dry friction of the springs over the static load that they carry."""
+    friction_load_growth: float = 0.0
+    bilinear_damping: float = 0.0
+    air_spring_exponent: float = 0.0
+
+
+NOTHING = Beyond()
 
 
 class Drive(NamedTuple):
@@ -80,6 +121,7 @@ def simulate_command(
     direction: str,
     gps_noise: bool,
     rate: float | None,
+    beyond: Beyond = NOTHING,
     output: Path,
     force: bool = False,
     console: "Console",
@@ -99,6 +141,7 @@ def simulate_command(
             forward=direction == "start_to_end",
             receiver_errors=gps_noise,
             rate_hz=rate,
+            beyond=beyond,
         )
         messages = write_drive(
             output, drive, declared(known, noise, drive.run.rate_hz), force=force
@@ -108,11 +151,14 @@ def simulate_command(
     return 0
 
 
-def declared(site: Site, noise_ug_per_rthz: float, rate_hz: float) -> Site:
+def declared(
+    site: Site, noise_ug_per_rthz: float | tuple[float, float, float, float], rate_hz: float
+) -> Site:
     """The site as the owner of this simulated truck would declare it: its own sensors' noise."""
+    alike = isinstance(noise_ug_per_rthz, float | int)
     sensor = site.sensor.model_copy(
         update={
-            "noise_density_ug_per_rthz": (noise_ug_per_rthz,) * 4,
+            "noise_density_ug_per_rthz": (noise_ug_per_rthz,) * 4 if alike else noise_ug_per_rthz,
             "rate_hz": (rate_hz,) * 4,
         }
     )
@@ -140,6 +186,7 @@ def simulate_drive(
     forward: bool = True,
     receiver_errors: bool = False,
     rate_hz: float | None = None,
+    beyond: Beyond = NOTHING,
 ) -> Drive:
     """Drive the site's first truck over its first bridge.
 
@@ -147,7 +194,7 @@ def simulate_drive(
     end. FailureError if the coupled simulation does not settle.
     """
     vehicle, bridge = site.vehicles[0], site.bridges[0]
-    car, beam = truck_of(vehicle), beam_of(bridge, rigidity_ratios)
+    car, beam = with_beyond(truck_of(vehicle), beam_of(bridge, rigidity_ratios), beyond)
     rate = rate_hz or max(site.sensor.rate_hz)
     every = max(1, round(1.0 / (rate * _LONGEST_STEP_S)))
     step_s = 1.0 / (rate * every)
@@ -177,6 +224,7 @@ def simulate_drive(
         _receiver(site, perfect=not receiver_errors),
         np.random.default_rng(seed),
         antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
+        left=beyond.left,
     )[:2]
     return Drive(run, road, np.asarray(rigidity_ratios, dtype=np.float64))
 
@@ -194,12 +242,14 @@ def measured_run(
     rng: np.random.Generator,
     *,
     antenna_to_front_axle_m: float = 0.0,
+    left: Left | None = None,
 ) -> tuple[Run, Profile, Simulation]:
     """Drive `car` over `beam` along `motion` and measure it with one sensor per channel.
 
     `road` is an ISO 8608 class and the seed of its phases. The recording begins after
-    `settling_steps`; the sensors are of one rate, of which the steps are a whole fraction. Returns
-    the recording, the road as the tyres felt it and all that truck and bridge did. FailureError if
+    `settling_steps`; the sensors are of one rate, of which the steps are a whole fraction. If
+    something has `left` the bridge before, it swings when the first wheel comes on. Returns the
+    recording, the road as the tyres felt it and all that truck and bridge did. FailureError if
     the coupled simulation does not settle.
     """
     sign = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
@@ -208,7 +258,10 @@ def measured_run(
     raw = iso_8608_profile(np.floor(low), np.ceil(high), _ROAD_SPACING_M, *road)
     profile = contact_patch_average(raw, _CONTACT_PATCH_M)
     felt = under_wheels(profile, motion, car.wheelbase_m, sign)
-    fine = simulate(car, refine(beam, _PARTS), motion, felt, step_s, modes=_modes(bridge))
+    mesh = refine(beam, _PARTS)
+    count = min(_MODES * (1 + len(mesh.interior_supports)), _freedoms(mesh))
+    swing = None if left is None else state_after(mesh, modes(mesh, count), *left)
+    fine = simulate(car, mesh, motion, felt, step_s, modes=count, swing=swing)
     if not fine.converged:
         raise FailureError("the simulation did not converge: are the site's values possible?")
     recorded = fine.acceleration_m_per_s2[settling_steps:]
@@ -249,7 +302,28 @@ def beam_of(bridge: Bridge, rigidity_ratios: Floats) -> Beam:
         bridge.mass_per_length_kg_per_m,
         bridge.rayleigh_alpha_per_s,
         bridge.rayleigh_beta_s,
-    )._replace(element_lengths_m=np.array(bridge.lengths_m))
+    )._replace(
+        element_lengths_m=np.array(bridge.lengths_m),
+        interior_supports=bridge.interior_support_nodes,
+    )
+
+
+def with_beyond(car: HalfCar, beam: Beam, beyond: Beyond) -> tuple[HalfCar, Beam]:
+    """The same truck and bridge with what no site file tells of them."""
+    loads = static_axle_loads_n(car, STANDARD_GRAVITY_M_PER_S2)
+    friction = [
+        beyond.friction_share * (load - STANDARD_GRAVITY_M_PER_S2 * unsprung)
+        for load, unsprung in zip(loads, car.unsprung_mass_kg, strict=True)
+    ]
+    return car._replace(
+        dry_friction_n=(friction[0], friction[1]),
+        friction_load_growth=beyond.friction_load_growth,
+        bilinear_damping=beyond.bilinear_damping,
+        air_spring_exponent=beyond.air_spring_exponent,
+    ), beam._replace(
+        support_rotational_stiffness_nm_per_rad=beyond.support_rotational_stiffness_nm_per_rad,
+        support_compliance_m_per_n=beyond.support_compliance_m_per_n,
+    )
 
 
 def ratios_of(bridge: Bridge, scenario: int | None, ei: Sequence[float] | None) -> Floats:
@@ -268,8 +342,8 @@ def ratios_of(bridge: Bridge, scenario: int | None, ei: Sequence[float] | None) 
     return ratios
 
 
-def _modes(bridge: Bridge) -> int:
-    return min(_MODES, 2 * bridge.elements * _PARTS)
+def _freedoms(beam: Beam) -> int:
+    return int(node_dofs(beam.element_lengths_m.size, held_nodes(beam)).max()) + 1
 
 
 def _receiver(site: Site, *, perfect: bool) -> Receiver:

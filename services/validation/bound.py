@@ -96,8 +96,11 @@ def _settled(problem: posterior.Problem, y: Floats) -> tuple[posterior.Problem, 
     """
     where = posterior.layout(problem)
     y[where.offset] = _best_offset(problem, y)
+    nuisances = np.arange(where.gains.start, where.size)
+    # What springs leave over is read off the rows: first without what the nuisances put there.
+    y = settle(problem, y, nuisances)
     problem = optimum.with_noise_at(problem, y)
-    return problem, settle(problem, y, np.arange(where.gains.start, where.size))
+    return problem, settle(problem, y, nuisances)
 
 
 def as_json(bound: Bound) -> dict[str, dict[str, float]]:

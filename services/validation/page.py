@@ -1,8 +1,9 @@
 """The page docs/validation.md, from what a validation of method `pre` measured."""
 
+from collections.abc import Sequence
 from typing import Any
 
-from services.validation.calibration import SMALLEST_P, Check, by_condition
+from services.validation.calibration import SMALLEST_P, Check, Record, by_condition
 from services.validation.uncertainty import (
     JUDGED,
     Outcome,
@@ -16,6 +17,7 @@ from services.validation.uncertainty import (
     scenario_rows,
     summary,
 )
+from services.validation.worlds import HEADINGS, cells, lines_of
 
 _HEAD = """# Validation of method `pre`
 
@@ -37,7 +39,8 @@ _DRAWN = """
 {crossings} crossings, seeds 0 to {last}. For each, everything that the method calls unknown is
 drawn from what its site file says of it: the truck (log-normal, 15 %), EI of every element
 (log-normal, 0.55 of ln EI), mass per length (10 %), Rayleigh damping (50 %), support springs
-(half-normal), wheelbase (0.2 %), gains (1 %) and delays (0.5 ms) of the channels, the total mass
+and how far bearings give (half-normal, or absent as likely as not), tyre damping (half-normal),
+wheelbase (0.2 %), gains (1 %) and delays (0.5 ms) of the channels, the total mass
 (1 %) and the gain common to all channels (1 %), the receiver's slow error (1.5 m), noise and
 latency (0.1 s), the height of the centre of gravity (15 %). No draw is cut off or thrown away.
 Biases of the sensors are 0.03 m/s², roads of ISO class A or B; 5 to 25 m/s in both directions,
@@ -101,6 +104,24 @@ beside it.
 {verdicts}
 """
 
+_WORLDS = """
+## More physics than the method has
+
+Crossings whose truck and bridge are drawn as above, but on free and rigid bearings and undamped
+tyres; then with one effect, or with all. What is drawn from which range is written in
+`services/simulation/worlds.py`; no range is a prior of the method. Answered is what is not
+rejected; covered is the share of the 95 % intervals of EI that hold the truth, of all that were
+answered and of those that are `good`; z is the error over the standard deviation: its mean over all
+elements and that of the worst element, its root mean square (rms), and its largest size where the
+verdict is `good` (max); std is the median relative standard deviation of EI.
+
+| {headings} |
+| --- |{rules}
+{rows}
+
+{reasons}
+"""
+
 _JUDGED = """
 ## Crossings of an independent simulator
 
@@ -128,8 +149,25 @@ def validation_page(outcome: Outcome, image: str = "images/calibration.png") -> 
         text += _control(outcome)
     if outcome.scenarios:
         text += _scenarios(outcome)
+    if outcome.worlds:
+        text += _worlds(outcome.worlds)
     text += _judged(outcome) if outcome.judged else _NOT_JUDGED
     return text
+
+
+def _worlds(records: Sequence[Record]) -> str:
+    lines = lines_of(records)
+    of_effect = {
+        line.effect: [record for record in records if record["effect"] == line.effect]
+        for line in lines
+    }
+    reasons = [f"{effect}: {', '.join(reasons_of(of))}" for effect, of in of_effect.items()]
+    return _WORLDS.format(
+        headings=" | ".join(HEADINGS),
+        rules=" --: |" * (len(HEADINGS) - 1),
+        rows="\n".join(f"| {' | '.join(cells(line))} |" for line in lines),
+        reasons="Verdicts and reasons: " + "; ".join(reasons) + ".",
+    )
 
 
 def _aims(checks: list[Check]) -> str:

@@ -150,6 +150,11 @@ def models(site: Path | None) -> tuple[HalfCar, Beam]:
             f"{site}: bridge {bridge.id} has {bridge.elements} elements, the paper's scenarios are "
             f"of {experiment.ELEMENTS}"
         )
+    if bridge.interior_supports_m:
+        raise InputError(
+            f"{site}: bridge {bridge.id} has interior_supports_m, the paper's methods are for a "
+            "single span"
+        )
     return truck_of(known.vehicles[0]), beam_of(bridge, np.ones(bridge.elements))
 
 

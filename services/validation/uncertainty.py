@@ -1,9 +1,10 @@
 """Is the uncertainty of method `pre` true?
 
-Four parts. Crossings drawn from the priors of a site, with the statistics of `calibration`
+Five parts. Crossings drawn from the priors of a site, with the statistics of `calibration`
 and aims that must be met. The same with noise declared half of what it is: a check that cannot fail
 shows nothing. The paper's twelve scenarios with real sensors. Crossings of an independent
-simulator, where the folder with them is there.
+simulator, where the folder with them is there. Crossings with more physics than the method has
+(`worlds`).
 """
 
 import json
@@ -37,6 +38,7 @@ from services.validation.calibration import (
     scores,
 )
 from services.validation.paper import of_paper
+from services.validation.worlds import world_checks
 
 SCENARIO_NOISE_UG = (25.0, 100.0)
 _SCENARIO_SEED = 1
@@ -74,6 +76,7 @@ class Outcome(NamedTuple):
     judged: list[Record]
     judged_from: Path | None
     """None: the folder with the crossings of an independent simulator was not there."""
+    worlds: Sequence[Record] = ()
 
 
 def run_parts(
@@ -226,7 +229,7 @@ def aims(outcome: Outcome) -> list[Check]:
     found += scenario_checks(outcome.scenarios)
     for line in outcome.judged:
         found += judged_checks(line)
-    return found
+    return found + world_checks(outcome.worlds)
 
 
 def control_checks(records: list[Record]) -> list[Check]:
@@ -345,6 +348,7 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
         "control": outcome.control,
         "scenarios": outcome.scenarios,
         "judged": outcome.judged,
+        "worlds": list(outcome.worlds),
     }
 
 

@@ -60,6 +60,7 @@ class CrossingView(NamedTuple):
     interval_nm2: FloatArray | None  # (n, 2): 2.5 % and 97.5 % points
     road: RoadView | None
     parameters: tuple[ParameterRow, ...]
+    interior_supports_m: tuple[float, ...] = ()
 
     @property
     def span_m(self) -> float:
@@ -117,4 +118,5 @@ def view_of_crossing(crossing: Crossing, bridge: Bridge) -> CrossingView:
             ParameterRow(name, value.unit, value.mean, value.q025, value.q975)
             for name, value in (parameters or {}).items()
         ),
+        interior_supports_m=bridge.interior_supports_m,
     )

@@ -120,7 +120,7 @@ def draw_crossing(
 
     for axes in (rigidity, profile, difference):
         _quieten(axes)
-        _mark_bridge(axes, crossing.span_m)
+        _mark_bridge(axes, (0.0, *crossing.interior_supports_m, crossing.span_m))
     for axes in (rigidity, profile):
         axes.tick_params(labelbottom=False)
     rigidity.set_xlim(*_chainage_limits(crossing))
@@ -295,13 +295,13 @@ def _unit_of_length(largest_m: float) -> tuple[str, float]:
     return ("µm", 1e6) if largest_m >= 1e-7 else ("nm", 1e9)
 
 
-def _mark_bridge(axes: Axes, span_m: float) -> None:
-    """Shade the bridge and set a bearing below each of its ends."""
-    axes.axvspan(0.0, span_m, color="#f4f7f9", zorder=0, linewidth=0)
-    for end in (0.0, span_m):
-        axes.axvline(end, color=MUTED, linewidth=0.8, zorder=1)
+def _mark_bridge(axes: Axes, supports_m: tuple[float, ...]) -> None:
+    """Shade the bridge and set a bearing below each of its supports."""
+    axes.axvspan(supports_m[0], supports_m[-1], color="#f4f7f9", zorder=0, linewidth=0)
+    for support in supports_m:
+        axes.axvline(support, color=MUTED, linewidth=0.8, zorder=1)
         axes.plot(
-            end,
+            support,
             0.0,
             marker=6,
             markersize=7,

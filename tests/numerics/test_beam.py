@@ -120,6 +120,42 @@ def test_stiff_springs_clamp_the_beam(agree: Agree) -> None:
         agree(f"clamped beam: f_{i + 1}, Hz", known, float(ours[i]), 1e-5)
 
 
+def test_a_stiff_beam_bounces_and_pitches_on_bearings_that_give(agree: Agree) -> None:
+    """Two equal springs k: omega^2 = 2 k/m, and 6 k/m about the middle (inertia m L^2/12)."""
+    compliance = 1e-6
+    beam = uniform_beam(SPAN, [1e4 * EI] * 7, RHO, 0.0, 0.0)
+    ours = natural_frequencies_hz(
+        beam._replace(support_compliance_m_per_n=(compliance, compliance)), 2
+    )
+    for i, (name, springs) in enumerate((("bounces", 2.0), ("pitches", 6.0))):
+        known = np.sqrt(springs / compliance / (RHO * SPAN)) / (2.0 * np.pi)
+        agree(f"stiff beam on two springs {name}, Hz", float(known), float(ours[i]), 1e-5)
+
+
+def test_bearings_that_give_sink_by_their_reaction() -> None:
+    """Static: w(0) = f P (L - a)/L, and at the load the rigid beam's deflection on top."""
+    beam = uniform_beam(SPAN, [EI] * 6, RHO, 0.0, 0.0)
+    soft = beam._replace(support_compliance_m_per_n=(1e-9, 3e-9))
+    a, load = 10.0, np.array([-1e5])
+    x = np.array([0.0, a, SPAN])
+    sunk = static_deflection_m(soft, np.array([a]), load, x)
+    ends = load[0] * np.array([1e-9 * (SPAN - a) / SPAN, 3e-9 * a / SPAN])
+    between = ends[0] + (ends[1] - ends[0]) * a / SPAN
+    rigid = static_deflection_m(beam, np.array([a]), load, x)[1]
+    np.testing.assert_allclose(sunk, [ends[0], rigid + between, ends[1]], rtol=1e-7)
+
+
+def test_two_equal_spans(agree: Agree) -> None:
+    """Odd modes are those of one span on two bearings, even ones of a span clamped at the middle:
+    tan(bl) = tanh(bl)."""
+    beam = uniform_beam(SPAN, [EI] * 80, RHO, 0.0, 0.0)._replace(interior_supports=(40,))
+    ours = natural_frequencies_hz(beam, 4)
+    half = 0.5 * SPAN
+    for i, bl in enumerate((np.pi, 3.926602312047919, 2.0 * np.pi, 7.068582745628732)):
+        known = (bl / half) ** 2 * np.sqrt(EI / RHO) / (2.0 * np.pi)
+        agree(f"two equal spans: f_{i + 1}, Hz", float(known), float(ours[i]), 1e-5)
+
+
 @pytest.mark.parametrize("springs", [0.0, 2.0])
 @pytest.mark.parametrize("mode", [1, 2, 3])
 def test_eigenvalues_converge_with_the_fourth_power_of_the_mesh(

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.integrate import quad
+from scipy.integrate import dblquad, quad
 from scipy.special import digamma, gammaln, polygamma
-from scipy.stats import loggamma, truncnorm
+from scipy.stats import loggamma, multivariate_normal, truncnorm
 
 from pre_core.search import crank_nicolson
 from pre_core.search.loop import Ending
@@ -21,9 +21,15 @@ DEVIATIONS = 4.5
 
 def straight(
     centre: FloatArray, matrix: FloatArray, positive: NDArray[np.int64], seed: int
-) -> crank_nicolson.Approximation:
+) -> crank_nicolson.Mixture:
     """Without any bent coordinate."""
-    return crank_nicolson.approximation(centre, matrix, positive, np.zeros(centre.size), seed)
+    return crank_nicolson.mixture(centre, matrix, positive, np.zeros(centre.size), seed)
+
+
+def changed(mixed: crank_nicolson.Mixture, **fields: FloatArray) -> crank_nicolson.Mixture:
+    """The same with other fields in its only part."""
+    (part,) = mixed.parts
+    return mixed._replace(parts=(part._replace(**fields),))
 
 
 class Run(NamedTuple):
@@ -34,7 +40,7 @@ class Run(NamedTuple):
 
 def run(
     target: crank_nicolson.LogDensity,
-    normal: crank_nicolson.Approximation,
+    normal: crank_nicolson.Mixture,
     *,
     steps: int = STEPS,
     adapt: int = 0,
@@ -46,7 +52,7 @@ def run(
             state, _ = crank_nicolson.step(target, normal, state)
             seen.append(state.v)
         better = crank_nicolson.adapted(normal, np.stack(seen[adapt // 3 :]))
-        assert np.any(better.shift != 0.0) or np.any(better.scale != 1.0)
+        assert np.any(better.parts[0].shift != 0.0) or np.any(better.parts[0].scale != 1.0)
         state = crank_nicolson.moved(target, normal, better, state)
         normal = better
     draws, acceptance = [], []
@@ -157,6 +163,77 @@ def test_quadrature_of_the_cut_normal_against_one_dimension() -> None:
         assert variance[i] == pytest.approx(known.var(), rel=1e-3)
 
 
+# Coordinates that may be nothing
+
+
+def shares_of_parts(
+    centre: FloatArray, matrix: FloatArray, odds: FloatArray
+) -> dict[tuple[bool, bool], float]:
+    """How likely each of the first two coordinates, positive, is zero: by quadrature.
+
+    The third is integrated over: of a normal the first two are normal by themselves.
+    """
+    density = multivariate_normal(centre[:2], matrix[:2, :2]).pdf
+    top = np.maximum(centre[:2], 0.0) + 9.0 * np.sqrt(np.diag(matrix)[:2])
+    both, _ = dblquad(lambda b, a: density([a, b]), 0.0, top[0], 0.0, top[1], epsabs=1e-8)
+    weights = {
+        (False, False): both,
+        (True, False): odds[0] * quad(lambda b: density([0.0, b]), 0.0, top[1])[0],
+        (False, True): odds[1] * quad(lambda a: density([a, 0.0]), 0.0, top[0])[0],
+        (True, True): odds[0] * odds[1] * density([0.0, 0.0]),
+    }
+    total = sum(weights.values())
+    return {which: weight / total for which, weight in weights.items()}
+
+
+@pytest.mark.parametrize("stretch", [1.0, 1.3])
+def test_how_often_a_coordinate_is_nothing(stretch: float) -> None:
+    """Both of two correlated ones, one of them, or none; with a right and a poor approximation."""
+    matrix = some_covariance(3)
+    centre, odds = np.array([0.6, -0.2, 0.4]), np.array([0.8, 2.0])
+    mixed = crank_nicolson.mixture(
+        centre + 0.2 * (stretch - 1.0),
+        stretch * matrix,
+        np.array([0, 1]),
+        np.zeros(3),
+        11,
+        np.array([*np.log(odds), -np.inf]),
+    )
+    assert len(mixed.parts) == 4
+    done = run(gaussian(centre, matrix), mixed, steps=4000)
+    assert done.draws[:, :, :2].min() == 0.0
+    for which, expected in shares_of_parts(centre, matrix, odds).items():
+        assert 0.03 < expected < 0.7
+        there = np.all((done.draws[:, :, :2] == 0.0) == np.array(which), axis=2)[:, :, None]
+        there = there.astype(np.float64)
+        n = crank_nicolson.effective_sample_size(there)[0]
+        error = np.sqrt(expected * (1.0 - expected) / n)
+        assert abs(there.mean() - expected) < DEVIATIONS * error, (which, expected)
+        assert abs(there.mean() - 1.5 * expected) > DEVIATIONS * error  # it would be noticed
+
+
+def test_what_is_always_nothing_and_what_never_is() -> None:
+    matrix = some_covariance(3)
+    centre = np.array([0.6, -0.2, 0.4])
+    mixed = crank_nicolson.mixture(
+        centre, matrix, np.array([0, 1]), np.zeros(3), 3, np.array([np.inf, -np.inf, -np.inf])
+    )
+    assert len(mixed.parts) == 1
+    draws = run(gaussian(centre, matrix), mixed).draws
+    assert not draws[:, :, 0].any()
+    assert draws[:, :, 1].min() > 0.0
+    # Given that the first is zero the other two are normal, the second cut off at zero.
+    slope = matrix[1:, 0] / matrix[0, 0]
+    rest = matrix[1:, 1:] - np.outer(slope, matrix[0, 1:])
+    mean = centre[1:] - slope * centre[0]
+    scale = np.sqrt(rest[0, 0])
+    known = truncnorm(-mean[0] / scale, np.inf, loc=mean[0], scale=scale)
+    onto = rest[1, 0] / rest[0, 0]
+    expected = np.array([known.mean(), mean[1] + onto * (known.mean() - mean[0])])
+    spread = np.array([known.var(), rest[1, 1] + onto**2 * (known.var() - rest[0, 0])])
+    assert np.abs(misses(draws[:, :, 1:], expected, spread)).max() < DEVIATIONS
+
+
 SHAPE = 2.5
 
 
@@ -165,11 +242,11 @@ def log_gamma_times_normal(y: FloatArray) -> FloatArray:
     return np.asarray(SHAPE * y[:, 0] - np.exp(y[:, 0]) - 0.5 * (y[:, 1] - 0.5 * y[:, 0]) ** 2)
 
 
-def skewed_approximation(seed: int = 9, bend: float = 0.0) -> crank_nicolson.Approximation:
+def skewed_approximation(seed: int = 9, bend: float = 0.0) -> crank_nicolson.Mixture:
     """The curvature at the optimum log(shape), as method `pre` would take it."""
     mode = np.log(SHAPE)
     precision = np.array([[SHAPE + 0.25, -0.5], [-0.5, 1.0]])
-    return crank_nicolson.approximation(
+    return crank_nicolson.mixture(
         np.array([mode, 0.5 * mode]), np.linalg.inv(precision), NONE, np.array([bend, 0.0]), seed
     )
 
@@ -186,7 +263,7 @@ def test_the_bent_approximation_itself_is_always_accepted(bend: float) -> None:
         w = np.stack([-np.expm1(slope) / bend, w[:, 1]], axis=1)
         return np.asarray(-0.5 * np.einsum("ki,ij,kj->k", w, precision, w) + slope)
 
-    normal = crank_nicolson.approximation(centre, matrix, NONE, np.array([bend, 0.0]), 6)
+    normal = crank_nicolson.mixture(centre, matrix, NONE, np.array([bend, 0.0]), 6)
     assert run(target, normal, steps=200).acceptance == 1.0
     assert run(target, straight(centre, matrix, NONE, 6), steps=200).acceptance < 0.98
 
@@ -194,7 +271,7 @@ def test_the_bent_approximation_itself_is_always_accepted(bend: float) -> None:
 def test_what_lies_beyond_the_bend_is_impossible() -> None:
     """A bent coordinate ends at w = 1/b: nothing there is accepted, and the rest stays exact."""
     normal = skewed_approximation(bend=0.9)
-    normal = normal._replace(factor=3.0 * normal.factor)
+    normal = changed(normal, factor=3.0 * normal.parts[0].factor)
     done = run(log_gamma_times_normal, normal, steps=4000)
     assert np.all(np.isfinite(done.draws))
     assert abs(done.draws[:, :, 0].mean() - digamma(SHAPE)) < 0.1
@@ -207,7 +284,7 @@ def test_a_target_that_leans_to_one_side(adapt: int, bend: float) -> None:
     variance = np.array([polygamma(1, SHAPE), 1.0 + 0.25 * polygamma(1, SHAPE)])
     normal = skewed_approximation(bend=bend)
     if adapt:
-        normal = normal._replace(centre=normal.centre + np.array([0.5, -0.6]))
+        normal = changed(normal, centre=normal.parts[0].centre + np.array([0.5, -0.6]))
     done = run(log_gamma_times_normal, normal, steps=6000, adapt=adapt)
     assert np.abs(misses(done.draws, mean, variance)).max() < DEVIATIONS
     for probability in (0.025, 0.25, 0.5, 0.975):
@@ -237,9 +314,10 @@ def test_a_target_moved_by_a_third_of_its_spread_is_caught(dimension: int) -> No
 def test_wrong_weights_would_be_caught() -> None:
     """Negative control: chains that take every proposal give the approximation, not the target."""
 
-    def flat(normal: crank_nicolson.Approximation) -> crank_nicolson.LogDensity:
+    def flat(normal: crank_nicolson.Mixture) -> crank_nicolson.LogDensity:
         # The approximation's own density as target: everything is accepted.
-        return gaussian(normal.centre, normal.factor @ normal.factor.T)
+        (part,) = normal.parts
+        return gaussian(part.centre, part.factor @ part.factor.T)
 
     normal = skewed_approximation()
     mean = np.array([digamma(SHAPE), 0.5 * digamma(SHAPE)])
@@ -263,14 +341,14 @@ def test_adapting_never_changes_a_point() -> None:
     done = run(target, normal, steps=50)
     v = np.random.default_rng(0).normal(0.6, 1.4, (100, crank_nicolson.CHAINS, 2))
     better = crank_nicolson.adapted(normal, v)
-    assert better.shift == pytest.approx(np.full(2, 0.6), abs=0.3)
-    assert better.scale == pytest.approx(np.full(2, 1.4), abs=0.2)
+    part = better.parts[0]
+    assert part.shift == pytest.approx(np.full(2, 0.6), abs=0.3)
+    assert part.scale == pytest.approx(np.full(2, 1.4), abs=0.2)
     after = crank_nicolson.moved(target, normal, better, done.state)
     np.testing.assert_allclose(after.y, done.state.y, rtol=1e-12)
     # Weights are target over approximation: from the densities of both normals, written out.
-    factor = normal.factor
-    w = np.linalg.solve(factor, (after.y[:, normal.order] - normal.centre[normal.order]).T).T
-    z = (w - better.shift) / better.scale
+    w = np.linalg.solve(part.factor, (after.y[:, part.order] - part.centre[part.order]).T).T
+    z = (w - part.shift) / part.scale
     expected = target(after.y) + 0.5 * np.sum(z**2, axis=1)
     difference = after.log_weight - expected
     np.testing.assert_allclose(difference, difference[0], atol=1e-9)
@@ -280,8 +358,8 @@ def test_little_that_stands_out_is_not_learnt() -> None:
     normal = skewed_approximation()
     v = np.random.default_rng(0).standard_normal((200, crank_nicolson.CHAINS, 2))
     same = crank_nicolson.adapted(normal, v)
-    assert not same.shift.any()
-    np.testing.assert_array_equal(same.scale, 1.0)
+    assert not same.parts[0].shift.any()
+    np.testing.assert_array_equal(same.parts[0].scale, 1.0)
 
 
 def test_same_seed_same_draws() -> None:
@@ -298,7 +376,7 @@ def test_a_run_stopped_and_resumed_is_the_same() -> None:
     for _ in range(30):
         state, _ = crank_nicolson.step(log_gamma_times_normal, normal, state)
     resumed = crank_nicolson.State(
-        state.v.copy(), state.y.copy(), state.log_weight.copy(), state.steps
+        state.v.copy(), state.y.copy(), state.part.copy(), state.log_weight.copy(), state.steps
     )
     for _ in range(5):
         state, _ = crank_nicolson.step(log_gamma_times_normal, normal, state)

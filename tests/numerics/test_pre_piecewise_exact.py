@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from pre_core.crossing.residuals import (
+    SWING_MODES,
     Crossing,
     Points,
     roads_and_deflections,
     sinc_table,
+    step_table,
     workspace,
 )
 from pre_core.crossing.whitening import row_filter
@@ -151,6 +153,8 @@ def silent_crossing(beam: Beam, offset_m: float) -> tuple[FloatArray, FloatArray
         0,
         n,
         sinc_table(),
+        step_table(),
+        0,
     )
     theta = theta_of(beam)
     at = Points(
@@ -162,6 +166,7 @@ def silent_crossing(beam: Beam, offset_m: float) -> tuple[FloatArray, FloatArray
         np.ones(1),
         np.zeros((1, 4)),
         np.zeros((1, 4, 3)),
+        np.zeros((1, 2 * SWING_MODES)),
     )
     work = workspace(crossing, theta.size, row_filter(STEP_S))
     return roads_and_deflections(crossing, work, at, 0)[1], front

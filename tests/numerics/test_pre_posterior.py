@@ -27,7 +27,7 @@ from pre_core.crossing.posterior import (
 from pre_core.paper import experiment
 from pre_core.physics.models import from_models
 from pre_core.physics.sensors import MICRO_G_M_PER_S2, white_noise
-from pre_core.unknowns import C_S1, D_1, EI_1, K_ROT, K_S1, K_U1, M_U1
+from pre_core.unknowns import C_S1, C_U1, D_1, EI_1, K_ROT, K_S1, K_U1, M_U1, F
 from schemas.signals import CHANNELS
 from services.simulation.drive import beam_of, paper_site, truck_of
 
@@ -38,6 +38,8 @@ FloatArray = NDArray[np.float64]
 
 POSITION_NOISE_M, SPEED_NOISE_M_PER_S, OFFSET_SPREAD_M = 0.02, 0.03, 1.2
 SPRING_SPREAD = 4e8
+COMPLIANCE_SPREAD = 1e-9
+TYRE_DAMPING_SPREAD = 1000.0
 KNOT_S = 0.4
 DEGREE = 5
 JERK_M_PER_S3 = 1.0
@@ -89,9 +91,22 @@ def here(scenario_6: "Drive") -> Case:
     spread = np.full(nominal.size, 0.15)
     spread[EI_1 : EI_1 + 7] = 0.55
     spread[K_ROT : K_ROT + 2] = SPRING_SPREAD
+    spread[F : F + 2] = COMPLIANCE_SPREAD
+    spread[C_U1 : C_U1 + 2] = TYRE_DAMPING_SPREAD
     at_zero = nominal == 0.0
     known = np.full(nominal.size, True)
-    priors = Priors(nominal, spread, at_zero, known, vehicle.wheelbase_m, 0.002, 0.01, 0.01, 0.0005)
+    priors = Priors(
+        nominal,
+        spread,
+        at_zero,
+        known,
+        np.zeros(nominal.size),
+        vehicle.wheelbase_m,
+        0.002,
+        0.01,
+        0.01,
+        0.0005,
+    )
     inputs = Inputs(
         acceleration,
         float(t[kept][0]),
@@ -99,6 +114,7 @@ def here(scenario_6: "Drive") -> Case:
         1,
         bridge.span_m,
         np.array(bridge.lengths_m),
+        (),
         vehicle.total_mass_kg,
         0.0,
         np.full(4, density),
@@ -136,10 +152,11 @@ def test_places_of_all_unknowns(here: Case) -> None:
         [where.common_gain],
         range(where.delays.start, where.delays.stop),
         range(where.initial.start, where.initial.stop),
+        range(where.swing.start, where.swing.stop),
         range(where.trajectory.start, where.trajectory.stop),
         [where.offset],
     ]
-    assert [len(group) for group in groups[:6]] == [22, 1, 3, 1, 4, 12]
+    assert [len(group) for group in groups[:7]] == [26, 1, 3, 1, 4, 12, 6]
     assert [i for group in groups for i in group] == list(range(where.size))
 
 
@@ -167,6 +184,8 @@ def test_coordinates_are_standard_normal_under_the_priors(here: Case) -> None:
         standard(at.delay_s[:, c], here.priors.delay_spread_s)
         for i in range(3):
             standard(at.initial[:, c, i], 0.1)
+    for i in range(6):
+        standard(at.swing[:, i], 1e-3)
     # Four independent gains without what is common to them: covariance s^2 (1 - 1/4 everywhere).
     expected = here.priors.gain_spread**2 * (np.eye(4) - 0.25)
     np.testing.assert_allclose(
@@ -269,7 +288,7 @@ def test_start_is_the_nominal_truck_and_bridge(here: Case) -> None:
     np.testing.assert_array_equal(at.theta[0], here.priors.theta)
     assert at.wheelbase_m[0] == here.priors.wheelbase_m
     assert at.common_gain[0] == 1.0
-    for correction in (at.gain, at.delay_s, at.initial):
+    for correction in (at.gain, at.delay_s, at.initial, at.swing):
         assert not correction.any()
 
 
@@ -291,9 +310,12 @@ def test_precision_and_covariance_of_a_known_matrix() -> None:
 
 
 def jacobian_of(case: Case, size: float) -> FloatArray:
+    """By central differences; for what must not be negative about a point that far above zero."""
     f = case.y.size
-    shifts = np.concatenate([case.y + size * np.eye(f), case.y - size * np.eye(f)])
-    rows = all_rows(case.problem, shifts)
+    at = np.tile(case.y, (f, 1))
+    for i in layout(case.problem).half_normal:
+        at[i, i] += size
+    rows = all_rows(case.problem, np.concatenate([at + size * np.eye(f), at - size * np.eye(f)]))
     return np.asarray((rows[:f] - rows[f:]).T / (2.0 * size))
 
 
@@ -302,16 +324,20 @@ def test_curvature_against_differences_of_the_sum_of_squares(here: Case) -> None
 
     The data are moved so that they fit exactly: what Gauss-Newton leaves out is zero then, and both
     must agree in every direction. Along the column of its covariance that belongs to an unknown,
-    one standard deviation costs exactly one.
+    one standard deviation costs exactly one. Bearings give and tyres have damping: below zero there
+    is nothing.
     """
+    y = here.y.copy()
+    y[[F, F + 1, C_U1, C_U1 + 1]] = 0.5, 0.3, 0.5, 0.5
+    here = here._replace(y=y)
     where = layout(here.problem)
     spread = covariance(precision_root(jacobian_of(here, 1e-4)))
     np.testing.assert_allclose(spread, spread.T, rtol=1e-6, atol=1e-12)
-    springs = [where.theta.stop - 2, where.theta.stop - 1]
+    at_zero = [K_ROT, K_ROT + 1, F, F + 1, C_U1, C_U1 + 1]
     rigidities = [EI_1, EI_1 + 1, EI_1 + 3]
     fitted = all_rows(here.problem, here.y[None])[0]
     size = 0.1
-    for i in [*rigidities, K_U1, D_1, *springs, where.wheelbase, where.gains.start]:
+    for i in [*rigidities, K_U1, D_1, *at_zero, where.wheelbase, where.gains.start]:
         step = spread[:, i] / np.sqrt(spread[i, i])
         around = all_rows(here.problem, np.stack([here.y - size * step, here.y + size * step]))
         second = np.sum((around - fitted) ** 2) / (2.0 * size**2)
@@ -331,8 +357,8 @@ def test_rows_up_to_42_hz_tell_of_ei_what_rows_up_to_125_hz_tell(
 ) -> None:
     """The Cramér-Rao bound at the truth, of the same samples with the model at 333 Hz and at 1 kHz.
 
-    Measured: 1 % apart at most. Negative control: at 100 Hz, with rows up to 12 Hz, it is 7 % to
-    26 % worse.
+    Measured: 2.7 % apart at most (EI_6). Negative control: at 100 Hz, with rows up to 12 Hz, it is
+    9 % to 28 % worse.
     """
     deviations = {}
     for rate_hz in (340.0, 1000.0, 100.0):
@@ -341,7 +367,7 @@ def test_rows_up_to_42_hz_tell_of_ei_what_rows_up_to_125_hz_tell(
         assert start.size == here.y.size
         bound = covariance(precision_root(jacobian_of(here._replace(problem=problem), 1e-4)))
         deviations[rate_hz] = np.sqrt(np.diag(bound))[EI_1 : EI_1 + 7]
-    np.testing.assert_allclose(deviations[340.0] / deviations[1000.0], 1.0, atol=0.02)
+    np.testing.assert_allclose(deviations[340.0] / deviations[1000.0], 1.0, atol=0.03)
     assert np.all(deviations[100.0] > 1.05 * deviations[340.0])
 
 

@@ -266,6 +266,12 @@ def test_recordings_that_cannot_be_identified(
         (["simulate", "--scenario", "6", "--noise", "nan", "-o", "x"], "must be a noise density"),
         (["simulate", "--scenario", "6", "--speed", "8:", "-o", "x"], "must be a speed in m/s"),
         (["simulate", "--scenario", "6", "--seed", "1.5", "-o", "x"], "a seed, a whole number"),
+        (["simulate", "--scenario", "6", "--left", "3e5:17", "-o", "x"], "(N:M_PER_S:S)"),
+        (
+            ["simulate", "--scenario", "6", "--bearing-stiffness", "3:3e9", "-o", "x"],
+            '--bearing-stiffness: is "3", it must be vertical stiffnesses in N/m (START:END) from',
+        ),
+        (["validate", "--effects", "swing,wind"], "must be all or some of free, sprung"),
         (["simulate", "--scen", "6", "-o", "x"], "one of the arguments --scenario --ei"),
         (["validate", "--scenarios", "1,0"], '--scenarios: is "0", it must be 1 to 12'),
         (["replay"], "required: REC.mcap"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pre_core import unknowns
 from services.simulation.drawn import Truth, _motion, default_site, draw_truth, drive, true_values
@@ -49,12 +50,42 @@ def test_what_no_residual_shows_is_drawn_too(truths: list[Truth]) -> None:
     assert abs(np.corrcoef(gains.T)[0, 1]) < 0.2
 
 
-def test_support_springs_are_half_normal(truths: list[Truth]) -> None:
+def half_normal_where_there(values: NDArray[np.float64], scale: float, absent: float) -> None:
+    """Exactly nothing with that probability, else half-normal."""
+    there = values[values > 0.0] / scale
+    assert values.min() >= 0.0
+    assert np.mean(values == 0.0) == pytest.approx(absent, abs=0.07)
+    assert np.mean(there**2) == pytest.approx(1.0, rel=0.25)
+    assert np.mean(there) == pytest.approx(np.sqrt(2.0 / np.pi), rel=0.12)
+
+
+def test_support_springs_and_bearings_may_be_there(truths: list[Truth]) -> None:
     scale = SITE.bridges[0].support_rotational_stiffness_nm_per_rad_scale_at_zero
-    springs = np.array([t.beam.support_rotational_stiffness_nm_per_rad for t in truths]) / scale
-    assert springs.min() >= 0.0
-    assert np.mean(springs**2) == pytest.approx(1.0, rel=0.15)
-    assert np.mean(springs) == pytest.approx(np.sqrt(2.0 / np.pi), rel=0.1)
+    springs = np.array([t.beam.support_rotational_stiffness_nm_per_rad for t in truths])
+    compliance = np.array([t.beam.support_compliance_m_per_n for t in truths])
+    for end in range(2):
+        half_normal_where_there(springs[:, end], scale, 0.5)
+        half_normal_where_there(compliance[:, end], 1e-9, 0.5)
+    assert abs(np.mean((springs[:, 0] > 0.0) == (springs[:, 1] > 0.0)) - 0.5) < 0.1
+
+
+def test_tyres_have_some_damping(truths: list[Truth]) -> None:
+    for wheel in range(2):
+        damping = np.array([t.car.tyre_damping_ns_per_m[wheel] for t in truths])
+        half_normal_where_there(damping, 1000.0, 0.0)
+
+
+def test_what_the_site_knows_of_bearings_and_tyres_is_drawn() -> None:
+    bridge = SITE.bridges[0].model_copy(update={"bearings": ("free", "sprung")})
+    vehicle = SITE.vehicles[0].model_copy(update={"tyre_damping_ns_per_m": (1500.0, 2000.0)})
+    site = SITE.model_copy(update={"bridges": (bridge,), "vehicles": (vehicle,)})
+    drawn = [draw_truth(site, seed) for seed in range(60)]
+    springs = np.array([t.beam.support_rotational_stiffness_nm_per_rad for t in drawn])
+    assert springs[:, 0].max() == 0.0
+    assert springs[:, 1].min() > 0.0
+    logs = np.log([t.car.tyre_damping_ns_per_m[1] / 2000.0 for t in drawn])
+    assert logs.std() == pytest.approx(0.15, rel=0.3)
+    assert abs(logs.mean()) < 0.08
 
 
 def test_all_kinds_of_drives_come(truths: list[Truth]) -> None:

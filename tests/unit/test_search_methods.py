@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares as least_squares_of_scipy
 
 from pre_core import unknowns
 from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.residual import Window
 from pre_core.physics.models import from_models
-from pre_core.search import levenberg_marquardt, loop
+from pre_core.search import crank_nicolson, levenberg_marquardt, loop
 from pre_core.search.loop import Ending
 from services.validation.paper import DERIVED, NAMES, table_columns
 
@@ -34,6 +35,7 @@ class Method(NamedTuple):
     bind: Callable[[Window, int, int], tuple[Callable[[], State], Step]]
     steps: int  # enough to see it move
     endings: frozenset[Ending]  # how it may end on sound data
+    descends: bool = True  # a sampler goes up and down
 
 
 def bind_random_walk(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
@@ -51,9 +53,54 @@ def bind_least_squares(window: Window, seed: int, threads: int) -> tuple[Callabl
     )
 
 
+def small_rows(window: Window) -> levenberg_marquardt.Rows:
+    """Rows (k, 4) of three unknowns, not linear; not finite where the window's data are not."""
+    sound = 1.0 + 0.0 * float(np.mean(window.acceleration))
+
+    def rows(y: np.ndarray) -> np.ndarray:
+        columns = [np.exp(y[:, 0]) - 2.0, y[:, 0] * y[:, 1] - 0.5, 3.0 * (y[:, 2] + 0.4), y[:, 1]]
+        return sound * np.stack(columns, axis=1)
+
+    return rows
+
+
+LOWER = np.array([-np.inf, -np.inf, 0.0])  # of small_rows: the third is held by its bound
+
+
+def bind_bounded(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
+    """Levenberg and Marquardt's steps of any problem, with bounds."""
+    rows = small_rows(window)
+    start = np.random.default_rng(seed).uniform(0.5, 1.5, 3)
+    return (
+        partial(levenberg_marquardt.begin, rows, start),
+        partial(levenberg_marquardt.descend, rows, lower=LOWER),
+    )
+
+
+def bind_chains(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
+    """Chains on what belongs to small_rows, the third unknown positive or exactly zero."""
+    rows = small_rows(window)
+
+    def target(y: np.ndarray) -> np.ndarray:
+        return -0.5 * np.sum(rows(y) ** 2, axis=1)
+
+    mixed = crank_nicolson.mixture(
+        np.array([0.6, 0.3, 0.0]),
+        np.diag([0.2, 0.6, 0.1]),
+        np.array([2]),
+        np.array([0.1, 0.0, 0.0]),
+        seed,
+        np.array([-np.inf, -np.inf, 0.0]),
+    )
+    assert len(mixed.parts) == 2
+    return partial(crank_nicolson.init, target, mixed), partial(crank_nicolson.step, target, mixed)
+
+
 METHODS = {
     "random_walk": Method(bind_random_walk, 30, frozenset({Ending.STEPS_EXHAUSTED})),
     "least_squares": Method(bind_least_squares, 30, frozenset({Ending.CONVERGED})),
+    "levenberg_marquardt": Method(bind_bounded, 30, frozenset({Ending.CONVERGED})),
+    "crank_nicolson": Method(bind_chains, 30, frozenset({Ending.STEPS_EXHAUSTED}), descends=False),
 }
 
 
@@ -149,7 +196,9 @@ def test_a_stopped_and_resumed_search_is_the_uninterrupted_one(method: Method, w
     assert first_infos + last_infos == infos
 
 
-def test_the_objective_never_grows(method: Method, window: Window):
+@pytest.mark.parametrize("name", [name for name, one in METHODS.items() if one.descends])
+def test_the_objective_never_grows(name: str, window: Window):
+    method = METHODS[name]
     init, step = method.bind(window, 7, 2)
     state = init()
     objective = [float(np.min(state.objective))]
@@ -226,6 +275,73 @@ def test_least_squares_ends_with_central_differences(window: Window):
 def test_a_kink_leaves_least_squares_stuck():
     state = levenberg_marquardt.begin(lambda y: 1.0 + np.abs(y), np.zeros(1))
     assert levenberg_marquardt.descend(lambda y: 1.0 + np.abs(y), state)[1].ending is Ending.STUCK
+
+
+# Bounds
+
+
+def scipys(rows: levenberg_marquardt.Rows, start: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    found = least_squares_of_scipy(
+        lambda y: rows(y[None, :])[0],
+        start,
+        bounds=(lower, np.inf),
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-14,
+    )
+    return np.asarray(found.x)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_bounds_against_scipy(seed: int):
+    """Exponentials of sums, half of the unknowns bounded at zero: some end there, some do not."""
+    rng = np.random.default_rng(seed)
+    matrix = rng.standard_normal((14, 6))
+    wanted = rng.standard_normal(6)
+    data = np.exp(0.3 * matrix @ wanted) + 0.1 * rng.standard_normal(14)
+
+    def rows(y: np.ndarray) -> np.ndarray:
+        return np.exp(0.3 * y @ matrix.T) - data
+
+    lower = np.array([0.0, 0.0, 0.0, -np.inf, -np.inf, -np.inf])
+    start = np.array([0.5, 0.0, 0.5, 0.0, 0.0, 0.0])
+
+    def within(y: np.ndarray) -> np.ndarray:
+        assert np.all(y >= lower)
+        return rows(y)
+
+    near = levenberg_marquardt.minimised(within, start, 200, 1e-12, lower)
+    assert near.ending is Ending.CONVERGED
+    # Forward differences leave a slope; central ones, which reach beyond a bound, next to none.
+    found = loop.run(
+        lambda: levenberg_marquardt.begin(rows, near.state.y, levenberg_marquardt.CENTRAL),
+        lambda state: levenberg_marquardt.descend(rows, state, lower),
+        200,
+    )
+    assert found.ending is Ending.CONVERGED
+    expected = scipys(rows, np.maximum(start, 1e-3), lower)
+    np.testing.assert_allclose(found.state.y, expected, atol=1e-5)
+    np.testing.assert_allclose(near.state.y, expected, atol=1e-3)
+    ours = found.state.objective
+    assert ours <= float(np.sum(rows(expected[None, :]) ** 2)) * (1.0 + 1e-10)
+    at_bound = found.state.y[:3] == 0.0
+    free = np.sum(rows(scipys(rows, start, np.full(6, -np.inf))[None, :]) ** 2)
+    assert at_bound.any() == bool(ours > free * (1.0 + 1e-6))
+
+
+def test_at_its_bounds_a_search_ends_at_once():
+    """Held coordinates promise nothing: at the bottom beside them no step is tried."""
+    matrix = np.array([[1.0, 0.5], [0.0, 1.0], [1.0, 0.0]])
+
+    def rows(y: np.ndarray) -> np.ndarray:
+        return y @ matrix.T + np.array([1.0, 1.0, 1.0])
+
+    lower = np.zeros(2)
+    state = levenberg_marquardt.begin(rows, np.zeros(2))
+    _, info = levenberg_marquardt.descend(rows, state, lower)
+    assert info.ending is Ending.CONVERGED
+    assert info.evaluations == 0
+    assert levenberg_marquardt.descend(rows, state)[1].accepted
 
 
 # The random walk

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from schemas.errors import InputError
 from schemas.signals import MAX_RATE_HZ
 from schemas.site import (
+    Bridge,
     Site,
     load_site,
     parse_site,
@@ -106,6 +107,104 @@ def test_optional_values_are_read() -> None:
     assert site.sensor.rate_hz == (100, 200, 400, 800)
     assert site.sensor.up == (1, 1, -1, -1)
     assert site.receiver.latency_s == 0.2
+
+
+def with_supports(supports: str, elements: int, more: str = "") -> str:
+    """The example's bridge of 20 m with supports between its ends."""
+    bridge = with_line("elements", str(elements), BRIDGE)
+    return f"{VEHICLE}\n{bridge}\ninterior_supports_m = {supports}\n{more}\n{SENSOR}"
+
+
+@pytest.mark.parametrize(
+    ("supports", "elements", "shares"),
+    [
+        ([10.0], 8, [4, 4]),
+        ([12.0], 5, [3, 2]),  # 3, 2
+        ([7.0], 6, [2, 4]),  # 2.1, 3.9: the larger remainder is the second's
+        ([4.0, 9.0], 7, [1, 2, 4]),  # 1.4, 1.75, 3.85
+        ([1.0, 2.0], 4, [1, 1, 2]),  # 0.2, 0.2, 3.6: at least one each
+        ([1.0, 2.0], 3, [1, 1, 1]),
+        ([], 5, [5]),
+    ],
+)
+def test_elements_are_shared_among_the_spans(
+    supports: list[float], elements: int, shares: list[int]
+) -> None:
+    bridge = parse_site(with_supports(str(supports), elements), "site.toml").bridges[0]
+    edges = [0.0, *supports, 20.0]
+    lengths = [
+        (after - before) / share
+        for before, after, share in zip(edges, edges[1:], shares, strict=False)
+        for _ in range(share)
+    ]
+    assert bridge.lengths_m == pytest.approx(lengths)
+    nodes = bridge.interior_support_nodes
+    assert list(nodes) == [sum(shares[: k + 1]) for k in range(len(supports))]
+    assert [math.fsum(bridge.lengths_m[:node]) for node in nodes] == pytest.approx(supports)
+
+
+def test_given_elements_end_at_the_supports() -> None:
+    lengths = "element_lengths_m = [3, 4.005, 5, 8]"
+    bridge = parse_site(with_supports("[7, 12]", 4, lengths), "site.toml").bridges[0]
+    assert bridge.lengths_m == (3, 4.005, 5, 8)
+    assert bridge.interior_support_nodes == (2, 3)
+    assert complaint(with_supports("[7, 13]", 4, lengths)) == (
+        "bridge.element_lengths_m has no element that ends at 13 m, one must end at every "
+        "interior support; the nearest ends at 12.005 m"
+    )
+
+
+@pytest.mark.parametrize(
+    ("supports", "line"),
+    [
+        (
+            "[12, 8]",
+            (
+                "bridge.interior_supports_m[1] is 8, it must be a chainage beyond 12 m: supports "
+                "between the ends are given from the start on"
+            ),
+        ),
+        (
+            "[8, 20]",
+            "bridge.interior_supports_m[1] is 20, it must be a chainage between 0 and span_m, 20 m",
+        ),
+        ("[0]", "bridge.interior_supports_m[0] is 0, it must be a length greater than 0 m"),
+        ("8", "bridge.interior_supports_m is 8, it must be a list of chainages in m"),
+        ("[3, 6, 9, 12, 15]", "bridge.elements is 5, it must be at least 6, one for each span"),
+    ],
+)
+def test_supports_that_cannot_be(supports: str, line: str) -> None:
+    assert complaint(with_supports(supports, 5)) == line
+
+
+def test_bearings_altitudes_and_what_is_for_planning() -> None:
+    def bridge(more: str) -> Bridge:
+        return parse_site(with_supports("[]", 5, more), "site.toml").bridges[0]
+
+    assert bridge("").bearings == ("unknown", "unknown")
+    assert bridge('bearings = "free"').bearings == ("free", "free")
+    assert bridge('bearings = ["sprung", "unknown"]').bearings == ("sprung", "unknown")
+    known = bridge(
+        'start_altitude_m = 12.5\nend_altitude_m = -3\nowner_id = "A 7/113"\nroad_class = "C"\n'
+        "survey_speed_m_per_s = 12"
+    )
+    assert (known.start_altitude_m, known.end_altitude_m) == (12.5, -3)
+    assert (known.owner_id, known.road_class, known.survey_speed_m_per_s) == ("A 7/113", "C", 12)
+    either = '"unknown", "free" or "sprung"'
+    for value, line in (
+        ('bearings = "loose"', f'bearings is "loose", it must be {either}, or a pair [start, end]'),
+        ('bearings = ["free", "rigid"]', f'bearings[1] is "rigid", it must be {either}'),
+        ('bearings = ["free"]', "bearings[1] is missing"),
+        ('road_class = "F"', 'road_class is "F", it must be an ISO 8608 class, "A" to "E"'),
+        ("survey_speed_m_per_s = 0", "survey_speed_m_per_s is 0, it must be a speed greater than"),
+        ("start_altitude_m = 1e5", "start_altitude_m is 100000.0, it must be a length of at most"),
+    ):
+        assert complaint(with_supports("[]", 5, value)).startswith(f"bridge.{line}")
+
+
+def test_scale_of_support_springs_is_that_of_a_span() -> None:
+    bridge = parse_site(with_supports("[12]", 5), "site.toml").bridges[0]
+    assert bridge.support_rotational_stiffness_nm_per_rad_scale_at_zero == 1.2e10 / 10
 
 
 def test_lists_of_vehicles_and_bridges() -> None:

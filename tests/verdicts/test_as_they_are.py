@@ -1,0 +1,95 @@
+"""Bridges and trucks as they are: crossings of a simulator that shares no code with ours.
+
+Bearings that sink, a bridge that swings under damped tyres, leaf springs, two spans. What each must
+give: an answer, `good`, every EI within five standard deviations of the truth and nearly all within
+their 95 % intervals, standard deviations that say something, and the cause found where there is a
+number for it. truth.json is read to judge, only.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from schemas.results import Crossing
+from schemas.settings import IdentificationSettings
+from schemas.site import load_site
+from services.drives.csv_import import read_folder
+from services.drives.runs import normalised
+from services.simulation.drawn import see
+
+FARTHEST = 5.0
+"""Standard deviations. Of 29 elements one beyond 3.5 would be seen once in seventy such tests."""
+
+
+class Judged(NamedTuple):
+    result: Crossing
+    truth: dict[str, Any]
+    z: NDArray[np.float64]
+    is_covered: NDArray[np.bool_]
+    relative_std: NDArray[np.float64]
+
+
+def judged(folder: Path, run: int) -> Judged:
+    site = load_site(folder / "site.toml")
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    drive = normalised(read_folder(folder)[run], site.sensor)
+    (seen,) = see([drive], site, IdentificationSettings(threads=1))
+    values = seen.result.parameters
+    assert values is not None, seen.result.reasons
+    true = np.array(truth["EI"])
+    found = [values[f"EI_{e + 1}"] for e in range(true.size)]
+    mean, std = np.array([p.mean for p in found]), np.array([p.std for p in found])
+    covered = [p.q025 <= t <= p.q975 for p, t in zip(found, true, strict=True)]
+    return Judged(seen.result, truth, (mean - true) / std, np.array(covered), std / true)
+
+
+def check(found: Judged, median_std: float) -> None:
+    assert found.result.verdict == "good", found.result.reasons
+    assert np.abs(found.z).max() < FARTHEST
+    assert found.is_covered.sum() >= found.is_covered.size - 2
+    assert np.median(found.relative_std) < median_std
+
+
+@pytest.mark.parametrize("run", [0, 1])
+def test_bearings_that_give(shared: Path, run: int) -> None:
+    found = judged(shared / "crossings" / "d4_bearings_that_give", run)
+    check(found, 0.04)
+    assert found.result.parameters is not None
+    assert found.result.derived is not None
+    for name, stiffness in zip(("f_start", "f_end"), found.truth["bridge"]["kv"], strict=True):
+        compliance = found.result.parameters[name]
+        assert abs(compliance.mean - 1.0 / stiffness) < FARTHEST * compliance.std
+        assert compliance.std < 0.1 / stiffness
+    giving = found.result.derived.probability_giving
+    assert giving is not None
+    assert min(giving.start, giving.end) > 0.99
+
+
+def test_a_swinging_bridge_and_damped_tyres(shared: Path) -> None:
+    found = judged(shared / "crossings" / "d5_swinging_bridge", 0)
+    check(found, 0.04)
+    assert found.result.parameters is not None
+    for name, damping in zip(("c_u1", "c_u2"), found.truth["vehicle"]["ct"], strict=True):
+        tyre = found.result.parameters[name]
+        assert abs(tyre.mean - damping) < FARTHEST * tyre.std
+
+
+@pytest.mark.parametrize("run", [0, 1])
+def test_leaf_springs(shared: Path, run: int) -> None:
+    found = judged(shared / "crossings" / "d6_leaf_springs", run)
+    check(found, 0.1)
+    assert found.result.derived is not None
+    assert found.result.derived.springs_believed is not None
+    assert found.result.derived.springs_believed < 0.05
+
+
+def test_two_spans(shared: Path) -> None:
+    found = judged(shared / "crossings" / "d7_two_spans", 0)
+    check(found, 0.05)
+    assert found.result.derived is not None
+    assert found.result.derived.springs_believed is not None
+    assert found.result.derived.springs_believed > 0.5
