@@ -36,6 +36,7 @@ from pre_core.crossing.posterior import (
 )
 from pre_core.crossing.residuals import Crossing, sinc_table, step_table, workspace
 from pre_core.crossing.whitening import (
+    RESIDUALS,
     force_noise,
     linear_springs,
     noise_power,
@@ -50,7 +51,7 @@ from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import Rows, minimised
 from pre_core.search.loop import Ending, Solution
-from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE, K_ROT, F
+from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE, F
 
 _KNOT_S = 0.4
 _SLOPE_STEP = 1e-3
@@ -278,35 +279,24 @@ def _evaluations(found: Solution[levenberg_marquardt.State, levenberg_marquardt.
 
 
 def _whole_bridge(problem: Problem, *, is_simple: bool) -> FloatArray:
-    """Directions in which all elements change alike and the supports have no springs.
+    """Directions in which all elements change alike, without springs and bearings that give.
 
-    With `is_simple` without `_extras`.
+    With `is_simple` the bridge is at rest besides.
     """
     where = layout(problem)
     unit = np.eye(where.size)
     elements = where.elements
-    held = [*elements, *_springs(problem), *(_extras(problem) if is_simple else ())]
+    ends = where.half_normal[where.half_normal >= where.bridge[0]]
+    held = [*elements, *ends, *(_swing(problem) if is_simple else ())]
     single = np.setdiff1d(np.arange(where.size), held)
     together = unit[:, elements].sum(axis=1) / np.sqrt(elements.size)
     return np.column_stack([unit[:, single], together])
 
 
-def _springs(problem: Problem) -> NDArray[np.int64]:
-    """Places in y of the springs at the supports."""
-    where = layout(problem)
-    return where.half_normal[where.half_normal >= where.bridge[0]]
-
-
-def _extras(problem: Problem) -> NDArray[np.int64]:
-    """Places in y of what most bridges and trucks do not have.
-
-    The bridge's own motion, bearings that give, tyres of unknown damping.
-    """
-    where = layout(problem)
-    kept = np.flatnonzero(problem.priors.estimated)
-    springs = np.isin(kept, (K_ROT, K_ROT + 1))
-    seldom = np.flatnonzero(problem.priors.half_normal[kept] & ~springs)
-    return np.concatenate([seldom, np.arange(where.swing.start, where.swing.stop)])
+def _swing(problem: Problem) -> NDArray[np.int64]:
+    """Places in y of the bridge's own motion."""
+    swing = layout(problem).swing
+    return np.arange(swing.start, swing.stop)
 
 
 def _not_negative(problem: Problem, y: FloatArray) -> FloatArray:
@@ -330,16 +320,15 @@ class _Place(NamedTuple):
 def _walk(problem: Problem, y: FloatArray, *, is_simple: bool) -> tuple[list[_Place], int]:
     """Places along the road, best first, and the evaluations that they took.
 
-    With `is_simple` no place may change `_extras`.
+    With `is_simple` the bridge is at rest.
     """
     where = layout(problem)
-    extras = _extras(problem) if is_simple else np.zeros(0, dtype=np.int64)
-    places = np.setdiff1d(where.bridge, extras)
+    places = where.bridge
     free = np.eye(y.size)
     here = levenberg_marquardt.begin(
         _tempered(problem, y, free, _WALK_TEMPERATURE), np.zeros(y.size)
     ).jacobian
-    held = np.union1d(places, extras)
+    held = np.union1d(places, _swing(problem)) if is_simple else places
     others, _ = np.linalg.qr(np.delete(here, held, axis=1))
     evaluations = y.size + 1
     seen: list[_Place] = []
@@ -388,7 +377,7 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
     """
     problem, y = prepare(inputs)
     found = _from_places(problem, y, report, is_simple=True)
-    if found.chi2_per_dof < _acceptable(found):
+    if _is_accepted(found):
         return found
     again = _from_places(problem, y, report, is_simple=False)
     best = found if found.chi2_per_dof < again.chi2_per_dof else again
@@ -397,14 +386,26 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
     )
 
 
-def _acceptable(found: Optimum) -> float:
-    """The chi2 up to which a minimum is taken for the right one."""
-    rows = found.problem.noise.reciprocal.size
-    return 1.0 + _ACCEPTED_EXCESS + _ACCEPTED_Z * float(np.sqrt(2.0 / rows))
+def _is_accepted(found: Optimum) -> bool:
+    """Whether a minimum is taken for the right one.
+
+    Where springs are doubted, by the road's rows alone: what is wrong with the truck's own, no
+    other place of the bridge would mend.
+    """
+    problem, chi2 = found.problem, found.chi2_per_dof
+    rows = problem.noise.reciprocal.size
+    if np.isfinite(chi2) and problem.force.any():
+        rows //= RESIDUALS
+        white = data_rows(problem, found.state.y[None, :])[0].reshape(rows, RESIDUALS)
+        chi2 = min(chi2, float(np.mean(white[:, 0] ** 2)))
+    return chi2 < 1.0 + _ACCEPTED_EXCESS + _ACCEPTED_Z * float(np.sqrt(2.0 / rows))
 
 
 def _from_places(problem: Problem, y: FloatArray, report: Report, *, is_simple: bool) -> Optimum:
-    """The best optimum of those that are reached from the likeliest places along the road."""
+    """The best optimum of those that are reached from the likeliest places along the road.
+
+    With `is_simple` none, as if no place gave finite rows, as soon as the springs plainly rub.
+    """
     force = linear_springs() if is_simple else None
     whole = _whole_bridge(problem, is_simple=is_simple)
     evaluations = 0
@@ -426,30 +427,33 @@ def _from_places(problem: Problem, y: FloatArray, report: Report, *, is_simple: 
         z = y.copy()
         z[layout(problem).trajectory] += place.shift_m
         z[place.places] += place.bridge
-        found = _freed(problem, z, is_simple=is_simple)
-        evaluations += found.evaluations
+        found, used = _freed(problem, z, is_simple=is_simple)
+        evaluations += used
+        if found is None:
+            break
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
             best = found
-        if best.chi2_per_dof < _acceptable(best) or len(tried) == _MOST_PLACES:
+        if _is_accepted(best) or len(tried) == _MOST_PLACES:
             break
         if best.chi2_per_dof > _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]:
             break
     if best is None:
         state = levenberg_marquardt.begin(lambda at: all_rows(problem, at), y)
-        return Optimum(problem, state, Ending.NOT_FINITE, np.inf, evaluations, 0)
+        return Optimum(problem, state, Ending.NOT_FINITE, np.inf, evaluations, len(tried))
     return best._replace(evaluations=evaluations, starts=len(tried))
 
 
-def _freed(problem: Problem, y: FloatArray, *, is_simple: bool) -> Optimum:
-    """Least squares in all unknowns; supports do not push, and no damping drives.
+def _freed(problem: Problem, y: FloatArray, *, is_simple: bool) -> tuple[Optimum | None, int]:
+    """Least squares in all unknowns, and its evaluations; supports do not push, no damping drives.
 
     What would be negative is held at zero, and the rest brought to the optimum beside it. The slope
     that is left there belongs to the normal approximation (`normal_approximation`).
 
     What the springs leave over and how much they are believed depend on each other: a truck that is
     not believed need not fit. So it is believed at first, and doubted only where the body equations
-    then leave more than the sensors' noise. With `is_simple` what most bridges and trucks do not
-    have (`_extras`) is left out until the rest is right: together it can imitate much.
+    then leave more than the sensors' noise. With `is_simple` the bridge's own motion is left out
+    until the rest is right, for together they can imitate much; and where springs plainly rub there
+    is no optimum, for the way here believed in them.
     """
     front = points(problem, y[None, :]).position_m[0]
     crossing = problem.crossing
@@ -459,7 +463,7 @@ def _freed(problem: Problem, y: FloatArray, *, is_simple: bool) -> Optimum:
     start = y.copy()
     start[layout(problem).swing] = 0.0
     free = np.eye(start.size)
-    first = np.delete(free, _extras(problem), axis=1) if is_simple else free
+    first = np.delete(free, _swing(problem), axis=1) if is_simple else free
     (temperature, few, little), (_, steps, enough) = _FREE
     believing = with_noise_at(problem, start, linear_springs())
     y, _, ending, evaluations = _descend(
@@ -467,21 +471,21 @@ def _freed(problem: Problem, y: FloatArray, *, is_simple: bool) -> Optimum:
     )
     problem = with_noise_at(believing, y)
     if problem.force.any() and belief_in_springs(problem, y) < _PLAINLY_RUBS:
+        if is_simple:
+            return None, evaluations
         problem = with_noise_at(believing, start)
         y, _, ending, used = _descend(problem, start, free, temperature, few, little, is_free=True)
-        problem = with_noise_at(problem, y)
+        evaluations += used
     else:
-        used = 0
         for is_free in (True, False):
             directions = first if is_free else free
             y = y if is_free else _not_negative(problem, y)
             problem = with_noise_at(problem, y, linear_springs())
-            y, _, ending, more = _descend(
+            y, _, ending, used = _descend(
                 problem, y, directions, 1.0, steps, enough, is_free=is_free
             )
-            used += more
-        problem = with_noise_at(problem, y)
-    evaluations += used
+            evaluations += used
+    problem = with_noise_at(problem, y)
     y = _not_negative(problem, y)
     for _ in range(_MOST_ROUNDS if problem.force.any() else 0):
         y, _, ending, used = _descend(problem, y, free, 1.0, steps, enough)
@@ -492,7 +496,8 @@ def _freed(problem: Problem, y: FloatArray, *, is_simple: bool) -> Optimum:
             break
         problem = after
     state = levenberg_marquardt.begin(lambda at: all_rows(problem, at), y)
-    return Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations + y.size + 1, 1)
+    found = Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations, 1)
+    return found, evaluations + y.size + 1
 
 
 def bends(problem: Problem) -> FloatArray:
