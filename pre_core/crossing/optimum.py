@@ -36,6 +36,8 @@ from pre_core.crossing.posterior import (
 )
 from pre_core.crossing.residuals import Crossing, sinc_table, step_table, workspace
 from pre_core.crossing.whitening import (
+    DOUBTED,
+    DOUBTED_OF_A_MISFIT,
     RESIDUALS,
     force_noise,
     linear_springs,
@@ -191,10 +193,13 @@ def _swing_sample(crossing: Crossing, front: FloatArray) -> int:
     return max(0, entry - round(_SWING_BEFORE_S / crossing.step_s))
 
 
-def with_noise_at(problem: Problem, y: FloatArray, force: FloatArray | None = None) -> Problem:
+def with_noise_at(
+    problem: Problem, y: FloatArray, force: FloatArray | None = None, doubted: float = DOUBTED
+) -> Problem:
     """The problem with the noise as it is for the truck at y, and coordinates for its bridge.
 
-    The noise of springs and dampers is `force`, by default what the body equations leave at y.
+    The noise of springs and dampers is `force`, by default what the body equations leave at y if
+    that is at least `doubted` (`force_noise`).
     """
     where = layout(problem)
     unknowns = where.gains.stop
@@ -205,7 +210,8 @@ def with_noise_at(problem: Problem, y: FloatArray, force: FloatArray | None = No
     total = problem.crossing.total_mass_kg
     if force is None:
         one = truck_of(at.theta[0], total, float(at.wheelbase_m[0]), problem.crossing.is_inertial)
-        force = force_noise(problem.rows, one, density[0], filtered_rows(problem, y)[1:])
+        body = filtered_rows(problem, y)[1:]
+        force = force_noise(problem.rows, one, density[0], body, doubted)
     is_inertial = bool(force.any())
     trucks = [
         truck_of(theta, total, float(wheelbase), is_inertial)
@@ -377,7 +383,7 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
     """
     problem, y = prepare(inputs)
     found = _from_places(problem, y, report, is_simple=True)
-    if _is_accepted(found):
+    if found.ending is not Ending.NOT_FINITE and _is_accepted(found.problem, found.state.y):
         return found
     again = _from_places(problem, y, report, is_simple=False)
     best = found if found.chi2_per_dof < again.chi2_per_dof else again
@@ -386,18 +392,18 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
     )
 
 
-def _is_accepted(found: Optimum) -> bool:
+def _is_accepted(problem: Problem, y: FloatArray) -> bool:
     """Whether a minimum is taken for the right one.
 
     Where springs are doubted, by the road's rows alone: what is wrong with the truck's own, no
     other place of the bridge would mend.
     """
-    problem, chi2 = found.problem, found.chi2_per_dof
     rows = problem.noise.reciprocal.size
-    if np.isfinite(chi2) and problem.force.any():
+    chi2 = chi2_per_dof(problem, y)
+    if problem.force.any():
         rows //= RESIDUALS
-        white = data_rows(problem, found.state.y[None, :])[0].reshape(rows, RESIDUALS)
-        chi2 = min(chi2, float(np.mean(white[:, 0] ** 2)))
+        road = data_rows(problem, y[None, :])[0, ::RESIDUALS]
+        chi2 = min(chi2, float(np.mean(road**2)))
     return chi2 < 1.0 + _ACCEPTED_EXCESS + _ACCEPTED_Z * float(np.sqrt(2.0 / rows))
 
 
@@ -433,7 +439,7 @@ def _from_places(problem: Problem, y: FloatArray, report: Report, *, is_simple: 
             break
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
             best = found
-        if _is_accepted(best) or len(tried) == _MOST_PLACES:
+        if _is_accepted(best.problem, best.state.y) or len(tried) == _MOST_PLACES:
             break
         if best.chi2_per_dof > _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]:
             break
@@ -487,10 +493,12 @@ def _freed(problem: Problem, y: FloatArray, *, is_simple: bool) -> tuple[Optimum
             evaluations += used
     problem = with_noise_at(problem, y)
     y = _not_negative(problem, y)
+    if not (problem.force.any() or _is_accepted(problem, y)):
+        problem = with_noise_at(problem, y, doubted=DOUBTED_OF_A_MISFIT)
     for _ in range(_MOST_ROUNDS if problem.force.any() else 0):
         y, _, ending, used = _descend(problem, y, free, 1.0, steps, enough)
         evaluations += used
-        after = with_noise_at(problem, y)
+        after = with_noise_at(problem, y, doubted=DOUBTED_OF_A_MISFIT)
         is_settled = abs(after.force.sum() - problem.force.sum()) < _SAME_FORCE * after.force.sum()
         if is_settled or not after.force.any():
             break

@@ -52,8 +52,10 @@ _FORCE_MEMORY_S = 0.3
 _FORCE_PASSES = 200
 _BELIEVED_HZ = 30.0
 """Up to which springs are asked whether they are believed."""
-_FORCE_GAIN = 60.0
-"""So much must twice the log-likelihood of an axle's rows gain for its springs to be doubted."""
+DOUBTED, DOUBTED_OF_A_MISFIT = 60.0, 15.0
+"""So much must twice the log-likelihood of an axle's rows gain for its springs to be doubted: less
+where nothing else is known to explain why rows do not fit. Fifteen levels that are not there gain
+less than 15 in 99 of 100 records."""
 
 
 class RowFilter(NamedTuple):
@@ -257,12 +259,19 @@ def noise_power(
     return np.asarray(traces) / _FEW_FREQUENCIES - RESIDUALS
 
 
-def force_noise(rows: RowFilter, truck: Truck, density: FloatArray, body: FloatArray) -> FloatArray:
+def force_noise(
+    rows: RowFilter,
+    truck: Truck,
+    density: FloatArray,
+    body: FloatArray,
+    enough: float = DOUBTED,
+) -> FloatArray:
     """Levels (2, shapes) of the springs' noise in N²/Hz that the body equations' rows (2, m) show.
 
     The most likely ones beside the sensors' noise, by the periodogram (Whittle 1953): each level is
     multiplied by the root of what it explains over what it claims until nothing changes. An axle
-    whose springs are as linear as its sensors can tell has none.
+    whose springs are as linear as its sensors can tell has none: one that gains no more than
+    `enough`.
     """
     m = body.shape[1]
     window = np.hanning(m)
@@ -290,7 +299,7 @@ def force_noise(rows: RowFilter, truck: Truck, density: FloatArray, body: FloatA
         expected = known + level @ shape
         gain = 2.0 * np.sum(np.log(known / expected) + seen / known - seen / expected)
         # Hann's window makes neighbours alike: half of the frequencies tell something new.
-        if 0.5 * gain > _FORCE_GAIN:
+        if 0.5 * gain > enough:
             levels[axle] = level
     return levels
 
