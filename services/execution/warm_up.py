@@ -96,6 +96,7 @@ def _warm_up_pre() -> None:
     )
     problem, y = optimum.prepare(inputs)
     posterior.all_rows(problem, y[None, :])
+    posterior.filtered_rows(problem, y)
     posterior.roads(problem, y)
 
 

@@ -105,7 +105,13 @@ def driven(case: Case, time_s: FloatArray) -> tuple[FloatArray, float]:
     return begin * (time_s - BEFORE_S) + 0.5 * rate * (time_s**2 - BEFORE_S**2), rate
 
 
-def crossing(case: Case, *, cg_height_m: float | None = None, parts: int = PARTS) -> Crossing:
+def crossing(
+    case: Case,
+    *,
+    cg_height_m: float | None = None,
+    parts: int = PARTS,
+    is_inertial: bool = True,
+) -> Crossing:
     vehicle, bridge = case.site.vehicles[0], case.site.bridges[0]
     basis = beam_basis(np.array(bridge.lengths_m), parts, bearings_give=True)
     model = channel_signals(case.acceleration, 1.0 / case.rate_hz, case.rate_hz)
@@ -125,6 +131,7 @@ def crossing(case: Case, *, cg_height_m: float | None = None, parts: int = PARTS
         front.size - first,
         sinc_table(),
         step_table(),
+        is_inertial,
         0,
     )
 
@@ -157,19 +164,20 @@ def residual(
     return evaluate(data, works, at)
 
 
-def white(case: Case, residuals: FloatArray) -> FloatArray:
+def white(case: Case, residuals: FloatArray, *, is_inertial: bool = True) -> FloatArray:
     """White rows (k, 3 m), where one is the noise of 5 µg/√Hz."""
     rows = row_filter(crossing(case).step_s)
     vehicle = case.site.vehicles[0]
-    truck = truck_of(case.theta, vehicle.total_mass_kg, vehicle.wheelbase_m)
+    truck = truck_of(case.theta, vehicle.total_mass_kg, vehicle.wheelbase_m, is_inertial)
     density = np.full(4, NOISE_UG * MICRO_G_M_PER_S2)
     noise = whitener(rows, row_count(rows, residuals.shape[2]), truck, density, linear_springs())
     return white_rows(rows, noise, residuals)
 
 
-def in_noise(case: Case, residuals: FloatArray) -> FloatArray:
+def in_noise(case: Case, residuals: FloatArray, *, is_inertial: bool = True) -> FloatArray:
     """Mean square of the three white rows, where 1 is the noise of 5 µg/√Hz: (3,)."""
-    return np.asarray(np.mean(white(case, residuals).reshape(-1, 3) ** 2, axis=0))
+    rows = white(case, residuals, is_inertial=is_inertial).reshape(-1, 3)
+    return np.asarray(np.mean(rows**2, axis=0))
 
 
 def little(left: FloatArray, factor: float = 1.0) -> bool:

@@ -12,9 +12,10 @@ from pre_core.physics.simulate import constant_speed, simulate
 from pre_core.physics.vehicle import HalfCar, total_mass_kg
 
 STEP_S = 0.005
-CAR = experiment.TRUCK._replace(pitch_inertia_ratio=1.3)
+CAR = experiment.TRUCK._replace(pitch_inertia_ratio=1.3, tyre_damping_ns_per_m=(700.0, 900.0))
 BEAM = experiment.beam(experiment.scenario_ratios(6))._replace(
     support_rotational_stiffness_nm_per_rad=(2e8, 1e8),
+    support_compliance_m_per_n=(3e-10, 2e-10),
 )
 
 

@@ -64,6 +64,17 @@ def test_at_the_truth_little_of_the_noise_is_left(
     assert little(left), left
 
 
+def test_both_forms_of_the_road_row_say_the_same(truth: Case) -> None:
+    """From masses or from springs: what is left of the noise is shared otherwise, no more."""
+    left = []
+    for is_inertial in (True, False):
+        data = crossing(truth, is_inertial=is_inertial)
+        rows = residual(truth, point(truth), data=data)
+        left.append(in_noise(truth, rows, is_inertial=is_inertial))
+    assert abs(left[0][0] - left[1][0]) > 0.02
+    assert left[0].sum() == pytest.approx(left[1].sum(), rel=0.01)
+
+
 @pytest.mark.parametrize("rate_hz", [100.0, 200.0, 250.0, 500.0])
 def test_slower_sensors_leave_as_little(truth: Case, rate_hz: float) -> None:
     """Their rows end sooner, at 25 Hz for 100 Hz; what is below is seen as well as at 1 kHz."""

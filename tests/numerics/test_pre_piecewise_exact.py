@@ -154,6 +154,7 @@ def silent_crossing(beam: Beam, offset_m: float) -> tuple[FloatArray, FloatArray
         n,
         sinc_table(),
         step_table(),
+        False,
         0,
     )
     theta = theta_of(beam)

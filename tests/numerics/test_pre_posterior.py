@@ -185,7 +185,7 @@ def test_coordinates_are_standard_normal_under_the_priors(here: Case) -> None:
         for i in range(3):
             standard(at.initial[:, c, i], 0.1)
     for i in range(6):
-        standard(at.swing[:, i], 1e-3)
+        standard(at.swing[:, i], 1e-3 / (1 + i // 2) ** 2)
     # Four independent gains without what is common to them: covariance s^2 (1 - 1/4 everywhere).
     expected = here.priors.gain_spread**2 * (np.eye(4) - 0.25)
     np.testing.assert_allclose(

@@ -9,7 +9,7 @@ import pytest
 
 from pre_core.physics.vehicle import static_axle_loads_n
 from schemas.settings import IdentificationSettings
-from services.cli import main
+from services.cli import validation as command_line
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_chainage
 from services.simulation import worlds
@@ -44,7 +44,7 @@ def within(values: Any, limits: tuple[float, float]) -> bool:
 
 
 def test_the_command_line_knows_all_effects() -> None:
-    assert main.EFFECTS == EFFECTS
+    assert command_line.EFFECTS == EFFECTS
 
 
 def test_without_an_effect_the_world_is_the_methods() -> None:

@@ -32,11 +32,6 @@ def test_braking_matters_where_the_height_of_the_mass_is_unknown(sign: float) ->
     assert caveats(steady_crossing(STEADY, cg_height_m=1.2), motion(0.9 * sign)) == []
 
 
-def test_tyres_that_damp_are_named() -> None:
-    damped = steady_crossing(STEADY, tyre_damping_ns_per_m=(0.0, 100.0))
-    assert caveats(damped, motion(0.0)) == [Reason.TYRE_DAMPING_IGNORED]
-
-
 @pytest.mark.parametrize(("seconds", "named"), [(1.4, False), (1.7, True), (5.0, True)])
 def test_a_receiver_that_fails_on_the_bridge_is_named(seconds: float, *, named: bool) -> None:
     middle = 0.5 * (ENTRY_S + EXIT_S)
