@@ -43,8 +43,9 @@ _RHO = 0.7
 """Of a step's first move; that of the second is zero."""
 _SMALLEST_SHIFT = 0.35
 _SMALLEST_STRETCH = 0.2
-_ASIDE = 1.5
-_FURTHEST = 1.0
+_ASIDE = (1.5, 3.0, 6.0)
+_FURTHEST = 2.0 / 3.0  # of where the target was looked at
+_NARROWEST = 0.5
 _STRAIGHTEST = 1e-9
 _LOG_TWO_PI = float(np.log(2.0 * np.pi))
 _MASS_DRAWS = 500
@@ -192,27 +193,43 @@ def adapted(mixed: Mixture, v: FloatArray) -> Mixture:
 def probed(target: LogDensity, mixed: Mixture) -> Mixture:
     """The approximation moved and stretched to fit the target along each of its own directions.
 
-    Curvature at the optimum says little of a posterior that is flatter or steeper further away:
-    the target is looked at 1.5 standard deviations to either side. What is never negative stays.
+    Curvature at the optimum says little of a posterior that is flatter or steeper further away: the
+    target is looked at 1.5 standard deviations to either side, and twice and four times as far
+    where that is still within one standard deviation of what is seen. What is never negative stays.
     """
     part = mixed.parts[0]
     free = np.arange(part.positive, part.centre.size)
-    v = np.zeros((2 * free.size + 1, part.centre.size))
-    v[np.arange(free.size), free] = _ASIDE
-    v[free.size + np.arange(free.size), free] = -_ASIDE
-    y, log_q = _map(mixed, np.zeros(v.shape[0], dtype=np.int64), v)
-    # Of the target as a function of v: that of the points, times what the map stretches.
-    log_p = _weigh(target, y, log_q) - 0.5 * np.sum(v**2, axis=1)
-    ahead, behind, here = log_p[: free.size], log_p[free.size : -1], log_p[-1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        curvature = -(ahead + behind - 2.0 * here) / _ASIDE**2
-        mean = np.clip((ahead - behind) / (2.0 * _ASIDE) / curvature, -_FURTHEST, _FURTHEST)
-        spread = np.clip(1.0 / np.sqrt(curvature), 0.5, 2.5)
-    usable = np.isfinite(mean) & np.isfinite(spread) & (curvature > 0.0)
     shift, scale = part.shift.copy(), part.scale.copy()
-    shift[free] += np.where(usable, scale[free] * mean, 0.0)
-    scale[free] *= np.where(usable, spread, 1.0)
+    for aside in _ASIDE:
+        ahead, behind, here = _log_densities_along(target, mixed, free, aside)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            curvature = -(ahead + behind - 2.0 * here) / aside**2
+            mean = (ahead - behind) / (2.0 * aside) / curvature
+            spread = np.maximum(1.0 / np.sqrt(curvature), _NARROWEST)
+        seen = np.isfinite(mean) & np.isfinite(spread) & (spread < aside)
+        furthest = _FURTHEST * aside
+        shift[free[seen]] += scale[free[seen]] * np.clip(mean[seen], -furthest, furthest)
+        scale[free[seen]] *= spread[seen]
+        free = free[~seen]
+        if free.size == 0:
+            break
     return mixed._replace(parts=tuple(p._replace(shift=shift, scale=scale) for p in mixed.parts))
+
+
+def _log_densities_along(
+    target: LogDensity, mixed: Mixture, free: NDArray[np.int64], aside: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Of the target as a function of v, `aside` ahead of zero and behind (d,), and there.
+
+    Along the axes `free` (d,): of the points, times what the map stretches.
+    """
+    d = free.size
+    v = np.zeros((2 * d + 1, mixed.parts[0].centre.size))
+    v[np.arange(d), free] = aside
+    v[d + np.arange(d), free] = -aside
+    y, log_q = _map(mixed, np.zeros(v.shape[0], dtype=np.int64), v)
+    log_p = _weigh(target, y, log_q) - 0.5 * np.sum(v**2, axis=1)
+    return log_p[:d], log_p[d:-1], float(log_p[-1])
 
 
 def moved(target: LogDensity, before: Mixture, after: Mixture, state: State) -> State:
