@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.results import Crossing, Results, results_json
+from schemas.results import AtEnds, Crossing, Derived, Results, results_json
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.common.errors import FailureError
@@ -137,6 +137,20 @@ def _print_crossing(console: "Console", crossing: Crossing, site: Site) -> None:
         console.print(line, highlight=False)
 
 
+def _of_ends_and_springs(derived: Derived) -> Iterator[str]:
+    """What was decided about things that may be there or not."""
+
+    def at_ends(likely: AtEnds) -> str:
+        return f"{100.0 * likely.start:.0f} % at the start, {100.0 * likely.end:.0f} % at the end"
+
+    if derived.probability_sprung is not None:
+        yield f"a spring holds the end of the bridge: {at_ends(derived.probability_sprung)}"
+    if derived.probability_giving is not None:
+        yield f"a bearing gives under load: {at_ends(derived.probability_giving)}"
+    if derived.springs_believed is not None:
+        yield f"the truck's springs are believed to {100.0 * derived.springs_believed:.0f} %"
+
+
 def _remarks(crossing: Crossing) -> Iterator[str]:
     """How well the model fits, and what of the intervals all elements have in common."""
     diagnostics = crossing.diagnostics
@@ -147,6 +161,8 @@ def _remarks(crossing: Crossing) -> Iterator[str]:
         )
     if crossing.chi2_per_dof is not None:
         yield f"misfit against the declared noise: chi2 {crossing.chi2_per_dof:.2f}, 1 expected"
+    if crossing.derived is not None:
+        yield from _of_ends_and_springs(crossing.derived)
     if "relative_misfit" in diagnostics:
         yield (
             f"the two roads differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm rms, "

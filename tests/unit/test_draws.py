@@ -50,6 +50,11 @@ def test_the_draws_are_those_of_the_result_and_of_what_is_printed(
         interval = f"{weak.q025 / unit:.{digits}f} … {weak.q975 / unit:.{digits}f}"
         assert re.search(rf"EI_4 .* {weak.mean / unit:.{digits}f} +{interval}", printed), printed
     assert f"common to all elements: {100.0 * crossing.scale_error:.1f} %" in printed
+    assert crossing.derived is not None
+    giving = crossing.derived.probability_giving
+    assert giving is not None
+    assert f"a bearing gives under load: {100.0 * giving.start:.0f} % at the start" in printed
+    assert "the truck's springs are believed to 100 %" in printed
     # Neighbours along a chain are alike, across the chains they are not: the axes are not mixed up.
     rigidity = arrays["EI_4"] - arrays["EI_4"].mean()
     along = np.mean(rigidity[:, 1:] * rigidity[:, :-1]) / np.mean(rigidity**2)
