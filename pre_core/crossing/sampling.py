@@ -20,7 +20,7 @@ SMALLEST_ESS = 100.0
 _LEARNING_SHARE = 0.4
 """Of the draws that are asked for, in each stage of learning."""
 _LEARNING_STAGES = 3
-_WELL_ACCEPTED = 0.5
+_WELL_ACCEPTED = 0.3
 """From here on the approximation is good enough, and nothing more is learnt."""
 _MOST_RUNS = 14
 """So many times the draws that are asked for may be drawn before the chains are given up."""
@@ -109,7 +109,7 @@ def _learnt(
     """A state and an approximation that is accepted often enough, and the steps it took."""
     mixed = crank_nicolson.probed(target, mixed)
     state = crank_nicolson.init(target, mixed)
-    steps = 0
+    before, best, steps = mixed, 0.0, 0
     for stage in range(_LEARNING_STAGES):
         seen, acceptance = [], []
         for number in range(count):
@@ -118,11 +118,14 @@ def _learnt(
             seen.append(state.v)
             acceptance.append(info.acceptance)
         steps += count
-        if np.mean(acceptance) > _WELL_ACCEPTED:
+        accepted = float(np.mean(acceptance))
+        if accepted < best:  # few draws teach nonsense now and then
+            return crank_nicolson.moved(target, mixed, before, state), before, steps
+        if accepted > _WELL_ACCEPTED or stage == _LEARNING_STAGES - 1:
             break
-        better = crank_nicolson.adapted(mixed, np.stack(seen[count // 3 :]))
-        state = crank_nicolson.moved(target, mixed, better, state)
-        mixed = better
+        best, before = accepted, mixed
+        mixed = crank_nicolson.adapted(mixed, np.stack(seen[count // 3 :]))
+        state = crank_nicolson.moved(target, before, mixed, state)
     return state, mixed, steps
 
 
