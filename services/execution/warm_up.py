@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from pre_core import unknowns
-from pre_core.crossing import optimum, posterior
+from pre_core.crossing import posterior
+from pre_core.crossing.preparation import Inputs, prepare
 from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.integrate import spline_integrate
@@ -66,7 +67,7 @@ def _warm_up_pre() -> None:
     fixes = posterior.Fixes(
         time_s, experiment.SPEED_M_PER_S * time_s - 10.0, np.full(time_s.size, 10.0), 0.4, 0.07, 1.5
     )
-    inputs = optimum.Inputs(
+    inputs = Inputs(
         np.random.default_rng(0).standard_normal((4, count)),
         0.0,
         step_s,
@@ -94,7 +95,7 @@ def _warm_up_pre() -> None:
         2,
         1,
     )
-    problem, y = optimum.prepare(inputs)
+    problem, y = prepare(inputs)
     posterior.all_rows(problem, y[None, :])
     posterior.filtered_rows(problem, y)
     posterior.roads(problem, y)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pre_core import unknowns
 from pre_core.crossing import optimum, posterior
+from pre_core.crossing.preparation import Inputs
 from pre_core.crossing.sampling import Sampled, sample
 from pre_core.crossing.whitening import RESIDUALS
 from pre_core.physics.beam_basis import first_frequencies_hz
@@ -63,7 +64,7 @@ Keep = Callable[[str, dict[str, Floats]], None]
 
 def inputs_of(
     data: CrossingData, settings: IdentificationSettings, acceleration: Floats, start_s: float
-) -> optimum.Inputs:
+) -> Inputs:
     """The crossing and the site's knowledge as method `pre` takes them."""
     vehicle, bridge, sensor, receiver = data.vehicle, data.bridge, data.sensor, data.receiver
     assert data.samples is not None  # noqa: S101 - it was checked before
@@ -86,7 +87,7 @@ def inputs_of(
         ),
     )
     density = np.maximum(np.array(sensor.noise_density_ug_per_rthz), _SMALLEST_NOISE_UG) * _MICRO_G
-    return optimum.Inputs(
+    return Inputs(
         acceleration,
         start_s,
         step_s,

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
-from pre_core.crossing import optimum, posterior
+from pre_core.crossing import posterior
 from pre_core.crossing.bound import DIFFERENCE, central_jacobian, settle
+from pre_core.crossing.preparation import prepare, with_noise_at
 from pre_core.diagnostics.calibration import without_negative
 from pre_core.physics.vehicle import total_mass_kg
 from schemas.signals import CHANNELS
@@ -99,7 +100,7 @@ def _settled(problem: posterior.Problem, y: Floats) -> tuple[posterior.Problem, 
     nuisances = np.arange(where.gains.start, where.size)
     # What springs leave over is read off the rows: first without what the nuisances put there.
     y = settle(problem, y, nuisances)
-    problem = optimum.with_noise_at(problem, y)
+    problem = with_noise_at(problem, y)
     return problem, settle(problem, y, nuisances)
 
 
@@ -164,7 +165,7 @@ def problem_of(seen: Seen) -> tuple[posterior.Problem, Floats, Floats]:
     assert samples is not None  # noqa: S101 - the crossing was identified
     acceleration = np.stack([samples.channels[name] for name in CHANNELS])
     inputs = inputs_of(seen.data, seen.settings, acceleration, samples.start_s)
-    problem, y = optimum.prepare(inputs)
+    problem, y = prepare(inputs)
     return problem, y, _times(problem, inputs.fixes)
 
 

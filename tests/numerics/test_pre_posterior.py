@@ -9,7 +9,6 @@ from scipy.interpolate import BSpline
 
 from pre_core.crossing import channels
 from pre_core.crossing.channels import channel_signals
-from pre_core.crossing.optimum import Inputs, prepare, with_noise_at
 from pre_core.crossing.posterior import (
     Fixes,
     Priors,
@@ -24,6 +23,7 @@ from pre_core.crossing.posterior import (
     start,
     trajectory_basis,
 )
+from pre_core.crossing.preparation import Inputs, prepare, with_noise_at
 from pre_core.paper import experiment
 from pre_core.physics.models import from_models
 from pre_core.physics.sensors import MICRO_G_M_PER_S2, white_noise

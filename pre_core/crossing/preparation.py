@@ -1,0 +1,170 @@
+"""Method `pre`: from one crossing's signals to the problem that is to be solved, and its noise."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pre_core.crossing.channels import channel_signals
+from pre_core.crossing.posterior import (
+    Fixes,
+    Priors,
+    Problem,
+    filtered_rows,
+    layout,
+    points,
+    start,
+    trajectory_basis,
+)
+from pre_core.crossing.residuals import Crossing, sinc_table, step_table, workspace
+from pre_core.crossing.whitening import (
+    DOUBTED,
+    force_noise,
+    linear_springs,
+    noise_power,
+    row_count,
+    row_filter,
+    truck_of,
+    whitener,
+)
+from pre_core.physics.beam_basis import beam_basis, rebased
+from pre_core.physics.bridge import FloatArray
+from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
+from pre_core.unknowns import FIRST_OF_BRIDGE
+
+_KNOT_S = 0.4
+_SLOPE_STEP = 1e-3
+_SWING_BEFORE_S = 0.1
+"""The bridge's swing is told at this time before the truck comes, to leave the search room."""
+_MARGIN_M = 3.0  # of road before the first row, for the trajectory to move
+
+
+class Inputs(NamedTuple):
+    """One crossing as method `pre` takes it; times in s on one clock, chainage in m."""
+
+    acceleration_m_per_s2: FloatArray  # (4, n)
+    start_s: float
+    step_s: float
+    direction: int
+    span_m: float
+    element_lengths_m: FloatArray
+    interior_supports: tuple[int, ...]
+    """Between which elements the bridge is held up: after so many of them."""
+    total_mass_kg: float
+    cg_height_m: float
+    density_m_per_s2_per_rthz: FloatArray  # (4,) one-sided
+    slowest_rate_hz: float
+    fixes: Fixes
+    priors: Priors
+    parts: int
+    threads: int
+
+
+def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
+    """The problem and the coordinates of its nominal start."""
+    model = channel_signals(inputs.acceleration_m_per_s2, inputs.step_s, inputs.slowest_rate_hz)
+    n = model.signals.shape[2]
+    basis = beam_basis(
+        inputs.element_lengths_m,
+        inputs.parts,
+        interior_supports=inputs.interior_supports,
+        bearings_give=True,
+    )
+    position, speeding, rows, values, best = trajectory_basis(
+        inputs.fixes, inputs.start_s + model.start_s, model.step_s, n, inputs.direction, _KNOT_S
+    )
+    front = position @ best[:-1]
+    travel = front if inputs.direction > 0 else inputs.span_m - front
+    wheelbase = inputs.priors.wheelbase_m
+    first = int(np.searchsorted(travel - wheelbase, travel[0] + _MARGIN_M))
+    crossing = Crossing(
+        model.step_s,
+        model.signals,
+        inputs.direction,
+        inputs.span_m,
+        inputs.total_mass_kg,
+        inputs.cg_height_m,
+        STANDARD_GRAVITY_M_PER_S2,
+        basis,
+        np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
+        first,
+        n - first,
+        sinc_table(),
+        step_table(),
+        False,
+        0,
+    )
+    crossing = crossing._replace(swing_sample=swing_sample(crossing, front))
+    row = row_filter(model.step_s)
+    theta = inputs.priors.theta
+    count = row_count(row, crossing.rows)
+    noise = whitener(
+        row,
+        count,
+        truck_of(theta, crossing.total_mass_kg, wheelbase, False),
+        inputs.density_m_per_s2_per_rthz,
+        linear_springs(),
+    )
+    problem = Problem(
+        crossing,
+        inputs.priors,
+        row,
+        noise,
+        inputs.density_m_per_s2_per_rthz,
+        linear_springs(),
+        position,
+        speeding,
+        rows,
+        values,
+        np.zeros(0),
+        tuple(workspace(crossing, theta.size, row) for _ in range(inputs.threads)),
+    )
+    return problem, start(problem, best)
+
+
+def swing_sample(crossing: Crossing, front: FloatArray) -> int:
+    """The sample a little before the front axle, at front (n,), comes to the bridge."""
+    begin, sign = (0.0, 1.0) if crossing.direction > 0 else (crossing.span_m, -1.0)
+    entry = int(np.searchsorted(sign * front, sign * begin))
+    return max(0, entry - round(_SWING_BEFORE_S / crossing.step_s))
+
+
+def with_noise_at(
+    problem: Problem, y: FloatArray, force: FloatArray | None = None, doubted: float = DOUBTED
+) -> Problem:
+    """The problem with the noise as it is for the truck at y, and coordinates for its bridge.
+
+    The noise of springs and dampers is `force`, by default what the body equations leave at y if
+    that is at least `doubted` (`force_noise`).
+    """
+    where = layout(problem)
+    unknowns = where.gains.stop
+    near = np.repeat(y[None, :], 1 + unknowns, axis=0)
+    near[np.arange(1, 1 + unknowns), np.arange(unknowns)] += _SLOPE_STEP
+    at = points(problem, near)
+    density = problem.density * (1.0 + at.gain)
+    total = problem.crossing.total_mass_kg
+    if force is None:
+        one = truck_of(at.theta[0], total, float(at.wheelbase_m[0]), problem.crossing.is_inertial)
+        body = filtered_rows(problem, y)[1:]
+        force = force_noise(problem.rows, one, density[0], body, doubted)
+    is_inertial = bool(force.any())
+    trucks = [
+        truck_of(theta, total, float(wheelbase), is_inertial)
+        for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
+    ]
+    count = row_count(problem.rows, problem.crossing.rows)
+    noise = whitener(problem.rows, count, trucks[0], density[0], force)
+    truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
+    changing = [*range(truck), *range(where.wheelbase, unknowns)]
+    slope = np.zeros(unknowns)
+    power = noise_power(problem.rows, trucks, density, force, changing)
+    slope[changing] = 0.5 * count * power / _SLOPE_STEP
+    basis = rebased(problem.crossing.basis, at.theta[0])
+    for work in problem.works:
+        work.modes_of[:] = np.nan
+    return problem._replace(
+        noise=noise,
+        force=force,
+        noise_slope=slope,
+        crossing=problem.crossing._replace(basis=basis, is_inertial=is_inertial),
+    )
