@@ -25,7 +25,10 @@ from numpy.typing import NDArray
 from pre_core.paper import experiment
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing, estimate_to_crossing
+from schemas.results import Crossing
+from schemas.results_on_the_wire import (
+    estimate_to_crossing,
+)
 from schemas.site import Site, site_toml
 from services.bus.session import open_session
 from services.bus.subscription import Received, Subscription

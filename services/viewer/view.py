@@ -18,7 +18,10 @@ from google.protobuf.message import DecodeError
 from rich.console import Console
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing, estimate_to_crossing, load_results
+from schemas.results import Crossing, load_results
+from schemas.results_on_the_wire import (
+    estimate_to_crossing,
+)
 from schemas.site import Site, load_site, parse_site
 from services.common.errors import FailureError, InputError
 from services.recordings.recording import Message, read_messages, read_site

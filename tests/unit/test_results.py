@@ -23,13 +23,15 @@ from schemas.results import (
     Prior,
     Results,
     Road,
+    load_results,
+    results,
+    results_json,
+)
+from schemas.results_on_the_wire import (
     bridge_to_protobuf,
     crossing_to_protobuf,
     direction_from_protobuf,
     estimate_to_crossing,
-    load_results,
-    results,
-    results_json,
     state_to_bridge,
 )
 

@@ -9,13 +9,9 @@ from pathlib import Path
 import pytest
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import (
-    Crossing,
-    Header,
+from schemas.results import Crossing, Header, load_results, results, results_json
+from schemas.results_on_the_wire import (
     crossing_to_protobuf,
-    load_results,
-    results,
-    results_json,
     state_to_bridge,
 )
 from schemas.topics import Key
