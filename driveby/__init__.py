@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from driveby.plotting import plot as plot
     from schemas.signals import CHANNELS as CHANNELS
     from schemas.site import Site as Site
-    from schemas.site import load_site as load_site
+    from schemas.site_file import load_site as load_site
     from services.common.errors import FailureError as FailureError
     from services.common.errors import InputError as InputError
     from services.drives.signals import Signals as Signals
@@ -55,7 +55,7 @@ _PLACES = {
     "Site": "schemas.site",
     "Solution": "services.notebook.solution",
     "identify": "services.notebook.identify",
-    "load_site": "schemas.site",
+    "load_site": "schemas.site_file",
     "plot": "driveby.plotting",
     "read": "services.notebook.read",
     "simulate": "services.notebook.simulate",

@@ -4,14 +4,10 @@ Field names are the keys of the TOML file (docs/contract.md). Pairs are [front, 
 is a relative standard deviation of a log-normal prior, unless its name carries a unit.
 """
 
-import difflib
-import hashlib
-import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import accumulate, pairwise
-from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import (
     BaseModel,
@@ -21,20 +17,16 @@ from pydantic import (
     Strict,
     StrictBool,
     StringConstraints,
-    ValidationError,
     model_validator,
 )
 
-from schemas.errors import InputError
 from schemas.signals import MAX_RATE_HZ
-from schemas.toml_text import parse_toml, read_toml_text
+from schemas.site_errors import at
 from schemas.topics import IDENTIFIER
 
 MAX_ELEMENTS: Final = 30
 MAX_TABLES: Final = 20_000
 """Vehicles or bridges of a site file."""
-_MOST_FIELDS: Final = 100
-"""In a table, and values in a list: more than there can be."""
 MAX_SPAN_DISAGREEMENT: Final = 0.2
 """Beyond this relative difference between `span_m` and the distance of the ends one of them is a
 slip of the pen. Ends read off a hand-held receiver are metres off, so less is not refused."""
@@ -148,13 +140,13 @@ class Vehicle(_Spreadable):
     @model_validator(mode="after")
     def _fits_together(self) -> "Vehicle":
         if self.front_axle_to_cg_m >= self.wheelbase_m:
-            raise _at(
+            raise at(
                 "front_axle_to_cg_m",
                 f"is {self.front_axle_to_cg_m}, it must be a length less than wheelbase_m, "
                 f"{self.wheelbase_m} m",
             )
         if self.sprung_mass_kg <= 0:
-            raise _at(
+            raise at(
                 "unsprung_mass_kg",
                 f"adds up to {sum(self.unsprung_mass_kg)}, it must be a mass less than "
                 f"total_mass_kg, {self.total_mass_kg} kg",
@@ -283,7 +275,7 @@ class Bridge(_Spreadable):
         self._supports_fit()
         per_element = self.flexural_rigidity_per_element_nm2
         if per_element is None and self.flexural_rigidity_nm2 is None:
-            raise _at(
+            raise at(
                 "flexural_rigidity_nm2",
                 "is missing, give the sound bridge's flexural rigidity in N·m² "
                 "(or flexural_rigidity_per_element_nm2)",
@@ -293,7 +285,7 @@ class Bridge(_Spreadable):
             ("element_lengths_m", self.element_lengths_m),
         ):
             if values is not None and len(values) != self.elements:
-                raise _at(
+                raise at(
                     key,
                     f"has {len(values)} values, it must have one for each of the "
                     f"{self.elements} elements",
@@ -301,7 +293,7 @@ class Bridge(_Spreadable):
         if self.element_lengths_m is not None:
             total = math.fsum(self.element_lengths_m)
             if not math.isclose(total, self.span_m, rel_tol=_SMALLEST_SLIP):
-                raise _at(
+                raise at(
                     "element_lengths_m",
                     f"adds up to {total:g} m, it must add up to span_m, {self.span_m:g} m",
                 )
@@ -310,19 +302,19 @@ class Bridge(_Spreadable):
             ):
                 end = math.fsum(self.element_lengths_m[:node])
                 if abs(end - support) > _SMALLEST_SLIP * self.span_m:
-                    raise _at(
+                    raise at(
                         "element_lengths_m",
                         f"has no element that ends at {support:g} m, one must end at every "
                         f"interior support; the nearest ends at {end:g} m",
                     )
         distance = self.ends_distance_m
         if distance < 0.01:
-            raise _at(
+            raise at(
                 "end_latitude_deg",
                 "and end_longitude_deg are the start's, the two ends must be different places",
             )
         if abs(self.span_m / distance - 1) > MAX_SPAN_DISAGREEMENT:
-            raise _at(
+            raise at(
                 "span_m",
                 f"is {self.span_m:g} but the ends are {distance:.1f} m apart, "
                 "the span and the coordinates of the bearings must agree",
@@ -334,18 +326,18 @@ class Bridge(_Spreadable):
         supports = (0.0, *self.interior_supports_m, self.span_m)
         for number, (before, after) in enumerate(pairwise(supports)):
             if after <= before and number < len(self.interior_supports_m):
-                raise _at(
+                raise at(
                     f"interior_supports_m.{number}",
                     f"is {after:g}, it must be a chainage beyond {before:g} m: supports between "
                     "the ends are given from the start on",
                 )
             if after <= before:
-                raise _at(
+                raise at(
                     f"interior_supports_m.{number - 1}",
                     f"is {before:g}, it must be a chainage between 0 and span_m, {self.span_m:g} m",
                 )
         if self.elements < len(self.lengths_of_spans_m):
-            raise _at(
+            raise at(
                 "elements",
                 f"is {self.elements}, it must be at least {len(self.lengths_of_spans_m)}, "
                 "one for each span",
@@ -416,258 +408,9 @@ class Site(_Table):
             seen: set[str] = set()
             for index, table in enumerate(tables):
                 if table.id in seen:
-                    raise _at(f"{name}.{index}.id", f'is "{table.id}" again, ids must be unique')
+                    raise at(f"{name}.{index}.id", f'is "{table.id}" again, ids must be unique')
                 seen.add(table.id)
         return self
-
-
-def load_site(path: Path) -> Site:
-    """Read a site file; raise InputError with one line if it cannot be read or is wrong."""
-    return parse_site(read_site_text(path), str(path))
-
-
-def read_site_text(path: Path) -> str:
-    """Return the text of a site file; raise InputError if it cannot be read or is too large."""
-    return read_toml_text(path, "a site file")
-
-
-def parse_site(toml_text: str, source_name: str) -> Site:
-    """Return the site that the text describes; raise InputError that begins with `source_name`."""
-    table = parse_toml(toml_text, source_name)
-    single = {name for name in ("vehicle", "bridge") if isinstance(table.get(name), dict)}
-    for name in single:
-        table[name] = [table[name]]
-    too_many = _too_many(table)
-    if too_many:
-        raise InputError(f"{source_name}: {too_many}")
-    try:
-        return Site.model_validate(table)
-    except ValidationError as error:
-        raise InputError(f"{source_name}: {_first_line(error, single)}") from error
-
-
-def _too_many(table: dict[str, Any]) -> str | None:
-    """Say which table or list is longer than any site file's: Pydantic tells of all its errors."""
-    parts = [("the file", table)]
-    for name, value in table.items():
-        tables = value if isinstance(value, list) else [value]
-        if len(tables) > MAX_TABLES:
-            return f"has {len(tables)} [[{name}]], at most {MAX_TABLES} are expected"
-        parts += [(f"[{name}]", part) for part in tables if isinstance(part, dict)]
-    for name, part in parts:
-        if len(part) > _MOST_FIELDS:
-            return f"{name} has {len(part)} fields, most of them unknown"
-        for key, value in part.items() if name != "the file" else ():
-            if isinstance(value, list) and len(value) > _MOST_FIELDS:
-                return f"{name} {key} has {len(value)} values, at most {MAX_ELEMENTS} are expected"
-    return None
-
-
-def site_hash(site: Site) -> str:
-    """Return 16 hex digits that change when any value changes, however the file is laid out."""
-    canonical = json.dumps(site.model_dump(by_alias=True), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
-
-
-def site_toml(site: Site) -> str:
-    """Return a site file with every value spelt out; parsing it gives an equal site."""
-    vehicle = "[vehicle]" if len(site.vehicles) == 1 else "[[vehicle]]"
-    bridge = "[bridge]" if len(site.bridges) == 1 else "[[bridge]]"
-    tables: list[tuple[str, BaseModel]] = [(vehicle, table) for table in site.vehicles]
-    tables += [(bridge, table) for table in site.bridges]
-    return _toml([*tables, ("[sensor]", site.sensor), ("[receiver]", site.receiver)])
-
-
-def vehicle_toml(site: Site, vehicle_id: str) -> str:
-    """Return what a truck says of itself: the [vehicle], [sensor] and [receiver] parts."""
-    return _toml(
-        [
-            ("[vehicle]", site.vehicle(vehicle_id)),
-            ("[sensor]", site.sensor),
-            ("[receiver]", site.receiver),
-        ]
-    )
-
-
-def _toml(tables: list[tuple[str, BaseModel]]) -> str:
-    return "".join(_table_text(heading, table.model_dump()) for heading, table in tables)
-
-
-def toml_of(tables: dict[str, dict[str, Any]]) -> str:
-    """Return the text of tables of numbers, texts, booleans and lists of them."""
-    return "".join(_table_text(f"[{name}]", table) for name, table in tables.items())
-
-
-def _table_text(heading: str, table: dict[str, Any]) -> str:
-    lines = [heading]
-    for key, value in table.items():
-        if value is not None:
-            # JSON's numbers, strings, booleans and lists are TOML's; DEL alone must be escaped.
-            text = json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
-            lines.append(f"{key} = {text}")
-    return "\n".join(lines) + "\n"
-
-
-class _FieldError(ValueError):
-    """A wrong value found by looking at several fields: says which one to mend."""
-
-    def __init__(self, path: str, message: str) -> None:
-        super().__init__(message)
-        self.path = path
-
-
-def _at(path: str, message: str) -> _FieldError:
-    return _FieldError(path, message)
-
-
-# The noun and the unit of a field, by the end of its name; longer endings first.
-_QUANTITIES: Final = (
-    ("_nm_per_rad", "a rotational stiffness", "N·m/rad"),
-    ("_ns_per_m", "a damping", "N·s/m"),
-    ("_n_per_m", "a stiffness", "N/m"),
-    ("_kg_per_m", "a mass per length", "kg/m"),
-    ("_ug_per_rthz", "a noise density", "µg/√Hz"),
-    ("_m_per_s", "a speed", "m/s"),
-    ("_per_s", "a coefficient", "1/s"),
-    ("_nm2", "a flexural rigidity", "N·m²"),
-    ("_spread", "a relative standard deviation", ""),
-    ("_kg", "a mass", "kg"),
-    ("_hz", "a rate", "Hz"),
-    ("_deg", "an angle", "degrees"),
-    ("_m", "a length", "m"),
-    ("_s", "a time", "s"),
-    ("elements", "a whole number", ""),
-)
-
-
-def _first_line(error: ValidationError, single: set[str]) -> str:
-    # A misspelt field is also a missing one: the spelling is what the user can see. And a list
-    # whose entry is wrong is counted by Pydantic as too short as well.
-    order = {"extra_forbidden": 0, "too_short": 2}
-    problems = sorted(error.errors(include_url=False), key=lambda p: order.get(p["type"], 1))
-    line = _describe(problems[0], single)
-    others = sum(p["type"] != "too_short" for p in problems) - 1
-    return f"{line} (and {others} more)" if others > 0 else line
-
-
-def _describe(problem: Any, single: set[str]) -> str:
-    location = list(problem["loc"])
-    context = problem.get("ctx", {})
-    cause = context.get("error")
-    if isinstance(cause, _FieldError):
-        location += [int(part) if part.isdigit() else part for part in cause.path.split(".")]
-        return f"{_path(location, single)} {cause}"
-    path = _path(location, single)
-    key = next((str(part) for part in reversed(location) if isinstance(part, str)), "")
-    if problem["type"] == "missing":
-        if len(location) == 1:
-            return f"the table [{path}] is missing"
-        what = _quantity(key)
-        return f"{path} is missing" + (f", it must be {what}" if what else "")
-    if problem["type"] == "extra_forbidden":
-        return f"{path} is not a known field, {_suggestion(key, len(location))}"
-    return f"{path} is {_shown(problem['input'])}, it must be {_expected(problem, key)}"
-
-
-def _suggestion(key: str, depth: int) -> str:
-    tables: dict[str, type[BaseModel]] = {
-        "vehicle": Vehicle,
-        "bridge": Bridge,
-        "sensor": Sensor,
-        "receiver": Receiver,
-    }
-    if depth == 1:
-        known = list(tables)
-    else:
-        for name, table in tables.items():
-            if key in table.model_fields:
-                return f"it belongs into [{name}]"
-        known = [field for table in tables.values() for field in table.model_fields]
-    close = difflib.get_close_matches(key, known, n=1, cutoff=0.8)
-    return f"did you mean {close[0]}?" if close else "check its spelling or remove it"
-
-
-def _path(location: list[int | str], single: set[str]) -> str:
-    """Spell a place as the user typed it: no index where there was one table and no list."""
-    parts = list(_path_parts(location, single))
-    return "".join(parts).removeprefix(".") or "the file"
-
-
-def _path_parts(location: list[int | str], single: set[str]) -> Iterator[str]:
-    for position, part in enumerate(location):
-        if isinstance(part, int):
-            if position != 1 or location[0] not in single:
-                yield f"[{part}]"
-        else:
-            yield f".{part}"
-
-
-def _quantity(key: str, condition: str = "") -> str:
-    for ending, noun, unit in _QUANTITIES:
-        if key.endswith(ending):
-            return " ".join(part for part in (noun, condition or ("in" * bool(unit)), unit) if part)
-    return f"a number {condition}".strip() if condition else ""
-
-
-def _expected(problem: Any, key: str) -> str:
-    kind, context = problem["type"], problem.get("ctx", {})
-    conditions = {
-        "greater_than": ("greater than", "gt"),
-        "greater_than_equal": ("of at least", "ge"),
-        "less_than": ("less than", "lt"),
-        "less_than_equal": ("of at most", "le"),
-    }
-    if kind in conditions:
-        words, name = conditions[kind]
-        return _quantity(key, f"{words} {context[name]:g}")
-    if kind == "finite_number":
-        return ", ".join(part for part in (_quantity(key), "a finite number") if part)
-    if key == "id":
-        return (
-            'an identifier of a-z, 0-9, "_" and "-", at most 63, beginning with a letter or digit'
-        )
-    if kind in ("float_type", "int_type", "int_from_float"):
-        return _quantity(key) or "a number"
-    if kind in ("tuple_type", "too_short", "too_long"):
-        return _list_expected(problem, key)
-    messages = {
-        "bool_type": "true or false",
-        "string_type": "a text in quotation marks",
-        "literal_error": _CHOICES.get(key, "1 or -1"),
-        "model_type": "a table",
-        "model_attributes_type": "a table",
-    }
-    message: str = problem["msg"]
-    return messages.get(kind, message[:1].lower() + message[1:])
-
-
-_CHOICES: Final = {
-    "bearings": '"unknown", "free" or "sprung"',
-    "road_class": 'an ISO 8608 class, "A" to "E"',
-}
-
-
-def _list_expected(problem: Any, key: str) -> str:
-    if key in ("vehicle", "bridge"):
-        return f"a table [{key}] or several [[{key}]]"
-    if key in ("flexural_rigidity_per_element_nm2", "element_lengths_m"):
-        return "a list with one number for each element"
-    if key == "interior_supports_m":
-        return "a list of chainages in m"
-    if key == "bearings":
-        return f"{_CHOICES[key]}, or a pair [start, end] of these"
-    if key in Sensor.model_fields:
-        return "a list of four, in the order sprung front, sprung rear, unsprung front, rear"
-    return "a pair [front, rear]"
-
-
-def _shown(value: object) -> str:
-    """Show a value as TOML would, cut to fit a line."""
-    try:
-        text = json.dumps(value, ensure_ascii=False)
-    except (TypeError, ValueError):
-        text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _distance_m(

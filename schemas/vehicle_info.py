@@ -9,7 +9,8 @@ from typing import Any, Final, NamedTuple
 
 from schemas.errors import InputError
 from schemas.signals import MAX_SITE_BYTES
-from schemas.site import Vehicle, toml_of
+from schemas.site import Vehicle
+from schemas.site_file import toml_of
 from schemas.toml_text import parse_toml
 
 _LARGEST_Z: Final = 4.0

@@ -29,7 +29,8 @@ from schemas.results import Crossing
 from schemas.results_on_the_wire import (
     estimate_to_crossing,
 )
-from schemas.site import Site, site_toml
+from schemas.site import Site
+from schemas.site_file import site_toml
 from services.bus.session import open_session
 from services.bus.subscription import Received, Subscription
 from services.common.errors import FailureError, InputError

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.settings import IdentificationSettings
-from schemas.site import load_site
+from schemas.site_file import load_site
 from services.cli.progress import progress_bar
 from services.cli.validate_paper import make_folder
 from services.common.files import check_writable, write_atomically

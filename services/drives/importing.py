@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from schemas.site import Site, parse_site, read_site_text
+from schemas.site import Site
+from schemas.site_file import parse_site, read_site_text
 from services.common.errors import InputError
 from services.common.files import check_writable
 from services.common.naming import checked_identifier, identifier_from

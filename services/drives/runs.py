@@ -19,7 +19,8 @@ from schemas.signals import (
     encode_info,
     encode_location,
 )
-from schemas.site import Sensor, Site, vehicle_toml
+from schemas.site import Sensor, Site
+from schemas.site_file import vehicle_toml
 from schemas.topics import Key
 from services.recordings.recording import Message
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from schemas.results import Header, Results, results
 from schemas.settings import IdentificationSettings
-from schemas.site import Site, load_site, parse_site, site_hash
+from schemas.site import Site
+from schemas.site_file import load_site, parse_site, site_hash
 from services.common.errors import InputError
 from services.execution.blas import one_blas_thread
 from services.execution.dispatch import awaited, dispatched

@@ -14,7 +14,8 @@ from itertools import chain
 from pathlib import Path
 
 from schemas.signals import GnssFix, decode_gnss
-from schemas.site import Site, parse_site
+from schemas.site import Site
+from schemas.site_file import parse_site
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame
 from services.history.store import Store

@@ -400,7 +400,7 @@ def _check_service(service_id: str) -> None:
 def _read_site(site: Path | None) -> str | None:
     if site is None:
         return None
-    from schemas.site import parse_site, read_site_text
+    from schemas.site_file import parse_site, read_site_text
 
     text = read_site_text(site)
     parse_site(text, str(site))

@@ -5,7 +5,8 @@ from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
 
-from schemas.site import Site, load_site, parse_site
+from schemas.site import Site
+from schemas.site_file import load_site, parse_site
 from services.common.errors import InputError
 from services.drives.importing import messages_of_folder, vehicle_of
 from services.drives.signals import Signals, signals_of_folder, signals_of_recording

@@ -27,7 +27,8 @@ from pre_core.physics.simulate import Motion
 from pre_core.physics.vehicle import HalfCar
 from schemas.results import Crossing, Header
 from schemas.settings import IdentificationSettings
-from schemas.site import Bridge, Site, Vehicle, site_hash
+from schemas.site import Bridge, Site, Vehicle
+from schemas.site_file import site_hash
 from services.drives.runs import Run, run_to_messages
 from services.execution.dispatch import feed_all
 from services.execution.here import Here

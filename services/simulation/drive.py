@@ -38,7 +38,8 @@ from pre_core.physics.simulate import (
 )
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
-from schemas.site import Bridge, Site, Vehicle, load_site, parse_site, site_toml
+from schemas.site import Bridge, Site, Vehicle
+from schemas.site_file import load_site, parse_site, site_toml
 from services.common.errors import FailureError, InputError
 from services.common.files import check_writable
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon

@@ -24,7 +24,7 @@ from pre_core.physics.bridge import Beam
 from pre_core.physics.models import body_masses, from_models
 from pre_core.physics.vehicle import HalfCar
 from pre_core.search import loop
-from schemas.site import load_site
+from schemas.site_file import load_site
 from services.common.errors import FailureError, InputError
 from services.simulation.drive import beam_of, truck_of
 

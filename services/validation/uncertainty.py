@@ -20,7 +20,8 @@ import numpy as np
 from pre_core import unknowns
 from pre_core.paper import experiment
 from schemas.settings import IdentificationSettings
-from schemas.site import Site, load_site
+from schemas.site import Site
+from schemas.site_file import load_site
 from services.common.errors import InputError
 from services.drives.csv_import import read_folder
 from services.drives.runs import normalised

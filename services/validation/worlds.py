@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.settings import IdentificationSettings
-from schemas.site import Site, site_hash
+from schemas.site import Site
+from schemas.site_file import site_hash
 from services.common.errors import InputError
 from services.recordings.recording import program_version
 from services.simulation.drawn import drive, see

@@ -22,7 +22,8 @@ from schemas.results import Crossing, load_results
 from schemas.results_on_the_wire import (
     estimate_to_crossing,
 )
-from schemas.site import Site, load_site, parse_site
+from schemas.site import Site
+from schemas.site_file import load_site, parse_site
 from services.common.errors import FailureError, InputError
 from services.recordings.recording import Message, read_messages, read_site
 from services.viewer.crossing_view import CrossingView, view_of_crossing

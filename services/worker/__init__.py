@@ -24,7 +24,7 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.results import Header
 from schemas.settings import IdentificationSettings
 from schemas.signals import Identity
-from schemas.site import parse_site, read_site_text, site_hash
+from schemas.site_file import parse_site, read_site_text, site_hash
 from schemas.topics import check_identifier, check_realm, is_replayed, parse_key, selector
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import leave_at_once, stopped_by_signals

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.site import load_site
+from schemas.site_file import load_site
 from services.cli import main as cli
 
 ROOT = Path(__file__).parents[2]

@@ -11,7 +11,7 @@ from rerun.chunk import RrdReader
 
 from schemas.results import load_results
 from schemas.signals import decode_accel, decode_gnss, location_class
-from schemas.site import load_site, site_toml
+from schemas.site_file import load_site, site_toml
 from services.cli import main as cli
 from services.common.geodesy import bridge_frame, to_chainage
 from services.drives.comma2k19 import read_comma2k19

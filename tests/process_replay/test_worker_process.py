@@ -17,7 +17,7 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import load_results
 from schemas.signals import Identity, decode_info, encode_info
-from schemas.site import site_toml
+from schemas.site_file import site_toml
 from schemas.topics import selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session

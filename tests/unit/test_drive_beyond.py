@@ -8,7 +8,8 @@ from rich.console import Console
 
 from pre_core.physics.vehicle import static_axle_loads_n
 from schemas.settings import IdentificationSettings
-from schemas.site import Site, parse_site, site_toml
+from schemas.site import Site
+from schemas.site_file import parse_site, site_toml
 from services.cli import main as cli
 from services.cli.identify import identify_recordings, site_of
 from services.common.errors import InputError

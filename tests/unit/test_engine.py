@@ -14,7 +14,8 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, Header
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS, VehicleInfo, decode_accel, encode_accel, encode_info
-from schemas.site import Site, site_hash, vehicle_toml
+from schemas.site import Site
+from schemas.site_file import site_hash, vehicle_toml
 from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages

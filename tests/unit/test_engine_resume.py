@@ -13,7 +13,7 @@ from schemas.results_on_the_wire import (
 )
 from schemas.settings import IdentificationSettings
 from schemas.signals import decode_accel, encode_accel
-from schemas.site import site_hash
+from schemas.site_file import site_hash
 from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.site import load_site, parse_site
+from schemas.site_file import load_site, parse_site
 from services.common.geodesy import bridge_frame, heading_deg, to_chainage, to_lat_lon
 
 

@@ -20,7 +20,8 @@ from pre_core.paper.experiment import scenario_ratios
 from schemas.results import Crossing, Results, load_results
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
-from schemas.site import Site, parse_site, site_hash, site_toml
+from schemas.site import Site
+from schemas.site_file import parse_site, site_hash, site_toml
 from services.cli import main as cli
 from services.cli.identify import identify_command
 from services.common.errors import InputError

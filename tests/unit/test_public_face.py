@@ -325,7 +325,7 @@ def test_a_rejected_crossing_has_rows_without_numbers(sample: Path) -> None:
 def test_a_folder_with_its_site_is_identified(
     simulation: driveby.Simulation, exact: driveby.Identification, tmp_path: Path
 ) -> None:
-    from schemas.site import site_toml
+    from schemas.site_file import site_toml
 
     signals = simulation.signals
     time = next(iter(signals.channels.values())).time_ns / 1e9

@@ -27,7 +27,8 @@ from schemas.signals import (
     encode_gnss,
     encode_location,
 )
-from schemas.site import Site, parse_site
+from schemas.site import Site
+from schemas.site_file import parse_site
 from schemas.topics import Key
 from services.common.errors import InputError
 from services.recordings.recording import Message

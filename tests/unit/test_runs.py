@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.signals import CHANNELS, decode_accel, decode_gnss, decode_info
-from schemas.site import Site, load_site, parse_site
+from schemas.site import Site
+from schemas.site_file import load_site, parse_site
 from services.drives.csv_import import read_folder
 from services.drives.runs import GnssTrack, Run, normalised, run_to_messages, sampling_rate_hz
 from services.recordings.recording import Message

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from schemas.errors import InputError
 from schemas.signals import MAX_RATE_HZ
-from schemas.site import (
-    Bridge,
-    Site,
+from schemas.site import Bridge, Site
+from schemas.site_file import (
     load_site,
     parse_site,
     read_site_text,

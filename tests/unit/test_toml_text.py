@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from schemas import toml_text
 from schemas.errors import InputError
-from schemas.site import load_site, parse_site
+from schemas.site_file import load_site, parse_site
 from schemas.toml_text import MAX_BYTES, MAX_DEPTH, parse_toml
 
 TEXT = (Path(__file__).parents[1] / "data" / "csv_example" / "site.toml").read_text()

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from pre_core.paper import experiment
 from pre_core.search.loop import Ending
-from schemas.site import site_toml
+from schemas.site_file import site_toml
 from services.cli import main as cli
 from services.cli.validate_paper import print_table, validate_command
 from services.common.errors import InputError

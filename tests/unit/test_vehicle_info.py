@@ -6,7 +6,7 @@ import pytest
 
 from schemas.errors import InputError
 from schemas.signals import MAX_SITE_BYTES
-from schemas.site import parse_site, vehicle_toml
+from schemas.site_file import parse_site, vehicle_toml
 from schemas.vehicle_info import differences, own_part
 
 TEXT = (Path(__file__).parents[1] / "data" / "csv_example" / "site.toml").read_text()

@@ -24,7 +24,8 @@ from pre_core.physics.vehicle import HalfCar
 from schemas.results import Crossing, Header
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS, Channel, decode_accel, encode_accel
-from schemas.site import Bridge, Site, Vehicle, site_hash
+from schemas.site import Bridge, Site, Vehicle
+from schemas.site_file import site_hash
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.execution.dispatch import feed_all

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from schemas.results import Crossing
 from schemas.settings import IdentificationSettings
-from schemas.site import load_site
+from schemas.site_file import load_site
 from services.drives.csv_import import read_folder
 from services.drives.runs import normalised
 from services.simulation.drawn import see

@@ -8,7 +8,8 @@ import pytest
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Header
 from schemas.settings import IdentificationSettings
-from schemas.site import Receiver, Site, site_hash, site_toml
+from schemas.site import Receiver, Site
+from schemas.site_file import site_hash, site_toml
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.execution.here import Here

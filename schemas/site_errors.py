@@ -1,0 +1,171 @@
+"""What is wrong with a site file, in one line that names the field and what would be right."""
+
+import difflib
+import json
+from collections.abc import Iterator
+from typing import Any, Final
+
+from pydantic import BaseModel, ValidationError
+
+Tables = dict[str, type[BaseModel]]
+
+
+class FieldError(ValueError):
+    """A wrong value found by looking at several fields: says which one to mend."""
+
+    def __init__(self, path: str, message: str) -> None:
+        super().__init__(message)
+        self.path = path
+
+
+def at(path: str, message: str) -> FieldError:
+    """The error that says what is wrong with the field at `path`."""
+    return FieldError(path, message)
+
+
+# The noun and the unit of a field, by the end of its name; longer endings first.
+_QUANTITIES: Final = (
+    ("_nm_per_rad", "a rotational stiffness", "N·m/rad"),
+    ("_ns_per_m", "a damping", "N·s/m"),
+    ("_n_per_m", "a stiffness", "N/m"),
+    ("_kg_per_m", "a mass per length", "kg/m"),
+    ("_ug_per_rthz", "a noise density", "µg/√Hz"),
+    ("_m_per_s", "a speed", "m/s"),
+    ("_per_s", "a coefficient", "1/s"),
+    ("_nm2", "a flexural rigidity", "N·m²"),
+    ("_spread", "a relative standard deviation", ""),
+    ("_kg", "a mass", "kg"),
+    ("_hz", "a rate", "Hz"),
+    ("_deg", "an angle", "degrees"),
+    ("_m", "a length", "m"),
+    ("_s", "a time", "s"),
+    ("elements", "a whole number", ""),
+)
+
+
+def first_line(error: ValidationError, single: set[str], tables: Tables) -> str:
+    """What to mend first, and how many more errors there are.
+
+    `single` are the tables that are no list in the file; `tables` the models by their names.
+    """
+    # A misspelt field is also a missing one: the spelling is what the user can see. And a list
+    # whose entry is wrong is counted by Pydantic as too short as well.
+    order = {"extra_forbidden": 0, "too_short": 2}
+    problems = sorted(error.errors(include_url=False), key=lambda p: order.get(p["type"], 1))
+    line = _describe(problems[0], single, tables)
+    others = sum(p["type"] != "too_short" for p in problems) - 1
+    return f"{line} (and {others} more)" if others > 0 else line
+
+
+def _describe(problem: Any, single: set[str], tables: Tables) -> str:
+    location = list(problem["loc"])
+    context = problem.get("ctx", {})
+    cause = context.get("error")
+    if isinstance(cause, FieldError):
+        location += [int(part) if part.isdigit() else part for part in cause.path.split(".")]
+        return f"{_path(location, single)} {cause}"
+    path = _path(location, single)
+    key = next((str(part) for part in reversed(location) if isinstance(part, str)), "")
+    if problem["type"] == "missing":
+        if len(location) == 1:
+            return f"the table [{path}] is missing"
+        what = _quantity(key)
+        return f"{path} is missing" + (f", it must be {what}" if what else "")
+    if problem["type"] == "extra_forbidden":
+        return f"{path} is not a known field, {_suggestion(key, len(location), tables)}"
+    return f"{path} is {_shown(problem['input'])}, it must be {_expected(problem, key, tables)}"
+
+
+def _suggestion(key: str, depth: int, tables: Tables) -> str:
+    if depth == 1:
+        known = list(tables)
+    else:
+        for name, table in tables.items():
+            if key in table.model_fields:
+                return f"it belongs into [{name}]"
+        known = [field for table in tables.values() for field in table.model_fields]
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.8)
+    return f"did you mean {close[0]}?" if close else "check its spelling or remove it"
+
+
+def _path(location: list[int | str], single: set[str]) -> str:
+    """Spell a place as the user typed it: no index where there was one table and no list."""
+    parts = list(_path_parts(location, single))
+    return "".join(parts).removeprefix(".") or "the file"
+
+
+def _path_parts(location: list[int | str], single: set[str]) -> Iterator[str]:
+    for position, part in enumerate(location):
+        if isinstance(part, int):
+            if position != 1 or location[0] not in single:
+                yield f"[{part}]"
+        else:
+            yield f".{part}"
+
+
+def _quantity(key: str, condition: str = "") -> str:
+    for ending, noun, unit in _QUANTITIES:
+        if key.endswith(ending):
+            return " ".join(part for part in (noun, condition or ("in" * bool(unit)), unit) if part)
+    return f"a number {condition}".strip() if condition else ""
+
+
+def _expected(problem: Any, key: str, tables: Tables) -> str:
+    kind, context = problem["type"], problem.get("ctx", {})
+    conditions = {
+        "greater_than": ("greater than", "gt"),
+        "greater_than_equal": ("of at least", "ge"),
+        "less_than": ("less than", "lt"),
+        "less_than_equal": ("of at most", "le"),
+    }
+    if kind in conditions:
+        words, name = conditions[kind]
+        return _quantity(key, f"{words} {context[name]:g}")
+    if kind == "finite_number":
+        return ", ".join(part for part in (_quantity(key), "a finite number") if part)
+    if key == "id":
+        return (
+            'an identifier of a-z, 0-9, "_" and "-", at most 63, beginning with a letter or digit'
+        )
+    if kind in ("float_type", "int_type", "int_from_float"):
+        return _quantity(key) or "a number"
+    if kind in ("tuple_type", "too_short", "too_long"):
+        return _list_expected(key, tables)
+    messages = {
+        "bool_type": "true or false",
+        "string_type": "a text in quotation marks",
+        "literal_error": _CHOICES.get(key, "1 or -1"),
+        "model_type": "a table",
+        "model_attributes_type": "a table",
+    }
+    message: str = problem["msg"]
+    return messages.get(kind, message[:1].lower() + message[1:])
+
+
+_CHOICES: Final = {
+    "bearings": '"unknown", "free" or "sprung"',
+    "road_class": 'an ISO 8608 class, "A" to "E"',
+}
+
+
+def _list_expected(key: str, tables: Tables) -> str:
+    if key in ("vehicle", "bridge"):
+        return f"a table [{key}] or several [[{key}]]"
+    if key in ("flexural_rigidity_per_element_nm2", "element_lengths_m"):
+        return "a list with one number for each element"
+    if key == "interior_supports_m":
+        return "a list of chainages in m"
+    if key == "bearings":
+        return f"{_CHOICES[key]}, or a pair [start, end] of these"
+    if key in tables["sensor"].model_fields:
+        return "a list of four, in the order sprung front, sprung rear, unsprung front, rear"
+    return "a pair [front, rear]"
+
+
+def _shown(value: object) -> str:
+    """Show a value as TOML would, cut to fit a line."""
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except (TypeError, ValueError):
+        text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,109 @@
+"""The site file as text: read into `schemas.site`, with errors that say what to mend; written."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import BaseModel, ValidationError
+
+from schemas.errors import InputError
+from schemas.site import MAX_ELEMENTS, MAX_TABLES, Bridge, Receiver, Sensor, Site, Vehicle
+from schemas.site_errors import Tables, first_line
+from schemas.toml_text import parse_toml, read_toml_text
+
+_MOST_FIELDS: Final = 100
+"""In a table, and values in a list: more than there can be."""
+_TABLES: Final[Tables] = {
+    "vehicle": Vehicle,
+    "bridge": Bridge,
+    "sensor": Sensor,
+    "receiver": Receiver,
+}
+
+
+def load_site(path: Path) -> Site:
+    """Read a site file; raise InputError with one line if it cannot be read or is wrong."""
+    return parse_site(read_site_text(path), str(path))
+
+
+def read_site_text(path: Path) -> str:
+    """Return the text of a site file; raise InputError if it cannot be read or is too large."""
+    return read_toml_text(path, "a site file")
+
+
+def parse_site(toml_text: str, source_name: str) -> Site:
+    """Return the site that the text describes; raise InputError that begins with `source_name`."""
+    table = parse_toml(toml_text, source_name)
+    single = {name for name in ("vehicle", "bridge") if isinstance(table.get(name), dict)}
+    for name in single:
+        table[name] = [table[name]]
+    too_many = _too_many(table)
+    if too_many:
+        raise InputError(f"{source_name}: {too_many}")
+    try:
+        return Site.model_validate(table)
+    except ValidationError as error:
+        raise InputError(f"{source_name}: {first_line(error, single, _TABLES)}") from error
+
+
+def _too_many(table: dict[str, Any]) -> str | None:
+    """Say which table or list is longer than any site file's: Pydantic tells of all its errors."""
+    parts = [("the file", table)]
+    for name, value in table.items():
+        tables = value if isinstance(value, list) else [value]
+        if len(tables) > MAX_TABLES:
+            return f"has {len(tables)} [[{name}]], at most {MAX_TABLES} are expected"
+        parts += [(f"[{name}]", part) for part in tables if isinstance(part, dict)]
+    for name, part in parts:
+        if len(part) > _MOST_FIELDS:
+            return f"{name} has {len(part)} fields, most of them unknown"
+        for key, value in part.items() if name != "the file" else ():
+            if isinstance(value, list) and len(value) > _MOST_FIELDS:
+                return f"{name} {key} has {len(value)} values, at most {MAX_ELEMENTS} are expected"
+    return None
+
+
+def site_hash(site: Site) -> str:
+    """Return 16 hex digits that change when any value changes, however the file is laid out."""
+    canonical = json.dumps(site.model_dump(by_alias=True), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+def site_toml(site: Site) -> str:
+    """Return a site file with every value spelt out; parsing it gives an equal site."""
+    vehicle = "[vehicle]" if len(site.vehicles) == 1 else "[[vehicle]]"
+    bridge = "[bridge]" if len(site.bridges) == 1 else "[[bridge]]"
+    tables: list[tuple[str, BaseModel]] = [(vehicle, table) for table in site.vehicles]
+    tables += [(bridge, table) for table in site.bridges]
+    return _toml([*tables, ("[sensor]", site.sensor), ("[receiver]", site.receiver)])
+
+
+def vehicle_toml(site: Site, vehicle_id: str) -> str:
+    """Return what a truck says of itself: the [vehicle], [sensor] and [receiver] parts."""
+    return _toml(
+        [
+            ("[vehicle]", site.vehicle(vehicle_id)),
+            ("[sensor]", site.sensor),
+            ("[receiver]", site.receiver),
+        ]
+    )
+
+
+def _toml(tables: list[tuple[str, BaseModel]]) -> str:
+    return "".join(_table_text(heading, table.model_dump()) for heading, table in tables)
+
+
+def toml_of(tables: dict[str, dict[str, Any]]) -> str:
+    """Return the text of tables of numbers, texts, booleans and lists of them."""
+    return "".join(_table_text(f"[{name}]", table) for name, table in tables.items())
+
+
+def _table_text(heading: str, table: dict[str, Any]) -> str:
+    lines = [heading]
+    for key, value in table.items():
+        if value is not None:
+            # JSON's numbers, strings, booleans and lists are TOML's; DEL alone must be escaped.
+            text = json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
+            lines.append(f"{key} = {text}")
+    return "\n".join(lines) + "\n"
