@@ -41,7 +41,6 @@ class Reason(StrEnum):
     NOT_CONVERGED = "not_converged"
     SAMPLER_DIAGNOSTICS = "sampler_diagnostics"
     FAILED = "failed"
-    TYRE_DAMPING_IGNORED = "tyre_damping_ignored"
     CONTINUOUS_BRIDGE = "continuous_bridge"
 
 
@@ -82,9 +81,6 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.NOT_CONVERGED: "The search did not converge.",
     Reason.SAMPLER_DIAGNOSTICS: "The Markov chain did not pass its own checks.",
     Reason.FAILED: "The identification failed.",
-    Reason.TYRE_DAMPING_IGNORED: (
-        "The site file gives the tyres a damping, which the method does not model."
-    ),
     Reason.CONTINUOUS_BRIDGE: (
         "The bridge has supports between its ends, and the method is for a single span."
     ),

@@ -104,6 +104,18 @@ class Road(_Fields):
         return self
 
 
+_OLD_REASONS: Final = frozenset({"tyre_damping_ignored"})
+"""That older programs gave, always beside another one."""
+
+
+def _without_old_reasons(values: object) -> object:
+    if not isinstance(values, Mapping) or _OLD_REASONS.isdisjoint(values.get("reasons") or ()):
+        return values
+    kept = [code for code in values["reasons"] if code not in _OLD_REASONS]
+    left = {key: value for key, value in values.items() if key != "reason_texts"}
+    return {**left, "reasons": kept}
+
+
 class Crossing(_Fields):
     """The result of one crossing by one method."""
 
@@ -133,6 +145,7 @@ class Crossing(_Fields):
     @model_validator(mode="before")
     @classmethod
     def _sentences(cls, values: object) -> object:
+        values = _without_old_reasons(values)
         if isinstance(values, Mapping) and values.get("reasons") and "reason_texts" not in values:
             return {**values, "reason_texts": texts(Reason(code) for code in values["reasons"])}
         return values

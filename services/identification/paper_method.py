@@ -221,8 +221,6 @@ def _result(
     diagnostics["misfit_over_deflection"] = misfit_m / max(deflection_m, 1e-12)
     if diagnostics["misfit_over_deflection"] > _LARGEST_MISFIT:
         reasons.append(Reason.MODEL_MISFIT)
-    if any(data.vehicle.tyre_damping_ns_per_m):
-        reasons.append(Reason.TYRE_DAMPING_IGNORED)
     reasons += caveats(data, motion)
     values = _parameters(data, fit, settings)
     names = tuple(unknowns.names(data.bridge.elements)[i] for i in fit.free)

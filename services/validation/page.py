@@ -23,10 +23,10 @@ _HEAD = """# Validation of method `pre`
 
 Is the uncertainty true? This page is written by
 
-    make validate
+    {command} --page docs/validation.md
 
-that is `driveby validate --method pre --page docs/validation.md`; every figure on it comes from
-that run. Nothing here was shown on a real bridge: no public record of one is known.
+(`make validate`: 200 crossings, 64 of each effect); every figure on it comes from that run. Nothing
+here was shown on a real bridge: no public record of one is known.
 
 ## The aims
 
@@ -142,7 +142,7 @@ Not judged in this run: the folder with them was not there.
 
 def validation_page(outcome: Outcome, image: str = "images/calibration.png") -> str:
     """The page as Markdown."""
-    text = _HEAD.format(aims=_aims(aims(outcome)))
+    text = _HEAD.format(command=_command(outcome), aims=_aims(aims(outcome)))
     if len(outcome.drawn) > 1:
         text += _drawn(outcome, image)
     if outcome.control:
@@ -153,6 +153,16 @@ def validation_page(outcome: Outcome, image: str = "images/calibration.png") -> 
         text += _worlds(outcome.worlds)
     text += _judged(outcome) if outcome.judged else _NOT_JUDGED
     return text
+
+
+def _command(outcome: Outcome) -> str:
+    """What was run, with the numbers of crossings that it gave."""
+    effects = dict.fromkeys(record["effect"] for record in outcome.worlds)
+    each = len(outcome.worlds) // max(1, len(effects))
+    return (
+        f"driveby validate --method pre --crossings {len(outcome.drawn)} "
+        f"--control {len(outcome.control)} --worlds {each}"
+    )
 
 
 def _worlds(records: Sequence[Record]) -> str:

@@ -102,14 +102,6 @@ def test_scenario_6_within_one_per_cent(recording: Path) -> None:
     assert found == pytest.approx(truck.tyre_stiffness_n_per_m, rel=0.01)
 
 
-def test_the_papers_methods_name_tyres_that_damp(recording: Path) -> None:
-    site = site_of([recording], None)
-    vehicle = site.vehicles[0].model_copy(update={"tyre_damping_ns_per_m": (0.0, 100.0)})
-    site = site.model_copy(update={"vehicles": (vehicle,)})
-    crossing = only(identify_recordings([recording], site, LEAST_SQUARES))
-    assert crossing.reasons == ("no_noise_model", "tyre_damping_ignored")
-
-
 def test_the_road_is_the_one_that_was_driven(recording: Path, scenario_6: Drive) -> None:
     road = only(identified(recording)).road
     assert road is not None
