@@ -269,13 +269,7 @@ def test_every_reason_has_a_sentence_of_its_own() -> None:
 
 
 def test_a_result_with_a_reason_of_before_is_read_without_it() -> None:
-    now = a_crossing().model_copy(
-        update={
-            "verdict": "suspect",
-            "reasons": (Reason.NO_NOISE_MODEL,),
-            "reason_texts": texts([Reason.NO_NOISE_MODEL]),
-        }
-    )
+    now = a_crossing()
     message = crossing_to_protobuf(now, HEADER)
     message.reasons.append("tyre_damping_ignored")
     message.reason_texts.append("The site file gives the tyres a damping.")
