@@ -108,9 +108,19 @@ class Optimum(NamedTuple):
 
 
 def chi2_per_dof(problem: Problem, y: FloatArray) -> float:
-    """Mean square of the white rows; each of the trajectory's and truck's unknowns takes one."""
+    """Mean square of the white rows; each of the trajectory's and truck's unknowns takes one.
+
+    Where springs are doubted, of the road's rows alone, which take their share of these: the others
+    are silenced.
+    """
+    rows = _judged_rows(problem, y)
+    taken = y.size * rows.size / problem.noise.reciprocal.size
+    return float(rows @ rows) / max(1.0, rows.size - taken)
+
+
+def _judged_rows(problem: Problem, y: FloatArray) -> FloatArray:
     rows = data_rows(problem, y[None, :])[0]
-    return float(rows @ rows) / max(1, rows.size - y.size)
+    return rows[::RESIDUALS] if problem.force.any() else rows
 
 
 def _tempered(problem: Problem, y: FloatArray, directions: FloatArray, temperature: float) -> Rows:
@@ -258,18 +268,9 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
 
 
 def _is_accepted(problem: Problem, y: FloatArray) -> bool:
-    """Whether a minimum is taken for the right one.
-
-    Where springs are doubted, by the road's rows alone: what is wrong with the truck's own, no
-    other place of the bridge would mend.
-    """
-    rows = problem.noise.reciprocal.size
-    chi2 = chi2_per_dof(problem, y)
-    if problem.force.any():
-        rows //= RESIDUALS
-        road = data_rows(problem, y[None, :])[0, ::RESIDUALS]
-        chi2 = min(chi2, float(np.mean(road**2)))
-    return chi2 < 1.0 + _ACCEPTED_EXCESS + _ACCEPTED_Z * float(np.sqrt(2.0 / rows))
+    """Whether a minimum is taken for the right one."""
+    spread = float(np.sqrt(2.0 / _judged_rows(problem, y).size))
+    return chi2_per_dof(problem, y) < 1.0 + _ACCEPTED_EXCESS + _ACCEPTED_Z * spread
 
 
 def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> Optimum:

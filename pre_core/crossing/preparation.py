@@ -38,6 +38,14 @@ _SWING_BEFORE_S = 0.1
 _MARGIN_M = 3.0  # of road before the first row, for the trajectory to move
 
 
+_SILENCED = 100.0
+"""Where springs are doubted their noise is taken for so many times its level. It is not noise: it
+follows the truck's motion, and what of it looks like a heavier end or another centre of gravity
+would be believed. With it as found EI was 0.34 standard deviations too low (the median of 36
+crossings with friction) and 93 % of the intervals held the truth; so 0.09 and 97 %, and the
+intervals are as wide as before."""
+
+
 class Inputs(NamedTuple):
     """One crossing as method `pre` takes it; times in s on one clock, chainage in m."""
 
@@ -153,11 +161,12 @@ def with_noise_at(
         for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
     ]
     count = row_count(problem.rows, problem.crossing.rows)
-    noise = whitener(problem.rows, count, trucks[0], density[0], force)
+    silenced = _SILENCED * force
+    noise = whitener(problem.rows, count, trucks[0], density[0], silenced)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
-    power = noise_power(problem.rows, trucks, density, force, changing)
+    power = noise_power(problem.rows, trucks, density, silenced, changing)
     slope[changing] = 0.5 * count * power / _SLOPE_STEP
     basis = rebased(problem.crossing.basis, at.theta[0])
     for work in problem.works:

@@ -17,7 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing.channels import A_1, A_2, A_3, PASS, STOP, A, V, Z
-from pre_core.crossing.whitening import RESIDUALS, RowFilter, Whitener, row_count, whiten_into
+from pre_core.crossing.whitening import (
+    DOUBTED_SPRING_N_PER_M,
+    RESIDUALS,
+    RowFilter,
+    Whitener,
+    row_count,
+    whiten_into,
+)
 from pre_core.kernels.lanes import LANES, kernel, summing
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 from pre_core.physics import modal_response
@@ -258,7 +265,8 @@ def _wheels(
         z_u, v_u, a_u = work.corrected[2 + w, 0], work.corrected[2 + w, 1], work.corrected[2 + w, 2]
         a_other = work.corrected[1 - w, 2]
         road, load, body = work.road[w], work.load[w], work.body[w]
-        soft, hard = 1.0 / k_u, 1.0 / k
+        soft = 1.0 / k_u
+        hard = 1.0 / DOUBTED_SPRING_N_PER_M if crossing.is_inertial else 1.0 / k
         for i in range(n):
             inertial = m_ii * a_s[i] + m_12 * a_other[i]
             load[i] = sign * transfer * speeding[i] - weight - inertial - m_u * a_u[i]
