@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pre_core import unknowns
 from pre_core.paper import experiment
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
@@ -173,20 +172,22 @@ def one_judged(folder: Path, run: int, settings: IdentificationSettings) -> Reco
 def _values(known: dict[str, Any]) -> dict[str, float]:
     """The truth of the independent simulator under the names of docs/contract.md."""
     truck, bridge = known["vehicle"], known["bridge"]
-    ordered = [
-        truck["d1"],
-        *truck["cs"],
-        *truck["ks"],
-        *truck["mu"],
-        *truck["ku"],
-        truck["pitch"],
-        *known["EI"],
-        bridge["rhoA"],
-        bridge["alpha"],
-        bridge["beta"],
-        *bridge["k_rot"],
-    ]
-    return dict(zip(unknowns.names(len(known["EI"])), ordered, strict=True))
+    pairs = {
+        "c_s": truck["cs"],
+        "k_s": truck["ks"],
+        "m_u": truck["mu"],
+        "k_u": truck["ku"],
+        "c_u": truck["ct"],
+    }
+    return (
+        {"d_1": truck["d1"], "kappa": truck["pitch"]}
+        | {f"{name}{1 + w}": pair[w] for name, pair in pairs.items() for w in range(2)}
+        | {name: bridge[name] for name in ("rhoA", "alpha", "beta")}
+        | dict(zip(("k_rot_start", "k_rot_end"), bridge["k_rot"], strict=True))
+        # Its first crossings are over rigid bearings.
+        | {"f_start": 0.0, "f_end": 0.0}
+        | {f"EI_{e + 1}": value for e, value in enumerate(known["EI"])}
+    )
 
 
 def _entry_time(known: dict[str, Any], run: int) -> float:
