@@ -92,7 +92,7 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         inputs.total_mass_kg,
         inputs.cg_height_m,
         STANDARD_GRAVITY_M_PER_S2,
-        basis,
+        rebased(basis, inputs.priors.theta),
         np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
         first,
         n - first,

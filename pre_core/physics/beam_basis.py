@@ -92,10 +92,13 @@ def beam_basis(
 def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
     """The same beam in coordinates in which the bridge `theta` (p,) is diagonal.
 
-    Bridges near it are then nearly diagonal, which makes their modes quick to find.
+    Bridges near it are then nearly diagonal, which makes their modes quick to find. All modes rise
+    from the start: an eigenvector's sign is chance, and how a mode swings is told with it.
     """
     factors = stiffness_factors(theta, basis.stiffness.shape[0])
     _, shapes = eigh(np.tensordot(factors, basis.stiffness, axes=1))
+    slopes = basis.cubics[0, 1] @ shapes
+    shapes = np.where(slopes < 0.0, -shapes, shapes)
     return BeamBasis(
         np.ascontiguousarray(shapes.T @ basis.stiffness @ shapes),
         np.ascontiguousarray(basis.cubics @ shapes),

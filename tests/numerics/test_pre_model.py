@@ -64,6 +64,17 @@ def test_at_the_truth_little_of_the_noise_is_left(
     assert little(left), left
 
 
+def test_modes_keep_their_signs_from_bridge_to_bridge(truth: Case) -> None:
+    """How a mode swings is told by its coordinate: it must not turn round with the next bridge."""
+    basis = crossing(truth).basis
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        theta = truth.theta.copy()
+        theta[EI_1:] *= np.exp(0.5 * rng.standard_normal(theta.size - EI_1))
+        basis = rebased(basis, theta)
+        assert np.all(basis.cubics[0, 1] > 0.0)
+
+
 def test_both_forms_of_the_road_row_say_the_same(truth: Case) -> None:
     """From masses or from springs: what is left of the noise is shared otherwise, no more."""
     left = []
