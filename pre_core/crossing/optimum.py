@@ -351,11 +351,11 @@ def _freed(problem: Problem, y: FloatArray, way: Way) -> tuple[Optimum | _Wrong,
         believing, start, first, temperature, few, little, is_free=True
     )
     problem = with_noise_at(believing, y)
-    is_doubted = bool(problem.force.any())
-    rubs = is_doubted and belief_in_springs(problem, y) < _PLAINLY_RUBS
+
+    rubs = problem.force.any() and belief_in_springs(problem, y) < _PLAINLY_RUBS
     if way.believes and rubs:
         return _Wrong.RUBS, evaluations
-    if way.believes and not is_doubted and chi2_per_dof(believing, y) > _LOST_CHI2:
+    if way.believes and chi2_per_dof(believing, y) > _LOST_CHI2:
         return _Wrong.LOST, evaluations
     if rubs:
         problem = with_noise_at(believing, start)

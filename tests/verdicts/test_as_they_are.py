@@ -50,7 +50,10 @@ def judged(folder: Path, run: int) -> Judged:
 def check(found: Judged, median_std: float) -> None:
     assert found.result.verdict == "good", found.result.reasons
     assert np.abs(found.z).max() < FARTHEST
-    assert found.is_covered.sum() >= found.is_covered.size - 2
+    # Neighbours trade rigidity: one crossing's errors are not independent, and three of seven may
+    # be outside together. Their mean square is what would show intervals that are too short.
+    assert found.is_covered.sum() >= found.is_covered.size - 3
+    assert np.sqrt(np.mean(found.z**2)) < 1.6
     assert np.median(found.relative_std) < median_std
 
 
