@@ -12,7 +12,6 @@ put half a metre too far can be explained almost as well by other rigidities. So
    it fits so badly that no place would.
 """
 
-from collections.abc import Callable
 from enum import Enum, auto
 from typing import NamedTuple
 
@@ -30,18 +29,12 @@ from pre_core.crossing.posterior import (
     precision_root,
 )
 from pre_core.crossing.preparation import Inputs, prepare, swing_sample, with_noise_at
-from pre_core.crossing.residuals import (
-    SWING_MODES,
-)
-from pre_core.crossing.whitening import (
-    DOUBTED_OF_A_MISFIT,
-    RESIDUALS,
-    linear_springs,
-)
+from pre_core.crossing.residuals import SWING_MODES
+from pre_core.crossing.whitening import DOUBTED_OF_A_MISFIT, RESIDUALS, linear_springs
 from pre_core.physics.bridge import FloatArray
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import Rows, minimised
-from pre_core.search.loop import Ending, Solution
+from pre_core.search.loop import Ending, Report, Solution
 from pre_core.unknowns import EI_1, F
 
 _COARSE = ((300.0, 4), (100.0, 4), (30.0, 4))
@@ -73,8 +66,6 @@ _HOPELESS_CHI2 = (1000.0, 25.0)
 Of 70 drawn sound crossings the first place was the right one in all; another one never brought a
 chi2 of this size down to something usable."""
 _BEND = 0.8
-
-Report = Callable[[str, float], None]
 
 
 class Way(NamedTuple):
@@ -113,14 +104,14 @@ def chi2_per_dof(problem: Problem, y: FloatArray) -> float:
     Where springs are doubted, of the road's rows alone, which take their share of these: the others
     are silenced.
     """
-    rows = _judged_rows(problem, y)
-    taken = y.size * rows.size / problem.noise.reciprocal.size
+    rows = data_rows(problem, y[None, :])[0, :: _every_judged(problem)]
+    taken = y.size / _every_judged(problem)
     return float(rows @ rows) / max(1.0, rows.size - taken)
 
 
-def _judged_rows(problem: Problem, y: FloatArray) -> FloatArray:
-    rows = data_rows(problem, y[None, :])[0]
-    return rows[::RESIDUALS] if problem.force.any() else rows
+def _every_judged(problem: Problem) -> int:
+    """How many white rows there are for each that chi2 is of."""
+    return RESIDUALS if problem.force.any() else 1
 
 
 def _tempered(problem: Problem, y: FloatArray, directions: FloatArray, temperature: float) -> Rows:
@@ -259,18 +250,17 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
         if way.believes and found and found[-1].rubs:
             continue
         found.append(_from_places(problem, y, way, report))
-        last = found[-1]
-        if last.ending is not Ending.NOT_FINITE and _is_accepted(last.problem, last.state.y):
+        if _is_accepted(found[-1].problem, found[-1].chi2_per_dof):
             break
     return min(found, key=lambda one: one.chi2_per_dof)._replace(
         evaluations=sum(one.evaluations for one in found), starts=sum(one.starts for one in found)
     )
 
 
-def _is_accepted(problem: Problem, y: FloatArray) -> bool:
-    """Whether a minimum is taken for the right one."""
-    spread = float(np.sqrt(2.0 / _judged_rows(problem, y).size))
-    return chi2_per_dof(problem, y) < 1.0 + _ACCEPTED_EXCESS + _ACCEPTED_Z * spread
+def _is_accepted(problem: Problem, chi2: float) -> bool:
+    """Whether a minimum of this chi2 is taken for the right one."""
+    judged = problem.noise.reciprocal.size // _every_judged(problem)
+    return chi2 < 1.0 + _ACCEPTED_EXCESS + _ACCEPTED_Z * float(np.sqrt(2.0 / judged))
 
 
 def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> Optimum:
@@ -307,7 +297,7 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
             break
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
             best = found
-        if _is_accepted(best.problem, best.state.y) or len(tried) == way.most_places:
+        if _is_accepted(best.problem, best.chi2_per_dof) or len(tried) == way.most_places:
             break
         if best.chi2_per_dof > _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]:
             break
@@ -351,7 +341,6 @@ def _freed(problem: Problem, y: FloatArray, way: Way) -> tuple[Optimum | _Wrong,
         believing, start, first, temperature, few, little, is_free=True
     )
     problem = with_noise_at(believing, y)
-
     rubs = problem.force.any() and belief_in_springs(problem, y) < _PLAINLY_RUBS
     if way.believes and rubs:
         return _Wrong.RUBS, evaluations
@@ -372,7 +361,7 @@ def _freed(problem: Problem, y: FloatArray, way: Way) -> tuple[Optimum | _Wrong,
             evaluations += used
     problem = with_noise_at(problem, y)
     y = _not_negative(problem, y)
-    if not (problem.force.any() or _is_accepted(problem, y)):
+    if not (problem.force.any() or _is_accepted(problem, chi2_per_dof(problem, y))):
         problem = with_noise_at(problem, y, doubted=DOUBTED_OF_A_MISFIT)
     for _ in range(_MOST_ROUNDS if problem.force.any() else 0):
         y, _, ending, used = _descend(problem, y, free, 1.0, steps, enough)
@@ -388,7 +377,7 @@ def _freed(problem: Problem, y: FloatArray, way: Way) -> tuple[Optimum | _Wrong,
 
 
 def bends(problem: Problem) -> FloatArray:
-    """How much each coordinate is to be bent for the chains (mcmc.py): those of ln EI are.
+    """How much each coordinate is to be bent for the chains (`crank_nicolson`): those of ln EI are.
 
     The deflection of a statically determinate beam is linear in 1/EI; a little less, for the prior
     is normal in ln EI.

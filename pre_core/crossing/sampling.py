@@ -1,6 +1,5 @@
 """Draws from the posterior of one crossing, by chains that run until they agree."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 
 from pre_core.crossing import optimum, posterior
 from pre_core.search import crank_nicolson
-from pre_core.search.loop import Ending, run
+from pre_core.search.loop import Ending, Report, run
 from pre_core.unknowns import element_count, table
 
 FloatArray = NDArray[np.float64]
@@ -24,8 +23,6 @@ _WELL_ACCEPTED = 0.3
 """From here on the approximation is good enough, and nothing more is learnt."""
 _MOST_RUNS = 14
 """So many times the draws that are asked for may be drawn before the chains are given up."""
-
-Report = Callable[[str, float], None]
 
 
 class Sampled(NamedTuple):

@@ -1,7 +1,8 @@
 """What sensor noise does to the residuals, and how to make it white.
 
 Three residuals are taken at every row, all as displacements: the mismatch of the two roads and the
-two body equations divided by k_s. White acceleration noise of densities n_s, n_u enters them as
+two body equations divided by k_s (by a constant where springs are doubted: `body_divisors`). White
+acceleration noise of densities n_s, n_u enters them as
 
     s^2 R_i   : [1 + (m_u s^2 + c_s s + k_s)/K] n_u - [(c_s s + k_s)/K] n_s,  K = k_u + c_u s
     s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
@@ -59,8 +60,8 @@ _BELIEVED_HZ = 30.0
 """Up to which springs are asked whether they are believed."""
 DOUBTED, DOUBTED_OF_A_MISFIT = 60.0, 15.0
 """So much must twice the log-likelihood of an axle's rows gain for its springs to be doubted: less
-where nothing else is known to explain why rows do not fit. Fifteen levels that are not there gain
-less than 15 in 99 of 100 records."""
+where nothing else is known to explain why rows do not fit. Of 400 axles with nothing but sensors'
+noise twelve gained more than 15, none more than 60."""
 
 
 class RowFilter(NamedTuple):
@@ -205,6 +206,11 @@ def _spectrum(
     return spectrum
 
 
+def _of_body(truck: Truck, density: FloatArray, force: FloatArray, omega: FloatArray) -> FloatArray:
+    """The spectra of the body equations (2, f) out of `_spectrum`."""
+    return np.asarray(_spectrum(truck, density, force, omega)[[1, 2], [1, 2]].real)
+
+
 def _of_force(truck: Truck, force: FloatArray, omega: FloatArray) -> FloatArray:
     """What the force noise adds to the spectra of the body equations: (2, f)."""
     over = body_divisors(truck)[:, None]
@@ -297,8 +303,7 @@ def force_noise(
     interval = (rows.omega[1] - rows.omega[0]) / (2.0 * np.pi)
     for at in (omega, 4.0 * np.pi * (0.5 / apart) - omega):  # what is above half the rate folds
         power = np.interp(at, rows.omega, rows.power) / interval
-        diagonal = _spectrum(truck, density, linear_springs(), at)[[1, 2], [1, 2]].real
-        sensors += diagonal * power
+        sensors += _of_body(truck, density, linear_springs(), at) * power
         shapes += _force_shapes(at) * at**4 * power
     over = body_divisors(truck)
     levels = linear_springs()
@@ -321,10 +326,9 @@ def belief_in_springs(
     rows: RowFilter, truck: Truck, density: FloatArray, force: FloatArray
 ) -> float:
     """0 to 1: which part of what the sensors could tell by the body equations the springs leave."""
-    low = rows.omega < 2.0 * np.pi * _BELIEVED_HZ
-    sensors = _spectrum(truck, density, linear_springs(), rows.omega[low])[[1, 2], [1, 2]].real
-    all_noise = _spectrum(truck, density, force, rows.omega[low])[[1, 2], [1, 2]].real
-    return float((sensors / all_noise).mean())
+    low = rows.omega[rows.omega < 2.0 * np.pi * _BELIEVED_HZ]
+    sensors = _of_body(truck, density, linear_springs(), low)
+    return float((sensors / _of_body(truck, density, force, low)).mean())
 
 
 @summing

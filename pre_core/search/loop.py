@@ -32,6 +32,9 @@ class StepInfo(Protocol):
         """The smallest objective so far."""
 
 
+Report = Callable[[str, float], None]
+"""Is told the stage of a computation in words, and how much of all is done, 0 to 1."""
+
 StateT = TypeVar("StateT")
 InfoT = TypeVar("InfoT", bound=StepInfo)
 

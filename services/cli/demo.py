@@ -26,9 +26,7 @@ from pre_core.paper import experiment
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing
-from schemas.results_on_the_wire import (
-    estimate_to_crossing,
-)
+from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import site_toml
 from services.bus.session import open_session

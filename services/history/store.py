@@ -11,9 +11,7 @@ from typing import NamedTuple
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, Header
-from schemas.results_on_the_wire import (
-    estimate_to_crossing,
-)
+from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.topics import Key, topic
 from services.identification.bridge_state import usable
 from services.identification.known import Known, search_hash

@@ -47,9 +47,6 @@ _FALSE_ALARM_Z = 4.5
 _SLACK = (1.35, 1.35, 1.35, 1.15)
 """So many times the declared noise power a band may have: its density is a data sheet's, and the
 1/f noise of a sensor is not declared."""
-_RUBBING = 3.0
-"""Friction comes and goes with the road; one level for a whole crossing is so far from it at most
-(8 % of the load: 2.4). What is left in these rows is not what the answer rests on."""
 _NOISY = 1.2
 """From here on a kind of residual is called noisier than declared, if it is white."""
 _GOOD_CHI2 = 1.25
@@ -80,8 +77,6 @@ class Fit(NamedTuple):
     """The receiver's slow error in multiples of its spread."""
     rigidity_spread: Floats
     """(elements,) standard deviation of ln EI, over the prior's."""
-    doubted: tuple[bool, bool] = (False, False)
-    """Whether the springs of the front and of the rear axle are not believed."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
@@ -102,7 +97,7 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
     suspicious = {
         key: cell
         for key, cell in found.items()
-        if quality.cell_excess(cell, _slack(fit, key)) > _FALSE_ALARM_Z
+        if quality.cell_excess(cell, _SLACK[key[2]]) > _FALSE_ALARM_Z
     }
     reasons: list[Reason] = []
     if suspicious and _is_only_noise(found):
@@ -115,13 +110,6 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
     if fit.chi2_per_dof < _SMALLEST_CHI2:
         reasons.append(Reason.NOISE_BELOW_DECLARED)
     return reasons
-
-
-def _slack(fit: Fit, key: tuple[int, int, int]) -> float:
-    """How many times its declared noise a cell may have."""
-    kind, _, band = key
-    doubted = kind in (BODY_FRONT, BODY_REAR) and fit.doubted[kind - BODY_FRONT]
-    return _SLACK[band] * (_RUBBING if doubted else 1.0)
 
 
 def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:

@@ -15,9 +15,7 @@ import numpy as np
 from schemas.proto import driveby_pb2 as pb
 from schemas.reasons import Reason
 from schemas.results import BridgeResult, Crossing, Header
-from schemas.results_on_the_wire import (
-    crossing_to_protobuf,
-)
+from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.settings import IdentificationSettings
 from schemas.signals import (
     MAX_BATCH_S,

@@ -13,6 +13,7 @@ import numpy as np
 
 from pre_core.crossing.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
 from pre_core.physics.simulate import Motion
+from pre_core.search.loop import Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
@@ -35,7 +36,6 @@ from services.identification.streams import Samples
 
 _log = logging.getLogger(__name__)
 Stopwatch = Callable[[], float]
-Report = Callable[[str, float], None]
 
 
 class Identify(Protocol):

@@ -4,10 +4,7 @@ from typing import NamedTuple
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import BridgeResult, Crossing
-from schemas.results_on_the_wire import (
-    bridge_to_protobuf,
-    direction_to_protobuf,
-)
+from schemas.results_on_the_wire import bridge_to_protobuf, direction_to_protobuf
 from schemas.settings import IdentificationSettings
 from schemas.topics import Key
 from services.identification.crossing_data import CrossingData

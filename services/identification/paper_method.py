@@ -18,6 +18,7 @@ from pre_core.physics.bridge import natural_frequencies_hz
 from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
 from pre_core.search import levenberg_marquardt, loop
+from pre_core.search.loop import Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
@@ -35,8 +36,6 @@ from services.identification.crossing_data import (
     rejected,
     road_result,
 )
-
-Report = Callable[[str, float], None]
 
 _LARGEST_MISFIT = 0.002
 """Root mean square of R_1 - R_2 relative to the bridge's largest deflection under a wheel. Without

@@ -19,7 +19,7 @@ from pre_core.crossing.whitening import RESIDUALS
 from pre_core.physics.beam_basis import first_frequencies_hz
 from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
-from pre_core.search.loop import Ending
+from pre_core.search.loop import Ending, Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
@@ -57,7 +57,6 @@ _ROAD_DRAWS = 80
 _DEFLECTION_DRAWS = 400
 _FREQUENCY_DRAWS = 1000
 
-Report = Callable[[str, float], None]
 Keep = Callable[[str, dict[str, Floats]], None]
 """Takes the draws of a crossing: its identifier, and (chains, draws) of every unknown by name."""
 
@@ -228,7 +227,6 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
         prior_z | {"wheelbase": float(y[where.wheelbase])},
         float(problem.receiver_rows[-1, -1] * y[where.offset]),
         np.sqrt(np.diag(covariance)[where.elements]),
-        (bool(problem.force[0].any()), bool(problem.force[1].any())),
     )
 
 

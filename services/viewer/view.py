@@ -19,9 +19,7 @@ from rich.console import Console
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, load_results
-from schemas.results_on_the_wire import (
-    estimate_to_crossing,
-)
+from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site
 from services.common.errors import FailureError, InputError

@@ -28,7 +28,7 @@ from pre_core.crossing.whitening import (
     whitener,
 )
 from pre_core.paper import experiment
-from pre_core.physics.beam_basis import beam_basis
+from pre_core.physics.beam_basis import BeamBasis, beam_basis
 from pre_core.physics.bridge import Beam, refine
 from pre_core.physics.models import from_models
 from pre_core.physics.road import contact_patch_average, iso_8608_profile, under_wheels
@@ -117,18 +117,44 @@ def crossing(
     model = channel_signals(case.acceleration, 1.0 / case.rate_hz, case.rate_hz)
     front = point(case).position_m[0]
     first = int(np.searchsorted(np.abs(front - front[0]), vehicle.wheelbase_m + 1.0))
-    return Crossing(
+    data = bare_crossing(
         model.step_s,
         model.signals,
-        case.direction,
+        basis,
         bridge.span_m,
         vehicle.total_mass_kg,
-        (vehicle.cg_height_m or 0.0) if cg_height_m is None else cg_height_m,
+        is_inertial=is_inertial,
+    )
+    return data._replace(
+        direction=case.direction,
+        cg_height_m=(vehicle.cg_height_m or 0.0) if cg_height_m is None else cg_height_m,
+        first_row=first,
+        rows=front.size - first,
+    )
+
+
+def bare_crossing(
+    step_s: float,
+    signals: FloatArray,
+    basis: BeamBasis,
+    span_m: float,
+    total_mass_kg: float,
+    *,
+    is_inertial: bool,
+) -> Crossing:
+    """From start to end, with a mass at the height of the road; every sample of (4, 6, n) a row."""
+    return Crossing(
+        step_s,
+        signals,
+        1,
+        span_m,
+        total_mass_kg,
+        0.0,
         STANDARD_GRAVITY_M_PER_S2,
         basis,
         np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
-        first,
-        front.size - first,
+        0,
+        signals.shape[2],
         sinc_table(),
         step_table(),
         is_inertial,
@@ -142,11 +168,19 @@ def point(case: Case, count: int = 1) -> Points:
     n = model.signals.shape[2]
     travel, rate = driven(case, case.start_s + model.start_s + model.step_s * np.arange(n))
     front = travel if case.direction > 0 else case.site.bridges[0].span_m - travel
+    at = uncorrected(case.theta, case.site.vehicles[0].wheelbase_m, front, count)
+    return at._replace(acceleration_m_per_s2=np.full((count, n), rate))
+
+
+def uncorrected(
+    theta: FloatArray, wheelbase_m: float, front_m: FloatArray, count: int = 1
+) -> Points:
+    """`count` times the same point at constant speed, front_m (n,), without any correction."""
     return Points(
-        np.tile(case.theta, (count, 1)),
-        np.full(count, case.site.vehicles[0].wheelbase_m),
-        np.tile(front, (count, 1)),
-        np.full((count, n), rate),
+        np.tile(theta, (count, 1)),
+        np.full(count, wheelbase_m),
+        np.tile(front_m, (count, 1)),
+        np.zeros((count, front_m.size)),
         np.zeros((count, 4)),
         np.ones(count),
         np.zeros((count, 4)),

@@ -17,8 +17,6 @@ from pre_core.crossing.residuals import (
     Crossing,
     Points,
     roads_and_deflections,
-    sinc_table,
-    step_table,
     workspace,
 )
 from pre_core.crossing.whitening import row_filter
@@ -28,12 +26,12 @@ from pre_core.physics import modal_response
 from pre_core.physics.beam_basis import RIGID_M_PER_N, beam_basis, rebased
 from pre_core.physics.bridge import Beam, interpolation_matrix, modes, refine
 from pre_core.physics.models import beam_from, from_models
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics.vehicle import body_masses_kg, total_mass_kg
 from pre_core.unknowns import C_U1, F
 from tests.numerics.crossings import (
     STEP_S,
     Driven,
+    bare_crossing,
     crossing,
     in_noise,
     little,
@@ -41,6 +39,7 @@ from tests.numerics.crossings import (
     point,
     residual,
     simulated,
+    uncorrected,
 )
 
 FloatArray = NDArray[np.float64]
@@ -88,35 +87,8 @@ def sine_crossing(step_s: float, hz: float) -> tuple[Crossing, Points, FloatArra
     for order in range(3):
         signals[0, A + order] = omega**order * np.sin(omega * t + 0.5 * np.pi * order)
     basis = beam_basis(BEAM.element_lengths_m, 1)
-    theta = from_models(TRUCK, BEAM)
-    data = Crossing(
-        step_s,
-        signals,
-        1,
-        30.0,
-        total_mass_kg(TRUCK),
-        0.0,
-        STANDARD_GRAVITY_M_PER_S2,
-        basis,
-        np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
-        0,
-        n,
-        sinc_table(),
-        step_table(),
-        True,
-        0,
-    )
-    at = Points(
-        theta[None],
-        np.array([TRUCK.wheelbase_m]),
-        (10.0 * t - 50.0)[None],
-        np.zeros((1, n)),
-        np.zeros((1, 4)),
-        np.ones(1),
-        np.zeros((1, 4)),
-        np.zeros((1, 4, 3)),
-        np.zeros((1, 2 * SWING_MODES)),
-    )
+    data = bare_crossing(step_s, signals, basis, 30.0, total_mass_kg(TRUCK), is_inertial=True)
+    at = uncorrected(from_models(TRUCK, BEAM), TRUCK.wheelbase_m, 10.0 * t - 50.0)
     return data, at, t
 
 

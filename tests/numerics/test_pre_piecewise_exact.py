@@ -13,12 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from pre_core.crossing.residuals import (
-    SWING_MODES,
-    Crossing,
-    Points,
     roads_and_deflections,
-    sinc_table,
-    step_table,
     workspace,
 )
 from pre_core.crossing.whitening import row_filter
@@ -26,6 +21,7 @@ from pre_core.physics import modal_response as piecewise_exact
 from pre_core.physics.beam_basis import beam_basis
 from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.unknowns import ALPHA, C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1, RHO_A
+from tests.numerics.crossings import bare_crossing, uncorrected
 
 FloatArray = NDArray[np.float64]
 
@@ -140,35 +136,11 @@ def silent_crossing(beam: Beam, offset_m: float) -> tuple[FloatArray, FloatArray
     n = round((BEFORE_S + (beam.span_m + WHEELBASE_M) / SPEED_M_PER_S + 0.2) / STEP_S)
     front = offset_m + SPEED_M_PER_S * (STEP_S * np.arange(n) - BEFORE_S)
     basis = beam_basis(np.full(7, beam.span_m / 7.0), 2)
-    crossing = Crossing(
-        STEP_S,
-        np.zeros((4, 6, n)),
-        1,
-        beam.span_m,
-        TOTAL_KG,
-        0.0,
-        STANDARD_GRAVITY_M_PER_S2,
-        basis,
-        np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
-        0,
-        n,
-        sinc_table(),
-        step_table(),
-        False,
-        0,
+    crossing = bare_crossing(
+        STEP_S, np.zeros((4, 6, n)), basis, beam.span_m, TOTAL_KG, is_inertial=False
     )
     theta = theta_of(beam)
-    at = Points(
-        theta[None],
-        np.array([WHEELBASE_M]),
-        front[None],
-        np.zeros((1, n)),
-        np.zeros((1, 4)),
-        np.ones(1),
-        np.zeros((1, 4)),
-        np.zeros((1, 4, 3)),
-        np.zeros((1, 2 * SWING_MODES)),
-    )
+    at = uncorrected(theta, WHEELBASE_M, front)
     work = workspace(crossing, theta.size, row_filter(STEP_S))
     return roads_and_deflections(crossing, work, at, 0)[1], front
 

@@ -8,9 +8,7 @@ import pytest
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, Header
-from schemas.results_on_the_wire import (
-    crossing_to_protobuf,
-)
+from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.settings import IdentificationSettings
 from schemas.signals import decode_accel, encode_accel
 from schemas.site_file import site_hash

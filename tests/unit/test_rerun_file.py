@@ -15,9 +15,7 @@ from rerun.chunk import Chunk, RrdReader
 from rerun.experimental import View, ViewerClient
 
 from schemas.results import Crossing, Header, results, results_json
-from schemas.results_on_the_wire import (
-    crossing_to_protobuf,
-)
+from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.signals import (
     CHANNELS,
     AccelBatch,

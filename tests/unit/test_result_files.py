@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 
 from schemas.results import Crossing, Header, load_results
-from schemas.results_on_the_wire import (
-    crossing_to_protobuf,
-)
+from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.topics import Key
 from services.common.errors import FailureError
 from services.history.result_files import Earlier, MessageName, ResultFiles, read_earlier

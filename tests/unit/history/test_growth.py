@@ -10,10 +10,7 @@ import pytest
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, Header, load_results, results, results_json
-from schemas.results_on_the_wire import (
-    crossing_to_protobuf,
-    state_to_bridge,
-)
+from schemas.results_on_the_wire import crossing_to_protobuf, state_to_bridge
 from schemas.topics import Key
 from services.common.errors import FailureError
 from services.execution.here import Here
