@@ -29,6 +29,7 @@ class Reason(StrEnum):
     STOPPED_ON_BRIDGE = "stopped_on_bridge"
     ACCELERATING_CG_UNKNOWN = "accelerating_cg_unknown"
     AXLES_ALIKE = "axles_alike"
+    APPROACH_TOO_SHORT = "approach_too_short"
     # What the fit says.
     NO_NOISE_MODEL = "no_noise_model"
     MODEL_MISFIT = "model_misfit"
@@ -68,6 +69,10 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     ),
     Reason.AXLES_ALIKE: (
         "The axle loads are nearly equal, so the difference between the wheels says little."
+    ),
+    Reason.APPROACH_TOO_SHORT: (
+        "The axles' roads seem to differ, and too little road before and behind the bridge was "
+        "recorded to tell by how much."
     ),
     Reason.NO_NOISE_MODEL: "The method has no noise model, so its intervals mean nothing.",
     Reason.MODEL_MISFIT: "The model does not explain the measured accelerations.",

@@ -69,6 +69,14 @@ class AtEnds(_Fields):
     end: Annotated[Finite, Field(ge=0, le=1)]
 
 
+class Thirds(_Fields):
+    """The level of each third of the bridge, from its start."""
+
+    left: Parameter
+    middle: Parameter
+    right: Parameter
+
+
 class Derived(_Fields):
     """What follows from the parameters."""
 
@@ -81,8 +89,22 @@ class Derived(_Fields):
     springs_believed: Annotated[Finite, Field(ge=0, le=1)] | None = None
     """How much of what the body's motion says through the truck's springs was believed: 1 if they
     are as linear as the sensors can tell, near 0 where they rub."""
+    ei_level: Parameter | None = None
+    """The factor common to all elements: geometric mean of EI over nominal, by length. Known where
+    single elements are not."""
+    ei_thirds: Thirds | None = None
+    """The same of each third of the bridge."""
     probability_below_90_percent_of_baseline: dict[str, Finite] | None = None
     """By element; None without a stored baseline."""
+
+
+class RoadMismatch(_Fields):
+    """By how much the axles' roads differ: S_d(n) = A/(1 + (n/n_0)²)² in m³, one-sided."""
+
+    A_m3: Annotated[Finite, Field(gt=0)]
+    n_0_per_m: Annotated[Finite, Field(gt=0)]
+    common_share: Annotated[Finite, Field(ge=0, le=1)] | None = None
+    """Of its power, what all runs of the truck in one track have in common; of one run unknown."""
 
 
 class Road(_Fields):
@@ -95,6 +117,8 @@ class Road(_Fields):
     std_m: tuple[Finite, ...] | None = None
     iri_m_per_km: Finite | None = None
     iso_class: str | None = None
+    mismatch: RoadMismatch | None = None
+    """None where both axles feel one road, as far as the sensors tell."""
 
     @model_validator(mode="after")
     def _has_one_length(self) -> "Road":
@@ -226,6 +250,25 @@ class Header(NamedTuple):
     settings: dict[str, JsonValue]
     seed: int
     program: str = "driveby"
+
+
+_RESOLVED = 0.25
+"""Relative standard deviation of EI up to which an element is called resolved: a loss of half of it
+is then beyond chance."""
+
+
+def resolution(crossing: Crossing) -> str | None:
+    """In words what a crossing could not tell; None where it resolves every element."""
+    if crossing.parameters is None or crossing.derived is None or crossing.derived.ei_level is None:
+        return None
+    elements = [p for name, p in crossing.parameters.items() if name.startswith("EI_")]
+    open_ones = sum(p.std > _RESOLVED * abs(p.mean) for p in elements)
+    if open_ones == 0:
+        return None
+    level = crossing.derived.ei_level
+    spread = 100.0 * level.std / level.mean
+    which = "elements" if open_ones == len(elements) else f"{open_ones} of {len(elements)} elements"
+    return f"mean level {level.mean:.2f} of nominal ± {spread:.0f} %, {which} not resolved"
 
 
 def results(header: Header, crossings: list[Crossing], bridges: dict[str, BridgeResult]) -> Results:

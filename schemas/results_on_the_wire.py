@@ -19,6 +19,8 @@ from schemas.results import (
     Parameter,
 )
 
+_THIRDS = ("left", "middle", "right")
+
 
 def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:
     """Return the message on the wire for one crossing."""
@@ -64,6 +66,12 @@ def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:
                 getattr(message.derived, name).end = ends.end
         if crossing.derived.springs_believed is not None:
             message.derived.springs_believed = crossing.derived.springs_believed
+        level, thirds = crossing.derived.ei_level, crossing.derived.ei_thirds
+        if level is not None:
+            message.derived.ei_level.CopyFrom(_parameter_to_protobuf(level))
+        for name in _THIRDS if thirds is not None else ():
+            third = _parameter_to_protobuf(getattr(thirds, name))
+            getattr(message.derived.ei_thirds, name).CopyFrom(third)
         message.derived.probability_below_90_percent_of_baseline.update(
             crossing.derived.probability_below_90_percent_of_baseline or {}
         )
@@ -80,6 +88,14 @@ def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:
                 iso_class=road.iso_class or "",
             )
         )
+        if road.mismatch is not None:
+            message.road.mismatch.CopyFrom(
+                pb.RoadMismatch(
+                    a_m3=road.mismatch.A_m3,
+                    n_0_per_m=road.mismatch.n_0_per_m,
+                    common_share=road.mismatch.common_share,
+                )
+            )
     return message
 
 
@@ -253,6 +269,12 @@ def _derived(message: pb.Derived) -> dict[str, object]:
         "springs_believed": (
             message.springs_believed if message.HasField("springs_believed") else None
         ),
+        "ei_level": _parameter(message.ei_level) if message.HasField("ei_level") else None,
+        "ei_thirds": (
+            {name: _parameter(getattr(message.ei_thirds, name)) for name in _THIRDS}
+            if message.HasField("ei_thirds")
+            else None
+        ),
         "probability_below_90_percent_of_baseline": (
             dict(message.probability_below_90_percent_of_baseline) or None
         ),
@@ -268,6 +290,15 @@ def _road(message: pb.RoadResult) -> dict[str, object]:
         "std_m": tuple(message.std_m) or None,
         "iri_m_per_km": message.iri_m_per_km if message.HasField("iri_m_per_km") else None,
         "iso_class": message.iso_class or None,
+        "mismatch": _mismatch(message.mismatch) if message.HasField("mismatch") else None,
+    }
+
+
+def _mismatch(message: pb.RoadMismatch) -> dict[str, float | None]:
+    return {
+        "A_m3": message.a_m3,
+        "n_0_per_m": message.n_0_per_m,
+        "common_share": message.common_share if message.HasField("common_share") else None,
     }
 
 

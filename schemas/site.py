@@ -110,6 +110,15 @@ class Vehicle(_Spreadable):
     """κ: the pitch inertia is κ·m_s·d_1·d_2."""
     tyre_damping_ns_per_m: NotNegativePair = (0.0, 0.0)
     """Zero: not known (see `scale_at_zero`)."""
+    tyre_width_m: PositivePair | None = None
+    """Of the tread; with the next four, by how much the road differs from axle to axle."""
+    tyre_contact_length_m: PositivePair | None = None
+    twin_tyre_distance_m: NotNegativePair | None = None
+    """Between the middles of twin tyres; 0 for single ones."""
+    track_m: Annotated[Number, Field(gt=0, le=5)] | None = None
+    """Between the middles of the wheels of both sides."""
+    rear_axle_offset_m: Annotated[Number, Field(ge=-1, le=1)] | None = None
+    """How far the rear axle runs to the left of the front axle."""
 
     total_mass_kg_spread: Spread = 0.01
     wheelbase_m_spread: Spread = 0.002

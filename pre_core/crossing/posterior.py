@@ -15,6 +15,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import qr, solve_triangular
 
 from pre_core.crossing import whitening
+from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.residuals import (
     SWING_MODES,
     Crossing,
@@ -90,11 +91,13 @@ class Problem(NamedTuple):
     density: FloatArray  # (4,) one-sided, m/s²/√Hz
     force: FloatArray
     """(2, shapes) noise of springs and dampers, N²/Hz; see whitening.py."""
+    mismatch: Mismatch
+    """Of the roads under both axles; without level where they are taken for the same."""
     basis_position: FloatArray  # (n, b): trajectory = basis @ coefficients
     basis_acceleration: FloatArray  # (n, b), positive when speeding up
     receiver_rows: FloatArray  # (r, b + 1): rows of (coefficients, offset)
     receiver_values: FloatArray  # (r,)
-    noise_slope: FloatArray  # (t + 1 + 3,): see `all_rows`
+    noise_slope: FloatArray  # of the first coordinates: see `all_rows`
     works: tuple[Work, ...]
 
 
@@ -237,6 +240,18 @@ def filtered_rows(problem: Problem, y: FloatArray) -> FloatArray:
     out = np.empty((RESIDUALS, row_count(problem.rows, problem.crossing.rows)))
     for kind in range(RESIDUALS):
         filter_rows(problem.rows.taps, problem.rows.every, residual[kind], out[kind])
+    return out
+
+
+def filtered_roads(problem: Problem, y: FloatArray) -> FloatArray:
+    """Filtered rows (2, m) of what both wheels feel themselves, of one point y (size,)."""
+    at = points(problem, y[None, :])
+    crossing = problem.crossing
+    heights, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
+    out = np.empty((2, row_count(problem.rows, crossing.rows)))
+    for wheel in range(2):
+        own = np.ascontiguousarray(heights[wheel, crossing.first_row :])
+        filter_rows(problem.rows.taps, problem.rows.every, own, out[wheel])
     return out
 
 

@@ -5,10 +5,12 @@ from typing import NamedTuple
 import numpy as np
 
 from pre_core.crossing.channels import channel_signals
+from pre_core.crossing.mismatch import GEOMETRY, Mismatch, shapes_of
 from pre_core.crossing.posterior import (
     Fixes,
     Priors,
     Problem,
+    filtered_roads,
     filtered_rows,
     layout,
     points,
@@ -20,6 +22,8 @@ from pre_core.crossing.whitening import (
     DOUBTED,
     force_noise,
     linear_springs,
+    mismatch_levels,
+    mismatch_power,
     noise_power,
     row_count,
     row_filter,
@@ -29,6 +33,7 @@ from pre_core.crossing.whitening import (
 from pre_core.physics.beam_basis import beam_basis, rebased
 from pre_core.physics.bridge import FloatArray
 from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
+from pre_core.physics.surface import Footprint
 from pre_core.unknowns import FIRST_OF_BRIDGE
 
 _KNOT_S = 0.4
@@ -44,6 +49,13 @@ follows the truck's motion, and what of it looks like a heavier end or another c
 would be believed. With it as found EI was 0.34 standard deviations too low (the median of 36
 crossings with friction) and 93 % of the intervals held the truth; so 0.09 and 97 %, and the
 intervals are as wide as before."""
+
+
+_FEWEST_ROWS = 24
+"""Off the bridge, in one stretch, that tell something of the mismatch."""
+_STEP_SAMPLES = 9
+MISMATCHED = 30.0
+"""So much must twice the log-likelihood of the rows off the bridge gain."""
 
 
 class Inputs(NamedTuple):
@@ -65,6 +77,8 @@ class Inputs(NamedTuple):
     priors: Priors
     parts: int
     threads: int
+    footprints: tuple[Footprint, Footprint] = GEOMETRY
+    """Where the front and the rear axle stand on the road."""
 
 
 def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
@@ -112,6 +126,8 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         inputs.density_m_per_s2_per_rthz,
         linear_springs(),
     )
+    shapes = shapes_of(*inputs.footprints)
+    speed = float(np.ptp(front)) / ((n - 1) * model.step_s)
     problem = Problem(
         crossing,
         inputs.priors,
@@ -119,6 +135,7 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         noise,
         inputs.density_m_per_s2_per_rthz,
         linear_springs(),
+        Mismatch(shapes, np.zeros(shapes.density.shape[0]), speed),
         position,
         speeding,
         rows,
@@ -137,17 +154,22 @@ def swing_sample(crossing: Crossing, front: FloatArray) -> int:
 
 
 def with_noise_at(
-    problem: Problem, y: FloatArray, force: FloatArray | None = None, doubted: float = DOUBTED
+    problem: Problem,
+    y: FloatArray,
+    force: FloatArray | None = None,
+    doubted: float = DOUBTED,
+    mismatch: FloatArray | None = None,
 ) -> Problem:
     """The problem with the noise as it is for the truck at y, and coordinates for its bridge.
 
     The noise of springs and dampers is `force`, by default what the body equations leave at y if
-    that is at least `doubted` (`force_noise`).
+    that is at least `doubted` (`force_noise`). Levels of the roads' mismatch are `mismatch`, by
+    default what the rows off the bridge show at y if the problem has such levels already.
     """
     where = layout(problem)
     unknowns = where.gains.stop
-    near = np.repeat(y[None, :], 1 + unknowns, axis=0)
-    near[np.arange(1, 1 + unknowns), np.arange(unknowns)] += _SLOPE_STEP
+    near = np.repeat(y[None, :], 1 + where.delays.stop, axis=0)
+    near[np.arange(1, near.shape[0]), np.arange(near.shape[0] - 1)] += _SLOPE_STEP
     at = points(problem, near)
     density = problem.density * (1.0 + at.gain)
     total = problem.crossing.total_mass_kg
@@ -155,6 +177,11 @@ def with_noise_at(
         one = truck_of(at.theta[0], total, float(at.wheelbase_m[0]), problem.crossing.is_inertial)
         body = filtered_rows(problem, y)[1:]
         force = force_noise(problem.rows, one, density[0], body, doubted)
+    if mismatch is None:
+        mismatch = problem.mismatch.level_m3
+        if mismatch.any():
+            mismatch = levels_at(problem, y)
+    road = problem.mismatch._replace(level_m3=mismatch)
     is_inertial = bool(force.any())
     trucks = [
         truck_of(theta, total, float(wheelbase), is_inertial)
@@ -162,18 +189,103 @@ def with_noise_at(
     ]
     count = row_count(problem.rows, problem.crossing.rows)
     silenced = _SILENCED * force
-    noise = whitener(problem.rows, count, trucks[0], density[0], silenced)
+    differs = road if mismatch.any() else None
+    noise = whitener(problem.rows, count, trucks[0], density[0], silenced, differs)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
-    power = noise_power(problem.rows, trucks, density, silenced, changing)
+    power = noise_power(problem.rows, trucks, density, silenced, changing, differs)
     slope[changing] = 0.5 * count * power / _SLOPE_STEP
+    if differs is not None:
+        slope = np.concatenate([slope, np.zeros(where.delays.stop - unknowns)])
+        slope += slope_of_mismatch(problem._replace(force=force, mismatch=road), y)
     basis = rebased(problem.crossing.basis, at.theta[0])
     for work in problem.works:
         work.modes_of[:] = np.nan
     return problem._replace(
         noise=noise,
         force=force,
+        mismatch=road,
         noise_slope=slope,
         crossing=problem.crossing._replace(basis=basis, is_inertial=is_inertial),
     )
+
+
+def slope_of_mismatch(problem: Problem, y: FloatArray) -> FloatArray:
+    """What the roads' mismatch alone makes of the objective's slope at y: (first coordinates,)."""
+    where = layout(problem)
+    near = np.repeat(y[None, :], 1 + where.delays.stop, axis=0)
+    near[np.arange(1, near.shape[0]), np.arange(near.shape[0] - 1)] += _SLOPE_STEP
+    at = points(problem, near)
+    total, is_inertial = problem.crossing.total_mass_kg, bool(problem.force.any())
+    trucks = [
+        truck_of(theta, total, float(wheelbase), is_inertial)
+        for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
+    ]
+    changing = [
+        *range(int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())),
+        *range(where.wheelbase, where.gains.stop),
+        *range(where.delays.start, where.delays.stop),
+    ]
+    power = mismatch_power(
+        problem.rows,
+        trucks,
+        at.gain,
+        at.delay_s,
+        problem.density * (1.0 + at.gain[0]),
+        _SILENCED * problem.force,
+        problem.mismatch,
+        float(at.wheelbase_m[0]),
+        changing,
+    )
+    slope = np.zeros(where.delays.stop)
+    slope[changing] = row_count(problem.rows, problem.crossing.rows) * power / _SLOPE_STEP
+    return slope
+
+
+def levels_at(problem: Problem, y: FloatArray) -> FloatArray:
+    """Levels (s,) of the roads' mismatch that the rows off the bridge show at y.
+
+    Nothing where these are too few, or explained as well without (`MISMATCHED`).
+    """
+    at = points(problem, y[None, :])
+    crossing = problem.crossing
+    truck = truck_of(
+        at.theta[0], crossing.total_mass_kg, float(at.wheelbase_m[0]), crossing.is_inertial
+    )
+    stretches = off_bridge(problem, y)
+    some = [one for one in stretches if one.stop - one.start >= _FEWEST_ROWS]
+    if not some:
+        return np.zeros_like(problem.mismatch.level_m3)
+    density = problem.density * (1.0 + at.gain[0])
+    differ, felt = filtered_rows(problem, y)[0], filtered_roads(problem, y)[1]
+    level, gain = mismatch_levels(
+        problem.rows,
+        truck,
+        density,
+        problem.mismatch,
+        [differ[one] for one in some],
+        [felt[one] for one in some],
+    )
+    return level if gain > MISMATCHED else np.zeros_like(level)
+
+
+def off_bridge_m(problem: Problem, y: FloatArray) -> float:
+    """How many metres of road the rows off the bridge compare, in stretches that tell something."""
+    rows = [one.stop - one.start for one in off_bridge(problem, y)]
+    apart_m = problem.rows.every * problem.rows.step_s * problem.mismatch.speed_m_per_s
+    return apart_m * sum(one for one in rows if one >= _FEWEST_ROWS)
+
+
+def off_bridge(problem: Problem, y: FloatArray) -> tuple[slice, slice]:
+    """Filtered rows that compare the roads before and behind the bridge alone."""
+    at = points(problem, y[None, :])
+    crossing, rows = problem.crossing, problem.rows
+    rear = at.position_m[0] - crossing.direction * at.wheelbase_m[0]
+    travel = (rear if crossing.direction > 0 else crossing.span_m - rear)[crossing.first_row :]
+    on, left = np.searchsorted(travel, [0.0, crossing.span_m])
+    count = row_count(rows, crossing.rows)
+    # A bearing that gives is felt some samples before and behind the end.
+    last = (int(on) - _STEP_SAMPLES - rows.taps.size) // rows.every + 1
+    first = -((-int(left) - _STEP_SAMPLES) // rows.every)
+    return slice(0, min(max(0, last), count)), slice(min(max(0, first), count), count)

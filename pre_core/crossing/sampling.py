@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing import optimum, posterior
+from pre_core.crossing import compliances, optimum, posterior
 from pre_core.search import crank_nicolson
 from pre_core.search.loop import Ending, Report, run
 from pre_core.unknowns import element_count, table
@@ -49,6 +49,8 @@ def sample(
     At least `draws` in all chains together; STEPS_EXHAUSTED if they do not agree.
     """
     problem = found.problem
+    if problem.mismatch.level_m3.any():
+        return _sampled_on_two_roads(found, draws, seed, inflation)
     where = posterior.layout(problem)
     centre, covariance = optimum.normal_approximation(found)
     mixed = crank_nicolson.mixture(
@@ -94,6 +96,35 @@ def sample(
             break
     evaluations = crank_nicolson.CHAINS * (1 + crank_nicolson.MOVES * steps)
     return Sampled(np.stack(kept), r_hat, ess, float(np.mean(acceptance)), evaluations, ending)
+
+
+def _sampled_on_two_roads(
+    found: optimum.Optimum, draws: int, seed: int, inflation: float
+) -> Sampled:
+    """Draws where the axles' roads differ and elements are hardly known: those of `compliances`.
+
+    The rows are not evaluated again. The truck's unknowns are known by its sensors alone, through
+    rows so exact that their curvature keeps chains from moving; what it makes of EI is far below
+    what the mismatch leaves open.
+    """
+    near = compliances.compliances(found, inflation)
+    told = _told(found.problem)
+    kept: list[FloatArray] = []
+    r_hat, ess, ending = np.inf, 0.0, Ending.STEPS_EXHAUSTED
+    for number in range(_MOST_RUNS):
+        first = number * crank_nicolson.CHAINS
+        streams = range(first, first + crank_nicolson.CHAINS)
+        wanted = draws // crank_nicolson.CHAINS
+        kept.append(
+            np.stack([compliances.draws(near, wanted, seed, one) for one in streams], axis=1)
+        )
+        of_interest = np.concatenate(kept)[:, :, told]
+        r_hat = float(crank_nicolson.split_r_hat(of_interest).max())
+        ess = float(crank_nicolson.effective_sample_size(of_interest).min())
+        if r_hat < LARGEST_R_HAT and ess > SMALLEST_ESS:
+            ending = Ending.STEPS_DONE
+            break
+    return Sampled(np.concatenate(kept), r_hat, ess, 1.0, 0, ending)
 
 
 def _begun(state: crank_nicolson.State) -> crank_nicolson.State:

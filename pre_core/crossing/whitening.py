@@ -20,6 +20,9 @@ differ by (k_s/K) b_i and tell the same; but which combination of rows is quiet 
 truck, and each form has it in a row of its own where it is needed. Friction remembers for a tenth
 of a second; a window that keeps its covariance positive (Bohman's) ends that memory altogether, so
 that the rows' covariance vanishes beyond it and the filter's length.
+
+Where the two axles do not feel the same road, their difference is noise of the mismatch alone
+(`crossing.mismatch`).
 """
 
 from typing import NamedTuple
@@ -27,7 +30,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.channels import low_pass
+from pre_core.crossing.mismatch import Mismatch
 from pre_core.kernels.lanes import summing
 from pre_core.physics.vehicle import masses_above_axles
 from pre_core.unknowns import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1
@@ -48,6 +53,8 @@ PASS = 1.0 / 8.0
 _STOP_BAND_DB = 70.0
 _TABLE = 1024  # frequencies of the numerical integral over the noise spectrum
 _FEW_FREQUENCIES = 48
+_MANY_FREQUENCIES = 512
+"""Enough for phases that turn with the time from axle to axle."""
 _SETTLED = 1e-12
 _FORCE_CENTRES_HZ = np.arange(0.0, 60.0, 4.0)
 FORCE_SHAPES = _FORCE_CENTRES_HZ.size
@@ -162,25 +169,40 @@ def filter_rows(taps: FloatArray, every: int, x: FloatArray, out: FloatArray) ->
         out[k] = total
 
 
-def _responses(truck: Truck, omega: FloatArray) -> NDArray[np.complex128]:
-    """From the noise of the six sources to the residuals: (3, 6, f), displacements."""
+def _estimation(truck: Truck, omega: FloatArray) -> NDArray[np.complex128]:
+    """What the truck's equations make of its accelerations: (4, 4, f).
+
+    Rows are s² times the input profiles R_1, R_2 and the body equations; columns s1, s2, u1, u2.
+    """
     s = 1j * omega
     theta = truck.theta
-    out = np.zeros((RESIDUALS, _SOURCES, omega.size), dtype=np.complex128)
-    for w, sign, m_ii in ((0, 1.0, truck.m_11), (1, -1.0, truck.m_22)):
+    out = np.zeros((4, 4, omega.size), dtype=np.complex128)
+    for w, m_ii in enumerate((truck.m_11, truck.m_22)):
         c, k = theta[C_S1 + w], theta[K_S1 + w]
         tyre, m_u = theta[K_U1 + w] + theta[C_U1 + w] * s, theta[M_U1 + w]
         if truck.is_inertial:
-            out[0, 2 + w] = sign * (1.0 + m_u * s**2 / tyre)
-            out[0, w] = sign * m_ii * s**2 / tyre
-            out[0, 4 + w] = sign * truck.m_12 * s**2 / tyre
+            out[w, 2 + w] = 1.0 + m_u * s**2 / tyre
+            out[w, w] = m_ii * s**2 / tyre
+            out[w, 1 - w] = truck.m_12 * s**2 / tyre
         else:
-            out[0, 2 + w] = sign * (1.0 + (m_u * s**2 + c * s + k) / tyre)
-            out[0, w] = -sign * (c * s + k) / tyre
+            out[w, 2 + w] = 1.0 + (m_u * s**2 + c * s + k) / tyre
+            out[w, w] = -(c * s + k) / tyre
         over = body_divisors(truck)[w]
-        out[1 + w, w] = (m_ii * s**2 + c * s + k) / over
-        out[1 + w, 2 + w] = -(c * s + k) / over
-        out[1 + w, 4 + w] = truck.m_12 * s**2 / over
+        out[2 + w, w] = (m_ii * s**2 + c * s + k) / over
+        out[2 + w, 2 + w] = -(c * s + k) / over
+        out[2 + w, 1 - w] = truck.m_12 * s**2 / over
+    return out
+
+
+def _responses(truck: Truck, omega: FloatArray) -> NDArray[np.complex128]:
+    """From the noise of the six sources to the residuals: (3, 6, f), displacements."""
+    estimation = _estimation(truck, omega)
+    out = np.zeros((RESIDUALS, _SOURCES, omega.size), dtype=np.complex128)
+    for w, sign in ((0, 1.0), (1, -1.0)):
+        # Another body sensor than the axle's own speaks at another moment: sources 4 and 5.
+        for source, channel in ((w, w), (2 + w, 2 + w), (4 + w, 1 - w)):
+            out[0, source] = sign * estimation[w, channel]
+            out[1 + w, source] = estimation[2 + w, channel]
     return out
 
 
@@ -192,23 +214,30 @@ def body_divisors(truck: Truck) -> FloatArray:
 
 
 def _spectrum(
-    truck: Truck, density: FloatArray, force: FloatArray, omega: FloatArray
+    truck: Truck,
+    density: FloatArray,
+    force: FloatArray,
+    road: Mismatch | None,
+    omega: FloatArray,
 ) -> NDArray[np.complex128]:
     """One-sided spectra of the residuals' noise as accelerations: (3, 3, f).
 
-    `force` (2, shapes) in N²/Hz is that of what springs and dampers do besides their linear part.
+    `force` (2, shapes) in N²/Hz is that of what springs and dampers do besides their linear part,
+    `road` what the axles' roads differ by.
     """
     responses = _responses(truck, omega)
     sources = np.concatenate([density, density[[1, 0]]])
     weighted = responses * (sources**2)[None, :, None]
     spectrum = np.asarray(np.einsum("icf,jcf->ijf", weighted, responses.conj()))
     spectrum[[1, 2], [1, 2]] += _of_force(truck, force, omega)
+    if road is not None:
+        spectrum[0, 0] += omega**4 * _mismatch.spectrum(road, omega)
     return spectrum
 
 
 def _of_body(truck: Truck, density: FloatArray, force: FloatArray, omega: FloatArray) -> FloatArray:
     """The spectra of the body equations (2, f) out of `_spectrum`."""
-    return np.asarray(_spectrum(truck, density, force, omega)[[1, 2], [1, 2]].real)
+    return np.asarray(_spectrum(truck, density, force, None, omega)[[1, 2], [1, 2]].real)
 
 
 def _of_force(truck: Truck, force: FloatArray, omega: FloatArray) -> FloatArray:
@@ -218,20 +247,24 @@ def _of_force(truck: Truck, force: FloatArray, omega: FloatArray) -> FloatArray:
 
 
 def whitener(
-    rows: RowFilter, count: int, truck: Truck, density: FloatArray, force: FloatArray
+    rows: RowFilter,
+    count: int,
+    truck: Truck,
+    density: FloatArray,
+    force: FloatArray,
+    road: Mismatch | None = None,
 ) -> Whitener:
     """Factor for `count` filtered rows; `density` (4,) is one-sided, in m/s²/√Hz.
 
-    `force` (2, shapes) is the springs' noise in N²/Hz (`linear_springs` where there is none).
-    Raises ValueError where the densities leave some row without noise.
+    `force` (2, shapes) is the springs' noise in N²/Hz (`linear_springs` where there is none),
+    `road` the mismatch of the axles' roads. Raises ValueError where the densities leave some row
+    without noise.
     """
-    spectrum = _spectrum(truck, density, force, rows.omega) * rows.power
-    turn = rows.turn
-    if force.any():
-        apart = rows.every * rows.step_s
-        more = np.arange(turn.shape[1], turn.shape[1] + int(np.ceil(_FORCE_MEMORY_S / apart)))
-        turn = np.concatenate([turn, np.exp(1j * np.outer(rows.omega * apart, more))], axis=1)
-    covariance = np.real(spectrum @ turn)  # of a one-sided density: E[e_i(t + lag) e_j(t)]
+    spectrum = _spectrum(truck, density, force, road, rows.omega) * rows.power
+    memory = _FORCE_MEMORY_S if force.any() else 0.0
+    if road is not None:
+        memory = max(memory, _mismatch.memory_s(road))
+    covariance = np.real(spectrum @ _turn(rows, memory))  # E[e_i(t + lag) e_j(t)]
     lags = covariance.shape[2]
     band = RESIDUALS * lags - 1
     one = np.zeros((RESIDUALS, band + 1))
@@ -248,34 +281,138 @@ def whitener(
     return Whitener(factor, 1.0 / factor[:, band])
 
 
+def _turn(rows: RowFilter, memory_s: float) -> NDArray[np.complex128]:
+    """Phases (f, lags) from row to row, for noise that itself remembers for `memory_s`."""
+    if memory_s == 0.0:
+        return rows.turn
+    apart = rows.every * rows.step_s
+    first = rows.turn.shape[1]
+    more = np.arange(first, first + int(np.ceil(memory_s / apart)))
+    return np.concatenate([rows.turn, np.exp(1j * np.outer(rows.omega * apart, more))], axis=1)
+
+
+class _Folded(NamedTuple):
+    """Frequencies up to half the rate of the rows, and those that fold on to them."""
+
+    below: FloatArray
+    above: FloatArray
+    power_below: FloatArray
+    power_above: FloatArray
+
+
+def _folded(rows: RowFilter, count: int) -> _Folded:
+    half = 0.5 / (rows.every * rows.step_s)
+    step = 2.0 * np.pi * half / count
+    below = step * (np.arange(count, dtype=np.float64) + 0.5)
+    above = 4.0 * np.pi * half - below
+    power_below, power_above = (
+        np.interp(omega, rows.omega, rows.power) for omega in (below, above)
+    )
+    return _Folded(below, above, power_below, power_above)
+
+
 def noise_power(
     rows: RowFilter,
     trucks: list[Truck],
     density: FloatArray,
     force: FloatArray,
     which: list[int],
+    road: Mismatch | None = None,
 ) -> FloatArray:
     """What tr(C_0^-1 C) per row becomes for other trucks, less what it is for the first: (w,).
 
     `which` (w,) counts from the second truck on; `density` (trucks, 4). The rows' spectra are those
     of an endless record, folded at half the rate of the rows.
     """
-    half = 0.5 / (rows.every * rows.step_s)
-    step = 2.0 * np.pi * half / _FEW_FREQUENCIES
-    below = step * (np.arange(_FEW_FREQUENCIES, dtype=np.float64) + 0.5)
-    above = 4.0 * np.pi * half - below
-    power_below, power_above = (
-        np.interp(omega, rows.omega, rows.power) for omega in (below, above)
-    )
+    at = _folded(rows, _FEW_FREQUENCIES)
 
     def folded(truck: int) -> NDArray[np.complex128]:
-        low = _spectrum(trucks[truck], density[truck], force, below) * power_below
-        high = _spectrum(trucks[truck], density[truck], force, above) * power_above
+        low = _spectrum(trucks[truck], density[truck], force, road, at.below) * at.power_below
+        high = _spectrum(trucks[truck], density[truck], force, road, at.above) * at.power_above
         return np.moveaxis(low + high.conj(), 2, 0)
 
     first = np.linalg.inv(folded(0))
     traces = [np.einsum("fij,fji->", first, folded(1 + k)).real for k in which]
     return np.asarray(traces) / _FEW_FREQUENCIES - RESIDUALS
+
+
+def mismatch_power(
+    rows: RowFilter,
+    trucks: list[Truck],
+    gains: FloatArray,
+    delays_s: FloatArray,
+    density: FloatArray,
+    force: FloatArray,
+    road: Mismatch,
+    wheelbase_m: float,
+    which: list[int],
+) -> FloatArray:
+    """E[r' C_0^-1 (r_k - r)] per row, of what the mismatch alone leaves in them: (w,).
+
+    The wheels answer to the road that they feel, so that the mismatch is in the rows and in what
+    the truck makes of its accelerations too: errors in variables, which would pull towards trucks
+    that see less of it. With r the rows of the first truck and r_k those of another (of channels
+    with `gains` and `delays_s`, (trucks, 4) each), E = M_k M_0^-1 - 1 says how the latter mixes the
+    input profiles, which differ by d; the front is read when it was where the rear is now.
+    """
+    at = _folded(rows, _MANY_FREQUENCIES)
+
+    def crossed(omega: FloatArray, power: FloatArray) -> NDArray[np.complex128]:
+        """(w, 3, f): E[(r_k - r)_l conj(r_0)], of which r_0, the mismatch, is d itself."""
+        s = 1j * omega
+
+        def estimation(k: int) -> NDArray[np.complex128]:
+            channel = (1.0 + gains[k])[:, None] * np.exp(np.outer(delays_s[k], s))
+            return np.moveaxis(_estimation(trucks[k], omega) * channel, 2, 0)
+
+        inverse = np.linalg.inv(estimation(0))
+        of_all = omega**4 * power * _mismatch.spectrum(road, omega)
+        of_front = omega**4 * power * _mismatch.leaning(road, omega)
+        of_rear = of_front - of_all  # what the rear feels, with d
+        turn = np.exp(s * wheelbase_m / road.speed_m_per_s)
+        out = np.empty((len(which), RESIDUALS, omega.size), dtype=np.complex128)
+        for number, k in enumerate(which):
+            e = np.moveaxis(estimation(1 + k) @ inverse, 0, 2) - np.eye(4)[:, :, None]
+            out[number, 0] = of_front * (e[0, 0] - turn * e[1, 0])
+            out[number, 0] += of_rear * (turn.conj() * e[0, 1] - e[1, 1])
+            out[number, 1] = of_front * e[2, 0] + of_rear * turn.conj() * e[2, 1]
+            out[number, 2] = of_front * turn * e[3, 0] + of_rear * e[3, 1]
+        return out
+
+    low = _spectrum(trucks[0], density, force, road, at.below) * at.power_below
+    high = _spectrum(trucks[0], density, force, road, at.above) * at.power_above
+    weight = np.linalg.inv(np.moveaxis(low + high.conj(), 2, 0))[:, 0]
+    both = crossed(at.below, at.power_below) + crossed(at.above, at.power_above).conj()
+    return np.einsum("fl,wlf->w", weight, both).real / _MANY_FREQUENCIES
+
+
+def mismatch_levels(
+    rows: RowFilter,
+    truck: Truck,
+    density: FloatArray,
+    road: Mismatch,
+    stretches: list[FloatArray],
+    roads: list[FloatArray],
+) -> tuple[FloatArray, float]:
+    """Levels (s,) in m³ that stretches of the mismatch's rows show, and their gain over nothing.
+
+    Each stretch (m,) is of consecutive filtered rows to which no bridge adds anything; `roads` are
+    rows of what the front axle felt there, by which an axle's offset is not taken for larger than
+    offsets are.
+    """
+    omega, shapes = rows.omega, road.shapes
+    table = np.concatenate([shapes.density, shapes.road[None, :]])
+    shape = omega**4 * _mismatch.density_at(road, omega, table) * rows.power
+    longest = max(stretch.size for stretch in stretches)
+    memory = min(_mismatch.memory_s(road), longest * rows.every * rows.step_s)
+    turn = _turn(rows, memory)
+    sensors = _spectrum(truck, density, linear_springs(), None, omega)[0, 0].real * rows.power
+    of_sensors, of_shapes = (sensors @ turn).real, (shape @ turn).real
+    whole = [_mismatch.segment(one, of_sensors, of_shapes[-1:]) for one in roads]
+    surface, _ = _mismatch.levels(whole)
+    usual = np.array([np.inf, surface[0] * shapes.expected_m[1]])
+    parts = [_mismatch.segment(one, of_sensors, of_shapes[:-1]) for one in stretches]
+    return _mismatch.levels(parts, usual)
 
 
 def force_noise(

@@ -188,8 +188,18 @@ class Covariance(_message.Message):
     matrix: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, names: _Optional[_Iterable[str]] = ..., matrix: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class RoadMismatch(_message.Message):
+    __slots__ = ("a_m3", "n_0_per_m", "common_share")
+    A_M3_FIELD_NUMBER: _ClassVar[int]
+    N_0_PER_M_FIELD_NUMBER: _ClassVar[int]
+    COMMON_SHARE_FIELD_NUMBER: _ClassVar[int]
+    a_m3: float
+    n_0_per_m: float
+    common_share: float
+    def __init__(self, a_m3: _Optional[float] = ..., n_0_per_m: _Optional[float] = ..., common_share: _Optional[float] = ...) -> None: ...
+
 class RoadResult(_message.Message):
-    __slots__ = ("x_m", "front_m", "rear_m", "mean_m", "std_m", "iri_m_per_km", "iso_class")
+    __slots__ = ("x_m", "front_m", "rear_m", "mean_m", "std_m", "iri_m_per_km", "iso_class", "mismatch")
     X_M_FIELD_NUMBER: _ClassVar[int]
     FRONT_M_FIELD_NUMBER: _ClassVar[int]
     REAR_M_FIELD_NUMBER: _ClassVar[int]
@@ -197,6 +207,7 @@ class RoadResult(_message.Message):
     STD_M_FIELD_NUMBER: _ClassVar[int]
     IRI_M_PER_KM_FIELD_NUMBER: _ClassVar[int]
     ISO_CLASS_FIELD_NUMBER: _ClassVar[int]
+    MISMATCH_FIELD_NUMBER: _ClassVar[int]
     x_m: _containers.RepeatedScalarFieldContainer[float]
     front_m: _containers.RepeatedScalarFieldContainer[float]
     rear_m: _containers.RepeatedScalarFieldContainer[float]
@@ -204,7 +215,8 @@ class RoadResult(_message.Message):
     std_m: _containers.RepeatedScalarFieldContainer[float]
     iri_m_per_km: float
     iso_class: str
-    def __init__(self, x_m: _Optional[_Iterable[float]] = ..., front_m: _Optional[_Iterable[float]] = ..., rear_m: _Optional[_Iterable[float]] = ..., mean_m: _Optional[_Iterable[float]] = ..., std_m: _Optional[_Iterable[float]] = ..., iri_m_per_km: _Optional[float] = ..., iso_class: _Optional[str] = ...) -> None: ...
+    mismatch: RoadMismatch
+    def __init__(self, x_m: _Optional[_Iterable[float]] = ..., front_m: _Optional[_Iterable[float]] = ..., rear_m: _Optional[_Iterable[float]] = ..., mean_m: _Optional[_Iterable[float]] = ..., std_m: _Optional[_Iterable[float]] = ..., iri_m_per_km: _Optional[float] = ..., iso_class: _Optional[str] = ..., mismatch: _Optional[_Union[RoadMismatch, _Mapping]] = ...) -> None: ...
 
 class AtEnds(_message.Message):
     __slots__ = ("start", "end")
@@ -214,8 +226,18 @@ class AtEnds(_message.Message):
     end: float
     def __init__(self, start: _Optional[float] = ..., end: _Optional[float] = ...) -> None: ...
 
+class Thirds(_message.Message):
+    __slots__ = ("left", "middle", "right")
+    LEFT_FIELD_NUMBER: _ClassVar[int]
+    MIDDLE_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_FIELD_NUMBER: _ClassVar[int]
+    left: Parameter
+    middle: Parameter
+    right: Parameter
+    def __init__(self, left: _Optional[_Union[Parameter, _Mapping]] = ..., middle: _Optional[_Union[Parameter, _Mapping]] = ..., right: _Optional[_Union[Parameter, _Mapping]] = ...) -> None: ...
+
 class Derived(_message.Message):
-    __slots__ = ("f1_hz", "max_deflection_m", "probability_below_90_percent_of_baseline", "probability_sprung", "probability_giving", "springs_believed")
+    __slots__ = ("f1_hz", "max_deflection_m", "probability_below_90_percent_of_baseline", "probability_sprung", "probability_giving", "springs_believed", "ei_level", "ei_thirds")
     class ProbabilityBelow90PercentOfBaselineEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -229,13 +251,17 @@ class Derived(_message.Message):
     PROBABILITY_SPRUNG_FIELD_NUMBER: _ClassVar[int]
     PROBABILITY_GIVING_FIELD_NUMBER: _ClassVar[int]
     SPRINGS_BELIEVED_FIELD_NUMBER: _ClassVar[int]
+    EI_LEVEL_FIELD_NUMBER: _ClassVar[int]
+    EI_THIRDS_FIELD_NUMBER: _ClassVar[int]
     f1_hz: Parameter
     max_deflection_m: Parameter
     probability_below_90_percent_of_baseline: _containers.ScalarMap[str, float]
     probability_sprung: AtEnds
     probability_giving: AtEnds
     springs_believed: float
-    def __init__(self, f1_hz: _Optional[_Union[Parameter, _Mapping]] = ..., max_deflection_m: _Optional[_Union[Parameter, _Mapping]] = ..., probability_below_90_percent_of_baseline: _Optional[_Mapping[str, float]] = ..., probability_sprung: _Optional[_Union[AtEnds, _Mapping]] = ..., probability_giving: _Optional[_Union[AtEnds, _Mapping]] = ..., springs_believed: _Optional[float] = ...) -> None: ...
+    ei_level: Parameter
+    ei_thirds: Thirds
+    def __init__(self, f1_hz: _Optional[_Union[Parameter, _Mapping]] = ..., max_deflection_m: _Optional[_Union[Parameter, _Mapping]] = ..., probability_below_90_percent_of_baseline: _Optional[_Mapping[str, float]] = ..., probability_sprung: _Optional[_Union[AtEnds, _Mapping]] = ..., probability_giving: _Optional[_Union[AtEnds, _Mapping]] = ..., springs_believed: _Optional[float] = ..., ei_level: _Optional[_Union[Parameter, _Mapping]] = ..., ei_thirds: _Optional[_Union[Thirds, _Mapping]] = ...) -> None: ...
 
 class Estimate(_message.Message):
     __slots__ = ("schema_version", "program", "version", "created_ns", "site_hash", "settings_json", "seed", "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time_ns", "exit_time_ns", "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts", "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road")

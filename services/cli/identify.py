@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.results import AtEnds, Crossing, Derived, Results, results_json
+from schemas.results import AtEnds, Crossing, Derived, Results, resolution, results_json
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.common.errors import FailureError
@@ -133,6 +133,9 @@ def _print_crossing(console: "Console", crossing: Crossing, site: Site) -> None:
         table.add_row(*row)
         start += length
     console.print(table)
+    words = resolution(crossing)
+    if words is not None:
+        console.print(f"[bold]{words}[/]", highlight=False)
     for line in _remarks(crossing):
         console.print(line, highlight=False)
 
@@ -151,6 +154,22 @@ def _of_ends_and_springs(derived: Derived) -> Iterator[str]:
         yield f"the truck's springs are believed to {100.0 * derived.springs_believed:.0f} %"
 
 
+def _of_level_and_road(crossing: Crossing) -> Iterator[str]:
+    """The coarser picture, and by how much the axles' roads differ."""
+    derived = crossing.derived
+    if derived is not None and derived.ei_level is not None and derived.ei_thirds is not None:
+        thirds = (derived.ei_thirds.left, derived.ei_thirds.middle, derived.ei_thirds.right)
+        told = " · ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
+        level = derived.ei_level
+        yield f"EI of nominal: all {level.mean:.2f} ± {level.std:.2f}; by thirds {told}"
+    if crossing.road is not None and crossing.road.mismatch is not None:
+        mismatch = crossing.road.mismatch
+        yield (
+            f"the axles' roads differ by {mismatch.A_m3:.2g} m³ at long waves, a quarter of it at "
+            f"{mismatch.n_0_per_m:.1f} cycles/m"
+        )
+
+
 def _remarks(crossing: Crossing) -> Iterator[str]:
     """How well the model fits, and what of the intervals all elements have in common."""
     diagnostics = crossing.diagnostics
@@ -161,6 +180,7 @@ def _remarks(crossing: Crossing) -> Iterator[str]:
         )
     if crossing.chi2_per_dof is not None:
         yield f"misfit against the declared noise: chi2 {crossing.chi2_per_dof:.2f}, 1 expected"
+    yield from _of_level_and_road(crossing)
     if crossing.derived is not None:
         yield from _of_ends_and_springs(crossing.derived)
     if "relative_misfit" in diagnostics:

@@ -47,6 +47,10 @@ _FALSE_ALARM_Z = 4.5
 _SLACK = (1.35, 1.35, 1.35, 1.15)
 """So many times the declared noise power a band may have: its density is a data sheet's, and the
 1/f noise of a sensor is not declared."""
+_SLACK_OF_TWO_ROADS = 1.6
+"""The level of the roads' mismatch is read off some ten waves: so much is three deviations."""
+_SHORTEST_APPROACH_M = 12.0
+"""Fewer metres off the bridge tell the level no better than to a factor of 1.4."""
 _NOISY = 1.2
 """From here on a kind of residual is called noisier than declared, if it is white."""
 _GOOD_CHI2 = 1.25
@@ -77,11 +81,18 @@ class Fit(NamedTuple):
     """The receiver's slow error in multiples of its spread."""
     rigidity_spread: Floats
     """(elements,) standard deviation of ln EI, over the prior's."""
+    has_two_roads: bool
+    """Whether the axles' roads were taken to differ, by what the rows off the bridge say."""
+    off_bridge_m: float
+    """How much road off the bridge there was to tell that from."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
     """What the fit says against its own answer, the most telling first; empty if nothing does."""
     reasons = _of_the_rows(data, fit)
+    is_unexplained = bool({Reason.MODEL_MISFIT, Reason.RESIDUALS_COLOURED} & set(reasons))
+    if fit.off_bridge_m < _SHORTEST_APPROACH_M and (fit.has_two_roads or is_unexplained):
+        reasons.append(Reason.APPROACH_TOO_SHORT)
     if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > _LARGEST_VEHICLE_Z:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
     if abs(fit.position_z) > _LARGEST_POSITION_Z:
@@ -97,10 +108,10 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
     suspicious = {
         key: cell
         for key, cell in found.items()
-        if quality.cell_excess(cell, _SLACK[key[2]]) > _FALSE_ALARM_Z
+        if quality.cell_excess(cell, _slack(fit, *key)) > _FALSE_ALARM_Z
     }
     reasons: list[Reason] = []
-    if suspicious and _is_only_noise(found):
+    if suspicious and _is_only_noise(fit, found):
         reasons.append(Reason.NOISE_ABOVE_DECLARED)
     elif suspicious or fit.chi2_per_dof > _GOOD_CHI2:
         if fit.chi2_per_dof > _GOOD_CHI2:
@@ -112,6 +123,11 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
     return reasons
 
 
+def _slack(fit: Fit, kind: int, stretch: int, band: int) -> float:
+    """So many times its expected power a cell may have."""
+    return _SLACK[band] * (_SLACK_OF_TWO_ROADS if fit.has_two_roads and kind == ROAD else 1.0)
+
+
 def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:
     """Whether a row compares the roads before, on or behind the bridge (m,)."""
     span = data.bridge.span_m
@@ -119,7 +135,7 @@ def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:
     return np.where(travelled < 0.0, BEFORE, np.where(travelled > span, AFTER, ON)).astype(np.int64)
 
 
-def _is_only_noise(found: dict[tuple[int, int, int], quality.Cell]) -> bool:
+def _is_only_noise(fit: Fit, found: dict[tuple[int, int, int], quality.Cell]) -> bool:
     """Whether the rows are like noise of more power than declared, and of nothing else.
 
     That power is read off the highest band, where there is nothing but noise; it may differ from
@@ -133,7 +149,7 @@ def _is_only_noise(found: dict[tuple[int, int, int], quality.Cell]) -> bool:
         power = max(noise.mean_square, 1.0)
         powers.append(power)
         for key, cell in parts.items():
-            if quality.cell_excess(cell, power * _SLACK[key[2]]) > _FALSE_ALARM_Z:
+            if quality.cell_excess(cell, power * _slack(fit, *key)) > _FALSE_ALARM_Z:
                 return False
     return max(powers) > _NOISY
 

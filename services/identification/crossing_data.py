@@ -19,8 +19,10 @@ from services.identification.streams import Fixes, Samples
 
 Floats = NDArray[np.float64]
 
-MARGIN_S = 1.0
-"""Samples are needed this long before the entry and after the exit."""
+_MARGIN_S = 1.0
+_APPROACH_M, _BEHIND_M = 40.0, 25.0
+"""Off the bridge the axles tell by how much their roads differ: to 15 % of its power on 50 m."""
+_LONGEST_MARGIN_S = 4.0
 NORMAL_975 = 1.959963984540054
 _ROAD_SPACING_M = 0.05
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3
@@ -54,6 +56,25 @@ class Passing(NamedTuple):
     entry_s: float
     exit_s: float
     speed_m_per_s: float
+
+
+class Window(NamedTuple):
+    """From when to when a crossing's data are looked at."""
+
+    begin_s: float
+    end_s: float
+
+
+def window(stay: Stay, bridge: Bridge, vehicle: Vehicle, method: str) -> Window:
+    """Around a stay, on the same clock; the paper's methods look at the bridge alone."""
+    if method != "pre":
+        return Window(stay.entry_s - _MARGIN_S, stay.exit_s + _MARGIN_S)
+    seconds_per_m = (stay.exit_s - stay.entry_s) / (bridge.span_m + vehicle.wheelbase_m)
+    before, behind = (
+        min(max(metres * seconds_per_m, _MARGIN_S), _LONGEST_MARGIN_S)
+        for metres in (_APPROACH_M, _BEHIND_M)
+    )
+    return Window(stay.entry_s - before, stay.exit_s + behind)
 
 
 def header(

@@ -31,7 +31,7 @@ from schemas.topics import Key
 from schemas.vehicle_info import differences
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
 from services.identification.bridge_state import count_in, latest_state, usable
-from services.identification.crossing_data import MARGIN_S, CrossingData
+from services.identification.crossing_data import CrossingData, Window, window
 from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
 from services.identification.outputs import Output, Work, crossing_output, state_output
 from services.identification.remembered import BridgeCrossings, TruckBoot, UnderWay
@@ -57,7 +57,7 @@ _DECODERS: dict[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]] = {
     "gnss": decode_gnss,
     "info": decode_info,
 }
-_Wait = Callable[[TruckBoot, Stay, float], bool]
+_Wait = Callable[[TruckBoot, Bridge, Stay, float], bool]
 """Whether a crossing that is over, at the truck's time of now (s), waits for more of its data."""
 
 
@@ -300,7 +300,7 @@ class Engine:
                 return
             if not stay.is_over:
                 stay = stay._replace(passage=Passage.TURNED_BACK)
-            elif wait(truck, stay, now_s):
+            elif wait(truck, bridge, stay, now_s):
                 return
         truck.done.add(crossing_id)
         truck.decided.append((bridge.id, *_fixes_around(truck, stay), crossing_id))
@@ -346,9 +346,12 @@ class Engine:
         if counts is not None and latest is not None:
             yield state_output(realm, name, result.exit_time, latest)
 
-    def _may_still_come(self, truck: TruckBoot, stay: Stay, now_s: float) -> bool:
+    def _window(self, truck: TruckBoot, bridge: Bridge, stay: Stay) -> Window:
+        return window(stay, bridge, truck.vehicle, self._settings.method)
+
+    def _may_still_come(self, truck: TruckBoot, bridge: Bridge, stay: Stay, now_s: float) -> bool:
         """Whether something of a crossing is missing that a little patience may bring."""
-        begin_s, end_s = stay.entry_s - MARGIN_S, stay.exit_s + MARGIN_S
+        begin_s, end_s = self._window(truck, bridge, stay)
         if now_s < end_s:
             return True
         if not truck.boot.lacks_accel(begin_s - MAX_BATCH_S, end_s):
@@ -357,13 +360,14 @@ class Engine:
             return False  # newer ones have come long ago: it is lost
         return now_s < end_s + _SILENCE_S
 
-    def _has_hole(self, truck: TruckBoot, stay: Stay, now_s: float) -> bool:
+    def _has_hole(self, truck: TruckBoot, bridge: Bridge, stay: Stay, now_s: float) -> bool:
         """Whether a crossing lacks what is older than something that has come."""
         latest_s = truck.boot.latest_accel_s()
         if latest_s < stay.exit_s:
             return True  # positions have come from behind the bridge
-        end_s = min(stay.exit_s + MARGIN_S, latest_s - _ROUNDING_S)
-        return truck.boot.lacks_accel(stay.entry_s - MARGIN_S - MAX_BATCH_S, end_s)
+        begin_s, end_s = self._window(truck, bridge, stay)
+        end_s = min(end_s, latest_s - _ROUNDING_S)
+        return truck.boot.lacks_accel(begin_s - MAX_BATCH_S, end_s)
 
     def _identity(
         self, realm: str, truck: TruckBoot, bridge: Bridge, stay: Stay
@@ -408,7 +412,7 @@ class Engine:
             stay,
             fixes,
             chainage,
-            truck.boot.samples(stay.entry_s - MARGIN_S, stay.exit_s + MARGIN_S),
+            truck.boot.samples(*self._window(truck, bridge, stay)),
             wall_offset_s,
             self._against(realm, truck, bridge, stay, crossing_id),
         )

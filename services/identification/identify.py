@@ -21,12 +21,13 @@ from schemas.signals import CHANNELS
 from services.identification.checks import reasons_before_fit
 from services.identification.crossing_data import (
     LONGEST_SURE_OUTAGE_S,
-    MARGIN_S,
     CrossingData,
     Floats,
     Passing,
+    Window,
     longest_outage_s,
     rejected,
+    window,
 )
 from services.identification.paper_method import identify_paper
 from services.identification.pre_method import Keep as Keep
@@ -55,6 +56,9 @@ class Identify(Protocol):
 _SLOWEST_M_PER_S = 3.0
 """Below this the wheels feel next to nothing of the bridge's stiffness."""
 _STANDING_M_PER_S = 0.5
+_JUDGED_ASIDE_S = 1.0
+_SLOW_SHARE = 0.4
+"""Of the speed on the bridge: slower than this the road on either side is not looked at."""
 _LONGEST_OUTAGE_S = 8.0
 """So long without a fix the trajectory may be found from the axles' signals, by method `pre`."""
 
@@ -69,8 +73,9 @@ def identify(
 ) -> results.Crossing:
     """The result of one crossing, whatever its data are; `keep` is given its draws, if any."""
     began = stopwatch()
-    trajectory = _trajectory(data)
-    entry_s, exit_s = _entry_and_exit(data, trajectory)
+    around = window(data.stay, data.bridge, data.vehicle, settings.method)
+    trajectory = _trajectory(data, around)
+    entry_s, exit_s = _entry_and_exit(data, trajectory, around)
     passing = Passing(entry_s, exit_s, _speed_m_per_s(data, entry_s, exit_s))
     reject = partial(rejected, data, settings, passing)
     reasons = _unusable(data, settings.method, trajectory, entry_s, exit_s)
@@ -80,11 +85,12 @@ def identify(
         cut = _cut(data, trajectory, data.samples, passing)
         if cut is None:
             return reject([Reason.GAP_ON_BRIDGE])
+        near = _near(cut, passing, 1.0 / data.samples.rate_hz)
         broken = reasons_before_fit(
             data.vehicle,
-            cut.acceleration,
+            cut.acceleration[:, near],
             1.0 / data.samples.rate_hz,
-            cut.motion,
+            Motion(*(values[near] for values in cut.motion)),
             data.stay.direction,
         )
         if broken:
@@ -123,18 +129,34 @@ def _cut(
     part = _covered(samples, time_s, passing.entry_s, passing.exit_s)
     if part is None:
         return None
+    motion = motion_at(trajectory, time_s[part], data.stay.direction)
+    driving = _driving(time_s[part], motion, passing)
     return _Cut(
-        np.stack([samples.channels[name][part] for name in CHANNELS]),
-        float(time_s[part][0]),
-        motion_at(trajectory, time_s[part], data.stay.direction),
+        np.stack([samples.channels[name][part][driving] for name in CHANNELS]),
+        float(time_s[part][driving][0]),
+        Motion(*(values[driving] for values in motion)),
     )
 
 
-def _trajectory(data: CrossingData) -> Trajectory | None:
+def _near(cut: _Cut, passing: Passing, step_s: float) -> slice:
+    """The samples of the crossing itself: signals are judged where the thresholds were found."""
+    time_s = cut.start_s + step_s * np.arange(cut.acceleration.shape[1])
+    edges = (passing.entry_s - _JUDGED_ASIDE_S, passing.exit_s + _JUDGED_ASIDE_S)
+    first, last = np.searchsorted(time_s, edges)
+    return slice(int(first), int(last))
+
+
+def _driving(time_s: Floats, motion: Motion, passing: Passing) -> slice:
+    """The samples around the crossing at which the truck does not nearly stand."""
+    slow = np.abs(motion.speed_m_per_s) < _SLOW_SHARE * passing.speed_m_per_s
+    before = np.flatnonzero(slow & (time_s < passing.entry_s))
+    behind = np.flatnonzero(slow & (time_s > passing.exit_s))
+    return slice(int(before.max(initial=-1)) + 1, int(behind.min(initial=time_s.size)))
+
+
+def _trajectory(data: CrossingData, around: Window) -> Trajectory | None:
     # No fixes later than those that are waited for: what came by chance must not matter.
-    near = (data.fixes.time_s > data.stay.entry_s - 10.0) & (
-        data.fixes.time_s <= data.stay.exit_s + MARGIN_S
-    )
+    near = (data.fixes.time_s > data.stay.entry_s - 10.0) & (data.fixes.time_s <= around.end_s)
     if near.sum() < 2 or data.stay.passage is not Passage.THROUGH:
         return None
     antenna = data.vehicle.gps_antenna_to_front_axle_m
@@ -146,19 +168,21 @@ def _trajectory(data: CrossingData) -> Trajectory | None:
         data.stay.direction * np.abs(data.fixes.speed_m_per_s[near]),
         position_noise_m=max(data.receiver.position_noise_m, 1e-3),
         speed_noise_m_per_s=max(data.receiver.speed_noise_m_per_s, 1e-3),
-        start_s=data.stay.entry_s - MARGIN_S,
-        stop_s=data.stay.exit_s + MARGIN_S,
+        start_s=around.begin_s,
+        stop_s=around.end_s,
     )
 
 
-def _entry_and_exit(data: CrossingData, trajectory: Trajectory | None) -> tuple[float, float]:
+def _entry_and_exit(
+    data: CrossingData, trajectory: Trajectory | None, around: Window
+) -> tuple[float, float]:
     """When the front axle enters and the rear axle leaves, by the smooth curve if it says so."""
     stay = data.stay
     if trajectory is None:
         return stay.entry_s, stay.exit_s
     direction, span = stay.direction, data.bridge.span_m
     near, far = (0.0, span) if direction > 0 else (span, 0.0)
-    begin, end = stay.entry_s - MARGIN_S, stay.exit_s + MARGIN_S
+    begin, end = around
     entry = passing_time_s(trajectory, near, direction, begin, end)
     beyond = far + direction * data.vehicle.wheelbase_m
     leave = passing_time_s(trajectory, beyond, direction, begin, end)

@@ -13,17 +13,19 @@ from numpy.typing import NDArray
 
 from pre_core import unknowns
 from pre_core.crossing import optimum, posterior
-from pre_core.crossing.preparation import Inputs
+from pre_core.crossing.mismatch import GEOMETRY, as_two_numbers
+from pre_core.crossing.preparation import Inputs, off_bridge_m
 from pre_core.crossing.sampling import Sampled, sample
 from pre_core.crossing.whitening import RESIDUALS
 from pre_core.physics.beam_basis import first_frequencies_hz
 from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
+from pre_core.physics.surface import Footprint
 from pre_core.search.loop import Ending, Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
-from schemas.site import Bridge
+from schemas.site import Bridge, Vehicle
 from services.identification.checks import Fit, reasons_after_fit
 from services.identification.crossing_data import (
     CrossingData,
@@ -102,7 +104,22 @@ def inputs_of(
         _priors(data),
         _parts(bridge),
         settings.threads,
+        footprints_of(vehicle),
     )
+
+
+def footprints_of(vehicle: Vehicle) -> tuple[Footprint, Footprint]:
+    """Where the axles stand on the road: as the site file says, else as on a common lorry."""
+    axles = []
+    for axle, usual in enumerate(GEOMETRY):
+        known = {
+            "width_m": vehicle.tyre_width_m,
+            "length_m": vehicle.tyre_contact_length_m,
+            "twin_distance_m": vehicle.twin_tyre_distance_m,
+        }
+        stated = {name: pair[axle] for name, pair in known.items() if pair is not None}
+        axles.append(usual._replace(**stated, track_m=vehicle.track_m or usual.track_m))
+    return axles[0], axles[1]._replace(offset_m=vehicle.rear_axle_offset_m or 0.0)
 
 
 def _parts(bridge: Bridge) -> int:
@@ -227,6 +244,8 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
         prior_z | {"wheelbase": float(y[where.wheelbase])},
         float(problem.receiver_rows[-1, -1] * y[where.offset]),
         np.sqrt(np.diag(covariance)[where.elements]),
+        bool(problem.mismatch.level_m3.any()),
+        off_bridge_m(problem, y),
     )
 
 
@@ -273,7 +292,7 @@ def _values(
             names=tuple(names[i] for i in kept),
             matrix=tuple(tuple(row) for row in np.atleast_2d(covariance).tolist()),
         ),
-        "derived": _derived(problem, at.theta, flat, rng),
+        "derived": _derived(data, problem, at.theta, theta, flat, rng),
         "road": _road(data, problem, flat, rng),
     }
 
@@ -307,11 +326,14 @@ def _chosen(count: int, wanted: int, rng: np.random.Generator) -> NDArray[np.int
 
 
 def _derived(
+    data: CrossingData,
     problem: posterior.Problem,
     theta: Floats,
+    scaled: Floats,
     flat: Floats,
     rng: np.random.Generator,
 ) -> results.Derived:
+    """What follows from draws of truck and bridge; `scaled` (k, p) has the total mass's error."""
     some = _chosen(theta.shape[0], _FREQUENCY_DRAWS, rng)
     frequencies = first_frequencies_hz(problem.crossing.basis, theta[some])
     few = _chosen(flat.shape[0], _DEFLECTION_DRAWS, rng)
@@ -322,7 +344,24 @@ def _derived(
         probability_sprung=_probability_of(theta, unknowns.K_ROT),
         probability_giving=_probability_of(theta, unknowns.F),
         springs_believed=posterior.belief_in_springs(problem, flat.mean(axis=0)),
+        ei_level=_parameter("1", _level(data.bridge, scaled, 0.0, 1.0), None),
+        ei_thirds=results.Thirds(
+            **{
+                name: _parameter("1", _level(data.bridge, scaled, k / 3.0, (k + 1) / 3.0), None)
+                for k, name in enumerate(("left", "middle", "right"))
+            }
+        ),
     )
+
+
+def _level(bridge: Bridge, theta: Floats, begin: float, end: float) -> Floats:
+    """Geometric mean of EI over nominal, by length, between two parts of the bridge: (k,)."""
+    edges = np.concatenate([[0.0], np.cumsum(bridge.lengths_m)])
+    edges /= edges[-1]
+    within = np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin)
+    share = np.maximum(within, 0.0)
+    ratio = theta[:, unknowns.EI_1 :] / np.array(bridge.nominal_flexural_rigidity_nm2)
+    return np.asarray(np.exp(np.log(ratio) @ share / share.sum()))
 
 
 def _probability_of(theta: Floats, place: int) -> results.AtEnds:
@@ -352,7 +391,11 @@ def _road(
         error = np.interp(grid, *_rising(x, error))
         profiles.append(detrended(grid, mean + error))
     spread = np.std(profiles, axis=0)
-    return road.model_copy(update={"std_m": tuple(spread.tolist())})
+    mismatch = None
+    if problem.mismatch.level_m3.any():
+        level, corner = as_two_numbers(problem.mismatch)
+        mismatch = results.RoadMismatch(A_m3=level, n_0_per_m=corner)
+    return road.model_copy(update={"std_m": tuple(spread.tolist()), "mismatch": mismatch})
 
 
 def _rising(x: Floats, values: Floats) -> tuple[Floats, Floats]:

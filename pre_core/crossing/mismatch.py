@@ -1,0 +1,201 @@
+"""Two axles that do not feel the same road: their difference as noise that the run itself tells.
+
+What the front axle feels at a place less what the rear axle feels there, d(x), is a stationary
+random process along the road with the one-sided spectrum
+
+    S_d(n) = sum over j of A_j T_j(n),   A_j >= 0.
+
+The shapes T_j are those of axles on an isotropic surface (`physics.surface`): tyres that average
+over different strips, and an axle that runs beside the other. Both have a known limit at long
+waves, where the bridge is seen and no run tells the level. The levels A_j are read off the rows
+before and behind the bridge. At the speed v, d is noise in time with the spectrum S_d(f/v)/v.
+
+The covariance of d is brought to an end by Bohman's window, which keeps it positive, so that the
+rows' covariance is banded. Five metres keep the spectrum of unlike tyres to 2 % everywhere, and
+that of an offset, which grows like the logarithm of the wave, to a quarter down to waves of 30 m.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.physics.surface import Footprint, spectra
+
+FloatArray = NDArray[np.float64]
+
+MEMORY_M = 5.0
+_OFFSET_M = 0.005
+"""For the shape of an axle that runs beside the other; it is the same for all small offsets."""
+_LARGE_OFFSET_M = 0.02
+"""Mean of the prior of such an offset's square, as a root: axles are set to millimetres, and steer
+to centimetres. Without it an offset of a hand's width passes for twin tyres."""
+_WORN = 0.9
+_GRID_CYCLES_PER_M = 0.02
+_MOST_CYCLES_PER_M = 24.0
+REFERENCE_CYCLES_PER_M = 0.1
+"""Where every shape is one, so that A_j is its spectrum there."""
+_LONG_CYCLES_PER_M = 0.05
+_PASSES = 200
+_ENOUGH = 1e-4
+_NOTHING = 1e-12
+GEOMETRY = (Footprint(), Footprint(width_m=0.22, twin_distance_m=0.33))
+"""Single tyres in front and twin tyres behind, of a lorry nobody has measured."""
+
+
+class Shapes(NamedTuple):
+    """Spectra (s, g) on an even grid (g,) of cycles/m from zero on, one at 0.1 cycles/m."""
+
+    cycles_per_m: FloatArray
+    density: FloatArray
+    """Of d, windowed."""
+    leaning: FloatArray
+    """Cross spectrum of what the front axle feels with d: (s, g). The rear's is that less d's."""
+    road: FloatArray
+    """What the front axle feels of a surface of Phi k^3 = 1 m²: (g,), windowed."""
+    expected_m: FloatArray
+    """(s,) m³ that a level is over Phi k^3: of tyres unlike each other as they are, of an offset of
+    `_LARGE_OFFSET_M`."""
+
+
+class Mismatch(NamedTuple):
+    """The noise of one run; without mismatch all levels are zero."""
+
+    shapes: Shapes
+    level_m3: FloatArray  # (s,)
+    speed_m_per_s: float
+
+
+@lru_cache(maxsize=8)
+def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
+    """Of tyres unlike each other, and of one axle beside the other."""
+    points = round(_MOST_CYCLES_PER_M / _GRID_CYCLES_PER_M) + 1
+    grid = _GRID_CYCLES_PER_M * np.arange(points, dtype=np.float64)
+    grid[0] = 0.02 * _GRID_CYCLES_PER_M  # an offset's spectrum has no limit at zero
+    single = front._replace(offset_m=0.0)
+    aside = single._replace(offset_m=_OFFSET_M)
+    unlike = rear._replace(offset_m=0.0)
+    if unlike == single:  # as tyres are that nobody has measured
+        unlike = single._replace(width_m=_WORN * single.width_m)
+    density, leaning, expected = [], [], []
+    for one, other, larger in (
+        (single, unlike, 1.0),
+        (single, aside, _LARGE_OFFSET_M / _OFFSET_M),
+    ):
+        of_front, _, common, difference = spectra(one, other, grid)
+        at = np.interp(REFERENCE_CYCLES_PER_M, grid, difference)
+        density.append(_windowed(difference / at))
+        leaning.append((of_front - common) / at)
+        expected.append(at * larger**2)
+    grid[0] = 0.0
+    return Shapes(
+        grid, np.stack(density), np.stack(leaning), _windowed(of_front), np.array(expected)
+    )
+
+
+def _windowed(spectrum: FloatArray) -> FloatArray:
+    """A spectrum (g,) on the grid when its covariance ends at `MEMORY_M`."""
+    both = np.concatenate([spectrum, spectrum[-2:0:-1]])
+    apart = 1.0 / (both.size * _GRID_CYCLES_PER_M)
+    covariance = np.fft.irfft(spectrum, both.size)
+    lag = apart * np.minimum(np.arange(both.size), both.size - np.arange(both.size))
+    return np.asarray(np.fft.rfft(covariance * _bohman(lag / MEMORY_M)).real)
+
+
+def _bohman(share: FloatArray) -> FloatArray:
+    inside = np.minimum(np.abs(share), 1.0)
+    return (1.0 - inside) * np.cos(np.pi * inside) + np.sin(np.pi * inside) / np.pi
+
+
+def density_at(mismatch: Mismatch, omega: FloatArray, table: FloatArray) -> FloatArray:
+    """Rows of a table (s, g) of shapes, as spectra in time: (s, f), per m³ of level, m²/Hz."""
+    n = omega / (2.0 * np.pi * mismatch.speed_m_per_s)
+    grid = mismatch.shapes.cycles_per_m
+    read = [np.interp(n, grid, row, right=0.0) for row in table]
+    return np.stack(read) / mismatch.speed_m_per_s
+
+
+def spectrum(mismatch: Mismatch, omega: FloatArray) -> FloatArray:
+    """One-sided spectrum (f,) of d in time at angular frequencies (f,), in m²/Hz."""
+    return mismatch.level_m3 @ density_at(mismatch, omega, mismatch.shapes.density)
+
+
+def leaning(mismatch: Mismatch, omega: FloatArray) -> FloatArray:
+    """Cross spectrum (f,) in time of what the front axle feels with d, in m²/Hz."""
+    return mismatch.level_m3 @ density_at(mismatch, omega, mismatch.shapes.leaning)
+
+
+def as_two_numbers(mismatch: Mismatch) -> tuple[float, float]:
+    """A (m³) and n_0 (cycles/m) of A/(1 + (n/n_0)²)² that is like the spectrum of d.
+
+    A is the spectrum at waves of 20 m, n_0 where it has fallen to a quarter of that.
+    """
+    density = mismatch.level_m3 @ mismatch.shapes.density
+    grid = mismatch.shapes.cycles_per_m
+    long_waves = float(np.interp(_LONG_CYCLES_PER_M, grid, density))
+    below = np.flatnonzero((density < 0.25 * long_waves) & (grid > _LONG_CYCLES_PER_M))
+    return long_waves, float(grid[below[0]] if below.size else grid[-1])
+
+
+def memory_s(mismatch: Mismatch) -> float:
+    """How long d remembers."""
+    return MEMORY_M / mismatch.speed_m_per_s
+
+
+class Segment(NamedTuple):
+    """What a periodogram shows of a stretch of rows and would show of each source: (f,), (s, f)."""
+
+    seen: FloatArray
+    sensors: FloatArray
+    shapes: FloatArray
+
+
+def segment(values: FloatArray, sensors: FloatArray, shapes: FloatArray) -> Segment:
+    """The tapered periodogram of values (m,), and its exact expectation for covariances.
+
+    `sensors` (lags,) is the autocovariance that the sensors' noise gives the values, `shapes`
+    (s, lags) that of each shape (the debiased periodogram of Sykulski et al. 2019).
+    """
+    m = values.size
+    taper = np.hanning(m + 2)[1:-1]
+    taper /= np.sqrt(taper @ taper)
+    seen = np.abs(np.fft.rfft(taper * values)[1:]) ** 2
+    size = 2 * m
+    # Lag by lag, how much of the taper overlaps itself.
+    overlap = np.fft.irfft(np.abs(np.fft.rfft(taper, size)) ** 2, size)[:m]
+
+    def expected(covariance: FloatArray) -> FloatArray:
+        lags = min(m, covariance.size)
+        weighted = np.zeros(m)
+        weighted[:lags] = covariance[:lags] * overlap[:lags]
+        weighted[0] *= 0.5
+        power = np.asarray(2.0 * np.fft.fft(weighted).real[1 : m // 2 + 1])
+        # Rounding alone makes what nothing is negative.
+        return np.maximum(power, _NOTHING * power.max())
+
+    return Segment(seen, expected(sensors), np.stack([expected(row) for row in shapes]))
+
+
+def levels(segments: list[Segment], usual: FloatArray | None = None) -> tuple[FloatArray, float]:
+    """Most likely levels (s,) in m³ (Whittle's likelihood), and the gain over none of them.
+
+    `usual` (s,) are the means of their exponential priors, infinite where there is none. The gain
+    is twice that of the log-likelihood. Every level is multiplied by the root of what it explains
+    over what it claims until nothing changes.
+    """
+    seen = np.concatenate([one.seen for one in segments])
+    known = np.concatenate([one.sensors for one in segments])
+    shape = np.concatenate([one.shapes for one in segments], axis=1)
+    claimed = np.zeros(shape.shape[0]) if usual is None else 2.0 / usual
+    level = np.full(shape.shape[0], np.mean(seen) / np.mean(shape.sum(axis=0)))
+    for _ in range(_PASSES):
+        expected = known + level @ shape
+        change = np.sqrt((shape @ (seen / expected**2)) / (claimed + shape @ (1.0 / expected)))
+        level = level * change
+        if np.abs(change[level > _ENOUGH * level.max()] - 1.0).max() < _ENOUGH:
+            break
+    expected = known + level @ shape
+    # A taper makes neighbours alike: half of the frequencies tell something new.
+    gain = np.sum(np.log(known / expected) + seen / known - seen / expected)
+    return level, float(gain)

@@ -1,0 +1,129 @@
+"""Roads as surfaces: what an axle feels that stands on strips of one, and how two axles differ.
+
+A tyre averages the road over its width and contact length, an axle over its two wheel tracks, twin
+tyres over two strips each. On an isotropic random surface with the one-sided spectrum Phi(k), k the
+wave number in any direction, an axle multiplies the wave (n_x, n_y) by
+
+    H = sinc(width n_y) sinc(length n_x) cos(pi track n_y) cos(pi twins n_y) exp(2 pi i offset n_y)
+
+with sinc x = sin(pi x)/(pi x), and what axles i and j feel along the road has the cross spectrum
+S_ij(n) = integral of Phi(k) H_i conj(H_j) over n_y, k^2 = n^2 + n_y^2. The surface is the one whose
+profile along every line has the density of ISO 8608, G_d(n_0) (n/n_0)^-2: Phi = G_d n_0^2/2 k^-3.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.physics.road import GEOMETRIC_MEAN_M3, REFERENCE_CYCLES_PER_M, Profile
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_WIDEST_CYCLES_PER_M = 40.0
+"""Waves across the road that are shorter no tyre feels."""
+_ACROSS, _FINE = 400, 8000
+"""Waves across: of a drawn surface, and of the integral."""
+_SHORTEST_WAVE_M, _LONGEST_WAVE_M = 0.05, 100.0
+_SCALE = 0.02
+"""Cycles/m across from which on waves stand apart by a share of themselves."""
+
+
+class Footprint(NamedTuple):
+    """Where an axle stands on the road, in m."""
+
+    width_m: float = 0.25
+    """Of a tyre's tread."""
+    twin_distance_m: float = 0.0
+    """Between the middles of twin tyres; 0 for single ones."""
+    length_m: float = 0.2
+    """Of the contact patch."""
+    track_m: float = 1.9
+    """Between the middles of the wheels of both sides."""
+    offset_m: float = 0.0
+    """How far to the left of the truck's line the axle runs."""
+
+
+def response(axle: Footprint, n_x: FloatArray, n_y: FloatArray) -> ComplexArray:
+    """H of the module's text for waves (…,) along and across the road, in cycles/m."""
+    strips = np.cos(np.pi * axle.track_m * n_y) * np.cos(np.pi * axle.twin_distance_m * n_y)
+    patch = np.sinc(axle.width_m * n_y) * np.sinc(axle.length_m * n_x)
+    return np.asarray(patch * strips * np.exp(2j * np.pi * axle.offset_m * n_y))
+
+
+def surface_density(road_class: str) -> float:
+    """Phi k^3 in m² (Phi in m^4): 8e-8 for class A."""
+    return 0.5 * GEOMETRIC_MEAN_M3[road_class] * REFERENCE_CYCLES_PER_M**2
+
+
+def spectra(front: Footprint, rear: Footprint, n: FloatArray) -> tuple[FloatArray, ...]:
+    """One-sided spectra (f,) at n > 0 cycles/m of a surface with Phi = k^-3, in m (times m²).
+
+    Front axle, rear axle, the real part of their cross spectrum, and their difference front less
+    rear. Trapezoids in asinh(n_y/scale); the integrands fall off like a power.
+    """
+    longest = np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)
+    t = np.linspace(-longest, longest, _FINE + 1)
+    n_y, weight = _SCALE * np.sinh(t), _SCALE * np.cosh(t) * (t[1] - t[0])
+    n_x = np.asarray(n)[:, None]
+    density = weight * (n_x**2 + n_y**2) ** -1.5
+    h_front, h_rear = response(front, n_x, n_y), response(rear, n_x, n_y)
+    return (
+        np.sum(density * np.abs(h_front) ** 2, axis=1),
+        np.sum(density * np.abs(h_rear) ** 2, axis=1),
+        np.sum(density * (h_front * h_rear.conj()).real, axis=1),
+        np.sum(density * np.abs(h_front - h_rear) ** 2, axis=1),
+    )
+
+
+class Surface(NamedTuple):
+    """A stretch of random road as its waves: `amplitude` (along, across), complex, in m."""
+
+    start_m: float
+    spacing_m: float
+    samples: int
+    n_x: FloatArray  # (along,) cycles/m
+    n_y: FloatArray  # (across,)
+    amplitude: ComplexArray
+
+
+def random_surface(
+    start_m: float, stop_m: float, spacing_m: float, road_class: str, seed: int
+) -> Surface:
+    """An isotropic surface whose profile along the road has an ISO 8608 class's geometric mean.
+
+    Gaussian: waves along are even and as many as fit into the stretch with a margin, so that no
+    period is seen to repeat; waves across stand closer where they are long. Waves between 0.05 m
+    and 100 m.
+    """
+    rng = np.random.default_rng(seed)
+    count = round((stop_m - start_m) / spacing_m) + 1
+    period_m = max(4.0 * (count - 1) * spacing_m, _LONGEST_WAVE_M)
+    step = 1.0 / period_m
+    n_x = np.arange(1.0 / _LONGEST_WAVE_M, min(1.0 / _SHORTEST_WAVE_M, 0.5 / spacing_m), step)
+    longest = np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)
+    edges = _SCALE * np.sinh(np.linspace(-longest, longest, _ACROSS + 1))
+    n_y = 0.5 * (edges[1:] + edges[:-1])
+    # The density's integral over each strip of n_y, exactly: that of k^-3 is n_y/(n_x^2 k).
+    at_edge = edges / np.hypot(n_x[:, None], edges)
+    power = surface_density(road_class) * np.diff(at_edge, axis=1) / n_x[:, None] ** 2 * step
+    noise = rng.standard_normal((2, n_x.size, n_y.size))
+    amplitude = np.sqrt(power) * (noise[0] + 1j * noise[1])
+    return Surface(start_m, spacing_m, count, n_x, n_y, amplitude)
+
+
+def felt_by(surface: Surface, axle: Footprint, beside_m: float = 0.0) -> Profile:
+    """The profile that an axle feels whose truck drives `beside_m` to the left of the line."""
+    moved = axle._replace(offset_m=axle.offset_m + beside_m)
+    along = response(moved, surface.n_x[:, None], surface.n_y[None, :]) * surface.amplitude
+    wave = along.sum(axis=1)
+    x = surface.start_m + surface.spacing_m * np.arange(surface.samples, dtype=np.float64)
+    step = surface.n_x[1] - surface.n_x[0]
+    period = round(1.0 / (step * surface.spacing_m))
+    phase = np.exp(2j * np.pi * surface.n_x * surface.start_m)
+    # ifft sums exp(+2 pi i n x) over harmonics of the period; the first one is not zero.
+    waves = period * np.fft.ifft(wave * phase, period)[: surface.samples]
+    lowest = surface.n_x[0]
+    height = np.real(waves * np.exp(2j * np.pi * lowest * (x - surface.start_m)))
+    return Profile(x, height)
