@@ -14,7 +14,7 @@ from schemas.errors import InputError
 from schemas.site_file import load_site, parse_site
 from schemas.toml_text import MAX_BYTES, MAX_DEPTH, parse_toml
 
-TEXT = (Path(__file__).parents[1] / "data" / "csv_example" / "site.toml").read_text()
+TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
 
 
 @pytest.fixture
