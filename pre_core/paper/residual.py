@@ -566,10 +566,10 @@ def road_profiles(window: Window, work: Workspace, theta: FloatArray) -> Roads:
     return Roads(window.x_m.copy(), np.einsum("mj,mj->m", window.front_weight, gathered), rear)
 
 
-def largest_deflection_m(window: Window, theta: FloatArray) -> float:
-    """Largest deflection of the bridge under a wheel during the crossing, positive downwards."""
+def deflections_m(window: Window, theta: FloatArray) -> FloatArray:
+    """Deflection (2, n) of the bridge under the front and the rear wheel, positive downwards."""
     work = workspace(window)
     four = np.repeat(theta[None, :], LANES, axis=0)
     march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
-    deflection = input_profiles(window.signals, theta) + work.road[:, :, 0]  # y = u - r
-    return float(-deflection.min())
+    # The road that is left there is minus r, and y = u - r.
+    return np.asarray(-input_profiles(window.signals, theta) - work.road[:, :, 0])
