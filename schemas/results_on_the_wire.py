@@ -18,6 +18,7 @@ from schemas.results import (
     Header,
     Parameter,
 )
+from schemas.signals import NS_PER_S
 
 
 def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:
@@ -272,7 +273,7 @@ def _road(message: pb.RoadResult) -> dict[str, object]:
 
 
 def _seconds(nanoseconds: int) -> float:
-    return nanoseconds / 1_000_000_000  # of two integers: rounded once, where / 1e9 rounds twice
+    return nanoseconds / NS_PER_S  # of two integers: rounded once, where / 1e9 rounds twice
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -23,6 +23,7 @@ from pydantic import (
 from schemas.signals import MAX_RATE_HZ
 from schemas.site_errors import at
 from schemas.topics import IDENTIFIER
+from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
 
 MAX_ELEMENTS: Final = 30
 MAX_TABLES: Final = 20_000
@@ -417,7 +418,7 @@ def _distance_m(
     latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float
 ) -> float:
     """Distance on the WGS 84 ellipsoid of places less than a few km apart."""
-    a, e2 = 6378137.0, 0.00669437999014
+    a, e2 = SEMI_MAJOR_AXIS_M, ECCENTRICITY_SQUARED
     middle = math.radians((latitude_1 + latitude_2) / 2)
     w = 1 - e2 * math.sin(middle) ** 2
     north = math.radians(latitude_2 - latitude_1) * a * (1 - e2) / w**1.5

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.channels import channel_signals
 from pre_core.crossing.posterior import (
     Fixes,
@@ -28,7 +29,6 @@ from pre_core.crossing.whitening import (
 )
 from pre_core.physics.beam_basis import beam_basis, rebased
 from pre_core.physics.bridge import FloatArray
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.unknowns import FIRST_OF_BRIDGE
 
 _KNOT_S = 0.4

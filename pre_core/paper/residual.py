@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
 from pre_core.paper.iep import iep_factors, iep_signals, input_profiles
 from pre_core.paper.integrate import Integrated
@@ -23,7 +24,7 @@ from pre_core.physics.beam_basis import (
     modal_filters_one,
 )
 from pre_core.physics.bridge import locate
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2, rear_position_m
+from pre_core.physics.simulate import rear_position_m
 from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
 from pre_core.unknowns import D_1, KAPPA, M_U1
 

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.diagnostics import quality
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2, Motion
+from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
 from schemas.site import Vehicle
 from services.identification.crossing_data import CrossingData, Floats

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
+from pre_core.constants import NORMAL_975
 from pre_core.physics.bridge import Beam
 from pre_core.physics.models import beam_from
 from pre_core.physics.road import Profile, iri_m_per_km, iso_8608_class, roughness_coefficient_m3
@@ -21,7 +22,6 @@ Floats = NDArray[np.float64]
 
 MARGIN_S = 1.0
 """Samples are needed this long before the entry and after the exit."""
-NORMAL_975 = 1.959963984540054
 _ROAD_SPACING_M = 0.05
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3
 """From here on load transfer matters, which the height of the centre of gravity decides."""

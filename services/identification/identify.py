@@ -31,7 +31,7 @@ from services.identification.crossing_data import (
 from services.identification.paper_method import identify_paper
 from services.identification.pre_method import Keep as Keep
 from services.identification.pre_method import identify_pre
-from services.identification.stays import Passage
+from services.identification.stays import STANDING_M_PER_S, Passage
 from services.identification.streams import Samples
 
 _log = logging.getLogger(__name__)
@@ -54,7 +54,6 @@ class Identify(Protocol):
 
 _SLOWEST_M_PER_S = 3.0
 """Below this the wheels feel next to nothing of the bridge's stiffness."""
-_STANDING_M_PER_S = 0.5
 _LONGEST_OUTAGE_S = 8.0
 """So long without a fix the trajectory may be found from the axles' signals, by method `pre`."""
 
@@ -204,7 +203,7 @@ def _unusable(
         return [*reasons, Reason.POSITION_OUTAGE]
     times = np.linspace(entry_s, exit_s, 200)
     speed = data.stay.direction * trajectory.spline.derivative()(times)
-    if speed.min() < _STANDING_M_PER_S:
+    if speed.min() < STANDING_M_PER_S:
         reasons.append(Reason.STOPPED_ON_BRIDGE)
     elif np.median(speed) < _SLOWEST_M_PER_S:
         reasons.append(Reason.SPEED_TOO_LOW)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
+from pre_core.constants import NORMAL_975
 from pre_core.paper import least_squares, random_walk, residual
 from pre_core.paper.integrate import spline_integrate
 from pre_core.paper.residual import Window
@@ -23,7 +24,6 @@ from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from services.identification.crossing_data import (
-    NORMAL_975,
     CrossingData,
     Floats,
     Passing,

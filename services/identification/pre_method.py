@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
+from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import optimum, posterior
 from pre_core.crossing.preparation import Inputs
 from pre_core.crossing.sampling import Sampled, sample
@@ -37,7 +38,6 @@ from services.identification.crossing_data import (
     road_result,
 )
 
-_MICRO_G = 9.80665e-6
 _FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN = 14, 8
 """At least so many in all, and in each of several spans on average, whatever the number of
 elements: quicker sensors would see a coarser mesh. A load between nodes sags by 1/(4 n^3) less of a
@@ -85,7 +85,10 @@ def inputs_of(
             )
         ),
     )
-    density = np.maximum(np.array(sensor.noise_density_ug_per_rthz), _SMALLEST_NOISE_UG) * _MICRO_G
+    density = (
+        np.maximum(np.array(sensor.noise_density_ug_per_rthz), _SMALLEST_NOISE_UG)
+        * MICRO_G_M_PER_S2
+    )
     return Inputs(
         acceleration,
         start_s,

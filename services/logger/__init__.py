@@ -16,6 +16,7 @@ from schemas.events import Event, EventKind
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import (
+    HEALTH_PERIOD_S,
     PREFIX,
     check_identifier,
     check_realms,
@@ -49,7 +50,6 @@ _ANNOUNCE_PERIOD_S = 0.1
 _DURABLE_PERIOD_S = 1.0
 """`durable` speaks of all trucks to each of them, over a mobile network perhaps."""
 _REPORT_PERIOD_S = 1.0
-_HEALTH_PERIOD_S = 60.0
 _DRAIN_S = 2.5
 _COUNT_S = 1.0
 _PAUSE_S = 0.05
@@ -313,7 +313,7 @@ class _Announcements:
                 next_durable_s = time.monotonic() + _DURABLE_PERIOD_S
                 version = self._publish_durable()
             if closing or time.monotonic() >= next_health_s:
-                next_health_s = time.monotonic() + _HEALTH_PERIOD_S
+                next_health_s = time.monotonic() + HEALTH_PERIOD_S
                 self._publish_health()
                 give_back_memory()
             if closing:

@@ -21,8 +21,7 @@ from typing import NamedTuple
 from schemas.events import Event, EventKind
 from schemas.topics import REALM, realm_within
 from services.common.disk import DISK, Disk
-from services.common.errors import FailureError, InputError
-from services.common.leash import EXIT
+from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 from services.recordings.recording import is_being_written, is_closed
 from services.recordings.recovery import ASIDE, put_aside, recovered_path
 
@@ -174,7 +173,11 @@ class Housekeeping:
             while True:
                 try:
                     out, log = process.communicate(timeout=_POLL_S)
-                    return None if process.returncode == EXIT else (process.returncode, out, log)
+                    return (
+                        None
+                        if process.returncode == EXIT_INTERRUPTED
+                        else (process.returncode, out, log)
+                    )
                 except subprocess.TimeoutExpired:
                     if self._closing.is_set():
                         leash.close()

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from schemas.events import Event, EventKind
 from schemas.messages import check_stamp
-from schemas.signals import Identity, Stamp
+from schemas.signals import NS_PER_S, Identity, Stamp
 from schemas.topics import Key, Topic, is_replayed, topic
 from services.bus.subscription import Received, Seen
 from services.common.intervals import Intervals
@@ -33,7 +33,6 @@ _LEAST_BURST = 1000
 _MAX_REFUSED_SOURCES = 100
 _REFUSALS_PERIOD_S = 60.0
 _RECENT = 256
-_NS_PER_S = 1_000_000_000
 
 
 class Refusals(NamedTuple):
@@ -316,7 +315,7 @@ class Intake:
         self._lag_ns = max(self._lag_ns, now_ns - stamp.wall_time_ns)
 
     def _own_clock(self, now_ns: int, now_s: float) -> list[tuple[Key, Event]]:
-        offset_ns = now_ns - round(now_s * _NS_PER_S)
+        offset_ns = now_ns - round(now_s * NS_PER_S)
         step_ns = clock_step_ns(self._own_clock_ns, offset_ns)
         self._own_clock_ns = offset_ns
         if not step_ns:

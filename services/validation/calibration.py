@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
+from pre_core.constants import NORMAL_975
 from pre_core.diagnostics import calibration
-from pre_core.diagnostics.calibration import NORMAL_975, Scores
+from pre_core.diagnostics.calibration import Scores
 from pre_core.physics.road import Profile
 from schemas.results import Crossing, Parameter
 from schemas.settings import IdentificationSettings
