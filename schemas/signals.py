@@ -42,7 +42,7 @@ _POSITIONS = {
 ACCEL_NAMES: dict[int, str] = {position: name for name, position in _POSITIONS.items()}
 """Name of a channel by its position in the protobuf message."""
 _CHANNEL_BYTES = 2 + 9 + 1
-"""Of an encoded channel: position, rate, and the tag of the samples."""
+"""What a channel takes beside its samples: position, rate, and the tag of the samples."""
 _FLOAT64 = np.dtype("<f8")
 _IDENTITY = struct.Struct("!QQ")
 
@@ -59,7 +59,7 @@ class Stamp(NamedTuple):
 
     wall_time_ns: int
     device_time_ns: int | None = None
-    """Of the sender's monotonic clock; None where the message has none."""
+    """By the sender's monotonic clock; None where the message has none."""
     identity: Identity | None = None
     """As in the payload itself; None where it has none."""
 

@@ -33,7 +33,7 @@ MAX_SPAN_DISAGREEMENT: Final = 0.2
 slip of the pen. Ends read off a hand-held receiver are metres off, so less is not refused."""
 
 _SMALLEST_SLIP: Final = 1e-3
-"""Of the span: lengths of elements are rounded."""
+"""Lengths of elements are rounded: they may miss the span by this share of it."""
 
 _TYRE_DAMPING_NS_PER_M: Final = 1000.0
 _BEARING_COMPLIANCE_M_PER_N: Final = 1e-9
@@ -376,7 +376,7 @@ class Receiver(_Table):
     """The satellite receiver."""
 
     position_spread_m: NotNegative = 1.5
-    """Of the slow error, the same during a crossing."""
+    """The spread of the slow error, which is the same during a crossing."""
     position_noise_m: NotNegative = 0.4
     speed_noise_m_per_s: NotNegative = 0.07
     latency_s: Annotated[Number, Field(ge=-10, le=10)] = 0.0

@@ -57,7 +57,7 @@ class Key(NamedTuple):
 
 
 HEALTH_PERIOD_S = 60.0
-"""Of each service: how often it says how it is."""
+"""How often each service says how it is."""
 
 TOPICS: tuple[Topic, ...] = (
     Topic(

@@ -32,7 +32,10 @@ from pre_core.physics.bridge import FloatArray
 from pre_core.unknowns import FIRST_OF_BRIDGE
 
 _KNOT_S = 0.4
+"""Between knots of the trajectory: a driver changes the speed more slowly."""
 _SLOPE_STEP = 1e-3
+"""Step of the one-sided difference for how the noise's power changes with the truck and the
+gains."""
 _SWING_BEFORE_S = 0.1
 """The bridge's swing is told at this time before the truck comes, to leave the search room."""
 _MARGIN_M = 3.0  # of road before the first row, for the trajectory to move

@@ -20,6 +20,8 @@ IntArray = NDArray[np.int64]
 
 
 MAX_STEPS = 60
+"""Ten to fifteen lead to the minimum without noise (docs/reproduction.md); who needs this many is
+lost."""
 
 
 class Problem(NamedTuple):

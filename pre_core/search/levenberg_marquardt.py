@@ -16,8 +16,11 @@ from pre_core.search.loop import Ending, Solution, run
 FloatArray = NDArray[np.float64]
 
 _FIRST_DAMPING = 1e-3
+"""Relative to the Jacobian's columns: nearly a Gauss-Newton step."""
 _SMALLEST_DAMPING = 1e-14
+"""Damping that is smaller changes nothing within rounding."""
 _GIVE_UP_DAMPING = 1e8
+"""Steps that are so short and do not help: the search is stuck."""
 _CONVERGED_STEP = 1e-9  # in logarithms
 _LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
 
@@ -44,8 +47,9 @@ bottom. What is told of it, `covariance`, takes `slopes`."""
 
 _SLOPE_STEP = 3e-3
 _SLOPE_WEIGHTS = (3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0)
-"""Of central differences over one, two and three steps: together exact for polynomials of sixth
-degree. With this step the error of the formula and what rounding makes of it are alike."""
+"""Weights of central differences over one, two and three steps, which are together exact for
+polynomials of sixth degree. With this step the error of the formula and what rounding makes of it
+are alike."""
 
 
 class State(NamedTuple):

@@ -29,6 +29,7 @@ from services.recordings.recording import Message
 Floats = NDArray[np.float64]
 
 BATCH_S = 0.05
+"""A truck sends batches of this length: few messages, and still live."""
 
 # In sampling intervals: below it the jitter of time stamps is taken for rounding.
 _LARGEST_JITTER = 0.1

@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 MARGIN_S = 1.0
 """Samples are needed this long before the entry and after the exit."""
 _ROAD_SPACING_M = 0.05
+"""Finer than a tyre feels: its patch is some 0.2 m long."""
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3
 """From here on load transfer matters, which the height of the centre of gravity decides."""
 LONGEST_SURE_OUTAGE_S = 1.5

@@ -51,7 +51,7 @@ class Samples(NamedTuple):
     rate_hz: float
     channels: dict[str, Floats]
     slowest_rate_hz: float = np.inf
-    """Of the channel that is sampled most slowly, where that is slower than the grid."""
+    """The rate of the slowest channel, where that is slower than the grid."""
 
 
 class Boot:

@@ -29,17 +29,24 @@ MAX_RUNS = 10_000
 RATE_FACTOR = 50
 """More than so many times the nominal rate, for longer than a cache lasts, is no sensor."""
 _RATE_ON_OCCASION_HZ = 100.0
+"""Limit of a stream without a nominal rate: what comes on occasion does not come so often."""
 _LEAST_BURST = 1000
+"""A link that was away brings so many messages at once, whatever the stream."""
 _MAX_REFUSED_SOURCES = 100
+"""Sources with a count of their own until they are told; what of others is refused is counted
+together."""
 _REFUSALS_PERIOD_S = 60.0
+"""What is refused of one source is an event once in this time, with a count."""
 _RECENT = 256
+"""Check sums kept of a stream, to tell a message that comes again from another one of its
+number."""
 
 
 class Refusals(NamedTuple):
     """Messages refused since the last report, of one vehicle or of nobody known."""
 
     realm: str
-    """Of the first."""
+    """The realm of the first that was refused."""
     first_reason: str
     number: int
 

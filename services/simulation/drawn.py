@@ -89,7 +89,8 @@ class Conditions(NamedTuple):
     fix_rate_hz: float
     noise_ug_per_rthz: float
     body_noise_ug_per_rthz: float | None = None
-    """Of the two sensors on the body, where they are of another kind than those of the axles."""
+    """The noise of the two sensors on the body, where they are of another kind than those of the
+    axles."""
 
 
 class Channels(NamedTuple):

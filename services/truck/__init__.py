@@ -44,7 +44,9 @@ __all__ = ["Gateway", "run"]
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
+"""A router that was started a moment before is there by then."""
 SUBSCRIBER_TIMEOUT_S = 1.0
+"""A truck does not wait for an audience: its cache serves those who come late."""
 
 
 def run(

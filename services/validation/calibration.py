@@ -29,6 +29,7 @@ Record = dict[str, Any]
 """One crossing as JSON, see `record`."""
 
 _FEWEST_RANKS = 20
+"""Fewer ranks cannot be told from even ones, whatever they are."""
 
 
 def _estimates(result: Crossing) -> dict[str, Parameter]:
@@ -184,7 +185,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 """Parameters whose ranks are told together; a group that no draws are kept of is left out."""
 SMALLEST_P = 0.01
-"""Of the ranks of a group, whose parameters are tested one by one."""
+"""A group fails whose ranks are less likely than this, its parameters being tested one by one."""
 
 
 def elements_of(records: list[Record]) -> int:
