@@ -29,8 +29,9 @@ class Unknown(NamedTuple):
     which: int = 0
     """Which of a pair (front, rear) or (start, end)."""
     mass_power: int = 0
-    """Of the total mass to which it is proportional where all accelerations are given: a truck
-    that is twice as heavy has twice as stiff springs, and so has the bridge that it bends alike."""
+    """The power of the total mass to which it is proportional where all accelerations are given: a
+    truck that is twice as heavy has twice as stiff springs, and so has the bridge that it bends
+    alike."""
     may_be_zero: bool = False
     """Nominally zero it is estimated all the same, with a half-normal prior at zero; any other
     unknown whose nominal value is zero is taken for known."""

@@ -18,6 +18,7 @@ from schemas.results import (
     Header,
     Parameter,
 )
+from schemas.signals import NS_PER_S
 
 _THIRDS = ("left", "middle", "right")
 
@@ -303,7 +304,7 @@ def _mismatch(message: pb.RoadMismatch) -> dict[str, float | None]:
 
 
 def _seconds(nanoseconds: int) -> float:
-    return nanoseconds / 1_000_000_000  # of two integers: rounded once, where / 1e9 rounds twice
+    return nanoseconds / NS_PER_S  # of two integers: rounded once, where / 1e9 rounds twice
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -27,11 +27,12 @@ MAX_ACCELERATION_M_PER_S2 = 1e4
 """About 1000 g: more is another unit or a broken sensor."""
 MAX_SEQUENCE = 2**32 - 1
 """MCAP stores 32 bits: six years of batches without a restart."""
+NS_PER_S = 1_000_000_000
+MAX_BOOT_ID = 2**64 - 1
 EARLIEST_WALL_TIME_NS = 946_684_800_000_000_000  # 2000-01-01
 LATEST_WALL_TIME_NS = 7_258_118_400_000_000_000  # 2200-01-01
 MAX_SITE_BYTES = 1 << 16
 
-_MAX_BOOT_ID = 2**64 - 1
 _POSITIONS = {
     "sprung_front": pb.SPRUNG_FRONT,
     "sprung_rear": pb.SPRUNG_REAR,
@@ -41,10 +42,9 @@ _POSITIONS = {
 ACCEL_NAMES: dict[int, str] = {position: name for name, position in _POSITIONS.items()}
 """Name of a channel by its position in the protobuf message."""
 _CHANNEL_BYTES = 2 + 9 + 1
-"""Of an encoded channel: position, rate, and the tag of the samples."""
+"""What a channel takes beside its samples: position, rate, and the tag of the samples."""
 _FLOAT64 = np.dtype("<f8")
 _IDENTITY = struct.Struct("!QQ")
-_NS_PER_S = 1_000_000_000
 
 
 class Identity(NamedTuple):
@@ -59,7 +59,7 @@ class Stamp(NamedTuple):
 
     wall_time_ns: int
     device_time_ns: int | None = None
-    """Of the sender's monotonic clock; None where the message has none."""
+    """By the sender's monotonic clock; None where the message has none."""
     identity: Identity | None = None
     """As in the payload itself; None where it has none."""
 
@@ -231,7 +231,7 @@ def encode_location(fix: GnssFix) -> bytes:
         longitude=fix.longitude_deg,
         altitude=fix.altitude_m,
     )
-    message.timestamp.seconds, message.timestamp.nanos = divmod(fix.wall_time_ns, _NS_PER_S)
+    message.timestamp.seconds, message.timestamp.nanos = divmod(fix.wall_time_ns, NS_PER_S)
     if fix.heading_deg is not None:
         message.heading = math.radians(fix.heading_deg)
     if fix.horizontal_accuracy_m is not None and fix.vertical_accuracy_m is not None:
@@ -250,7 +250,7 @@ def check_location(payload: bytes) -> int:
     except DecodeError as error:
         raise ValueError(f"not a foxglove.LocationFix: {error}") from None
     _check_position(message.latitude, message.longitude, message.altitude)
-    return check_wall_time(message.timestamp.seconds * _NS_PER_S + message.timestamp.nanos)
+    return check_wall_time(message.timestamp.seconds * NS_PER_S + message.timestamp.nanos)
 
 
 def encode_identity(boot_id: int, sequence: int) -> bytes:
@@ -326,7 +326,7 @@ def _samples(channel: pb.AccelChannel) -> npt.NDArray[np.float64]:
 
 
 def _check_identity(boot_id: int, sequence: int) -> None:
-    if not 0 <= boot_id <= _MAX_BOOT_ID:
+    if not 0 <= boot_id <= MAX_BOOT_ID:
         raise ValueError(f"boot_id {boot_id} does not fit 64 bits without sign")
     if not 0 <= sequence <= MAX_SEQUENCE:
         raise ValueError(f"sequence {sequence} is not between 0 and {MAX_SEQUENCE}")

@@ -23,6 +23,7 @@ from pydantic import (
 from schemas.signals import MAX_RATE_HZ
 from schemas.site_errors import at
 from schemas.topics import IDENTIFIER
+from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
 
 MAX_ELEMENTS: Final = 30
 MAX_TABLES: Final = 20_000
@@ -32,7 +33,7 @@ MAX_SPAN_DISAGREEMENT: Final = 0.2
 slip of the pen. Ends read off a hand-held receiver are metres off, so less is not refused."""
 
 _SMALLEST_SLIP: Final = 1e-3
-"""Of the span: lengths of elements are rounded."""
+"""Lengths of elements are rounded: they may miss the span by this share of it."""
 
 _TYRE_DAMPING_NS_PER_M: Final = 1000.0
 _BEARING_COMPLIANCE_M_PER_N: Final = 1e-9
@@ -384,7 +385,7 @@ class Receiver(_Table):
     """The satellite receiver."""
 
     position_spread_m: NotNegative = 1.5
-    """Of the slow error, the same during a crossing."""
+    """The spread of the slow error, which is the same during a crossing."""
     position_noise_m: NotNegative = 0.4
     speed_noise_m_per_s: NotNegative = 0.07
     latency_s: Annotated[Number, Field(ge=-10, le=10)] = 0.0
@@ -426,7 +427,7 @@ def _distance_m(
     latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float
 ) -> float:
     """Distance on the WGS 84 ellipsoid of places less than a few km apart."""
-    a, e2 = 6378137.0, 0.00669437999014
+    a, e2 = SEMI_MAJOR_AXIS_M, ECCENTRICITY_SQUARED
     middle = math.radians((latitude_1 + latitude_2) / 2)
     w = 1 - e2 * math.sin(middle) ** 2
     north = math.radians(latitude_2 - latitude_1) * a * (1 - e2) / w**1.5

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from google.protobuf.message import DecodeError
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.signals import MAX_SEQUENCE, SCHEMA_VERSION, check_version
+from schemas.signals import MAX_BOOT_ID, MAX_SEQUENCE, SCHEMA_VERSION, check_version
 from schemas.topics import PREFIX, Key, key, parse_key, realm_chunk
 
 SUFFIX = "/spool"
@@ -26,7 +26,6 @@ PAGE_BYTES = 1 << 20
 """What one answer holds at most; a single message that is larger is given alone."""
 MAX_RANGES = 10_000
 """More holes than that in what a truck holds are not told; each is a restart or a disk error."""
-_MAX_BOOT_ID = 2**64 - 1
 _DIGITS = re.compile(r"[0-9]{1,20}")
 
 Range = tuple[int, int]
@@ -87,7 +86,7 @@ def parse_query(parameters: Mapping[str, str]) -> Query | None:
     if not parameters:
         return None
     wanted = []
-    for name, highest in (("boot", _MAX_BOOT_ID), ("from", MAX_SEQUENCE), ("to", MAX_SEQUENCE)):
+    for name, highest in (("boot", MAX_BOOT_ID), ("from", MAX_SEQUENCE), ("to", MAX_SEQUENCE)):
         text = parameters.get(name, "")
         if not _DIGITS.fullmatch(text) or int(text) > highest:
             raise ValueError(f"spool query: {name}={text[:40]!r}, 0 to {highest} is expected")

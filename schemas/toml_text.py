@@ -15,9 +15,9 @@ from typing import Any, Final
 from schemas.errors import InputError
 
 MAX_BYTES: Final = 16 << 20
-"""Of a site file: some 20,000 bridges."""
+"""A site file of this size has some 20,000 bridges."""
 MAX_DEPTH: Final = 8
-"""Of a key or heading in dots, and of tables and lists in each other; a site file needs two."""
+"""Parts of a key or heading in dots, and tables and lists in each other; a site file needs two."""
 MAX_DEEP: Final = 1000
 """Keys in three parts or more, each of which costs tomllib as much as its depth squared."""
 MAX_KEYS: Final = 500_000

@@ -56,6 +56,9 @@ class Key(NamedTuple):
     stream: str
 
 
+HEALTH_PERIOD_S = 60.0
+"""How often each service says how it is."""
+
 TOPICS: tuple[Topic, ...] = (
     Topic(
         "vehicle", "accel", "driveby.v1.AccelBatch", True, False, 20.0, "reliable",
@@ -90,7 +93,7 @@ TOPICS: tuple[Topic, ...] = (
         1, 1_000, 1 << 20, "the bridge's latest fused estimate; also answers queries",
     ),
     Topic(
-        "service", "health", "driveby.v1.Health", False, False, 1 / 60, "latest",
+        "service", "health", "driveby.v1.Health", False, False, 1 / HEALTH_PERIOD_S, "latest",
         1, 1_000, 1 << 16, "how a service is: rate, lag, queue, lost, recovered, disk left",
     ),
     Topic(

@@ -34,8 +34,8 @@ class WorkingEngine:
     def resume(self, said: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
         return self.inner.resume(known_crossings(said, search_hash(self._header)))
 
-    def expect(self, key: Key, payload: bytes) -> None:
-        self.inner.expect(key, payload)
+    def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
+        self.inner.expect(key, payload, for_ever=for_ever)
 
     def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
         return dispatched(self.inner, self._execution, self.inner.feed(key, payload))

@@ -15,6 +15,7 @@ DIFFERENCE = 1e-4
 """The step of a central difference, in the coordinates of the posterior: multiples of a prior's
 spread, and metres of the trajectory. Halving it moves no bound by a thousandth of itself."""
 _NUISANCE_STEPS = 20
+"""The most steps; `_ENOUGH` ends the way sooner as a rule."""
 _ENOUGH = 0.01
 """A gain in the sum of squares, whose standard deviation is tens, that is no step."""
 

@@ -46,6 +46,7 @@ from pre_core.search.loop import Ending, Report, Solution
 from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE, F
 
 _COARSE = ((300.0, 4), (100.0, 4), (30.0, 4))
+"""Temperatures and the steps at each on the way to the truck, the bridge taken as a whole."""
 _COARSE_ON_TWO_ROADS = (*_COARSE, (10.0, 4))
 """Where roads differ the search begins with their difference as noise, which is told anew after
 every step: with the sensors' alone it would not find its way."""
@@ -56,23 +57,32 @@ _FREE = ((5.0, 8, 0.2), (1.0, 25, 0.1))
 """Temperatures (noise is taken for this many times what it is), the steps at each, and the gain in
 the sum of squares that is not worth another step."""
 _PLAINLY_RUBS = 0.05
-"""Of what the sensors could tell by the body equations; a truck that leaves less is not tried."""
+"""A truck whose springs leave less of what the sensors could tell by the body equations is not
+tried with springs believed: they plainly rub."""
 _LOST_CHI2 = 10.0
 """With the noise taken for five times what it is, sound starts of 90 drawn crossings were at 1.6 at
 most, wrong ones at 10 to 70."""
 _MOST_ROUNDS, _ROUNDS_ON_THE_WAY, _STEPS_OF_A_ROUND = 6, 2, 4
+"""Fits and levels of noise that the rows tell take turns at most so often, of that on the way; steps
+of each where the roads differ."""
 _UNTOLD = 0.3
 """Of what a data sheet leaves open: a direction that is not known better tells nothing."""
 _SAME_LEVEL = 0.1
 """A level of noise that changes by less than this part is settled."""
 _WALK_TEMPERATURE = 3.0
+"""The temperature at which the walk along the road compares places: minima are wide there."""
 _WALK_STEPS = 6
+"""Steps at each place: only how good it is compared with the others is asked."""
 _WALK_ENOUGH = 0.5
+"""A gain in the sum of squares that is not worth another step there."""
 _STRIDE_M = 0.6
+"""Places that the walk along the road looks at are so far apart."""
 _REFINED_M = (0.3, 0.15)
+"""And so much closer about the best one."""
 _PATIENCE = 1.5  # strides beyond the best place
 _REACH = 3.0  # of the offset's spread
 _APART_M = 0.2
+"""Places closer to each other than this lead to one minimum."""
 _ACCEPTED_Z, _ACCEPTED_EXCESS = 3.0, 0.05
 """A minimum is taken for the right one if chi2 is no further above one than chance (so many
 standard deviations) and what the noise model leaves out explain."""
@@ -82,6 +92,7 @@ _HOPELESS_CHI2 = (1000.0, 25.0)
 Of 70 drawn sound crossings the first place was the right one in all; another one never brought a
 chi2 of this size down to something usable."""
 _BEND = 0.8
+"""A little less than what would make the coordinate linear in 1/EI: see `bends`."""
 
 
 class Way(NamedTuple):
@@ -177,7 +188,7 @@ def _lower(problem: Problem, y: FloatArray, directions: FloatArray, *, is_free: 
 
 
 def _evaluations(found: Solution[levenberg_marquardt.State, levenberg_marquardt.Info]) -> int:
-    """Of a search with forward differences, its first Jacobian included."""
+    """How many a search with forward differences took, its first Jacobian included."""
     return found.state.y.size + 1 + sum(info.evaluations for info in found.infos)
 
 

@@ -48,8 +48,11 @@ _SWING_M = 1e-3
 lorry that has left a tenth of a second ago leaves a bridge of 30 m swinging by a millimetre. Of the
 second it is a quarter, of the third a ninth: a load bends a beam into its j-th mode by 1/j^4."""
 _JERK_M_PER_S3 = 1.0
+"""Root mean square of the jerk that a driver's changes of speed have, before anything is
+measured."""
 _DEGREE = 5
-"""Of the trajectory: load moves with its second derivative, which must not have kinks."""
+"""The trajectory is a spline of this degree: load moves with its second derivative, which must not
+have kinks."""
 
 
 class Priors(NamedTuple):
@@ -64,7 +67,7 @@ class Priors(NamedTuple):
     wheelbase_m: float
     wheelbase_spread: float
     gain_spread: float
-    """Of each channel's gain, independent of the others'."""
+    """The spread of each channel's gain, independent of the others'."""
     common_gain_spread: float
     delay_spread_s: float
 
@@ -106,7 +109,7 @@ class Layout(NamedTuple):
 
     theta: slice
     bridge: NDArray[np.int64]
-    """Of theta, what is the bridge's; `elements` are its last."""
+    """Where in theta the bridge's unknowns are; `elements` are its last."""
     elements: NDArray[np.int64]
     half_normal: NDArray[np.int64]
     """Coordinates that must not be negative."""
@@ -194,7 +197,7 @@ def trajectory_basis(
 
 
 def common_gain_spread(priors: Priors) -> float:
-    """Of the mean of the four gains: what is common to them, and the mean of what is each's own."""
+    """The spread of the mean of four gains: what is common to them, and the mean of each's own."""
     return float(np.hypot(priors.common_gain_spread, 0.5 * priors.gain_spread))
 
 

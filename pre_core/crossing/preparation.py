@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.channels import channel_signals
 from pre_core.crossing.mismatch import GEOMETRY, Mismatch, shapes_of
 from pre_core.crossing.posterior import (
@@ -32,12 +33,14 @@ from pre_core.crossing.whitening import (
 )
 from pre_core.physics.beam_basis import beam_basis, rebased
 from pre_core.physics.bridge import FloatArray
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics.surface import Footprint
 from pre_core.unknowns import FIRST_OF_BRIDGE
 
 _KNOT_S = 0.4
+"""Between knots of the trajectory: a driver changes the speed more slowly."""
 _SLOPE_STEP = 1e-3
+"""Step of the one-sided difference for how the noise's power changes with the truck and the
+gains."""
 _SWING_BEFORE_S = 0.1
 """The bridge's swing is told at this time before the truck comes, to leave the search room."""
 _MARGIN_M = 3.0  # of road before the first row, for the trajectory to move

@@ -46,10 +46,15 @@ from pre_core.unknowns import (
 FloatArray = NDArray[np.float64]
 
 _LONGEST_STRETCH = 128
+"""Steps that are marched at a time, so that their work arrays stay in the cache."""
 _PHASES = 64
+"""Places between two samples for which the step of a wheel that comes on or leaves is tabled."""
 _SINC_TAPS = 16
+"""Samples that reading a signal between two samples takes."""
 _STEP_REACH = 8
+"""Samples to either side that a step of the model's own band rings for."""
 SWING_MODES = 3
+"""Modes that may swing before the truck comes: what has left swings the j-th by 1/j^2 as much."""
 _FEW = 4  # points that are not worth starting a thread
 
 

@@ -17,8 +17,9 @@ LARGEST_R_HAT = 1.05
 SMALLEST_ESS = 100.0
 """Chains agree if no unknown that is told to users is beyond these."""
 _LEARNING_SHARE = 0.4
-"""Of the draws that are asked for, in each stage of learning."""
+"""Each stage of learning takes this share of the draws that are asked for."""
 _LEARNING_STAGES = 3
+"""So many stages at most; one with chains that are accepted often enough is the last."""
 _WELL_ACCEPTED = 0.3
 """From here on the approximation is good enough, and nothing more is learnt."""
 _MOST_RUNS = 14

@@ -49,13 +49,18 @@ _SOURCES = 6  # s1, s2, u1, u2; and the other body sensor at the front's and at 
 EVERY = 3
 """A row every so many samples of the model."""
 PASS = 1.0 / 8.0
-"""Of the model's rate: what is below passes whole; half is left at half the rate of the rows."""
+"""What is below this share of the model's rate passes whole; half is left at half the rows'
+rate."""
 _STOP_BAND_DB = 70.0
+"""What leaks through is 3e-4 of a signal, which is then thinned out and must not alias."""
 _TABLE = 1024  # frequencies of the numerical integral over the noise spectrum
 _FEW_FREQUENCIES = 48
+"""Middles of even intervals up to half the rows' rate, for a trace that is taken again and
+again."""
 _MANY_FREQUENCIES = 512
 """Enough for phases that turn with the time from axle to axle."""
 _SETTLED = 1e-12
+"""From a relative change by less than this on, rows of the factor repeat to rounding."""
 _FORCE_CENTRES_HZ = np.arange(0.0, 60.0, 4.0)
 FORCE_SHAPES = _FORCE_CENTRES_HZ.size
 """The spectrum of the force noise is a sum of bumps about these frequencies, a few hertz wide: that
@@ -63,6 +68,7 @@ of dry friction falls by six decades from the body's bounce to the rows' highest
 _FORCE_MEMORY_S = 0.3
 """Its covariance ends here, which is what makes the bumps as wide as they are."""
 _FORCE_PASSES = 200
+"""Rounds of the multiplicative fit of the spectrum, a fixed number."""
 _BELIEVED_HZ = 30.0
 """Up to which springs are asked whether they are believed."""
 DOUBTED, DOUBTED_OF_A_MISFIT = 60.0, 15.0
@@ -77,7 +83,7 @@ class RowFilter(NamedTuple):
     taps: FloatArray
     every: int
     step_s: float
-    """Of the samples before the filter."""
+    """The step of the samples before the filter."""
     omega: FloatArray  # (f,) middles of even intervals of angular frequency, up to where it stops
     power: FloatArray  # (f,) from white noise of an acceleration to the rows, times the interval
     turn: NDArray[np.complex128]  # (f, lags) phase that a wave gains from row to row

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, log_ndtr, ndtr
 
-FloatArray = NDArray[np.float64]
+from pre_core.constants import NORMAL_975
 
-NORMAL_975 = 1.959963984540054
+FloatArray = NDArray[np.float64]
 
 
 class Scores(NamedTuple):

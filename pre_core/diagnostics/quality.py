@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _BODY_BAND_HZ = (0.7, 10.0)
+"""Where bodies move on their springs; wheels hop above."""
 _BODY_FACTOR = 4.0
 """k/m and c/m may be so many times what is known, either way."""
 _LARGEST_COUPLING = 0.6
+"""The coupling of a pair through the pitch inertia is sought up to this, either way."""
 _ROAD_BAND_HZ = (1.0, 8.0)
+"""Where both axles feel the road alike."""
 
 
 # Signals.
@@ -121,7 +124,7 @@ class Pairing(NamedTuple):
     recorded: float
     """Part of the body's motion that the body equations leave unexplained, channels as recorded."""
     upright: tuple[float, float]
-    """Of the front and the rear pair apart."""
+    """What the front and the rear pair leave, each by itself."""
     reversed_: tuple[float, float]
     """The same with the axle's sign turned round."""
     best: float

@@ -14,9 +14,10 @@ from pre_core.kernels.lanes import LANES, Lanes, fma, kernel, load, mul, store
 FloatArray = NDArray[np.float64]
 
 MAX_SWEEPS = 30
+"""Where all numbers are finite a few sweeps do; this bounds the others."""
 _NEGLIGIBLE = 1e-16
-"""Of a_pq^2/(a_pp a_qq) before a sweep: convergence is quadratic, so that after it what is left is
-far below rounding."""
+"""A sweep that begins with a_pq^2/(a_pp a_qq) below this is the last: convergence is quadratic, so
+that what it leaves is far below rounding."""
 
 
 @kernel

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate
 from pre_core.paper.residual import Window, build_window
@@ -13,7 +14,6 @@ from pre_core.physics.vehicle import HalfCar, total_mass_kg
 ROAD_CLASS = "B"
 ROAD_SEED = 1
 """The paper's road is not published; docs/reproduction.md says what another one changes."""
-_MICRO_G = 9.80665e-6
 
 
 def paper_window(
@@ -44,7 +44,7 @@ def paper_window(
         raise ArithmeticError("the simulation did not converge")
     acceleration = np.ascontiguousarray(run.acceleration_m_per_s2.T)
     if noise_ug_per_rthz > 0.0:
-        sigma = noise_ug_per_rthz * _MICRO_G * np.sqrt(0.5 / experiment.STEP_S)
+        sigma = noise_ug_per_rthz * MICRO_G_M_PER_S2 * np.sqrt(0.5 / experiment.STEP_S)
         rng = np.random.default_rng(np.random.SeedSequence([seed, 0x6E]))
         acceleration = acceleration + sigma * rng.standard_normal(acceleration.shape)
     return build_window(

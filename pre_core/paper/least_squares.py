@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.paper.residual import Window, Workspace, residual_batch
+from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import Info, Rows, State, begin, descend, polish
 from pre_core.unknowns import D_1
 
@@ -19,6 +20,8 @@ IntArray = NDArray[np.int64]
 
 
 MAX_STEPS = 60
+"""Ten to fifteen lead to the minimum without noise (docs/reproduction.md); who needs this many is
+lost."""
 
 
 class Problem(NamedTuple):
@@ -53,7 +56,7 @@ def full_vector(problem: Problem, y: FloatArray) -> FloatArray:
     return theta
 
 
-def derivative_of_values(problem: Problem, y: FloatArray) -> FloatArray:
+def _derivative_of_values(problem: Problem, y: FloatArray) -> FloatArray:
     """d value/d y (f,) at y: for carrying a covariance into physical units."""
     values = untransform(problem, y)
     slope = values.copy()
@@ -77,3 +80,10 @@ def step(problem: Problem, work: Workspace, state: State) -> tuple[State, Info]:
     So the way costs no more than it must, and where it ends does not depend on the processor.
     """
     return polish(_rows_of(problem, work), *descend(_rows_of(problem, work), state))
+
+
+def covariance(problem: Problem, work: Workspace, y: FloatArray) -> FloatArray:
+    """Formal covariance (f, f) of the free parameters, in physical units, at the bottom y (f,)."""
+    slope = _derivative_of_values(problem, y)
+    in_logarithms = levenberg_marquardt.covariance(_rows_of(problem, work), y)
+    return np.asarray(in_logarithms * np.outer(slope, slope))

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
 from pre_core.paper.iep import iep_factors, iep_signals, input_profiles
 from pre_core.paper.integrate import Integrated
@@ -23,7 +24,7 @@ from pre_core.physics.beam_basis import (
     modal_filters_one,
 )
 from pre_core.physics.bridge import locate
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2, rear_position_m
+from pre_core.physics.simulate import rear_position_m
 from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
 from pre_core.unknowns import D_1, KAPPA, M_U1
 
@@ -566,10 +567,10 @@ def road_profiles(window: Window, work: Workspace, theta: FloatArray) -> Roads:
     return Roads(window.x_m.copy(), np.einsum("mj,mj->m", window.front_weight, gathered), rear)
 
 
-def largest_deflection_m(window: Window, theta: FloatArray) -> float:
-    """Largest deflection of the bridge under a wheel during the crossing, positive downwards."""
+def deflections_m(window: Window, theta: FloatArray) -> FloatArray:
+    """Deflection (2, n) of the bridge under the front and the rear wheel, positive downwards."""
     work = workspace(window)
     four = np.repeat(theta[None, :], LANES, axis=0)
     march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
-    deflection = input_profiles(window.signals, theta) + work.road[:, :, 0]  # y = u - r
-    return float(-deflection.min())
+    # The road that is left there is minus r, and y = u - r.
+    return np.asarray(-input_profiles(window.signals, theta) - work.road[:, :, 0])

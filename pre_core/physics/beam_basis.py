@@ -9,6 +9,15 @@ is the bilinear transform of its transfer function,
 so that a mode costs a handful of multiplications a step. The recursion here is the direct form II,
 w[n] = p[n] - (b_1 w[n-1] + b_2 w[n-2])/b_0, q[n] = (w[n] + 2 w[n-1] + w[n-2])/b_0, with 1/b_0 split
 evenly into the mode shapes. It starts from rest before the first wheel arrives.
+
+What is marched is w and its change d[n] = w[n] - w[n-1],
+
+    d[n] = p[n] + (a^2 - a c - 3 lambda)/b_0 d[n-1] - 4 lambda/b_0 w[n-2].
+
+In the form above the factors of a slow mode are all but 2 and -1, and what is rounded off them and
+off their sum comes back (a^2/lambda) times: hundreds of roundings, other ones on every processor,
+which slopes by differences then divide by their step. It is w[n-2] here and not w[n-1], so that a
+step need not wait for the sum before it.
 """
 
 from typing import NamedTuple
@@ -18,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from pre_core.kernels.jacobi import diagonalise, diagonalise_one
-from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store
+from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store, sub
 from pre_core.physics.bridge import (
     element_cubics,
     held_nodes,
@@ -152,7 +161,7 @@ def modal_filters(
     """Modes of four bridges as the coefficients of their recursions; False if not finite.
 
     `theta` is (4, p). Written: `cubics` (parts, m, 4, 4) [part, mode, power, particle], scaled
-    by 1/sqrt(b_0), and `feedback` (m, 2, 4): -b_1/b_0 and -b_2/b_0.
+    by 1/sqrt(b_0), and `feedback` (m, 2, 4): what multiplies w[n-2] and d[n-1].
     """
     factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
     by_lane = np.empty((factors, LANES))
@@ -173,8 +182,8 @@ def modal_filters(
             eigenvalue = matrix[k, k, lane] / theta[lane, RHO_A]
             damping = modal_damping(theta[lane], eigenvalue)
             b_0 = a * a + a * damping + eigenvalue
-            feedback[k, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
-            feedback[k, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
+            feedback[k, 0, lane] = -4.0 * eigenvalue / b_0
+            feedback[k, 1, lane] = (a * a - a * damping - 3.0 * eigenvalue) / b_0
             matrix[k, k, lane] = 1.0 / np.sqrt(theta[lane, RHO_A] * b_0)
     for e in range(basis_cubics.shape[0]):
         for k in range(m):
@@ -254,8 +263,8 @@ def modal_filters_one(
         eigenvalue = matrix[k, k] / theta[RHO_A]
         damping = modal_damping(theta, eigenvalue)
         b_0 = a * a + a * damping + eigenvalue
-        feedback[group, 0, lane] = -2.0 * (eigenvalue - a * a) / b_0
-        feedback[group, 1, lane] = -(a * a - a * damping + eigenvalue) / b_0
+        feedback[group, 0, lane] = -4.0 * eigenvalue / b_0
+        feedback[group, 1, lane] = (a * a - a * damping - 3.0 * eigenvalue) / b_0
         size = 1.0 / np.sqrt(theta[RHO_A] * b_0)
         shape_cubics(basis_cubics, vectors[k], size, lane, cubics[:, group])
     return True
@@ -276,7 +285,8 @@ def _one_mode_two_wheels(
     a0, a1, a2, a3 = load(front, 0), load(front, 1), load(front, 2), load(front, 3)
     b0, b1, b2, b3 = load(rear, 0), load(rear, 1), load(rear, 2), load(rear, 3)
     f1, f2 = load(feedback, 0), load(feedback, 1)
-    w1, w2 = load(state, 0), load(state, 1)
+    w1, d = load(state, 0), load(state, 1)
+    w2 = sub(w1, d)
     before = add(w1, w2)
     force_front, force_rear = force[0], force[1]
     for n in range(front_place.size):
@@ -285,7 +295,8 @@ def _one_mode_two_wheels(
         a = fma_scalar(fma_scalar(fma_scalar(a3, x, a2), x, a1), x, a0)
         b = fma_scalar(fma_scalar(fma_scalar(b3, z, b2), z, b1), z, b0)
         p = fma(a, load(force_front, n), mul(b, load(force_rear, n)))
-        w = fma(f1, w1, fma(f2, w2, p))
+        d = fma(f2, d, fma(f1, w2, p))
+        w = add(w1, d)
         after = add(w, w1)
         q = add(after, before)
         before = after
@@ -294,7 +305,7 @@ def _one_mode_two_wheels(
         store(deflection_front, n, fma(a, q, load(deflection_front, n)))
         store(deflection_rear, n, fma(b, q, load(deflection_rear, n)))
     store(state, 0, w1)
-    store(state, 1, w2)
+    store(state, 1, d)
 
 
 @kernel
@@ -308,12 +319,14 @@ def _one_mode_one_wheel(
 ) -> None:
     a0, a1, a2, a3 = load(cubic, 0), load(cubic, 1), load(cubic, 2), load(cubic, 3)
     f1, f2 = load(feedback, 0), load(feedback, 1)
-    w1, w2 = load(state, 0), load(state, 1)
+    w1, d = load(state, 0), load(state, 1)
+    w2 = sub(w1, d)
     before = add(w1, w2)
     for n in range(wheel_place.size):
         x = wheel_place[n]
         a = fma_scalar(fma_scalar(fma_scalar(a3, x, a2), x, a1), x, a0)
-        w = fma(f1, w1, fma(f2, w2, mul(a, load(force, n))))
+        d = fma(f2, d, fma(f1, w2, mul(a, load(force, n))))
+        w = add(w1, d)
         after = add(w, w1)
         q = add(after, before)
         before = after
@@ -321,7 +334,7 @@ def _one_mode_one_wheel(
         w1 = w
         store(deflection, n, fma(a, q, load(deflection, n)))
     store(state, 0, w1)
-    store(state, 1, w2)
+    store(state, 1, d)
 
 
 @kernel

@@ -174,12 +174,16 @@ def unit_stiffness_matrices(element_lengths_m: FloatArray, held: tuple[int, ...]
 
 def stiffness_matrix(beam: Beam) -> FloatArray:
     """Stiffness matrix (d, d) with the support springs."""
+    units = unit_stiffness_matrices(beam.element_lengths_m, held_nodes(beam))
+    return np.tensordot(_stiffness_factors(beam), units, axes=1)
+
+
+def _stiffness_factors(beam: Beam) -> FloatArray:
+    """What multiplies the matrices (n + 4, d, d) of `unit_stiffness_matrices`."""
     vertical = [1.0 / f if f > 0.0 else 0.0 for f in beam.support_compliance_m_per_n]
-    factors = np.concatenate(
+    return np.concatenate(
         [beam.flexural_rigidity_nm2, beam.support_rotational_stiffness_nm_per_rad, vertical]
     )
-    units = unit_stiffness_matrices(beam.element_lengths_m, held_nodes(beam))
-    return np.tensordot(factors, units, axes=1)
 
 
 def modes(beam: Beam, count: int | None = None, coupling_sign: float = 1.0) -> Modes:
@@ -198,6 +202,19 @@ def natural_frequencies_hz(
 ) -> FloatArray:
     """Undamped natural frequencies, ascending."""
     return np.asarray(np.sqrt(modes(beam, count, coupling_sign).eigenvalues_per_s2) / (2.0 * np.pi))
+
+
+def strain_energy_shares(beam: Beam) -> FloatArray:
+    """Shares (n + 4,) of the lowest mode's strain energy that the n elements and the springs hold.
+
+    They say what its frequency answers to: Rayleigh's quotient is stationary at the mode, so that
+    d ln f_1/d ln s_j is half of share j for each factor s_j of `unit_stiffness_matrices`, and
+    d ln f_1/d ln rho A is -1/2.
+    """
+    shape = modes(beam, 1).shapes[:, 0]
+    units = unit_stiffness_matrices(beam.element_lengths_m, held_nodes(beam))
+    energy = _stiffness_factors(beam) * np.einsum("i,jik,k->j", shape, units, shape)
+    return np.asarray(energy / energy.sum())
 
 
 def locate(element_lengths_m: FloatArray, x_m: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:

@@ -25,7 +25,7 @@ from pre_core.unknowns import RHO_A
 FloatArray = NDArray[np.float64]
 
 COEFFICIENTS = 5
-"""Of a mode: -a_1, -a_2 and b_0, b_1, b_2 over their sum."""
+"""Numbers that a mode has: -a_1, -a_2 and b_0, b_1, b_2 over their sum."""
 
 
 @kernel

@@ -14,12 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 
 FloatArray = NDArray[np.float64]
-
-MICRO_G_M_PER_S2 = 1e-6 * STANDARD_GRAVITY_M_PER_S2
 
 _STOP_BAND_DB = 90.0
 _PASS_SHARE = 0.8  # of half the output rate: up to there the anti-aliasing filter passes all

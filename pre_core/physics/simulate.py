@@ -10,12 +10,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics import bridge as _bridge
 from pre_core.physics import vehicle as _vehicle
 
 FloatArray = NDArray[np.float64]
-
-STANDARD_GRAVITY_M_PER_S2 = 9.80665
 
 
 class Motion(NamedTuple):

@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 Pair = tuple[float, float]
 
 _LEAST_HEIGHT = 0.05
-"""Of an air spring at rest; real ones have a bump stop before."""
+"""An air spring keeps this share of its height at rest; real ones have a bump stop before."""
 
 
 class HalfCar(NamedTuple):

@@ -37,16 +37,23 @@ from pre_core.search.loop import Ending
 FloatArray = NDArray[np.float64]
 
 CHAINS = 8
+"""Split in halves they are sixteen, between which `split_r_hat` sees what does not mix."""
 MOVES = 2
-"""Of every chain in a step: each costs one evaluation of the target."""
+"""Each chain has so many in a step, and each costs one evaluation of the target."""
 _RHO = 0.7
-"""Of a step's first move; that of the second is zero."""
+"""How much of where it was a chain keeps in a step's first move; in the second it keeps nothing."""
 _SMALLEST_SHIFT = 0.35
+"""A mean that few draws put closer to where it was is their own scatter."""
 _SMALLEST_STRETCH = 0.2
+"""The same of a spread, relative to what it was."""
 _ASIDE = (1.5, 3.0, 6.0)
+"""Where the target is looked at along each axis, in standard deviations of the approximation:
+further where nearer tells nothing."""
 _FURTHEST = 2.0 / 3.0  # of where the target was looked at
 _NARROWEST = 0.5
+"""No axis becomes narrower at once than this share of what it was."""
 _STRAIGHTEST = 1e-9
+"""What is left before the end of a bent coordinate, whose logarithm is taken."""
 _LOG_TWO_PI = float(np.log(2.0 * np.pi))
 _MASS_DRAWS = 500
 """For the share of a normal in which nothing is negative, to a few per cent."""
@@ -219,7 +226,7 @@ def probed(target: LogDensity, mixed: Mixture) -> Mixture:
 def _log_densities_along(
     target: LogDensity, mixed: Mixture, free: NDArray[np.int64], aside: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Of the target as a function of v, `aside` ahead of zero and behind (d,), and there.
+    """Log density of the target over v, `aside` ahead of zero and behind (d,), and there.
 
     Along the axes `free` (d,): of the points, times what the map stretches.
     """

@@ -12,7 +12,7 @@ from types import FrameType
 from schemas.topics import Key
 from services.bus.delivery import Delivery
 from services.bus.publisher import Publisher
-from services.common.errors import FailureError, InputError
+from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 from services.recordings.recording import Message
 
 _log = logging.getLogger(__name__)
@@ -22,8 +22,6 @@ _CHECK_EVERY = 1000
 """So many messages are sent between two looks at what has arrived."""
 DELIVERY_TIMEOUT_S = 30.0
 """A logger may have a slow disk; one that is silent for longer has gone."""
-_EXIT_AT_ONCE = 130
-"""What a shell reports of a program that was interrupted."""
 SETTLE_S = 0.3
 """For the queries that every subscriber sends to a new publisher."""
 
@@ -127,4 +125,4 @@ def stopped_by_signals(
 
 def leave_at_once() -> None:
     """End the process as a second signal wants it: what is on the disk stays as it is."""
-    os._exit(_EXIT_AT_ONCE)
+    os._exit(EXIT_INTERRUPTED)

@@ -36,11 +36,9 @@ from services.bus.credentials import (
     check_credentials,
     link_settings,
 )
+from services.common.endpoints import default_endpoint
 from services.common.errors import FailureError, InputError
 from services.common.files import read_bytes
-
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-DEFAULT_TLS_ENDPOINT = "tls/127.0.0.1:7447"
 
 _log = logging.getLogger(__name__)
 _ENDPOINT = re.compile(r"(tcp|tls|quic|ws|unixsock-stream)/\S+")
@@ -101,11 +99,6 @@ def open_session(
             # Zenoh would wait by itself, but meanwhile Python hears no signal.
             if time.monotonic() >= deadline:
                 raise FailureError(_why_not_connected(endpoint, timeout_s, tls)) from None
-
-
-def default_endpoint(tls: Path | None) -> str:
-    """Return where a logger listens and the others connect unless told otherwise."""
-    return DEFAULT_ENDPOINT if tls is None else DEFAULT_TLS_ENDPOINT
 
 
 def _why_not_connected(endpoint: str, timeout_s: float | None, tls: Path | None) -> str:

@@ -18,6 +18,7 @@ from services.common.errors import FailureError, InputError
 OLDEST_S = 150.0
 """Two and a half times the period."""
 _ANSWER_S = 5.0
+"""A service that is well answers from memory, at once but for the network."""
 
 
 def health_command(

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from services.cli.parsing import (
-    ENDPOINT,
     a_console,
     add_endpoint,
     add_file,
@@ -18,10 +17,10 @@ from services.cli.parsing import (
     add_speed,
     add_tls,
     command,
-    default_endpoint,
     number,
     whole,
 )
+from services.common.endpoints import DEFAULT_ENDPOINT, default_endpoint
 
 
 def add_demo(commands: Any) -> None:
@@ -54,9 +53,9 @@ def add_logger(commands: Any) -> None:
         "logger",
         _logger,
         "record all that travels; hosts the router that the others connect to",
-        f"driveby logger --listen {ENDPOINT} --folder recordings --site site.toml",
+        f"driveby logger --listen {DEFAULT_ENDPOINT} --folder recordings --site site.toml",
     )
-    p.add_argument("--listen", help=f"where to listen (default: {ENDPOINT})")
+    p.add_argument("--listen", help=f"where to listen (default: {DEFAULT_ENDPOINT})")
     add_tls(p)
     p.add_argument(
         "--insecure",
@@ -109,7 +108,7 @@ def _logger(options: argparse.Namespace) -> int:
     from services import logger
     from services.logger.writer import Limits
 
-    listen = options.listen or default_endpoint(options)
+    listen = options.listen or default_endpoint(options.tls)
     return logger.run(
         listen=listen,
         folder=options.folder,
@@ -158,7 +157,7 @@ def _worker(options: argparse.Namespace) -> int:
     from services import worker
 
     return worker.run(
-        endpoint=options.endpoint or default_endpoint(options),
+        endpoint=options.endpoint or default_endpoint(options.tls),
         realm=options.realm,
         site=options.site,
         folder=options.folder,
@@ -211,7 +210,7 @@ def _truck(options: argparse.Namespace) -> int:
 
     return truck.run(
         recording=options.recording,
-        endpoint=options.endpoint or default_endpoint(options),
+        endpoint=options.endpoint or default_endpoint(options.tls),
         realm=options.realm,
         speed=options.speed,
         vehicle=options.vehicle,
@@ -244,7 +243,7 @@ def _replay(options: argparse.Namespace) -> int:
     name = options.name
     return replay.run(
         recordings=options.recordings,
-        endpoint=options.endpoint or default_endpoint(options),
+        endpoint=options.endpoint or default_endpoint(options.tls),
         speed=options.speed,
         name=(
             identifier_from(options.recordings[0].stem)
@@ -275,7 +274,7 @@ def _health(options: argparse.Namespace) -> int:
     print(
         health_command(
             service=options.service,
-            endpoint=options.endpoint or default_endpoint(options),
+            endpoint=options.endpoint or default_endpoint(options.tls),
             tls=options.tls,
             realm=options.realm,
         )

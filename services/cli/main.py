@@ -27,7 +27,7 @@ from services.cli.live import (
 from services.cli.offline import add_identify, add_import, add_recover, add_simulate, add_view
 from services.cli.parsing import Handler, Parser, add_common
 from services.cli.validation import add_validate
-from services.common.errors import FailureError, InputError
+from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 
 _COMMANDS: Final = (
     add_simulate,
@@ -48,9 +48,8 @@ _COMMANDS: Final = (
 
 EXIT_FAILED: Final = 1
 EXIT_BAD_INPUT: Final = 2
-EXIT_INTERRUPTED: Final = 130
 EXIT_BROKEN_PIPE: Final = 141
-"""The last two are what a shell reports of SIGINT and SIGPIPE."""
+"""What a shell reports of SIGPIPE, as `EXIT_INTERRUPTED` is of SIGINT."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,13 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
+from services.common.endpoints import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
 from services.common.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-ENDPOINT: Final = "tcp/127.0.0.1:7447"
-TLS_ENDPOINT: Final = "tls/127.0.0.1:7447"
 RECORDINGS: Final = Path("recordings")
 SCENARIOS: Final = range(1, 13)
 METHODS: Final = ("pre", "least-squares", "random-walk")
@@ -141,7 +140,7 @@ def add_method(p: argparse.ArgumentParser) -> None:
 
 def add_endpoint(p: argparse.ArgumentParser) -> None:
     """`--endpoint` and `--tls`: where the bus is, and who one is there."""
-    p.add_argument("--endpoint", help=f"where the logger listens (default: {ENDPOINT})")
+    p.add_argument("--endpoint", help=f"where the logger listens (default: {DEFAULT_ENDPOINT})")
     add_tls(p)
 
 
@@ -151,13 +150,9 @@ def add_tls(p: argparse.ArgumentParser) -> None:
         "--tls",
         type=Path,
         metavar="FOLDER",
-        help=f"credentials made by `driveby certs`; the default address is {TLS_ENDPOINT} then",
+        help="credentials made by `driveby certs`; "
+        f"the default address is {DEFAULT_TLS_ENDPOINT} then",
     )
-
-
-def default_endpoint(options: argparse.Namespace) -> str:
-    """Where the logger is unless told otherwise, with and without credentials."""
-    return ENDPOINT if options.tls is None else TLS_ENDPOINT
 
 
 def add_realm(p: argparse.ArgumentParser) -> None:

@@ -8,8 +8,7 @@ import numpy as np
 
 from pre_core.search import loop
 from services.cli.progress import progress_bar
-from services.common.errors import InputError
-from services.common.files import check_writable, write_atomically
+from services.common.files import check_writable, make_folder, write_atomically
 from services.validation.paper import (
     Scenario,
     accuracy_of_paper,
@@ -22,6 +21,9 @@ from services.validation.paper import (
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+_OVERVIEW = "scenarios.png"
+"""The picture of all scenarios, beside one for each."""
 
 
 def validate_command(
@@ -41,6 +43,7 @@ def validate_command(
         check_writable(json_path)
     if figures is not None:
         make_folder(figures)
+        check_writable(figures / _OVERVIEW)
     car, sound = models(site)
     with progress_bar(console) as progress:
         task = progress.add_task("starting", total=len(scenarios) * (steps + 1))
@@ -68,18 +71,9 @@ def validate_command(
         for scenario in found:
             path = figures / f"scenario-{scenario.number:02d}.png"
             posterior_figure(path, scenario, scenario.names)
-        overview_figure(figures / "scenarios.png", found, tables_of_paper() if published else None)
+        overview_figure(figures / _OVERVIEW, found, tables_of_paper() if published else None)
         console.print(f"figures in {figures}/", highlight=False)
     return 0
-
-
-def make_folder(path: Path) -> None:
-    """Make the folder of the figures; InputError if nothing can be written there."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be made a folder: {error.strerror}") from error
-    check_writable(path / "scenarios.png")
 
 
 def print_table(console: "Console", found: list[Scenario], *, published: bool) -> None:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
 from services.cli.progress import progress_bar
-from services.cli.validate_paper import make_folder
-from services.common.files import check_writable, write_atomically
+from services.common.files import check_writable, make_folder, write_atomically
 from services.simulation.drawn import default_site
 from services.validation.calibration import Check, by_condition, ranks_of, scores
 from services.validation.uncertainty import (
@@ -27,6 +26,8 @@ from services.validation.worlds import HEADINGS, cells, lines_of, read_records, 
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+_FIGURE = "calibration.png"
 
 
 def validate_pre_command(
@@ -54,6 +55,7 @@ def validate_pre_command(
         make_folder(records.parent)
     if figures is not None:
         make_folder(figures)
+        check_writable(figures / _FIGURE)
     known = default_site() if site is None else load_site(site)
     with progress_bar(console) as bar:
         task = bar.add_task("crossings", total=None)
@@ -85,7 +87,7 @@ def validate_pre_command(
         from services.validation.calibration_figure import calibration_figure
 
         calibration_figure(
-            figures / "calibration.png",
+            figures / _FIGURE,
             scores(outcome.drawn),
             ranks_of(outcome.drawn),
             f"{len(outcome.drawn)} simulated crossings whose truth was drawn from the priors",

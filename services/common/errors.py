@@ -1,8 +1,11 @@
-"""The two ways in which a command ends badly, each with one line for the user."""
+"""The ways in which a command ends badly: two with one line for the user, and an interruption."""
 
 from schemas.errors import InputError
 
-__all__ = ["FailureError", "InputError"]
+__all__ = ["EXIT_INTERRUPTED", "FailureError", "InputError"]
+
+EXIT_INTERRUPTED = 130
+"""What a shell reports of a program that SIGINT ended, and so do our own commands."""
 
 
 class FailureError(Exception):

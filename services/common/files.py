@@ -110,6 +110,18 @@ def check_folder_writable(folder: Path) -> None:
         raise InputError(f"{folder}: no permission to write in the folder {there}")
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it; raise InputError if nothing can be written there.
+
+    For use before hours of work, as `check_writable` is.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made a folder: {_reason(error)}") from error
+    check_folder_writable(folder)
+
+
 def check_ordinary(path: Path) -> None:
     """Raise InputError if there is something at `path` that is neither a file nor a folder.
 

@@ -11,11 +11,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
+from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
 
-SEMI_MAJOR_AXIS_M = 6378137.0
-FLATTENING = 1 / 298.257223563
-_E2 = FLATTENING * (2 - FLATTENING)
+Floats = NDArray[np.float64]
 
 
 class BridgeEnds(Protocol):
@@ -49,7 +47,8 @@ def bridge_frame(bridge: BridgeEnds) -> BridgeFrame:
     start = _earth_centred(bridge.start_latitude_deg, bridge.start_longitude_deg)
     end = _earth_centred(bridge.end_latitude_deg, bridge.end_longitude_deg)
     middle = (start + end) / 2
-    up = middle / np.array([1.0, 1.0, 1.0 - _E2])  # gradient of the ellipsoid's equation
+    # The gradient of the ellipsoid's equation.
+    up = middle / np.array([1.0, 1.0, 1.0 - ECCENTRICITY_SQUARED])
     up /= np.linalg.norm(up)
     chord = end - start
     forward = chord - up * (chord @ up)
@@ -84,13 +83,13 @@ def to_lat_lon(
     on_plane = frame.origin + along[..., None] * frame.forward + lateral[..., None] * frame.left
     # Drop along `up` to the ellipsoid: the root nearest zero of a quadratic in the height. The
     # form c / (b + sqrt) keeps its digits when the height is tiny.
-    weight = np.array([1.0, 1.0, 1 / (1 - _E2)])
+    weight = np.array([1.0, 1.0, 1 / (1 - ECCENTRICITY_SQUARED)])
     a = float(frame.up @ (weight * frame.up))
     b = on_plane @ (weight * frame.up)
     c = np.sum(weight * on_plane * on_plane, axis=-1) - SEMI_MAJOR_AXIS_M**2
     height = -c / (b + np.sqrt(b * b - a * c))
     x, y, z = np.moveaxis(on_plane + height[..., None] * frame.up, -1, 0)
-    latitude = np.arctan2(z, (1 - _E2) * np.hypot(x, y))
+    latitude = np.arctan2(z, (1 - ECCENTRICITY_SQUARED) * np.hypot(x, y))
     return np.degrees(latitude), np.degrees(np.arctan2(y, x))
 
 
@@ -107,12 +106,12 @@ def heading_deg(frame: BridgeFrame, *, start_to_end: bool = True) -> float:
 def _earth_centred(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
     latitude, longitude = np.broadcast_arrays(np.radians(latitude_deg), np.radians(longitude_deg))
     sine, cosine = np.sin(latitude), np.cos(latitude)
-    normal = SEMI_MAJOR_AXIS_M / np.sqrt(1 - _E2 * sine * sine)
+    normal = SEMI_MAJOR_AXIS_M / np.sqrt(1 - ECCENTRICITY_SQUARED * sine * sine)
     return np.stack(
         [
             normal * cosine * np.cos(longitude),
             normal * cosine * np.sin(longitude),
-            normal * (1 - _E2) * sine,
+            normal * (1 - ECCENTRICITY_SQUARED) * sine,
         ],
         axis=-1,
     )

@@ -15,10 +15,10 @@ import sys
 import threading
 import time
 
+from services.common.errors import EXIT_INTERRUPTED
+
 _CLEAN_UP_S = 2.0
 """To remove what is half-written; then the process ends in any case."""
-EXIT = 130
-"""Of a process that was interrupted, as a shell and our own commands have it."""
 
 
 def _end_with_standard_input() -> None:
@@ -26,7 +26,7 @@ def _end_with_standard_input() -> None:
         pass
     os.kill(os.getpid(), signal.SIGINT)
     time.sleep(_CLEAN_UP_S)
-    os._exit(EXIT)
+    os._exit(EXIT_INTERRUPTED)
 
 
 def main(module: str, *arguments: str) -> None:

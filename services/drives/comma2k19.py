@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from services.common.errors import InputError
 from services.common.files import check_ordinary
 from services.drives.runs import (
-    STANDARD_GRAVITY_M_PER_S2,
     GnssTrack,
     Run,
     resample,

@@ -15,6 +15,7 @@ from services.recordings.recording import Message
 from services.recordings.writer import write_recording
 
 _LARGEST_RATE_ERROR = 0.05
+"""Clocks of sensors are right to far less; wrong units and wrong site files are off by far more."""
 
 
 def import_command(

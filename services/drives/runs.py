@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from schemas.signals import (
     CHANNELS,
+    NS_PER_S,
     AccelBatch,
     Channel,
     GnssFix,
@@ -26,10 +28,9 @@ from services.recordings.recording import Message
 
 Floats = NDArray[np.float64]
 
-STANDARD_GRAVITY_M_PER_S2 = 9.80665
 BATCH_S = 0.05
+"""A truck sends batches of this length: few messages, and still live."""
 
-_NS = 1_000_000_000
 # In sampling intervals: below it the jitter of time stamps is taken for rounding.
 _LARGEST_JITTER = 0.1
 # In sampling intervals: samples further apart have a gap between them.
@@ -111,7 +112,7 @@ def _accel_messages(run: Run, realm: str, vehicle_id: str, start_ns: int) -> Ite
     edges = [0, *(np.flatnonzero(np.diff(index) != 1) + 1), len(index)]
     starts = [s for a, b in pairwise(edges) for s in range(a, b, size)]
     for sequence, (a, b) in enumerate(pairwise([*starts, len(index)])):
-        time_ns = first_ns + round(int(index[a]) * _NS / run.rate_hz)
+        time_ns = first_ns + round(int(index[a]) * NS_PER_S / run.rate_hz)
         batch = AccelBatch(
             start_ns,
             sequence,
@@ -119,7 +120,7 @@ def _accel_messages(run: Run, realm: str, vehicle_id: str, start_ns: int) -> Ite
             time_ns,
             {name: Channel(run.rate_hz, values[a:b]) for name, values in channels.items()},
         )
-        sent_ns = time_ns + round((b - a) * _NS / run.rate_hz)
+        sent_ns = time_ns + round((b - a) * NS_PER_S / run.rate_hz)
         yield Message(key, encode_accel(batch), start_ns, sequence, time_ns, sent_ns)
 
 

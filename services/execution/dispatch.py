@@ -78,6 +78,7 @@ def feed_all(
 ) -> Iterator[Output]:
     """Feed a whole recording, and finish."""
     for key, payload in messages:
+        engine.expect(key, payload)
         yield from dispatched(engine, execution, engine.feed(key, payload))
     yield from dispatched(engine, execution, engine.finish())
     yield from awaited(engine, execution)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from schemas.errors import InputError
 from schemas.results import BridgeResult, Crossing, Header, load_results
-from schemas.signals import Identity
+from schemas.signals import NS_PER_S, Identity
 from schemas.topics import Key
 from services.common.errors import FailureError
 from services.common.files import replaced_atomically
@@ -26,7 +26,7 @@ from services.recordings.writer import RecordingWriter
 _log = logging.getLogger(__name__)
 _KNOWN_AGE_S = 2 * 86_400.0
 """Older files are not read: no truck still sends what they are about."""
-_UNSURE_NS = 60 * 1_000_000_000
+_UNSURE_NS = 60 * NS_PER_S
 """What a run wrote in its last minute may not have reached every subscriber: it was killed, or the
 router was away, which nobody tells a publisher."""
 

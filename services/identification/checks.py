@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.diagnostics import quality
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2, Motion
+from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
 from schemas.site import Vehicle
 from services.identification.crossing_data import CrossingData, Floats
@@ -26,6 +27,7 @@ _PILE_UP = 8.0
 _PILE_VISITS = 3
 """Sound: at most 5.8 over three visits; a range of half of what is needed: 12 to 67."""
 _REPEATS = 4
+"""An extreme that comes exactly so often is the end of a range: noise repeats none."""
 _SPIKE_HEIGHT = 20.0
 """Over the typical distance from the neighbours. Sound: at most 7."""
 _LARGEST_MEAN_M_PER_S2 = 0.3 * STANDARD_GRAVITY_M_PER_S2
@@ -43,7 +45,7 @@ _LEAD = 0.6
 _BANDS_HZ = np.array([0.0, 6.0, 12.0, 30.0, np.inf])
 """What bridge, body and wheels do lies mostly in the first three; the rest is noise."""
 _FALSE_ALARM_Z = 4.5
-"""Of 36 cells, by chance above it in 1e-4 of the crossings."""
+"""Chance brings one of 36 cells above it in 1e-4 of the crossings."""
 _SLACK = (1.35, 1.35, 1.35, 1.15)
 """So many times the declared noise power a band may have: its density is a data sheet's, and the
 1/f noise of a sensor is not declared."""
@@ -54,11 +56,19 @@ _SHORTEST_APPROACH_M = 12.0
 _NOISY = 1.2
 """From here on a kind of residual is called noisier than declared, if it is white."""
 _GOOD_CHI2 = 1.25
+"""A larger one is a misfit of the model, where it is not only the noise."""
 _SMALLEST_CHI2 = 0.6
+"""A smaller one means that the noise is far below the declared, and intervals are too wide."""
 _LARGEST_VEHICLE_Z = 4.0
+"""No unknown of a truck is by chance so many standard deviations from its prior."""
 _LARGEST_POSITION_Z = 4.0
+"""Nor is the receiver's slow error."""
 _ALIKE_LOADS = 0.1
+"""Axles whose loads differ by less than this share of their sum press the bridge alike: what the
+road does to both cannot be told from what the bridge does."""
 _UNINFORMED = 0.8
+"""Where the narrowest posterior of an element is wider than this part of its prior, nothing was
+learnt."""
 
 ROAD, BODY_FRONT, BODY_REAR = range(3)
 BEFORE, ON, AFTER = range(3)

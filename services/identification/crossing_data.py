@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
+from pre_core.constants import NORMAL_975
 from pre_core.physics.bridge import Beam
 from pre_core.physics.models import beam_from
 from pre_core.physics.road import Profile, iri_m_per_km, iso_8608_class, roughness_coefficient_m3
@@ -20,11 +21,12 @@ from services.identification.streams import Fixes, Samples
 Floats = NDArray[np.float64]
 
 _MARGIN_S = 1.0
+"""Samples are needed at least this long before the entry and after the exit."""
 _APPROACH_M, _BEHIND_M = 40.0, 25.0
 """Off the bridge the axles tell by how much their roads differ: to 15 % of its power on 50 m."""
 _LONGEST_MARGIN_S = 4.0
-NORMAL_975 = 1.959963984540054
 _ROAD_SPACING_M = 0.05
+"""Finer than a tyre feels: its patch is some 0.2 m long."""
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3
 """From here on load transfer matters, which the height of the centre of gravity decides."""
 LONGEST_SURE_OUTAGE_S = 1.5

@@ -119,10 +119,12 @@ class Engine:
             known.last = known.usable = None  # nobody asks for them again, and they are large
 
     def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
-        """Take a position into account before its turn: that another truck was there then.
+        """Note where a truck is, as soon as that comes: another one may be on the bridge then.
 
-        For who feeds truck by truck; `for_ever` for a recording, in which nothing is too old. What
-        is malformed is left to `feed`.
+        Once for every message, whatever its stream, before its turn to be fed, which may come after
+        another truck's; `for_ever` for a recording, in which nothing is too old. `feed` notes no
+        position: one that had been forgotten meanwhile would come back as the newest. What is
+        malformed is left to `feed`.
         """
         if key.owner == "vehicle" and key.stream == "gnss":
             with contextlib.suppress(ValueError):
@@ -130,7 +132,7 @@ class Engine:
                 self._traffic.note(key.realm, key.identifier, fix, for_ever=for_ever)
 
     def feed(self, key: Key, payload: bytes) -> Iterator[Output | Work]:
-        """Take one message of a vehicle; other streams are ignored.
+        """Take one message of a vehicle that `expect` has had; other streams are ignored.
 
         ValueError, at once: malformed. What follows from the message comes from the iterator, as
         things happen, so that a state can be published before the long work begins.
@@ -140,14 +142,8 @@ class Engine:
         vehicle = self._vehicles.get(key.identifier)
         if vehicle is None:
             self.unknown_vehicles.add(key.identifier)
-            if key.stream == "gnss":  # it may cross a bridge together with one that is known
-                with contextlib.suppress(ValueError):
-                    self._traffic.note(key.realm, key.identifier, decode_gnss(payload))
             return iter(())
-        decoded = _DECODERS[key.stream](payload)
-        if isinstance(decoded, GnssFix):
-            self._traffic.note(key.realm, key.identifier, decoded)
-        return self._take(key, vehicle, decoded)
+        return self._take(key, vehicle, _DECODERS[key.stream](payload))
 
     def _take(
         self, key: Key, vehicle: Vehicle, message: AccelBatch | GnssFix | VehicleInfo

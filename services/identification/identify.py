@@ -32,7 +32,7 @@ from services.identification.crossing_data import (
 from services.identification.paper_method import identify_paper
 from services.identification.pre_method import Keep as Keep
 from services.identification.pre_method import identify_pre
-from services.identification.stays import Passage
+from services.identification.stays import STANDING_M_PER_S, Passage
 from services.identification.streams import Samples
 
 _log = logging.getLogger(__name__)
@@ -55,8 +55,8 @@ class Identify(Protocol):
 
 _SLOWEST_M_PER_S = 3.0
 """Below this the wheels feel next to nothing of the bridge's stiffness."""
-_STANDING_M_PER_S = 0.5
 _JUDGED_ASIDE_S = 1.0
+"""Signals are judged so far before and behind the bridge, where thresholds were found."""
 _SLOW_SHARE = 0.4
 """Of the speed on the bridge: slower than this the road on either side is not looked at."""
 _LONGEST_OUTAGE_S = 8.0
@@ -228,7 +228,7 @@ def _unusable(
         return [*reasons, Reason.POSITION_OUTAGE]
     times = np.linspace(entry_s, exit_s, 200)
     speed = data.stay.direction * trajectory.spline.derivative()(times)
-    if speed.min() < _STANDING_M_PER_S:
+    if speed.min() < STANDING_M_PER_S:
         reasons.append(Reason.STOPPED_ON_BRIDGE)
     elif np.median(speed) < _SLOWEST_M_PER_S:
         reasons.append(Reason.SPEED_TOO_LOW)

@@ -60,7 +60,7 @@ def is_stay_of(known: Known, stay: Stay, entry_ns: int) -> bool:
     if abs(known.entry_ns - entry_ns) < MERGE_S * 1e9:
         return True
     if not known.exit_ns:
-        # Of a history that begins on the bridge the entry is not known, only that it is earlier.
+        # Where a history begins on the bridge, its entry is not known, only that it is earlier.
         longest_ns = LONGEST_STAY_S * 1e9
         begins = stay.passage is Passage.BEGINS_ON_BRIDGE
         return begins and 0 < entry_ns - known.entry_ns < longest_ns

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
+from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import optimum, posterior
 from pre_core.crossing.mismatch import GEOMETRY, as_two_numbers
 from pre_core.crossing.preparation import Inputs, off_bridge_m
@@ -39,7 +40,6 @@ from services.identification.crossing_data import (
     road_result,
 )
 
-_MICRO_G = 9.80665e-6
 _FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN = 14, 8
 """At least so many in all, and in each of several spans on average, whatever the number of
 elements: quicker sensors would see a coarser mesh. A load between nodes sags by 1/(4 n^3) less of a
@@ -56,8 +56,11 @@ far an interval that is widened by so much can be trusted nobody has measured.""
 _EVEN = 0.5
 """Probability before the crossing that a support has no spring, or that a bearing is rigid."""
 _ROAD_DRAWS = 80
+"""Standard deviations of a road from so many are right to 8 %, and each draw is an evaluation."""
 _DEFLECTION_DRAWS = 400
+"""Ends of a 95 % interval rest on ten draws at either side; each draw is an evaluation."""
 _FREQUENCY_DRAWS = 1000
+"""An eigenvalue problem each: cheap enough for 25 draws beyond each end of the interval."""
 
 Keep = Callable[[str, dict[str, Floats]], None]
 """Takes the draws of a crossing: its identifier, and (chains, draws) of every unknown by name."""
@@ -87,7 +90,10 @@ def inputs_of(
             )
         ),
     )
-    density = np.maximum(np.array(sensor.noise_density_ug_per_rthz), _SMALLEST_NOISE_UG) * _MICRO_G
+    density = (
+        np.maximum(np.array(sensor.noise_density_ug_per_rthz), _SMALLEST_NOISE_UG)
+        * MICRO_G_M_PER_S2
+    )
     return Inputs(
         acceleration,
         start_s,

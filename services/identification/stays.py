@@ -27,7 +27,7 @@ MERGE_S = 5.0
 """Two entries less than this apart are one crossing (docs/contract.md)."""
 MARGIN_M = 3.0
 """More than a usable receiver's noise between two fixes."""
-_STANDING_M_PER_S = 0.5
+STANDING_M_PER_S = 0.5
 """Below it the positions move by their noise, not by driving."""
 
 
@@ -136,7 +136,7 @@ def _senses(antenna_m: Floats, speed_m_per_s: Floats, margin_m: float) -> Floats
     sense = np.zeros(antenna_m.size)
     current = 0.0
     lowest = highest = farthest = 0
-    for n in np.flatnonzero(np.abs(speed_m_per_s) >= _STANDING_M_PER_S).tolist():
+    for n in np.flatnonzero(np.abs(speed_m_per_s) >= STANDING_M_PER_S).tolist():
         here = antenna_m[n]
         if current == 0.0:
             lowest = n if here < antenna_m[lowest] else lowest

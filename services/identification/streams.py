@@ -15,13 +15,12 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.signals import CHANNELS, MAX_BATCH_S, AccelBatch, GnssFix
+from schemas.signals import CHANNELS, MAX_BATCH_S, NS_PER_S, AccelBatch, GnssFix
 
 Floats = NDArray[np.float64]
 
 PATIENCE_S = 10.0
 """How much newer data may come before a message that is missing is taken to be lost."""
-_NS_PER_S = 1_000_000_000
 _LARGEST_RATE_ERROR = 0.02
 """A crystal is good to 1e-4; beyond this the declared rate is another sensor's."""
 _CLOCK_ERROR = 1e-3
@@ -52,7 +51,7 @@ class Samples(NamedTuple):
     rate_hz: float
     channels: dict[str, Floats]
     slowest_rate_hz: float = np.inf
-    """Of the channel that is sampled most slowly, where that is slower than the grid."""
+    """The rate of the slowest channel, where that is slower than the grid."""
 
 
 class Boot:
@@ -99,7 +98,7 @@ class Boot:
             if sequence != self._next_fix and not all_there_is:
                 latest_ns = max(fix.device_time_ns for fix in self._waiting.values())
                 waited_ns = latest_ns - self._waiting[sequence].device_time_ns
-                if waited_ns < PATIENCE_S * _NS_PER_S:
+                if waited_ns < PATIENCE_S * NS_PER_S:
                     return
             fix = self._waiting.pop(sequence)
             self._next_fix = sequence + 1
@@ -113,23 +112,21 @@ class Boot:
 
     def forget_before(self, time_s: float) -> None:
         """Drop what is older, so that the memory stays bounded on a long drive."""
-        limit_ns = max(self._forgotten_ns, round(time_s * _NS_PER_S))
+        limit_ns = max(self._forgotten_ns, round(time_s * NS_PER_S))
         self._forgotten_ns = limit_ns
         for sequence in [s for s, b in self._batches.items() if b.device_time_ns < limit_ns]:
             del self._batches[sequence]
         self._fixes = [(s, f) for s, f in self._fixes if f.device_time_ns >= limit_ns]
         known_s = self.fixes().time_s
-        self._columns = np.ascontiguousarray(self._columns[:, known_s >= limit_ns / _NS_PER_S])
+        self._columns = np.ascontiguousarray(self._columns[:, known_s >= limit_ns / NS_PER_S])
 
     def latest_accel_s(self) -> float:
         """Time after the last sample that has come; -inf without any."""
-        return max(
-            (_end_ns(batch) / _NS_PER_S for batch in self._batches.values()), default=-np.inf
-        )
+        return max((_end_ns(batch) / NS_PER_S for batch in self._batches.values()), default=-np.inf)
 
     def lacks_accel(self, start_s: float, stop_s: float) -> bool:
         """Whether batches between two times have not come, but may still."""
-        start_ns, stop_ns = round(start_s * _NS_PER_S), round(stop_s * _NS_PER_S)
+        start_ns, stop_ns = round(start_s * NS_PER_S), round(stop_s * NS_PER_S)
         ordered = sorted(self._batches)
         begin = stop = -1
         for sequence in ordered:
@@ -149,11 +146,11 @@ class Boot:
 
         Their median: single stamps jitter. There must be a fix.
         """
-        time_ns = round(time_s * _NS_PER_S)
+        time_ns = round(time_s * NS_PER_S)
         before = [
             fix.wall_time_ns - fix.device_time_ns
             for _, fix in self._fixes
-            if time_ns - _WALL_CLOCK_S * _NS_PER_S < fix.device_time_ns <= time_ns
+            if time_ns - _WALL_CLOCK_S * NS_PER_S < fix.device_time_ns <= time_ns
         ]
         if not before:
             nearest = min(self._fixes, key=lambda item: abs(item[1].device_time_ns - time_ns))[1]
@@ -164,7 +161,7 @@ class Boot:
         """All settled fixes in order of time."""
         if self._fresh:
             rows = [
-                (f.device_time_ns / _NS_PER_S, f.latitude_deg, f.longitude_deg, f.speed_m_per_s)
+                (f.device_time_ns / NS_PER_S, f.latitude_deg, f.longitude_deg, f.speed_m_per_s)
                 for f in self._fresh
             ]
             self._fresh.clear()
@@ -238,7 +235,7 @@ def _grid(name: str, batches: list[AccelBatch], start_s: float, stop_s: float) -
         return None
     declared = float(np.median([batch.channels[name].rate_hz for batch in parts]))
     first_ns = parts[0].device_time_ns
-    times = np.array([batch.device_time_ns - first_ns for batch in parts]) / _NS_PER_S
+    times = np.array([batch.device_time_ns - first_ns for batch in parts]) / NS_PER_S
     sizes = [batch.channels[name].samples.size for batch in parts]
     numbers = _numbers(times * declared, sizes, [batch.sequence for batch in parts])
     rate, offset_s = _fit_clock(numbers, times, declared)
@@ -247,7 +244,7 @@ def _grid(name: str, batches: list[AccelBatch], start_s: float, stop_s: float) -
         samples = batch.channels[name].samples
         values[number : number + samples.size] = samples
     # The times of the ends relative to the first sample: exact to far less than a sample.
-    zero_s = first_ns / _NS_PER_S + offset_s
+    zero_s = first_ns / NS_PER_S + offset_s
     begin = max(0, int(np.ceil((start_s - zero_s) * rate - 1e-6)))
     stop = min(values.size, int(np.floor((stop_s - zero_s) * rate + 1e-6)) + 1)
     if stop <= begin:
@@ -315,8 +312,8 @@ def _resampled(grid: _Grid, time_s: Floats) -> Floats:
 
 def _end_ns(batch: AccelBatch) -> int:
     longest = max(channel.samples.size / channel.rate_hz for channel in batch.channels.values())
-    return batch.device_time_ns + round(longest * _NS_PER_S)
+    return batch.device_time_ns + round(longest * NS_PER_S)
 
 
 def _seconds(device_time_ns: int) -> float:
-    return device_time_ns / _NS_PER_S
+    return device_time_ns / NS_PER_S

@@ -17,14 +17,16 @@ from services.identification.stays import CORRIDOR_M, Floats, Stay, find_stays
 _REACH_M: Final = 200.0
 """Fixes further away than this from a bridge are not kept: a fast truck has two on its way in."""
 _METRES_PER_DEGREE: Final = 111_000.0
+"""About so many of latitude anywhere: for a first look, which a reach twice too long makes safe."""
 _STRANGER_WHEELBASE_M: Final = 4.0
-"""Of a truck that the site file does not know."""
+"""What the wheelbase of a truck is taken to be that the site file does not know."""
 _LONGEST_OUTAGE_S: Final = 30.0
-"""Between two fixes of one visit."""
+"""Fixes further apart are two visits: the truck may have gone round in between."""
 _MOST_TRUCKS: Final = 1000
+"""Trucks remembered, one at two bridges being two: who was silent for longest makes room."""
 _MOST_FIXES: Final = 2000
-"""Kept of a truck at a bridge, 200 s at 10 Hz. Who stands there longer is forgotten as it was, not
-as it is."""
+"""Fixes kept of a truck at a bridge, 200 s at 10 Hz. Who stands there longer is forgotten as it
+was, not as it is."""
 
 _Near = OrderedDict[int, tuple[float, float, float]]
 """By wall time of a fix: chainage and lateral offset of the antenna in m, speed in m/s."""

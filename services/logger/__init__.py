@@ -16,6 +16,7 @@ from schemas.events import Event, EventKind
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import (
+    HEALTH_PERIOD_S,
     PREFIX,
     check_identifier,
     check_realms,
@@ -46,12 +47,15 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 _ANNOUNCE_PERIOD_S = 0.1
+"""How soon an event reaches the bus."""
 _DURABLE_PERIOD_S = 1.0
 """`durable` speaks of all trucks to each of them, over a mobile network perhaps."""
 _REPORT_PERIOD_S = 1.0
-_HEALTH_PERIOD_S = 60.0
+"""How often it is counted what came and what is missing."""
 _DRAIN_S = 2.5
+"""Whoever stops a logger waits so long for what has come already; the rest is counted."""
 _COUNT_S = 1.0
+"""And so long for the counting, or a flood would keep the logger alive."""
 _PAUSE_S = 0.05
 """With nothing to do. Many messages one after the other cost a quarter less each than a few."""
 _AT_ONCE_S = 0.02
@@ -59,10 +63,15 @@ _AT_ONCE_S = 0.02
 _FETCH_ROOM = 32 << 20
 """With less room in the writer's queue, bytes, trucks are not asked for what is missing."""
 _GOODBYE_S = 0.2
+"""A put only hands over: the connection has so long to send the last words."""
 _DROPS_PERIOD_S = 60.0
+"""What a source loses otherwise than by a full queue is an event once in this time, with a
+count."""
 _MAX_DROPS_TOLD = 1000
+"""So many sources are remembered as told of; with more, all are told of anew."""
 _EVENTS_LOGGED = 20
-"""Of each kind in a minute; all of them are in the recordings and on the bus."""
+"""So many events of a kind are lines of the log in a minute; all are in the recordings and on the
+bus."""
 
 
 def run(
@@ -313,7 +322,7 @@ class _Announcements:
                 next_durable_s = time.monotonic() + _DURABLE_PERIOD_S
                 version = self._publish_durable()
             if closing or time.monotonic() >= next_health_s:
-                next_health_s = time.monotonic() + _HEALTH_PERIOD_S
+                next_health_s = time.monotonic() + HEALTH_PERIOD_S
                 self._publish_health()
                 give_back_memory()
             if closing:

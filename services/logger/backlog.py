@@ -6,6 +6,7 @@ from collections import deque
 from services.recordings.recording import Message
 
 QUEUE_MESSAGES = 200_000
+"""A bound for messages that are so small that the one in bytes would let in millions."""
 QUEUE_BYTES = 256 << 20
 """At the rated load, 100 trucks, 4,000 messages and 4 MB a second: a disk may stall for 50 s."""
 _RESERVE_MESSAGES = 1000

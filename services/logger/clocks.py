@@ -18,10 +18,15 @@ STEP_NS = 500_000_000
 """A smaller jump is left to the drift: clocks that are steered slew by less."""
 _MINUTE_NS = 60_000_000_000
 _MINUTES = 60
+"""Drift is the slope over the last hour."""
 _PAIRS_FROM = 3
+"""The slope of fewer minutes is that of their delays."""
 _OFFSET_MINUTES = 5
+"""The offset is the median over so many minutes: recent, and not that of one bad one."""
 _TOLD_EVERY_S = 600.0
+"""How often at most an event tells of a drift."""
 _CHANGE_S = 0.05
+"""An offset that has moved by less is not told again."""
 
 
 class ClockDrift(NamedTuple):
@@ -52,7 +57,8 @@ class TruckClock:
     _smallest: tuple[int, int] | None = None
     _began_ns: int | None = None
     _drift: ClockDrift | None = None
-    """Of the minutes that are over: it changes once a minute and is asked for every second."""
+    """What the minutes that are over give: it changes once a minute and is asked for every
+    second."""
     _told: tuple[float, float] | None = None
 
     def wall_against_device(self, wall_ns: int, device_ns: int) -> int:
@@ -103,7 +109,7 @@ class TruckClock:
             (b[1] - a[1]) / (b[0] - a[0]) for a, b in combinations(self._minutes, 2) if b[0] > a[0]
         ]
         ppm = median(slopes) * 1e6 if len(self._minutes) >= _PAIRS_FROM and slopes else None
-        # Of several minutes, or one in which all came late would look like a clock that is behind.
+        # Over several minutes: one in which all came late would look like a clock that is behind.
         recent = list(self._minutes)[-_OFFSET_MINUTES:]
         offset_ns = round(median(delay_ns for _, delay_ns in recent))
         return ClockDrift(offset_ns * 1e-9, ppm)

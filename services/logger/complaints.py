@@ -6,6 +6,7 @@ import time
 from collections import Counter
 
 _PERIOD_S = 60.0
+"""What is beyond the first few of a kind is counted for so long and told in one line."""
 
 
 class Complaints:

@@ -29,7 +29,9 @@ _log = logging.getLogger(__name__)
 KNOWN_AGE_S = 2 * 86_400.0
 """Older recordings are not read at the start: what they hold trucks have long been told of."""
 _TRUCKS = 1000
+"""Trucks whose tokens are watched, one in two realms being two: memory is bounded whoever comes."""
 _TOKENS_WAITING = 1000
+"""Tokens that may come between two looks before the bus waits."""
 _HISTORY = 60
 """Reports over which rate and lag are taken; there is one a second."""
 _KEPT_BY = ("vehicle", "bridge")

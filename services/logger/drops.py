@@ -9,6 +9,7 @@ from schemas.topics import Key
 QUEUE_IS_FULL = "found the writer's queue full"
 FAILED = "could not be written any more"
 _MAX_SOURCES = 100
+"""Sources with a count of their own until they are told; what others lose is counted together."""
 
 
 class Drop(NamedTuple):

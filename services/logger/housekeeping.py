@@ -21,16 +21,19 @@ from typing import NamedTuple
 from schemas.events import Event, EventKind
 from schemas.topics import REALM, realm_within
 from services.common.disk import DISK, Disk
-from services.common.errors import FailureError, InputError
-from services.common.leash import EXIT
+from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 from services.recordings.recording import is_being_written, is_closed
 from services.recordings.recovery import ASIDE, put_aside, recovered_path
 
 _log = logging.getLogger(__name__)
 _BUDGET_PERIOD_S = 10.0
+"""How often it is looked whether the folder has outgrown its budget."""
 _ASK_AGAIN_S = 600.0
+"""A recording that may not go is not asked about again sooner: each question is a process."""
 _POLL_S = 0.1
+"""So late an end of the logger is seen while a child works."""
 _NICE = 15
+"""Children give way to what records."""
 _REALM = re.compile(REALM)
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
 _EXIT_CLEAN, _EXIT_BAD_INPUT, _EXIT_LOSSY = 0, 2, 3
@@ -174,7 +177,11 @@ class Housekeeping:
             while True:
                 try:
                     out, log = process.communicate(timeout=_POLL_S)
-                    return None if process.returncode == EXIT else (process.returncode, out, log)
+                    return (
+                        None
+                        if process.returncode == EXIT_INTERRUPTED
+                        else (process.returncode, out, log)
+                    )
                 except subprocess.TimeoutExpired:
                     if self._closing.is_set():
                         leash.close()

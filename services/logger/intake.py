@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from schemas.events import Event, EventKind
 from schemas.messages import check_stamp
-from schemas.signals import Identity, Stamp
+from schemas.signals import NS_PER_S, Identity, Stamp
 from schemas.topics import Key, Topic, is_replayed, topic
 from services.bus.subscription import Received, Seen
 from services.common.intervals import Intervals
@@ -29,18 +29,24 @@ MAX_RUNS = 10_000
 RATE_FACTOR = 50
 """More than so many times the nominal rate, for longer than a cache lasts, is no sensor."""
 _RATE_ON_OCCASION_HZ = 100.0
+"""Limit of a stream without a nominal rate: what comes on occasion does not come so often."""
 _LEAST_BURST = 1000
+"""A link that was away brings so many messages at once, whatever the stream."""
 _MAX_REFUSED_SOURCES = 100
+"""Sources with a count of their own until they are told; what of others is refused is counted
+together."""
 _REFUSALS_PERIOD_S = 60.0
+"""What is refused of one source is an event once in this time, with a count."""
 _RECENT = 256
-_NS_PER_S = 1_000_000_000
+"""Check sums kept of a stream, to tell a message that comes again from another one of its
+number."""
 
 
 class Refusals(NamedTuple):
     """Messages refused since the last report, of one vehicle or of nobody known."""
 
     realm: str
-    """Of the first."""
+    """The realm of the first that was refused."""
     first_reason: str
     number: int
 
@@ -316,7 +322,7 @@ class Intake:
         self._lag_ns = max(self._lag_ns, now_ns - stamp.wall_time_ns)
 
     def _own_clock(self, now_ns: int, now_s: float) -> list[tuple[Key, Event]]:
-        offset_ns = now_ns - round(now_s * _NS_PER_S)
+        offset_ns = now_ns - round(now_s * NS_PER_S)
         step_ns = clock_step_ns(self._own_clock_ns, offset_ns)
         self._own_clock_ns = offset_ns
         if not step_ns:

@@ -12,14 +12,15 @@ from schemas.signals import Identity
 from schemas.topics import Key
 
 MAX_STREAMS = 8000
-"""Of all vehicles together, and again of all bridges and of all services."""
+"""All vehicles together have no more, and again all bridges and all services."""
 MAX_STREAMS_OF_ONE = 64
-"""Of one vehicle, bridge or service in all realms: a vehicle has four in each."""
+"""One vehicle, bridge or service has no more in all realms: a vehicle has four in each."""
 MAX_BOOTS = 64
 """Boots remembered of one stream."""
 _QUIET_NS = 3_600_000_000_000
 """A stream or boot that was silent for so long makes room for another one."""
 _LOOK_AGAIN_NS = 60_000_000_000
+"""An owner that is full is not searched for silent streams more often than this."""
 
 
 @dataclass

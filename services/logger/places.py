@@ -11,10 +11,11 @@ from services.recordings.recording import Message
 from services.recordings.recovery import is_name_taken
 
 MAX_OPEN_FILES = 256
+"""Recordings open at a time, of all vehicles: each costs a descriptor, buffers and a sync."""
 MAX_FILES_OF_ONE = 4
-"""Of one vehicle, which drives in one realm as a rule, and can show itself in any number."""
+"""A vehicle drives in one realm as a rule, and can show itself in any number."""
 MAX_SERVICE_FILES = 32
-"""Of what concerns no vehicle; each realm has one."""
+"""Each realm has one for what concerns no vehicle."""
 _SHORTEST_QUIET_S = 10.0
 """Where too many files are open, the quietest is closed sooner, but no sooner than this."""
 SERVICE_FILE = "_service"  # no vehicle can be called that

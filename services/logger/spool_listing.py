@@ -20,10 +20,14 @@ from services.logger.complaints import Complaints
 
 _log = logging.getLogger(__name__)
 _TIMEOUT_S = 1.5
+"""Trucks that have not answered by then are asked again in the next round, which begins every two
+seconds."""
 _PAUSE_S = 0.005
+"""Between two looks when no answer waits."""
 _REPLIES_WAITING = 200
+"""Answers that wait to be read before the bus holds back the others."""
 _MAX_BYTES = 1 << 20
-"""Of one vehicle in one round; 10,000 ranges take a sixth of it."""
+"""More of one vehicle in one round is not read; 10,000 ranges take a sixth of it."""
 
 
 class SpoolListing:
@@ -36,7 +40,7 @@ class SpoolListing:
         self._answers: dict[Key, list[Held]] = {}
         self._lock = threading.Lock()
         self._is_over = threading.Event()
-        """Of the round that is going on."""
+        """Set when the round that is going on is to end, each round having its own."""
         self._thread: threading.Thread | None = None
 
     def ask(self) -> None:

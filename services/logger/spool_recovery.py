@@ -43,21 +43,30 @@ __all__ = ["Shortfall", "SpoolRecovery", "shortfall"]
 
 _log = logging.getLogger(__name__)
 LIST_PERIOD_S = 2.0
+"""How often trucks are asked what they hold."""
 _HURRY_S = 0.3
 """Its token is there a moment before it answers."""
 _PAGE_TIMEOUT_S = 10.0
+"""A page may have to come over a slow mobile network."""
 _QUERIES_AT_ONCE = 8
+"""Trucks that are asked for pages at a time: what is live goes first."""
 _MAX_REPLIES = 2 * PAGE_MESSAGES
+"""A page with more messages has no end; it is twice what a truck may put into one."""
 _MAX_BYTES = 2 * PAGE_BYTES
-"""Of one answer: a page and its end, or one message that is larger, and as much again."""
+"""A longer answer has no end: it is a page and its end, or one message that is larger, and here as
+much again."""
 _REPLIES_PER_STEP = 500
+"""So many answers are taken between two looks at what comes live."""
 _FIRST_PAUSE_S = 1.0
+"""A truck that did not answer is left alone for so long, and twice as long after each failure."""
 _LONGEST_PAUSE_S = 60.0
+"""No pause is longer: the truck may be back any minute."""
 _TRUCKS = 1000
+"""Trucks whose spools are read, one in two realms being two: memory is bounded whoever comes."""
 REALMS_OF_ONE = 16
 """In which one vehicle is asked for what it has, or is noted as being there."""
 _BOOTS_AT_ONCE = 64
-"""Of one answer: the newest, and so many of the earlier ones, which take turns."""
+"""An answer tells of the newest boot and is read for so many earlier ones, which take turns."""
 _COMPARE_S = 0.01
 """After so long a step leaves further answers to the next one."""
 _NEAR = 200
@@ -109,9 +118,9 @@ class _Task:
 @dataclass
 class _Truck:
     ripe: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Of each stream: the newest boot, and below which sequence all is at least a round old."""
+    """For each stream the newest boot, and below which sequence all is at least a round old."""
     turn: Counter[str] = field(default_factory=Counter)
-    """Of each stream: how many earlier boots have had their turn."""
+    """For each stream how many earlier boots have had their turn."""
     unlisted: set[tuple[Key, int]] = field(default_factory=set)
     todo: deque[tuple[Key, Query]] = field(default_factory=deque)
     task: _Task | None = None

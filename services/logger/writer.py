@@ -45,14 +45,19 @@ _log = logging.getLogger(__name__)
 SYNC_PERIOD_S = 0.5
 """Half of what is promised, so that a slow disk does not break the promise."""
 _SYNCS_AT_ONCE = 8
+"""A disk takes several syncs together, so that many open files are done within a period."""
 _LOOK_S = 0.05
 """How often the writer looks for messages when there were none."""
 QUIET_S = 300.0
 """A truck that has said nothing for so long gets a new file when it comes back."""
 _DISK_CHECK_S = 1.0
+"""How often free space is asked for."""
 _STOP_SHARE = 0.125
-"""Of the floor of free space: there recording stops, while files can still be closed well."""
+"""Recording stops at this share of the floor of free space, while files can still be closed
+well."""
 _MAX_LATCHED_BYTES = 16 << 20
+"""Latched messages begin every new file; beyond this the ones that were heard longest ago are left
+out."""
 
 
 class Limits(NamedTuple):

@@ -44,7 +44,8 @@ from mcap.writer import MCAP0_MAGIC
 from services.common.errors import InputError
 
 MAX_RECORD_BYTES = 64 << 20
-"""Of one record, and of what one chunk decompresses to; ours are a thousand times smaller."""
+"""A record, or what a chunk decompresses to, that says it is larger is damage: ours are a thousand
+times smaller."""
 
 _SURE_BYTES = 64 << 20
 _LARGEST_RATIO = 1000
@@ -194,7 +195,7 @@ class _Record(NamedTuple):
     items: Callable[[], Iterator[Item]]
     is_chunk: bool = False
     unpacked_bytes: int = 0
-    """Of a chunk."""
+    """What a chunk says it decompresses to."""
 
 
 def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Record | None:

@@ -19,7 +19,9 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
+"""A router that was started a moment before is there by then."""
 SUBSCRIBER_TIMEOUT_S = 10.0
+"""A replay that nobody hears is of no use: it waits longer than a truck does."""
 
 
 def run(

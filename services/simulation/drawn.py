@@ -37,19 +37,22 @@ from services.identification.engine import Engine
 from services.identification.identify import identify
 from services.identification.pre_method import absence
 from services.recordings.recording import program_version
-from services.simulation.drive import Left, beam_of, declared, measured_run, paper_site
+from services.simulation.drive import (
+    LONGEST_STEP_S,
+    SETTLE_S,
+    SLOW_ERROR_S,
+    Left,
+    beam_of,
+    declared,
+    measured_run,
+    paper_site,
+)
 
 Floats = NDArray[np.float64]
 
 REALM = "sim-calibration"
-_SETTLE_S = 3.0
-"""The truck drives this long before its recording begins: it starts at rest on a rough road."""
 _BEFORE_S, _AFTER_S = 4.0, 3.5
 """A recording begins so long before the entry and ends so long after the exit."""
-_LONGEST_STEP_S = 1e-4
-"""The truth must be far more exact than what is to be tested by it."""
-_SLOW_ERROR_S = 300.0
-"""A receiver's slow error is forgotten within minutes."""
 
 _ROADS = ("A", "B")
 _SPEED_M_PER_S = (5.0, 25.0)
@@ -86,7 +89,8 @@ class Conditions(NamedTuple):
     fix_rate_hz: float
     noise_ug_per_rthz: float
     body_noise_ug_per_rthz: float | None = None
-    """Of the two sensors on the body, where they are of another kind than those of the axles."""
+    """The noise of the two sensors on the body, where they are of another kind than those of the
+    axles."""
 
 
 class Channels(NamedTuple):
@@ -244,9 +248,9 @@ def _draw_conditions(vehicle: Vehicle, rng: np.random.Generator) -> Conditions:
 def drive(site: Site, truth: Truth, seed: int) -> Drawn:
     """Drive and measure one crossing; `seed` is that of noise and receiver."""
     vehicle, bridge, how = site.vehicles[0], site.bridges[0], truth.conditions
-    every = max(1, int(np.ceil(1.0 / (how.rate_hz * _LONGEST_STEP_S))))
+    every = max(1, int(np.ceil(1.0 / (how.rate_hz * LONGEST_STEP_S))))
     step_s = 1.0 / (how.rate_hz * every)
-    settling = round(_SETTLE_S * how.rate_hz) * every
+    settling = round(SETTLE_S * how.rate_hz) * every
     motion = _motion(truth, bridge, step_s, every)
     errors = truth.channels
     axles = how.noise_ug_per_rthz
@@ -266,7 +270,7 @@ def drive(site: Site, truth: Truth, seed: int) -> Drawn:
         how.fix_rate_hz,
         position_noise_m=site.receiver.position_noise_m,
         position_spread_m=site.receiver.position_spread_m,
-        correlation_s=_SLOW_ERROR_S,
+        correlation_s=SLOW_ERROR_S,
         speed_noise_m_per_s=site.receiver.speed_noise_m_per_s,
         latency_s=truth.latency_s,
     )
@@ -297,14 +301,14 @@ def drive(site: Site, truth: Truth, seed: int) -> Drawn:
 
 
 def _motion(truth: Truth, bridge: Bridge, step_s: float, every: int) -> Motion:
-    """From `_SETTLE_S` + `_BEFORE_S` before the entry to `_AFTER_S` after the exit."""
+    """From `SETTLE_S` + `_BEFORE_S` before the entry to `_AFTER_S` after the exit."""
     how, car = truth.conditions, truth.car
     omega = 2.0 * np.pi / how.period_s
     # At the entry, t = 0, the speed is what the conditions say.
     level = how.speed_m_per_s - how.change_m_per_s * np.sin(how.phase)
     slowest = level - how.change_m_per_s
     longest = (bridge.span_m + car.wheelbase_m) / slowest
-    before = _SETTLE_S + _BEFORE_S
+    before = SETTLE_S + _BEFORE_S
     # Whole sampling intervals, so that the recording begins with a sample.
     first = -round(before / (step_s * every)) * every
     time_s = step_s * np.arange(first, round((longest + _AFTER_S) / step_s) + 1)

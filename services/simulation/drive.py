@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.paper import experiment
 from pre_core.physics.bridge import (
     Beam,
@@ -30,7 +31,6 @@ from pre_core.physics.sensors import (
     measure_position,
 )
 from pre_core.physics.simulate import (
-    STANDARD_GRAVITY_M_PER_S2,
     Motion,
     Simulation,
     constant_acceleration,
@@ -56,14 +56,15 @@ START_TIME_S = 1_767_225_600.0
 _PARTS = 10
 _MODES = 40
 """For each span."""
-_LONGEST_STEP_S = 1e-4
-_SETTLE_S = 3.0
+LONGEST_STEP_S = 1e-4
+"""The truth must be far more exact than what is to be tested by it."""
+SETTLE_S = 3.0
 """The truck drives this long before its recording begins: it starts at rest on a rough road."""
 _BEFORE_S, _AFTER_S = 3.0, 2.5
 _ROAD_SPACING_M = 0.01
 _CONTACT_PATCH_M = 0.2
 _FIX_RATE_HZ = 10.0
-_SLOW_ERROR_S = 300.0
+SLOW_ERROR_S = 300.0
 """A receiver's slow error is forgotten within minutes: a crossing sees it as almost constant."""
 _ALTITUDE_M = 25.0
 
@@ -197,18 +198,18 @@ def simulate_drive(
     vehicle, bridge = site.vehicles[0], site.bridges[0]
     car, beam = with_beyond(truck_of(vehicle), beam_of(bridge, rigidity_ratios), beyond)
     rate = rate_hz or max(site.sensor.rate_hz)
-    every = max(1, round(1.0 / (rate * _LONGEST_STEP_S)))
+    every = max(1, round(1.0 / (rate * LONGEST_STEP_S)))
     step_s = 1.0 / (rate * every)
     begin, end = speed_m_per_s
     mean = 0.5 * (begin + end)
     driven_s = _BEFORE_S + (bridge.span_m + vehicle.wheelbase_m) / mean + _AFTER_S
     acceleration = (end - begin) / driven_s
-    settle = round(_SETTLE_S * rate) * every
+    settle = round(SETTLE_S * rate) * every
     steps = settle + int(np.ceil(driven_s * rate)) * every + 1
     # At the moment the recording begins the truck has its first speed and 3 s to the bridge.
-    first_speed = begin - acceleration * _SETTLE_S
+    first_speed = begin - acceleration * SETTLE_S
     approach = begin * _BEFORE_S + 0.5 * acceleration * _BEFORE_S**2
-    approach += first_speed * _SETTLE_S + 0.5 * acceleration * _SETTLE_S**2
+    approach += first_speed * SETTLE_S + 0.5 * acceleration * SETTLE_S**2
     sign = 1 if forward else -1
     start = -approach if forward else bridge.span_m + approach
     motion = constant_acceleration(start, sign * first_speed, acceleration, steps, step_s)
@@ -356,7 +357,7 @@ def _receiver(site: Site, *, perfect: bool) -> Receiver:
         _FIX_RATE_HZ,
         position_noise_m=declared_errors.position_noise_m,
         position_spread_m=declared_errors.position_spread_m,
-        correlation_s=_SLOW_ERROR_S,
+        correlation_s=SLOW_ERROR_S,
         speed_noise_m_per_s=declared_errors.speed_noise_m_per_s,
         latency_s=declared_errors.latency_s,
     )

@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics.bridge import Beam
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics.vehicle import HalfCar
 from schemas.site import Bridge, Site
 from services.common.geodesy import bridge_frame, to_lat_lon

@@ -15,6 +15,7 @@ from typing import Any
 import zenoh
 
 from schemas.signals import (
+    NS_PER_S,
     Identity,
     decode_accel,
     decode_gnss,
@@ -43,8 +44,9 @@ __all__ = ["Gateway", "run"]
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
+"""A router that was started a moment before is there by then."""
 SUBSCRIBER_TIMEOUT_S = 1.0
-_NS_PER_S = 1_000_000_000
+"""A truck does not wait for an audience: its cache serves those who come late."""
 
 
 def run(
@@ -233,7 +235,7 @@ def _restamped(
             payload = encode_info(info._replace(**times))
         case _:
             location: Any = location_class().FromString(message.payload)
-            seconds, nanoseconds = divmod(wall_time_ns, _NS_PER_S)
+            seconds, nanoseconds = divmod(wall_time_ns, NS_PER_S)
             location.timestamp.seconds, location.timestamp.nanos = seconds, nanoseconds
             payload = location.SerializeToString(deterministic=True)
     return Message(

@@ -62,12 +62,18 @@ __all__ = ["Gateway"]
 
 _log = logging.getLogger(__name__)
 _OUTBOX_MESSAGES = 10_000
+"""What waits for the bus; what finds no room stays in the spool and is asked for."""
 _SYNC_PERIOD_S = 0.5
+"""What is older is on the disk when the power goes."""
 _FREE_EVERY = 10  # syncs
 _GOODBYE_S = 5.0
+"""A truck that is switched off waits so long for the bus to take what is left; the spool has it."""
 _QUERIES_WAITING = 100
+"""Questions about the spool that wait for an answer: a few loggers, each every two seconds."""
 _COMPLAINT_PERIOD_S = 60.0
+"""A disk that fails does so at every message: a line says so once in this time."""
 _CONNECT_PAUSE_S = 0.2
+"""Between two attempts, each of which may end at once."""
 Connect = Callable[[], zenoh.Session]
 """Opens a session, or raises FailureError if nobody answers now."""
 

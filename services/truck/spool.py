@@ -41,11 +41,15 @@ _HEADER = struct.Struct("!8sQI")
 _RECORD = struct.Struct("!IIQB")
 _RECORD_PREFIX = 8  # CRC and length, which the length does not count
 _SMALLEST_BUDGET_BYTES = 1 << 20
+"""Segments of a smaller one would hold few messages."""
 _LARGEST_SEGMENT_BYTES = 4 << 20
+"""The largest file: what is freed is freed a file at a time."""
 _SEGMENTS_IN_BUDGET = 16
+"""So many files at least share the budget, so that freeing one gives up a small part only."""
 _STATE = "state.json"
 _LOCK = "lock"
 _BOOTS_REMEMBERED = 100
+"""Boots that are remembered for what was lost of them, though nothing of them is held."""
 
 
 class SpooledMessage(NamedTuple):

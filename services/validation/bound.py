@@ -33,7 +33,7 @@ class Bound(NamedTuple):
     """With the scale error, as results give it."""
     std_without_scale: dict[str, float]
     chi2_per_dof: float
-    """Of the data at the truth: the model itself, whatever a search finds."""
+    """What the truth leaves over of the data: it tells of the model, whatever a search finds."""
 
 
 def bound_at_truth(seen: Seen, drawn: Drawn) -> dict[str, dict[str, float]]:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
+from pre_core.constants import NORMAL_975
 from pre_core.diagnostics import calibration
-from pre_core.diagnostics.calibration import NORMAL_975, Scores
+from pre_core.diagnostics.calibration import Scores
 from pre_core.physics.road import Profile
 from schemas.results import Crossing, Parameter
 from schemas.settings import IdentificationSettings
@@ -28,6 +29,7 @@ Record = dict[str, Any]
 """One crossing as JSON, see `record`."""
 
 _FEWEST_RANKS = 20
+"""Fewer ranks cannot be told from even ones, whatever they are."""
 
 
 def _estimates(result: Crossing) -> dict[str, Parameter]:
@@ -183,7 +185,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 """Parameters whose ranks are told together; a group that no draws are kept of is left out."""
 SMALLEST_P = 0.01
-"""Of the ranks of a group, whose parameters are tested one by one."""
+"""A group fails whose ranks are less likely than this, its parameters being tested one by one."""
 
 
 def elements_of(records: list[Record]) -> int:

@@ -47,7 +47,7 @@ _SCENARIO_12_WITHIN = 0.05
 """So far may EI_7 = 0.4 of scenario 12 be off at the lower noise."""
 
 HALF = 0.5
-"""Of the noise is declared in the negative control."""
+"""The negative control declares so much of the noise, and must be seen to fail."""
 _NOISE_REASONS = {"noise_above_declared", "model_misfit", "residuals_coloured"}
 
 

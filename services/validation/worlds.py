@@ -40,13 +40,14 @@ class Line(NamedTuple):
     """Share that is not rejected."""
     good: float
     coverage: float | None
-    """Of the 95 % intervals of EI of all elements of all that were answered."""
+    """The share of the 95 % intervals of EI, of all elements of all crossings with an answer, that
+    hold the truth."""
     coverage_good: float | None
     mean_z: float | None
     """Over crossings and elements."""
     worst_mean_z: float | None
-    """Of the element, counted from the start, whose mean over crossings is furthest from zero;
-    only where all bridges have the same number of elements."""
+    """The mean of that element, counted from the start, whose mean over crossings is furthest from
+    zero; only where all bridges have the same number of elements."""
     rms_z: float | None
     largest_z_good: float | None
     std: float | None

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.viewer.crossing_view import (
-    CrossingView,
-)
+from pre_core.constants import NORMAL_975
+from services.viewer.crossing_view import CrossingView
 
 STRIP_WIDTH, STRIP_HEIGHT = 1200, 600
 """Pixels along the span, and for the rigidity."""
@@ -33,7 +32,7 @@ def rigidity_strip(crossing: CrossingView) -> NDArray[np.uint8]:
         spread = np.full_like(ratio, thinnest)
     else:
         width = np.diff(crossing.interval_nm2, axis=1)[:, 0] / crossing.nominal_nm2
-        spread = np.maximum(width / (2.0 * 1.96), thinnest)
+        spread = np.maximum(width / (2.0 * NORMAL_975), thinnest)
     rows = STRIP_TOP_RATIO * (1.0 - (np.arange(STRIP_HEIGHT) + 0.5) / STRIP_HEIGHT)
     chainage = crossing.span_m * (np.arange(STRIP_WIDTH) + 0.5) / STRIP_WIDTH
     element = np.searchsorted(crossing.element_edges_m, chainage) - 1

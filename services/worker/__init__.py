@@ -25,7 +25,14 @@ from schemas.results import Header
 from schemas.settings import IdentificationSettings
 from schemas.signals import Identity
 from schemas.site_file import parse_site, read_site_text, site_hash
-from schemas.topics import check_identifier, check_realm, is_replayed, parse_key, selector
+from schemas.topics import (
+    HEALTH_PERIOD_S,
+    check_identifier,
+    check_realm,
+    is_replayed,
+    parse_key,
+    selector,
+)
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.publisher import Publisher
@@ -48,8 +55,6 @@ _log = logging.getLogger(__name__)
 _Queue = queue.Queue[Arrived | Token]
 _POLL_S = 0.1
 """So late a stop, a token or a result is seen where no message comes."""
-_HEALTH_PERIOD_S = 60.0
-"""As docs/topics.md says of `health`."""
 _LONGEST_QUEUE = 200_000
 """Messages: two hours of one truck, or a minute of a hundred. Then publishers wait."""
 _CONNECT_S = 1.0
@@ -271,7 +276,7 @@ def _serve(
         not stop.is_set() or not queued.empty() or _may_lose(engine, arrivals)
     ):
         if time.monotonic() >= next_health_s:
-            next_health_s = time.monotonic() + _HEALTH_PERIOD_S
+            next_health_s = time.monotonic() + HEALTH_PERIOD_S
             _say_health(publisher, service_id, queued.qsize())
         batch: list[Arrived] = []
         one = _next(queued)

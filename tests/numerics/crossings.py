@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.channels import channel_signals
 from pre_core.crossing.residuals import (
     SWING_MODES,
@@ -32,9 +33,8 @@ from pre_core.physics.beam_basis import BeamBasis, beam_basis
 from pre_core.physics.bridge import Beam, refine
 from pre_core.physics.models import from_models
 from pre_core.physics.road import contact_patch_average, iso_8608_profile, under_wheels
-from pre_core.physics.sensors import MICRO_G_M_PER_S2, Accelerometer, measure_acceleration
+from pre_core.physics.sensors import Accelerometer, measure_acceleration
 from pre_core.physics.simulate import (
-    STANDARD_GRAVITY_M_PER_S2,
     Simulation,
     constant_speed,
     simulate,

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.channels import A, V, Z
 from pre_core.crossing.residuals import Crossing, Points, roads_and_deflections, workspace
 from pre_core.crossing.whitening import row_filter
 from pre_core.paper import experiment
 from pre_core.physics.beam_basis import RIGID_M_PER_N, BeamBasis, beam_basis, rebased
 from pre_core.physics.sensors import resample, white_noise
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.unknowns import ALPHA, BETA, C_U1, EI_1, K_ROT, K_U1, KAPPA, RHO_A, F
 from services.simulation.drive import paper_site, simulate_drive, truck_of
 from tests.numerics.crossings import (

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.residuals import (
     roads_and_deflections,
     workspace,
@@ -19,7 +20,6 @@ from pre_core.crossing.residuals import (
 from pre_core.crossing.whitening import row_filter
 from pre_core.physics import modal_response as piecewise_exact
 from pre_core.physics.beam_basis import beam_basis
-from pre_core.physics.simulate import STANDARD_GRAVITY_M_PER_S2
 from pre_core.unknowns import ALPHA, C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1, RHO_A
 from tests.numerics.crossings import bare_crossing, uncorrected
 

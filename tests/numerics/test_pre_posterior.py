@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import channels
 from pre_core.crossing.channels import channel_signals
 from pre_core.crossing.posterior import (
@@ -26,7 +27,7 @@ from pre_core.crossing.posterior import (
 from pre_core.crossing.preparation import Inputs, prepare, with_noise_at
 from pre_core.paper import experiment
 from pre_core.physics.models import from_models
-from pre_core.physics.sensors import MICRO_G_M_PER_S2, white_noise
+from pre_core.physics.sensors import white_noise
 from pre_core.unknowns import C_S1, C_U1, D_1, EI_1, K_ROT, K_S1, K_U1, M_U1, F
 from schemas.signals import CHANNELS
 from services.simulation.drive import beam_of, paper_site, truck_of

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import cholesky_banded, solve_banded
 
+from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing.channels import A_1, A_2, A, V, Z, channel_signals
 from pre_core.crossing.whitening import (
     DOUBTED_SPRING_N_PER_M,
@@ -30,7 +31,7 @@ from pre_core.crossing.whitening import (
     whitener,
 )
 from pre_core.physics.models import from_models
-from pre_core.physics.sensors import MICRO_G_M_PER_S2, white_noise
+from pre_core.physics.sensors import white_noise
 from pre_core.physics.vehicle import HalfCar, body_masses_kg
 from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
 from services.simulation.drive import beam_of, paper_site, truck_of

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import csd, welch
 
+from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.physics.sensors import (
-    MICRO_G_M_PER_S2,
     Accelerometer,
     Receiver,
     gauss_markov,

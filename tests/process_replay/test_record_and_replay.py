@@ -143,7 +143,7 @@ def test_replay_is_never_ahead_of_the_spacing(
     accel = by_stream(list(read_messages(tmp_path / "again.mcap")))["accel"]
     came_s = np.array([message.publish_time_ns for message in accel]) * 1e-9
     due_s = np.array([message.log_time_ns for message in accel]) * 1e-9
-    # 10 s in 2 s; how it waits for each is in tests/unit/test_playback.py, with a clock of its own.
+    # 10 s in 2 s; how it waits for each: tests/unit/bus/test_playback.py, with a clock of its own.
     assert np.all(came_s - began_ns * 1e-9 >= (due_s - due_s[0]) / 5.0)
 
 

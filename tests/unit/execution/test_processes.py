@@ -20,7 +20,7 @@ from services.execution.processes import Processes
 from services.identification.crossing_data import CrossingData
 from services.identification.engine import Engine
 from services.identification.outputs import Work
-from tests.unit.test_engine_resume import (
+from tests.unit.identification.test_engine_resume import (
     HEADER,
     SETTINGS,
     SITE,

@@ -29,8 +29,8 @@ from services.identification.known import search_hash
 from services.identification.outputs import state_output
 from services.recordings.recording import Message
 from services.simulation.drive import paper_site
-from tests.unit.test_engine_resume import HEADER as ENGINE_HEADER
-from tests.unit.test_engine_resume import (
+from tests.unit.identification.test_engine_resume import HEADER as ENGINE_HEADER
+from tests.unit.identification.test_engine_resume import (
     SETTINGS,
     Identifications,
     fed,

@@ -19,7 +19,7 @@ from services.identification.known import search_hash
 from services.recordings.recording import Message
 from services.recordings.writer import write_recording
 from services.simulation.drive import paper_site
-from tests.unit.test_engine_resume import Identifications
+from tests.unit.identification.test_engine_resume import Identifications
 from tests.working_engine import WorkingEngine
 
 REALM = "sim-test"

@@ -9,6 +9,7 @@ import pytest
 from services.common.errors import FailureError, InputError
 from services.common.files import (
     check_writable,
+    make_folder,
     read_bytes,
     read_text,
     replaced_atomically,
@@ -77,12 +78,25 @@ def test_places_that_cannot_be_written_are_named_before_any_work(tmp_path: Path)
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_is_made_with_those_above_it_and_kept(tmp_path: Path) -> None:
+    folder = tmp_path / "above" / "below"
+    make_folder(folder)
+    (folder / "kept").touch()
+    make_folder(folder)
+    assert (folder / "kept").exists()
+    for place in (folder / "kept", folder / "kept" / "below"):
+        with pytest.raises(InputError, match="cannot be made a folder"):
+            make_folder(place)
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_folder_without_permission(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     try:
         with pytest.raises(InputError, match="no permission"):
             check_writable(tmp_path / "out.json")
+        with pytest.raises(InputError, match="no permission"):
+            make_folder(tmp_path)
     finally:
         tmp_path.chmod(0o700)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare, kstest, lognorm, norm, truncnorm
 
+from pre_core.constants import NORMAL_975
 from pre_core.diagnostics.calibration import (
-    NORMAL_975,
     group_p_value,
     pooled_share,
     rank,

@@ -14,7 +14,7 @@ from services.common.errors import InputError
 from services.drives.csv_import import read_folder, read_pair
 from services.drives.runs import Run
 
-EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
+EXAMPLE = Path(__file__).parents[2] / "data" / "csv_example"
 ACCEL = (EXAMPLE / "accel_00.csv").read_text()
 GPS = (EXAMPLE / "gps_00.csv").read_text()
 

@@ -165,7 +165,11 @@ def test_a_damping_of_exactly_zero_is_no_unknown(tmp_path: Path):
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    with mock.patch("services.validation.paper.run_scenario", side_effect=AssertionError("begun")):
+    begun = AssertionError("begun")
+    with (
+        mock.patch("services.validation.paper.run_scenario", side_effect=begun),
+        mock.patch("services.cli.validate_pre.run_parts", side_effect=begun),
+    ):
         code = cli.main(["validate", *arguments])
     out, err = capsys.readouterr()
     assert (code, out) == (2, "")
@@ -181,6 +185,11 @@ def test_bad_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str
     file.touch()
     assert "cannot be made a folder" in refused(capsys, "--figures", str(file))
     assert "cannot be made a folder" in refused(capsys, "--figures", str(file / "below"))
+    for method, picture in (("paper", "scenarios.png"), ("pre", "calibration.png")):
+        (tmp_path / method / picture).mkdir(parents=True)
+        figures = ("--figures", str(tmp_path / method), "--worlds", "0")
+        message = refused(capsys, "--method", method, *figures)
+        assert f"{picture}: is a folder" in message
     site = paper_site()
     shorter = site.bridges[0].model_copy(
         update={"elements": 5, "nominal_flexural_rigidity_nm2": (1.56e10,) * 5}

@@ -20,7 +20,7 @@ from services.drives import importing
 from services.recordings.recording import Message, read_info, read_site
 from services.recordings.writer import RecordingWriter, write_recording
 
-EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
+EXAMPLE = Path(__file__).parents[2] / "data" / "csv_example"
 COMMANDS = (
     "simulate", "import", "identify", "validate", "recover", "view",
     "demo", "logger", "worker", "truck", "replay", "health",

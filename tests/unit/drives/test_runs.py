@@ -15,7 +15,7 @@ from services.drives.csv_import import read_folder
 from services.drives.runs import GnssTrack, Run, normalised, run_to_messages, sampling_rate_hz
 from services.recordings.recording import Message
 
-EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
+EXAMPLE = Path(__file__).parents[2] / "data" / "csv_example"
 START_S = 1_790_000_000.0
 
 

@@ -19,6 +19,7 @@ from schemas.site_file import site_hash, vehicle_toml
 from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.identification import traffic
 from services.identification.outputs import Output
 from services.recordings.recording import Message
 from services.simulation.drive import Drive, paper_site
@@ -80,7 +81,11 @@ def fed(
     messages: Iterable[Message], site: Site = SITE, chosen: IdentificationSettings = HASTY
 ) -> list[Output]:
     one = engine(site, chosen)
-    return [*(o for m in messages for o in one.feed(m.key, m.payload)), *one.finish()]
+    outputs = []
+    for message in messages:
+        one.expect(message.key, message.payload)
+        outputs += one.feed(message.key, message.payload)
+    return [*outputs, *one.finish()]
 
 
 def results_in(outputs: list[Output]) -> list[Crossing]:
@@ -533,6 +538,40 @@ def test_a_recording_is_fed_truck_by_truck_and_counts_both_all_the_same() -> Non
     outputs = [o for m in [*first, *second] for o in one.feed(m.key, m.payload)]
     found = results_in([*outputs, *one.finish()])
     assert ["other_truck_on_bridge" in c.reasons for c in found] == [True, True]
+
+
+def test_a_position_that_was_forgotten_does_not_come_back_at_its_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It would push out newer ones, which say that the other truck is on the bridge now."""
+    monkeypatch.setattr(traffic, "_MOST_FIXES", 80)
+    site = with_second_truck()
+    turns_back = legs((0.0, -60.0), (6.0, -10.0), (8.0, 15.0), (10.0, -10.0), (15.0, -60.0))
+    first = messages_of(drive(ACROSS, 15.0), site=site)
+    second = messages_of(drive(turns_back, 15.0), site=site, vehicle="truck-2")
+    began_ns = second[0].log_time_ns
+    old = [m for m in second if m.log_time_ns - began_ns < 5_900_000_000]
+    one = engine(site)
+    for message in sorted([*first, *second], key=lambda m: m.log_time_ns):
+        one.expect(message.key, message.payload)
+    outputs = [o for m in [*old, *first] for o in one.feed(m.key, m.payload)]
+    (crossing,) = results_in(outputs)
+    assert crossing.vehicle == "truck-1"
+    assert "other_truck_on_bridge" in crossing.reasons
+
+
+def test_in_a_recording_no_position_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(traffic, "_MOST_FIXES", 80)
+    site = with_second_truck()
+    then_waits = legs((0.0, -60.0), (6.0, -10.0), (8.0, 15.0), (10.0, -10.0), (15.0, -60.0))
+    first = messages_of(drive(ACROSS, 15.0), site=site)
+    second = messages_of(drive(then_waits, 30.0), site=site, vehicle="truck-2")
+    one = engine(site)
+    for message in [*first, *second]:
+        one.expect(message.key, message.payload, for_ever=True)
+    outputs = [o for m in [*second, *first] for o in one.feed(m.key, m.payload)]
+    (crossing,) = (c for c in results_in(outputs) if c.vehicle == "truck-1")
+    assert "other_truck_on_bridge" in crossing.reasons
 
 
 def info_of(text: str, message: Message) -> Message:

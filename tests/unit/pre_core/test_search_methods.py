@@ -272,6 +272,35 @@ def test_least_squares_ends_with_central_differences(window: Window):
     assert state.objective <= min(info.objective for info in infos) * (1.0 + 1e-8)
 
 
+def test_slopes_are_of_sixth_order():
+    """A quicker function stands for a longer step; a polynomial of sixth degree is met exactly."""
+    at = np.array([0.3, -0.2])
+
+    def error(speed: float) -> float:
+        slopes = levenberg_marquardt.slopes(lambda y: np.sin(speed * y), at)
+        return float(np.abs(slopes - np.diag(speed * np.cos(speed * at))).max() / speed)
+
+    assert error(1.0) < 1e-13
+    speeds = np.array([50.0, 100.0, 200.0])
+    errors = [error(speed) for speed in speeds]
+    order = np.polyfit(np.log(speeds), np.log(errors), 1)[0]
+    assert order == pytest.approx(6.0, abs=0.2)
+    scale = 300.0
+    sixth = levenberg_marquardt.slopes(lambda y: (scale * y) ** 6, at)
+    expected = np.diag(6.0 * scale**6 * at**5)
+    np.testing.assert_allclose(sixth, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+
+
+def test_the_covariance_of_linear_rows_is_that_of_the_textbook():
+    rng = np.random.default_rng(5)
+    matrix = rng.standard_normal((30, 4)) * np.array([1.0, 1e-3, 10.0, 0.1])
+    data = rng.standard_normal(30)
+    bottom, squares, _, _ = np.linalg.lstsq(matrix, data, rcond=None)
+    found = levenberg_marquardt.covariance(lambda y: y @ matrix.T - data, bottom)
+    expected = np.linalg.inv(matrix.T @ matrix) * squares[0] / 26.0
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=0.0)
+
+
 def test_a_kink_leaves_least_squares_stuck():
     state = levenberg_marquardt.begin(lambda y: 1.0 + np.abs(y), np.zeros(1))
     assert levenberg_marquardt.descend(lambda y: 1.0 + np.abs(y), state)[1].ending is Ending.STUCK

@@ -14,7 +14,7 @@ from schemas.errors import InputError
 from schemas.site_file import load_site, parse_site
 from schemas.toml_text import MAX_BYTES, MAX_DEPTH, parse_toml
 
-TEXT = (Path(__file__).parents[1] / "data" / "csv_example" / "site.toml").read_text()
+TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
 
 
 @pytest.fixture
@@ -94,10 +94,22 @@ def test_what_is_toml_and_not_deep_is_never_refused(text: str) -> None:
         assert parse_toml(text, "x") == expected
 
 
+def keys_in(value: Any) -> set[str]:
+    """All keys, however deep; what stands in a string is none."""
+    if isinstance(value, list):
+        return {key for inner in value for key in keys_in(inner)}
+    if isinstance(value, dict):
+        return set(value) | {key for inner in value.values() for key in keys_in(inner)}
+    return set()
+
+
 @given(
     st.text(alphabet="a=\"'#\\\n []{}1,", max_size=40),
     st.text(alphabet="a=\"'#\\\n []{}1,", max_size=40),
 )
+@example("", "=1")
+@example("a = [{", "=1}]")
+@example("1='", "'")
 def test_no_string_or_comment_hides_a_deep_key_from_the_check(before: str, after: str) -> None:
     """If the parser would take the deep key for one, so does the check."""
     text = f"{before}{'.'.join(['zz'] * 9)}{after}"
@@ -105,7 +117,7 @@ def test_no_string_or_comment_hides_a_deep_key_from_the_check(before: str, after
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         return
-    if "zz" in str(table).replace("zz.zz", ""):
+    if "zz" in keys_in(table):
         with pytest.raises(InputError, match="deep"):
             parse_toml(text, "x")
 

@@ -19,7 +19,7 @@ from schemas.site_file import (
     vehicle_toml,
 )
 
-TEXT = (Path(__file__).parents[1] / "data" / "csv_example" / "site.toml").read_text()
+TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
 VEHICLE = TEXT[TEXT.index("[vehicle]") : TEXT.index("[bridge]")]
 BRIDGE = TEXT[TEXT.index("[bridge]") : TEXT.index("[sensor]")]
 SENSOR = TEXT[TEXT.index("[sensor]") :]

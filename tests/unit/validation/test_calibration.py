@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 from scipy.special import ndtr
 
-from pre_core.diagnostics.calibration import NORMAL_975
+from pre_core.constants import NORMAL_975
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.cli import validate_pre

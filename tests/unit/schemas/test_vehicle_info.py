@@ -9,7 +9,7 @@ from schemas.signals import MAX_SITE_BYTES
 from schemas.site_file import parse_site, vehicle_toml
 from schemas.vehicle_info import differences, own_part
 
-TEXT = (Path(__file__).parents[1] / "data" / "csv_example" / "site.toml").read_text()
+TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
 SITE = parse_site(TEXT, "site.toml")
 TRUCK = SITE.vehicles[0]
 OWN = vehicle_toml(SITE, "truck-x")
