@@ -20,12 +20,12 @@ from services.cli.live import (
     add_demo,
     add_health,
     add_logger,
-    add_replay,
     add_truck,
     add_worker,
 )
 from services.cli.offline import add_identify, add_import, add_recover, add_simulate, add_view
 from services.cli.parsing import Handler, Parser, add_common
+from services.cli.replay import add_replay
 from services.cli.validation import add_validate
 from services.common.errors import FailureError, InputError
 
