@@ -15,6 +15,8 @@ from collections.abc import Sequence
 from typing import Final, NoReturn
 
 from services.cli.access import add_certs
+from services.cli.export import add_export
+from services.cli.info import add_info
 from services.cli.live import (
     SERVICES,
     add_demo,
@@ -33,6 +35,8 @@ _COMMANDS: Final = (
     add_simulate,
     add_import,
     add_identify,
+    add_info,
+    add_export,
     add_validate,
     add_recover,
     add_view,

@@ -21,9 +21,10 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, load_results
 from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
-from schemas.site_file import load_site, parse_site
+from schemas.site_file import load_site
 from services.common.errors import FailureError, InputError
-from services.recordings.recording import Message, read_messages, read_site
+from services.history.site_of_results import site_of_results, site_within
+from services.recordings.recording import Message, read_messages
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.rerun_file import bridges_of_site, write_rrd
 from services.viewer.vehicle_signals import VehicleSignals, signals_of_messages
@@ -58,7 +59,7 @@ def convert(target: Path, rrd: Path, *, site: Path | None = None) -> None:
     """
     if target.suffix == ".json":
         results = load_results(target)
-        bridges = load_site(site) if site is not None else _site_beside(target)
+        bridges = site_of_results(target, results, site)
         write_views(rrd, vehicles={}, crossings=results.crossings, site=bridges)
         return
     messages = list(read_messages(target))
@@ -66,7 +67,7 @@ def convert(target: Path, rrd: Path, *, site: Path | None = None) -> None:
         rrd,
         vehicles=signals_of_messages(messages),
         crossings=crossings_of_messages(messages),
-        site=load_site(site) if site is not None else _site_within(target),
+        site=load_site(site) if site is not None else site_within(target),
     )
 
 
@@ -113,22 +114,6 @@ def viewer_arguments(shown: Path, *, web: bool) -> list[str]:
     if web:
         arguments += ["--web-viewer", "--web-viewer-port", "0"]
     return [*arguments, str(shown)]
-
-
-def _site_within(recording: Path) -> Site | None:
-    toml = read_site(recording)
-    return None if toml is None else parse_site(toml, str(recording))
-
-
-def _site_beside(target: Path) -> Site:
-    for recording in sorted(target.absolute().parent.glob("*.mcap")):
-        site = _site_within(recording)
-        if site is not None:
-            return site
-    raise InputError(
-        f"{target}: results do not say where their bridge is, "
-        "put the recording (.mcap) that they come from into the same folder"
-    )
 
 
 def _run_viewer(shown: Path, *, web: bool) -> int:

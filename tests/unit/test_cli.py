@@ -22,7 +22,7 @@ from services.recordings.writer import RecordingWriter, write_recording
 
 EXAMPLE = Path(__file__).parents[1] / "data" / "csv_example"
 COMMANDS = (
-    "simulate", "import", "identify", "validate", "recover", "view",
+    "simulate", "import", "identify", "info", "export", "validate", "recover", "view",
     "demo", "logger", "worker", "truck", "replay", "health",
 )  # fmt: skip
 
