@@ -28,6 +28,7 @@ from services.cli.live import (
 from services.cli.offline import add_identify, add_import, add_recover, add_simulate, add_view
 from services.cli.parsing import Handler, Parser, add_common
 from services.cli.replay import add_replay
+from services.cli.report import add_report
 from services.cli.validation import add_validate
 from services.common.errors import FailureError, InputError
 
@@ -37,6 +38,7 @@ _COMMANDS: Final = (
     add_identify,
     add_info,
     add_export,
+    add_report,
     add_validate,
     add_recover,
     add_view,
