@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.reasons import Reason
 from schemas.results import Crossing, Results
-from schemas.site import Bridge
+from schemas.site import Bridge, Site
 from services.viewer.comparison import Comparison, Estimate, compare, estimate_of_state
 from services.viewer.crossing_view import CrossingView, FloatArray, view_of_crossing
 
@@ -35,6 +35,12 @@ class BridgeView(NamedTuple):
     def span_m(self) -> float:
         """Length of the bridge between its outer bearings."""
         return float(self.edges_m[-1])
+
+
+def views_of_bridges(results: Results, site: Site) -> list[BridgeView]:
+    """Every bridge of the site that was crossed, without a baseline."""
+    crossed = {crossing.bridge for crossing in results.crossings}
+    return [view_of_bridge(b, results, None) for b in site.bridges if b.id in crossed]
 
 
 def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) -> BridgeView:

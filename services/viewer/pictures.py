@@ -6,7 +6,7 @@ from pathlib import Path
 from schemas.results import Results
 from schemas.site import Site
 from services.viewer.bridge_figure import bridge_figure
-from services.viewer.bridge_view import view_of_bridge
+from services.viewer.bridge_view import views_of_bridges
 from services.viewer.crossing_view import view_of_crossing
 from services.viewer.figure import crossing_figure
 
@@ -26,13 +26,11 @@ def write_pictures(folder: Path, results: Results, site: Site) -> list[Path]:
             path = folder / f"{_file_name(crossing.crossing_id)}.{form}"
             crossing_figure(path, crossing=view)
             written.append(path)
-    crossed = {crossing.bridge for crossing in results.crossings}
-    for bridge in site.bridges:
-        if bridge.id in crossed:
-            for form in FORMS:
-                path = folder / f"{bridge.id}.{form}"
-                bridge_figure(path, view_of_bridge(bridge, results, None))
-                written.append(path)
+    for bridge in views_of_bridges(results, site):
+        for form in FORMS:
+            path = folder / f"{bridge.bridge}.{form}"
+            bridge_figure(path, bridge)
+            written.append(path)
     return written
 
 

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import tempfile
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from schemas.site_file import load_site
 from services.common.errors import FailureError, InputError
 from services.history.site_of_results import site_of_results, site_within
 from services.recordings.recording import Message, read_messages
+from services.viewer.bridge_view import BridgeView, views_of_bridges
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.rerun_file import bridges_of_site, write_rrd
 from services.viewer.vehicle_signals import VehicleSignals, signals_of_messages
@@ -60,7 +61,13 @@ def convert(target: Path, rrd: Path, *, site: Path | None = None) -> None:
     if target.suffix == ".json":
         results = load_results(target)
         bridges = site_of_results(target, results, site)
-        write_views(rrd, vehicles={}, crossings=results.crossings, site=bridges)
+        write_views(
+            rrd,
+            vehicles={},
+            crossings=results.crossings,
+            site=bridges,
+            overviews=views_of_bridges(results, bridges),
+        )
         return
     messages = list(read_messages(target))
     write_views(
@@ -77,6 +84,7 @@ def write_views(
     vehicles: dict[str, VehicleSignals],
     crossings: Iterable[Crossing],
     site: Site | None,
+    overviews: Sequence[BridgeView] = (),
 ) -> None:
     """Write a Rerun file of results and signals; without a site only the signals are drawn."""
     bridges = {} if site is None else {bridge.id: bridge for bridge in site.bridges}
@@ -86,7 +94,7 @@ def write_views(
         if crossing.bridge in bridges
     ]
     on_map = [] if site is None else bridges_of_site(site)
-    write_rrd(rrd, vehicles=vehicles, bridges=on_map, crossings=views)
+    write_rrd(rrd, vehicles=vehicles, bridges=on_map, crossings=views, overviews=overviews)
 
 
 def crossings_of_messages(messages: Iterable[Message]) -> list[Crossing]:
