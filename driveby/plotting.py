@@ -7,7 +7,8 @@ from services.common.errors import InputError
 from services.notebook.simulate import Simulation
 from services.notebook.solution import Identification, Solution
 from services.viewer.crossing_view import view_of_crossing
-from services.viewer.figure import STYLE, draw_crossing
+from services.viewer.drawing import STYLE
+from services.viewer.figure import draw_crossing
 
 
 def plot(found: Solution | Identification, truth: Simulation | None = None) -> Figure:

@@ -63,8 +63,8 @@ _LOST_CHI2 = 10.0
 """With the noise taken for five times what it is, sound starts of 90 drawn crossings were at 1.6 at
 most, wrong ones at 10 to 70."""
 _MOST_ROUNDS, _ROUNDS_ON_THE_WAY, _STEPS_OF_A_ROUND = 6, 2, 4
-"""Fits and levels of noise that the rows tell take turns at most so often, of that on the way; steps
-of each where the roads differ."""
+"""Fits and levels of noise that the rows tell take turns at most so often, on the way so often; and
+the steps of each where the roads differ."""
 _UNTOLD = 0.3
 """Of what a data sheet leaves open: a direction that is not known better tells nothing."""
 _SAME_LEVEL = 0.1

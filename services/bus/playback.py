@@ -60,9 +60,14 @@ def play(
             break
         put(message)
         number += 1
-        if number % _CHECK_EVERY == 0 and delivery.missing() and delivery.has_logger:
-            delivery.wait(DELIVERY_TIMEOUT_S, most_missing=_MAX_IN_FLIGHT)
+        hold_back(delivery, number)
     return number
+
+
+def hold_back(delivery: Delivery, number: int) -> None:
+    """Wait for the logger, if there is one, where too much of so many messages is under way."""
+    if number % _CHECK_EVERY == 0 and delivery.missing() and delivery.has_logger:
+        delivery.wait(DELIVERY_TIMEOUT_S, most_missing=_MAX_IN_FLIGHT)
 
 
 def settle(publisher: Publisher, keys: Iterable[Key], timeout_s: float) -> bool:

@@ -9,7 +9,12 @@ from schemas.results import AtEnds, Crossing, Derived, Results, resolution, resu
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.common.errors import FailureError
-from services.common.files import check_writable, replaced_atomically, write_atomically
+from services.common.files import (
+    check_folder_writable,
+    check_writable,
+    replaced_atomically,
+    write_atomically,
+)
 from services.execution.offline import identify_recordings, site_of
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.recordings.recording import read_messages
@@ -29,6 +34,7 @@ def identify_command(
     json_path: Path | None,
     rrd_path: Path | None,
     draws_path: Path | None,
+    figures: Path | None,
     seed: int,
     console: "Console",
 ) -> int:
@@ -41,6 +47,8 @@ def identify_command(
     for path in (json_path, rrd_path, draws_path):
         if path is not None:
             check_writable(path)
+    if figures is not None:
+        check_folder_writable(figures)
     known = site_of(recordings, site)
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
     if method == "pre" and not any(known.sensor.noise_density_ug_per_rthz):
@@ -57,6 +65,7 @@ def identify_command(
     if json_path is not None:
         write_atomically(json_path, results_json(found))
     if rrd_path is not None:
+        from services.viewer.bridge_view import views_of_bridges
         from services.viewer.crossing_view import view_of_crossing
         from services.viewer.rerun_file import bridges_of_site, write_rrd
         from services.viewer.vehicle_signals import signals_of_messages
@@ -72,9 +81,15 @@ def identify_command(
                     crossings=[
                         view_of_crossing(c, known.bridge(c.bridge)) for c in found.crossings
                     ],
+                    overviews=views_of_bridges(found, known),
                 )
         except RuntimeError as error:  # so Rerun says that its file could not be written
             raise FailureError(f"{rrd_path}: could not be written: {error}") from error
+    if figures is not None:
+        from services.viewer.pictures import write_pictures
+
+        written = write_pictures(figures, found, known)
+        console.print(f"{len(written)} pictures in {figures}", highlight=False, soft_wrap=True)
     if draws_path is not None:
         kept = (
             DrawsOfCrossing(c.crossing_id, c.vehicle, c.bridge, draws.get(c.crossing_id, {}))

@@ -1,4 +1,4 @@
-"""Commands on the bus: demo, logger, worker, truck, replay, health."""
+"""Commands on the bus: demo, logger, worker, truck, health."""
 
 import argparse
 from pathlib import Path
@@ -221,39 +221,6 @@ def _truck(options: argparse.Namespace) -> int:
     )
 
 
-def add_replay(commands: Any) -> None:
-    """`driveby replay`: publish recorded messages again, unchanged, in a realm of their own."""
-    p = command(
-        commands,
-        "replay",
-        _replay,
-        "publish recorded messages again, unchanged, in a realm of their own",
-        "driveby replay run.mcap --speed 10",
-    )
-    p.add_argument("recordings", type=Path, nargs="+", metavar="REC.mcap", help="recordings")
-    add_endpoint(p)
-    add_speed(p, 1.0, zero="0 for as fast as possible")
-    p.add_argument("--name", help="realm replay-NAME (default: name of the first recording)")
-
-
-def _replay(options: argparse.Namespace) -> int:
-    from services import replay
-    from services.common.naming import checked_identifier, identifier_from
-
-    name = options.name
-    return replay.run(
-        recordings=options.recordings,
-        endpoint=options.endpoint or default_endpoint(options.tls),
-        speed=options.speed,
-        name=(
-            identifier_from(options.recordings[0].stem)
-            if name is None
-            else checked_identifier(name, "--name")
-        ),
-        tls=options.tls,
-    )
-
-
 def add_health(commands: Any) -> None:
     """`driveby health`: ask a logger or a worker over the bus whether it does its work."""
     p = command(
@@ -282,5 +249,5 @@ def _health(options: argparse.Namespace) -> int:
     return 0
 
 
-SERVICES: Final = (_logger, _worker, _truck, _replay)
+SERVICES: Final = (_logger, _worker, _truck)
 """Run until they are stopped, and have nothing else to show for themselves than what they say."""

@@ -15,17 +15,20 @@ from collections.abc import Sequence
 from typing import Final, NoReturn
 
 from services.cli.access import add_certs
+from services.cli.export import add_export
+from services.cli.info import add_info
 from services.cli.live import (
     SERVICES,
     add_demo,
     add_health,
     add_logger,
-    add_replay,
     add_truck,
     add_worker,
 )
 from services.cli.offline import add_identify, add_import, add_recover, add_simulate, add_view
 from services.cli.parsing import Handler, Parser, add_common
+from services.cli.replay import add_replay
+from services.cli.report import add_report
 from services.cli.validation import add_validate
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 
@@ -33,6 +36,9 @@ _COMMANDS: Final = (
     add_simulate,
     add_import,
     add_identify,
+    add_info,
+    add_export,
+    add_report,
     add_validate,
     add_recover,
     add_view,

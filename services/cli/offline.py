@@ -230,6 +230,7 @@ def add_identify(commands: Any) -> None:
     add_file(
         p, "--draws", "OUT.npz|OUT.nc", "write the Markov chains of method pre here, for ArviZ"
     )
+    add_file(p, "--figures", "DIR", "draw every crossing and bridge here, as PNG and SVG")
     add_seed(p)
 
 
@@ -243,6 +244,7 @@ def _identify(options: argparse.Namespace) -> int:
         json_path=options.json,
         rrd_path=options.rrd,
         draws_path=options.draws,
+        figures=options.figures,
         seed=options.seed,
         console=a_console(),
     )

@@ -116,7 +116,7 @@ def add_noise(p: argparse.ArgumentParser, text: str, default: float = 0.0) -> No
     )
 
 
-def add_speed(p: argparse.ArgumentParser, default: float, zero: str = "") -> None:
+def add_speed(p: Any, default: float, zero: str = "") -> None:
     """`--speed` in times of what it really was; `zero` says what 0 would mean."""
     p.add_argument(
         "--speed",

@@ -8,7 +8,6 @@ this recording or in others. A process of its own, because it reads whole files.
 """
 
 import sys
-from collections import deque
 from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
@@ -21,7 +20,7 @@ from services.common.geodesy import bridge_frame
 from services.history.store import Store
 from services.identification.known import Known, is_stay_of
 from services.identification.stays import stays_on
-from services.identification.streams import Boot
+from services.identification.streams import Boot, boot_of
 from services.recordings.recording import read_identities, read_messages, read_site
 
 
@@ -61,15 +60,7 @@ def _boots(recording: Path) -> dict[tuple[str, str, int], Boot]:
                 fixes[message.sequence] = decode_gnss(message.payload)
             except ValueError:
                 continue
-    return {name: _boot(fixes) for name, fixes in found.items()}
-
-
-def _boot(fixes: dict[int, GnssFix]) -> Boot:
-    boot = Boot()
-    for sequence in sorted(fixes):
-        boot.add_fix(fixes[sequence])
-        deque(boot.settle(all_there_is=True), maxlen=0)
-    return boot
+    return {name: boot_of(fixes) for name, fixes in found.items()}
 
 
 def _are_known(site: Site, realm: str, vehicle: str, boot: Boot, known: list[Known]) -> bool:

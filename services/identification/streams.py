@@ -7,7 +7,7 @@ they came nor on what came later.
 """
 
 from bisect import insort
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -308,6 +308,16 @@ def _resampled(grid: _Grid, time_s: Floats) -> Floats:
         # A NaN among the samples of a moment makes that moment NaN.
         values[between] = read_between(grid.values, place[between])
     return values
+
+
+def boot_of(fixes: Mapping[int, GnssFix]) -> Boot:
+    """A boot with all the fixes that there will ever be, given by their sequence."""
+    boot = Boot()
+    for sequence in sorted(fixes):
+        boot.add_fix(fixes[sequence])
+        for _ in boot.settle(all_there_is=True):
+            pass
+    return boot
 
 
 def _end_ns(batch: AccelBatch) -> int:

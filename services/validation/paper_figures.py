@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 from services.common.files import write_atomically
 from services.validation.paper import Scenario
 from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
-from services.viewer.figure import DPI, GRID, INK, MUTED, STYLE, TRUTH_MARKER
+from services.viewer.drawing import DPI, GRID, INK, MUTED, STYLE, TRUTH_MARKER
 
 WIDTH_IN = 9.0
 WALK, OURS = VEHICLE_COLOURS["front"], VEHICLE_COLOURS["rear"]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 
 import rerun as rr
 import rerun.blueprint as rrb
 
-from services.viewer.crossing_view import (
-    CrossingView,
-)
+from services.viewer.bridge_view import BridgeView
+from services.viewer.crossing_view import CrossingView
 from services.viewer.strip import STRIP_HEIGHT, STRIP_PAPER, STRIP_WIDTH
 from services.viewer.vehicle_signals import VehicleSignals
 
@@ -23,11 +23,14 @@ def crossing_root(crossing: CrossingView) -> str:
 
 
 def blueprint(
-    vehicles: Mapping[str, VehicleSignals], crossings: Sequence[CrossingView]
+    vehicles: Mapping[str, VehicleSignals],
+    crossings: Sequence[CrossingView],
+    overviews: Sequence[BridgeView] = (),
 ) -> rrb.Blueprint:
-    """A tab for every crossing, the first one open, and one for the whole drive."""
+    """A tab for every bridge and every crossing, the first one open, and one for the drive."""
     drive = _drive_layout(vehicles)
-    layouts = [_crossing_layout(crossing, vehicles.get(crossing.vehicle)) for crossing in crossings]
+    layouts: list[rrb.Container] = [_overview_layout(bridge) for bridge in overviews]
+    layouts += [_crossing_layout(one, vehicles.get(one.vehicle)) for one in crossings]
     content = rrb.Tabs(*layouts, drive, active_tab=0) if layouts else drive
     return rrb.Blueprint(
         content,
@@ -57,24 +60,56 @@ def _crossing_layout(crossing: CrossingView, signals: VehicleSignals | None) -> 
     if plots:
         columns.insert(0, (rrb.Vertical(*plots), 6))
     if crossing.rigidity_nm2 is not None:
-        columns.insert(0, (_rigidity_layout(root), 5))
+        columns.insert(0, (_rigidity_layout(root, doubtful=is_doubtful(crossing)), 5))
     return rrb.Horizontal(
         *(column for column, _ in columns),
         column_shares=[share for _, share in columns],
-        name=f"Crossing of {crossing.bridge}",
+        name=tab_name(crossing),
     )
 
 
-def _rigidity_layout(root: str) -> rrb.Vertical:
+def tab_name(crossing: CrossingView) -> str:
+    """Which crossing, and what is to be thought of it: there may be many of one bridge."""
+    moment = datetime.fromtimestamp(crossing.entry_time_s, UTC)
+    way = "→" if crossing.forward else "←"
+    return f"{moment:%Y-%m-%d %H:%M} {way} {crossing.bridge}, {crossing.verdict}"
+
+
+def bridge_root(bridge: BridgeView) -> str:
+    """Entity path under which everything of one bridge stands."""
+    return f"bridge/{rr.escape_entity_path_part(bridge.bridge)}"
+
+
+def _overview_layout(bridge: BridgeView) -> rrb.Container:
+    """The picture of the bridge, for who has one minute, and where it is."""
+    picture = rrb.Spatial2DView(
+        origin=f"{bridge_root(bridge)}/picture",
+        name="Stiffness, and all crossings",
+        background=(255, 255, 255),
+    )
+    side = rrb.Vertical(
+        rrb.TextDocumentView(origin=f"{bridge_root(bridge)}/finding", name="Finding"), _map()
+    )
+    name = f"Bridge {bridge.owner_id or bridge.bridge}"
+    return rrb.Horizontal(picture, side, column_shares=[3, 1], name=name)
+
+
+def is_doubtful(crossing: CrossingView) -> bool:
+    """Whether what was found is not to be relied upon."""
+    return crossing.verdict != "good" or not crossing.interval_has_meaning
+
+
+def _rigidity_layout(root: str, *, doubtful: bool) -> rrb.Vertical:
+    doubt = "DOUBTFUL: " if doubtful else ""
     return rrb.Vertical(
         rrb.BarChartView(
             origin=f"{root}/rigidity",
-            name="EI of each element (GN·m²) over chainage (m)",
+            name=f"{doubt}EI of each element (GN·m²) over chainage (m)",
             plot_legend=rrb.PlotLegend(visible=False),
         ),
         rrb.Spatial2DView(
             origin=f"{root}/strip",
-            name="EI along the span, ratio to nominal (line)",
+            name=f"{doubt}EI along the span, ratio to nominal (line)",
             background=STRIP_PAPER,
             visual_bounds=rrb.VisualBounds2D(
                 x_range=(-20.0, STRIP_WIDTH + 20.0), y_range=(-20.0, STRIP_HEIGHT + 150.0)

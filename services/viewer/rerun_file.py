@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import matplotlib
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
@@ -19,13 +20,24 @@ from schemas.signals import AccelBatch, GnssFix
 from schemas.site import Site
 from services.common.files import replaced_atomically
 from services.drives.signals import series_of_batches
+from services.viewer.bridge_figure import draw_bridge
+from services.viewer.bridge_view import BridgeView
+from services.viewer.comparison import sentences
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,
     FloatArray,
     summary_line,
 )
-from services.viewer.layout import CHAINAGE, TIME, blueprint, crossing_root
+from services.viewer.drawing import STYLE, figure_bytes
+from services.viewer.layout import (
+    CHAINAGE,
+    TIME,
+    blueprint,
+    bridge_root,
+    crossing_root,
+    is_doubtful,
+)
 from services.viewer.strip import STRIP_HEIGHT, STRIP_TOP_RATIO, STRIP_WIDTH, rigidity_strip
 from services.viewer.vehicle_signals import VehicleSignals
 
@@ -58,13 +70,15 @@ def write_rrd(
     vehicles: Mapping[str, VehicleSignals],
     bridges: Sequence[BridgeOnMap],
     crossings: Sequence[CrossingView],
+    overviews: Sequence[BridgeView] = (),
 ) -> None:
     """Write a Rerun recording with its own layout; an existing file is replaced as a whole.
 
+    `overviews` are the bridges' states with all their crossings, and come first.
     `vehicles` are the signals by vehicle identifier. A crossing's accelerations are looked up in
     the signals of its vehicle; one without any, or with fewer channels, is drawn with what it has.
     """
-    default = blueprint(vehicles, crossings)
+    default = blueprint(vehicles, crossings, overviews)
     with (
         replaced_atomically(path) as temporary,
         rr.RecordingStream(APPLICATION, recording_id=_recording_id(crossings)) as recording,
@@ -78,6 +92,8 @@ def write_rrd(
                 entity = f"vehicle/{vehicle}/acceleration/{channel}"
                 _log_line(recording, entity, channel.replace("_", " "), CHANNEL_COLOURS[channel])
                 _send_scalars(recording, entity, samples, time_ns=time_ns)
+        for view in overviews:
+            _log_overview(recording, view)
         for crossing in crossings:
             _log_crossing(recording, crossing, vehicles.get(crossing.vehicle))
         recording.flush()
@@ -183,6 +199,21 @@ def _log_track(recording: rr.RecordingStream, vehicle: str, fixes: Sequence[Gnss
     _send_scalars(recording, speed, np.array([fix.speed_m_per_s for fix in fixes]), time_ns=time_ns)
 
 
+def _log_overview(recording: rr.RecordingStream, bridge: BridgeView) -> None:
+    with matplotlib.rc_context(STYLE):
+        picture = figure_bytes(draw_bridge(bridge), "png")
+    root = bridge_root(bridge)
+    image = rr.EncodedImage(contents=picture, media_type="image/png")
+    recording.log(f"{root}/picture", image, static=True)
+    said = "None of the crossings could be used."
+    if bridge.estimate is not None:
+        said = " ".join(sentences(bridge.comparison))
+    doubt = "**Doubtful: to be looked at, not to be relied upon.** " if bridge.is_doubtful else ""
+    text = f"# {bridge.owner_id or bridge.bridge}\n\n{doubt}{said}"
+    document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+    recording.log(f"{root}/finding", document, static=True)
+
+
 def _log_crossing(
     recording: rr.RecordingStream, crossing: CrossingView, signals: VehicleSignals | None
 ) -> None:
@@ -211,12 +242,13 @@ def _log_rigidity(recording: rr.RecordingStream, root: str, crossing: CrossingVi
             crossing.rigidity_nm2 / 1e9,
             abscissa=edges[:-1] + 0.05 * lengths,  # Rerun wants where a bar begins
             widths=0.9 * lengths,
-            color=_rgb(VEHICLE_COLOURS["front"]),
+            color=_rgb(MUTED if is_doubtful(crossing) else VEHICLE_COLOURS["front"]),
         ),
         static=True,
     )
+    strip = rigidity_strip(crossing, doubtful=is_doubtful(crossing))
     nominal_row = STRIP_HEIGHT * (1.0 - 1.0 / STRIP_TOP_RATIO)
-    recording.log(f"{root}/strip/density", rr.Image(rigidity_strip(crossing)), static=True)
+    recording.log(f"{root}/strip/density", rr.Image(strip), static=True)
     recording.log(
         f"{root}/strip/nominal",
         rr.LineStrips2D(
@@ -368,10 +400,11 @@ def _time_column(time_ns: IntArray) -> rr.TimeColumn:
 
 def verdict_markdown(crossing: CrossingView) -> str:
     """The verdict with its reasons and a table of all parameters, as Markdown."""
-    lines = [f"# {crossing.verdict.capitalize()}", "", summary_line(crossing), ""]
+    lines = [f"# {crossing.verdict.capitalize()}", ""]
+    if crossing.verdict == "suspect":
+        lines += ["**Doubtful: to be looked at, not to be relied upon.**", ""]
+    lines += [summary_line(crossing), ""]
     lines += [f"- {text}" for text in crossing.reason_texts]
-    if crossing.chi2_per_dof is not None:
-        lines += ["", f"χ² per degree of freedom: {crossing.chi2_per_dof:.3g}"]
     if crossing.rigidity_nm2 is None:
         return "\n".join([*lines, "", "No estimate is given for a rejected crossing."])
     lines += ["", "| | estimate | 95 % interval | ratio to nominal |", "|---|---|---|---|"]

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import tempfile
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -21,9 +21,11 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, load_results
 from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
-from schemas.site_file import load_site, parse_site
+from schemas.site_file import load_site
 from services.common.errors import FailureError, InputError
-from services.recordings.recording import Message, read_messages, read_site
+from services.history.site_of_results import site_of_results, site_within
+from services.recordings.recording import Message, read_messages
+from services.viewer.bridge_view import BridgeView, views_of_bridges
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.rerun_file import bridges_of_site, write_rrd
 from services.viewer.vehicle_signals import VehicleSignals, signals_of_messages
@@ -58,15 +60,21 @@ def convert(target: Path, rrd: Path, *, site: Path | None = None) -> None:
     """
     if target.suffix == ".json":
         results = load_results(target)
-        bridges = load_site(site) if site is not None else _site_beside(target)
-        write_views(rrd, vehicles={}, crossings=results.crossings, site=bridges)
+        bridges = site_of_results(target, results, site)
+        write_views(
+            rrd,
+            vehicles={},
+            crossings=results.crossings,
+            site=bridges,
+            overviews=views_of_bridges(results, bridges),
+        )
         return
     messages = list(read_messages(target))
     write_views(
         rrd,
         vehicles=signals_of_messages(messages),
         crossings=crossings_of_messages(messages),
-        site=load_site(site) if site is not None else _site_within(target),
+        site=load_site(site) if site is not None else site_within(target),
     )
 
 
@@ -76,6 +84,7 @@ def write_views(
     vehicles: dict[str, VehicleSignals],
     crossings: Iterable[Crossing],
     site: Site | None,
+    overviews: Sequence[BridgeView] = (),
 ) -> None:
     """Write a Rerun file of results and signals; without a site only the signals are drawn."""
     bridges = {} if site is None else {bridge.id: bridge for bridge in site.bridges}
@@ -85,7 +94,7 @@ def write_views(
         if crossing.bridge in bridges
     ]
     on_map = [] if site is None else bridges_of_site(site)
-    write_rrd(rrd, vehicles=vehicles, bridges=on_map, crossings=views)
+    write_rrd(rrd, vehicles=vehicles, bridges=on_map, crossings=views, overviews=overviews)
 
 
 def crossings_of_messages(messages: Iterable[Message]) -> list[Crossing]:
@@ -113,22 +122,6 @@ def viewer_arguments(shown: Path, *, web: bool) -> list[str]:
     if web:
         arguments += ["--web-viewer", "--web-viewer-port", "0"]
     return [*arguments, str(shown)]
-
-
-def _site_within(recording: Path) -> Site | None:
-    toml = read_site(recording)
-    return None if toml is None else parse_site(toml, str(recording))
-
-
-def _site_beside(target: Path) -> Site:
-    for recording in sorted(target.absolute().parent.glob("*.mcap")):
-        site = _site_within(recording)
-        if site is not None:
-            return site
-    raise InputError(
-        f"{target}: results do not say where their bridge is, "
-        "put the recording (.mcap) that they come from into the same folder"
-    )
 
 
 def _run_viewer(shown: Path, *, web: bool) -> int:

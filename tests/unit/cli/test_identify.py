@@ -261,6 +261,7 @@ def test_results_are_written_as_the_contract_says(recording: Path, tmp_path: Pat
         json_path=out,
         rrd_path=rrd,
         draws_path=None,
+        figures=None,
         seed=5,
         console=console,
     )

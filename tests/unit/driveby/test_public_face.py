@@ -398,7 +398,7 @@ def test_plot_draws_estimate_and_truth(
 
     assert "truth" in labels(driveby.plot(exact, truth=simulation))
     figure = driveby.plot(exact.solutions[0])
-    assert "estimate" in labels(figure)
+    assert "estimate, doubtful" in labels(figure)  # without a noise model it is
     assert "truth" not in labels(figure)
     assert (
         "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()

@@ -22,7 +22,7 @@ from services.validation.paper_figures import (
     overview_figure,
     posterior_figure,
 )
-from services.viewer.figure import STYLE
+from services.viewer.drawing import STYLE
 from tests.unit.words import assert_words_apart, words
 
 PARTICLES = 400

@@ -15,7 +15,8 @@ from matplotlib.patches import Rectangle
 
 from services.common.errors import InputError
 from services.viewer.crossing_view import CrossingView, RoadView
-from services.viewer.figure import STYLE, crossing_figure, draw_crossing
+from services.viewer.drawing import STYLE
+from services.viewer.figure import crossing_figure, draw_crossing
 from tests.unit.words import assert_words_apart, words
 
 RATIOS = np.array([1.0, 0.98, 1.01, 0.4, 1.02, 1.0, 0.99])

@@ -1,0 +1,132 @@
+"""`driveby export`: what was measured and found, in forms that other programs read."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from services.cli.parsing import add_site, command
+from services.common.errors import InputError
+
+if TYPE_CHECKING:
+    from schemas.results import Results
+    from schemas.site import Site
+    from services.export.tables import Format, Table
+
+
+def add_export(commands: Any) -> None:
+    """`driveby export`: write recordings and results as tables and maps."""
+    p = command(
+        commands,
+        "export",
+        _export,
+        "write recordings and results as CSV or Parquet tables and GeoJSON",
+        "driveby export drive.mcap drive.json --to tables --format parquet",
+    )
+    p.add_argument(
+        "sources",
+        type=Path,
+        nargs="+",
+        metavar="REC.mcap|RESULTS.json|DIR",
+        help="recordings, folders with recordings below, and at most one results file",
+    )
+    p.add_argument("--to", type=Path, required=True, metavar="DIR", help="folder for the files")
+    p.add_argument(
+        "--format", choices=("csv", "parquet"), default="csv", help="of the tables (default: csv)"
+    )
+    add_site(p, "where bridges are (default: as the recordings say)")
+
+
+def _export(options: argparse.Namespace) -> int:
+    from services.common.files import check_folder_writable, write_atomically
+    from services.drives.signals import signals_of_recording
+    from services.drives.survey import survey
+    from services.export.found import tables_of_results
+    from services.export.geojson import crossings_geojson, elements_geojson
+    from services.export.measured import as_measured, tables_of_run, tables_of_runs
+    from services.export.tables import write_table
+    from services.recordings.together import recordings_in
+
+    form: Format = options.format
+    folder: Path = options.to
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file, give the name of a folder")
+    check_folder_writable(folder)
+    recordings = recordings_in(path for path in options.sources if path.suffix != ".json")
+    results, results_path = _results(options.sources)
+    site = _site(options.site, recordings, results, results_path)
+    runs = [run for path in recordings for run in signals_of_recording(path)]
+    passings = []
+    if results is None and site is not None:
+        passings = [p for path in recordings for p in survey(path, site).passings]
+    tables: list[Table] = []
+    if form == "parquet":
+        tables += tables_of_runs(runs) if runs else []
+    else:
+        tables += [table for n, run in enumerate(runs) for table in tables_of_run(run, n)]
+    if results is not None:
+        tables += tables_of_results(results, site)
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_no_others(folder, {f"{table.name}.csv" for table in tables if form == "csv" and runs})
+    for table in tables:
+        path = write_table(folder, table, form)
+        print(f"{path}: {len(next(iter(table.columns.values())))} rows")
+    if site is None:
+        print("no site file: places of bridges are not known, so there is no GeoJSON")
+        return 0
+    crossings = () if results is None else results.crossings
+    texts = {
+        "elements.geojson": elements_geojson(site, results),
+        "crossings.geojson": crossings_geojson(site, crossings, passings),
+    }
+    if form == "csv" and runs:
+        texts["site.toml"] = as_measured(site)
+    for name, text in texts.items():
+        write_atomically(folder / name, text)
+        print(folder / name)
+    return 0
+
+
+def _check_no_others(folder: Path, names: set[str]) -> None:
+    """Runs of an earlier export would be imported together with these."""
+    others = {path.name for kind in ("accel_", "gps_") for path in folder.glob(f"{kind}*.csv")}
+    if names and others - names:
+        raise InputError(
+            f"{folder}: holds {min(others - names)} of another drive; give another folder"
+        )
+
+
+def _results(sources: list[Path]) -> "tuple[Results | None, Path]":
+    from schemas.results import load_results
+
+    paths = [path for path in sources if path.suffix == ".json"]
+    if len(paths) > 1:
+        raise InputError(f"{paths[1]}: is a second results file, export one at a time")
+    return (load_results(paths[0]), paths[0]) if paths else (None, Path())
+
+
+def _site(
+    given: Path | None, recordings: list[Path], results: "Results | None", results_path: Path
+) -> "Site | None":
+    """The site file given, or of the recordings, or of one beside the results; None without any."""
+    from schemas.site_file import load_site
+    from services.history.site_of_results import site_of_results, site_within, wanted_bridges
+
+    if results is not None and (given is not None or not recordings):
+        try:
+            return site_of_results(results_path, results, given)
+        except InputError:
+            if given is not None:
+                raise
+            return None
+    if given is not None:
+        return load_site(given)
+    found = (site_within(path) for path in recordings)
+    site = next((site for site in found if site is not None), None)
+    if site is not None and results is not None:
+        unknown = wanted_bridges(results) - {bridge.id for bridge in site.bridges}
+        if unknown:
+            raise InputError(
+                f"{results_path}: has results of {min(unknown)}, which the site file of "
+                f"{recordings[0]} does not know"
+            )
+    return site

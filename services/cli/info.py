@@ -1,0 +1,284 @@
+"""`driveby info`: what is in recordings, for people and as JSON."""
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from services.cli.parsing import add_site, command
+from services.common.errors import InputError
+
+if TYPE_CHECKING:
+    from services.drives.survey import Gap, Passing, Survey, Truck
+
+_NS_PER_S: Final = 1_000_000_000
+_MOST_LINES: Final = 20
+"""Of gaps and of crossings of one recording, for people."""
+
+
+def add_info(commands: Any) -> None:
+    """`driveby info`: say what is in recordings."""
+    p = command(
+        commands,
+        "info",
+        _info,
+        "say what is in recordings: trucks, times, rates, gaps, crossings",
+        "driveby info recordings/sample/crossing.mcap",
+    )
+    p.add_argument(
+        "paths",
+        type=Path,
+        nargs="+",
+        metavar="REC.mcap|DIR",
+        help="recordings, or folders with recordings below",
+    )
+    add_site(p, "where bridges are (default: as each recording says)")
+    p.add_argument("--json", action="store_true", help="everything, as JSON")
+
+
+def _info(options: argparse.Namespace) -> int:
+    from schemas.site_file import load_site
+    from services.drives.survey import survey
+    from services.recordings.together import recordings_in
+
+    site = None if options.site is None else load_site(options.site)
+    found: list[Survey] = []
+    unreadable: dict[Path, str] = {}
+    for path in recordings_in(options.paths):
+        try:
+            found.append(survey(path, site))
+        except InputError as error:
+            if path in options.paths:  # of a folder the others are of interest all the same
+                raise
+            unreadable[path] = str(error).removeprefix(f"{path}: ")
+    if options.json:
+        content = [as_json(one) for one in found]
+        content += [{"path": str(path), "error": error} for path, error in unreadable.items()]
+        print(json.dumps({"recordings": content}, indent=1, ensure_ascii=False))
+        return 0
+    if len(found) == 1 and not unreadable:
+        print("\n".join(lines_of(found[0])))
+    else:
+        _print_table(found, unreadable)
+    return 0
+
+
+def as_json(one: "Survey") -> dict[str, Any]:
+    """Everything that is known of a recording; times are seconds since 1970 UTC."""
+    about, info = one.info.about, one.info
+    return {
+        "path": str(one.path),
+        "size_bytes": one.size_bytes,
+        "program": about.get("program"),
+        "version": about.get("version"),
+        "begin": one.first_ns / _NS_PER_S,
+        "end": one.last_ns / _NS_PER_S,
+        "is_closed": info.end is not None,
+        "is_cut_off": info.truncated,
+        "damaged_places": info.damaged_chunks,
+        "messages": info.messages,
+        "site": None
+        if one.site is None
+        else {
+            "vehicles": [vehicle.id for vehicle in one.site.vehicles],
+            "bridges": [
+                {
+                    "id": bridge.id,
+                    "owner_id": bridge.owner_id,
+                    "span_m": bridge.span_m,
+                    "elements": bridge.elements,
+                }
+                for bridge in one.site.bridges
+            ],
+        },
+        "site_error": one.site_error,
+        "trucks": [
+            {
+                "realm": truck.realm,
+                "vehicle": truck.vehicle,
+                "boots": truck.boots,
+                "begin": truck.first_ns / _NS_PER_S,
+                "end": truck.last_ns / _NS_PER_S,
+                "streams": {name: s._asdict() for name, s in truck.streams.items()},
+                "channel_rates_hz": truck.channel_rates_hz,
+            }
+            for truck in one.trucks
+        ],
+        "gaps": [
+            {
+                "vehicle": gap.vehicle,
+                "stream": gap.stream,
+                "begin": gap.begin_ns / _NS_PER_S,
+                "end": gap.end_ns / _NS_PER_S,
+            }
+            for gap in one.gaps
+        ],
+        "crossings": [
+            {
+                "realm": passing.realm,
+                "vehicle": passing.vehicle,
+                "bridge": passing.bridge,
+                "direction": _direction(passing).replace(" ", "_"),
+                "entry_time": passing.entry_ns / _NS_PER_S,
+                "exit_time": passing.exit_ns / _NS_PER_S,
+                "passage": passing.passage.value.replace(" ", "_"),
+            }
+            for passing in one.passings
+        ],
+    }
+
+
+def lines_of(one: "Survey") -> Iterator[str]:
+    """What a person wants to know of one recording."""
+    seconds = (one.last_ns - one.first_ns) / _NS_PER_S
+    yield f"{one.path}"
+    yield f"  {_size(one.size_bytes)}, {_state(one)}"
+    if not one.info.messages:
+        yield "  no messages"
+        return
+    yield f"  {_day(one.first_ns)} {_time(one.first_ns)} to {_end(one)} UTC, {_length(seconds)}"
+    if one.site is not None:
+        bridges = ", ".join(
+            f"{b.id} ({b.owner_id + ', ' if b.owner_id else ''}{b.span_m:g} m, "
+            f"{b.elements} elements)"
+            for b in one.site.bridges
+        )
+        vehicles = ", ".join(vehicle.id for vehicle in one.site.vehicles)
+        yield f"  site: {vehicles} over {bridges}"
+    else:
+        yield f"  site: {one.site_error or 'none stored in it; crossings are not known'}"
+    for truck in one.trucks:
+        yield from _lines_of_truck(truck)
+    others = Counter(
+        {
+            name.split("/", 3)[3]: number
+            for name, number in one.info.messages.items()
+            if "/vehicle/" not in name
+        }
+    )
+    for name, number in sorted(others.items()):
+        yield f"{name}: {_count(number, 'message')}"
+    yield from _some("gap", one.gaps, map(_line_of_gap, one.gaps))
+    if one.site is not None:
+        yield from _some("crossing", one.passings, map(_line_of_passing, one.passings))
+
+
+def _lines_of_truck(truck: "Truck") -> Iterator[str]:
+    seconds = (truck.last_ns - truck.first_ns) / _NS_PER_S
+    boots = f", {truck.boots} runs" if truck.boots > 1 else ""
+    yield f"{truck.vehicle} in realm {truck.realm}: {_length(seconds)}{boots}"
+    for name, stream in truck.streams.items():
+        rate = f", {stream.rate_hz:.3g} a second" if stream.rate_hz is not None else ""
+        missing = f", {stream.missing} missing" if stream.missing else ""
+        yield f"  {name}: {stream.messages} messages{rate}{missing}"
+        if name == "accel" and truck.channel_rates_hz:
+            rates = truck.channel_rates_hz
+            if len(set(rates.values())) == 1:
+                yield f"    {', '.join(rates)}: {next(iter(rates.values())):g} Hz"
+            else:
+                yield "    " + ", ".join(f"{c} {rate:g} Hz" for c, rate in rates.items())
+
+
+def _some(what: str, all_of_them: "tuple[object, ...]", lines: Iterable[str]) -> Iterator[str]:
+    number = len(all_of_them)
+    yield _count(number, what) if number else f"no {what}s"
+    for _, line in zip(range(_MOST_LINES), lines, strict=False):
+        yield f"  {line}"
+    if number > _MOST_LINES:
+        yield f"  … and {number - _MOST_LINES} more (--json has all)"
+
+
+def _line_of_gap(gap: "Gap") -> str:
+    seconds = (gap.end_ns - gap.begin_ns) / _NS_PER_S
+    return f"{_time(gap.begin_ns)}  {gap.vehicle} {gap.stream}: nothing for {seconds:.1f} s"
+
+
+def _line_of_passing(passing: "Passing") -> str:
+    seconds = (passing.exit_ns - passing.entry_ns) / _NS_PER_S
+    through = passing.passage.value == "through"
+    how = f"{seconds:.1f} s on it" if through else passing.passage.value
+    return (
+        f"{_day(passing.entry_ns)} {_time(passing.entry_ns)}  {passing.vehicle} over "
+        f"{passing.bridge}, {_direction(passing)}, {how}"
+    )
+
+
+def _print_table(found: "list[Survey]", unreadable: dict[Path, str]) -> None:
+    """A line for each file, its name last: names are long."""
+    rows = [("from (UTC)", "length", "trucks", "crossings", "gaps", "size", "state", "recording")]
+    for one in sorted(found, key=lambda survey: (survey.first_ns, survey.path)):
+        begin = f"{_day(one.first_ns)} {_time(one.first_ns)[:8]}"
+        rows.append(
+            (
+                begin if one.info.messages else "—",
+                _length((one.last_ns - one.first_ns) / _NS_PER_S),
+                ", ".join(sorted({truck.vehicle for truck in one.trucks})) or "—",
+                "not known" if one.site is None else str(len(one.passings)),
+                str(len(one.gaps)),
+                _size(one.size_bytes),
+                _state(one),
+                str(one.path),
+            )
+        )
+    widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]) - 1)]
+    for *cells, name in rows:
+        aligned = (cell.ljust(width) for cell, width in zip(cells, widths, strict=True))
+        print("  ".join([*aligned, name]))
+    for path, error in unreadable.items():
+        print(f"{path}: {error}")
+    trucks = {truck.vehicle for one in found for truck in one.trucks}
+    crossings = sum(len(one.passings) for one in found)
+    counts = [
+        _count(len(found) + len(unreadable), "recording"),
+        _size(sum(one.size_bytes for one in found)),
+        _count(len(trucks), "truck"),
+        _count(crossings, "crossing"),
+    ]
+    print(", ".join(counts))
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _state(one: "Survey") -> str:
+    damage = f", {one.info.damaged_chunks} damaged places" if one.info.damaged_chunks else ""
+    if one.info.truncated:
+        return f"cut off{damage}"
+    return f"whole{damage}" if not damage else damage.removeprefix(", ")
+
+
+def _direction(passing: "Passing") -> str:
+    return "start to end" if passing.forward else "end to start"
+
+
+def _end(one: "Survey") -> str:
+    same_day = _day(one.first_ns) == _day(one.last_ns)
+    return _time(one.last_ns) if same_day else f"{_day(one.last_ns)} {_time(one.last_ns)}"
+
+
+def _day(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns / _NS_PER_S, UTC).strftime("%Y-%m-%d")
+
+
+def _time(time_ns: int) -> str:
+    moment = datetime.fromtimestamp(time_ns / _NS_PER_S, UTC)
+    return f"{moment:%H:%M:%S}.{moment.microsecond // 100_000}"
+
+
+def _length(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60.0)
+    hours, minutes = divmod(int(minutes), 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02.0f} s" if minutes else f"{rest:.1f} s"
+
+
+def _size(size_bytes: int) -> str:
+    for unit, bytes_ in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size_bytes >= bytes_:
+            return f"{size_bytes / bytes_:.3g} {unit}"
+    return f"{size_bytes} B"

@@ -1,0 +1,69 @@
+"""`driveby report`: results as a page to hand over."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from services.cli.parsing import add_file, add_site, command
+
+
+def add_report(commands: Any) -> None:
+    """`driveby report`: write results as one printable HTML file."""
+    p = command(
+        commands,
+        "report",
+        _report,
+        "write results as one printable HTML file, and PDF",
+        "driveby report drive.json --site site.toml -o report.html",
+    )
+    p.add_argument(
+        "results", type=Path, nargs="+", metavar="RESULTS.json", help="of identify or a worker"
+    )
+    p.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("report.html"),
+        metavar="OUT.html",
+        help="(default: report.html)",
+    )
+    p.add_argument(
+        "--pdf", action="store_true", help="print it as OUT.pdf too, by an installed browser"
+    )
+    add_site(p, "where bridges are (default: of a recording in the folder of the results)")
+    add_file(p, "--baseline", "OLD.json", "results to compare with (default: the site file's)")
+
+
+def _report(options: argparse.Namespace) -> int:
+    from schemas.results import load_results
+    from services.common.errors import InputError
+    from services.common.files import check_writable, write_atomically
+    from services.history.site_of_results import site_of_results
+    from services.report.bridge import bridge_reports
+    from services.report.page import page
+    from services.report.pdf import find_browser, write_pdf
+
+    output: Path = options.output
+    if output.suffix not in (".html", ".htm"):
+        raise InputError(f"{output}: the name of an HTML file (.html) is expected")
+    pdf = output.with_suffix(".pdf")
+    check_writable(output)
+    if options.pdf:
+        check_writable(pdf)
+        browser = find_browser()
+    files = []
+    for path in options.results:
+        results = load_results(path)
+        files.append((path, results, site_of_results(path, results, options.site)))
+    beside = None if options.site is None else options.site.parent
+    reports = bridge_reports(files, options.baseline, beside)
+    write_atomically(output, page(reports))
+    for report in reports:
+        print(f"{report.bridge.id}: {report.finding.headline} {' '.join(report.finding.sentences)}")
+    if not reports:
+        print("no crossing of a known bridge")
+    print(output)
+    if options.pdf:
+        write_pdf(output, pdf, browser)
+        print(pdf)
+    return 0

@@ -1,0 +1,87 @@
+"""What trucks measured as tables, one of accelerations and one of fixes.
+
+As CSV they are pairs of files for each run in the form that `driveby import` reads, as Parquet one
+file of each kind for all runs.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.signals import CHANNELS
+from schemas.site import Site
+from schemas.site_file import site_toml
+from services.drives.signals import Series, Signals
+from services.export.tables import Table
+
+_FIXES = ("latitude_deg", "longitude_deg", "altitude_m", "speed_m_per_s", "heading_deg")
+
+
+def tables_of_run(run: Signals, number: int) -> list[Table]:
+    """Accelerations and fixes of one run, as `accel_NN` and `gps_NN`."""
+    fixes = run.fixes
+    return [
+        Table(f"accel_{number:02d}", _accelerations(run.channels)),
+        Table(
+            f"gps_{number:02d}",
+            {
+                "time_ns": fixes.time_ns,
+                "latitude_deg": fixes.latitude_deg,
+                "longitude_deg": fixes.longitude_deg,
+                "altitude_m": fixes.altitude_m,
+                "speed_mps": fixes.speed_m_per_s,
+            },
+        ),
+    ]
+
+
+def tables_of_runs(runs: Sequence[Signals]) -> list[Table]:
+    """Accelerations and fixes of all runs, with the truck and the number of the run."""
+    accel = [_accelerations(run.channels) for run in runs]
+    empty = np.empty(0)
+    accelerations: dict[str, NDArray[np.generic]] = {
+        "time_ns": np.concatenate([one["time_ns"] for one in accel] or [np.empty(0, np.int64)])
+    }
+    for name in CHANNELS:
+        parts = [one.get(name, np.full(one["time_ns"].size, np.nan)) for one in accel]
+        accelerations[name] = np.concatenate(parts or [empty])
+    fixes = {"time_ns": np.concatenate([run.fixes.time_ns for run in runs])}
+    for name in _FIXES:
+        fixes[name] = np.concatenate([getattr(run.fixes, name) for run in runs])
+    return [
+        Table(
+            "accelerations", _whose(runs, [one["time_ns"].size for one in accel]) | accelerations
+        ),
+        Table("fixes", _whose(runs, [run.fixes.time_ns.size for run in runs]) | fixes),
+    ]
+
+
+def as_measured(site: Site) -> str:
+    """The site file to go with exported CSV files, which are upward and without gravity."""
+    sensor = site.sensor.model_copy(update={"gravity_included": False, "up": (1, 1, 1, 1)})
+    return site_toml(site.model_copy(update={"sensor": sensor}))
+
+
+def _whose(runs: Sequence[Signals], sizes: Sequence[int]) -> dict[str, NDArray[np.generic]]:
+    vehicles = np.array([run.vehicle for run in runs], dtype=object)
+    return {
+        "vehicle": np.repeat(vehicles, sizes),
+        "run": np.repeat(np.arange(len(runs), dtype=np.int64), sizes),
+    }
+
+
+def _accelerations(channels: dict[str, Series]) -> dict[str, NDArray[np.generic]]:
+    """One row for each time at which any channel has a sample; NaN where another has none."""
+    if not channels:
+        return {"time_ns": np.empty(0, np.int64)}
+    times = [series.time_ns for series in channels.values()]
+    every = times[0]
+    if any(not np.array_equal(every, other) for other in times[1:]):
+        every = np.unique(np.concatenate(times))
+    columns: dict[str, NDArray[np.generic]] = {"time_ns": every}
+    for name, (time_ns, values) in channels.items():
+        column = np.full(every.size, np.nan)
+        column[np.searchsorted(every, time_ns)] = values
+        columns[name] = column
+    return columns

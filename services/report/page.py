@@ -1,0 +1,321 @@
+"""The page itself: a first page for each bridge, then the evidence for each crossing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+
+import matplotlib
+
+from schemas.results import Crossing
+from services.report.bridge import BridgeReport, advice
+from services.report.html import Html, inlined_svg, joined, table, tag
+from services.report.style import CSS
+from services.viewer.bridge_figure import draw_bridge
+from services.viewer.comparison import Comparison
+from services.viewer.crossing_view import view_of_crossing
+from services.viewer.drawing import STYLE, figure_bytes
+from services.viewer.figure import draw_crossing
+
+_MOST_PICTURES = 12
+"""Of single crossings of a bridge; the others have their numbers."""
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+_NOT_MEANT = (
+    (
+        "It is a hint where to look at the next inspection, never a condition rating. It says "
+        "nothing of strength, load capacity or safety."
+    ),
+    (
+        "It says how stiff the line is along which the truck drove, deck and pavement included, "
+        "and not why. Temperature, moisture, bearings and pavement change stiffness too."
+    ),
+    (
+        "What was not found may be there all the same: a smaller loss, one beside the truck's "
+        "line, or one that does not change the stiffness in bending."
+    ),
+    (
+        "Intervals of 95 % were checked on simulated crossings only; no real bridge of known "
+        "condition has been measured with this program yet."
+    ),
+)
+
+
+def page(reports: Sequence[BridgeReport]) -> str:
+    """The whole report as one HTML file that needs nothing else, neither network nor scripts."""
+    title = ", ".join(_name(report) for report in reports) or "no bridge"
+    head = tag(
+        "head",
+        tag("meta", charset="utf-8"),
+        tag("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("title", f"Stiffness of {title}"),
+        tag("style", Html(CSS)),
+    )
+    bodies = [_bridge(report, f"b{n}-") for n, report in enumerate(reports)]
+    if not bodies:
+        bodies = [joined(tag("h1", "No crossing"), tag("p", "No truck crossed a known bridge."))]
+    return f"<!DOCTYPE html>\n{tag('html', head, tag('body', *bodies), lang='en')}\n"
+
+
+def _bridge(report: BridgeReport, prefix: str) -> Html:
+    finding = report.finding
+    first = tag(
+        "section",
+        tag("h1", f"Bridge {_name(report)}"),
+        tag("p", "Stiffness along the span, measured by trucks that drove over it", class_="sub"),
+        tag(
+            "div",
+            tag("strong", finding.headline),
+            *(tag("p", sentence) for sentence in finding.sentences),
+            class_=f"finding {finding.kind}",
+        ),
+        _facts(report),
+        *_result(report, prefix),
+        tag("h2", "What this does not mean"),
+        tag("ul", *(tag("li", text) for text in _not_meant(report))),
+        class_="first",
+    )
+    newest_first = list(reversed(report.crossings))
+    heading = joined(tag("h2", "Evidence, crossing by crossing"))
+    if finding.kind == "doubtful":
+        heading = joined(*_what_to_do(report.crossings), heading)
+    evidence, pictures = [], 0
+    for n, crossing in enumerate(newest_first):
+        has_picture = crossing.parameters is not None and pictures < _MOST_PICTURES
+        pictures += has_picture
+        evidence.append(_crossing(report, crossing, f"{prefix}c{n}-" if has_picture else None))
+    return joined(first, tag("section", heading, class_="break"), *evidence)
+
+
+def _not_meant(report: BridgeReport) -> Sequence[str]:
+    if report.finding.kind == "nothing":
+        text = "It means neither that the bridge is sound nor that it is damaged: nothing was "
+        return (text + "measured that could tell.",)
+    return _NOT_MEANT
+
+
+def _facts(report: BridgeReport) -> Html:
+    bridge, crossings = report.bridge, report.crossings
+    spans = bridge.lengths_of_spans_m
+    length = f"{bridge.span_m:g} m"
+    if len(spans) > 1:
+        length += f" over {len(spans)} spans ({', '.join(f'{s:g}' for s in spans)} m)"
+    first, last = _day(crossings[0].entry_time), _day(crossings[-1].entry_time)
+    trucks = ", ".join(sorted({crossing.vehicle for crossing in crossings}))
+    compared = "each other (no baseline is stored)"
+    if report.baseline_name is not None:
+        compared = f"the baseline {report.baseline_name}"
+    rows = [
+        ("Bridge", f"{_name(report)}, {length}, {bridge.elements} elements from its start"),
+        ("Driven", (first if first == last else f"{first} to {last}") + f", by {trucks}"),
+        ("Quality", report.quality),
+        *([] if report.view.estimate is None else [("Compared with", compared)]),
+        ("Road", _road(crossings)),
+        ("Source", f"{', '.join(report.sources)}; {', '.join(report.programs)}"),
+    ]
+    return tag(
+        "table",
+        tag("tbody", *(tag("tr", tag("th", what), tag("td", text)) for what, text in rows)),
+        class_="facts",
+    )
+
+
+def _result(report: BridgeReport, prefix: str) -> Iterator[Html]:
+    view = report.view
+    if view.estimate is None:
+        yield tag("h2", "Why nothing can be said")
+        counted: dict[str, int] = {}
+        for crossing in report.crossings:
+            for text in crossing.reason_texts:
+                counted[text] = counted.get(text, 0) + 1
+        total = len(report.crossings)
+        rows = sorted(counted.items(), key=lambda item: -item[1])
+        yield tag("ul", *(tag("li", f"{text} ({number} of {total})") for text, number in rows))
+        yield from _what_to_do(report.crossings)
+        return
+    with matplotlib.rc_context(STYLE):
+        svg = figure_bytes(draw_bridge(view, with_heading=False), "svg")
+    said = " ".join(report.finding.sentences)
+    yield tag("figure", inlined_svg(svg, prefix, f"EI along the span. {said}"))
+    yield _elements(report)
+    yield from _caveats(report)
+
+
+def _elements(report: BridgeReport) -> Html:
+    view = report.view
+    assert view.estimate is not None  # noqa: S101 - its caller looked
+    than = "Against the baseline" if report.baseline_name is not None else "Against the others"
+    heads = ["Element", "From–to (m)", "EI (GN·m²)", "95 % interval", "Of nominal", than, "Remark"]
+    rows, classes = [], []
+    compared = view.comparison.elements if view.comparison is not None else ()
+    for n, mean in enumerate(view.estimate.mean):
+        low, high = view.estimate.low[n] / 1e9, view.estimate.high[n] / 1e9
+        change = remark = ""
+        if compared:
+            element = compared[n]
+            change = f"{_signed(element.ratio)} ({_signed(element.low)} to {_signed(element.high)})"
+            remark = "weaker" if element.is_weak else "stiffer" if element.is_stiff else ""
+        rows.append(
+            [
+                str(n + 1),
+                f"{view.edges_m[n]:.1f}–{view.edges_m[n + 1]:.1f}",
+                f"{mean / 1e9:.2f}",
+                f"{low:.2f}–{high:.2f}",
+                f"{mean / view.nominal_nm2[n]:.3f}",
+                change,
+                remark + ("?" if remark and view.is_doubtful else ""),
+            ]
+        )
+        classes.append("" if view.is_doubtful else {"weaker": "weak"}.get(remark, ""))
+    return table(heads, rows, classes)
+
+
+def _caveats(report: BridgeReport) -> Iterator[Html]:
+    comparison = report.view.comparison
+    if comparison is None:
+        return
+    if comparison.reference == "others":
+        yield tag(
+            "p",
+            "No baseline is stored, and a nominal value is often a guess, so each element is "
+            f"compared with the middle of the others. The middle of all is {comparison.level:.2f} "
+            "of the nominal value: this says nothing where that is a guess, and is true of the "
+            "whole bridge where it was measured. A loss that all elements share cannot be seen "
+            "without a baseline.",
+            class_="note",
+        )
+    yield tag("p", _visible(comparison), class_="note")
+
+
+def _visible(comparison: Comparison) -> str:
+    losses = sorted(element.visible_loss for element in comparison.elements)
+    return (
+        f"A loss of {100.0 * losses[0]:.0f} % in one element would have been called clear where "
+        f"this measurement is sharpest, one of {100.0 * losses[-1]:.0f} % where it is bluntest."
+    )
+
+
+def _what_to_do(crossings: Sequence[Crossing]) -> Iterator[Html]:
+    what = advice(crossings)
+    if what:
+        yield tag("h2", "What would help")
+        yield tag("ul", *(tag("li", text) for text in what))
+
+
+def _crossing(report: BridgeReport, crossing: Crossing, prefix: str | None) -> Html:
+    way = crossing.direction.replace("_", " ")
+    used = ", used for the numbers above" if crossing.crossing_id in report.view.used else ""
+    parts: list[Html] = [
+        tag("h3", f"{_moment(crossing.entry_time)}: {crossing.verdict}{used}"),
+        tag(
+            "p",
+            f"{crossing.vehicle}, {way}, {crossing.speed_m_per_s:.1f} m/s, method "
+            f"{crossing.method.replace('_', ' ')} ({crossing.crossing_id})",
+        ),
+    ]
+    if crossing.reasons:
+        pairs = zip(crossing.reasons, crossing.reason_texts, strict=True)
+        parts.append(tag("ul", *(tag("li", f"{text} ({code.value})") for code, text in pairs)))
+    numbers = list(_numbers(crossing))
+    if numbers:
+        parts.append(table(["Measure", "Value", "Meaning"], [list(row) for row in numbers]))
+    if prefix is not None:
+        with matplotlib.rc_context(STYLE):
+            figure = draw_crossing(
+                view_of_crossing(crossing, report.bridge), element_truth=None, road_truth=None
+            )
+        svg = figure_bytes(figure, "svg")
+        label = f"Crossing of {_moment(crossing.entry_time)}, verdict {crossing.verdict}"
+        parts.append(tag("figure", inlined_svg(svg, prefix, label)))
+    return tag("section", *parts, class_=f"crossing {crossing.verdict}")
+
+
+def _numbers(crossing: Crossing) -> Iterator[tuple[str, str, str]]:
+    if crossing.chi2_per_dof is not None:
+        yield (
+            "χ² per degree of freedom",
+            _number(crossing.chi2_per_dof),
+            "misfit against the declared noise; 1 is expected, above 1.25 is doubtful",
+        )
+    if crossing.scale_error is not None:
+        yield (
+            "common error",
+            f"{100.0 * crossing.scale_error:.1f} %",
+            "standard deviation that all elements share (mass of the truck, gain of the sensors)",
+        )
+    derived = crossing.derived
+    if derived is not None:
+        f1, deflection = derived.f1_hz, derived.max_deflection_m
+        yield (
+            "first natural frequency",
+            f"{f1.mean:.2f} Hz ({f1.q025:.2f} to {f1.q975:.2f})",
+            "of the bridge that fits",
+        )
+        yield (
+            "largest deflection",
+            f"{deflection.mean * 1e3:.3f} mm",
+            "under this truck",
+        )
+        if derived.springs_believed is not None:
+            share = f"{100.0 * derived.springs_believed:.0f} %"
+            yield "springs believed", share, "100 %: linear as far as can be told; low: they rub"
+        for ends, what in (
+            (derived.probability_sprung, "bearings held by a spring"),
+            (derived.probability_giving, "bearings that give"),
+        ):
+            if ends is not None:
+                percent = (
+                    f"{100.0 * ends.start:.0f} % at the start, {100.0 * ends.end:.0f} % at the end"
+                )
+                yield what, percent, "probability"
+    road = crossing.road
+    if road is not None and (road.iri_m_per_km is not None or road.iso_class is not None):
+        yield "road", _one_road(crossing) or "", "International Roughness Index, ISO 8608 class"
+    meanings = {
+        "r_hat": ("R-hat", "agreement of the Markov chains; below 1.05"),
+        "ess": ("effective draws", "at least 100"),
+        "position_shift_m": ("shift of positions (m)", "slow error of the receiver that fits"),
+        "iterations": ("evaluations", "of the model"),
+    }
+    for key, (name, meaning) in meanings.items():
+        if key in crossing.diagnostics:
+            yield name, _number(crossing.diagnostics[key]), meaning
+
+
+def _number(value: float) -> str:
+    text = f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+    return text.replace("-", "−")
+
+
+def _road(crossings: Sequence[Crossing]) -> str:
+    found = [text for crossing in reversed(crossings) if (text := _one_road(crossing))]
+    return f"{found[0]} (newest crossing with a road)" if found else "not known"
+
+
+def _one_road(crossing: Crossing) -> str | None:
+    road = crossing.road
+    if road is None:
+        return None
+    parts = []
+    if road.iso_class is not None:
+        parts.append(f"class {road.iso_class} of ISO 8608")
+    if road.iri_m_per_km is not None:
+        parts.append(f"IRI {road.iri_m_per_km:.1f} m/km")
+    return ", ".join(parts) or None
+
+
+def _name(report: BridgeReport) -> str:
+    bridge = report.bridge
+    return bridge.id if bridge.owner_id is None else f"{bridge.owner_id} ({bridge.id})"
+
+
+def _signed(ratio: float) -> str:
+    return f"{100.0 * (ratio - 1.0):+.0f} %".replace("-", "−")
+
+
+def _day(seconds: float) -> str:
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d}"
+
+
+def _moment(seconds: float) -> str:
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -1,0 +1,185 @@
+"""The picture of one bridge: its stiffness along the span, and all crossings that told of it."""
+
+from __future__ import annotations
+
+import textwrap
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from services.viewer.bridge_view import BridgeView
+from services.viewer.comparison import sentences
+from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
+from services.viewer.drawing import (
+    BANNERS,
+    BAR_EDGE,
+    INK,
+    LEFT,
+    MUTED,
+    NOMINAL_LINE,
+    RIGHT,
+    STYLE,
+    WIDTH_IN,
+    add_ratio_axis,
+    draw_bars,
+    draw_intervals,
+    label_bars,
+    legend_beside_title,
+    mark_bridge,
+    quieten,
+    write_centred,
+    write_figure,
+)
+
+_MOST_LISTED = 12
+_SIGNS = {"good": "●", "suspect": "○", "rejected": "×"}
+"""Told apart without colour."""
+
+
+def bridge_figure(path: Path, bridge: BridgeView) -> None:
+    """Draw one bridge into a PNG or SVG file; an existing file is replaced."""
+    with matplotlib.rc_context(STYLE):
+        figure = draw_bridge(bridge)
+    write_figure(path, figure)
+
+
+def draw_bridge(bridge: BridgeView, *, with_heading: bool = True) -> Figure:
+    """The figure itself, to be drawn in `STYLE`; without heading and list it is one panel."""
+    listed = min(len(bridge.crossings), _MOST_LISTED + 1) if with_heading else 0
+    panel_in, heading_in, list_in = 3.6, 1.15 if with_heading else 0.35, 0.2 * listed
+    list_in += 0.35 if listed else 0.0
+    height = heading_in + panel_in + 0.5 + list_in
+    figure = Figure(figsize=(WIDTH_IN, height), facecolor="white")
+    FigureCanvasAgg(figure)
+    bottom = (list_in + 0.5) / height
+    axes = figure.add_axes((LEFT, bottom, RIGHT - LEFT, panel_in / height))
+    _draw_panel(axes, bridge)
+    if with_heading:
+        _draw_heading(figure, bridge)
+        _list_crossings(figure, bridge, (list_in - 0.1) / height, 0.2 / height)
+    return figure
+
+
+def _draw_panel(axes: Axes, bridge: BridgeView) -> None:
+    nominal = bridge.nominal_nm2 / 1e9
+    axes.set_title("Rigidity EI")
+    axes.set_ylabel("EI (GN·m²)")
+    axes.stairs(nominal, bridge.edges_m, baseline=None, label="nominal", **NOMINAL_LINE)
+    highest = float(nominal.max())
+    if bridge.estimate is None:
+        write_centred(axes, _why_nothing(bridge))
+    else:
+        mean, low, high = (column / 1e9 for column in bridge.estimate[:3])
+        weak = () if bridge.comparison is None else bridge.comparison.weak
+        numbers = {element.number for element in weak}
+        draw_bars(axes, bridge.edges_m, mean, numbers, doubtful=bridge.is_doubtful)
+        colour = MUTED if bridge.is_doubtful else BAR_EDGE
+        draw_intervals(axes, bridge.edges_m, low, high, colour=colour, label="95 % interval")
+        highest = max(highest, float(high.max()), _draw_crossings(axes, bridge))
+        label_bars(axes, bridge.edges_m, mean, low, [f"{r:.3f}" for r in mean / nominal])
+        for element in weak:
+            axes.annotate(
+                f"{100.0 * (1.0 - element.ratio):.0f} % less{'?' if bridge.is_doubtful else ''}",
+                ((element.from_m + element.to_m) / 2.0, high[element.number - 1]),
+                xytext=(0, 14 if len(bridge.crossings) > 1 else 8),
+                textcoords="offset points",
+                ha="center",
+                fontsize=9.5 if mean.size <= 11 else 8,
+                fontweight="bold",
+                zorder=8,
+            )
+    axes.set_ylim(0.0, 1.1 * highest)
+    legend_beside_title(axes)
+    add_ratio_axis(axes, nominal)
+    quieten(axes)
+    mark_bridge(axes, (0.0, *bridge.interior_supports_m, bridge.span_m))
+    axes.set_xlim(-0.03 * bridge.span_m, 1.03 * bridge.span_m)
+    axes.set_xlabel("chainage from the start of the bridge (m)")
+
+
+def _draw_crossings(axes: Axes, bridge: BridgeView) -> float:
+    """What single crossings said, beside the interval; returns the highest."""
+    drawn = [c for c in bridge.crossings if c.rigidity_nm2 is not None]
+    if len(drawn) < 2:
+        return 0.0
+    centres, lengths = (bridge.edges_m[:-1] + bridge.edges_m[1:]) / 2.0, np.diff(bridge.edges_m)
+    highest = 0.0
+    named: set[str] = set()
+    for place, crossing in zip(np.linspace(-0.36, -0.16, len(drawn)), drawn, strict=True):
+        assert crossing.rigidity_nm2 is not None  # noqa: S101 - chosen by that
+        values = crossing.rigidity_nm2 / 1e9
+        good = crossing.verdict == "good"
+        axes.plot(
+            centres + place * lengths,
+            values,
+            linestyle="none",
+            marker="o",
+            markersize=4.2,
+            color=INK,
+            markerfacecolor=INK if good else "white",
+            markeredgewidth=0.9,
+            zorder=6,
+            label=None if crossing.verdict in named else f"{crossing.verdict} crossing",
+        )
+        named.add(crossing.verdict)
+        highest = max(highest, float(values.max()))
+    return highest
+
+
+def _draw_heading(figure: Figure, bridge: BridgeView) -> None:
+    height = figure.get_figheight()
+    name = bridge.bridge if bridge.owner_id is None else f"{bridge.owner_id} ({bridge.bridge})"
+    title = textwrap.shorten(f"Bridge {name}, {bridge.span_m:g} m", width=52, placeholder=" …")
+    large: dict[str, Any] = {"fontsize": 14, "fontweight": "bold", "va": "top"}
+    figure.text(LEFT, 1.0 - 0.18 / height, title, parse_math=False, **large)
+    doubt = "DOUBTFUL: a crossing that was used is suspect. " if bridge.is_doubtful else ""
+    said = " ".join(sentences(bridge.comparison))
+    if bridge.estimate is None:
+        said = f"No finding: none of {len(bridge.crossings)} crossings could be used."
+    lines = textwrap.wrap(doubt + said, 112, max_lines=2, placeholder=" …")
+    top = 1.0 - 0.47 / height
+    banner = None
+    if bridge.is_doubtful:
+        colours = {"facecolor": BANNERS["suspect"], "edgecolor": VERDICT_COLOURS["suspect"]}
+        banner = {"boxstyle": "round,pad=0.35", "linewidth": 1.4} | colours
+    words = "\n".join(lines)
+    figure.text(LEFT + 0.006, top, words, fontsize=9.5, color=INK, va="top", bbox=banner)
+
+
+def _why_nothing(bridge: BridgeView) -> str:
+    if not bridge.crossings:
+        return "No truck has crossed this bridge."
+    reasons = dict.fromkeys(text for c in bridge.crossings for text in c.reason_texts)
+    lines = ["No estimate, because"]
+    return "\n".join([*lines, *(f"• {text}" for text in list(reasons)[:6])])
+
+
+def _list_crossings(figure: Figure, bridge: BridgeView, top: float, step: float) -> None:
+    listed = bridge.crossings[-_MOST_LISTED:]
+    more = len(bridge.crossings) - len(listed)
+    rows = [_row(bridge, crossing) for crossing in reversed(listed)]
+    for number, (sign, row) in enumerate(rows):
+        y = top - number * step
+        figure.text(LEFT, y, sign, fontsize=9, va="top")
+        figure.text(LEFT + 0.018, y, row, fontsize=8.5, va="top", color=INK, parse_math=False)
+    if more:
+        y = top - len(rows) * step
+        figure.text(LEFT + 0.018, y, f"… and {more} earlier", fontsize=8.5, va="top", color=MUTED)
+
+
+def _row(bridge: BridgeView, crossing: CrossingView) -> tuple[str, str]:
+    moment = datetime.fromtimestamp(crossing.entry_time_s, UTC)
+    way = "start to end" if crossing.forward else "end to start"
+    used = ", used" if crossing.crossing_id in bridge.used else ""
+    why = f": {' '.join(crossing.reason_texts)}" if crossing.reason_texts else ""
+    line = (
+        f"{moment:%Y-%m-%d %H:%M} UTC, {crossing.vehicle}, {way}, "
+        f"{crossing.speed_m_per_s:.1f} m/s, {crossing.verdict}{used}{why}"
+    )
+    return _SIGNS[crossing.verdict], textwrap.shorten(line, width=116, placeholder=" …")

@@ -1,0 +1,82 @@
+"""What a picture of one bridge shows: its latest state, and what every crossing said."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from schemas.reasons import Reason
+from schemas.results import Crossing, Results
+from schemas.site import Bridge, Site
+from services.viewer.comparison import Comparison, Estimate, compare, estimate_of_state
+from services.viewer.crossing_view import CrossingView, FloatArray, view_of_crossing
+
+
+class BridgeView(NamedTuple):
+    """One bridge as it is drawn."""
+
+    bridge: str
+    owner_id: str | None
+    edges_m: FloatArray  # (n + 1,)
+    nominal_nm2: FloatArray  # (n,)
+    interior_supports_m: tuple[float, ...]
+    crossings: tuple[CrossingView, ...]
+    """All that there are, in order of time."""
+    used: frozenset[str]
+    """Those that the state was made of."""
+    estimate: Estimate | None
+    """None if no crossing could be used."""
+    is_doubtful: bool
+    """Whether a crossing that was used is suspect, or its method knows no intervals."""
+    comparison: Comparison | None
+
+    @property
+    def span_m(self) -> float:
+        """Length of the bridge between its outer bearings."""
+        return float(self.edges_m[-1])
+
+
+def views_of_bridges(results: Results, site: Site) -> list[BridgeView]:
+    """Every bridge of the site that was crossed, without a baseline."""
+    crossed = {crossing.bridge for crossing in results.crossings}
+    return [view_of_bridge(b, results, None) for b in site.bridges if b.id in crossed]
+
+
+def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) -> BridgeView:
+    """Take results of one bridge apart; `baseline` is what was stored of it."""
+    crossings = sorted(
+        (crossing for crossing in results.crossings if crossing.bridge == bridge.id),
+        key=lambda crossing: crossing.entry_time,
+    )
+    state = results.bridges.get(bridge.id)
+    nominal = np.array(bridge.nominal_flexural_rigidity_nm2)
+    edges = np.concatenate(([0.0], np.cumsum(bridge.lengths_m)))
+    estimate, used = None, frozenset[str]()
+    if state is not None and len(state.elements) == nominal.size:
+        used = frozenset(state.crossings_used)
+        estimate = estimate_of_state(state, _common_error(crossings, used))
+    of_state = [crossing for crossing in crossings if crossing.crossing_id in used]
+    is_doubtful = estimate is not None and (not of_state or any(map(_is_doubtful, of_state)))
+    return BridgeView(
+        bridge.id,
+        bridge.owner_id,
+        edges,
+        nominal,
+        bridge.interior_supports_m,
+        tuple(view_of_crossing(crossing, bridge) for crossing in crossings),
+        used,
+        estimate,
+        is_doubtful,
+        None if estimate is None else compare(estimate, nominal, edges, baseline),
+    )
+
+
+def _is_doubtful(crossing: Crossing) -> bool:
+    return crossing.verdict != "good" or Reason.NO_NOISE_MODEL in crossing.reasons
+
+
+def _common_error(crossings: list[Crossing], used: frozenset[str]) -> float:
+    """The least of those used: what several crossings have in common is not smaller than that."""
+    errors = [c.scale_error for c in crossings if c.crossing_id in used and c.scale_error]
+    return min(errors, default=0.0)

@@ -1,0 +1,39 @@
+"""A folder of pictures: every crossing and every bridge of results, as PNG and as SVG."""
+
+import re
+from pathlib import Path
+
+from schemas.results import Results
+from schemas.site import Site
+from services.viewer.bridge_figure import bridge_figure
+from services.viewer.bridge_view import views_of_bridges
+from services.viewer.crossing_view import view_of_crossing
+from services.viewer.figure import crossing_figure
+
+FORMS = ("png", "svg")
+
+
+def write_pictures(folder: Path, results: Results, site: Site) -> list[Path]:
+    """Write `CROSSING.png`, `BRIDGE.png` and the same as `.svg`; return them.
+
+    The folder is made if it is not there, files of these names are replaced.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for crossing in results.crossings:
+        view = view_of_crossing(crossing, site.bridge(crossing.bridge))
+        for form in FORMS:
+            path = folder / f"{_file_name(crossing.crossing_id)}.{form}"
+            crossing_figure(path, crossing=view)
+            written.append(path)
+    for bridge in views_of_bridges(results, site):
+        for form in FORMS:
+            path = folder / f"{bridge.bridge}.{form}"
+            bridge_figure(path, bridge)
+            written.append(path)
+    return written
+
+
+def _file_name(crossing_id: str) -> str:
+    """A results file may be anybody's: its names are no paths."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", crossing_id).lstrip(".")[:200] or "crossing"

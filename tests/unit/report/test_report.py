@@ -1,0 +1,340 @@
+"""`driveby report`: what it says is what was found, it is one file, and nothing in it is alive."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from schemas.results import Results, results_json
+from schemas.site import Site
+from schemas.site_file import load_site, site_toml
+from services.cli import main as cli
+from services.report import pdf
+from services.report.bridge import bridge_reports
+from services.report.html import Html, inlined_svg, joined, tag
+from services.report.page import page
+from tests.unit.viewer.found import RATIOS, results_of, some_crossing
+
+
+@pytest.fixture(scope="module")
+def site(project: Path) -> Site:
+    return load_site(project / "docs/site.example.toml")
+
+
+class Seen(HTMLParser):
+    """What is in a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(name, value or "") for name, value in attrs]
+
+    def handle_data(self, data: str) -> None:
+        if self.tags[-1:] != ["style"]:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def reported(site: Site, *results: Results, baseline: Path | None = None) -> Seen:
+    files = [(Path(f"{n}.json"), one, site) for n, one in enumerate(results)]
+    return Seen(page(bridge_reports(files, baseline)))
+
+
+def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: Site) -> None:
+    crossings = [some_crossing("a"), some_crossing("b", entry=86400.0)]
+    text = reported(site, results_of(site, *crossings, used="b")).text
+    assert "One element is clearly less stiff." in text
+    assert (
+        "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 58 to 62 %."
+        in text
+    )
+    assert "All others agree within 3 %." in text
+    assert "30 m, 7 elements from its start" in text
+    assert "2026-09-21 to 2026-09-22, by truck-1" in text
+    assert "2 crossings: 2 good. The numbers below are of the newest usable one." in text
+    assert "The other good crossing agrees with them: at most 0.0 standard deviations apart" in text
+    assert "class A of ISO 8608, IRI 2.4 m/km" in text
+    assert "never a condition rating" in text
+    # Where there is no baseline that is said, and what it means.
+    assert "each other (no baseline is stored)" in text
+    assert "A loss that all elements share cannot be seen without a baseline." in text
+    # The evidence.
+    assert "χ² per degree of freedom 1.02" in text
+    assert "springs believed 100 %" in text
+    assert "bearings held by a spring 3 % at the start, 4 % at the end" in text
+    assert "R-hat 1 " in text
+
+
+def test_a_nominal_value_that_is_too_high_is_no_damage_everywhere(site: Site) -> None:
+    sound = results_of(site, some_crossing("a"), used="a", ratios=np.full(7, 0.86))
+    text = reported(site, sound).text
+    assert "No element is clearly less stiff." in text
+    assert "No element stands out: all agree within 1 %." in text
+    assert "The middle of all is 0.86 of the nominal value" in text
+
+
+def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) -> None:
+    then = tmp_path / "then.json"
+    then.write_text(results_json(results_of(site, some_crossing("a"), used="a")))
+    now = results_of(site, some_crossing("b"), used="b", ratios=0.7 * RATIOS)
+    text = reported(site, now, baseline=then).text
+    assert "7 elements are clearly less stiff." in text
+    assert "Element 1, 0.0 to 4.3 m: 30 % less stiff than the baseline, interval" in text
+    assert "Compared with the baseline then.json" in text
+    assert "No baseline is stored" not in text
+    unchanged = reported(site, results_of(site, some_crossing("b"), used="b"), baseline=then).text
+    assert "No element has clearly changed: all are unchanged within 1 %." in unchanged
+
+
+def test_a_suspect_result_is_doubtful_and_says_why(site: Site) -> None:
+    suspect = some_crossing("a", verdict="suspect", reasons=("position_outage",))
+    found = reported(site, results_of(site, suspect, used="a"))
+    assert ("class", "finding doubtful") in found.attributes
+    assert "Doubtful: to be looked at, not to be relied upon." in found.text
+    assert "The reasons: The receiver gave no position" in found.text
+    assert "Look at the satellite receiver and its antenna." in found.text
+    assert "weaker?" in found.text
+    assert ("class", "weak") not in found.attributes
+
+
+def test_where_all_are_rejected_it_says_why_nothing_can_be_said(site: Site) -> None:
+    why = (("speed_too_low",), ("speed_too_low", "model_misfit"))
+    rejected = [
+        some_crossing(name, verdict="rejected", reasons=reasons)
+        for name, reasons in zip("ab", why, strict=True)
+    ]
+    found = reported(site, results_of(site, *rejected))
+    assert "Nothing can be said about this bridge." in found.text
+    assert (
+        "The truck was too slow for its axles to feel the bridge's stiffness. (2 of 2)"
+        in found.text
+    )
+    assert "Drive again, at 5 m/s or more." in found.text
+    assert "neither that the bridge is sound nor that it is damaged" in found.text
+    assert "svg" not in found.tags  # no picture without a number
+    assert "GN·m²" not in found.text
+
+
+def test_crossings_that_do_not_agree_are_said_not_to(site: Site) -> None:
+    one = results_of(site, some_crossing("a"), used="a")
+    other = results_of(site, some_crossing("b", entry=60.0), used="b", ratios=1.5 * RATIOS)
+    merged = other.model_copy(update={"crossings": one.crossings + other.crossings})
+    assert "does NOT agree with them: at most 9.6 standard" in reported(site, merged).text
+
+
+def test_what_single_crossings_say_of_a_weak_element_shows_how_far_they_scatter(
+    site: Site,
+) -> None:
+    one = results_of(site, some_crossing("a"), used="a")
+    ratios = RATIOS.copy()
+    ratios[3] = 0.5
+    other = results_of(site, some_crossing("b", entry=60.0), used="b", ratios=ratios)
+    third = results_of(site, some_crossing("c", verdict="suspect", reasons=("position_outage",)))
+    everything = one.crossings + other.crossings + third.crossings
+    merged = other.model_copy(update={"crossings": everything})
+    said = "By each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff."
+    assert said in reported(site, merged).text
+    assert "crossings alone" not in reported(site, one).text
+
+
+def test_several_files_are_one_report_and_the_newest_result_of_a_crossing_counts(
+    site: Site,
+) -> None:
+    first = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="b")
+    again = some_crossing("a", verdict="rejected", reasons=("gap_on_bridge",))
+    second = results_of(site, again).model_copy(update={"created": first.created + 1.0})
+    for order in ((first, second), (second, first)):
+        text = reported(site, *order).text
+        assert "2 crossings: 1 good, 1 rejected." in text
+        assert "Element 4" in text  # the state of the older file
+
+
+@pytest.mark.parametrize(
+    "bad", ["<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "a & b < c", "$\\frac$"]
+)
+def test_nothing_from_a_file_becomes_part_of_the_page(site: Site, bad: str) -> None:
+    bridges = (site.bridges[0].model_copy(update={"owner_id": bad}),)
+    hostile = site.model_copy(update={"bridges": bridges})
+    crossing = some_crossing(bad, verdict="suspect", reasons=("position_outage",))
+    crossing |= {"vehicle": bad, "realm": bad, "reason_texts": [bad]}
+    results = results_of(site, crossing, used=bad).model_copy(update={"version": bad})
+    text = page(bridge_reports([(Path(f"{bad.replace('/', '')}.json"), results, hostile)], None))
+    seen = Seen(text)
+    assert not {"script", "img", "iframe", "object", "link", "a"} & set(seen.tags)
+    assert not [name for name, _ in seen.attributes if name.startswith("on")]
+    assert bad in seen.text  # as words
+
+
+def test_it_needs_nothing_but_itself(site: Site) -> None:
+    text = page(
+        bridge_reports(
+            [(Path("x.json"), results_of(site, some_crossing("a"), used="a"), site)], None
+        )
+    )
+    seen = Seen(text)
+    assert (
+        "content",
+        "default-src 'none'; style-src 'unsafe-inline'; img-src data:",
+    ) in seen.attributes
+    links = [value for name, value in seen.attributes if name in ("src", "href", "xlink:href")]
+    assert links
+    assert all(value.startswith("#") for value in links)
+    urls = set(re.findall(r"https?://[^\s\"'<>]+", text))
+    assert urls <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
+    assert not re.search(r"url\((?!#)|@import", text)
+    # Names within the pictures are unique and lead somewhere, though there are several of them.
+    names = [value for name, value in seen.attributes if name == "id"]
+    assert len(names) == len(set(names))
+    wanted = {value[1:] for value in links} | set(re.findall(r"url\(#([^)]+)\)", text))
+    assert wanted <= set(names)
+
+
+def test_text_is_escaped_unless_it_is_html() -> None:
+    assert (
+        tag("p", "a < b", tag("b", "&"), class_='"') == '<p class="&quot;">a &lt; b<b>&amp;</b></p>'
+    )
+    assert joined("<", Html("<br>")) == "&lt;<br>"
+    svg = b'<?xml?><svg><path id="m1"/><use xlink:href="#m1" clip-path="url(#c)"/></svg>'
+    inlined = inlined_svg(svg, "p-", '"x"')
+    assert 'id="p-m1"' in inlined
+    assert 'xlink:href="#p-m1"' in inlined
+    assert "url(#p-c)" in inlined
+    assert 'aria-label="&quot;x&quot;"' in inlined
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    code = cli.main(["report", *map(str, arguments)])
+    return (code, *capsys.readouterr())
+
+
+@pytest.fixture
+def written(tmp_path: Path, site: Site) -> tuple[Path, Path]:
+    """A results file and its site file."""
+    (tmp_path / "site.toml").write_text(site_toml(site))
+    found = results_of(site, some_crossing("a"), used="a")
+    (tmp_path / "found.json").write_text(results_json(found))
+    return tmp_path / "found.json", tmp_path / "site.toml"
+
+
+def test_the_command_writes_the_page_and_says_the_finding(
+    capsys: pytest.CaptureFixture[str], written: tuple[Path, Path], tmp_path: Path
+) -> None:
+    found, site = written
+    out = tmp_path / "r.html"
+    code, said, err = run(capsys, found, "--site", site, "-o", out)
+    assert (code, err) == (0, "")
+    assert said.startswith("bridge-1: One element is clearly less stiff. Element 4, 12.9 to 17.1 m")
+    assert "Element 4" in Seen(out.read_text()).text
+    first = out.read_bytes()
+    assert run(capsys, found, "--site", site, "-o", out)[0] == 0
+    assert out.read_bytes() == first  # the same results give the same report
+
+
+def test_the_baseline_of_the_site_file_lies_beside_it(
+    capsys: pytest.CaptureFixture[str], written: tuple[Path, Path], tmp_path: Path
+) -> None:
+    found, site = written
+    (tmp_path / "sites").mkdir()
+    toml = site.read_text().replace("[bridge]\n", '[bridge]\nbaseline = "then.json"\n')
+    (tmp_path / "sites" / "site.toml").write_text(toml)
+    options = (found, "--site", tmp_path / "sites" / "site.toml", "-o", tmp_path / "r.html")
+    code, out, err = run(capsys, *options)
+    assert (code, out) == (2, "")
+    assert "then.json: no such file" in err
+    (tmp_path / "sites" / "then.json").write_bytes(found.read_bytes())
+    assert run(capsys, *options)[0] == 0
+    assert "unchanged within 1 %" in (tmp_path / "r.html").read_text()
+
+
+def test_what_cannot_be_reported_is_one_line_and_leaves_nothing(
+    capsys: pytest.CaptureFixture[str], written: tuple[Path, Path], tmp_path: Path
+) -> None:
+    found, site = written
+    content = json.loads(found.read_text())
+
+    def changed(name: str, change: dict[str, Any]) -> Path:
+        other = json.loads(json.dumps(content))
+        other["crossings"][0] |= change
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(other))
+        return path
+
+    parameters = {k: v for k, v in content["crossings"][0]["parameters"].items() if k != "EI_7"}
+    with_site = ("--site", site)
+    for arguments, words in (
+        ((found,), "results do not say where their bridge is"),
+        ((tmp_path / "none.json", *with_site), "no such file"),
+        ((site, *with_site), "not a results file"),
+        ((found, *with_site, "-o", tmp_path / "r.txt"), "an HTML file (.html) is expected"),
+        ((found, *with_site, "-o", tmp_path / "no" / "r.html"), "does not exist"),
+        ((found, *with_site, "--baseline", changed("b", {}).with_name("x.json")), "no such file"),
+        ((changed("c", {"parameters": parameters}), *with_site), "has not the 7 elements that"),
+        ((changed("d", {"entry_time": 1e300}), *with_site), "is no time since 1970"),
+        ((changed("e", {"bridge": "b-9"}), *with_site), "has results of b-9, which"),
+    ):
+        out = () if "-o" in arguments else ("-o", tmp_path / "r.html")
+        code, said, err = run(capsys, *arguments, *out)
+        assert (code, said) == (2, ""), words
+        assert words in err.splitlines()[-1]
+        assert not (tmp_path / "r.html").exists()
+
+
+def test_without_a_browser_pdf_says_what_to_do_and_writes_nothing(
+    capsys: pytest.CaptureFixture[str],
+    written: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    found, site = written
+    code, out, err = run(capsys, found, "--site", site, "-o", tmp_path / "r.html", "--pdf")
+    assert (code, out) == (1, "")
+    assert "--pdf needs Chromium, Chrome or Edge, none is installed" in err
+    assert not (tmp_path / "r.html").exists()
+
+
+def test_a_browser_that_prints_nothing_is_a_failure_with_the_page_left(
+    capsys: pytest.CaptureFixture[str],
+    written: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pdf, "find_browser", lambda: "true")
+    found, site = written
+    code, _, err = run(capsys, found, "--site", site, "-o", tmp_path / "r.html", "--pdf")
+    assert code == 1
+    assert "true ended with 0 and printed nothing; the report is in" in err
+    assert (tmp_path / "r.html").exists()
+    assert not (tmp_path / "r.pdf").exists()
+
+
+@pytest.mark.process
+def test_on_paper_a_bridge_of_one_crossing_has_two_pages(
+    capsys: pytest.CaptureFixture[str], written: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """The first page holds all that an owner needs."""
+    try:
+        pdf.find_browser()
+    except Exception as error:
+        pytest.skip(str(error))
+    found, site = written
+    code, out, _ = run(capsys, found, "--site", site, "-o", tmp_path / "r.html", "--pdf")
+    assert code == 0
+    assert out.splitlines()[-1] == str(tmp_path / "r.pdf")
+    printed = (tmp_path / "r.pdf").read_bytes()
+    assert printed.startswith(b"%PDF")
+    assert len(re.findall(rb"/Type\s*/Page\b", printed)) == 2

@@ -1,0 +1,146 @@
+"""Which element is weak, on numbers worked out by hand and on drawn ones."""
+
+import numpy as np
+import pytest
+
+from services.viewer.comparison import Comparison, Estimate, compare, sentences
+
+EDGES_M = np.linspace(0.0, 30.0, 8)
+RATIOS = np.array([1.0, 0.98, 1.01, 0.4, 1.02, 1.0, 0.99])
+NOMINAL = np.full(7, 15e9)
+
+
+def estimate(ratios: np.ndarray, relative: float = 0.03, scale_error: float = 0.0) -> Estimate:
+    mean = ratios * NOMINAL[: ratios.size]
+    factor = np.exp(1.96 * relative)
+    return Estimate(mean, mean / factor, mean * factor, scale_error)
+
+
+def compared(
+    ratios: np.ndarray = RATIOS, baseline: Estimate | None = None, **options: float
+) -> Comparison:
+    edges = np.linspace(0.0, 30.0, ratios.size + 1)
+    found = compare(estimate(ratios, **options), NOMINAL[: ratios.size], edges, baseline)
+    assert found is not None
+    return found
+
+
+def test_a_weak_element_is_named_with_its_place_loss_and_interval() -> None:
+    found = compared()
+    (weak,) = found.weak
+    assert (weak.number, weak.ratio) == (4, pytest.approx(0.4))
+    # 3 % of its own and 1.25 · 3 % / √6 of the middle of the others.
+    half = 1.96 * 0.03 * np.hypot(1.0, 1.25 / np.sqrt(6.0))
+    assert (weak.low, weak.high) == pytest.approx((0.4 * np.exp(-half), 0.4 * np.exp(half)), 1e-3)
+    assert sentences(found) == [
+        "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 57 to 63 %.",
+        "All others agree within 3 %.",
+    ]
+
+
+@pytest.mark.parametrize("guess", [0.5, 0.86, 1.0, 1.3])
+def test_a_wrong_nominal_value_changes_no_comparison(guess: float) -> None:
+    """Nobody knows the nominal value well: 14 % too high is no loss of 14 % everywhere."""
+    found = compared(guess * RATIOS)
+    assert found.level == pytest.approx(guess)
+    assert [e.ratio for e in found.elements] == pytest.approx(
+        [e.ratio for e in compared().elements]
+    )
+    assert compared(np.full(7, guess)).weak == ()
+    assert sentences(compared(np.full(7, guess))) == [
+        "No element stands out: all agree within 1 %."
+    ]
+
+
+def test_what_all_elements_have_in_common_is_no_error_of_a_comparison() -> None:
+    """The scale error is in every interval, and drops out of a ratio of two elements."""
+    own, scale = 0.03, 0.04
+    wide = compared(relative=float(np.hypot(own, scale)), scale_error=scale)
+    (weak,), (exact,) = wide.weak, compared(relative=own).weak
+    assert (weak.low, weak.high) == pytest.approx((exact.low, exact.high), rel=1e-3)
+    (blunt,) = compared(relative=float(np.hypot(own, scale))).weak
+    assert blunt.high - blunt.low > 1.3 * (exact.high - exact.low)
+
+
+def test_a_loss_is_clear_only_if_all_of_its_interval_is() -> None:
+    ratios = np.array([1.0, 1.0, 0.85, 1.0, 1.0])
+    assert [e.number for e in compared(ratios, relative=0.01).weak] == [3]
+    assert compared(ratios, relative=0.05).weak == ()
+    assert "No element stands out: all agree within 15 %." in sentences(
+        compared(ratios, relative=0.05)
+    )
+
+
+def test_the_smallest_loss_that_would_be_clear_is_clear_and_a_smaller_one_is_not() -> None:
+    sound = compared(np.ones(7))
+    loss = sound.elements[2].visible_loss
+    assert 0.1 < loss < 0.25
+    for factor, is_clear in ((1.02, True), (0.98, False)):
+        ratios = np.ones(7)
+        ratios[2] = 1.0 - factor * loss
+        assert compared(ratios).elements[2].is_weak == is_clear
+
+
+def test_a_baseline_is_compared_with_and_its_errors_count() -> None:
+    """Every element is 30 % less stiff: the others would not show it."""
+    now = 0.7 * np.ones(7)
+    baseline = estimate(np.ones(7), relative=0.02)
+    found = compared(now, baseline)
+    assert len(found.weak) == 7
+    first = found.elements[0]
+    half = 1.96 * np.hypot(0.03, 0.02)
+    assert first.high == pytest.approx(0.7 * np.exp(half), rel=1e-3)
+    assert "than the baseline" in sentences(found)[0]
+    assert compared(now).weak == ()
+    unchanged = sentences(compared(np.array([1.0, 1.04, 0.97]), estimate(np.ones(3))))
+    assert unchanged == ["No element has clearly changed: all are unchanged within 4 %."]
+
+
+def test_several_weak_elements_come_weakest_first_and_stiffer_ones_are_said() -> None:
+    ratios = np.array([1.0, 0.6, 1.0, 0.3, 1.0, 1.5, 1.0])
+    found = compared(ratios)
+    assert [element.number for element in found.weak] == [4, 2]
+    assert [element.number for element in found.stiff] == [6]
+    said = sentences(found)
+    assert said[0].startswith("Element 4, 12.9 to 17.1 m: 70 % less stiff")
+    assert said[2].startswith("Element 6, 21.4 to 25.7 m: 50 % stiffer than the other elements")
+
+
+def test_bridges_whose_elements_are_not_alike_are_compared_by_their_pattern() -> None:
+    nominal = np.array([10e9, 20e9, 30e9, 20e9, 10e9])
+    mean = 0.9 * nominal
+    mean[2] *= 0.5
+    found = compare(Estimate(mean, 0.95 * mean, 1.05 * mean), nominal, np.linspace(0, 1, 6))
+    assert found is not None
+    assert [element.number for element in found.weak] == [3]
+    assert found.weak[0].ratio == pytest.approx(0.5)
+
+
+def test_where_nothing_can_be_compared_that_is_said() -> None:
+    two = estimate(np.ones(2))
+    assert compare(two, NOMINAL[:2], EDGES_M[:3]) is None
+    assert compare(two, NOMINAL[:2], EDGES_M[:3], two) is not None
+    zero = Estimate(NOMINAL, 0.0 * NOMINAL, NOMINAL)
+    assert compare(zero, NOMINAL, EDGES_M) is None
+    assert compare(estimate(np.ones(7)), NOMINAL, EDGES_M, two) is None  # of another bridge
+    assert sentences(None) == [
+        "The elements cannot be compared with each other, and there is no baseline."
+    ]
+
+
+def test_sound_bridges_are_seldom_accused_and_losses_lie_in_their_intervals() -> None:
+    """1000 drawn bridges of seven elements with errors of 5 % and a scale error of 2 %."""
+    rng = np.random.default_rng(7)
+    held = accused = 0
+    for _ in range(1000):
+        truth = np.ones(7)
+        truth[rng.integers(7)] = 0.6
+        errors = np.exp(0.05 * rng.standard_normal(7) + 0.02 * rng.standard_normal())
+        relative = float(np.hypot(0.05, 0.02))
+        found = compared(0.9 * truth * errors, relative=relative, scale_error=0.02)
+        weak = int(np.argmin(truth))
+        element = found.elements[weak]
+        held += element.low <= 0.6 <= element.high
+        accused += any(e.is_weak for e in found.elements if e.number != weak + 1)
+    assert 930 <= held <= 985  # 95 %, and six standard deviations less for what is approximate
+    assert accused <= 5

@@ -1,0 +1,100 @@
+"""The Rerun file shows a bridge first, and what is doubtful is seen to be."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from rerun.chunk import Chunk, RrdReader
+
+from schemas.results import results_json
+from schemas.site import Site
+from schemas.site_file import load_site, site_toml
+from services.recordings.writer import write_recording
+from services.viewer.crossing_view import CrossingView, view_of_crossing
+from services.viewer.layout import crossing_root, tab_name
+from services.viewer.rerun_file import verdict_markdown
+from services.viewer.strip import rigidity_strip
+from services.viewer.view import convert
+from tests.unit.drives.recorded import drive
+from tests.unit.viewer.found import results_of, some_crossing
+
+
+@pytest.fixture
+def site(project: Path) -> Site:
+    return load_site(project / "docs/site.example.toml")
+
+
+def converted(folder: Path, site: Site, verdict: str) -> dict[str, Chunk]:
+    """What `driveby view` draws of results, with a recording beside them."""
+    reasons = () if verdict == "good" else ("position_outage",)
+    found = results_of(site, some_crossing("a", verdict=verdict, reasons=reasons), used="a")
+    (folder / "found.json").write_text(results_json(found))
+    write_recording(folder / "r.mcap", drive(), site_toml=site_toml(site), reason="test")
+    convert(folder / "found.json", folder / "found.rrd")
+    chunks = RrdReader(folder / "found.rrd").stream().to_chunks()
+    return {chunk.entity_path: chunk for chunk in chunks}
+
+
+def value(chunk: Chunk, component: str) -> object:
+    batch = chunk.to_record_batch()
+    column = next(name for name in batch.schema.names if name.endswith(f":{component}"))
+    return batch.column(column).to_pylist()[0]
+
+
+def view_of(site: Site, verdict: str, **changes: object) -> CrossingView:
+    reasons = () if verdict == "good" else ("position_outage",)
+    found = results_of(site, some_crossing("a", verdict=verdict, reasons=reasons))
+    return view_of_crossing(found.crossings[0], site.bridges[0])._replace(**changes)
+
+
+def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
+    tmp_path: Path, site: Site
+) -> None:
+    found = converted(tmp_path, site, "good")
+    (blob,) = value(found["/bridge/bridge-1/picture"], "blob")  # type: ignore[misc]
+    picture = imread(io.BytesIO(bytes(blob)))
+    assert picture.shape[1] == 1800
+    (text,) = value(found["/bridge/bridge-1/finding"], "text")  # type: ignore[misc]
+    assert "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements" in text
+    assert "Doubtful" not in text
+
+
+def test_a_doubtful_state_and_its_bars_have_no_colour(tmp_path: Path, site: Site) -> None:
+    colours = {}
+    for verdict in ("good", "suspect"):
+        (tmp_path / verdict).mkdir()
+        found = converted(tmp_path / verdict, site, verdict)
+        root = crossing_root(view_of(site, verdict))
+        (colours[verdict],) = value(found[f"/{root}/rigidity"], "color")  # type: ignore[misc]
+        (text,) = value(found["/bridge/bridge-1/finding"], "text")  # type: ignore[misc]
+        assert ("Doubtful" in text) == (verdict == "suspect")
+
+    def spread(packed: int) -> int:
+        channels = [packed >> shift & 255 for shift in (24, 16, 8)]
+        return max(channels) - min(channels)
+
+    assert spread(colours["good"]) > 100
+    assert spread(colours["suspect"]) < 30
+
+
+def test_the_strip_of_a_doubtful_crossing_is_grey(site: Site) -> None:
+    for doubtful, most in ((False, 255), (True, 12)):
+        strip = rigidity_strip(view_of(site, "suspect"), doubtful=doubtful).astype(int)
+        assert (np.ptp(strip, axis=2).max() > 100) != doubtful
+        assert np.ptp(strip, axis=2).max() <= most
+
+
+def test_tabs_tell_crossings_apart(site: Site) -> None:
+    good = view_of(site, "good")
+    assert tab_name(good) == "2026-09-21 14:13 → bridge-1, good"
+    back = view_of(site, "suspect", forward=False, entry_time_s=good.entry_time_s + 60.0)
+    assert tab_name(back) == "2026-09-21 14:14 ← bridge-1, suspect"
+
+
+def test_the_verdict_says_doubt_first_and_the_misfit_once(site: Site) -> None:
+    text = verdict_markdown(view_of(site, "suspect"))
+    assert text.splitlines()[2] == "**Doubtful: to be looked at, not to be relied upon.**"
+    assert text.count("χ²") == 1
+    assert "Doubtful" not in verdict_markdown(view_of(site, "good"))

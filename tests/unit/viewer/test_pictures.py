@@ -1,0 +1,164 @@
+"""Pictures of bridges, of doubtful and of rejected crossings; `identify --figures`."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.patches import Rectangle
+
+from schemas.results import Results
+from schemas.site import Site
+from schemas.site_file import load_site
+from services.cli import main as cli
+from services.viewer.bridge_figure import draw_bridge
+from services.viewer.bridge_view import BridgeView, view_of_bridge
+from services.viewer.crossing_view import view_of_crossing
+from services.viewer.drawing import STYLE
+from services.viewer.figure import draw_crossing
+from services.viewer.pictures import write_pictures
+from tests.unit.viewer.found import results_of, some_crossing
+from tests.unit.words import assert_words_apart, words
+
+
+@pytest.fixture(autouse=True)
+def style() -> Any:
+    with matplotlib.rc_context(STYLE):
+        yield
+
+
+@pytest.fixture(scope="module")
+def site(project: Path) -> Site:
+    return load_site(project / "docs/site.example.toml")
+
+
+def bars(figure: Figure) -> list[Rectangle]:
+    return [patch for container in figure.axes[0].containers for patch in container.patches]
+
+
+def written(figure: Figure) -> str:
+    return "\n".join(text.get_text() for text in words(figure))
+
+
+def bridge_of(site: Site, *crossings: dict[str, Any], used: str | None = None) -> BridgeView:
+    return view_of_bridge(site.bridges[0], results_of(site, *crossings, used=used), None)
+
+
+def luminance(colour: Any) -> float:
+    return float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
+
+
+def test_the_weak_element_stands_out_also_in_grey(site: Site) -> None:
+    figure = draw_bridge(bridge_of(site, some_crossing("a"), used="a"))
+    drawn = bars(figure)
+    grey = [luminance(bar.get_facecolor()) for bar in drawn]
+    assert all(grey[3] < other - 0.15 for n, other in enumerate(grey) if n != 3)
+    assert drawn[3].get_linewidth() > drawn[0].get_linewidth()
+    assert not any(bar.get_hatch() for bar in drawn)
+    text = written(figure)
+    assert "60 % less" in text
+    assert "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements" in text
+    assert_words_apart(figure)
+
+
+def test_what_is_doubtful_looks_doubtful(site: Site) -> None:
+    doubtful = some_crossing("a", verdict="suspect", reasons=("position_outage",))
+    for figure in (
+        draw_bridge(bridge_of(site, doubtful, used="a")),
+        draw_crossing(
+            view_of_crossing(results_of(site, doubtful).crossings[0], site.bridges[0]),
+            element_truth=None,
+            road_truth=None,
+        ),
+    ):
+        assert all(bar.get_hatch() for bar in bars(figure))
+        assert len({bar.get_facecolor() for bar in bars(figure)}) == 1  # none is called weak
+        red, green, blue = to_rgb(bars(figure)[0].get_facecolor())
+        assert red == green == blue
+        assert "doubtful" in written(figure).lower()
+        assert "The receiver gave no position" in written(figure)
+        assert_words_apart(figure)
+
+
+def test_a_rejected_crossing_says_why_and_shows_no_empty_panel(site: Site) -> None:
+    why = ("model_misfit", "not_converged", "implausible_vehicle")
+    crossing = results_of(site, some_crossing("a", verdict="rejected", reasons=why)).crossings[0]
+    figure = draw_crossing(
+        view_of_crossing(crossing, site.bridges[0]), element_truth=None, road_truth=None
+    )
+    assert bars(figure) == []
+    text = written(figure)
+    assert "verdict: rejected" in text
+    for sentence in crossing.reason_texts:
+        assert f"• {sentence}" in text
+    assert "Road profile" not in text
+    assert_words_apart(figure)
+
+
+def test_a_bridge_that_nothing_is_known_of_says_why(site: Site) -> None:
+    rejected = [
+        some_crossing(name, verdict="rejected", reasons=("speed_too_low",)) for name in "abc"
+    ]
+    figure = draw_bridge(bridge_of(site, *rejected))
+    text = written(figure)
+    assert bars(figure) == []
+    assert "No finding: none of 3 crossings could be used." in text
+    assert "• The truck was too slow" in text
+    assert_words_apart(figure)
+
+
+def test_all_crossings_are_listed_and_drawn_with_their_verdict(site: Site) -> None:
+    many = [some_crossing(f"c{n}", entry=n * 86400.0) for n in range(20)]
+    many[3] |= {"verdict": "suspect", "reasons": ["position_outage"]}
+    view = bridge_of(site, *many, used="c19")
+    figure = draw_bridge(view)
+    text = written(figure)
+    assert "… and 8 earlier" in text
+    assert text.count("good, used") == 1
+    labels = {t.get_text() for t in figure.axes[0].get_legend().get_texts()}
+    assert {"good crossing", "suspect crossing"} <= labels
+    assert_words_apart(figure)
+
+
+@pytest.mark.parametrize("name", ["x" * 60, "A 13 / <b>bridge</b> over $\\frac$ \\river"])
+def test_long_and_strange_names_of_an_owner_stand_on_the_page(site: Site, name: str) -> None:
+    view = bridge_of(site, some_crossing("a"), used="a")._replace(owner_id=name)
+    assert_words_apart(draw_bridge(view))
+
+
+def test_pictures_are_written_in_both_forms_the_same_each_time(site: Site, tmp_path: Path) -> None:
+    results = results_of(site, some_crossing("../a b"), used="../a b")
+    first = write_pictures(tmp_path / "one" / "new", results, site)
+    second = write_pictures(tmp_path / "two", results, site)
+    assert [path.name for path in first] == ["-a-b.png", "-a-b.svg", "bridge-1.png", "bridge-1.svg"]
+    assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
+    assert {path.parent for path in first} == {tmp_path / "one" / "new"}
+    assert imread(first[0]).shape[1] == 1800
+    svg = first[1].read_text()
+    assert svg.startswith("<?xml")
+    assert "http://" not in re.sub(r'(xmlns\S*|"-//W3C\S*|"http://www.w3.org\S*)', "", svg)
+
+
+def test_identify_draws_what_it_found(
+    tmp_path: Path, project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording, folder = project / "tests/data/noise_free.mcap", tmp_path / "pictures"
+    options = ("--method", "least-squares", "--figures", str(folder))
+    assert cli.main(["identify", str(recording), *options]) == 0
+    assert f"4 pictures in {folder}" in capsys.readouterr().out
+    assert len(list(folder.iterdir())) == 4
+    (tmp_path / "file").touch()
+    code = cli.main(["identify", str(recording), "--figures", str(tmp_path / "file" / "x")])
+    assert code == 2
+    assert "is a file" in capsys.readouterr().err
+
+
+def test_results_of_a_bridge_without_its_state_are_drawn(site: Site) -> None:
+    results = results_of(site, some_crossing("a"))
+    assert isinstance(results, Results)
+    assert view_of_bridge(site.bridges[0], results, None).estimate is None
