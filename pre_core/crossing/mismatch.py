@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.physics.surface import Footprint, spectra
+from pre_core.physics.surface import Footprint, common_spectrum, spectra
 
 FloatArray = NDArray[np.float64]
 
@@ -52,6 +52,7 @@ class Shapes(NamedTuple):
     """Of d, windowed."""
     leaning: FloatArray
     """Cross spectrum of what the front axle feels with d: (s, g). The rear's is that less d's."""
+    footprints: tuple[Footprint, Footprint]
     road: FloatArray
     """What the front axle feels of a surface of Phi k^3 = 1 m²: (g,), windowed."""
     expected_m: FloatArray
@@ -67,6 +68,32 @@ class Mismatch(NamedTuple):
     speed_m_per_s: float
 
 
+@lru_cache(maxsize=64)
+def common_shapes(front: Footprint, rear: Footprint, wander_m: float) -> FloatArray:
+    """The part (s, g) of the densities of `shapes_of` that runs on tracks so wide have in common.
+
+    Long waves across the road are the same on all tracks, short ones are not: how much is common
+    depends on the wave, and what it is at long ones no run tells.
+    """
+    shapes = shapes_of(front, rear)
+    single = front._replace(offset_m=0.0)
+    aside = single._replace(offset_m=_OFFSET_M)
+    grid = shapes.cycles_per_m.copy()
+    grid[0] = 0.02 * _GRID_CYCLES_PER_M
+    at = np.array([REFERENCE_CYCLES_PER_M])
+    common = []
+    for other in (_unlike(front, rear), aside):
+        whole = spectra(single, other, at)[3][0]
+        common.append(_windowed(common_spectrum(single, other, grid, wander_m) / whole))
+    return np.stack(common)
+
+
+def _unlike(front: Footprint, rear: Footprint) -> Footprint:
+    """The rear axle in the front's line; tyres that are just alike as those nobody has measured."""
+    single, unlike = front._replace(offset_m=0.0), rear._replace(offset_m=0.0)
+    return single._replace(width_m=_WORN * single.width_m) if unlike == single else unlike
+
+
 @lru_cache(maxsize=8)
 def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
     """Of tyres unlike each other, and of one axle beside the other."""
@@ -75,12 +102,9 @@ def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
     grid[0] = 0.02 * _GRID_CYCLES_PER_M  # an offset's spectrum has no limit at zero
     single = front._replace(offset_m=0.0)
     aside = single._replace(offset_m=_OFFSET_M)
-    unlike = rear._replace(offset_m=0.0)
-    if unlike == single:  # as tyres are that nobody has measured
-        unlike = single._replace(width_m=_WORN * single.width_m)
     density, leaning, expected = [], [], []
     for one, other, larger in (
-        (single, unlike, 1.0),
+        (single, _unlike(front, rear), 1.0),
         (single, aside, _LARGE_OFFSET_M / _OFFSET_M),
     ):
         of_front, _, common, difference = spectra(one, other, grid)
@@ -89,8 +113,9 @@ def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
         leaning.append((of_front - common) / at)
         expected.append(at * larger**2)
     grid[0] = 0.0
+    road = _windowed(of_front)
     return Shapes(
-        grid, np.stack(density), np.stack(leaning), _windowed(of_front), np.array(expected)
+        grid, np.stack(density), np.stack(leaning), (front, rear), road, np.array(expected)
     )
 
 

@@ -26,6 +26,7 @@ from pre_core.crossing.posterior import (
     covariance,
     data_rows,
     layout,
+    noise_floor,
     points,
     precision_root,
 )
@@ -50,6 +51,9 @@ _COARSE = ((300.0, 4), (100.0, 4), (30.0, 4))
 _COARSE_ON_TWO_ROADS = (*_COARSE, (10.0, 4))
 """Where roads differ the search begins with their difference as noise, which is told anew after
 every step: with the sensors' alone it would not find its way."""
+NOISY, HOPELESS_NOISE = 2.0, 25.0
+"""From so many times the declared power on, evenly in the body equations' rows, noise is taken for
+what it is; above the second the sensor is another one, or broken."""
 _PLAINLY_DIFFERS = 2000.0
 """Mean square of white rows off the bridge after the coarse steps: of nine measured crossings of
 one road 1 to 6, with twin tyres on the best class of road 200,000."""
@@ -131,6 +135,9 @@ class Optimum(NamedTuple):
     differs: bool = False
     """Whether a search on one road was given up because the axles' roads plainly differ, or ended
     where they seem to."""
+    noise_power: float = 1.0
+    """That of the sensors over what was declared, where it is plainly more: it looks like springs
+    that rub and roads that differ. Up to `HOPELESS_NOISE` it was taken for what it is."""
 
 
 def chi2_per_dof(problem: Problem, y: FloatArray) -> float:
@@ -286,14 +293,17 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
     if found[0].differs:
         ways = (_ON_TWO_ROADS[0], doubting, _ON_TWO_ROADS[1], believing)
     for way in ways:
-        if _is_accepted(found[-1].problem, found[-1].chi2_per_dof):
+        is_hopeless = found[-1].noise_power > HOPELESS_NOISE
+        if is_hopeless or _is_accepted(found[-1].problem, found[-1].chi2_per_dof):
             break
         rubs = found[-1].rubs
         # Springs that rub look like roads that differ until they are doubted.
         if rubs if way.believes else (way == doubting and found[0].differs and not rubs):
             continue
         found.append(_from_places(problem, y, way, report))
-    return min(found, key=lambda one: one.chi2_per_dof)._replace(
+    return min(
+        found, key=lambda one: (one.noise_power <= HOPELESS_NOISE, one.chi2_per_dof)
+    )._replace(
         evaluations=sum(one.evaluations for one in found), starts=sum(one.starts for one in found)
     )
 
@@ -319,6 +329,14 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
         y, _, _, used = _descend(problem, y, whole, temperature, steps, 0.5, is_free=True)
         evaluations += used
         problem = with_noise_at(problem, y, force)
+    power = noise_floor(problem, y)
+    if power > HOPELESS_NOISE:
+        return _nowhere(problem, y, evaluations, 0)._replace(noise_power=power)
+    if power > NOISY:
+        problem = problem._replace(density=problem.density * np.sqrt(power))
+        problem = with_noise_at(problem, y, force)
+    else:
+        power = 1.0
     if not way.differs and _plainly_differs(problem, y):
         return _nowhere(problem, y, evaluations, 0, differs=True)
     report("finding the bridge", 0.2)
@@ -349,7 +367,19 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
     if best is None:
         return _nowhere(problem, y, evaluations, len(tried), rubs=rubs)
     differs = bool(levels_at(best.problem, best.state.y).any())
-    return best._replace(evaluations=evaluations, starts=len(tried), rubs=rubs, differs=differs)
+    return best._replace(
+        evaluations=evaluations,
+        starts=len(tried),
+        rubs=rubs,
+        differs=differs,
+        noise_power=power * max(1.0, _left_noise(best)),
+    )
+
+
+def _left_noise(found: Optimum) -> float:
+    """What `noise_floor` still says at an optimum, 1 if that is not plain."""
+    power = noise_floor(found.problem, found.state.y)
+    return power if power > NOISY else 1.0
 
 
 def _nowhere(

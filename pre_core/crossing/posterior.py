@@ -268,6 +268,16 @@ def belief_in_springs(problem: Problem, y: FloatArray) -> float:
     return whitening.belief_in_springs(problem.rows, truck, density, problem.force)
 
 
+def noise_floor(problem: Problem, y: FloatArray) -> float:
+    """So many times its declared power the sensors' noise has, by the truck at y (size,)."""
+    at = points(problem, y[None, :])
+    crossing = problem.crossing
+    wheelbase = float(at.wheelbase_m[0])
+    truck = truck_of(at.theta[0], crossing.total_mass_kg, wheelbase, crossing.is_inertial)
+    density = problem.density * (1.0 + at.gain[0])
+    return whitening.noise_floor(problem.rows, truck, density, filtered_rows(problem, y)[1:])
+
+
 def all_rows(problem: Problem, y: FloatArray, temperature: float = 1.0) -> FloatArray:
     """Rows of data, receiver and priors: their squares sum to -2 log posterior + constant.
 

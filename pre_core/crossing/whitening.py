@@ -69,6 +69,12 @@ _FORCE_MEMORY_S = 0.3
 """Its covariance ends here, which is what makes the bumps as wide as they are."""
 _FORCE_PASSES = 200
 """Rounds of the multiplicative fit of the spectrum, a fixed number."""
+_MIDDLE_BAND, _TOP_BAND = (0.22, 0.54), (0.65, 0.757)
+"""Of half the rows' rate: 12 to 30 and 36 to 42 Hz of sensors of 250 Hz and more."""
+_EVENLY = 3.0
+"""Noise of two to ten times the declared density has up to 1.6 times as much in the middle as at
+the top before the truck is found; springs that rub, bilinear dampers and roads that differ 4 to
+100 times."""
 _BELIEVED_HZ = 30.0
 """Up to which springs are asked whether they are believed."""
 DOUBTED, DOUBTED_OF_A_MISFIT = 60.0, 15.0
@@ -435,19 +441,7 @@ def force_noise(
     whose springs are as linear as its sensors can tell has none: one that gains no more than
     `enough`.
     """
-    m = body.shape[1]
-    window = np.hanning(m)
-    apart = rows.every * rows.step_s
-    shown = np.abs(np.fft.rfft(body * window, axis=1)[:, 1:]) ** 2
-    shown *= 2.0 * apart / np.sum(window**2)
-    omega = np.asarray(2.0 * np.pi * np.fft.rfftfreq(m, apart)[1:], dtype=np.float64)
-    shapes = np.zeros((FORCE_SHAPES, omega.size))
-    sensors = np.zeros((2, omega.size))
-    interval = (rows.omega[1] - rows.omega[0]) / (2.0 * np.pi)
-    for at in (omega, 4.0 * np.pi * (0.5 / apart) - omega):  # what is above half the rate folds
-        power = np.interp(at, rows.omega, rows.power) / interval
-        sensors += _of_body(truck, density, linear_springs(), at) * power
-        shapes += _force_shapes(at) * at**4 * power
+    _, shown, sensors, shapes = _body_periodogram(rows, truck, density, body)
     over = body_divisors(truck)
     levels = linear_springs()
     for axle in range(2):
@@ -463,6 +457,46 @@ def force_noise(
         if 0.5 * gain > enough:
             levels[axle] = level
     return levels
+
+
+def _body_periodogram(
+    rows: RowFilter, truck: Truck, density: FloatArray, body: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Frequencies (f,) of the body equations' rows (2, m), and what is there.
+
+    Their periodogram (2, f), what the sensors' noise makes of it (2, f), and each shape of force
+    noise (shapes, f).
+    """
+    m = body.shape[1]
+    window = np.hanning(m)
+    apart = rows.every * rows.step_s
+    shown = np.abs(np.fft.rfft(body * window, axis=1)[:, 1:]) ** 2
+    shown *= 2.0 * apart / np.sum(window**2)
+    omega = np.asarray(2.0 * np.pi * np.fft.rfftfreq(m, apart)[1:], dtype=np.float64)
+    shapes = np.zeros((FORCE_SHAPES, omega.size))
+    sensors = np.zeros((2, omega.size))
+    interval = (rows.omega[1] - rows.omega[0]) / (2.0 * np.pi)
+    for at in (omega, 4.0 * np.pi * (0.5 / apart) - omega):  # what is above half the rate folds
+        power = np.interp(at, rows.omega, rows.power) / interval
+        sensors += _of_body(truck, density, linear_springs(), at) * power
+        shapes += _force_shapes(at) * at**4 * power
+    return omega, shown, sensors, shapes
+
+
+def noise_floor(rows: RowFilter, truck: Truck, density: FloatArray, body: FloatArray) -> float:
+    """So many times the sensors' declared power the body equations' rows (2, m) have, if evenly.
+
+    The lesser of both axles, in the highest band of the rows, where nothing but noise is; one where
+    lower frequencies have more than `_EVENLY` times that, as what springs or a wrong truck leave.
+    """
+    omega, shown, sensors, _ = _body_periodogram(rows, truck, density, body)
+    share = omega * (rows.every * rows.step_s / np.pi)
+    ratio = shown / sensors
+    low, top = (
+        np.median(ratio[:, (share > begin) & (share < end)], axis=1) / np.log(2.0)
+        for begin, end in (_MIDDLE_BAND, _TOP_BAND)
+    )
+    return float(top.min()) if np.all(low < _EVENLY * top) else 1.0
 
 
 def belief_in_springs(

@@ -77,6 +77,23 @@ def spectra(front: Footprint, rear: Footprint, n: FloatArray) -> tuple[FloatArra
     )
 
 
+def common_spectrum(
+    front: Footprint, rear: Footprint, n: FloatArray, wander_m: float
+) -> FloatArray:
+    """What the difference of `spectra` has in common in two runs: one-sided cross spectrum (f,).
+
+    The track of each run lies beside the line by a normal of standard deviation `wander_m`, so that
+    two are apart by sqrt(2) of it: waves across the road are multiplied by exp(-(2 pi n_y w)²).
+    """
+    longest = np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)
+    t = np.linspace(-longest, longest, _FINE + 1)
+    n_y, weight = _SCALE * np.sinh(t), _SCALE * np.cosh(t) * (t[1] - t[0])
+    n_x = np.asarray(n)[:, None]
+    density = weight * (n_x**2 + n_y**2) ** -1.5 * np.exp(-((2.0 * np.pi * n_y * wander_m) ** 2))
+    difference = response(front, n_x, n_y) - response(rear, n_x, n_y)
+    return np.asarray(np.sum(density * np.abs(difference) ** 2, axis=1))
+
+
 class Surface(NamedTuple):
     """A stretch of random road as its waves: `amplitude` (along, across), complex, in m."""
 

@@ -182,6 +182,19 @@ def identify_pre(
 ) -> results.Crossing:
     """The posterior of one crossing as a result; a fit that explains nothing is rejected."""
     found = optimum.find_optimum(inputs_of(data, settings, acceleration, start_s), report)
+    if found.noise_power > optimum.HOPELESS_NOISE:
+        return rejected(
+            data,
+            settings,
+            passing,
+            [Reason.NOISE_ABOVE_DECLARED],
+            chi2_per_dof=found.noise_power,
+            diagnostics={
+                "iterations": float(found.evaluations),
+                "starts": float(found.starts),
+                "seconds": elapsed(),
+            },
+        )
     if found.ending is Ending.NOT_FINITE:
         return rejected(data, settings, passing, [Reason.NOT_FINITE])
     problem, y = found.problem, found.state.y
@@ -193,6 +206,8 @@ def identify_pre(
     reasons = reasons_after_fit(data, _fit(data, found))
     if found.ending is not Ending.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
+    if found.noise_power > 1.0 and Reason.NOISE_ABOVE_DECLARED not in reasons:
+        reasons.insert(0, Reason.NOISE_ABOVE_DECLARED)
     usable = _LARGEST_CHI2 if Reason.NOISE_ABOVE_DECLARED in reasons else _USABLE_CHI2
     if found.chi2_per_dof > usable:
         diagnostics["seconds"] = elapsed()
@@ -222,7 +237,7 @@ def identify_pre(
         **header(data, settings, passing),
         verdict="suspect" if reasons else "good",
         reasons=tuple(dict.fromkeys(reasons)),
-        chi2_per_dof=found.chi2_per_dof,
+        chi2_per_dof=found.chi2_per_dof * found.noise_power,
         diagnostics=diagnostics,
         **values,
     )

@@ -1,9 +1,10 @@
 """Bridges and trucks as they are: crossings of a simulator that shares no code with ours.
 
-Bearings that sink, a bridge that swings under damped tyres, leaf springs, two spans. What each must
-give: an answer, `good`, every EI within five standard deviations of the truth and nearly all within
-their 95 % intervals, standard deviations that say something, and the cause found where there is a
-number for it. truth.json is read to judge, only.
+Bearings that sink, a bridge that swings under damped tyres, leaf springs, two spans, roads that
+differ under the axles, and all of it at once. What each must give: an answer, `good`, every EI
+within five standard deviations of the truth and nearly all within their 95 % intervals, standard
+deviations that say something, and the cause found where there is a number for it. truth.json is
+read to judge, only.
 """
 
 import json
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from schemas.results import Crossing
+from schemas.results import Crossing, resolution
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
 from services.drives.csv_import import read_folder
@@ -26,6 +27,7 @@ FARTHEST = 5.0
 
 
 class Judged(NamedTuple):
+    folder: Path
     result: Crossing
     truth: dict[str, Any]
     z: NDArray[np.float64]
@@ -44,7 +46,7 @@ def judged(folder: Path, run: int) -> Judged:
     found = [values[f"EI_{e + 1}"] for e in range(true.size)]
     mean, std = np.array([p.mean for p in found]), np.array([p.std for p in found])
     covered = [p.q025 <= t <= p.q975 for p, t in zip(found, true, strict=True)]
-    return Judged(seen.result, truth, (mean - true) / std, np.array(covered), std / true)
+    return Judged(folder, seen.result, truth, (mean - true) / std, np.array(covered), std / true)
 
 
 def check(found: Judged, median_std: float) -> None:
@@ -96,3 +98,52 @@ def test_two_spans(shared: Path) -> None:
     assert found.result.derived is not None
     assert found.result.derived.springs_believed is not None
     assert found.result.derived.springs_believed > 0.5
+
+
+MOST_EVALUATIONS = 2 * 11_317
+"""Of a crossing on such a road: twice what the sample took before roads could differ."""
+
+
+def check_on_two_roads(found: Judged) -> None:
+    """Wide and true: the level to a tenth or so, single elements hardly."""
+    result = found.result
+    assert np.abs(found.z).max() < FARTHEST
+    assert found.is_covered.sum() >= found.is_covered.size - 1
+    assert 0.2 < np.median(found.relative_std) < 0.9  # the prior's is 0.6 of what is believed
+    assert result.derived is not None
+    assert result.derived.ei_level is not None
+    level = result.derived.ei_level
+    assert 0.05 < level.std / level.mean < 0.2
+    truth = float(np.exp(np.mean(np.log(found.truth["EI"]))))
+    nominal = load_site(found.folder / "site.toml").bridges[0].nominal_flexural_rigidity_nm2[0]
+    assert abs(level.mean - truth / nominal) < 3.0 * level.std
+    words = resolution(result)
+    assert words is not None
+    assert "not resolved" in words
+    assert result.road is not None
+    assert result.road.mismatch is not None
+    assert 1.3e-8 < result.road.mismatch.A_m3 < 5.5e-8  # 2.8e-8 by the integral over the surface
+    evaluations = result.diagnostics["iterations"] + result.diagnostics["chain_evaluations"]
+    assert evaluations < MOST_EVALUATIONS
+
+
+RUNS_OF_D8 = [
+    pytest.param(run, marks=() if run in (3, 8) else pytest.mark.slow) for run in range(12)
+]
+
+
+@pytest.mark.parametrize("run", RUNS_OF_D8)
+def test_a_road_that_differs_from_axle_to_axle(shared: Path, run: int) -> None:
+    found = judged(shared / "crossings" / "d8_real_road_12_runs", run)
+    assert found.result.verdict == "good", found.result.reasons
+    check_on_two_roads(found)
+    assert found.result.chi2_per_dof == pytest.approx(1.0, abs=0.15)
+
+
+RUNS_OF_D9 = [pytest.param(run, marks=() if run == 1 else pytest.mark.slow) for run in range(16)]
+
+
+@pytest.mark.parametrize("run", RUNS_OF_D9)
+def test_everything_at_once(shared: Path, run: int) -> None:
+    found = judged(shared / "crossings" / "d9_everything_16_runs", run)
+    check_on_two_roads(found)

@@ -22,7 +22,9 @@ def crossing(**vehicle: Any) -> CrossingData:
 def fit(white: Floats, **changes: Any) -> Fit:
     place = np.linspace(-15.0, 40.0, white.shape[0])
     chi2 = float(np.mean(white**2))
-    return Fit(white, STEP_S, place, chi2, {"c_s1": 0.3}, 0.1, np.full(7, 0.05))._replace(**changes)
+    return Fit(
+        white, STEP_S, place, chi2, {"c_s1": 0.3}, 0.1, np.full(7, 0.05), False, 50.0
+    )._replace(**changes)
 
 
 def normals(seed: int = 0) -> Floats:
@@ -162,3 +164,16 @@ def test_excess_is_a_standard_normal(size: int) -> None:
     assert abs(z.mean()) < 0.03
     assert z.std() == pytest.approx(1.0, abs=0.03)
     assert np.mean(z > 3.0) < 0.003
+
+
+def test_a_short_approach_is_named_where_the_roads_seem_to_differ() -> None:
+    data = crossing()
+    white = np.random.default_rng(3).standard_normal((ROWS, 3))
+    for changes, named in (
+        ({"off_bridge_m": 11.0, "has_two_roads": True}, True),
+        ({"off_bridge_m": 13.0, "has_two_roads": True}, False),
+        ({"off_bridge_m": 11.0}, False),
+        ({"off_bridge_m": 11.0, "chi2_per_dof": 1.5}, True),
+    ):
+        reasons = reasons_after_fit(data, fit(white, **changes))
+        assert (Reason.APPROACH_TOO_SHORT in reasons) is named

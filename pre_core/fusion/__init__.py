@@ -1,0 +1,1 @@
+"""What several crossings of one bridge say together."""
