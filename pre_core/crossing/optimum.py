@@ -69,6 +69,9 @@ most, wrong ones at 10 to 70."""
 _MOST_ROUNDS, _ROUNDS_ON_THE_WAY, _STEPS_OF_A_ROUND = 6, 2, 4
 """Fits and levels of noise that the rows tell take turns at most so often, on the way so often; and
 the steps of each where the roads differ."""
+_ENOUGH_ON_TWO_ROADS = 0.5
+"""A gain in the sum of squares that is not worth another step there: what is left to find is far
+within the width of what is hardly known."""
 _UNTOLD = 0.3
 """Of what a data sheet leaves open: a direction that is not known better tells nothing."""
 _SAME_LEVEL = 0.1
@@ -91,6 +94,8 @@ _ACCEPTED_Z, _ACCEPTED_EXCESS = 3.0, 0.05
 """A minimum is taken for the right one if chi2 is no further above one than chance (so many
 standard deviations) and what the noise model leaves out explain."""
 
+_EXCESS_ON_TWO_ROADS = 0.25
+"""Where roads differ: how much by is read off a few waves, and chi2 is as uncertain as that."""
 _HOPELESS_CHI2 = (1000.0, 25.0)
 """Above the first after one place is freed, above the second after more, no other place is tried.
 Of 70 drawn sound crossings the first place was the right one in all; another one never brought a
@@ -311,7 +316,8 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
 def _is_accepted(problem: Problem, chi2: float) -> bool:
     """Whether a minimum of this chi2 is taken for the right one."""
     judged = problem.noise.reciprocal.size // _every_judged(problem)
-    return chi2 < 1.0 + _ACCEPTED_EXCESS + _ACCEPTED_Z * float(np.sqrt(2.0 / judged))
+    excess = _EXCESS_ON_TWO_ROADS if problem.mismatch.level_m3.any() else _ACCEPTED_EXCESS
+    return chi2 < 1.0 + excess + _ACCEPTED_Z * float(np.sqrt(2.0 / judged))
 
 
 def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> Optimum:
@@ -492,9 +498,9 @@ def _in_rounds(
     evaluations = 0
     for _ in range(rounds):
         differs = bool(problem.mismatch.level_m3.any())
-        most = _STEPS_OF_A_ROUND if differs else steps
+        most, little = (_STEPS_OF_A_ROUND, _ENOUGH_ON_TWO_ROADS) if differs else (steps, enough)
         y, state, ending, used = _descend(
-            problem, y, directions, temperature, most, enough, is_free=is_free
+            problem, y, directions, temperature, most, little, is_free=is_free
         )
         evaluations += used
         if not (differs or problem.force.any()):
@@ -506,7 +512,7 @@ def _in_rounds(
         problem = after
     if ending is not Ending.CONVERGED and problem.mismatch.level_m3.any():
         y, _, ending, used = _descend(
-            problem, y, directions, temperature, steps, enough, is_free=is_free
+            problem, y, directions, temperature, steps, _ENOUGH_ON_TWO_ROADS, is_free=is_free
         )
         evaluations += used
     return problem, y, ending, evaluations

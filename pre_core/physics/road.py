@@ -96,19 +96,27 @@ def under_wheels(profile: Profile, motion: Motion, wheelbase_m: float, direction
 
     Raises ValueError if the profile does not reach under both wheels all the way.
     """
-    wheels = np.stack(
-        [motion.position_m, rear_position_m(motion.position_m, wheelbase_m, direction)], axis=1
-    )
-    tolerance = 1e-9
-    if wheels.min() < profile.x_m[0] - tolerance or wheels.max() > profile.x_m[-1] + tolerance:
-        raise ValueError(
-            f"the road from {profile.x_m[0]:.2f} m to {profile.x_m[-1]:.2f} m does not reach under "
-            f"the wheels, which drive from {wheels.min():.2f} m to {wheels.max():.2f} m"
-        )
-    spline = CubicSpline(profile.x_m, profile.height_m)
+    return under_axles(profile, profile, motion, wheelbase_m, direction)
+
+
+def under_axles(
+    front: Profile, rear: Profile, motion: Motion, wheelbase_m: float, direction: int
+) -> WheelRoad:
+    """The same where each axle has a profile of its own."""
+    behind_m = rear_position_m(motion.position_m, wheelbase_m, direction)
+    heights, slopes = [], []
+    for profile, wheel in ((front, motion.position_m), (rear, behind_m)):
+        tolerance = 1e-9
+        if wheel.min() < profile.x_m[0] - tolerance or wheel.max() > profile.x_m[-1] + tolerance:
+            raise ValueError(
+                f"the road from {profile.x_m[0]:.2f} m to {profile.x_m[-1]:.2f} m does not reach "
+                f"under the wheels, which drive from {wheel.min():.2f} m to {wheel.max():.2f} m"
+            )
+        spline = CubicSpline(profile.x_m, profile.height_m)
+        heights.append(spline(wheel))
+        slopes.append(spline(wheel, 1))
     return WheelRoad(
-        np.asarray(spline(wheels)),
-        np.asarray(spline(wheels, 1)) * motion.speed_m_per_s[:, None],
+        np.stack(heights, axis=1), np.stack(slopes, axis=1) * motion.speed_m_per_s[:, None]
     )
 
 

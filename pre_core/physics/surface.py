@@ -123,18 +123,20 @@ def random_surface(
     edges = _SCALE * np.sinh(np.linspace(-longest, longest, _ACROSS + 1))
     n_y = 0.5 * (edges[1:] + edges[:-1])
     # The density's integral over each strip of n_y, exactly: that of k^-3 is n_y/(n_x^2 k).
-    at_edge = edges / np.hypot(n_x[:, None], edges)
-    power = surface_density(road_class) * np.diff(at_edge, axis=1) / n_x[:, None] ** 2 * step
-    noise = rng.standard_normal((2, n_x.size, n_y.size))
-    amplitude = np.sqrt(power) * (noise[0] + 1j * noise[1])
+    power = np.diff(edges / np.hypot(n_x[:, None], edges), axis=1)
+    power *= surface_density(road_class) * step / n_x[:, None] ** 2
+    # In place: of half a kilometre these are a hundred megabytes each.
+    amplitude = np.empty(power.shape, dtype=np.complex128)
+    rng.standard_normal(out=amplitude.view(np.float64))
+    amplitude *= np.sqrt(power, out=power)
     return Surface(start_m, spacing_m, count, n_x, n_y, amplitude)
 
 
 def felt_by(surface: Surface, axle: Footprint, beside_m: float = 0.0) -> Profile:
     """The profile that an axle feels whose truck drives `beside_m` to the left of the line."""
     moved = axle._replace(offset_m=axle.offset_m + beside_m)
-    along = response(moved, surface.n_x[:, None], surface.n_y[None, :]) * surface.amplitude
-    wave = along.sum(axis=1)
+    across = response(moved, np.zeros(1), surface.n_y)
+    wave = np.sinc(axle.length_m * surface.n_x) * (surface.amplitude @ across)
     x = surface.start_m + surface.spacing_m * np.arange(surface.samples, dtype=np.float64)
     step = surface.n_x[1] - surface.n_x[0]
     period = round(1.0 / (step * surface.spacing_m))

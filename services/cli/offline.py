@@ -17,7 +17,9 @@ from services.cli.parsing import (
     number,
     numbers,
     scenario,
+    whole,
 )
+from services.common.errors import InputError
 
 
 def _ratios(text: str) -> tuple[float, ...]:
@@ -86,8 +88,59 @@ def add_simulate(commands: Any) -> None:
         metavar="HZ",
         help="sampling rate (default: the site's, or 1000)",
     )
+    _add_surface(p.add_argument_group("several runs, and a road that is a surface"))
     _add_beyond(p.add_argument_group("beyond what a site file tells (default: nothing)"))
     add_output(p)
+
+
+def _add_surface(p: Any) -> None:
+    p.add_argument(
+        "--runs",
+        type=whole("a number of runs", 1, 100),
+        default=1,
+        help="over the same road, ten minutes apart, in one recording (default: 1)",
+    )
+    p.add_argument(
+        "--drive-seed",
+        type=whole("a seed", 0),
+        metavar="SEED",
+        help="of noise and of the place across the lane (default: --seed, which is the road's)",
+    )
+    p.add_argument(
+        "--road-surface",
+        action="store_true",
+        help="the road is rough across too, so that the axles feel different roads "
+        "(default: one groove under both)",
+    )
+    p.add_argument(
+        "--tyres",
+        choices=("single", "twin"),
+        help="of the rear axle, on a surface (default: the site's, or twin)",
+    )
+    p.add_argument(
+        "--rear-offset",
+        type=number("an offset in m", low=-1, high=1),
+        metavar="M",
+        help="the rear axle runs so far beside the front, on a surface "
+        "(default: the site's, or 0.005)",
+    )
+    p.add_argument(
+        "--wander",
+        type=number("a standard deviation in m", low=0, high=2),
+        metavar="M",
+        help="of the truck's place across the lane from run to run, on a surface (default: 0)",
+    )
+
+
+def _on_surface(options: argparse.Namespace) -> Any:
+    from services.simulation.wheel_paths import OnSurface
+
+    if options.road_surface:
+        return OnSurface(options.tyres, options.rear_offset, options.wander or 0.0)
+    for name in ("tyres", "rear_offset", "wander"):
+        if getattr(options, name) is not None:
+            raise InputError(f"--{name.replace('_', '-')}: only a --road-surface has it")
+    return None
 
 
 def _add_beyond(p: Any) -> None:
@@ -169,6 +222,9 @@ def _simulate(options: argparse.Namespace) -> int:
             options.bilinear,
             options.air_springs,
         ),
+        surface=_on_surface(options),
+        runs=options.runs,
+        drive_seed=options.drive_seed,
         output=options.output,
         force=options.force,
         console=a_console(),

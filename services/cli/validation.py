@@ -34,6 +34,7 @@ EFFECTS: Final = (
     "bilinear",
     "air",
     "spans",
+    "surface",
     "everything",
 )
 """As in `simulation.worlds`, which is not imported for a line of help."""

@@ -47,6 +47,7 @@ from services.simulation.drive import (
     measured_run,
     paper_site,
 )
+from services.simulation.wheel_paths import WheelPaths
 
 Floats = NDArray[np.float64]
 
@@ -112,6 +113,8 @@ class Truth(NamedTuple):
     conditions: Conditions
     left: Left | None = None
     """What was on the bridge before."""
+    paths: WheelPaths | None = None
+    """Where the wheels run on a road that is a surface; None: both axles feel one groove."""
 
 
 class Drawn(NamedTuple):
@@ -126,6 +129,7 @@ class Drawn(NamedTuple):
     """Time of the first position of `motion` on the clock of `run`."""
     step_s: float
     road: Profile
+    """As the tyres felt it; on a surface, those in front."""
     largest_deflection_m: float
 
 
@@ -274,7 +278,7 @@ def drive(site: Site, truth: Truth, seed: int) -> Drawn:
         speed_noise_m_per_s=site.receiver.speed_noise_m_per_s,
         latency_s=truth.latency_s,
     )
-    run, road, happened = measured_run(
+    run, roads, happened = measured_run(
         bridge,
         truth.car,
         truth.beam,
@@ -287,6 +291,7 @@ def drive(site: Site, truth: Truth, seed: int) -> Drawn:
         np.random.default_rng(np.random.SeedSequence([seed, 0x6E])),
         antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
         left=truth.left,
+        paths=truth.paths,
     )
     return Drawn(
         truth,
@@ -295,7 +300,7 @@ def drive(site: Site, truth: Truth, seed: int) -> Drawn:
         motion,
         float(run.accel_time_s[0]) - settling * step_s,
         step_s,
-        road,
+        roads.front,
         float(-happened.wheel_deflection_m.min()),
     )
 

@@ -23,7 +23,7 @@ from pre_core.physics.bridge import (
     uniform_beam,
 )
 from pre_core.physics.passing import state_after
-from pre_core.physics.road import Profile, contact_patch_average, iso_8608_profile, under_wheels
+from pre_core.physics.road import Profile, contact_patch_average, iso_8608_profile, under_axles
 from pre_core.physics.sensors import (
     Accelerometer,
     Receiver,
@@ -45,6 +45,13 @@ from services.common.files import check_writable
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.recordings.writer import write_recording
+from services.simulation.wheel_paths import (
+    AxleRoads,
+    OnSurface,
+    WheelPaths,
+    roads_of_surface,
+    wheel_paths_of,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -67,6 +74,8 @@ _FIX_RATE_HZ = 10.0
 SLOW_ERROR_S = 300.0
 """A receiver's slow error is forgotten within minutes: a crossing sees it as almost constant."""
 _ALTITUDE_M = 25.0
+BETWEEN_RUNS_S = 600.0
+"""From the beginning of a run to that of the next."""
 
 
 class Left(NamedTuple):
@@ -100,9 +109,11 @@ class Drive(NamedTuple):
 
     run: Run
     road: Profile
-    """As the tyres felt it."""
+    """As the tyres felt it; on a surface, those in front."""
     rigidity_ratios: Floats
     """EI of each element over the site's nominal value."""
+    rear_road: Profile | None = None
+    """As the rear tyres felt it, on a surface."""
 
 
 def paper_site() -> Site:
@@ -124,32 +135,44 @@ def simulate_command(
     gps_noise: bool,
     rate: float | None,
     beyond: Beyond = NOTHING,
+    surface: OnSurface | None = None,
+    runs: int = 1,
+    drive_seed: int | None = None,
     output: Path,
     force: bool = False,
     console: "Console",
 ) -> int:
-    """Write the recording of one simulated crossing."""
+    """Write the recording of one simulated crossing, or of several over the same road."""
     check_writable(output, force=force)
     known = paper_site() if site is None else load_site(site)
     ratios = ratios_of(known.bridges[0], scenario, ei)
+    paths = None if surface is None else wheel_paths_of(known.vehicles[0], surface)
+    of_noise = seed if drive_seed is None else drive_seed
     with console.status("simulating", spinner="dots"):
-        drive = simulate_drive(
-            known,
-            ratios,
-            road_class=road,
-            seed=seed,
-            noise_ug_per_rthz=noise,
-            speed_m_per_s=speed,
-            forward=direction == "start_to_end",
-            receiver_errors=gps_noise,
-            rate_hz=rate,
-            beyond=beyond,
-        )
-        messages = write_drive(
-            output, drive, declared(known, noise, drive.run.rate_hz), force=force
-        )
-    seconds = drive.run.accel_time_s[-1] - drive.run.accel_time_s[0]
-    console.print(f"{output}: {seconds:.1f} s, {messages} messages", highlight=False)
+        drives = [
+            simulate_drive(
+                known,
+                ratios,
+                road_class=road,
+                seed=seed,
+                noise_ug_per_rthz=noise,
+                speed_m_per_s=speed,
+                forward=direction == "start_to_end",
+                receiver_errors=gps_noise,
+                rate_hz=rate,
+                beyond=beyond,
+                paths=paths,
+                drive_seed=(of_noise, number) if number else of_noise,
+            )
+            for number in range(runs)
+        ]
+        site_of_sensors = declared(known, noise, drives[0].run.rate_hz)
+        messages = write_drives(output, drives, site_of_sensors, force=force)
+    times = drives[0].run.accel_time_s
+    passages = "" if runs == 1 else f"{runs} runs of "
+    console.print(
+        f"{output}: {passages}{times[-1] - times[0]:.1f} s, {messages} messages", highlight=False
+    )
     return 0
 
 
@@ -171,10 +194,28 @@ def write_drive(
     path: Path, drive: Drive, site: Site, realm: str = "sim-drive", *, force: bool = False
 ) -> int:
     """Write the recording that the truck would have made, with the site in it."""
-    messages = run_to_messages([drive.run], site, realm, site.vehicles[0].id)
+    return write_drives(path, [drive], site, realm, force=force)
+
+
+def write_drives(
+    path: Path,
+    drives: Sequence[Drive],
+    site: Site,
+    realm: str = "sim-drive",
+    *,
+    force: bool = False,
+) -> int:
+    """Write the recording of drives one after the other, ten minutes apart."""
+    runs = [_later(drive.run, number * BETWEEN_RUNS_S) for number, drive in enumerate(drives)]
+    messages = run_to_messages(runs, site, realm, site.vehicles[0].id)
     return write_recording(
         path, messages, site_toml=site_toml(site), reason="simulation complete", force=force
     )
+
+
+def _later(run: Run, seconds: float) -> Run:
+    gnss = run.gnss._replace(time_s=run.gnss.time_s + seconds)
+    return run._replace(accel_time_s=run.accel_time_s + seconds, gnss=gnss)
 
 
 def simulate_drive(
@@ -189,11 +230,15 @@ def simulate_drive(
     receiver_errors: bool = False,
     rate_hz: float | None = None,
     beyond: Beyond = NOTHING,
+    paths: WheelPaths | None = None,
+    drive_seed: int | tuple[int, ...] | None = None,
 ) -> Drive:
     """Drive the site's first truck over its first bridge.
 
     The speed changes evenly from the first to the second value between 3 s before the entry and the
-    end. FailureError if the coupled simulation does not settle.
+    end. With `paths` the road is a surface; `drive_seed` is that of noise and of the truck's place
+    across the lane where it is another one than the road's. FailureError if the coupled simulation
+    does not settle.
     """
     vehicle, bridge = site.vehicles[0], site.bridges[0]
     car, beam = with_beyond(truck_of(vehicle), beam_of(bridge, rigidity_ratios), beyond)
@@ -214,7 +259,7 @@ def simulate_drive(
     start = -approach if forward else bridge.span_m + approach
     motion = constant_acceleration(start, sign * first_speed, acceleration, steps, step_s)
     sensor = Accelerometer(rate, noise_density_ug_per_rthz=noise_ug_per_rthz)
-    run, road = measured_run(
+    run, roads = measured_run(
         bridge,
         car,
         beam,
@@ -224,11 +269,13 @@ def simulate_drive(
         (road_class, seed),
         (sensor,) * len(CHANNELS),
         _receiver(site, perfect=not receiver_errors),
-        np.random.default_rng(seed),
+        np.random.default_rng(seed if drive_seed is None else drive_seed),
         antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
         left=beyond.left,
+        paths=paths,
     )[:2]
-    return Drive(run, road, np.asarray(rigidity_ratios, dtype=np.float64))
+    ratios = np.asarray(rigidity_ratios, dtype=np.float64)
+    return Drive(run, roads.front, ratios, None if paths is None else roads.rear)
 
 
 def measured_run(
@@ -245,21 +292,28 @@ def measured_run(
     *,
     antenna_to_front_axle_m: float = 0.0,
     left: Left | None = None,
-) -> tuple[Run, Profile, Simulation]:
+    paths: WheelPaths | None = None,
+) -> tuple[Run, AxleRoads, Simulation]:
     """Drive `car` over `beam` along `motion` and measure it with one sensor per channel.
 
-    `road` is an ISO 8608 class and the seed of its phases. The recording begins after
-    `settling_steps`; the sensors are of one rate, of which the steps are a whole fraction. If
-    something has `left` the bridge before, it swings when the first wheel comes on. Returns the
-    recording, the road as the tyres felt it and all that truck and bridge did. FailureError if
-    the coupled simulation does not settle.
+    `road` is an ISO 8608 class and the seed of its phases: of one groove for both axles, or of a
+    surface where the wheels run along `paths`. The recording begins after `settling_steps`; the
+    sensors are of one rate, of which the steps are a whole fraction. If something has `left` the
+    bridge before, it swings when the first wheel comes on. Returns the recording, the road as the
+    tyres felt it and all that truck and bridge did. FailureError if the coupled simulation does not
+    settle.
     """
+    accel_rng, gnss_rng, place_rng = rng.spawn(3)
     sign = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
     reach = car.wheelbase_m + 1.0
-    low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
-    raw = iso_8608_profile(np.floor(low), np.ceil(high), _ROAD_SPACING_M, *road)
-    profile = contact_patch_average(raw, _CONTACT_PATCH_M)
-    felt = under_wheels(profile, motion, car.wheelbase_m, sign)
+    if paths is None:
+        low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
+        raw = iso_8608_profile(np.floor(low), np.ceil(high), _ROAD_SPACING_M, *road)
+        groove = contact_patch_average(raw, _CONTACT_PATCH_M)
+        roads = AxleRoads(groove, groove)
+    else:
+        roads = roads_of_surface(bridge, motion, reach, _ROAD_SPACING_M, road, paths, place_rng)
+    felt = under_axles(*roads, motion, car.wheelbase_m, sign)
     mesh = refine(beam, _PARTS)
     count = min(_MODES * (1 + len(mesh.interior_supports)), _freedoms(mesh))
     swing = None if left is None else state_after(mesh, modes(mesh, count), *left)
@@ -267,7 +321,6 @@ def measured_run(
     if not fine.converged:
         raise FailureError("the simulation did not converge: are the site's values possible?")
     recorded = fine.acceleration_m_per_s2[settling_steps:]
-    accel_rng, gnss_rng = rng.spawn(2)
     rate = sensors[0].rate_hz
     channels = {
         name: measure_acceleration(recorded[:, i], 1.0 / step_s, sensors[i], accel_rng)
@@ -277,7 +330,7 @@ def measured_run(
     antenna = motion.position_m[settling_steps:] - sign * antenna_to_front_axle_m
     speed = np.abs(motion.speed_m_per_s[settling_steps:])
     gnss = _fixes(bridge, step_s, antenna, speed, receiver, gnss_rng, forward=sign > 0)
-    return Run("simulation", time_s, rate, channels, gnss), profile, fine
+    return Run("simulation", time_s, rate, channels, gnss), roads, fine
 
 
 def truck_of(vehicle: Vehicle) -> HalfCar:

@@ -15,7 +15,11 @@ What is drawn, uniformly unless said:
 - bilinear: dampers 5 to 30 % stronger in rebound and weaker in compression;
 - air: springs of air with an exponent of 1.2 to 1.4;
 - spans: two to five of 12 to 25 m, with eight elements for two, else three for each on average;
-- everything: all of these, each end sprung and the bridge continuous every other time.
+- surface: the road is a random surface under single tyres in front and twin tyres behind, unless
+  the site says which (`wheel_paths`); the rear axle runs 0 to 10 mm beside the front, the truck
+  0.12 m from the line (standard deviation);
+- everything: all of these but the surface, each end sprung and the bridge continuous every other
+  time.
 """
 
 from typing import NamedTuple
@@ -30,6 +34,7 @@ from schemas.site import Bridge, Site
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.simulation.drawn import Truth, draw_truth
 from services.simulation.drive import Beyond, Left, with_beyond
+from services.simulation.wheel_paths import OnSurface, wheel_paths_of
 
 Floats = NDArray[np.float64]
 
@@ -46,9 +51,14 @@ BILINEAR = (0.05, 0.30)
 AIR_EXPONENT = (1.2, 1.4)
 SPANS = (2, 5)
 SPAN_M = (12.0, 25.0)
+REAR_OFFSET_M = (0.0, 0.01)
+WANDER_M = 0.12
 
 EVERYTHING = "everything"
-ALONE = ("free", "sprung", "sinking", "swing", "tyres", "friction", "bilinear", "air", "spans")
+SURFACE = "surface"
+"""Not a part of everything, whose answers on such a road would say little of the rest."""
+AMONG_ALL = ("free", "sprung", "sinking", "swing", "tyres", "friction", "bilinear", "air", "spans")
+ALONE = (*AMONG_ALL, SURFACE)
 EFFECTS = (*ALONE, EVERYTHING)
 
 
@@ -83,11 +93,12 @@ def draw_world(site: Site, effect: str, seed: int) -> World:
     body_noise = float(quiet * (loud / quiet) ** rng.uniform())
     bilinear, air = float(rng.uniform(*BILINEAR)), float(rng.uniform(*AIR_EXPONENT))
     spans = rng.uniform(*SPAN_M, int(rng.integers(SPANS[0], SPANS[1] + 1)))
+    rear_offset = float(rng.uniform(*REAR_OFFSET_M))
 
     alone = effect != EVERYTHING
 
     def has(name: str) -> bool:
-        return not alone or effect == name
+        return effect == name or (not alone and name in AMONG_ALL)
 
     if effect == "spans" or (not alone and every_other[0]):
         site = site.model_copy(update={"bridges": (continuous(site.bridges[0], spans),)})
@@ -110,7 +121,12 @@ def draw_world(site: Site, effect: str, seed: int) -> World:
     conditions = drawn.conditions
     if has("friction"):
         conditions = conditions._replace(body_noise_ug_per_rthz=body_noise)
-    truth = drawn._replace(car=car, beam=beam, conditions=conditions, left=beyond.left)
+    paths = None
+    if has(SURFACE):
+        vehicle = site.vehicles[0]
+        unknown = vehicle.rear_axle_offset_m is None
+        paths = wheel_paths_of(vehicle, OnSurface(None, rear_offset if unknown else None, WANDER_M))
+    truth = drawn._replace(car=car, beam=beam, conditions=conditions, left=beyond.left, paths=paths)
     return World(truth, site, beyond)
 
 

@@ -57,6 +57,7 @@ class Line(NamedTuple):
 def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettings) -> Record:
     """Draw, drive, identify and judge one crossing; see `calibration.record`."""
     world = draw_world(site, effect, seed)
+    left, paths = world.beyond.left, world.truth.paths
     drawn = drive(world.site, world.truth, seed)
     found = see([drawn.run], drawn.site, settings)
     seen = found[0] if len(found) == 1 else None
@@ -67,7 +68,14 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
         "effect": effect,
         "world": world.beyond._asdict()
         | {
-            "left": None if world.beyond.left is None else world.beyond.left._asdict(),
+            "left": None if left is None else left._asdict(),
+            "wheel_paths": None
+            if paths is None
+            else {
+                "front": paths.front._asdict(),
+                "rear": paths.rear._asdict(),
+                "wander_m": paths.wander_m,
+            },
             "friction_length_m": world.truth.car.friction_length_m,
             "interior_supports_m": world.site.bridges[0].interior_supports_m,
         },

@@ -13,7 +13,6 @@ import pytest
 
 from pre_core.paper.experiment import scenario_ratios
 from pre_core.physics.bridge import natural_frequencies_hz, refine
-from pre_core.physics.road import Profile
 from pre_core.physics.simulate import Simulation
 from schemas.results import Crossing, Results, results_json
 from schemas.settings import IdentificationSettings
@@ -28,6 +27,7 @@ from services.simulation.drive import (
     simulate_drive,
     write_drive,
 )
+from services.simulation.wheel_paths import AxleRoads
 
 NOISE_UG = 25.0
 SEED = 3
@@ -46,7 +46,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     site = paper_site()
     simulated: list[Simulation] = []
 
-    def keeping(*arguments: Any, **named: Any) -> tuple[Run, Profile, Simulation]:
+    def keeping(*arguments: Any, **named: Any) -> tuple[Run, AxleRoads, Simulation]:
         measured = measured_run(*arguments, **named)
         simulated.append(measured[2])
         return measured

@@ -267,6 +267,17 @@ def test_recordings_that_cannot_be_identified(
         (["simulate", "--scenario", "6", "--speed", "8:", "-o", "x"], "must be a speed in m/s"),
         (["simulate", "--scenario", "6", "--seed", "1.5", "-o", "x"], "a seed, a whole number"),
         (["simulate", "--scenario", "6", "--left", "3e5:17", "-o", "x"], "(N:M_PER_S:S)"),
+        (["simulate", "--scenario", "6", "--tyres", "wide", "-o", "x"], "--tyres: invalid choice"),
+        (["simulate", "--scenario", "6", "--runs", "0", "-o", "x"], "a number of runs, a whole"),
+        (["simulate", "--scenario", "6", "--wander", "-1", "-o", "x"], "a standard deviation in m"),
+        (
+            ["simulate", "--scenario", "6", "--rear-offset", "5", "-o", "x"],
+            "must be an offset in m",
+        ),
+        (
+            ["simulate", "--scenario", "6", "--drive-seed", "a", "-o", "x"],
+            "must be a seed, a whole",
+        ),
         (
             ["simulate", "--scenario", "6", "--bearing-stiffness", "3:3e9", "-o", "x"],
             '--bearing-stiffness: is "3", it must be vertical stiffnesses in N/m (START:END) from',
@@ -285,6 +296,18 @@ def test_wrong_options_give_one_line(
     line = refused(capsys, *arguments)
     assert words in line
     assert re.search(r"\(see driveby ?\w* --help\)$", line)
+
+
+@pytest.mark.parametrize(
+    "option", [("--tyres", "twin"), ("--rear-offset", "0"), ("--wander", "0")], ids=lambda o: o[0]
+)
+def test_only_a_surface_has_axles_beside_one_another(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, option: tuple[str, str]
+) -> None:
+    output = tmp_path / "x.mcap"
+    line = refused(capsys, "simulate", "--scenario", "6", *option, "-o", output)
+    assert line == f"{option[0]}: only a --road-surface has it"
+    assert not output.exists()
 
 
 def test_lists_and_ranges_are_read() -> None:

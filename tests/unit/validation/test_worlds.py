@@ -12,8 +12,10 @@ from schemas.settings import IdentificationSettings
 from services.cli import validation as command_line
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_chainage
+from services.simulation import drawn as drawn_crossings
 from services.simulation import worlds
 from services.simulation.drawn import default_site, draw_truth
+from services.simulation.wheel_paths import OnSurface, wheel_paths_of
 from services.simulation.worlds import ALONE, EFFECTS, EVERYTHING, World, draw_world
 from services.validation import worlds as validation
 from services.validation.worlds import (
@@ -76,6 +78,7 @@ def test_an_effect_alone_changes_nothing_else(effect: str) -> None:
             "bilinear": world.truth.car.bilinear_damping > 0.0,
             "air": world.truth.car.air_spring_exponent > 0.0,
             "spans": bool(world.site.bridges[0].interior_supports_m),
+            "surface": world.truth.paths is not None,
         }
         assert [name for name, there in others.items() if there] == [effect] * (effect != "free")
 
@@ -136,6 +139,49 @@ def test_everything_is_all_of_it() -> None:
     springs = np.array([w.truth.beam.support_rotational_stiffness_nm_per_rad for w in found]) > 0.0
     assert 0.4 < springs.mean() < 0.6
     assert 0.4 < np.mean([bool(w.site.bridges[0].interior_supports_m) for w in found]) < 0.6
+
+
+def test_on_a_surface_the_rear_axle_has_twin_tyres_and_runs_beside() -> None:
+    found = [w.truth.paths for w in drawn("surface")]
+    assert all(paths is not None for paths in found)
+    offsets = [paths.rear.offset_m for paths in found if paths]
+    assert within(offsets, worlds.REAR_OFFSET_M)
+    for paths in found:
+        assert paths == wheel_paths_of(
+            SITE.vehicles[0], OnSurface("twin", paths.rear.offset_m, 0.12)
+        )
+    assert {w.truth.conditions.road_class for w in drawn("surface")} == {"A", "B"}
+    assert all(w.truth.paths is None for w in drawn(EVERYTHING))
+
+
+def test_on_a_surface_tyres_are_the_sites_where_it_tells() -> None:
+    vehicle = SITE.vehicles[0].model_copy(
+        update={"twin_tyre_distance_m": (0.0, 0.0), "rear_axle_offset_m": 0.02}
+    )
+    paths = draw_world(SITE.model_copy(update={"vehicles": (vehicle,)}), "surface", 0).truth.paths
+    assert paths == wheel_paths_of(vehicle, OnSurface(wander_m=0.12))
+    assert paths is not None
+    assert (paths.rear.twin_distance_m, paths.rear.offset_m) == (0.0, 0.02)
+
+
+def test_the_surface_is_driven_over_by_the_worlds_truck(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The truth's paths reach the simulation, and the record tells them."""
+    told: list[object] = []
+    real = drawn_crossings.measured_run
+
+    def keeping(*arguments: Any, **named: Any) -> Any:
+        told.append(named["paths"])
+        return real(*arguments, **named)
+
+    monkeypatch.setattr(drawn_crossings, "measured_run", keeping)
+    monkeypatch.setattr(validation, "see", lambda runs, site, settings: [])
+    lines = [validation.one_world(SITE, effect, 2, SETTINGS) for effect in ("free", "surface")]
+    paths = draw_world(SITE, "surface", 2).truth.paths
+    assert paths is not None
+    assert told == [None, paths]
+    assert lines[0]["world"]["wheel_paths"] is None
+    assert lines[1]["world"]["wheel_paths"]["rear"] == paths.rear._asdict()
+    assert json.loads(json.dumps(lines[1]["world"]))["wheel_paths"]["wander_m"] == 0.12
 
 
 def test_an_effect_that_is_none() -> None:
