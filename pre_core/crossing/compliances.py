@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky
 
 from pre_core.crossing.optimum import Optimum
-from pre_core.crossing.posterior import Problem, layout, log_odds_of_absence
+from pre_core.crossing.posterior import layout, log_odds_of_absence
 from pre_core.crossing.preparation import slope_of_mismatch
 from pre_core.kernels.lanes import kernel
 from pre_core.unknowns import EI_1
@@ -29,7 +29,7 @@ FloatArray = NDArray[np.float64]
 _SETTLING = 500
 _SWEEPS = 60
 """From one draw to the next: an element is known by what its neighbours are not."""
-_LEANING_SPREAD = 0.25
+LEANING_SPREAD = 0.25
 """Of what is taken off the slope for the mismatch: its level is known to 15 %, the tyres' widths
 and distance as little."""
 _SLICE_WIDTH = 1.0
@@ -89,19 +89,26 @@ def compliances(found: Optimum, inflation: float) -> Compliances:
         np.asarray(cholesky(precision[np.ix_(others, others)], lower=True)),
         linear[others],
         across,
-        _led(problem, y, found.state.jacobian),
+        led_by_mismatch(found),
     )
 
 
-def _led(problem: Problem, y: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """What `slope_of_mismatch` moves; nothing of what must not be negative."""
-    slope = slope_of_mismatch(problem, y)
+def led_by_mismatch(found: Optimum) -> FloatArray:
+    """Where the optimum goes if all is taken off that the mismatch makes of the slope: (f,).
+
+    Nothing of what must not be negative, and of the elements, for which it is negligible.
+    """
+    problem, y, jacobian = found.problem, found.state.y, found.state.jacobian
     moved = np.zeros(y.size)
+    if not problem.mismatch.level_m3.any():
+        return moved
+    slope = slope_of_mismatch(problem, y)
     moved[: slope.size] = slope
     moved = cho_solve(cho_factor(jacobian.T @ jacobian), moved)
-    moved[layout(problem).half_normal] = 0.0
-    moved[layout(problem).elements] = 0.0
-    return moved
+    where = layout(problem)
+    moved[where.half_normal] = 0.0
+    moved[where.elements] = 0.0
+    return np.asarray(moved)
 
 
 def draws(of: Compliances, count: int, seed: int, stream: int) -> FloatArray:
@@ -130,7 +137,7 @@ def draws(of: Compliances, count: int, seed: int, stream: int) -> FloatArray:
     y = np.empty((count, of.told.size + of.others.size))
     y[:, of.told] = told
     y[:, of.others] = np.linalg.solve(of.others_root.T, half + normal.T).T
-    return y + _LEANING_SPREAD * rng.standard_normal((count, 1)) * of.leaning
+    return y + LEANING_SPREAD * rng.standard_normal((count, 1)) * of.leaning
 
 
 @kernel

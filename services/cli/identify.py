@@ -174,9 +174,9 @@ def _of_level_and_road(crossing: Crossing) -> Iterator[str]:
     derived = crossing.derived
     if derived is not None and derived.ei_level is not None and derived.ei_thirds is not None:
         thirds = (derived.ei_thirds.left, derived.ei_thirds.middle, derived.ei_thirds.right)
-        told = " · ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
+        told = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
         level = derived.ei_level
-        yield f"EI of nominal: all {level.mean:.2f} ± {level.std:.2f}; by thirds {told}"
+        yield f"EI of nominal: mean {level.mean:.2f} ± {level.std:.2f}; thirds {told}"
     if crossing.road is not None and crossing.road.mismatch is not None:
         mismatch = crossing.road.mismatch
         yield (

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pre_core import unknowns
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import optimum, posterior
+from pre_core.crossing.compliances import LEANING_SPREAD, led_by_mismatch
 from pre_core.crossing.mismatch import GEOMETRY, as_two_numbers
 from pre_core.crossing.preparation import Inputs, off_bridge_m
 from pre_core.crossing.sampling import Sampled, sample
@@ -124,7 +125,10 @@ def footprints_of(vehicle: Vehicle) -> tuple[Footprint, Footprint]:
             "twin_distance_m": vehicle.twin_tyre_distance_m,
         }
         stated = {name: pair[axle] for name, pair in known.items() if pair is not None}
-        axles.append(usual._replace(**stated, track_m=vehicle.track_m or usual.track_m))
+        track_m = usual.track_m if vehicle.track_m is None else vehicle.track_m
+        if stated.get("twin_distance_m") == 0.0:  # single tyres, as wide as such are
+            usual = Footprint()
+        axles.append(usual._replace(**stated, track_m=track_m))
     return axles[0], axles[1]._replace(offset_m=vehicle.rear_axle_offset_m or 0.0)
 
 
@@ -253,8 +257,12 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
     rear = at.position_m[0] - data.stay.direction * at.wheelbase_m[0]
     rows_of = unknowns.table(data.bridge.elements)
     estimated = [rows_of[i] for i in np.flatnonzero(problem.priors.estimated)]
+    # Where the axles' roads differ that leads the truck as far as it is known.
+    led = np.hypot(1.0, LEANING_SPREAD * led_by_mismatch(found))
     prior_z = {
-        row.name: float(y[k]) for k, row in enumerate(estimated) if row.part == unknowns.TRUCK
+        row.name: float(y[k] / led[k])
+        for k, row in enumerate(estimated)
+        if row.part == unknowns.TRUCK
     }
     _, covariance = optimum.normal_approximation(found)
     return Fit(
