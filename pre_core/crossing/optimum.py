@@ -55,8 +55,8 @@ NOISY, HOPELESS_NOISE = 2.0, 25.0
 """From so many times the declared power on, evenly in the body equations' rows, noise is taken for
 what it is; above the second the sensor is another one, or broken."""
 _PLAINLY_DIFFERS = 200.0
-"""Mean square of white rows off the bridge after the coarse steps: of 106 drawn crossings of one road
-130 at most and mostly below 25, with twin tyres on the best class of road 200,000."""
+"""Mean square of white rows off the bridge after the coarse steps: of 100 drawn crossings of one
+road 130 at most and mostly below 25, with twin tyres on the best class of road 200,000."""
 _FREE = ((5.0, 8, 0.2), (1.0, 25, 0.1))
 """Temperatures (noise is taken for this many times what it is), the steps at each, and the gain in
 the sum of squares that is not worth another step."""
