@@ -17,10 +17,11 @@ from schemas.results import (
     Direction,
     Header,
     Parameter,
+    Thirds,
 )
 from schemas.signals import NS_PER_S
 
-_THIRDS = ("left", "middle", "right")
+_THIRDS = tuple(Thirds.model_fields)
 
 
 def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:

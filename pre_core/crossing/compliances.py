@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky
 
 from pre_core.crossing.optimum import Optimum
-from pre_core.crossing.posterior import layout, log_odds_of_absence
+from pre_core.crossing.posterior import Problem, layout, log_odds_of_absence
 from pre_core.crossing.preparation import slope_of_mismatch
 from pre_core.kernels.lanes import kernel
 from pre_core.unknowns import EI_1
@@ -58,38 +58,86 @@ class Compliances(NamedTuple):
 
 def compliances(found: Optimum, inflation: float) -> Compliances:
     """About the optimum, of noise `inflation` times what was declared."""
-    problem = found.problem
+    problem, state = found.problem, found.state
     where = layout(problem)
-    y = found.state.y
-    sigma = problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]]
-    elements = where.elements
-    prior = found.state.residual.size - where.trajectory.start + elements
-    kept = np.setdiff1d(np.arange(found.state.residual.size), prior)
-    jacobian = found.state.jacobian[kept].copy()
-    centre = y.copy()
-    centre[elements] = np.exp(-sigma * y[elements])
-    jacobian[:, elements] /= -sigma * centre[elements]
-    residual = found.state.residual[kept]
-    told = np.concatenate([elements, where.half_normal])
-    others = np.setdiff1d(np.arange(y.size), told)
+    kept = without_priors(problem, state.residual.size, where.elements)
+    centre, jacobian = in_compliances(problem, state.y, state.jacobian[kept])
     precision = jacobian.T @ jacobian / inflation**2
-    linear = precision @ centre - jacobian.T @ residual / inflation**2
+    linear = precision @ centre - jacobian.T @ state.residual[kept] / inflation**2
+    return of_normal(
+        precision,
+        linear,
+        where.elements,
+        where.half_normal,
+        problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]],
+        log_odds_of_absence(problem, inflation),
+        inflation,
+        centre[where.elements],
+        led_by_mismatch(found),
+    )
+
+
+def without_priors(problem: Problem, rows: int, places: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Of so many `rows` of the posterior those that are not the priors of some places in y."""
+    # Rows of the priors come last, in the order of y up to the trajectory.
+    return np.setdiff1d(np.arange(rows), rows - layout(problem).trajectory.start + places)
+
+
+def in_compliances(
+    problem: Problem, y: FloatArray, jacobian: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The point y (f,) and a Jacobian (m, f) there with c in place of the elements' coordinates."""
+    elements = layout(problem).elements
+    sigma = problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]]
+    centre, changed = y.copy(), jacobian.copy()
+    centre[elements] = np.exp(-sigma * y[elements])
+    changed[:, elements] /= -sigma * centre[elements]
+    return centre, changed
+
+
+def marginal(
+    precision: FloatArray, linear: FloatArray, told: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """Precision and linear part of a normal's coordinates `told`, the others integrated out."""
+    others = np.setdiff1d(np.arange(linear.size), told)
     factor = cho_factor(precision[np.ix_(others, others)], lower=True)
     across = precision[np.ix_(others, told)]
+    return (
+        precision[np.ix_(told, told)] - across.T @ cho_solve(factor, across),
+        linear[told] - across.T @ cho_solve(factor, linear[others]),
+    )
+
+
+def of_normal(
+    precision: FloatArray,
+    linear: FloatArray,
+    elements: NDArray[np.int64],
+    cut_off: NDArray[np.int64],
+    sigma: FloatArray,
+    log_odds: FloatArray,
+    inflation: float,
+    centre: FloatArray,
+    leaning: FloatArray,
+) -> Compliances:
+    """Of a normal (f,) with c at `elements`, times their priors, cut off at zero at `cut_off`.
+
+    `log_odds` (f,) as in `posterior.log_odds_of_absence`.
+    """
+    told = np.concatenate([elements, cut_off])
+    others = np.setdiff1d(np.arange(linear.size), told)
     return Compliances(
         elements,
         sigma,
         told,
         others,
-        centre[elements],
+        centre,
         inflation,
-        precision[np.ix_(told, told)] - across.T @ cho_solve(factor, across),
-        linear[told] - across.T @ cho_solve(factor, linear[others]),
-        log_odds_of_absence(problem, inflation)[told],
+        *marginal(precision, linear, told),
+        log_odds[told],
         np.asarray(cholesky(precision[np.ix_(others, others)], lower=True)),
         linear[others],
-        across,
-        led_by_mismatch(found),
+        precision[np.ix_(others, told)],
+        leaning,
     )
 
 

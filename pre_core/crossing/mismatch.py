@@ -21,6 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.crossing.whittle import likeliest_levels
+from pre_core.physics.road import REFERENCE_CYCLES_PER_M
 from pre_core.physics.surface import Footprint, common_spectrum, spectra
 
 FloatArray = NDArray[np.float64]
@@ -34,18 +36,17 @@ to centimetres. Without it an offset of a hand's width passes for twin tyres."""
 _WORN = 0.9
 _GRID_CYCLES_PER_M = 0.02
 _MOST_CYCLES_PER_M = 24.0
-REFERENCE_CYCLES_PER_M = 0.1
-"""Where every shape is one, so that A_j is its spectrum there."""
-_LONG_CYCLES_PER_M = 0.05
-_PASSES = 200
+LONG_CYCLES_PER_M = 0.05
+"""Waves by which bridges are seen, and by which a mismatch is told."""
 _ENOUGH = 1e-4
 _NOTHING = 1e-12
-GEOMETRY = (Footprint(), Footprint(width_m=0.22, twin_distance_m=0.33))
-"""Single tyres in front and twin tyres behind, of a lorry nobody has measured."""
 
 
 class Shapes(NamedTuple):
-    """Spectra (s, g) on an even grid (g,) of cycles/m from zero on, one at 0.1 cycles/m."""
+    """Spectra (s, g) on an even grid (g,) of cycles/m from zero on, one at 0.1 cycles/m.
+
+    So a level A_j is its shape's spectrum there.
+    """
 
     cycles_per_m: FloatArray
     density: FloatArray
@@ -68,6 +69,26 @@ class Mismatch(NamedTuple):
     speed_m_per_s: float
 
 
+@lru_cache(maxsize=8)
+def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
+    """Of tyres unlike each other, and of one axle beside the other."""
+    grid = _above_zero()
+    density, leaning, expected = [], [], []
+    for (one, other), larger in zip(
+        _pairs(front, rear), (1.0, _LARGE_OFFSET_M / _OFFSET_M), strict=True
+    ):
+        of_front, _, common, difference = spectra(one, other, grid)
+        at = np.interp(REFERENCE_CYCLES_PER_M, grid, difference)
+        density.append(_windowed(difference / at))
+        leaning.append((of_front - common) / at)
+        expected.append(at * larger**2)
+    road = _windowed(of_front)
+    grid[0] = 0.0
+    return Shapes(
+        grid, np.stack(density), np.stack(leaning), (front, rear), road, np.array(expected)
+    )
+
+
 @lru_cache(maxsize=64)
 def common_shapes(front: Footprint, rear: Footprint, wander_m: float) -> FloatArray:
     """The part (s, g) of the densities of `shapes_of` that runs on tracks so wide have in common.
@@ -75,48 +96,34 @@ def common_shapes(front: Footprint, rear: Footprint, wander_m: float) -> FloatAr
     Long waves across the road are the same on all tracks, short ones are not: how much is common
     depends on the wave, and what it is at long ones no run tells.
     """
-    shapes = shapes_of(front, rear)
-    single = front._replace(offset_m=0.0)
-    aside = single._replace(offset_m=_OFFSET_M)
-    grid = shapes.cycles_per_m.copy()
-    grid[0] = 0.02 * _GRID_CYCLES_PER_M
     at = np.array([REFERENCE_CYCLES_PER_M])
-    common = []
-    for other in (_unlike(front, rear), aside):
-        whole = spectra(single, other, at)[3][0]
-        common.append(_windowed(common_spectrum(single, other, grid, wander_m) / whole))
-    return np.stack(common)
+    return np.stack(
+        [
+            _windowed(
+                common_spectrum(one, other, _above_zero(), wander_m) / spectra(one, other, at)[3][0]
+            )
+            for one, other in _pairs(front, rear)
+        ]
+    )
 
 
-def _unlike(front: Footprint, rear: Footprint) -> Footprint:
-    """The rear axle in the front's line; tyres that are just alike as those nobody has measured."""
-    single, unlike = front._replace(offset_m=0.0), rear._replace(offset_m=0.0)
-    return single._replace(width_m=_WORN * single.width_m) if unlike == single else unlike
-
-
-@lru_cache(maxsize=8)
-def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
-    """Of tyres unlike each other, and of one axle beside the other."""
+def _above_zero() -> FloatArray:
+    """The grid, but for its zero, where the spectrum of an offset has no limit."""
     points = round(_MOST_CYCLES_PER_M / _GRID_CYCLES_PER_M) + 1
     grid = _GRID_CYCLES_PER_M * np.arange(points, dtype=np.float64)
-    grid[0] = 0.02 * _GRID_CYCLES_PER_M  # an offset's spectrum has no limit at zero
-    single = front._replace(offset_m=0.0)
-    aside = single._replace(offset_m=_OFFSET_M)
-    density, leaning, expected = [], [], []
-    for one, other, larger in (
-        (single, _unlike(front, rear), 1.0),
-        (single, aside, _LARGE_OFFSET_M / _OFFSET_M),
-    ):
-        of_front, _, common, difference = spectra(one, other, grid)
-        at = np.interp(REFERENCE_CYCLES_PER_M, grid, difference)
-        density.append(_windowed(difference / at))
-        leaning.append((of_front - common) / at)
-        expected.append(at * larger**2)
-    grid[0] = 0.0
-    road = _windowed(of_front)
-    return Shapes(
-        grid, np.stack(density), np.stack(leaning), (front, rear), road, np.array(expected)
-    )
+    grid[0] = 0.02 * _GRID_CYCLES_PER_M
+    return grid
+
+
+def _pairs(front: Footprint, rear: Footprint) -> tuple[tuple[Footprint, Footprint], ...]:
+    """Two axles for each shape: with tyres unlike each other, and one beside the other.
+
+    Tyres that are just alike are taken for worn ones: nobody has measured any.
+    """
+    single, unlike = front._replace(offset_m=0.0), rear._replace(offset_m=0.0)
+    if unlike == single:
+        unlike = single._replace(width_m=_WORN * single.width_m)
+    return (single, unlike), (single, single._replace(offset_m=_OFFSET_M))
 
 
 def _windowed(spectrum: FloatArray) -> FloatArray:
@@ -158,8 +165,8 @@ def as_two_numbers(mismatch: Mismatch) -> tuple[float, float]:
     """
     density = mismatch.level_m3 @ mismatch.shapes.density
     grid = mismatch.shapes.cycles_per_m
-    long_waves = float(np.interp(_LONG_CYCLES_PER_M, grid, density))
-    below = np.flatnonzero((density < 0.25 * long_waves) & (grid > _LONG_CYCLES_PER_M))
+    long_waves = float(np.interp(LONG_CYCLES_PER_M, grid, density))
+    below = np.flatnonzero((density < 0.25 * long_waves) & (grid > LONG_CYCLES_PER_M))
     return long_waves, float(grid[below[0]] if below.size else grid[-1])
 
 
@@ -205,22 +212,12 @@ def segment(values: FloatArray, sensors: FloatArray, shapes: FloatArray) -> Segm
 def levels(segments: list[Segment], usual: FloatArray | None = None) -> tuple[FloatArray, float]:
     """Most likely levels (s,) in m³ (Whittle's likelihood), and the gain over none of them.
 
-    `usual` (s,) are the means of their exponential priors, infinite where there is none. The gain
-    is twice that of the log-likelihood. Every level is multiplied by the root of what it explains
-    over what it claims until nothing changes.
+    `usual` (s,) are the means of their exponential priors, infinite where there is none; the gain
+    is that of `likeliest_levels`.
     """
     seen = np.concatenate([one.seen for one in segments])
     known = np.concatenate([one.sensors for one in segments])
     shape = np.concatenate([one.shapes for one in segments], axis=1)
-    claimed = np.zeros(shape.shape[0]) if usual is None else 2.0 / usual
-    level = np.full(shape.shape[0], np.mean(seen) / np.mean(shape.sum(axis=0)))
-    for _ in range(_PASSES):
-        expected = known + level @ shape
-        change = np.sqrt((shape @ (seen / expected**2)) / (claimed + shape @ (1.0 / expected)))
-        level = level * change
-        if np.abs(change[level > _ENOUGH * level.max()] - 1.0).max() < _ENOUGH:
-            break
-    expected = known + level @ shape
-    # A taper makes neighbours alike: half of the frequencies tell something new.
-    gain = np.sum(np.log(known / expected) + seen / known - seen / expected)
-    return level, float(gain)
+    start = np.full(shape.shape[0], np.mean(seen) / np.mean(shape.sum(axis=0)))
+    claimed = 0.0 if usual is None else 2.0 / usual
+    return likeliest_levels(seen, known, shape, start, claimed, _ENOUGH)

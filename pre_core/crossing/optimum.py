@@ -138,8 +138,7 @@ class Optimum(NamedTuple):
     rubs: bool = False
     """Whether a search that believed in springs was given up because they plainly rub."""
     differs: bool = False
-    """Whether a search on one road was given up because the axles' roads plainly differ, or ended
-    where they seem to."""
+    """Whether a search on one road was given up because the axles' roads plainly differ."""
     noise_power: float = 1.0
     """That of the sensors over what was declared, where it is plainly more: it looks like springs
     that rub and roads that differ. Up to `HOPELESS_NOISE` it was taken for what it is."""
@@ -293,24 +292,41 @@ def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) 
     """The optimum of the posterior. Its `ending` is NOT_FINITE if no place gave finite rows."""
     problem, y = prepare(inputs)
     found = [_from_places(problem, y, _SIMPLEST, report)]
-    believing, doubting = _ON_ONE_ROAD
-    ways = (*_ON_ONE_ROAD, *_ON_TWO_ROADS)
-    if found[0].differs:
-        ways = (_ON_TWO_ROADS[0], doubting, _ON_TWO_ROADS[1], believing)
-    for way in ways:
-        is_hopeless = found[-1].noise_power > HOPELESS_NOISE
-        if is_hopeless or _is_accepted(found[-1].problem, found[-1].chi2_per_dof):
-            break
-        rubs = found[-1].rubs
-        # Springs that rub look like roads that differ until they are doubted.
-        if rubs if way.believes else (way == doubting and found[0].differs and not rubs):
-            continue
-        found.append(_from_places(problem, y, way, report))
+    if not _is_final(found[0]):
+        found += _further(problem, y, found[0], report)
     return min(
         found, key=lambda one: (one.noise_power <= HOPELESS_NOISE, one.chi2_per_dof)
     )._replace(
         evaluations=sum(one.evaluations for one in found), starts=sum(one.starts for one in found)
     )
+
+
+def _further(problem: Problem, y: FloatArray, first: Optimum, report: Report) -> list[Optimum]:
+    """What the other ways led to, up to the first that is final."""
+    differs = first.differs
+    if first.ending is not Ending.NOT_FINITE:
+        differs = bool(levels_at(first.problem, first.state.y).any())
+    believing, doubting = _ON_ONE_ROAD
+    ways = (*_ON_ONE_ROAD, *_ON_TWO_ROADS)
+    if differs:
+        ways = (_ON_TWO_ROADS[0], doubting, _ON_TWO_ROADS[1], believing)
+    found: list[Optimum] = []
+    rubs = first.rubs
+    for way in ways:
+        # Springs that rub look like roads that differ until they are doubted.
+        if rubs if way.believes else (way == doubting and differs and not rubs):
+            continue
+        found.append(_from_places(problem, y, way, report))
+        rubs = found[-1].rubs
+        if _is_final(found[-1]):
+            break
+    return found
+
+
+def _is_final(found: Optimum) -> bool:
+    """Whether no other way is worth a try: this is a fit, or nothing will be."""
+    is_hopeless = found.noise_power > HOPELESS_NOISE
+    return is_hopeless or _is_accepted(found.problem, found.chi2_per_dof)
 
 
 def _is_accepted(problem: Problem, chi2: float) -> bool:
@@ -372,13 +388,11 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
             break
     if best is None:
         return _nowhere(problem, y, evaluations, len(tried), rubs=rubs)
-    differs = bool(levels_at(best.problem, best.state.y).any())
     return best._replace(
         evaluations=evaluations,
         starts=len(tried),
         rubs=rubs,
-        differs=differs,
-        noise_power=power * max(1.0, _left_noise(best)),
+        noise_power=power * _left_noise(best),
     )
 
 

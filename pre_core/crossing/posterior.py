@@ -28,6 +28,7 @@ from pre_core.crossing.residuals import (
 from pre_core.crossing.whitening import (
     RESIDUALS,
     RowFilter,
+    Truck,
     Whitener,
     filter_rows,
     row_count,
@@ -246,36 +247,35 @@ def filtered_rows(problem: Problem, y: FloatArray) -> FloatArray:
     return out
 
 
-def filtered_roads(problem: Problem, y: FloatArray) -> FloatArray:
-    """Filtered rows (2, m) of what both wheels feel themselves, of one point y (size,)."""
+def filtered_rear_road(problem: Problem, y: FloatArray) -> FloatArray:
+    """Filtered rows (m,) of what the rear wheel itself feels, of one point y (size,)."""
+    crossing, rows = problem.crossing, problem.rows
+    at = points(problem, y[None, :])
+    heights, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
+    out = np.empty(row_count(rows, crossing.rows))
+    own = np.ascontiguousarray(heights[1, crossing.first_row :])
+    filter_rows(rows.taps, rows.every, own, out)
+    return out
+
+
+def truck_at(problem: Problem, y: FloatArray) -> tuple[Truck, FloatArray]:
+    """The truck at y (size,) as noise meets it, and its sensors' densities (4,) with gains."""
     at = points(problem, y[None, :])
     crossing = problem.crossing
-    heights, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
-    out = np.empty((2, row_count(problem.rows, crossing.rows)))
-    for wheel in range(2):
-        own = np.ascontiguousarray(heights[wheel, crossing.first_row :])
-        filter_rows(problem.rows.taps, problem.rows.every, own, out[wheel])
-    return out
+    wheelbase = float(at.wheelbase_m[0])
+    truck = truck_of(at.theta[0], crossing.total_mass_kg, wheelbase, crossing.is_inertial)
+    return truck, problem.density * (1.0 + at.gain[0])
 
 
 def belief_in_springs(problem: Problem, y: FloatArray) -> float:
     """0 to 1, of the truck at y (size,): how much its springs leave of what the sensors tell."""
-    at = points(problem, y[None, :])
-    crossing = problem.crossing
-    wheelbase = float(at.wheelbase_m[0])
-    truck = truck_of(at.theta[0], crossing.total_mass_kg, wheelbase, crossing.is_inertial)
-    density = problem.density * (1.0 + at.gain[0])
-    return whitening.belief_in_springs(problem.rows, truck, density, problem.force)
+    return whitening.belief_in_springs(problem.rows, *truck_at(problem, y), problem.force)
 
 
 def noise_floor(problem: Problem, y: FloatArray) -> float:
     """So many times its declared power the sensors' noise has, by the truck at y (size,)."""
-    at = points(problem, y[None, :])
-    crossing = problem.crossing
-    wheelbase = float(at.wheelbase_m[0])
-    truck = truck_of(at.theta[0], crossing.total_mass_kg, wheelbase, crossing.is_inertial)
-    density = problem.density * (1.0 + at.gain[0])
-    return whitening.noise_floor(problem.rows, truck, density, filtered_rows(problem, y)[1:])
+    body = filtered_rows(problem, y)[1:]
+    return whitening.noise_floor(problem.rows, *truck_at(problem, y), body)
 
 
 def all_rows(problem: Problem, y: FloatArray, temperature: float = 1.0) -> FloatArray:

@@ -6,21 +6,23 @@ import numpy as np
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.channels import channel_signals
-from pre_core.crossing.mismatch import GEOMETRY, Mismatch, shapes_of
+from pre_core.crossing.mismatch import Mismatch, shapes_of
 from pre_core.crossing.posterior import (
     Fixes,
     Priors,
     Problem,
-    filtered_roads,
+    filtered_rear_road,
     filtered_rows,
     layout,
     points,
     start,
     trajectory_basis,
+    truck_at,
 )
-from pre_core.crossing.residuals import Crossing, sinc_table, step_table, workspace
+from pre_core.crossing.residuals import Crossing, Points, sinc_table, step_table, workspace
 from pre_core.crossing.whitening import (
     DOUBTED,
+    Truck,
     force_noise,
     linear_springs,
     mismatch_levels,
@@ -33,7 +35,8 @@ from pre_core.crossing.whitening import (
 )
 from pre_core.physics.beam_basis import beam_basis, rebased
 from pre_core.physics.bridge import FloatArray
-from pre_core.physics.surface import Footprint
+from pre_core.physics.simulate import rear_position_m
+from pre_core.physics.surface import COMMON_LORRY, Footprint
 from pre_core.unknowns import FIRST_OF_BRIDGE
 
 _KNOT_S = 0.4
@@ -80,7 +83,7 @@ class Inputs(NamedTuple):
     priors: Priors
     parts: int
     threads: int
-    footprints: tuple[Footprint, Footprint] = GEOMETRY
+    footprints: tuple[Footprint, Footprint] = COMMON_LORRY
     """Where the front and the rear axle stand on the road."""
 
 
@@ -171,25 +174,17 @@ def with_noise_at(
     """
     where = layout(problem)
     unknowns = where.gains.stop
-    near = np.repeat(y[None, :], 1 + where.delays.stop, axis=0)
-    near[np.arange(1, near.shape[0]), np.arange(near.shape[0] - 1)] += _SLOPE_STEP
-    at = points(problem, near)
-    density = problem.density * (1.0 + at.gain)
-    total = problem.crossing.total_mass_kg
     if force is None:
-        one = truck_of(at.theta[0], total, float(at.wheelbase_m[0]), problem.crossing.is_inertial)
         body = filtered_rows(problem, y)[1:]
-        force = force_noise(problem.rows, one, density[0], body, doubted)
+        force = force_noise(problem.rows, *truck_at(problem, y), body, doubted)
     if mismatch is None:
         mismatch = problem.mismatch.level_m3
         if mismatch.any():
             mismatch = levels_at(problem, y)
     road = problem.mismatch._replace(level_m3=mismatch)
     is_inertial = bool(force.any())
-    trucks = [
-        truck_of(theta, total, float(wheelbase), is_inertial)
-        for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
-    ]
+    at, trucks = _aside(problem, y, unknowns, is_inertial=is_inertial)
+    density = problem.density * (1.0 + at.gain)
     count = row_count(problem.rows, problem.crossing.rows)
     silenced = _SILENCED * force
     differs = road if mismatch.any() else None
@@ -214,17 +209,25 @@ def with_noise_at(
     )
 
 
-def slope_of_mismatch(problem: Problem, y: FloatArray) -> FloatArray:
-    """What the roads' mismatch alone makes of the objective's slope at y: (first coordinates,)."""
-    where = layout(problem)
-    near = np.repeat(y[None, :], 1 + where.delays.stop, axis=0)
-    near[np.arange(1, near.shape[0]), np.arange(near.shape[0] - 1)] += _SLOPE_STEP
+def _aside(
+    problem: Problem, y: FloatArray, count: int, *, is_inertial: bool
+) -> tuple[Points, list[Truck]]:
+    """Points and trucks at y, and a step aside in each of the first `count` coordinates."""
+    near = np.repeat(y[None, :], 1 + count, axis=0)
+    near[np.arange(1, 1 + count), np.arange(count)] += _SLOPE_STEP
     at = points(problem, near)
-    total, is_inertial = problem.crossing.total_mass_kg, bool(problem.force.any())
-    trucks = [
+    total = problem.crossing.total_mass_kg
+    return at, [
         truck_of(theta, total, float(wheelbase), is_inertial)
         for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
     ]
+
+
+def slope_of_mismatch(problem: Problem, y: FloatArray) -> FloatArray:
+    """What the roads' mismatch alone makes of the objective's slope at y: (first coordinates,)."""
+    where = layout(problem)
+    is_inertial = bool(problem.force.any())
+    at, trucks = _aside(problem, y, where.delays.stop, is_inertial=is_inertial)
     changing = [
         *range(int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())),
         *range(where.wheelbase, where.gains.stop),
@@ -251,21 +254,13 @@ def levels_at(problem: Problem, y: FloatArray) -> FloatArray:
 
     Nothing where these are too few, or explained as well without (`MISMATCHED`).
     """
-    at = points(problem, y[None, :])
-    crossing = problem.crossing
-    truck = truck_of(
-        at.theta[0], crossing.total_mass_kg, float(at.wheelbase_m[0]), crossing.is_inertial
-    )
-    stretches = off_bridge(problem, y)
-    some = [one for one in stretches if one.stop - one.start >= _FEWEST_ROWS]
+    some = [one for one in off_bridge(problem, y) if one.stop - one.start >= _FEWEST_ROWS]
     if not some:
         return np.zeros_like(problem.mismatch.level_m3)
-    density = problem.density * (1.0 + at.gain[0])
-    differ, felt = filtered_rows(problem, y)[0], filtered_roads(problem, y)[1]
+    differ, felt = filtered_rows(problem, y)[0], filtered_rear_road(problem, y)
     level, gain = mismatch_levels(
         problem.rows,
-        truck,
-        density,
+        *truck_at(problem, y),
         problem.mismatch,
         [differ[one] for one in some],
         [felt[one] for one in some],
@@ -284,7 +279,7 @@ def off_bridge(problem: Problem, y: FloatArray) -> tuple[slice, slice]:
     """Filtered rows that compare the roads before and behind the bridge alone."""
     at = points(problem, y[None, :])
     crossing, rows = problem.crossing, problem.rows
-    rear = at.position_m[0] - crossing.direction * at.wheelbase_m[0]
+    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
     travel = (rear if crossing.direction > 0 else crossing.span_m - rear)[crossing.first_row :]
     on, left = np.searchsorted(travel, [0.0, crossing.span_m])
     count = row_count(rows, crossing.rows)

@@ -89,11 +89,8 @@ def sample(
 
         state = run(partial(_begun, state), step, wanted, progress=tell).state
         steps += wanted
-        of_interest = np.stack(kept)[:, :, told]
-        r_hat = float(crank_nicolson.split_r_hat(of_interest).max())
-        ess = float(crank_nicolson.effective_sample_size(of_interest).min())
-        if r_hat < LARGEST_R_HAT and ess > SMALLEST_ESS:
-            ending = Ending.STEPS_DONE
+        r_hat, ess, ending = _agreement(np.stack(kept)[:, :, told])
+        if ending is Ending.STEPS_DONE:
             break
     evaluations = crank_nicolson.CHAINS * (1 + crank_nicolson.MOVES * steps)
     return Sampled(np.stack(kept), r_hat, ess, float(np.mean(acceptance)), evaluations, ending)
@@ -119,13 +116,18 @@ def _sampled_on_two_roads(
         kept.append(
             np.stack([compliances.draws(near, wanted, seed, one) for one in streams], axis=1)
         )
-        of_interest = np.concatenate(kept)[:, :, told]
-        r_hat = float(crank_nicolson.split_r_hat(of_interest).max())
-        ess = float(crank_nicolson.effective_sample_size(of_interest).min())
-        if r_hat < LARGEST_R_HAT and ess > SMALLEST_ESS:
-            ending = Ending.STEPS_DONE
+        r_hat, ess, ending = _agreement(np.concatenate(kept)[:, :, told])
+        if ending is Ending.STEPS_DONE:
             break
     return Sampled(np.concatenate(kept), r_hat, ess, 1.0, 0, ending)
+
+
+def _agreement(draws: FloatArray) -> tuple[float, float, Ending]:
+    """R-hat, effective sample size and what they say of draws (n, chains, unknowns)."""
+    r_hat = float(crank_nicolson.split_r_hat(draws).max())
+    ess = float(crank_nicolson.effective_sample_size(draws).min())
+    agrees = r_hat < LARGEST_R_HAT and ess > SMALLEST_ESS
+    return r_hat, ess, Ending.STEPS_DONE if agrees else Ending.STEPS_EXHAUSTED
 
 
 def _begun(state: crank_nicolson.State) -> crank_nicolson.State:

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from pre_core.crossing import mismatch as _mismatch
 from pre_core.crossing.channels import low_pass
 from pre_core.crossing.mismatch import Mismatch
+from pre_core.crossing.whittle import likeliest_levels
 from pre_core.kernels.lanes import summing
 from pre_core.physics.vehicle import masses_above_axles
 from pre_core.unknowns import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1
@@ -67,7 +68,6 @@ FORCE_SHAPES = _FORCE_CENTRES_HZ.size
 of dry friction falls by six decades from the body's bounce to the rows' highest frequency."""
 _FORCE_MEMORY_S = 0.3
 """Its covariance ends here, which is what makes the bumps as wide as they are."""
-_FORCE_PASSES = 200
 """Rounds of the multiplicative fit of the spectrum, a fixed number."""
 _MIDDLE_BAND, _TOP_BAND = (0.22, 0.54), (0.65, 0.757)
 """Of half the rows' rate: 12 to 30 and 36 to 42 Hz of sensors of 250 Hz and more."""
@@ -409,8 +409,8 @@ def mismatch_levels(
     """Levels (s,) in m³ that stretches of the mismatch's rows show, and their gain over nothing.
 
     Each stretch (m,) is of consecutive filtered rows to which no bridge adds anything; `roads` are
-    rows of what the front axle felt there, by which an axle's offset is not taken for larger than
-    offsets are.
+    rows of what one axle felt there, taken for the front one, by which an axle's offset is not
+    taken for larger than offsets are.
     """
     omega, shapes = rows.omega, road.shapes
     table = np.concatenate([shapes.density, shapes.road[None, :]])
@@ -436,8 +436,7 @@ def force_noise(
 ) -> FloatArray:
     """Levels (2, shapes) of the springs' noise in N²/Hz that the body equations' rows (2, m) show.
 
-    The most likely ones beside the sensors' noise, by the periodogram (Whittle 1953): each level is
-    multiplied by the root of what it explains over what it claims until nothing changes. An axle
+    The most likely ones beside the sensors' noise, by the periodogram (`whittle`). An axle
     whose springs are as linear as its sensors can tell has none: one that gains no more than
     `enough`.
     """
@@ -448,13 +447,8 @@ def force_noise(
         shape = shapes / over[axle] ** 2
         seen, known = shown[axle], sensors[axle]
         level = np.full(FORCE_SHAPES, seen.mean()) / shape.mean(axis=1)
-        for _ in range(_FORCE_PASSES):
-            expected = known + level @ shape
-            level *= np.sqrt((shape @ (seen / expected**2)) / (shape @ (1.0 / expected)))
-        expected = known + level @ shape
-        gain = 2.0 * np.sum(np.log(known / expected) + seen / known - seen / expected)
-        # Hann's window makes neighbours alike: half of the frequencies tell something new.
-        if 0.5 * gain > enough:
+        level, gain = likeliest_levels(seen, known, shape, level)
+        if gain > enough:
             levels[axle] = level
     return levels
 

@@ -10,24 +10,22 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, cholesky
 
 from pre_core.crossing import posterior
-from pre_core.crossing.compliances import Compliances, draws
-from pre_core.crossing.mismatch import MEMORY_M, Mismatch, common_shapes
+from pre_core.crossing.compliances import draws, marginal, of_normal
+from pre_core.crossing.mismatch import LONG_CYCLES_PER_M, MEMORY_M, Mismatch, common_shapes
 from pre_core.crossing.optimum import Optimum
 from pre_core.fusion.likelihood import Likelihood, knots, likelihood, mismatch_off_bridge
+from pre_core.search.crank_nicolson import CHAINS
 from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE
 
 FloatArray = NDArray[np.float64]
 
-_CHAINS = 8
 _GRID_M = 0.1
 _APART_M = 0.5
 """Of the second difference by which the common share is read: waves of half a metre to two."""
 _WANDERS_M, _HALVINGS = (0.01, 1.0), 12
 _LAG_M = 0.01
-_LONG_CYCLES_PER_M = 0.05
 _JITTER = 1e-6
 
 
@@ -112,7 +110,7 @@ def fuse(runs: Sequence[Optimum], count: int, seed: int) -> Fused:
         for run in runs
     ]
     together = _together(parts, shapes.cycles_per_m, whole.level_m3 @ common, places)
-    at_long = np.searchsorted(shapes.cycles_per_m, _LONG_CYCLES_PER_M)
+    at_long = np.searchsorted(shapes.cycles_per_m, LONG_CYCLES_PER_M)
     densities = (whole.level_m3 @ common, whole.level_m3 @ shapes.density)
     share = float(densities[0][at_long] / densities[1][at_long]) if whole.level_m3.any() else 0.0
     return Fused(_drawn(together, runs[0], count, seed), share, wander_m, whole.level_m3)
@@ -139,14 +137,8 @@ def _together(
         return Likelihood(precision, linear, b)
     of_mm = 1e6 * covariance(grid, common, np.abs(places[:, None] - places[None, :]))
     of_mm += _JITTER * of_mm[0, 0] * np.eye(places.size)
-    road_precision = precision[b:, b:] + np.linalg.inv(of_mm)
-    factor = cho_factor(road_precision, lower=True)
-    across = precision[b:, :b]
-    return Likelihood(
-        precision[:b, :b] - across.T @ cho_solve(factor, across),
-        linear[:b] - across.T @ cho_solve(factor, linear[b:]),
-        b,
-    )
+    precision[b:, b:] += np.linalg.inv(of_mm)
+    return Likelihood(*marginal(precision, linear, np.arange(b)), b)
 
 
 def _drawn(all_runs: Likelihood, one: Optimum, count: int, seed: int) -> FloatArray:
@@ -157,27 +149,18 @@ def _drawn(all_runs: Likelihood, one: Optimum, count: int, seed: int) -> FloatAr
     bridge = np.flatnonzero(kept >= FIRST_OF_BRIDGE)
     elements = np.searchsorted(bridge, where.elements)
     cut_off = np.searchsorted(bridge, np.intersect1d(where.half_normal, bridge))
-    told = np.concatenate([elements, cut_off])
-    others = np.setdiff1d(np.arange(bridge.size), told)
     precision = all_runs.precision.copy()
     single = np.setdiff1d(np.arange(bridge.size), elements)
     precision[single, single] += 1.0
-    sigma = problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]]
-    factor = cho_factor(precision[np.ix_(others, others)], lower=True)
-    across = precision[np.ix_(others, told)]
-    of = Compliances(
+    of = of_normal(
+        precision,
+        all_runs.linear,
         elements,
-        sigma,
-        told,
-        others,
-        np.ones(elements.size),
+        cut_off,
+        problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]],
+        posterior.log_odds_of_absence(problem)[bridge],
         1.0,
-        precision[np.ix_(told, told)] - across.T @ cho_solve(factor, across),
-        all_runs.linear[told] - across.T @ cho_solve(factor, all_runs.linear[others]),
-        posterior.log_odds_of_absence(problem)[bridge][told],
-        np.asarray(cholesky(precision[np.ix_(others, others)], lower=True)),
-        all_runs.linear[others],
-        across,
+        np.ones(elements.size),
         np.zeros(bridge.size),
     )
-    return np.stack([draws(of, count, seed, chain) for chain in range(_CHAINS)], axis=1)
+    return np.stack([draws(of, count, seed, chain) for chain in range(CHAINS)], axis=1)

@@ -11,16 +11,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
-from scipy.linalg import cho_factor, cho_solve
 
 from pre_core.crossing import posterior
+from pre_core.crossing.compliances import in_compliances, marginal, without_priors
 from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.optimum import Optimum
 from pre_core.crossing.preparation import off_bridge, with_noise_at
-from pre_core.crossing.residuals import evaluate
+from pre_core.crossing.residuals import Crossing, Points, evaluate
 from pre_core.crossing.whitening import RESIDUALS, filter_rows, row_count, solve
+from pre_core.physics.simulate import rear_position_m
 from pre_core.search import levenberg_marquardt
-from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE
+from pre_core.unknowns import FIRST_OF_BRIDGE
 
 FloatArray = NDArray[np.float64]
 
@@ -48,18 +49,11 @@ def likelihood(found: Optimum, own: Mismatch, knots_m: FloatArray | None = None)
     y = found.state.y
     apart = found.problem._replace(mismatch=own)
     problem = with_noise_at(apart, y, found.problem.force, mismatch=own.level_m3)
-    where = posterior.layout(problem)
     state = levenberg_marquardt.begin(lambda at: posterior.all_rows(problem, at), y)
     kept = np.flatnonzero(problem.priors.estimated)
     bridge = np.flatnonzero(kept >= FIRST_OF_BRIDGE)
-    # Rows of the priors begin after those of data and receiver, in the order of y.
-    priors = state.residual.size - where.trajectory.start + bridge
-    rows = np.setdiff1d(np.arange(state.residual.size), priors)
-    jacobian, residual = state.jacobian[rows].copy(), state.residual[rows]
-    centre = y.copy()
-    sigma = problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]]
-    centre[where.elements] = np.exp(-sigma * y[where.elements])
-    jacobian[:, where.elements] /= -sigma * centre[where.elements]
+    rows = without_priors(problem, state.residual.size, bridge)
+    centre, jacobian = in_compliances(problem, y, state.jacobian[rows])
     if knots_m is not None:
         common = np.zeros((rows.size, knots_m.size))
         white = _white_knots(problem, y, knots_m)
@@ -67,23 +61,22 @@ def likelihood(found: Optimum, own: Mismatch, knots_m: FloatArray | None = None)
         jacobian = np.hstack([jacobian, common])
         centre = np.concatenate([centre, np.zeros(knots_m.size)])
     told = np.concatenate([bridge, np.arange(y.size, centre.size)])
-    nuisances = np.setdiff1d(np.arange(centre.size), told)
     precision = jacobian.T @ jacobian
-    linear = precision @ centre - jacobian.T @ residual
-    factor = cho_factor(precision[np.ix_(nuisances, nuisances)], lower=True)
-    across = precision[np.ix_(nuisances, told)]
-    return Likelihood(
-        precision[np.ix_(told, told)] - across.T @ cho_solve(factor, across),
-        linear[told] - across.T @ cho_solve(factor, linear[nuisances]),
-        bridge.size,
-    )
+    linear = precision @ centre - jacobian.T @ state.residual[rows]
+    return Likelihood(*marginal(precision, linear, told), bridge.size)
+
+
+def _rear_m(crossing: Crossing, at: Points) -> FloatArray:
+    """Where the rear axle is at every row's sample: (rows,)."""
+    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
+    return rear[crossing.first_row :]
 
 
 def _white_knots(problem: posterior.Problem, y: FloatArray, knots_m: FloatArray) -> FloatArray:
     """What 1 mm of d_c at each knot does to the white rows: (3 m, k)."""
     crossing, rows = problem.crossing, problem.rows
     at = posterior.points(problem, y[None, :])
-    rear = (at.position_m[0] - crossing.direction * at.wheelbase_m[0])[crossing.first_row :]
+    rear = _rear_m(crossing, at)
     padded = np.concatenate(
         [
             knots_m[0] - KNOT_M * np.arange(2, 0, -1),
@@ -109,7 +102,7 @@ def mismatch_off_bridge(found: Optimum, x_m: FloatArray) -> FloatArray:
     problem, y = found.problem, found.state.y
     crossing, rows = problem.crossing, problem.rows
     at = posterior.points(problem, y[None, :])
-    rear = (at.position_m[0] - crossing.direction * at.wheelbase_m[0])[crossing.first_row :]
+    rear = _rear_m(crossing, at)
     (residual,) = evaluate(crossing, problem.works, at)
     out = np.full(x_m.size, np.nan)
     for one in off_bridge(problem, y):

@@ -45,6 +45,10 @@ class Footprint(NamedTuple):
     """How far to the left of the truck's line the axle runs."""
 
 
+COMMON_LORRY = (Footprint(), Footprint(width_m=0.22, twin_distance_m=0.33))
+"""Front and rear axle of a lorry nobody has measured: single tyres, and twin tyres behind."""
+
+
 def response(axle: Footprint, n_x: FloatArray, n_y: FloatArray) -> ComplexArray:
     """H of the module's text for waves (…,) along and across the road, in cycles/m."""
     strips = np.cos(np.pi * axle.track_m * n_y) * np.cos(np.pi * axle.twin_distance_m * n_y)
@@ -61,13 +65,9 @@ def spectra(front: Footprint, rear: Footprint, n: FloatArray) -> tuple[FloatArra
     """One-sided spectra (f,) at n > 0 cycles/m of a surface with Phi = k^-3, in m (times m²).
 
     Front axle, rear axle, the real part of their cross spectrum, and their difference front less
-    rear. Trapezoids in asinh(n_y/scale); the integrands fall off like a power.
+    rear.
     """
-    longest = np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)
-    t = np.linspace(-longest, longest, _FINE + 1)
-    n_y, weight = _SCALE * np.sinh(t), _SCALE * np.cosh(t) * (t[1] - t[0])
-    n_x = np.asarray(n)[:, None]
-    density = weight * (n_x**2 + n_y**2) ** -1.5
+    n_x, n_y, density = _across(n)
     h_front, h_rear = response(front, n_x, n_y), response(rear, n_x, n_y)
     return (
         np.sum(density * np.abs(h_front) ** 2, axis=1),
@@ -85,13 +85,22 @@ def common_spectrum(
     The track of each run lies beside the line by a normal of standard deviation `wander_m`, so that
     two are apart by sqrt(2) of it: waves across the road are multiplied by exp(-(2 pi n_y w)²).
     """
+    n_x, n_y, density = _across(n)
+    density = density * np.exp(-((2.0 * np.pi * n_y * wander_m) ** 2))
+    difference = response(front, n_x, n_y) - response(rear, n_x, n_y)
+    return np.asarray(np.sum(density * np.abs(difference) ** 2, axis=1))
+
+
+def _across(n: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Waves along (f, 1) and across (q,), and k^-3 times the weights (f, q) of the integral.
+
+    Trapezoids in asinh(n_y/scale); the integrands fall off like a power.
+    """
     longest = np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)
     t = np.linspace(-longest, longest, _FINE + 1)
     n_y, weight = _SCALE * np.sinh(t), _SCALE * np.cosh(t) * (t[1] - t[0])
     n_x = np.asarray(n)[:, None]
-    density = weight * (n_x**2 + n_y**2) ** -1.5 * np.exp(-((2.0 * np.pi * n_y * wander_m) ** 2))
-    difference = response(front, n_x, n_y) - response(rear, n_x, n_y)
-    return np.asarray(np.sum(density * np.abs(difference) ** 2, axis=1))
+    return n_x, n_y, weight * (n_x**2 + n_y**2) ** -1.5
 
 
 class Surface(NamedTuple):

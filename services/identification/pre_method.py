@@ -15,19 +15,18 @@ from pre_core import unknowns
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import optimum, posterior
 from pre_core.crossing.compliances import LEANING_SPREAD, led_by_mismatch
-from pre_core.crossing.mismatch import GEOMETRY, as_two_numbers
+from pre_core.crossing.mismatch import as_two_numbers
 from pre_core.crossing.preparation import Inputs, off_bridge_m
 from pre_core.crossing.sampling import Sampled, sample
 from pre_core.crossing.whitening import RESIDUALS
 from pre_core.physics.beam_basis import first_frequencies_hz
 from pre_core.physics.models import body_masses
-from pre_core.physics.simulate import Motion
-from pre_core.physics.surface import Footprint
+from pre_core.physics.simulate import Motion, rear_position_m
 from pre_core.search.loop import Ending, Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
-from schemas.site import Bridge, Vehicle
+from schemas.site import Bridge
 from services.identification.checks import Fit, reasons_after_fit
 from services.identification.crossing_data import (
     CrossingData,
@@ -40,6 +39,7 @@ from services.identification.crossing_data import (
     rejected,
     road_result,
 )
+from services.identification.footprints import footprints_of
 
 _FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN = 14, 8
 """At least so many in all, and in each of several spans on average, whatever the number of
@@ -113,23 +113,6 @@ def inputs_of(
         settings.threads,
         footprints_of(vehicle),
     )
-
-
-def footprints_of(vehicle: Vehicle) -> tuple[Footprint, Footprint]:
-    """Where the axles stand on the road: as the site file says, else as on a common lorry."""
-    axles = []
-    for axle, usual in enumerate(GEOMETRY):
-        known = {
-            "width_m": vehicle.tyre_width_m,
-            "length_m": vehicle.tyre_contact_length_m,
-            "twin_distance_m": vehicle.twin_tyre_distance_m,
-        }
-        stated = {name: pair[axle] for name, pair in known.items() if pair is not None}
-        track_m = usual.track_m if vehicle.track_m is None else vehicle.track_m
-        if stated.get("twin_distance_m") == 0.0:  # single tyres, as wide as such are
-            usual = Footprint()
-        axles.append(usual._replace(**stated, track_m=track_m))
-    return axles[0], axles[1]._replace(offset_m=vehicle.rear_axle_offset_m or 0.0)
 
 
 def _parts(bridge: Bridge) -> int:
@@ -254,7 +237,7 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
     white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
     at = posterior.points(problem, y[None, :])
     middle = crossing.first_row + rows.taps.size // 2 + rows.every * np.arange(white.shape[0])
-    rear = at.position_m[0] - data.stay.direction * at.wheelbase_m[0]
+    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), data.stay.direction)
     rows_of = unknowns.table(data.bridge.elements)
     estimated = [rows_of[i] for i in np.flatnonzero(problem.priors.estimated)]
     # Where the axles' roads differ that leads the truck as far as it is known.
@@ -377,7 +360,7 @@ def _derived(
         ei_thirds=results.Thirds(
             **{
                 name: _parameter("1", _level(data.bridge, scaled, k / 3.0, (k + 1) / 3.0), None)
-                for k, name in enumerate(("left", "middle", "right"))
+                for k, name in enumerate(results.Thirds.model_fields)
             }
         ),
     )

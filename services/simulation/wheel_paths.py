@@ -11,17 +11,18 @@ import numpy as np
 
 from pre_core.physics.road import Profile
 from pre_core.physics.simulate import Motion
-from pre_core.physics.surface import Footprint, felt_by, random_surface
+from pre_core.physics.surface import COMMON_LORRY, Footprint, felt_by, random_surface
 from schemas.site import Bridge, Vehicle
 from services.common.errors import InputError
+from services.identification.footprints import footprints_of
 
 REAR_OFFSET_M: Final = 0.005
 """Axles are set to millimetres."""
 REACH_M: Final = 150.0
 """A surface is drawn so far beyond both ends of the bridge, or twice as far, …: runs that stay
 within the same reach, fast or slow, either way, drive over the same road."""
-_SINGLE: Final = Footprint()
-_BEHIND: Final = {"single": _SINGLE, "twin": Footprint(width_m=0.22, twin_distance_m=0.33)}
+_SINGLE, _TWIN = COMMON_LORRY
+_BEHIND: Final = {"single": _SINGLE, "twin": _TWIN}
 
 
 class OnSurface(NamedTuple):
@@ -69,16 +70,7 @@ def wheel_paths_of(vehicle: Vehicle, asked: OnSurface = USUAL) -> WheelPaths:
         behind = "twin" if distance[1] > 0.0 else "single"
     if offset_m is None:
         offset_m = REAR_OFFSET_M if asked.rear_offset_m is None else asked.rear_offset_m
-    pairs = {
-        "width_m": vehicle.tyre_width_m,
-        "length_m": vehicle.tyre_contact_length_m,
-        "twin_distance_m": distance,
-        "track_m": None if vehicle.track_m is None else (vehicle.track_m, vehicle.track_m),
-    }
-    front, rear = (
-        usual._replace(**{key: pair[axle] for key, pair in pairs.items() if pair is not None})
-        for axle, usual in enumerate((_SINGLE, _BEHIND[behind]))
-    )
+    front, rear = footprints_of(vehicle, (_SINGLE, _BEHIND[behind]))
     return WheelPaths(front, rear._replace(offset_m=offset_m), asked.wander_m)
 
 

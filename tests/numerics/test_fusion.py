@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from pre_core.crossing import mismatch as mm
 from pre_core.crossing.optimum import Optimum
 from pre_core.fusion import joint
-from pre_core.physics.surface import felt_by, random_surface, spectra, surface_density
+from pre_core.physics.road import REFERENCE_CYCLES_PER_M
+from pre_core.physics.surface import COMMON_LORRY, felt_by, random_surface, spectra, surface_density
 from pre_core.unknowns import EI_1
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
@@ -19,11 +20,11 @@ from services.drives.runs import normalised
 from services.identification import pre_method
 from services.simulation.drawn import see
 
-FRONT, REAR = mm.GEOMETRY
+FRONT, REAR = COMMON_LORRY
 
 
 def whole() -> mm.Mismatch:
-    at = np.array([mm.REFERENCE_CYCLES_PER_M])
+    at = np.array([REFERENCE_CYCLES_PER_M])
     level = surface_density("A") * float(spectra(FRONT, REAR, at)[3][0])
     return mm.Mismatch(mm.shapes_of(FRONT, REAR), np.array([level, 0.0]), 10.0)
 

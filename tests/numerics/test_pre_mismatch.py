@@ -26,7 +26,15 @@ from pre_core.crossing.whitening import (
     whitener,
 )
 from pre_core.physics.models import from_models
-from pre_core.physics.surface import Footprint, felt_by, random_surface, spectra, surface_density
+from pre_core.physics.road import REFERENCE_CYCLES_PER_M
+from pre_core.physics.surface import (
+    COMMON_LORRY,
+    Footprint,
+    felt_by,
+    random_surface,
+    spectra,
+    surface_density,
+)
 from services.simulation.drive import beam_of, paper_site
 from services.simulation.drive import truck_of as car_of
 
@@ -34,7 +42,7 @@ FloatArray = NDArray[np.float64]
 
 STEP_S = 3e-3
 SPEED = 10.0
-FRONT, REAR = mm.GEOMETRY
+FRONT, REAR = COMMON_LORRY
 QUIET = np.full(4, 1e-6)
 
 
@@ -53,7 +61,7 @@ def of_level(level: float) -> mm.Mismatch:
 
 def true_level(road_class: str) -> float:
     """What the spectrum of the difference is at 0.1 cycles/m, by the integral."""
-    at = np.array([mm.REFERENCE_CYCLES_PER_M])
+    at = np.array([REFERENCE_CYCLES_PER_M])
     return surface_density(road_class) * float(spectra(FRONT, REAR, at)[3][0])
 
 
@@ -80,7 +88,7 @@ def filtered(values: FloatArray) -> FloatArray:
 def test_window_keeps_the_spectrum() -> None:
     shapes = mm.shapes_of(FRONT, REAR)
     n = np.array([0.04, 0.1, 0.3, 1.0, 2.0])
-    at = np.array([mm.REFERENCE_CYCLES_PER_M])
+    at = np.array([REFERENCE_CYCLES_PER_M])
     aside = Footprint(offset_m=0.005)
     for row, other, within in zip(shapes.density, (REAR, aside), (0.04, 0.35), strict=True):
         wanted = spectra(FRONT, other, n)[3] / spectra(FRONT, other, at)[3]
