@@ -38,6 +38,9 @@ _GRID_CYCLES_PER_M = 0.02
 _MOST_CYCLES_PER_M = 24.0
 LONG_CYCLES_PER_M = 0.05
 """Waves by which bridges are seen, and by which a mismatch is told."""
+_EVERY_LONG, _OTHERS = 30, 50
+"""Of the grid's waves the common part is computed for so many, the longest, and for so many of the
+others: it has no detail."""
 _ENOUGH = 1e-4
 _NOTHING = 1e-12
 
@@ -96,11 +99,13 @@ def common_shapes(front: Footprint, rear: Footprint, wander_m: float) -> FloatAr
     Long waves across the road are the same on all tracks, short ones are not: how much is common
     depends on the wave, and what it is at long ones no run tells.
     """
-    at = np.array([REFERENCE_CYCLES_PER_M])
+    at, grid = np.array([REFERENCE_CYCLES_PER_M]), _above_zero()
+    some = np.concatenate([grid[:_EVERY_LONG], np.geomspace(grid[_EVERY_LONG], grid[-1], _OTHERS)])
     return np.stack(
         [
             _windowed(
-                common_spectrum(one, other, _above_zero(), wander_m) / spectra(one, other, at)[3][0]
+                np.interp(grid, some, common_spectrum(one, other, some, wander_m))
+                / spectra(one, other, at)[3][0]
             )
             for one, other in _pairs(front, rear)
         ]

@@ -209,6 +209,20 @@ def with_noise_at(
     )
 
 
+def with_mismatch_alone(problem: Problem, y: FloatArray, mismatch: Mismatch) -> Problem:
+    """The problem with another mismatch in its noise at y, all else as it is, the slope too."""
+    truck, density = truck_at(problem, y)
+    noise = whitener(
+        problem.rows,
+        row_count(problem.rows, problem.crossing.rows),
+        truck,
+        density,
+        _SILENCED * problem.force,
+        mismatch,
+    )
+    return problem._replace(noise=noise)
+
+
 def _aside(
     problem: Problem, y: FloatArray, count: int, *, is_inertial: bool
 ) -> tuple[Points, list[Truck]]:

@@ -1,8 +1,11 @@
-"""One bridge from the likelihoods of several crossings: each prior once, the common mismatch apart.
+"""One bridge from the likelihoods of several crossings: each prior counts once.
 
-Runs of one truck in one track share a part of the mismatch of its axles' roads, which no number of
-them averages out. It is a Gaussian process along the road, with its values at knots among the
-unknowns; they are integrated out together with everything else that is normal.
+The unknowns are the bridge's; each truck's, with its total mass; and, of each track (a truck in one
+direction), the long waves of the part of the mismatch that its runs share, which no number of them
+averages out. A crossing has of its own the rest of those waves, and a change of every element's
+compliance: between crossings EI changes with temperature and with what the model lacks, by a
+relative standard deviation tau of which a share rho is common to all elements. All that is normal
+is integrated out; tau and rho are looked at on a grid.
 """
 
 from collections.abc import Sequence
@@ -11,44 +14,381 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing import posterior
-from pre_core.crossing.compliances import draws, marginal, of_normal
-from pre_core.crossing.mismatch import LONG_CYCLES_PER_M, MEMORY_M, Mismatch, common_shapes
-from pre_core.crossing.optimum import Optimum
-from pre_core.fusion.likelihood import Likelihood, knots, likelihood, mismatch_off_bridge
+from pre_core.crossing.compliances import Compliances, draws, marginal, of_normal
+from pre_core.crossing.mismatch import LONG_CYCLES_PER_M, Mismatch, common_shapes, shapes_of
+from pre_core.fusion.likelihood import (
+    OFF_BRIDGE_STEP_M,
+    Coordinates,
+    Likelihood,
+    OffBridge,
+    covariance_of_coefficients,
+    loosened,
+)
+from pre_core.physics.surface import Footprint
 from pre_core.search.crank_nicolson import CHAINS
-from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE
 
 FloatArray = NDArray[np.float64]
 
-_GRID_M = 0.1
-_APART_M = 0.5
+_APART_STEPS = 2
 """Of the second difference by which the common share is read: waves of half a metre to two."""
 _WANDERS_M, _HALVINGS = (0.01, 1.0), 12
-_LAG_M = 0.01
-_JITTER = 1e-6
+BETWEEN_SCALE = 0.04
+"""Of the half-normal prior of tau: temperature changes a concrete bridge's EI by some per cent."""
+_TAUS = BETWEEN_SCALE * np.array([0.0, 0.07, 0.15, 0.25, 0.4, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0])
+_RHOS = (0.1, 0.5, 0.9)
+_ROUGH_COMPLIANCE = (0.2, 5.0)
+"""Outside, a compliance that is hardly known is not taken for the size of its own changes."""
+_ROUGH_SPREAD = 0.6
+"""A normal prior of c that stands for the log-normal one where evidence is compared."""
+_PASSES = 2
+_NOTHING = 1e-9
+"""Of the largest variance of a sum of waves: a smaller one is rounding."""
 
 
-class Fused(NamedTuple):
-    """Draws of the bridge's unknowns in the coordinates of `posterior`, and how they were made."""
+class Part(NamedTuple):
+    """A crossing to fuse."""
 
-    draws: FloatArray  # (n, chains, b): the bridge's, elements last
+    name: str
+    likelihood: Likelihood
+    truck: str
+    direction: int
+    footprints: tuple[Footprint, Footprint]
+    mass_spread: float
+    """Relative, of the truck's total mass: the same error in all its crossings."""
+
+
+class BridgePriors(NamedTuple):
+    """In the order of the likelihoods' coordinates of the bridge, which have `elements` last."""
+
+    coordinates: Coordinates
+    mass_powers: FloatArray  # (b,)
+    log_odds: FloatArray  # (b,) of being exactly zero; `posterior.log_odds_of_absence`
+    elements: int
+
+
+class Shared(NamedTuple):
+    """What runs of a truck in one track have in common of the road's mismatch."""
+
+    truck: str
+    direction: int
     common_share: float
     """Of the mismatch's power at waves of 20 m."""
     wander_m: float | None
-    """How far the runs' tracks lie beside each other; None where that does not matter."""
-    level_m3: FloatArray  # (s,)
+    """How far the runs' tracks lie beside each other; None where one run tells nothing of it."""
+    level_m3: FloatArray
 
 
-def common_share(runs: Sequence[Optimum]) -> float:
+class Fused(NamedTuple):
+    """Draws of the bridge's unknowns in the coordinates of `crossing.posterior`."""
+
+    draws: FloatArray  # (n, chains, b): the bridge's, elements last
+    between: FloatArray
+    """(n, chains) the standard deviation tau of ln EI between crossings."""
+    tracks: tuple[Shared, ...]
+
+
+class Between(NamedTuple):
+    """tau and rho with their posterior weights, (k,) each."""
+
+    tau: FloatArray
+    rho: FloatArray
+    weight: FloatArray
+
+
+class _Layout(NamedTuple):
+    """Where among all unknowns stand those of the bridge, of each truck, of each track."""
+
+    bridge: int
+    elements: NDArray[np.int64]
+    trucks: dict[str, NDArray[np.int64]]
+    """The truck's coordinates, the error of its mass last."""
+    tracks: dict[tuple[str, int], NDArray[np.int64]]
+    size: int
+
+
+class _Ready(NamedTuple):
+    """A crossing's likelihood with what is its own of the long waves integrated out."""
+
+    precision: FloatArray
+    linear: FloatArray
+    places: NDArray[np.int64]
+    """Where its coordinates are among all."""
+
+
+class _Track(NamedTuple):
+    """What the runs of a truck in one direction share, and the covariances of their long waves."""
+
+    shared: Shared
+    own_root: FloatArray
+    common: FloatArray | None
+    """(q, q) mm²; None where there is one run: what it would share with others is its own."""
+
+
+def fuse(parts: Sequence[Part], priors: BridgePriors, count: int, seed: int) -> Fused:
+    """Draws of a bridge, `count` of each chain, from crossings with the coordinates of `priors`.
+
+    The order of the parts does not matter. ValueError without parts.
+    """
+    if not parts:
+        raise ValueError("no crossings to fuse")
+    joint = join(parts, priors)
+    between = _between(joint, priors)
+    return Fused(*_drawn(joint, priors, between, count, seed), joint.shared)
+
+
+class Joint(NamedTuple):
+    """Crossings that are ready to be added."""
+
+    names: tuple[str, ...]
+    layout: _Layout
+    ready: tuple[_Ready, ...]
+    prior: FloatArray
+    """Precision (n, n) of trucks and tracks before any crossing."""
+    centre: FloatArray
+    """(b,) about which the bridge's unknowns are: changes of compliances are relative to it."""
+    shared: tuple[Shared, ...]
+
+
+def join(parts: Sequence[Part], priors: BridgePriors) -> Joint:
+    """Crossings with what is their own integrated out, but for the change of the bridge."""
+    parts = sorted(parts, key=lambda part: part.name)
+    tracks = _tracks(parts)
+    layout = _layout_of(parts, tracks, priors)
+    prior = np.zeros((layout.size, layout.size))
+    for places in layout.trucks.values():
+        prior[places, places] = 1.0
+    for key, places in layout.tracks.items():
+        common = tracks[key].common
+        assert common is not None  # noqa: S101 - it has a place among the unknowns
+        prior[np.ix_(places, places)] = np.linalg.inv(common)
+    shared = tuple(track.shared for track in tracks.values())
+    names = tuple(part.name for part in parts)
+    centre = np.zeros(layout.bridge)
+    centre[layout.elements] = 1.0
+    for _ in range(_PASSES):
+        ready = tuple(_ready(part, layout, tracks, priors, centre) for part in parts)
+        joint = Joint(names, layout, ready, prior, centre, shared)
+        precision, linear = _sum(joint, priors, joint.ready)
+        centre = np.asarray(np.linalg.solve(precision, linear)[: layout.bridge])
+        centre[layout.elements] = np.clip(centre[layout.elements], *_ROUGH_COMPLIANCE)
+    return joint._replace(centre=centre)
+
+
+def _layout_of(
+    parts: Sequence[Part], tracks: dict[tuple[str, int], _Track], priors: BridgePriors
+) -> _Layout:
+    b = len(priors.coordinates.names)
+    size, trucks, places = b, {}, {}
+    for part in parts:
+        if part.truck not in trucks:
+            own = len(part.likelihood.truck.names) + 1
+            trucks[part.truck] = size + np.arange(own)
+            size += own
+        key = (part.truck, part.direction)
+        if key not in places and key in tracks and tracks[key].common is not None:
+            q = part.likelihood.knots_m.size
+            places[key] = size + np.arange(q)
+            size += q
+    return _Layout(b, np.arange(b - priors.elements, b), trucks, places, size)
+
+
+def _tracks(parts: Sequence[Part]) -> dict[tuple[str, int], _Track]:
+    """Of every truck in each direction in which its axles feel different roads."""
+    runs: dict[tuple[str, int], list[Part]] = {}
+    for part in parts:
+        if part.likelihood.knots_m.size:
+            runs.setdefault((part.truck, part.direction), []).append(part)
+    return {key: _track(key, some) for key, some in runs.items()}
+
+
+def _track(key: tuple[str, int], runs: list[Part]) -> _Track:
+    shapes = shapes_of(*runs[0].footprints)
+    level = np.mean([run.likelihood.level_m3 for run in runs], axis=0)
+    whole = level @ shapes.density
+    knots = runs[0].likelihood.knots_m
+    everything = covariance_of_coefficients(knots, shapes.cycles_per_m, whole)
+    if len(runs) == 1:
+        return _Track(Shared(*key, 0.0, None, level), _root(everything), None)
+    share = common_share([run.likelihood.off_bridge for run in runs])
+    wander_m = wander(Mismatch(shapes, level, 1.0), share)
+    density = level @ common_shapes(*shapes.footprints, wander_m)
+    common = covariance_of_coefficients(knots, shapes.cycles_per_m, density)
+    at_long = np.searchsorted(shapes.cycles_per_m, LONG_CYCLES_PER_M)
+    shared = Shared(*key, float(density[at_long] / whole[at_long]), wander_m, level)
+    return _Track(shared, _root(everything - common), common)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > _NOTHING * values[-1]
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def _ready(
+    part: Part,
+    layout: _Layout,
+    tracks: dict[tuple[str, int], _Track],
+    priors: BridgePriors,
+    centre: FloatArray,
+) -> _Ready:
+    of, b = part.likelihood, layout.bridge
+    truck = layout.trucks[part.truck]
+    # The mass scales truck and bridge alike: what is found of the bridge lies aside of what it is.
+    heavier = part.mass_spread * _with_mass(priors, centre)
+    root = np.hstack(
+        [
+            of.root[:, : b + truck.size - 1],
+            of.root[:, :b] @ heavier[:, None],
+            of.root[:, b + truck.size - 1 :],
+        ]
+    )
+    precision, linear = root.T @ root, root.T @ of.target
+    places = np.concatenate([np.arange(b), truck])
+    key = (part.truck, part.direction)
+    if key in tracks:
+        q = of.knots_m.size
+        along = np.zeros((linear.size, q))
+        along[-q:] = np.eye(q)
+        precision, linear = loosened(precision, linear, along, tracks[key].own_root)
+        if key in layout.tracks:
+            places = np.concatenate([places, layout.tracks[key]])
+        else:  # nothing else moves these waves
+            precision, linear = precision[:-q, :-q], linear[:-q]
+    return _Ready(precision, linear, places)
+
+
+def _with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
+    """How the bridge's coordinates (b,) at `centre` change with the logarithm of the total mass."""
+    of, power = priors.coordinates, priors.mass_powers
+    change = np.where(of.is_log, power / of.scale, power * centre)
+    elements = np.arange(centre.size - priors.elements, centre.size)
+    change[elements] = -power[elements] * centre[elements]
+    return np.asarray(change)
+
+
+def _sum(
+    joint: Joint, priors: BridgePriors, ready: Sequence[_Ready]
+) -> tuple[FloatArray, FloatArray]:
+    """Precision and linear part of all unknowns, with normal priors of the bridge's."""
+    layout = joint.layout
+    precision, linear = joint.prior.copy(), np.zeros(layout.size)
+    single = np.arange(layout.bridge - priors.elements)
+    precision[single, single] += 1.0
+    rough = _ROUGH_SPREAD**-2
+    precision[layout.elements, layout.elements] += rough
+    linear[layout.elements] += rough
+    for one in ready:
+        precision[np.ix_(one.places, one.places)] += one.precision
+        linear[one.places] += one.linear
+    return precision, linear
+
+
+def _changing(joint: Joint, tau: float, rho: float) -> tuple[list[_Ready], float]:
+    """The crossings, each with a bridge of its own, and what that adds to ln of the evidence."""
+    if tau == 0.0:
+        return list(joint.ready), 0.0
+    elements = joint.layout.elements
+    e = elements.size
+    root = np.linalg.cholesky((1.0 - rho) * np.eye(e) + rho) * tau
+    root = joint.centre[elements][:, None] * root
+    evidence, out = 0.0, []
+    for one in joint.ready:
+        across = one.precision[:, elements] @ root
+        pull = root.T @ one.linear[elements]
+        factor = np.linalg.cholesky(np.eye(e) + root.T @ across[elements])
+        moved = np.linalg.solve(factor, np.column_stack([across.T, pull]))
+        evidence += 0.5 * float(moved[:, -1] @ moved[:, -1]) - float(np.log(np.diag(factor)).sum())
+        out.append(
+            one._replace(
+                precision=one.precision - moved[:, :-1].T @ moved[:, :-1],
+                linear=one.linear - moved[:, :-1].T @ moved[:, -1],
+            )
+        )
+    return out, evidence
+
+
+def _between(joint: Joint, priors: BridgePriors) -> Between:
+    """Posterior of tau and rho; of one crossing it is the prior."""
+    tau, rho = (grid.ravel() for grid in np.meshgrid(_TAUS, _RHOS, indexing="ij"))
+    log = np.empty(tau.size)
+    for k in range(tau.size):
+        ready, log[k] = _changing(joint, float(tau[k]), float(rho[k]))
+        precision, linear = _sum(joint, priors, ready)
+        factor = np.linalg.cholesky(precision)
+        at = np.linalg.solve(factor, linear)
+        log[k] += 0.5 * float(at @ at) - float(np.log(np.diag(factor)).sum())
+    log -= 0.5 * (tau / BETWEEN_SCALE) ** 2
+    weight = np.exp(log - log.max()) * np.diff(_edges())[np.searchsorted(_TAUS, tau)]
+    return Between(tau, rho, weight / weight.sum())
+
+
+def _edges() -> FloatArray:
+    """Between the cells of tau of which the grid's are inside."""
+    return np.concatenate([[0.0], 0.5 * (_TAUS[1:] + _TAUS[:-1]), [_TAUS[-1]]])
+
+
+def _drawn(
+    joint: Joint, priors: BridgePriors, between: Between, count: int, seed: int
+) -> tuple[FloatArray, FloatArray]:
+    """Draws (count, chains, b) of the bridge's coordinates, and of tau (count, chains)."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
+    # As many of each as its weight says, but for chance: systematic sampling.
+    at = (np.arange(count) + rng.random()) / count
+    chosen = np.minimum(np.searchsorted(np.cumsum(between.weight), at), between.weight.size - 1)
+    edges = _edges()
+    out, taus = [], []
+    for k in np.unique(chosen):
+        some = int((chosen == k).sum())
+        tau, rho = float(between.tau[k]), float(between.rho[k])
+        density = _posterior(joint, priors, _changing(joint, tau, rho)[0])
+        out.append(
+            np.stack(
+                [
+                    draws(density, some, seed, (int(k) + 1) * CHAINS + chain)
+                    for chain in range(CHAINS)
+                ],
+                axis=1,
+            )
+        )
+        cell = int(np.searchsorted(_TAUS, tau))
+        taus.append(rng.uniform(edges[cell], edges[cell + 1], (some, CHAINS)))
+    order = rng.permutation(count)
+    return np.concatenate(out)[order], np.concatenate(taus)[order]
+
+
+def _posterior(joint: Joint, priors: BridgePriors, ready: Sequence[_Ready]) -> Compliances:
+    """All crossings times the priors, each once, with what is not the bridge's integrated out."""
+    layout, of = joint.layout, priors.coordinates
+    precision, linear = joint.prior.copy(), np.zeros(layout.size)
+    for one in ready:
+        precision[np.ix_(one.places, one.places)] += one.precision
+        linear[one.places] += one.linear
+    precision, linear = marginal(precision, linear, np.arange(layout.bridge))
+    single = np.arange(layout.bridge - priors.elements)
+    precision[single, single] += 1.0
+    return of_normal(
+        precision,
+        linear,
+        layout.elements,
+        np.flatnonzero(~of.is_log),
+        of.scale[layout.elements],
+        priors.log_odds,
+        1.0,
+        joint.centre[layout.elements],
+        np.zeros(layout.bridge),
+    )
+
+
+def common_share(runs: Sequence[OffBridge | None]) -> float:
     """Which part of the mismatch's short waves the runs have in common, by rows off the bridge."""
-    if len(runs) < 2:
-        return 0.0
-    x = np.arange(-60.0, max(run.problem.crossing.span_m for run in runs) + 60.0, _GRID_M)
-    step = round(_APART_M / _GRID_M)
-    bent = []
-    for run in runs:
-        d = mismatch_off_bridge(run, x)
+    known = [run for run in runs if run is not None]
+    first = min(round(run.begin_m / OFF_BRIDGE_STEP_M) for run in known)
+    last = max(round(run.begin_m / OFF_BRIDGE_STEP_M) + run.value_m.size for run in known)
+    step, bent = _APART_STEPS, []
+    for run in known:
+        d = np.full(last - first, np.nan)
+        begin = round(run.begin_m / OFF_BRIDGE_STEP_M) - first
+        d[begin : begin + run.value_m.size] = run.value_m
         bent.append(d[2 * step :] - 2.0 * d[step:-step] + d[: -2 * step])
     together = power = 0.0
     for i in range(len(bent)):
@@ -64,7 +404,7 @@ def wander(mismatch: Mismatch, share: float) -> float:
     shapes = mismatch.shapes
     n = shapes.cycles_per_m
     # As the second differences of `common_share` see the waves.
-    seen = np.sin(np.pi * n * _APART_M) ** 4
+    seen = np.sin(np.pi * n * _APART_STEPS * OFF_BRIDGE_STEP_M) ** 4
     whole = float(mismatch.level_m3 @ shapes.density @ seen)
 
     def of(wander_m: float) -> float:
@@ -76,91 +416,3 @@ def wander(mismatch: Mismatch, share: float) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if of(middle) > share else (low, middle)
     return 0.5 * (low + high)
-
-
-def covariance(grid: FloatArray, density: FloatArray, apart_m: FloatArray) -> FloatArray:
-    """Covariance in m² at places `apart_m` from each other of a density (g,) on an even grid."""
-    step = grid[1] - grid[0]
-    weight = np.full(grid.size, step)
-    weight[0] *= 0.5
-    lags = np.arange(0.0, MEMORY_M + _LAG_M, _LAG_M)
-    table = np.cos(2.0 * np.pi * np.outer(lags, grid)) @ (weight * density)
-    return np.asarray(np.interp(apart_m, lags, table, right=0.0))
-
-
-def fuse(runs: Sequence[Optimum], count: int, seed: int) -> Fused:
-    """Draws of a bridge from runs of one truck in one direction: (count, chains, b).
-
-    ValueError without runs.
-    """
-    if not runs:
-        raise ValueError("no runs to fuse")
-    whole = runs[0].problem.mismatch._replace(
-        level_m3=np.mean([run.problem.mismatch.level_m3 for run in runs], axis=0)
-    )
-    shapes = whole.shapes
-    common, places, wander_m = np.zeros_like(shapes.density), None, None
-    if len(runs) > 1 and whole.level_m3.any():
-        wander_m = wander(whole, common_share(runs))
-        common = common_shapes(*shapes.footprints, wander_m)
-        places = _places(runs)
-    own = whole._replace(shapes=shapes._replace(density=shapes.density - common))
-    parts = [
-        likelihood(run, own._replace(speed_m_per_s=run.problem.mismatch.speed_m_per_s), places)
-        for run in runs
-    ]
-    together = _together(parts, shapes.cycles_per_m, whole.level_m3 @ common, places)
-    at_long = np.searchsorted(shapes.cycles_per_m, LONG_CYCLES_PER_M)
-    densities = (whole.level_m3 @ common, whole.level_m3 @ shapes.density)
-    share = float(densities[0][at_long] / densities[1][at_long]) if whole.level_m3.any() else 0.0
-    return Fused(_drawn(together, runs[0], count, seed), share, wander_m, whole.level_m3)
-
-
-def _places(runs: Sequence[Optimum]) -> FloatArray:
-    fronts = [posterior.points(run.problem, run.state.y[None, :]).position_m[0] for run in runs]
-    wheelbase = max(run.problem.priors.wheelbase_m for run in runs)
-    begin = min(float(front.min()) for front in fronts) - wheelbase
-    return knots(begin, max(float(front.max()) for front in fronts) + wheelbase)
-
-
-def _together(
-    parts: Sequence[Likelihood],
-    grid: FloatArray,
-    common: FloatArray,
-    places: FloatArray | None,
-) -> Likelihood:
-    """The product of all, the common mismatch integrated out."""
-    precision = np.sum([part.precision for part in parts], axis=0)
-    linear = np.sum([part.linear for part in parts], axis=0)
-    b = parts[0].bridge
-    if places is None:
-        return Likelihood(precision, linear, b)
-    of_mm = 1e6 * covariance(grid, common, np.abs(places[:, None] - places[None, :]))
-    of_mm += _JITTER * of_mm[0, 0] * np.eye(places.size)
-    precision[b:, b:] += np.linalg.inv(of_mm)
-    return Likelihood(*marginal(precision, linear, np.arange(b)), b)
-
-
-def _drawn(all_runs: Likelihood, one: Optimum, count: int, seed: int) -> FloatArray:
-    """Draws of the likelihood times the bridge's priors, each once."""
-    problem = one.problem
-    where = posterior.layout(problem)
-    kept = np.flatnonzero(problem.priors.estimated)
-    bridge = np.flatnonzero(kept >= FIRST_OF_BRIDGE)
-    elements = np.searchsorted(bridge, where.elements)
-    cut_off = np.searchsorted(bridge, np.intersect1d(where.half_normal, bridge))
-    precision = all_runs.precision.copy()
-    single = np.setdiff1d(np.arange(bridge.size), elements)
-    precision[single, single] += 1.0
-    of = of_normal(
-        precision,
-        all_runs.linear,
-        elements,
-        cut_off,
-        problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]],
-        posterior.log_odds_of_absence(problem)[bridge],
-        1.0,
-        np.ones(elements.size),
-        np.zeros(bridge.size),
-    )
-    return np.stack([draws(of, count, seed, chain) for chain in range(CHAINS)], axis=1)

@@ -1,9 +1,15 @@
-"""What one crossing says of the bridge and of the part of the road's mismatch that runs share.
+"""What one crossing says of bridge, truck and the long waves of its road's mismatch.
 
-The likelihood alone, priors of the bridge left out so that each counts once: normal in the bridge's
-unknowns, with c = EI_nominal/EI in place of ln EI (`crossing.compliances`), and in the values of
-the common mismatch d_c at knots along the road; everything of this crossing's own - truck,
-trajectory, delays, its own part of the mismatch - is integrated out.
+The likelihood alone, so that each prior counts once however many crossings are fused: normal in
+
+- the bridge's unknowns, with c = EI_nominal/EI in place of ln EI (`crossing.compliances`),
+- the truck's, its wheelbase and the gain common to its sensors, which are the same in all its runs,
+- the waves of the mismatch d that are long enough to look like a deflection, as coefficients of
+  cubic splines along the road. Part of them is the same in all runs of a truck in one track, which
+  no crossing can tell by itself.
+
+Everything else of this crossing - trajectory, delays, gains, how the bridge swung, the mismatch's
+short waves - is integrated out. What is left is small and is stored with the crossing's result.
 """
 
 from typing import NamedTuple
@@ -11,59 +17,226 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
+from scipy.linalg import cho_factor, cho_solve, qr
 
+from pre_core import unknowns
 from pre_core.crossing import posterior
-from pre_core.crossing.compliances import in_compliances, marginal, without_priors
-from pre_core.crossing.mismatch import Mismatch
+from pre_core.crossing.compliances import (
+    LEANING_SPREAD,
+    in_compliances,
+    led_by_mismatch,
+    marginal,
+    without_priors,
+)
+from pre_core.crossing.mismatch import MEMORY_M, Mismatch
 from pre_core.crossing.optimum import Optimum
-from pre_core.crossing.preparation import off_bridge, with_noise_at
+from pre_core.crossing.preparation import off_bridge, with_mismatch_alone
 from pre_core.crossing.residuals import Crossing, Points, evaluate
 from pre_core.crossing.whitening import RESIDUALS, filter_rows, row_count, solve
 from pre_core.physics.simulate import rear_position_m
 from pre_core.search import levenberg_marquardt
-from pre_core.unknowns import FIRST_OF_BRIDGE
 
 FloatArray = NDArray[np.float64]
 
-KNOT_M = 0.4
-"""Between knots of the common mismatch, cubic between: waves of a metre are still there."""
+KNOT_M = 1.25
+"""Between knots of the mismatch's long waves, cubic between."""
+_LONG_CYCLES_PER_M = 0.2
+"""Waves longer than this in round numbers are told apart: 80 to 97 % of what is told of a bridge
+lies below half of it."""
+_LONG_SHARE = 0.97
+"""Of the power of the longest waves; the rest stays noise of the crossing's own, for the rows'
+covariance must be positive."""
+_BESIDE_M = 7.5
+"""Before and behind the bridge as far as the mismatch there is related to that on it."""
 _CUBIC = 3
+_ROUNDED = 1e-12
+OFF_BRIDGE_STEP_M = 0.25
+"""Between the places at which the mismatch off the bridge is told."""
+_FARTHEST_OFF_M = 60.0
+
+
+class Coordinates(NamedTuple):
+    """What the first places of x mean: (k,) each. EI: c = location/EI; else see `is_log`."""
+
+    names: tuple[str, ...]
+    location: FloatArray
+    """Nominal values."""
+    scale: FloatArray
+    is_log: NDArray[np.bool_]
+    """x = ln(value/location)/scale; elsewhere value/scale."""
+
+
+class OffBridge(NamedTuple):
+    """The mismatch in m at begin_m, begin_m + `OFF_BRIDGE_STEP_M`, …; NaN where it is not told."""
+
+    begin_m: float
+    value_m: FloatArray
 
 
 class Likelihood(NamedTuple):
-    """-(x'Ax)/2 + b'x up to a constant, of x: the bridge's unknowns, then d_c in mm at knots."""
+    """-|root x - target|²/2 up to a constant, of x = (bridge, truck, coefficients of d in mm)."""
 
-    precision: FloatArray  # (b + k, b + k)
-    linear: FloatArray  # (b + k,)
-    bridge: int
-    """How many of x are the bridge's; elements are the last of them."""
+    root: FloatArray  # (m, m) upper triangular
+    target: FloatArray  # (m,)
+    bridge: Coordinates
+    truck: Coordinates
+    knots_m: FloatArray
+    """(q,) knots of the long waves of d; none where both axles feel one road."""
+    level_m3: FloatArray  # (s,) levels of the mismatch that the crossing told
+    off_bridge: OffBridge | None
 
 
-def knots(begin_m: float, end_m: float) -> FloatArray:
-    """Chainages of the knots that cover a stretch of road."""
-    return np.arange(begin_m - 2.0 * KNOT_M, end_m + 3.0 * KNOT_M, KNOT_M)
+def long_share(cycles_per_m: FloatArray) -> FloatArray:
+    """Which share of the mismatch's power counts as long waves: (g,)."""
+    return np.asarray(_LONG_SHARE * np.exp(-((cycles_per_m / _LONG_CYCLES_PER_M) ** 2)))
 
 
-def likelihood(found: Optimum, own: Mismatch, knots_m: FloatArray | None = None) -> Likelihood:
-    """Of a crossing at its optimum, `own` being its own part of the mismatch at its own speed."""
-    y = found.state.y
-    apart = found.problem._replace(mismatch=own)
-    problem = with_noise_at(apart, y, found.problem.force, mismatch=own.level_m3)
-    state = levenberg_marquardt.begin(lambda at: posterior.all_rows(problem, at), y)
-    kept = np.flatnonzero(problem.priors.estimated)
-    bridge = np.flatnonzero(kept >= FIRST_OF_BRIDGE)
-    rows = without_priors(problem, state.residual.size, bridge)
+def covariance_of_coefficients(
+    knots_m: FloatArray, cycles_per_m: FloatArray, density: FloatArray
+) -> FloatArray:
+    """Covariance (q, q) in mm² of the splines' coefficients, for long waves of a density in m³."""
+    seen = np.sinc(cycles_per_m * KNOT_M) ** (2 * (_CUBIC + 1))
+    within = cycles_per_m < 0.5 / KNOT_M
+    of = np.where(within, long_share(cycles_per_m) * density, 0.0) / np.where(within, seen, 1.0)
+    step = cycles_per_m[1] - cycles_per_m[0]
+    weight = np.full(cycles_per_m.size, step)
+    weight[0] *= 0.5
+    lags = np.arange(knots_m.size) * KNOT_M
+    row = 1e6 * np.cos(2.0 * np.pi * np.outer(lags, cycles_per_m)) @ (weight * of)
+    row[lags > MEMORY_M + 3.0 / _LONG_CYCLES_PER_M] = 0.0
+    row[0] *= 1.0 + 1e-6
+    places = np.arange(knots_m.size)
+    return np.asarray(row[np.abs(places[:, None] - places[None, :])])
+
+
+def likelihood(found: Optimum) -> Likelihood:
+    """Of a crossing at its optimum."""
+    problem, y = found.problem, found.state.y
+    where = posterior.layout(problem)
+    state = found.state
+    grid, inner = np.zeros(0), np.zeros(0, dtype=np.int64)
+    differs = bool(problem.mismatch.level_m3.any())
+    if differs:
+        problem = with_mismatch_alone(problem, y, _short_waves(problem.mismatch))
+        state = levenberg_marquardt.begin(lambda at: posterior.all_rows(problem, at), y)
+        grid, inner = _knots(problem, y)
+    bridge = where.bridge
+    truck = np.concatenate(
+        [np.setdiff1d(np.arange(where.theta.stop), bridge), [where.wheelbase, where.common_gain]]
+    )
+    told = np.concatenate([bridge, truck])
+    rows = without_priors(problem, state.residual.size, told)
     centre, jacobian = in_compliances(problem, y, state.jacobian[rows])
-    if knots_m is not None:
-        common = np.zeros((rows.size, knots_m.size))
-        white = _white_knots(problem, y, knots_m)
-        common[: white.shape[0]] = white
-        jacobian = np.hstack([jacobian, common])
-        centre = np.concatenate([centre, np.zeros(knots_m.size)])
-    told = np.concatenate([bridge, np.arange(y.size, centre.size)])
+    # What is taken off the slope stands in the rows of the priors, which are left out.
+    slope = np.zeros(centre.size + grid.size)
+    slope[: problem.noise_slope.size] = problem.noise_slope
+    slope[np.setdiff1d(np.arange(slope.size), truck)] = 0.0
+    if differs:
+        splines = np.zeros((rows.size, grid.size))
+        white = _white_knots(problem, y, grid)
+        splines[: white.shape[0]] = white
+        jacobian = np.hstack([jacobian, splines])
+        told = np.concatenate([told, centre.size + inner])
+        centre = np.concatenate([centre, np.zeros(grid.size)])
     precision = jacobian.T @ jacobian
-    linear = precision @ centre - jacobian.T @ state.residual[rows]
-    return Likelihood(*marginal(precision, linear, told), bridge.size)
+    linear = precision @ centre - jacobian.T @ state.residual[rows] + slope
+    if differs:
+        _beside(precision, found.problem.mismatch, grid, inner)
+    precision, linear = marginal(precision, linear, told)
+    if differs:
+        led = np.zeros(linear.size)
+        led[bridge.size : bridge.size + truck.size] = led_by_mismatch(found)[truck]
+        precision, linear = loosened(precision, linear, led[:, None], np.array([[LEANING_SPREAD]]))
+    return Likelihood(
+        *_as_root(precision, linear),
+        _coordinates(problem, bridge),
+        _coordinates(problem, truck),
+        grid[inner],
+        found.problem.mismatch.level_m3,
+        _off_bridge(found) if differs else None,
+    )
+
+
+def loosened(
+    precision: FloatArray, linear: FloatArray, along: FloatArray, root: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """A normal of which the coordinates move along columns (m, r) by what is unknown: r normals.
+
+    `root` (r, r) is a root of their covariance, root root'. The precision may be singular.
+    """
+    moved = along @ root
+    across = precision @ moved
+    inner = np.eye(root.shape[1]) + moved.T @ across
+    factor = cho_factor(inner, lower=True)
+    return (
+        precision - across @ cho_solve(factor, across.T),
+        linear - across @ cho_solve(factor, moved.T @ linear),
+    )
+
+
+def _short_waves(mismatch: Mismatch) -> Mismatch:
+    shapes = mismatch.shapes
+    density = shapes.density * (1.0 - long_share(shapes.cycles_per_m))
+    return mismatch._replace(shapes=shapes._replace(density=density))
+
+
+def _knots(problem: posterior.Problem, y: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Knots on all of the road that was driven, and which of them are on the bridge or near it."""
+    at = posterior.points(problem, y[None, :])
+    rear = _rear_m(problem.crossing, at)
+    # From the bridge's start on, so that all crossings have the same.
+    first = int(np.floor(rear.min() / KNOT_M)) - 2
+    last = int(np.ceil(rear.max() / KNOT_M)) + 2
+    grid = KNOT_M * np.arange(first, last + 1)
+    near = (grid > -_BESIDE_M) & (grid < problem.crossing.span_m + _BESIDE_M)
+    return np.asarray(grid), np.asarray(np.flatnonzero(near), dtype=np.int64)
+
+
+def _beside(
+    precision: FloatArray, mismatch: Mismatch, grid: FloatArray, inner: NDArray[np.int64]
+) -> None:
+    """Add what is known of the coefficients beside the bridge given those on it; in place.
+
+    The prior of those on the bridge is left for where crossings are fused.
+    """
+    shapes = mismatch.shapes
+    of_all = covariance_of_coefficients(
+        grid, shapes.cycles_per_m, mismatch.level_m3 @ shapes.density
+    )
+    first = precision.shape[0] - grid.size
+    precision[first:, first:] += np.linalg.inv(of_all)
+    precision[np.ix_(first + inner, first + inner)] -= np.linalg.inv(of_all[np.ix_(inner, inner)])
+
+
+def _as_root(precision: FloatArray, linear: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Upper triangular R and z with R'R the precision and R'z the linear part."""
+    values, vectors = np.linalg.eigh(0.5 * (precision + precision.T))
+    kept = values > _ROUNDED * values[-1]
+    size = np.sqrt(np.where(kept, values, 1.0))
+    rows = np.where(kept, size, 0.0)[:, None] * vectors.T
+    target = np.where(kept, vectors.T @ linear, 0.0) / size
+    (both,) = qr(np.column_stack([rows, target]), mode="r")
+    m = linear.size
+    return np.asarray(both[:m, :m]), np.asarray(both[:m, m])
+
+
+def _coordinates(problem: posterior.Problem, places: NDArray[np.int64]) -> Coordinates:
+    """Of places in y, or of wheelbase and common gain, which come last."""
+    priors, where = problem.priors, posterior.layout(problem)
+    table = unknowns.table(unknowns.element_count(priors.theta))
+    kept = np.flatnonzero(priors.estimated)
+    of_truck = {
+        where.wheelbase: ("wheelbase", priors.wheelbase_m, priors.wheelbase_spread),
+        where.common_gain: ("common_gain", 1.0, posterior.common_gain_spread(priors)),
+    }
+    rows = [
+        of_truck.get(int(place))
+        or (table[kept[place]].name, priors.theta[kept[place]], priors.spread[kept[place]])
+        for place in places
+    ]
+    names, location, scale = zip(*rows, strict=True)
+    zero = np.isin(places, where.half_normal)
+    return Coordinates(names, np.array(location, float), np.array(scale, float), ~zero)
 
 
 def _rear_m(crossing: Crossing, at: Points) -> FloatArray:
@@ -72,23 +245,18 @@ def _rear_m(crossing: Crossing, at: Points) -> FloatArray:
     return rear[crossing.first_row :]
 
 
-def _white_knots(problem: posterior.Problem, y: FloatArray, knots_m: FloatArray) -> FloatArray:
-    """What 1 mm of d_c at each knot does to the white rows: (3 m, k)."""
+def _white_knots(problem: posterior.Problem, y: FloatArray, grid: FloatArray) -> FloatArray:
+    """What 1 mm of each coefficient does to the white rows: (3 m, q)."""
     crossing, rows = problem.crossing, problem.rows
     at = posterior.points(problem, y[None, :])
     rear = _rear_m(crossing, at)
-    padded = np.concatenate(
-        [
-            knots_m[0] - KNOT_M * np.arange(2, 0, -1),
-            knots_m,
-            knots_m[-1] + KNOT_M * np.arange(1, 3),
-        ]
-    )
-    basis = BSpline(padded, np.eye(knots_m.size), _CUBIC, extrapolate=False)
+    aside = KNOT_M * np.arange(1, _CUBIC)
+    padded = np.concatenate([grid[0] - aside[::-1], grid, grid[-1] + aside])
+    basis = BSpline(padded, np.eye(grid.size), _CUBIC, extrapolate=False)
     shape = 1e-3 * np.nan_to_num(np.asarray(basis(rear)))
-    out = np.zeros((problem.noise.reciprocal.size, knots_m.size))
+    out = np.zeros((problem.noise.reciprocal.size, grid.size))
     filtered = np.empty(row_count(rows, rear.size))
-    for k in range(knots_m.size):
+    for k in range(grid.size):
         filter_rows(rows.taps, rows.every, np.ascontiguousarray(shape[:, k]), filtered)
         column = np.zeros(out.shape[0])
         column[::RESIDUALS] = filtered
@@ -97,20 +265,24 @@ def _white_knots(problem: posterior.Problem, y: FloatArray, knots_m: FloatArray)
     return out
 
 
-def mismatch_off_bridge(found: Optimum, x_m: FloatArray) -> FloatArray:
-    """What the axles' roads differ by at x (k,) in m, off the bridge; NaN elsewhere."""
+def _off_bridge(found: Optimum) -> OffBridge:
+    """What the axles' roads differ by off the bridge, at places that all crossings have."""
     problem, y = found.problem, found.state.y
     crossing, rows = problem.crossing, problem.rows
     at = posterior.points(problem, y[None, :])
     rear = _rear_m(crossing, at)
     (residual,) = evaluate(crossing, problem.works, at)
-    out = np.full(x_m.size, np.nan)
+    step = OFF_BRIDGE_STEP_M
+    first = int(np.ceil(max(rear.min(), -_FARTHEST_OFF_M) / step))
+    last = int(np.floor(min(rear.max(), crossing.span_m + _FARTHEST_OFF_M) / step))
+    x = step * np.arange(first, last + 1)
+    out = np.full(x.size, np.nan)
     for one in off_bridge(problem, y):
         samples = slice(one.start * rows.every, one.stop * rows.every)
         place, value = rear[samples], residual[0][samples]
         if place.size < 2:
             continue
         order = np.argsort(place)
-        inside = (x_m > place.min()) & (x_m < place.max())
-        out[inside] = np.interp(x_m[inside], place[order], value[order])
-    return out
+        inside = (x > place.min()) & (x < place.max())
+        out[inside] = np.interp(x[inside], place[order], value[order])
+    return OffBridge(float(x[0]), out)

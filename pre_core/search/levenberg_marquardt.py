@@ -22,7 +22,7 @@ _SMALLEST_DAMPING = 1e-14
 _GIVE_UP_DAMPING = 1e8
 """Steps that are so short and do not help: the search is stuck."""
 _CONVERGED_STEP = 1e-9  # in logarithms
-_LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
+LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
 
 
 class Differences(NamedTuple):
@@ -85,11 +85,20 @@ def begin(rows: Rows, y: FloatArray, differences: Differences = FORWARD) -> Stat
     return State(y, residual, jacobian, _square(residual), _FIRST_DAMPING, differences)
 
 
-def descend(rows: Rows, state: State, lower: FloatArray | None = None) -> tuple[State, Info]:
-    """One Levenberg-Marquardt step of any problem: damping grows until the objective falls.
+class Move(NamedTuple):
+    """Where a step leads, before the slopes there are known."""
 
-    No coordinate goes below `lower` (f,); one that lies there and would is held for this step.
-    """
+    y: FloatArray
+    residual: FloatArray
+    objective: float
+    damping: float
+    """Of the following step."""
+    size: float  # largest change of a coordinate
+    evaluations: int
+
+
+def move(rows: Rows, state: State, lower: FloatArray | None = None) -> Move | tuple[State, Info]:
+    """The way to a smaller objective from `state`, or why there is none; see `descend`."""
     if not (np.isfinite(state.objective) and np.all(np.isfinite(state.jacobian))):
         return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.NOT_FINITE)
     f = state.y.size
@@ -111,9 +120,9 @@ def descend(rows: Rows, state: State, lower: FloatArray | None = None) -> tuple[
         change = np.zeros(f)
         change[free] = _damped(triangle, projected, damping) / scale
         size = float(np.abs(change).max())
-        if size > _LARGEST_STEP:
-            change *= _LARGEST_STEP / size
-            size = _LARGEST_STEP
+        if size > LARGEST_STEP:
+            change *= LARGEST_STEP / size
+            size = LARGEST_STEP
         trial = state.y + change
         if lower is not None:
             trial = np.maximum(trial, lower)
@@ -123,17 +132,28 @@ def descend(rows: Rows, state: State, lower: FloatArray | None = None) -> tuple[
         # False for NaN too.
         if objective < state.objective * (1.0 + state.differences.rounding):
             eased = max(damping * 0.1, _SMALLEST_DAMPING)
-            slopes = _jacobian(rows, trial, residual, state.differences)
-            evaluations += _evaluations(state.differences, f)
-            ending = Ending.CONVERGED if size < _CONVERGED_STEP else None
-            return (
-                State(trial, residual, slopes, objective, eased, state.differences),
-                Info(objective, size, damping, True, evaluations, ending),
-            )
+            return Move(trial, residual, objective, eased, size, evaluations)
         if size < _CONVERGED_STEP:
             return state, Info(state.objective, size, damping, False, evaluations, Ending.CONVERGED)
         damping *= 10.0
     return state, Info(state.objective, 0.0, damping, False, evaluations, Ending.STUCK)
+
+
+def descend(rows: Rows, state: State, lower: FloatArray | None = None) -> tuple[State, Info]:
+    """One Levenberg-Marquardt step of any problem: damping grows until the objective falls.
+
+    No coordinate goes below `lower` (f,); one that lies there and would is held for this step.
+    """
+    there = move(rows, state, lower)
+    if not isinstance(there, Move):
+        return there
+    slopes = _jacobian(rows, there.y, there.residual, state.differences)
+    evaluations = there.evaluations + _evaluations(state.differences, state.y.size)
+    ending = Ending.CONVERGED if there.size < _CONVERGED_STEP else None
+    return (
+        State(there.y, there.residual, slopes, there.objective, there.damping, state.differences),
+        Info(there.objective, there.size, there.damping, True, evaluations, ending),
+    )
 
 
 def _square(residual: FloatArray) -> float:

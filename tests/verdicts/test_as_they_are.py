@@ -146,4 +146,13 @@ RUNS_OF_D9 = [pytest.param(run, marks=() if run == 1 else pytest.mark.slow) for 
 @pytest.mark.parametrize("run", RUNS_OF_D9)
 def test_everything_at_once(shared: Path, run: int) -> None:
     found = judged(shared / "crossings" / "d9_everything_16_runs", run)
+    assert found.result.verdict == "good", found.result.reasons
     check_on_two_roads(found)
+    of = found.truth["vehicle"]
+    truth = {"d_1": of["d1"]}
+    for k in range(2):
+        truth |= {f"m_u{k + 1}": of["mu"][k], f"k_u{k + 1}": of["ku"][k]}
+    assert found.result.parameters is not None
+    for name, value in truth.items():
+        parameter = found.result.parameters[name]
+        assert abs(parameter.mean - value) < 4.0 * parameter.std, name
