@@ -92,6 +92,49 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
 }
 
 
+class BridgeReason(StrEnum):
+    """Why the fused estimate of a bridge is not `good`."""
+
+    NO_GOOD_CROSSING = "no_good_crossing"
+    NOT_FUSED = "not_fused"
+    CROSSINGS_DISAGREE = "crossings_disagree"
+    MANY_LEFT_OUT = "many_left_out"
+    USES_SUSPECT = "uses_suspect"
+
+
+BRIDGE_REASON_TEXTS: Final[dict[BridgeReason, str]] = {
+    BridgeReason.NO_GOOD_CROSSING: "No crossing of the bridge is good.",
+    BridgeReason.NOT_FUSED: (
+        "The method leaves nothing that crossings could be fused by: this is the latest alone."
+    ),
+    BridgeReason.CROSSINGS_DISAGREE: (
+        "Crossings disagree by more than their uncertainty and the change between them explain, "
+        "and too few are there to tell which is wrong."
+    ),
+    BridgeReason.MANY_LEFT_OUT: "More than a third of the good crossings disagree with the others.",
+    BridgeReason.USES_SUSPECT: "Suspect crossings were fused because that was asked for.",
+}
+
+
+class LeftOutReason(StrEnum):
+    """Why a crossing is not in the fused estimate of its bridge."""
+
+    SUSPECT = "suspect"
+    DISAGREES = "disagrees"
+    OTHER_MODEL = "other_model"
+    NO_LIKELIHOOD = "no_likelihood"
+    NOT_FUSED = "not_fused"
+
+
+LEFT_OUT_TEXTS: Final[dict[str, str]] = {
+    LeftOutReason.SUSPECT: "suspect",
+    LeftOutReason.DISAGREES: "disagrees with the others beyond its uncertainty",
+    LeftOutReason.OTHER_MODEL: "was identified with other elements or other unknowns",
+    LeftOutReason.NO_LIKELIHOOD: "an older result, without what fusion needs",
+    LeftOutReason.NOT_FUSED: "this method's results are not fused",
+}
+
+
 def texts(reasons: Iterable[Reason]) -> list[str]:
     """Return the sentence of each reason, in the same order."""
     return [REASON_TEXTS[reason] for reason in reasons]

@@ -11,7 +11,8 @@ from typing import Annotated, Final, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
 
 from schemas.errors import InputError
-from schemas.reasons import Reason, texts
+from schemas.fusion import FusionLikelihood
+from schemas.reasons import BRIDGE_REASON_TEXTS, BridgeReason, Reason, texts
 
 SCHEMA_VERSION: Final = 1
 
@@ -165,6 +166,8 @@ class Crossing(_Fields):
     covariance: Covariance | None = None
     derived: Derived | None = None
     road: Road | None = None
+    fusion_likelihood: FusionLikelihood | None = None
+    """What fusion needs of the crossing; None from methods that know of none."""
 
     @model_validator(mode="before")
     @classmethod
@@ -201,13 +204,55 @@ class LeftOut(_Fields):
     reason: str
 
 
+class ThirdsState(_Fields):
+    """The level of each third of the bridge, from its start, relative to nominal."""
+
+    left: ElementState
+    middle: ElementState
+    right: ElementState
+
+
+class Track(_Fields):
+    """What the runs of a truck in one direction share of the mismatch of its axles' roads."""
+
+    vehicle: str
+    direction: Direction
+    common_share: Annotated[Finite, Field(ge=0, le=1)]
+    """Of its power at waves of 20 m."""
+    wander_m: Finite | None = None
+    """How far the runs lie beside each other; None of a single run."""
+
+
+LOSSES_PERCENT: Final = (10, 20, 30)
+
+
 class BridgeResult(BaseModel):
-    """The fused estimate of one bridge; its elements are fields EI_1 … EI_n."""
+    """The fused estimate of one bridge; its elements are fields EI_1 … EI_n.
+
+    `verdict` judges the measurement and nothing else, `finding` is about the bridge.
+    """
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
     __pydantic_extra__: dict[Annotated[str, Field(pattern=r"^EI_[1-9]\d?$")], ElementState]
 
     between_crossing_std: Finite | None = None
+    """Relative standard deviation of EI from crossing to crossing, beyond what each can tell."""
+    between_crossing_std_q025: Finite | None = None
+    between_crossing_std_q975: Finite | None = None
+    verdict: Verdict | None = None
+    """None from programs that did not fuse."""
+    reasons: tuple[BridgeReason, ...] = ()
+    reason_texts: tuple[str, ...] = ()
+    """Filled in from `reasons` if not given."""
+    finding: str | None = None
+    weakest_element: str | None = None
+    """Of which EI is smallest, relative to the baseline or to nominal."""
+    probability_of_loss: dict[str, dict[str, Finite]] | None = None
+    """By element and per cent: that it lost more of the baseline's EI; None without a baseline."""
+    level: ElementState | None = None
+    """Geometric mean of EI over nominal, by length."""
+    thirds: ThirdsState | None = None
+    tracks: tuple[Track, ...] = ()
     crossings_used: tuple[str, ...] = ()
     crossings_left_out: tuple[LeftOut, ...] = ()
     """The newest of them, if there are many."""
@@ -217,9 +262,15 @@ class BridgeResult(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _counted(cls, values: object) -> object:
-        if isinstance(values, Mapping) and values.get("crossings_left_out_count") is None:
-            return {**values, "crossings_left_out_count": len(values.get("crossings_left_out", ()))}
-        return values
+        if not isinstance(values, Mapping):
+            return values
+        filled = dict(values)
+        if values.get("crossings_left_out_count") is None:
+            filled["crossings_left_out_count"] = len(values.get("crossings_left_out", ()))
+        if values.get("reasons") and not values.get("reason_texts"):
+            codes = [BridgeReason(code) for code in values["reasons"]]
+            filled["reason_texts"] = [BRIDGE_REASON_TEXTS[code] for code in codes]
+        return filled
 
     @property
     def elements(self) -> dict[str, ElementState]:

@@ -7,14 +7,18 @@ import json
 import math
 from typing import Literal
 
+from google.protobuf import json_format
+from google.protobuf.message import Message
 from pydantic import JsonValue, ValidationError
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import (
+    LOSSES_PERCENT,
     SCHEMA_VERSION,
     BridgeResult,
     Crossing,
     Direction,
+    ElementState,
     Header,
     Parameter,
     Thirds,
@@ -22,6 +26,7 @@ from schemas.results import (
 from schemas.signals import NS_PER_S
 
 _THIRDS = tuple(Thirds.model_fields)
+_LOSSES = ("ten", "twenty", "thirty")
 
 
 def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:
@@ -98,6 +103,10 @@ def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:
                     common_share=road.mismatch.common_share,
                 )
             )
+    if crossing.fusion_likelihood is not None:
+        json_format.ParseDict(
+            crossing.fusion_likelihood.model_dump(exclude_none=True), message.fusion_likelihood
+        )
     return message
 
 
@@ -131,35 +140,91 @@ def bridge_to_protobuf(name: str, time_ns: int, bridge: BridgeResult) -> pb.Brid
         crossings_used=bridge.crossings_used,
         crossings_left_out=[pb.LeftOut(**out.model_dump()) for out in bridge.crossings_left_out],
         crossings_left_out_count=bridge.crossings_left_out_count,
+        verdict=None if bridge.verdict is None else bridge.verdict.upper(),
+        reasons=bridge.reasons,
+        reason_texts=bridge.reason_texts,
+        finding=bridge.finding or "",
+        weakest_element=bridge.weakest_element or "",
+        between_crossing_std_q025=bridge.between_crossing_std_q025,
+        between_crossing_std_q975=bridge.between_crossing_std_q975,
     )
     for element, state in bridge.elements.items():
-        message.flexural_rigidity_nm2[element].CopyFrom(pb.ElementState(**state.model_dump()))
+        message.flexural_rigidity_nm2[element].CopyFrom(_state_to_protobuf(state))
+    for element, losses in (bridge.probability_of_loss or {}).items():
+        values = (losses[str(percent)] for percent in LOSSES_PERCENT)
+        of = dict(zip(_LOSSES, values, strict=True))
+        message.probability_of_loss[element].CopyFrom(pb.Losses(**of))
+    if bridge.level is not None:
+        message.level.CopyFrom(_state_to_protobuf(bridge.level))
+    for name in _THIRDS if bridge.thirds is not None else ():
+        getattr(message, name).CopyFrom(_state_to_protobuf(getattr(bridge.thirds, name)))
+    for track in bridge.tracks:
+        direction = direction_to_protobuf(track.direction)
+        message.tracks.add(**track.model_dump() | {"direction": direction})
     return message
+
+
+def _state_to_protobuf(state: ElementState) -> pb.ElementState:
+    return pb.ElementState(**state.model_dump())
+
+
+def _state(message: pb.ElementState) -> dict[str, float]:
+    return {
+        "mean": message.mean,
+        "std": message.std,
+        "q025": message.q025,
+        "q975": message.q975,
+    }
+
+
+def _or_none(message: Message, name: str) -> float | None:
+    """A field that may be absent."""
+    return getattr(message, name) if message.HasField(name) else None
 
 
 def state_to_bridge(message: pb.BridgeState) -> tuple[str, int, BridgeResult]:
     """Return bridge, time in ns and fused estimate of a message; ValueError if it is malformed."""
     if message.schema_version != SCHEMA_VERSION:
         raise ValueError(f"BridgeState has schema version {message.schema_version}, not 1")
-    elements = {
-        name: {"mean": s.mean, "std": s.std, "q025": s.q025, "q975": s.q975}
-        for name, s in message.flexural_rigidity_nm2.items()
+    elements = {name: _state(one) for name, one in message.flexural_rigidity_nm2.items()}
+    losses = {
+        element: {
+            str(p): getattr(of, name) for p, name in zip(LOSSES_PERCENT, _LOSSES, strict=True)
+        }
+        for element, of in message.probability_of_loss.items()
     }
     values = {
         **elements,
-        "between_crossing_std": (
-            message.between_crossing_std if message.HasField("between_crossing_std") else None
+        "between_crossing_std": _or_none(message, "between_crossing_std"),
+        "between_crossing_std_q025": _or_none(message, "between_crossing_std_q025"),
+        "between_crossing_std_q975": _or_none(message, "between_crossing_std_q975"),
+        "verdict": pb.Verdict.Name(message.verdict).lower() if message.verdict else None,
+        "reasons": tuple(message.reasons),
+        "reason_texts": tuple(message.reason_texts),
+        "finding": message.finding or None,
+        "weakest_element": message.weakest_element or None,
+        "probability_of_loss": losses or None,
+        "level": _state(message.level) if message.HasField("level") else None,
+        "thirds": (
+            {name: _state(getattr(message, name)) for name in _THIRDS}
+            if message.HasField("left")
+            else None
         ),
+        "tracks": [
+            {
+                "vehicle": track.vehicle,
+                "direction": direction_from_protobuf(track.direction),
+                "common_share": track.common_share,
+                "wander_m": _or_none(track, "wander_m"),
+            }
+            for track in message.tracks
+        ],
         "crossings_used": message.crossings_used,
         "crossings_left_out": [
             {"crossing_id": out.crossing_id, "reason": out.reason}
             for out in message.crossings_left_out
         ],
-        "crossings_left_out_count": (
-            message.crossings_left_out_count
-            if message.HasField("crossings_left_out_count")
-            else None
-        ),
+        "crossings_left_out_count": _or_none(message, "crossings_left_out_count"),
     }
     return message.bridge, message.time_ns, BridgeResult.model_validate(values)
 
@@ -203,8 +268,18 @@ def _crossing(message: pb.Estimate) -> Crossing:
         "covariance": _covariance(message.covariance) if message.HasField("covariance") else None,
         "derived": _derived(message.derived) if message.HasField("derived") else None,
         "road": _road(message.road) if message.HasField("road") else None,
+        "fusion_likelihood": (
+            _fields(message.fusion_likelihood) if message.HasField("fusion_likelihood") else None
+        ),
     }
     return Crossing.model_validate(values)
+
+
+def _fields(message: Message) -> dict[str, object]:
+    """A message of which the fields are those of its model."""
+    return json_format.MessageToDict(
+        message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+    )
 
 
 def _settings(text: str) -> dict[str, JsonValue]:

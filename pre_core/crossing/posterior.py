@@ -309,17 +309,21 @@ def all_rows(problem: Problem, y: FloatArray, temperature: float = 1.0) -> Float
 def log_odds_of_absence(problem: Problem, inflation: float = 1.0) -> FloatArray:
     """For each coordinate of y (size,): what its density at exactly zero is against per unit.
 
-    ln[P / ((1 - P) 2 phi(0))], of noise `inflation` times as large, with a prior as much wider; P
-    is the probability of absence. Minus infinity where there is none.
+    Of noise `inflation` times as large, with a prior as much wider; minus infinity where there is
+    none.
     """
     where, priors = layout(problem), problem.priors
     odds = np.full(where.size, -np.inf)
-    share = priors.absence[priors.estimated]
-    with np.errstate(divide="ignore"):
-        odds[where.theta] = (
-            np.log(share) - np.log1p(-share) + 0.5 * np.log(0.5 * np.pi * inflation**2)
-        )
+    odds[where.theta] = log_odds(priors.absence[priors.estimated], inflation)
     return odds
+
+
+def log_odds(absence: FloatArray, inflation: float = 1.0) -> FloatArray:
+    """ln[P / ((1 - P) 2 phi(0))] of probabilities P of absence (k,), beside a half-normal prior."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(
+            np.log(absence) - np.log1p(-absence) + 0.5 * np.log(0.5 * np.pi * inflation**2)
+        )
 
 
 def start(problem: Problem, trajectory: FloatArray) -> FloatArray:

@@ -40,6 +40,8 @@ _ROUGH_COMPLIANCE = (0.2, 5.0)
 """Outside, a compliance that is hardly known is not taken for the size of its own changes."""
 _ROUGH_SPREAD = 0.6
 """A normal prior of c that stands for the log-normal one where evidence is compared."""
+_AS_LIKELY = np.exp(-0.5 * 1.96**2)
+"""Of a normal's density, at the ends of its 95 % interval."""
 _PASSES = 2
 _NOTHING = 1e-9
 """Of the largest variance of a sum of waves: a smaller one is rounding."""
@@ -84,6 +86,8 @@ class Fused(NamedTuple):
     draws: FloatArray  # (n, chains, b): the bridge's, elements last
     between: FloatArray
     """(n, chains) the standard deviation tau of ln EI between crossings."""
+    between_may_be_zero: bool
+    """Whether no tau is much likelier than none at all."""
     tracks: tuple[Shared, ...]
 
 
@@ -132,8 +136,8 @@ def fuse(parts: Sequence[Part], priors: BridgePriors, count: int, seed: int) -> 
     if not parts:
         raise ValueError("no crossings to fuse")
     joint = join(parts, priors)
-    between = _between(joint, priors)
-    return Fused(*_drawn(joint, priors, between, count, seed), joint.shared)
+    between = between_of(joint, priors)
+    return Fused(*_drawn(joint, priors, between, count, seed), _may_be_zero(between), joint.shared)
 
 
 class Joint(NamedTuple):
@@ -168,7 +172,7 @@ def join(parts: Sequence[Part], priors: BridgePriors) -> Joint:
     for _ in range(_PASSES):
         ready = tuple(_ready(part, layout, tracks, priors, centre) for part in parts)
         joint = Joint(names, layout, ready, prior, centre, shared)
-        precision, linear = _sum(joint, priors, joint.ready)
+        precision, linear = sum_of(joint, priors, joint.ready)
         centre = np.asarray(np.linalg.solve(precision, linear)[: layout.bridge])
         centre[layout.elements] = np.clip(centre[layout.elements], *_ROUGH_COMPLIANCE)
     return joint._replace(centre=centre)
@@ -266,7 +270,7 @@ def _with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
     return np.asarray(change)
 
 
-def _sum(
+def sum_of(
     joint: Joint, priors: BridgePriors, ready: Sequence[_Ready]
 ) -> tuple[FloatArray, FloatArray]:
     """Precision and linear part of all unknowns, with normal priors of the bridge's."""
@@ -307,19 +311,25 @@ def _changing(joint: Joint, tau: float, rho: float) -> tuple[list[_Ready], float
     return out, evidence
 
 
-def _between(joint: Joint, priors: BridgePriors) -> Between:
+def between_of(joint: Joint, priors: BridgePriors) -> Between:
     """Posterior of tau and rho; of one crossing it is the prior."""
     tau, rho = (grid.ravel() for grid in np.meshgrid(_TAUS, _RHOS, indexing="ij"))
     log = np.empty(tau.size)
     for k in range(tau.size):
         ready, log[k] = _changing(joint, float(tau[k]), float(rho[k]))
-        precision, linear = _sum(joint, priors, ready)
+        precision, linear = sum_of(joint, priors, ready)
         factor = np.linalg.cholesky(precision)
         at = np.linalg.solve(factor, linear)
         log[k] += 0.5 * float(at @ at) - float(np.log(np.diag(factor)).sum())
     log -= 0.5 * (tau / BETWEEN_SCALE) ** 2
     weight = np.exp(log - log.max()) * np.diff(_edges())[np.searchsorted(_TAUS, tau)]
     return Between(tau, rho, weight / weight.sum())
+
+
+def _may_be_zero(between: Between) -> bool:
+    of_tau = np.array([between.weight[between.tau == tau].sum() for tau in _TAUS])
+    density = of_tau / np.diff(_edges())
+    return bool(density[0] > _AS_LIKELY * density.max())
 
 
 def _edges() -> FloatArray:

@@ -157,6 +157,25 @@ def likelihood(found: Optimum) -> Likelihood:
     )
 
 
+def in_coordinates(of: Likelihood, coordinates: Coordinates, elements: int) -> Likelihood:
+    """The same with other nominal values and spreads of the bridge's unknowns.
+
+    Of the same unknowns in the same order, `elements` of them last.
+    """
+    mine = of.bridge
+    b = len(mine.names)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = coordinates.location / mine.location
+        aside = np.where(mine.is_log, np.log(ratio) / mine.scale, 0.0)
+    factor = coordinates.scale / mine.scale
+    # EI is location/x: with another location, x is another by their ratio.
+    factor[b - elements :] = 1.0 / ratio[b - elements :]
+    aside[b - elements :] = 0.0
+    root = of.root.copy()
+    root[:, :b] *= factor
+    return of._replace(root=root, target=of.target - of.root[:, :b] @ aside, bridge=coordinates)
+
+
 def loosened(
     precision: FloatArray, linear: FloatArray, along: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

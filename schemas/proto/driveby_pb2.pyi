@@ -263,8 +263,72 @@ class Derived(_message.Message):
     ei_thirds: Thirds
     def __init__(self, f1_hz: _Optional[_Union[Parameter, _Mapping]] = ..., max_deflection_m: _Optional[_Union[Parameter, _Mapping]] = ..., probability_below_90_percent_of_baseline: _Optional[_Mapping[str, float]] = ..., probability_sprung: _Optional[_Union[AtEnds, _Mapping]] = ..., probability_giving: _Optional[_Union[AtEnds, _Mapping]] = ..., springs_believed: _Optional[float] = ..., ei_level: _Optional[_Union[Parameter, _Mapping]] = ..., ei_thirds: _Optional[_Union[Thirds, _Mapping]] = ...) -> None: ...
 
+class Coordinate(_message.Message):
+    __slots__ = ("name", "location", "scale", "is_log", "absence")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    LOCATION_FIELD_NUMBER: _ClassVar[int]
+    SCALE_FIELD_NUMBER: _ClassVar[int]
+    IS_LOG_FIELD_NUMBER: _ClassVar[int]
+    ABSENCE_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    location: float
+    scale: float
+    is_log: bool
+    absence: float
+    def __init__(self, name: _Optional[str] = ..., location: _Optional[float] = ..., scale: _Optional[float] = ..., is_log: _Optional[bool] = ..., absence: _Optional[float] = ...) -> None: ...
+
+class Footprint(_message.Message):
+    __slots__ = ("width_m", "twin_distance_m", "length_m", "track_m", "offset_m")
+    WIDTH_M_FIELD_NUMBER: _ClassVar[int]
+    TWIN_DISTANCE_M_FIELD_NUMBER: _ClassVar[int]
+    LENGTH_M_FIELD_NUMBER: _ClassVar[int]
+    TRACK_M_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_M_FIELD_NUMBER: _ClassVar[int]
+    width_m: float
+    twin_distance_m: float
+    length_m: float
+    track_m: float
+    offset_m: float
+    def __init__(self, width_m: _Optional[float] = ..., twin_distance_m: _Optional[float] = ..., length_m: _Optional[float] = ..., track_m: _Optional[float] = ..., offset_m: _Optional[float] = ...) -> None: ...
+
+class Stretch(_message.Message):
+    __slots__ = ("begin_m", "step_m", "values")
+    BEGIN_M_FIELD_NUMBER: _ClassVar[int]
+    STEP_M_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    begin_m: float
+    step_m: float
+    values: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, begin_m: _Optional[float] = ..., step_m: _Optional[float] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class FusionLikelihood(_message.Message):
+    __slots__ = ("bridge", "truck", "root", "target", "element_lengths_m", "mass_spread", "footprints", "first_knot_m", "knot_spacing_m", "level_m3", "off_bridge_m")
+    BRIDGE_FIELD_NUMBER: _ClassVar[int]
+    TRUCK_FIELD_NUMBER: _ClassVar[int]
+    ROOT_FIELD_NUMBER: _ClassVar[int]
+    TARGET_FIELD_NUMBER: _ClassVar[int]
+    ELEMENT_LENGTHS_M_FIELD_NUMBER: _ClassVar[int]
+    MASS_SPREAD_FIELD_NUMBER: _ClassVar[int]
+    FOOTPRINTS_FIELD_NUMBER: _ClassVar[int]
+    FIRST_KNOT_M_FIELD_NUMBER: _ClassVar[int]
+    KNOT_SPACING_M_FIELD_NUMBER: _ClassVar[int]
+    LEVEL_M3_FIELD_NUMBER: _ClassVar[int]
+    OFF_BRIDGE_M_FIELD_NUMBER: _ClassVar[int]
+    bridge: _containers.RepeatedCompositeFieldContainer[Coordinate]
+    truck: _containers.RepeatedCompositeFieldContainer[Coordinate]
+    root: _containers.RepeatedScalarFieldContainer[float]
+    target: _containers.RepeatedScalarFieldContainer[float]
+    element_lengths_m: _containers.RepeatedScalarFieldContainer[float]
+    mass_spread: float
+    footprints: _containers.RepeatedCompositeFieldContainer[Footprint]
+    first_knot_m: float
+    knot_spacing_m: float
+    level_m3: _containers.RepeatedScalarFieldContainer[float]
+    off_bridge_m: _containers.RepeatedCompositeFieldContainer[Stretch]
+    def __init__(self, bridge: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., truck: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., root: _Optional[_Iterable[float]] = ..., target: _Optional[_Iterable[float]] = ..., element_lengths_m: _Optional[_Iterable[float]] = ..., mass_spread: _Optional[float] = ..., footprints: _Optional[_Iterable[_Union[Footprint, _Mapping]]] = ..., first_knot_m: _Optional[float] = ..., knot_spacing_m: _Optional[float] = ..., level_m3: _Optional[_Iterable[float]] = ..., off_bridge_m: _Optional[_Iterable[_Union[Stretch, _Mapping]]] = ...) -> None: ...
+
 class Estimate(_message.Message):
-    __slots__ = ("schema_version", "program", "version", "created_ns", "site_hash", "settings_json", "seed", "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time_ns", "exit_time_ns", "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts", "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road")
+    __slots__ = ("schema_version", "program", "version", "created_ns", "site_hash", "settings_json", "seed", "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time_ns", "exit_time_ns", "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts", "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road", "fusion_likelihood")
     class DiagnosticsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -306,6 +370,7 @@ class Estimate(_message.Message):
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     DERIVED_FIELD_NUMBER: _ClassVar[int]
     ROAD_FIELD_NUMBER: _ClassVar[int]
+    FUSION_LIKELIHOOD_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     program: str
     version: str
@@ -333,7 +398,8 @@ class Estimate(_message.Message):
     covariance: Covariance
     derived: Derived
     road: RoadResult
-    def __init__(self, schema_version: _Optional[int] = ..., program: _Optional[str] = ..., version: _Optional[str] = ..., created_ns: _Optional[int] = ..., site_hash: _Optional[str] = ..., settings_json: _Optional[str] = ..., seed: _Optional[int] = ..., crossing_id: _Optional[str] = ..., realm: _Optional[str] = ..., vehicle: _Optional[str] = ..., bridge: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., entry_time_ns: _Optional[int] = ..., exit_time_ns: _Optional[int] = ..., speed_m_per_s: _Optional[float] = ..., method: _Optional[str] = ..., certificate: _Optional[str] = ..., verdict: _Optional[_Union[Verdict, str]] = ..., reasons: _Optional[_Iterable[str]] = ..., reason_texts: _Optional[_Iterable[str]] = ..., chi2_per_dof: _Optional[float] = ..., diagnostics: _Optional[_Mapping[str, float]] = ..., parameters: _Optional[_Mapping[str, Parameter]] = ..., scale_error: _Optional[float] = ..., covariance: _Optional[_Union[Covariance, _Mapping]] = ..., derived: _Optional[_Union[Derived, _Mapping]] = ..., road: _Optional[_Union[RoadResult, _Mapping]] = ...) -> None: ...
+    fusion_likelihood: FusionLikelihood
+    def __init__(self, schema_version: _Optional[int] = ..., program: _Optional[str] = ..., version: _Optional[str] = ..., created_ns: _Optional[int] = ..., site_hash: _Optional[str] = ..., settings_json: _Optional[str] = ..., seed: _Optional[int] = ..., crossing_id: _Optional[str] = ..., realm: _Optional[str] = ..., vehicle: _Optional[str] = ..., bridge: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., entry_time_ns: _Optional[int] = ..., exit_time_ns: _Optional[int] = ..., speed_m_per_s: _Optional[float] = ..., method: _Optional[str] = ..., certificate: _Optional[str] = ..., verdict: _Optional[_Union[Verdict, str]] = ..., reasons: _Optional[_Iterable[str]] = ..., reason_texts: _Optional[_Iterable[str]] = ..., chi2_per_dof: _Optional[float] = ..., diagnostics: _Optional[_Mapping[str, float]] = ..., parameters: _Optional[_Mapping[str, Parameter]] = ..., scale_error: _Optional[float] = ..., covariance: _Optional[_Union[Covariance, _Mapping]] = ..., derived: _Optional[_Union[Derived, _Mapping]] = ..., road: _Optional[_Union[RoadResult, _Mapping]] = ..., fusion_likelihood: _Optional[_Union[FusionLikelihood, _Mapping]] = ...) -> None: ...
 
 class ElementState(_message.Message):
     __slots__ = ("mean", "std", "q025", "q975")
@@ -356,7 +422,7 @@ class LeftOut(_message.Message):
     def __init__(self, crossing_id: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
 
 class BridgeState(_message.Message):
-    __slots__ = ("schema_version", "bridge", "time_ns", "flexural_rigidity_nm2", "between_crossing_std", "crossings_used", "crossings_left_out", "crossings_left_out_count")
+    __slots__ = ("schema_version", "bridge", "time_ns", "flexural_rigidity_nm2", "between_crossing_std", "crossings_used", "crossings_left_out", "crossings_left_out_count", "verdict", "reasons", "reason_texts", "finding", "weakest_element", "probability_of_loss", "level", "left", "middle", "right", "between_crossing_std_q025", "between_crossing_std_q975", "tracks")
     class FlexuralRigidityNm2Entry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -364,6 +430,13 @@ class BridgeState(_message.Message):
         key: str
         value: ElementState
         def __init__(self, key: _Optional[str] = ..., value: _Optional[_Union[ElementState, _Mapping]] = ...) -> None: ...
+    class ProbabilityOfLossEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: Losses
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[_Union[Losses, _Mapping]] = ...) -> None: ...
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     BRIDGE_FIELD_NUMBER: _ClassVar[int]
     TIME_NS_FIELD_NUMBER: _ClassVar[int]
@@ -372,6 +445,19 @@ class BridgeState(_message.Message):
     CROSSINGS_USED_FIELD_NUMBER: _ClassVar[int]
     CROSSINGS_LEFT_OUT_FIELD_NUMBER: _ClassVar[int]
     CROSSINGS_LEFT_OUT_COUNT_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
+    REASONS_FIELD_NUMBER: _ClassVar[int]
+    REASON_TEXTS_FIELD_NUMBER: _ClassVar[int]
+    FINDING_FIELD_NUMBER: _ClassVar[int]
+    WEAKEST_ELEMENT_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_OF_LOSS_FIELD_NUMBER: _ClassVar[int]
+    LEVEL_FIELD_NUMBER: _ClassVar[int]
+    LEFT_FIELD_NUMBER: _ClassVar[int]
+    MIDDLE_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_FIELD_NUMBER: _ClassVar[int]
+    BETWEEN_CROSSING_STD_Q025_FIELD_NUMBER: _ClassVar[int]
+    BETWEEN_CROSSING_STD_Q975_FIELD_NUMBER: _ClassVar[int]
+    TRACKS_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     bridge: str
     time_ns: int
@@ -380,7 +466,42 @@ class BridgeState(_message.Message):
     crossings_used: _containers.RepeatedScalarFieldContainer[str]
     crossings_left_out: _containers.RepeatedCompositeFieldContainer[LeftOut]
     crossings_left_out_count: int
-    def __init__(self, schema_version: _Optional[int] = ..., bridge: _Optional[str] = ..., time_ns: _Optional[int] = ..., flexural_rigidity_nm2: _Optional[_Mapping[str, ElementState]] = ..., between_crossing_std: _Optional[float] = ..., crossings_used: _Optional[_Iterable[str]] = ..., crossings_left_out: _Optional[_Iterable[_Union[LeftOut, _Mapping]]] = ..., crossings_left_out_count: _Optional[int] = ...) -> None: ...
+    verdict: Verdict
+    reasons: _containers.RepeatedScalarFieldContainer[str]
+    reason_texts: _containers.RepeatedScalarFieldContainer[str]
+    finding: str
+    weakest_element: str
+    probability_of_loss: _containers.MessageMap[str, Losses]
+    level: ElementState
+    left: ElementState
+    middle: ElementState
+    right: ElementState
+    between_crossing_std_q025: float
+    between_crossing_std_q975: float
+    tracks: _containers.RepeatedCompositeFieldContainer[Track]
+    def __init__(self, schema_version: _Optional[int] = ..., bridge: _Optional[str] = ..., time_ns: _Optional[int] = ..., flexural_rigidity_nm2: _Optional[_Mapping[str, ElementState]] = ..., between_crossing_std: _Optional[float] = ..., crossings_used: _Optional[_Iterable[str]] = ..., crossings_left_out: _Optional[_Iterable[_Union[LeftOut, _Mapping]]] = ..., crossings_left_out_count: _Optional[int] = ..., verdict: _Optional[_Union[Verdict, str]] = ..., reasons: _Optional[_Iterable[str]] = ..., reason_texts: _Optional[_Iterable[str]] = ..., finding: _Optional[str] = ..., weakest_element: _Optional[str] = ..., probability_of_loss: _Optional[_Mapping[str, Losses]] = ..., level: _Optional[_Union[ElementState, _Mapping]] = ..., left: _Optional[_Union[ElementState, _Mapping]] = ..., middle: _Optional[_Union[ElementState, _Mapping]] = ..., right: _Optional[_Union[ElementState, _Mapping]] = ..., between_crossing_std_q025: _Optional[float] = ..., between_crossing_std_q975: _Optional[float] = ..., tracks: _Optional[_Iterable[_Union[Track, _Mapping]]] = ...) -> None: ...
+
+class Losses(_message.Message):
+    __slots__ = ("ten", "twenty", "thirty")
+    TEN_FIELD_NUMBER: _ClassVar[int]
+    TWENTY_FIELD_NUMBER: _ClassVar[int]
+    THIRTY_FIELD_NUMBER: _ClassVar[int]
+    ten: float
+    twenty: float
+    thirty: float
+    def __init__(self, ten: _Optional[float] = ..., twenty: _Optional[float] = ..., thirty: _Optional[float] = ...) -> None: ...
+
+class Track(_message.Message):
+    __slots__ = ("vehicle", "direction", "common_share", "wander_m")
+    VEHICLE_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    COMMON_SHARE_FIELD_NUMBER: _ClassVar[int]
+    WANDER_M_FIELD_NUMBER: _ClassVar[int]
+    vehicle: str
+    direction: Direction
+    common_share: float
+    wander_m: float
+    def __init__(self, vehicle: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., common_share: _Optional[float] = ..., wander_m: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
     __slots__ = ("schema_version", "time_ns", "service", "ok", "figures", "note")

@@ -5,9 +5,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.results import AtEnds, Crossing, Derived, Results, resolution, results_json
+from schemas.results import (
+    AtEnds,
+    Crossing,
+    Derived,
+    Results,
+    resolution,
+    results_json,
+)
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
+from services.cli.bridge_table import print_bridge, print_elements
 from services.common.errors import FailureError
 from services.common.files import (
     check_folder_writable,
@@ -16,7 +24,9 @@ from services.common.files import (
     write_atomically,
 )
 from services.execution.offline import identify_recordings, site_of
+from services.history.baselines import baselines_of
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
+from services.identification.bridge_state import Fusing
 from services.recordings.recording import read_messages
 
 if TYPE_CHECKING:
@@ -36,6 +46,8 @@ def identify_command(
     draws_path: Path | None,
     figures: Path | None,
     seed: int,
+    baseline: Path | None,
+    fuse_suspect: bool,
     console: "Console",
 ) -> int:
     """Identify every crossing in the recordings, print a table and write what was asked for.
@@ -50,6 +62,8 @@ def identify_command(
     if figures is not None:
         check_folder_writable(figures)
     known = site_of(recordings, site)
+    beside = None if site is None else site.parent
+    fusing = Fusing(baselines_of(known, beside, baseline), fuse_suspect)
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
     if method == "pre" and not any(known.sensor.noise_density_ug_per_rthz):
         _log.warning(
@@ -59,7 +73,7 @@ def identify_command(
     draws: dict[str, Draws] = {}
     with console.status("reading", spinner="dots") as status:
         found = identify_recordings(
-            recordings, known, settings, status.update, keep=draws.__setitem__
+            recordings, known, settings, status.update, keep=draws.__setitem__, fusing=fusing
         )
     _print(console, found, known)
     if json_path is not None:
@@ -108,11 +122,14 @@ def _print(console: "Console", found: Results, site: Site) -> None:
         if number > 0:
             console.print()
         _print_crossing(console, crossing, site)
+    for name, state in found.bridges.items():
+        crossed = [crossing for crossing in found.crossings if crossing.bridge == name]
+        if len(crossed) > 1 or state.probability_of_loss is not None:
+            console.print()
+            print_bridge(console, site.bridge(name), state)
 
 
 def _print_crossing(console: "Console", crossing: Crossing, site: Site) -> None:
-    from rich.table import Table
-
     method = crossing.method.replace("_", " ")
     console.print(
         f"[bold]{crossing.crossing_id}[/]\n"
@@ -126,33 +143,23 @@ def _print_crossing(console: "Console", crossing: Crossing, site: Site) -> None:
     if crossing.parameters is None:
         return
     bridge = site.bridge(crossing.bridge)
-    has_meaning = "no_noise_model" not in crossing.reasons
-    table = Table(box=None, pad_edge=False)
-    for heading in ("element", "from (m)", "to (m)", "EI (GN·m²)"):
-        table.add_column(heading, justify="right")
-    if has_meaning:
-        table.add_column("95 % interval", justify="right")
-    table.add_column("of nominal", justify="right")
-    if has_meaning:
-        table.add_column("95 % interval", justify="right")
-    start = 0.0
-    for number, (length, sound) in enumerate(
-        zip(bridge.lengths_m, bridge.nominal_flexural_rigidity_nm2, strict=True), start=1
-    ):
-        p = crossing.parameters[f"EI_{number}"]
-        row = [f"EI_{number}", f"{start:.2f}", f"{start + length:.2f}"]
-        for unit, digits in ((1e9, 2), (sound, 3)):
-            row.append(f"{p.mean / unit:.{digits}f}")
-            if has_meaning:
-                row.append(f"{p.q025 / unit:.{digits}f} … {p.q975 / unit:.{digits}f}")
-        table.add_row(*row)
-        start += length
-    console.print(table)
+    print_elements(
+        console,
+        bridge,
+        crossing.parameters,
+        "no_noise_model" not in crossing.reasons,
+        None if crossing.derived is None else _below(crossing.derived),
+    )
     words = resolution(crossing)
     if words is not None:
         console.print(f"[bold]{words}[/]", highlight=False)
     for line in _remarks(crossing):
         console.print(line, highlight=False)
+
+
+def _below(derived: Derived) -> dict[str, dict[str, float]] | None:
+    below = derived.probability_below_90_percent_of_baseline
+    return None if below is None else {name: {"10": share} for name, share in below.items()}
 
 
 def _of_ends_and_springs(derived: Derived) -> Iterator[str]:

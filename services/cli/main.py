@@ -25,7 +25,14 @@ from services.cli.live import (
     add_truck,
     add_worker,
 )
-from services.cli.offline import add_identify, add_import, add_recover, add_simulate, add_view
+from services.cli.offline import (
+    add_fuse,
+    add_identify,
+    add_import,
+    add_recover,
+    add_simulate,
+    add_view,
+)
 from services.cli.parsing import Handler, Parser, add_common
 from services.cli.replay import add_replay
 from services.cli.report import add_report
@@ -36,6 +43,7 @@ _COMMANDS: Final = (
     add_simulate,
     add_import,
     add_identify,
+    add_fuse,
     add_info,
     add_export,
     add_report,

@@ -287,7 +287,48 @@ def add_identify(commands: Any) -> None:
         p, "--draws", "OUT.npz|OUT.nc", "write the Markov chains of method pre here, for ArviZ"
     )
     add_file(p, "--figures", "DIR", "draw every crossing and bridge here, as PNG and SVG")
+    _add_fusing(p)
     add_seed(p)
+
+
+def _add_fusing(p: argparse.ArgumentParser) -> None:
+    add_file(
+        p,
+        "--baseline",
+        "OLD.json",
+        "results with which the bridge is compared (default: what the site file names)",
+    )
+    p.add_argument(
+        "--fuse-suspect",
+        action="store_true",
+        help="fuse suspect crossings too; the bridge's estimate is suspect then",
+    )
+
+
+def add_fuse(commands: Any) -> None:
+    """`driveby fuse`: one estimate of each bridge from stored results."""
+    p = command(
+        commands,
+        "fuse",
+        _fuse,
+        "make one estimate of each bridge from the results of many crossings",
+        "driveby fuse monday.json tuesday.json --json week.json",
+    )
+    p.add_argument("results", type=Path, nargs="+", metavar="RESULTS.json", help="results")
+    add_file(p, "--json", "OUT.json", "write all crossings and the fused estimates here")
+    _add_fusing(p)
+
+
+def _fuse(options: argparse.Namespace) -> int:
+    from services.cli.fuse import fuse_command
+
+    return fuse_command(
+        paths=options.results,
+        json_path=options.json,
+        baseline=options.baseline,
+        fuse_suspect=options.fuse_suspect,
+        console=a_console(),
+    )
 
 
 def _identify(options: argparse.Namespace) -> int:
@@ -302,6 +343,8 @@ def _identify(options: argparse.Namespace) -> int:
         draws_path=options.draws,
         figures=options.figures,
         seed=options.seed,
+        baseline=options.baseline,
+        fuse_suspect=options.fuse_suspect,
         console=a_console(),
     )
 

@@ -14,6 +14,7 @@ from services.common.errors import InputError
 from services.execution.blas import one_blas_thread
 from services.execution.dispatch import awaited, dispatched
 from services.execution.here import Here
+from services.identification.bridge_state import NOTHING_STORED, Fusing, with_common_shares
 from services.identification.engine import Engine
 from services.identification.identify import Keep
 from services.identification.outputs import Output, Work
@@ -40,11 +41,12 @@ def identify_recordings(
     settings: IdentificationSettings,
     say: Callable[[str], None] = lambda text: None,
     keep: Keep = lambda crossing_id, draws: None,
+    fusing: Fusing = NOTHING_STORED,
 ) -> Results:
     """Results of all crossings in the recordings, in order of time; `keep` is given their draws."""
     messages = (message for path in recordings for message in read_messages(path))
     name = ", ".join(str(path) for path in recordings)
-    return identify_messages(messages, name, site, settings, say, keep)
+    return identify_messages(messages, name, site, settings, say, keep, fusing)
 
 
 def identify_messages(
@@ -54,6 +56,7 @@ def identify_messages(
     settings: IdentificationSettings,
     say: Callable[[str], None] = lambda text: None,
     keep: Keep = lambda crossing_id, draws: None,
+    fusing: Fusing = NOTHING_STORED,
 ) -> Results:
     """Results of all crossings in the messages, which errors call `name`; they may be unordered.
 
@@ -66,7 +69,7 @@ def identify_messages(
         settings=settings.model_dump(mode="json"),
         seed=settings.seed,
     )
-    engine = Engine(site, settings, header)
+    engine = Engine(site, settings, header, fusing, tells_states=False)
     execution = Here(
         report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"), keep=keep
     )
@@ -91,7 +94,8 @@ def identify_messages(
         )
         found = [output.result for output in outputs if output.result is not None]
     found.sort(key=lambda crossing: crossing.entry_time)
-    return results(header, found, engine.bridges())
+    bridges = engine.bridges()
+    return results(header, with_common_shares(found, bridges), bridges)
 
 
 def _check_vehicles(name: str, site: Site, messages: list[Message]) -> None:

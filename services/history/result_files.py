@@ -18,7 +18,14 @@ from services.common.errors import FailureError
 from services.common.files import replaced_atomically
 from services.history.results_json import GrowingJson
 from services.history.store import Store, Told
-from services.identification.bridge_state import Counted, count_in, latest_state, usable
+from services.identification.bridge_state import (
+    NOTHING_STORED,
+    Counted,
+    Fusing,
+    count_in,
+    state_of,
+    usable,
+)
 from services.identification.known import Known, search_hash
 from services.recordings.recording import Message, is_being_written, read_info, read_messages
 from services.recordings.writer import RecordingWriter
@@ -133,7 +140,8 @@ class _Run(NamedTuple):
 class _Read:
     """What has been read of the files so far; of the messages only those that are needed."""
 
-    def __init__(self, search: str) -> None:
+    def __init__(self, search: str, fusing: Fusing) -> None:
+        self.fusing = fusing
         self.store = Store(search)
         self.said: dict[MessageName, None] = {}
         self.states: dict[Key, Message] = {}
@@ -158,18 +166,23 @@ class _Read:
 
     def bridges(self, search: str) -> dict[str, BridgeResult]:
         """The states of all bridges after what has been read, by a search."""
-        states = {name: latest_state(counted) for name, counted in self.counted[search].items()}
+        states = {
+            name: state_of(counted, name, self.fusing)
+            for name, counted in self.counted[search].items()
+        }
         return {name: state for name, state in states.items() if state is not None}
 
 
-def read_earlier(folder: Path, realm: str, now_s: float, search: str) -> Earlier:
+def read_earlier(
+    folder: Path, realm: str, now_s: float, search: str, fusing: Fusing = NOTHING_STORED
+) -> Earlier:
     """What earlier runs left of a realm in a folder, in the last two days.
 
     `now_s` is the wall clock, `search` tells which results are ours (`search_hash`). A file that
     cannot be read is a warning; one that was cut off is read as far as it goes, and its JSON file
     is made to hold all that it holds.
     """
-    read = _Read(search)
+    read = _Read(search, fusing)
     continued: set[str | None] = set()
     tails: list[tuple[_Run, list[Message]]] = []
     for run in _runs(folder, now_s):

@@ -1,18 +1,38 @@
-"""What a bridge's crossings say of it together: today its latest one; they are not fused yet.
+"""What a bridge's crossings say of it together.
 
-Only as much is kept as the state of a bridge says, so that the thousandth crossing costs what the
-first did.
+Only as much is kept as the state of a bridge is made of, so that the thousandth crossing costs what
+the first did.
 """
 
 from bisect import insort
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from schemas.results import BridgeResult, Crossing, ElementState, LeftOut
+import numpy as np
+from scipy.stats import norm
+
+from pre_core.constants import NORMAL_975
+from schemas.reasons import BridgeReason, LeftOutReason
+from schemas.results import (
+    LOSSES_PERCENT,
+    BridgeResult,
+    Crossing,
+    ElementState,
+    LeftOut,
+    Parameter,
+    ThirdsState,
+    Verdict,
+)
+from services.identification.comparison import compare, estimate_of_state, sentences
+from services.identification.crossing_data import part_of_elements
+from services.identification.fusing import Floats, FusedBridge, Source, fused, source_of
 
 LISTED_AT_MOST = 100
-"""So many crossings that are left out are named: the state stays below 10 kB, while a message on
-the bus may have 1 MiB. The others are counted."""
+"""So many crossings are fused, the newest, and as many that are left out are named: the state stays
+below 20 kB, while a message on the bus may have 1 MiB. The others are counted."""
+_MANY = 1.0 / 3.0
+_RESOLVED = 0.25
+"""Relative standard deviation up to which an element is called resolved."""
 
 
 class Usable(NamedTuple):
@@ -22,7 +42,10 @@ class Usable(NamedTuple):
     """Seconds since 1970 UTC, as `exit_time`."""
     exit_time: float
     crossing_id: str
+    verdict: Verdict
+    method: str
     elements: dict[str, ElementState]
+    source: Source | None
 
 
 class Counted(NamedTuple):
@@ -34,6 +57,43 @@ class Counted(NamedTuple):
     """How many there are, with those that are no longer kept."""
 
 
+class Fusing(NamedTuple):
+    """What is fused and compared."""
+
+    baselines: Mapping[str, BridgeResult] = {}
+    """By bridge: a stored state, with which probabilities of loss are told."""
+    with_suspect: bool = False
+    """Whether suspect crossings are fused too."""
+
+
+NOTHING_STORED = Fusing()
+_SOUND = 0.9
+"""Of the baseline; see `Derived.probability_below_90_percent_of_baseline`."""
+
+
+def against(result: Crossing, baseline: BridgeResult | None) -> Crossing:
+    """The result with what it says against a stored state of the bridge."""
+    if baseline is None or result.derived is None or result.parameters is None:
+        return result
+    stored = baseline.elements
+    below = {
+        name: _probability_below(_SOUND, result.parameters[name], of)
+        for name, of in stored.items()
+        if name in result.parameters and of.mean > 0.0 and result.parameters[name].mean > 0.0
+    }
+    derived = result.derived.model_copy(
+        update={"probability_below_90_percent_of_baseline": below or None}
+    )
+    return result.model_copy(update={"derived": derived})
+
+
+def _probability_below(share: float, now: Parameter, before: ElementState) -> float:
+    """Of two log-normals with independent errors."""
+    spread = np.hypot(now.std / now.mean, before.std / before.mean)
+    apart = np.log(share * before.mean / now.mean)
+    return float(norm.cdf(apart / spread)) if spread > 0.0 else float(apart > 0.0)
+
+
 def usable(result: Crossing) -> Usable | None:
     """What a state needs of a result; None if it gave no parameters."""
     if result.parameters is None:
@@ -43,30 +103,175 @@ def usable(result: Crossing) -> Usable | None:
         for name, p in result.parameters.items()
         if name.startswith("EI_")
     }
-    return Usable(result.entry_time, result.exit_time, result.crossing_id, elements)
+    return Usable(
+        result.entry_time,
+        result.exit_time,
+        result.crossing_id,
+        result.verdict,
+        result.method,
+        elements,
+        source_of(result),
+    )
 
 
 def count_in(counted: Counted, crossings: Iterable[Usable]) -> Counted:
     """The same with more crossings; who entered last counts as the latest, not who came last."""
     newest, number = list(counted.newest), counted.number
     for crossing in crossings:
-        insort(newest, crossing, key=lambda one: one.entry_time)
+        insort(newest, crossing, key=lambda one: (one.entry_time, one.crossing_id))
         del newest[: -LISTED_AT_MOST - 1]
         number += 1
     return Counted(tuple(newest), number)
 
 
-def latest_state(counted: Counted) -> BridgeResult | None:
-    """The bridge as its latest usable crossing sees it, the others left out; None without any."""
+def state_of(counted: Counted, bridge: str, fusing: Fusing = NOTHING_STORED) -> BridgeResult | None:
+    """The bridge by all its good crossings together; None without a crossing that gave numbers.
+
+    Of a method that leaves nothing to fuse it is the latest crossing alone, and `suspect`. Suspect
+    crossings by themselves are no state of a bridge: then it is `rejected`, without numbers.
+    """
     if not counted.newest:
         return None
+    if all(one.source is None for one in counted.newest):
+        return _latest(counted)
+    newest = counted.newest[-LISTED_AT_MOST:]
+    verdicts = ("good", "suspect") if fusing.with_suspect else ("good",)
+    wanted = [one for one in newest if one.verdict in verdicts and one.source is not None]
+    left_out = {
+        one.crossing_id: (
+            LeftOutReason.NO_LIKELIHOOD if one.source is None else LeftOutReason.SUSPECT
+        )
+        for one in newest
+        if one not in wanted
+    }
+    if not wanted:
+        return BridgeResult(  # type: ignore[call-arg]
+            verdict="rejected",
+            reasons=(BridgeReason.NO_GOOD_CROSSING,),
+            crossings_left_out=_named(left_out),
+            crossings_left_out_count=counted.number,
+        )
+    found = fused([one.source for one in wanted if one.source is not None])
+    left_out |= dict.fromkeys(found.left_out, LeftOutReason.DISAGREES)
+    left_out |= dict.fromkeys(found.other_model, LeftOutReason.OTHER_MODEL)
+    reasons = []
+    if found.disagree:
+        reasons.append(BridgeReason.CROSSINGS_DISAGREE)
+    if len(found.left_out) > _MANY * (len(found.left_out) + len(found.used)):
+        reasons.append(BridgeReason.MANY_LEFT_OUT)
+    if any(one.verdict != "good" and one.crossing_id in found.used for one in wanted):
+        reasons.append(BridgeReason.USES_SUSPECT)
+    between = _summary(found.between)
+    baseline = fusing.baselines.get(bridge)
+    elements = {f"EI_{n}": _summary(ei) for n, ei in enumerate(found.ei_nm2.T, start=1)}
+    ratio = found.ei_nm2 / _reference(found, baseline)
+    weakest = int(np.argmin(np.median(ratio, axis=0))) + 1
+    state = BridgeResult(
+        **elements,  # type: ignore[arg-type]
+        between_crossing_std=between.mean,
+        between_crossing_std_q025=0.0 if found.between_may_be_zero else between.q025,
+        between_crossing_std_q975=between.q975,
+        verdict="suspect" if reasons else "good",
+        reasons=tuple(reasons),
+        weakest_element=f"EI_{weakest}",
+        probability_of_loss=None if baseline is None else _losses(ratio),
+        level=_level(found, 0.0, 1.0),
+        thirds=ThirdsState(
+            left=_level(found, 0.0, 1 / 3),
+            middle=_level(found, 1 / 3, 2 / 3),
+            right=_level(found, 2 / 3, 1.0),
+        ),
+        tracks=found.tracks,
+        crossings_used=found.used,
+        crossings_left_out=_named(left_out),
+        crossings_left_out_count=counted.number - len(found.used),
+    )
+    return state.model_copy(update={"finding": _finding(found, state, baseline)})
+
+
+def with_common_shares(
+    crossings: Iterable[Crossing], bridges: Mapping[str, BridgeResult]
+) -> list[Crossing]:
+    """Crossings with the share of the mismatch that other runs in their track have too."""
+    return [_with_common_share(crossing, bridges.get(crossing.bridge)) for crossing in crossings]
+
+
+def _with_common_share(crossing: Crossing, bridge: BridgeResult | None) -> Crossing:
+    road = crossing.road
+    if bridge is None or road is None or road.mismatch is None:
+        return crossing
+    for track in bridge.tracks:
+        if (track.vehicle, track.direction) == (crossing.vehicle, crossing.direction):
+            mismatch = road.mismatch.model_copy(update={"common_share": track.common_share})
+            return crossing.model_copy(
+                update={"road": road.model_copy(update={"mismatch": mismatch})}
+            )
+    return crossing
+
+
+def _latest(counted: Counted) -> BridgeResult:
     *others, last = counted.newest
     return BridgeResult(
-        between_crossing_std=None,
+        **last.elements,  # type: ignore[arg-type]
+        verdict="suspect",
+        reasons=(BridgeReason.NOT_FUSED,),
         crossings_used=(last.crossing_id,),
-        crossings_left_out=tuple(
-            LeftOut(crossing_id=crossing.crossing_id, reason="not_fused") for crossing in others
+        crossings_left_out=_named(
+            dict.fromkeys((one.crossing_id for one in others), LeftOutReason.NOT_FUSED)
         ),
         crossings_left_out_count=counted.number - 1,
-        **last.elements,  # type: ignore[arg-type]
     )
+
+
+def _named(left_out: Mapping[str, LeftOutReason]) -> tuple[LeftOut, ...]:
+    return tuple(LeftOut(crossing_id=name, reason=why) for name, why in left_out.items())
+
+
+def _reference(found: FusedBridge, baseline: BridgeResult | None) -> Floats:
+    """EI (n,), or draws of it (draws, n), with which elements are compared."""
+    if baseline is None or len(baseline.elements) != found.nominal_nm2.size:
+        return found.nominal_nm2
+    # The baseline's errors, taken for log-normal and for independent of the new ones.
+    rng = np.random.default_rng(found.ei_nm2.shape[0])
+    of = estimate_of_state(baseline)
+    spread = np.log(of.high / of.low) / (2.0 * NORMAL_975)
+    return np.asarray(of.mean * np.exp(spread * rng.standard_normal(found.ei_nm2.shape)))
+
+
+def _losses(ratio: Floats) -> dict[str, dict[str, float]]:
+    return {
+        f"EI_{n}": {
+            str(percent): float(np.mean(one < 1.0 - percent / 100.0)) for percent in LOSSES_PERCENT
+        }
+        for n, one in enumerate(ratio.T, start=1)
+    }
+
+
+def _level(found: FusedBridge, begin: float, end: float) -> ElementState:
+    share = part_of_elements(found.element_lengths_m, begin, end)
+    return _summary(np.exp(np.log(found.ei_nm2 / found.nominal_nm2) @ share))
+
+
+def _summary(draws: Floats) -> ElementState:
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return ElementState(
+        mean=float(draws.mean()), std=float(draws.std()), q025=float(low), q975=float(high)
+    )
+
+
+def _finding(found: FusedBridge, state: BridgeResult, baseline: BridgeResult | None) -> str:
+    """The bridge in words: what is told of its elements, and what is not."""
+    edges = np.concatenate([[0.0], np.cumsum(found.element_lengths_m)])
+    of = estimate_of_state(state)
+    stored = None if baseline is None else estimate_of_state(baseline)
+    common = float(np.log(found.ei_nm2).mean(axis=1).std())
+    said = sentences(compare(of._replace(scale_error=common), found.nominal_nm2, edges, stored))
+    open_ones = sum(one.std > _RESOLVED * one.mean for one in state.elements.values())
+    if open_ones and state.level is not None:
+        spread = 100.0 * state.level.std / state.level.mean
+        which = f"{open_ones} of {of.mean.size} elements are"
+        said.append(
+            f"{which} not resolved; the mean level is {state.level.mean:.2f} of nominal "
+            f"± {spread:.0f} %."
+        )
+    return " ".join(said)

@@ -67,6 +67,14 @@ class Window(NamedTuple):
     end_s: float
 
 
+def part_of_elements(lengths_m: Floats, begin: float, end: float) -> Floats:
+    """Shares (n,) of elements in the bridge between two parts of its length; they sum to one."""
+    edges = np.concatenate([[0.0], np.cumsum(lengths_m)])
+    edges /= edges[-1]
+    within = np.maximum(np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin), 0.0)
+    return np.asarray(within / within.sum())
+
+
 def window(stay: Stay, bridge: Bridge, vehicle: Vehicle, method: str) -> Window:
     """Around a stay, on the same clock; the paper's methods look at the bridge alone."""
     if method != "pre":

@@ -30,7 +30,7 @@ from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
 from schemas.vehicle_info import differences
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
-from services.identification.bridge_state import count_in, latest_state, usable
+from services.identification.bridge_state import Fusing, against, count_in, state_of, usable
 from services.identification.crossing_data import CrossingData, Window, window
 from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
 from services.identification.outputs import Output, Work, crossing_output, state_output
@@ -66,10 +66,21 @@ class Engine:
 
     It identifies nothing itself: what it yields holds a `Work` for each crossing, whose result is
     to be given to `done`, at any later time and in any order. `services.execution` does that.
-    `header` says what goes into every estimate.
+    `header` says what goes into every estimate, `fusing` how those of a bridge become one. Whoever
+    asks for `bridges` at the end only may do without their states on the way (`tells_states`).
     """
 
-    def __init__(self, site: Site, settings: IdentificationSettings, header: Header) -> None:
+    def __init__(
+        self,
+        site: Site,
+        settings: IdentificationSettings,
+        header: Header,
+        fusing: Fusing | None = None,
+        *,
+        tells_states: bool = True,
+    ) -> None:
+        self._fusing = Fusing() if fusing is None else fusing
+        self._tells_states = tells_states
         self._site = site
         self._settings = settings
         self._header = header
@@ -111,7 +122,7 @@ class Engine:
                     known.last.SerializeToString(deterministic=True),
                 )
             if known.usable is not None and not known.is_in_state:
-                latest = latest_state(self._bridge(known.realm, known.bridge).counted)
+                latest = self._state(known.realm, known.bridge)
                 if latest is not None:
                     exit_time = known.usable.exit_time
                     yield state_output(known.realm, known.bridge, exit_time, latest)
@@ -329,6 +340,7 @@ class Engine:
         self, bridge: BridgeCrossings, found: UnderWay, result: Crossing
     ) -> Iterator[Output]:
         realm, name = found.work.data.realm, found.work.data.bridge.id
+        result = against(result, self._fusing.baselines.get(name))
         counts = usable(result)
         if counts is not None:  # who asks for the state together with the result has it
             bridge.counted = count_in(bridge.counted, [counts])
@@ -338,9 +350,10 @@ class Engine:
         payload = estimate.SerializeToString(deterministic=True)
         yield Output(Key(realm, "bridge", name, "estimate"), payload, result)
         yield found.done
-        latest = latest_state(bridge.counted)
-        if counts is not None and latest is not None:
-            yield state_output(realm, name, result.exit_time, latest)
+        if counts is not None and self._tells_states:
+            latest = self._state(realm, name)
+            if latest is not None:
+                yield state_output(realm, name, result.exit_time, latest)
 
     def _window(self, truck: TruckBoot, bridge: Bridge, stay: Stay) -> Window:
         return window(stay, bridge, truck.vehicle, self._settings.method)
@@ -436,9 +449,12 @@ class Engine:
     def _bridge(self, realm: str, bridge: str) -> BridgeCrossings:
         return self._of_bridge.setdefault((realm, bridge), BridgeCrossings())
 
+    def _state(self, realm: str, bridge: str) -> BridgeResult | None:
+        return state_of(self._bridge(realm, bridge).counted, bridge, self._fusing)
+
     def bridges(self) -> dict[str, BridgeResult]:
         """The latest state of every bridge that has one, for the results file."""
-        states = {name: latest_state(one.counted) for (_, name), one in self._of_bridge.items()}
+        states = {name: self._state(realm, name) for realm, name in self._of_bridge}
         return {name: state for name, state in states.items() if state is not None}
 
 

@@ -36,10 +36,12 @@ from services.identification.crossing_data import (
     detrended,
     header,
     nominal_parameters,
+    part_of_elements,
     rejected,
     road_result,
 )
 from services.identification.footprints import footprints_of
+from services.identification.fusing import stored
 
 _FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN = 14, 8
 """At least so many in all, and in each of several spans on average, whatever the number of
@@ -226,6 +228,7 @@ def identify_pre(
         reasons=tuple(dict.fromkeys(reasons)),
         chi2_per_dof=found.chi2_per_dof * found.noise_power,
         diagnostics=diagnostics,
+        fusion_likelihood=stored(data, found),
         **values,
     )
 
@@ -368,12 +371,9 @@ def _derived(
 
 def _level(bridge: Bridge, theta: Floats, begin: float, end: float) -> Floats:
     """Geometric mean of EI over nominal, by length, between two parts of the bridge: (k,)."""
-    edges = np.concatenate([[0.0], np.cumsum(bridge.lengths_m)])
-    edges /= edges[-1]
-    within = np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin)
-    share = np.maximum(within, 0.0)
+    share = part_of_elements(np.array(bridge.lengths_m), begin, end)
     ratio = theta[:, unknowns.EI_1 :] / np.array(bridge.nominal_flexural_rigidity_nm2)
-    return np.asarray(np.exp(np.log(ratio) @ share / share.sum()))
+    return np.asarray(np.exp(np.log(ratio) @ share))
 
 
 def _probability_of(theta: Floats, place: int) -> results.AtEnds:

@@ -14,8 +14,8 @@ from schemas.reasons import Reason
 from schemas.results import BridgeResult, Crossing, Results, load_results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
+from services.identification.comparison import Estimate, compare, estimate_of_state, sentences
 from services.viewer.bridge_view import BridgeView, view_of_bridge
-from services.viewer.comparison import Estimate, compare, estimate_of_state, sentences
 
 _log = logging.getLogger(__name__)
 _LATEST_S = 7_258_118_400.0

@@ -8,11 +8,11 @@ from datetime import UTC, datetime
 import matplotlib
 
 from schemas.results import Crossing
+from services.identification.comparison import Comparison
 from services.report.bridge import BridgeReport, advice
 from services.report.html import Html, inlined_svg, joined, table, tag
 from services.report.style import CSS
 from services.viewer.bridge_figure import draw_bridge
-from services.viewer.comparison import Comparison
 from services.viewer.crossing_view import view_of_crossing
 from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.figure import draw_crossing

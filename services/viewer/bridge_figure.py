@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from services.identification.comparison import sentences
 from services.viewer.bridge_view import BridgeView
-from services.viewer.comparison import sentences
 from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
     BANNERS,

@@ -9,7 +9,7 @@ import numpy as np
 from schemas.reasons import Reason
 from schemas.results import Crossing, Results
 from schemas.site import Bridge, Site
-from services.viewer.comparison import Comparison, Estimate, compare, estimate_of_state
+from services.identification.comparison import Comparison, Estimate, compare, estimate_of_state
 from services.viewer.crossing_view import CrossingView, FloatArray, view_of_crossing
 
 

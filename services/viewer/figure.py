@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from services.viewer.comparison import Estimate, compare
+from services.identification.comparison import Estimate, compare
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,

@@ -20,9 +20,9 @@ from schemas.signals import AccelBatch, GnssFix
 from schemas.site import Site
 from services.common.files import replaced_atomically
 from services.drives.signals import series_of_batches
+from services.identification.comparison import sentences
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import BridgeView
-from services.viewer.comparison import sentences
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,

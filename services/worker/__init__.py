@@ -42,7 +42,9 @@ from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
 from services.execution.dispatch import Execution, awaited, collected, dispatched
 from services.execution.processes import Processes
+from services.history.baselines import baselines_of
 from services.history.result_files import Earlier, ResultFiles, read_earlier
+from services.identification.bridge_state import Fusing
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.outputs import Output
@@ -95,12 +97,13 @@ def run(
         settings=settings.model_dump(mode="json"),
         seed=settings.seed,
     )
+    fusing = Fusing(baselines_of(known, site.parent))
     earlier = Earlier()
     if file is None:
         moment = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         file = folder / realm / f"results-{moment}.mcap"
         if not is_replayed(realm):
-            earlier = read_earlier(folder / realm, realm, time.time(), search_hash(header))
+            earlier = read_earlier(folder / realm, realm, time.time(), search_hash(header), fusing)
     check_folder_writable(file.parent)
     if file.exists():
         raise InputError(f"{file}: exists, and results are never overwritten; give another name")
@@ -117,7 +120,7 @@ def run(
             return 0
         stack.enter_context(bus)
         publisher = Publisher(bus, realm)
-        engine = Engine(known, settings, header)
+        engine = Engine(known, settings, header, fusing)
         execution.wait_until_warm()
         arrivals: _Queue = queue.Queue(_LONGEST_QUEUE)
         closing, failed = threading.Event(), threading.Event()

@@ -263,6 +263,8 @@ def test_results_are_written_as_the_contract_says(recording: Path, tmp_path: Pat
         draws_path=None,
         figures=None,
         seed=5,
+        baseline=None,
+        fuse_suspect=False,
         console=console,
     )
     assert code == 0

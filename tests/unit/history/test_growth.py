@@ -22,7 +22,7 @@ from services.identification.bridge_state import (
     LISTED_AT_MOST,
     Counted,
     count_in,
-    latest_state,
+    state_of,
     usable,
 )
 from services.identification.known import search_hash
@@ -105,7 +105,7 @@ def test_a_crossing_costs_its_own_bytes_on_the_disk_however_many_were_before(
     costs = []
     # The crossings left out are listed up to a number: from there on nothing grows.
     for number, counted in zip(range(1000), counted_bridges(), strict=False):
-        state = latest_state(counted)
+        state = state_of(counted, "bridge-1")
         assert state is not None
         before = bytes_of.written
         file.add(result(number), {"bridge-1": state})
@@ -121,7 +121,7 @@ def test_the_file_is_as_if_it_had_been_written_at_once(tmp_path: Path, number: i
     file = GrowingJson(path, HEADER)
     crossings = []
     for n, counted in zip(range(number), counted_bridges(), strict=False):
-        state = latest_state(counted)
+        state = state_of(counted, "bridge-1")
         assert state is not None
         bridges = {"bridge-1": state, "bridge-2": state} if n % 2 == 0 else {}
         crossings.append(result(n))
@@ -134,7 +134,7 @@ def test_an_end_that_is_much_shorter_leaves_nothing_behind(tmp_path: Path) -> No
     """More goes with the bridges than comes with the crossing."""
     path = tmp_path / "results.json"
     file = GrowingJson(path, HEADER)
-    state = latest_state(next(counted_bridges()))
+    state = state_of(next(counted_bridges()), "bridge-1")
     assert state is not None
     short = [result(n).model_copy(update={"road": None}) for n in range(2)]
     file.add(short[0], {f"bridge-{n}": state for n in range(100)})
@@ -171,7 +171,7 @@ def test_the_messages_of_a_run_are_written_once(tmp_path: Path) -> None:
 def test_a_state_stays_small_after_20_000_crossings() -> None:
     for number, counted in zip(range(20_000), cheap_counted(), strict=False):
         if number in (LISTED_AT_MOST + 1, 19_999):
-            state = latest_state(counted)
+            state = state_of(counted, "bridge-1")
             assert state is not None
             output = state_output("live", "bridge-1", 1.8e9, state)
             message = pb.BridgeState.FromString(output.payload)
@@ -195,7 +195,7 @@ def cheap_counted() -> Iterator[Counted]:
 def test_who_entered_last_is_the_latest_even_if_it_comes_first() -> None:
     ones = [usable(result(n)) for n in (3, 1, 2, 0)]
     counted = count_in(Counted(), [one for one in ones if one is not None])
-    state = latest_state(counted)
+    state = state_of(counted, "bridge-1")
     assert state is not None
     assert state.crossings_used == (result(3).crossing_id,)
     assert [o.crossing_id for o in state.crossings_left_out] == [

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from schemas.errors import InputError
+from schemas.fusion import Axle, Coordinate, FusionLikelihood, Stretch
 from schemas.proto import driveby_pb2 as pb
 from schemas.reasons import REASON_TEXTS, Reason, texts
 from schemas.results import (
@@ -113,8 +114,47 @@ def crossings(draw: st.DrawFn) -> Crossing:
             )
         ),
         "road": draw(st.none() | roads()),
+        "fusion_likelihood": draw(st.none() | likelihoods()),
     }
     return Crossing(**values)
+
+
+@st.composite
+def likelihoods(draw: st.DrawFn) -> FusionLikelihood:
+    sizes = st.floats(1e-9, 1e9)
+    coordinate = st.builds(
+        Coordinate,
+        name=names,
+        location=numbers,
+        scale=sizes,
+        is_log=st.booleans(),
+        absence=st.floats(0.0, 1.0),
+    )
+    bridge = draw(st.lists(coordinate, min_size=1, max_size=3))
+    truck = draw(st.lists(coordinate, max_size=2))
+    knots = draw(st.integers(0, 2))
+    m = len(bridge) + len(truck) + knots
+    axle = Axle(width_m=0.25, twin_distance_m=0.0, length_m=0.2, track_m=1.9, offset_m=0.0)
+
+    def some(count: int) -> tuple[float, ...]:
+        return tuple(draw(st.lists(numbers, min_size=count, max_size=count)))
+
+    return FusionLikelihood(
+        bridge=tuple(bridge),
+        truck=tuple(truck),
+        root=some(m * (m + 1) // 2),
+        target=some(m),
+        element_lengths_m=some(1),
+        mass_spread=draw(st.floats(0.0, 1.0)),
+        footprints=(axle, axle),
+        first_knot_m=draw(numbers) if knots else None,
+        knot_spacing_m=draw(sizes),
+        level_m3=some(2),
+        off_bridge_m=tuple(
+            Stretch(begin_m=draw(numbers), step_m=draw(sizes), values=some(draw(st.integers(0, 3))))
+            for _ in range(draw(st.integers(0, 2)))
+        ),
+    )
 
 
 def a_crossing(**changes: object) -> Crossing:
@@ -142,6 +182,24 @@ def a_bridge() -> BridgeResult:
         {
             **{f"EI_{n}": element for n in (10, 9, 2, 1)},
             "between_crossing_std": 0.02,
+            "between_crossing_std_q025": 0.0,
+            "between_crossing_std_q975": 0.05,
+            "verdict": "suspect",
+            "reasons": ["crossings_disagree"],
+            "finding": "No element stands out.",
+            "weakest_element": "EI_9",
+            "probability_of_loss": {"EI_1": {"10": 0.5, "20": 0.25, "30": 0.125}},
+            "level": element,
+            "thirds": dict.fromkeys(("left", "middle", "right"), element),
+            "tracks": [
+                {
+                    "vehicle": "truck-1",
+                    "direction": "end_to_start",
+                    "common_share": 0.25,
+                    "wander_m": 0.125,
+                },
+                {"vehicle": "truck-2", "direction": "start_to_end", "common_share": 0.0},
+            ],
             "crossings_used": ["a"],
             "crossings_left_out": [{"crossing_id": "b", "reason": "rejected"}],
         }
@@ -172,6 +230,7 @@ def test_the_file_has_the_fields_of_the_contract() -> None:
         "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time", "exit_time",
         "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts",
         "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road",
+        "fusion_likelihood",
     ]  # fmt: skip
     assert list(content["crossings"][0]["parameters"]["EI_1"]) == [
         "unit", "mean", "std", "q025", "q50", "q975", "prior",
@@ -179,7 +238,9 @@ def test_the_file_has_the_fields_of_the_contract() -> None:
     assert content["crossings"][0]["reason_texts"] == [REASON_TEXTS[Reason.NO_NOISE_MODEL]]
     assert set(content["bridges"]["bridge-1"]) == {
         "EI_1", "EI_2", "EI_9", "EI_10",
-        "between_crossing_std", "crossings_used", "crossings_left_out",
+        "between_crossing_std", "between_crossing_std_q025", "between_crossing_std_q975",
+        "verdict", "reasons", "reason_texts", "finding", "weakest_element", "probability_of_loss",
+        "level", "thirds", "tracks", "crossings_used", "crossings_left_out",
         "crossings_left_out_count",
     }  # fmt: skip
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.viewer.comparison import Comparison, Estimate, compare, sentences
+from services.identification.comparison import Comparison, Estimate, compare, sentences
 
 EDGES_M = np.linspace(0.0, 30.0, 8)
 RATIOS = np.array([1.0, 0.98, 1.01, 0.4, 1.02, 1.0, 0.99])

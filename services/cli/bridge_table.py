@@ -1,0 +1,114 @@
+"""A bridge and its elements as they are printed."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+from schemas.reasons import LEFT_OUT_TEXTS, BridgeReason
+from schemas.results import BridgeResult, ElementState, Parameter
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+class Elements(Protocol):
+    """What a table says of a bridge itself: of a site file's, or of one that results tell of."""
+
+    @property
+    def id(self) -> str:
+        """Its name."""
+
+    @property
+    def lengths_m(self) -> Sequence[float]:
+        """Of its elements."""
+
+    @property
+    def nominal_flexural_rigidity_nm2(self) -> Sequence[float]:
+        """Of its elements."""
+
+
+def print_bridge(console: "Console", bridge: Elements, state: BridgeResult) -> None:
+    """All crossings of a bridge together: first how good the measurement is, then the bridge."""
+    used, left = len(state.crossings_used), state.crossings_left_out_count
+    console.print(
+        f"[bold]{bridge.id}[/], {used} crossing{'' if used == 1 else 's'} together"
+        + (f", {left} left out" if left else ""),
+        highlight=False,
+    )
+    for one in state.crossings_left_out:
+        console.print(
+            f"  {one.crossing_id}: {LEFT_OUT_TEXTS.get(one.reason, one.reason)}",
+            highlight=False,
+            soft_wrap=True,
+        )
+    console.print(f"measurement [bold]{state.verdict}[/]", highlight=False)
+    for code, text in zip(state.reasons, state.reason_texts, strict=True):
+        console.print(f"  {code}: {text}", highlight=False)
+    if not state.elements:
+        return
+    has_meaning = BridgeReason.NOT_FUSED not in state.reasons
+    print_elements(console, bridge, state.elements, has_meaning, state.probability_of_loss)
+    if state.finding is not None:
+        console.print(f"[bold]the bridge:[/] {state.finding}", highlight=False)
+    for line in _of_state(state):
+        console.print(line, highlight=False)
+
+
+def _of_state(state: BridgeResult) -> Iterator[str]:
+    if state.level is not None and state.thirds is not None:
+        thirds = (state.thirds.left, state.thirds.middle, state.thirds.right)
+        told = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
+        yield f"EI of nominal: mean {state.level.mean:.2f} ± {state.level.std:.2f}; thirds {told}"
+    if state.between_crossing_std is not None and len(state.crossings_used) > 1:
+        low, high = state.between_crossing_std_q025, state.between_crossing_std_q975
+        yield (
+            f"EI changes by {100.0 * state.between_crossing_std:.1f} % from crossing to crossing, "
+            f"{100.0 * (low or 0.0):.1f} to {100.0 * (high or 0.0):.1f} %"
+        )
+    for track in state.tracks:
+        beside = "" if track.wander_m is None else f", {track.wander_m:.2f} m beside each other"
+        yield (
+            f"runs of {track.vehicle}, {track.direction.replace('_', ' ')}{beside}: "
+            f"{100.0 * track.common_share:.0f} % of what its axles' roads differ by is the same"
+        )
+
+
+def print_elements(
+    console: "Console",
+    bridge: Elements,
+    elements: Mapping[str, Parameter | ElementState],
+    has_meaning: bool,
+    losses: Mapping[str, Mapping[str, float]] | None,
+) -> None:
+    """A line for each element; `has_meaning` says whether intervals have.
+
+    `losses` are probabilities, by element and per cent of the baseline.
+    """
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("element", "from (m)", "to (m)", "EI (GN·m²)"):
+        table.add_column(heading, justify="right")
+    if has_meaning:
+        table.add_column("95 % interval", justify="right")
+    table.add_column("of nominal", justify="right")
+    if has_meaning and not losses:  # what it lost says more, and a line has eighty characters
+        table.add_column("95 % interval", justify="right")
+    percents = list(next(iter(losses.values()))) if losses else []
+    if losses:
+        table.add_column(f"lost {'/'.join(percents)} %", justify="right")
+    start = 0.0
+    for number, (length, sound) in enumerate(
+        zip(bridge.lengths_m, bridge.nominal_flexural_rigidity_nm2, strict=True), start=1
+    ):
+        p = elements[f"EI_{number}"]
+        row = [f"EI_{number}", f"{start:.2f}", f"{start + length:.2f}"]
+        for unit, digits in ((1e9, 2), (sound, 3)):
+            row.append(f"{p.mean / unit:.{digits}f}")
+            if has_meaning and not (losses and unit == sound):
+                row.append(f"{p.q025 / unit:.{digits}f} … {p.q975 / unit:.{digits}f}")
+        if losses:
+            of = losses.get(f"EI_{number}", {})
+            row.append("/".join(f"{100.0 * of[p]:.0f}" for p in percents if p in of) + " %")
+        table.add_row(*row)
+        start += length
+    console.print(table)

@@ -1,0 +1,87 @@
+"""`driveby fuse`: one estimate of each bridge from stored results."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from schemas.results import BridgeResult, Crossing, Header, load_results, results, results_json
+from services.cli.bridge_table import print_bridge
+from services.common.errors import InputError
+from services.common.files import check_writable, write_atomically
+from services.identification.bridge_state import (
+    NOTHING_STORED,
+    Counted,
+    Fusing,
+    count_in,
+    state_of,
+    usable,
+    with_common_shares,
+)
+from services.recordings.recording import program_version
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+class _Elements(NamedTuple):
+    id: str
+    lengths_m: tuple[float, ...]
+    nominal_flexural_rigidity_nm2: tuple[float, ...]
+
+
+def fuse_command(
+    *,
+    paths: list[Path],
+    json_path: Path | None,
+    baseline: Path | None,
+    fuse_suspect: bool,
+    console: "Console",
+) -> int:
+    """Fuse all crossings of the results, each once, print every bridge and write it if asked to.
+
+    Of a crossing that several files hold the newest result counts. InputError: a file that is no
+    results file, results without a crossing that could be fused, or of several realms.
+    """
+    if json_path is not None:
+        check_writable(json_path)
+    files = sorted((load_results(path) for path in paths), key=lambda one: one.created)
+    crossings = {c.crossing_id: c for one in files for c in one.crossings}
+    realms = sorted({crossing.realm for crossing in crossings.values()})
+    if len(realms) > 1:
+        raise InputError(f"{paths[0]}: crossings of {', '.join(realms)}; fuse one realm at a time")
+    fusing = NOTHING_STORED._replace(with_suspect=fuse_suspect)
+    if baseline is not None:
+        fusing = Fusing(load_results(baseline).bridges, fuse_suspect)
+    found: dict[str, BridgeResult] = {}
+    for name in sorted({crossing.bridge for crossing in crossings.values()}):
+        of = sorted((c for c in crossings.values() if c.bridge == name), key=lambda c: c.entry_time)
+        counts = [one for one in map(usable, of) if one is not None]
+        state = state_of(count_in(Counted(), counts), name, fusing)
+        elements = _elements(name, of)
+        if state is None or elements is None:
+            console.print(f"{name}: none of {len(of)} crossings can be fused", highlight=False)
+            continue
+        if found:
+            console.print()
+        found[name] = state
+        print_bridge(console, elements, state)
+    if not found:
+        raise InputError(f"{paths[0]}: no crossing that could be fused; identify with method pre")
+    if json_path is not None:
+        last = files[-1]
+        header = Header(program_version(), time.time(), last.site_hash, last.settings, last.seed)
+        ordered = sorted(crossings.values(), key=lambda crossing: crossing.entry_time)
+        every = results(header, with_common_shares(ordered, found), found)
+        write_atomically(json_path, results_json(every))
+    return 0
+
+
+def _elements(name: str, crossings: list[Crossing]) -> _Elements | None:
+    """The bridge as the newest crossing that can be fused knows it."""
+    for crossing in reversed(crossings):
+        of = crossing.fusion_likelihood
+        if of is not None:
+            lengths = of.element_lengths_m
+            nominal = tuple(c.location for c in of.bridge[-len(lengths) :])
+            return _Elements(name, lengths, nominal)
+    return None

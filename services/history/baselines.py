@@ -1,0 +1,46 @@
+"""Stored states of bridges, with which new ones are compared."""
+
+import logging
+from pathlib import Path
+
+from schemas.results import BridgeResult, load_results
+from schemas.site import Bridge, Site
+from services.common.errors import InputError
+
+_log = logging.getLogger(__name__)
+
+
+def baselines_of(
+    site: Site, beside: Path | None, given: Path | None = None
+) -> dict[str, BridgeResult]:
+    """The states, by bridge, of a results file that is given, or of those that the site names.
+
+    A name in a site file is a path from the folder `beside` it. Of a site file that a recording
+    carries (None) the results need not be there: then it is said that there is no baseline.
+    InputError if a file is no results file or tells nothing of the bridge.
+    """
+    if given is not None:
+        bridges = load_results(given).bridges
+        found = {b.id: bridges[b.id] for b in site.bridges if b.id in bridges}
+        if not found:
+            names = ", ".join(bridge.id for bridge in site.bridges)
+            raise InputError(f"{given}: has no state of {names} to compare with")
+        return {b.id: _fitting(given, b, found.get(b.id)) for b in site.bridges if b.id in found}
+    out = {}
+    for bridge in site.bridges:
+        if bridge.baseline is None:
+            continue
+        path = (beside or Path()) / bridge.baseline
+        if beside is None and not path.is_file():
+            _log.warning("the baseline %s of %s is not there; see --baseline", path, bridge.id)
+            continue
+        out[bridge.id] = _fitting(path, bridge, load_results(path).bridges.get(bridge.id))
+    return out
+
+
+def _fitting(path: Path, bridge: Bridge, state: BridgeResult | None) -> BridgeResult:
+    if state is None or len(state.elements) != bridge.elements:
+        raise InputError(
+            f"{path}: has no state of {bridge.id} with {bridge.elements} elements to compare with"
+        )
+    return state

@@ -1,0 +1,224 @@
+"""A bridge from results of many crossings: what is used, what is left out, and what is said."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas import fusion
+from schemas.reasons import BridgeReason, LeftOutReason, Reason
+from schemas.results import BridgeResult, Crossing, Header, load_results, results, results_json
+from services.cli.main import main
+from services.identification.bridge_state import (
+    NOTHING_STORED,
+    Counted,
+    Fusing,
+    against,
+    count_in,
+    state_of,
+    usable,
+    with_common_shares,
+)
+from services.identification.fusing import fused, source_of
+
+NOMINAL = 1.6e10
+ELEMENTS = 5
+AXLE = fusion.Axle(width_m=0.25, twin_distance_m=0.0, length_m=0.2, track_m=1.9, offset_m=0.0)
+
+
+def likelihood(
+    ratio: tuple[float, ...], seed: int, nominal: float = NOMINAL, std: float = 0.03
+) -> fusion.FusionLikelihood:
+    """Of a crossing that tells EI/nominal of every element to `std`."""
+    rng = np.random.default_rng(seed)
+    elements = [
+        fusion.Coordinate(name=f"EI_{n}", location=nominal, scale=0.55, is_log=True)
+        for n in range(1, len(ratio) + 1)
+    ]
+    spring = fusion.Coordinate(
+        name="k_rot_start", location=0.0, scale=5e8, is_log=False, absence=0.5
+    )
+    gain = fusion.Coordinate(name="common_gain", location=1.0, scale=0.01, is_log=True)
+    compliance = nominal / (NOMINAL * np.array(ratio))
+    x = np.concatenate([[0.1], compliance, [0.0]])
+    root = np.diag(np.concatenate([[2.0], 1.0 / (std * compliance), [0.1]]))
+    return fusion.FusionLikelihood(
+        bridge=(spring, *elements),
+        truck=(gain,),
+        root=tuple(root[np.triu_indices(x.size)]),
+        target=tuple(root @ x + rng.standard_normal(x.size)),
+        element_lengths_m=(6.0,) * len(ratio),
+        mass_spread=0.01,
+        footprints=(AXLE, AXLE),
+        knot_spacing_m=1.25,
+        level_m3=(0.0, 0.0),
+    )
+
+
+def crossing(
+    number: int,
+    ratio: tuple[float, ...] = (1.0, 1.0, 0.6, 1.0, 1.0),
+    verdict: str = "good",
+    nominal: float = NOMINAL,
+) -> Crossing:
+    of_all = {"unit": "N·m²", "std": 5e8, "q025": 1e9, "q975": 3e10}
+    parameters = {
+        f"EI_{n}": of_all | {"mean": r * NOMINAL, "q50": r * NOMINAL}
+        for n, r in enumerate(ratio, start=1)
+    }
+    return Crossing.model_validate(
+        {
+            "crossing_id": f"truck-1.bridge-1.{number:03d}",
+            "realm": "sim-x",
+            "vehicle": "truck-1",
+            "bridge": "bridge-1",
+            "direction": "start_to_end",
+            "entry_time": 1.8e9 + 600.0 * number,
+            "exit_time": 1.8e9 + 600.0 * number + 4.0,
+            "speed_m_per_s": 10.0,
+            "method": "pre",
+            "verdict": verdict,
+            "reasons": () if verdict == "good" else (Reason.RESIDUALS_COLOURED,),
+            "parameters": parameters,
+            "derived": {
+                name: {"unit": "1", "mean": 1.0, "std": 0.1, "q025": 0.8, "q50": 1.0, "q975": 1.2}
+                for name in ("f1_hz", "max_deflection_m")
+            },
+            "fusion_likelihood": likelihood(ratio, number, nominal),
+        }
+    )
+
+
+def state(crossings: list[Crossing], fusing: Fusing = NOTHING_STORED) -> BridgeResult:
+    counted = count_in(Counted(), [one for one in map(usable, crossings) if one is not None])
+    found = state_of(counted, "bridge-1", fusing)
+    assert found is not None
+    return found
+
+
+def test_many_crossings_are_one_estimate() -> None:
+    crossings = [crossing(n) for n in range(8)]
+    found = state(crossings)
+    assert found.verdict == "good"
+    assert found.weakest_element == "EI_3"
+    assert found.crossings_used == tuple(one.crossing_id for one in crossings)
+    assert found.elements["EI_3"].q025 < 0.6 * NOMINAL < found.elements["EI_3"].q975
+    # Of one crossing 3 %; of eight a third of that, the mass' 1 % and what a bridge may change by.
+    assert found.elements["EI_1"].std / NOMINAL < 0.025
+    assert found.probability_of_loss is None
+    assert found.finding is not None
+    assert "Element 3, 12.0 to 18.0 m: " in found.finding
+    assert found.thirds is not None
+    assert found.thirds.middle.mean < found.thirds.left.mean
+    assert found == state(crossings[::-1])
+
+
+def test_suspect_crossings_are_left_out_unless_asked_for() -> None:
+    crossings = [crossing(0), crossing(1, (3.0,) * ELEMENTS, "suspect"), crossing(2)]
+    found = state(crossings)
+    assert found.crossings_used == (crossings[0].crossing_id, crossings[2].crossing_id)
+    (left,) = found.crossings_left_out
+    assert (left.crossing_id, left.reason) == (crossings[1].crossing_id, LeftOutReason.SUSPECT)
+    assert found.crossings_left_out_count == 1
+    every = [crossing(0), crossing(1, verdict="suspect")]
+    found = state(every, NOTHING_STORED._replace(with_suspect=True))
+    assert len(found.crossings_used) == 2
+    assert (found.verdict, found.reasons) == ("suspect", (BridgeReason.USES_SUSPECT,))
+
+
+def test_a_suspect_crossing_alone_is_no_state_of_a_bridge() -> None:
+    found = state([crossing(0, verdict="suspect")])
+    assert (found.verdict, found.reasons) == ("rejected", (BridgeReason.NO_GOOD_CROSSING,))
+    assert not found.elements
+    assert not found.crossings_used
+
+
+def test_one_that_disagrees_is_named() -> None:
+    crossings = [crossing(n) for n in range(9)]
+    crossings.append(crossing(9, (1.0, 1.8, 0.6, 1.0, 1.0)))
+    found = state(crossings)
+    assert [one.reason for one in found.crossings_left_out] == [LeftOutReason.DISAGREES]
+    assert found.verdict == "good"
+    assert found.elements["EI_2"].mean == pytest.approx(NOMINAL, rel=0.05)
+    two = state([crossing(0), crossing(1, (1.0, 1.8, 0.6, 1.0, 1.0))])
+    assert (two.verdict, two.reasons) == ("suspect", (BridgeReason.CROSSINGS_DISAGREE,))
+
+
+def test_crossings_with_other_elements_are_left_out() -> None:
+    found = state([crossing(0, (1.0,) * 4), crossing(1), crossing(2)])
+    assert [one.reason for one in found.crossings_left_out] == [LeftOutReason.OTHER_MODEL]
+
+
+def test_another_nominal_value_is_the_same_bridge() -> None:
+    one = state([crossing(n) for n in range(6)])
+    other = state([crossing(n, nominal=1.3 * NOMINAL if n < 5 else NOMINAL) for n in range(6)])
+    for name in one.elements:
+        assert other.elements[name].mean == pytest.approx(one.elements[name].mean, rel=0.03)
+
+
+def test_probabilities_of_loss_are_against_a_baseline() -> None:
+    before = state([crossing(n, (1.0,) * ELEMENTS) for n in range(6)])
+    now = state([crossing(n) for n in range(10, 16)], Fusing({"bridge-1": before}))
+    assert now.probability_of_loss is not None
+    lost = now.probability_of_loss["EI_3"]
+    assert lost["10"] == lost["20"] == lost["30"] == 1.0
+    assert now.probability_of_loss["EI_1"]["10"] < 0.01
+    assert now.finding is not None
+    assert "than the baseline" in now.finding
+    derived = against(crossing(20), before).derived
+    assert derived is not None
+    below = derived.probability_below_90_percent_of_baseline
+    assert below is not None
+    assert below["EI_3"] > 0.99
+    assert below["EI_1"] < 0.05
+
+
+def test_other_methods_and_older_results_are_not_fused() -> None:
+    old = [crossing(n).model_copy(update={"fusion_likelihood": None}) for n in range(3)]
+    found = state(old)
+    assert (found.verdict, found.reasons) == ("suspect", (BridgeReason.NOT_FUSED,))
+    assert found.crossings_used == (old[2].crossing_id,)
+    found = state([*old[:2], crossing(5)])
+    assert [one.reason for one in found.crossings_left_out] == [LeftOutReason.NO_LIKELIHOOD] * 2
+
+
+def test_nothing_is_fused_from_nothing() -> None:
+    assert state_of(Counted(), "bridge-1") is None
+    with pytest.raises(ValueError, match="no crossings"):
+        fused([])
+    assert source_of(crossing(0).model_copy(update={"fusion_likelihood": None})) is None
+    one = crossing(0)
+    assert with_common_shares([one], {}) == [one]
+
+
+HEADER = Header("1", 1.8e9, "hash", {"method": "pre"}, 1)
+
+
+def write(path: Path, crossings: list[Crossing]) -> Path:
+    path.write_text(results_json(results(HEADER, crossings, {})), encoding="utf-8")
+    return path
+
+
+def test_the_command_fuses_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = write(tmp_path / "one.json", [crossing(n) for n in range(3)])
+    other = write(tmp_path / "other.json", [crossing(n) for n in range(2, 5)])
+    out = tmp_path / "out.json"
+    assert main(["fuse", str(one), str(other), "--json", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "bridge-1, 5 crossings together" in said
+    assert "measurement good" in said
+    found = load_results(out)
+    assert len(found.crossings) == 5
+    assert len(found.bridges["bridge-1"].crossings_used) == 5
+    assert main(["fuse", str(one), "--baseline", str(out)]) == 0
+    assert "lost 10/20/30 %" in capsys.readouterr().out
+
+
+def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = write(tmp_path / "empty.json", [])
+    assert main(["fuse", str(empty)]) == 2
+    assert "no crossing that could be fused" in capsys.readouterr().err
+    live = crossing(1).model_copy(update={"realm": "live"})
+    both = write(tmp_path / "both.json", [crossing(0), live])
+    assert main(["fuse", str(both)]) == 2
+    assert "one realm at a time" in capsys.readouterr().err
