@@ -67,7 +67,8 @@ def identify_command(
     if rrd_path is not None:
         from services.viewer.bridge_view import views_of_bridges
         from services.viewer.crossing_view import view_of_crossing
-        from services.viewer.rerun_file import bridges_of_site, write_rrd
+        from services.viewer.rerun_file import write_rrd
+        from services.viewer.rerun_places import bridges_of_site
         from services.viewer.vehicle_signals import signals_of_messages
 
         try:
@@ -81,7 +82,7 @@ def identify_command(
                     crossings=[
                         view_of_crossing(c, known.bridge(c.bridge)) for c in found.crossings
                     ],
-                    overviews=views_of_bridges(found, known),
+                    overviews=views_of_bridges(found, known, (site or recordings[0]).parent),
                 )
         except RuntimeError as error:  # so Rerun says that its file could not be written
             raise FailureError(f"{rrd_path}: could not be written: {error}") from error
