@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from datetime import UTC, datetime
 
 import rerun as rr
@@ -51,15 +51,20 @@ def blueprint(
     were seen in it.
     """
     on_map = {bridge.identifier: bridge for bridge in bridges}
+    channels = {
+        vehicle: {name for batch in signals.accel for name in batch.channels}
+        for vehicle, signals in vehicles.items()
+    }
     found: list[rrb.Container] = [_overview_layout(b, on_map.get(b.bridge)) for b in overviews]
     found += [
-        _crossing_layout(one, vehicles.get(one.vehicle), on_map.get(one.bridge))
+        _crossing_layout(one, channels.get(one.vehicle, set()), on_map.get(one.bridge))
         for one in crossings
     ]
     seen = [
-        _passing_layout(one, vehicles.get(one.vehicle), on_map.get(one.bridge)) for one in passings
+        _passing_layout(one, channels.get(one.vehicle, set()), on_map.get(one.bridge))
+        for one in passings
     ]
-    drive = _drive_layout(vehicles, has_results=bool(found), has_about=about is not None)
+    drive = _drive_layout(channels, has_results=bool(found), has_about=about is not None)
     tabs = [*found, drive, *seen] if found else [drive, *seen]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
@@ -71,11 +76,11 @@ def blueprint(
 
 
 def _crossing_layout(
-    crossing: CrossingView, signals: VehicleSignals | None, bridge: BridgeOnMap | None
+    crossing: CrossingView, channels: Set[str], bridge: BridgeOnMap | None
 ) -> rrb.Container:
     """Verdict and place, what was found, and what it was found from; only what there is."""
     root = crossing_root(crossing)
-    plots = _acceleration_plots(f"{root}/acceleration", signals)
+    plots = _acceleration_plots(f"{root}/acceleration", channels)
     if crossing.road is not None:
         plots = [
             _plot(f"{root}/road", "Road profile (mm)"),
@@ -185,11 +190,11 @@ def _learned_view(root: str, crossing: CrossingView) -> rrb.View:
 
 
 def _passing_layout(
-    passing: PassingView, signals: VehicleSignals | None, bridge: BridgeOnMap | None
+    passing: PassingView, channels: Set[str], bridge: BridgeOnMap | None
 ) -> rrb.Container:
     """The accelerations of a crossing that nobody has identified."""
     root = passing_root(passing)
-    plots = _acceleration_plots(f"{root}/acceleration", signals)
+    plots = _acceleration_plots(f"{root}/acceleration", channels)
     return rrb.Vertical(
         *plots,
         _places(bridge, root, has_elements=False, coloured=False),
@@ -198,11 +203,11 @@ def _passing_layout(
 
 
 def _drive_layout(
-    vehicles: Mapping[str, VehicleSignals], *, has_results: bool, has_about: bool
+    channels: Mapping[str, Set[str]], *, has_results: bool, has_about: bool
 ) -> rrb.Container:
     plots: list[rrb.View] = []
-    for vehicle, signals in vehicles.items():
-        plots += _acceleration_plots(f"vehicle/{vehicle}/acceleration", signals, f"{vehicle}:")
+    for vehicle, known in channels.items():
+        plots += _acceleration_plots(f"vehicle/{vehicle}/acceleration", known, f"{vehicle}:")
         plots.append(_plot(f"vehicle/{vehicle}/speed", f"{vehicle}: Speed (m/s)"))
     places = rrb.Tabs(
         rrb.Spatial2DView(origin="plan_of_drive", name="Plan of the drive (m, north up)"),
@@ -218,11 +223,8 @@ def _drive_layout(
     return rrb.Horizontal(side, rrb.Vertical(*plots), column_shares=[2, 3], name=name)
 
 
-def _acceleration_plots(
-    origin: str, signals: VehicleSignals | None, vehicle: str = ""
-) -> list[rrb.View]:
+def _acceleration_plots(origin: str, channels: Set[str], vehicle: str = "") -> list[rrb.View]:
     """Body and axles apart: those of the axles are ten times larger. Only what the truck has."""
-    channels = {channel for batch in signals.accel for channel in batch.channels} if signals else ()
     return [
         _plot(origin, f"{vehicle} {name} accelerations (m/s²)".strip(), part)
         for part, name in (("sprung", "Body"), ("unsprung", "Axle"))

@@ -21,10 +21,16 @@ from services.drives.signals import series_of_batches
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import BridgeView
 from services.viewer.comparison import sentences
-from services.viewer.crossing_view import CrossingView, FloatArray, PassingView
+from services.viewer.crossing_view import CrossingView, FloatArray, OnBridge, PassingView
 from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.layout import blueprint, bridge_root, passing_root
-from services.viewer.rerun_crossing import Channels, log_acceleration, log_crossing, log_position
+from services.viewer.rerun_crossing import (
+    WINDOW_S,
+    Channels,
+    log_acceleration,
+    log_crossing,
+    log_position,
+)
 from services.viewer.rerun_parts import (
     CHANNEL_COLOURS,
     IntArray,
@@ -44,6 +50,8 @@ from services.viewer.rerun_places import (
 from services.viewer.vehicle_signals import VehicleSignals
 
 APPLICATION = "driveby"
+_PIECE = 2000
+"""Batches that are sent at a time."""
 _PICTURE_DPI = 110
 """A picture that is larger than its view is drawn without smoothing, and cannot be read."""
 
@@ -80,14 +88,9 @@ def write_rrd(
             _log_state(recording, bridge, states.get(bridge.identifier))
             log_surroundings(recording, bridge, vehicles)
         log_drive_plan(recording, near, vehicles)
-        series: dict[str, Channels] = {}
         for vehicle, signals in vehicles.items():
             log_vehicle(recording, vehicle, signals.gnss)
-            series[vehicle] = channels = acceleration_series(signals.accel)
-            for channel, (time_ns, samples) in channels.items():
-                entity = f"vehicle/{vehicle}/acceleration/{channel}"
-                log_line(recording, entity, channel.replace("_", " "), CHANNEL_COLOURS[channel])
-                send_scalars(recording, entity, samples, time_ns=time_ns)
+            _log_accelerations(recording, vehicle, signals)
         for view in overviews:
             _log_overview(recording, view)
         for crossing in crossings:
@@ -97,12 +100,13 @@ def write_rrd(
                 crossing,
                 places.get(crossing.bridge),
                 vehicles.get(crossing.vehicle),
-                series.get(crossing.vehicle, {}),
+                _series_around(crossing, vehicles.get(crossing.vehicle)),
                 None if state is None else state.baseline,
             )
         for passing in passings:
             root = passing_root(passing)
-            log_acceleration(recording, root, passing, series.get(passing.vehicle, {}))
+            around = _series_around(passing, vehicles.get(passing.vehicle))
+            log_acceleration(recording, root, passing, around)
             if passing.vehicle in vehicles:
                 place = places.get(passing.bridge)
                 log_position(recording, root, passing, vehicles[passing.vehicle], place)
@@ -125,6 +129,34 @@ def acceleration_series(batches: Sequence[AccelBatch]) -> dict[str, tuple[IntArr
             np.insert(samples, gaps, np.nan),
         )
     return marked
+
+
+def _log_accelerations(
+    recording: rr.RecordingStream, vehicle: str, signals: VehicleSignals
+) -> None:
+    """All samples, a piece at a time: an hour at once takes a gigabyte more."""
+    named: set[str] = set()
+    for first in range(0, len(signals.accel), _PIECE):
+        # With the batch before it, so that a gap between two pieces is one, too.
+        before = first - 1 if first else 0
+        piece = signals.accel[before : first + _PIECE]
+        for channel, (time_ns, samples) in acceleration_series(piece).items():
+            entity = f"vehicle/{vehicle}/acceleration/{channel}"
+            if channel not in named:
+                named.add(channel)
+                log_line(recording, entity, channel.replace("_", " "), CHANNEL_COLOURS[channel])
+            known = piece[0].channels.get(channel) if first else None
+            sent = 0 if known is None else known.samples.size
+            send_scalars(recording, entity, samples[sent:], time_ns=time_ns[sent:])
+
+
+def _series_around(passage: OnBridge, signals: VehicleSignals | None) -> Channels:
+    """Accelerations while a truck was on a bridge, and somewhat more."""
+    if signals is None:
+        return {}
+    first_ns = (passage.entry_time_s - 2.0 * WINDOW_S) * 1e9
+    last_ns = (passage.exit_time_s + WINDOW_S) * 1e9
+    return acceleration_series([b for b in signals.accel if first_ns <= b.wall_time_ns <= last_ns])
 
 
 def _recording_id(crossings: Sequence[CrossingView]) -> str:

@@ -90,6 +90,7 @@ NOT_RUN = {
     "python -m tests.benchmarks.logger_load --trucks 100 --seconds 300": LONG,
     "python -m tests.benchmarks.recordings": LONG,
     "python -m tests.benchmarks.replay_speed": LONG,
+    "python -m tests.benchmarks.view": LONG,
     "python -m tests.screenshots": "tests/unit/viewer/test_screenshots.py takes them",
     "python -m schemas.topics_page": "tests/contract/test_topics_page.py compares what it writes",
 }

@@ -27,6 +27,7 @@ from schemas.topics import Key
 from services.common.errors import InputError
 from services.recordings.recording import Message
 from services.recordings.writer import write_recording
+from services.viewer import rerun_file
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.layout import crossing_root
 from services.viewer.rerun_crossing import front_axle_chainage, verdict_markdown
@@ -475,3 +476,24 @@ def test_a_recording_is_shown_with_its_channels_places_and_crossings(tmp_path: P
         for name, least in (("truck-1: Body", 500), ("truck-1: Speed", 100), ("Plan of", 100)):
             drawn = pixels(picture(viewer, view_named(viewer, name)))
             assert coloured(drawn) > least, name
+
+
+def test_a_long_drive_is_sent_in_pieces_with_every_sample_and_gap(
+    tmp_path: Path, site: Site, monkeypatch: pytest.MonkeyPatch
+):
+    batches = accel(40)
+    del batches[19:21]  # a gap between two pieces, and one inside
+    del batches[5]
+    whole = acceleration_series(batches)
+    monkeypatch.setattr(rerun_file, "_PIECE", 9)
+    path = tmp_path / "drive.rrd"
+    vehicles = {"truck-1": VehicleSignals(batches, gnss())}
+    write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
+    chunks = RrdReader(path).stream().to_chunks()
+    for channel in CHANNELS:
+        found = rows(chunks, f"vehicle/truck-1/acceleration/{channel}")
+        order = np.argsort(times_ns(found), kind="stable")
+        time_ns, samples = whole[channel]
+        assert times_ns(found)[order].tolist() == time_ns.tolist()
+        assert scalars(found)[order] == pytest.approx(samples, nan_ok=True)
+    assert np.isnan(whole["sprung_front"][1]).sum() == 2
