@@ -1,7 +1,8 @@
 """`driveby identify`: identifies the crossings of recordings, prints and writes what was found."""
 
+import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
+from services.common.progress import progress_bar
+from services.drives.survey import survey
 from services.execution.offline import identify_recordings, site_of
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.recordings.recording import read_messages
@@ -57,10 +60,8 @@ def identify_command(
             "simulations without noise are for --method least-squares"
         )
     draws: dict[str, Draws] = {}
-    with console.status("reading", spinner="dots") as status:
-        found = identify_recordings(
-            recordings, known, settings, status.update, keep=draws.__setitem__
-        )
+    with _crossings_bar(console, recordings, known) as say:
+        found = identify_recordings(recordings, known, settings, say, keep=draws.__setitem__)
     _print(console, found, known)
     if json_path is not None:
         write_atomically(json_path, results_json(found))
@@ -98,6 +99,26 @@ def identify_command(
         )
         write_draws(draws_path, kept)
     return 0
+
+
+@contextlib.contextmanager
+def _crossings_bar(
+    console: "Console", recordings: list[Path], site: Site
+) -> Iterator[Callable[[str], None]]:
+    """A bar over all crossings that are seen in the recordings, with what is done at the moment."""
+    # Without a terminal nobody sees it, and the recordings need not be looked through for it.
+    seen = []
+    if console.is_terminal:
+        seen = [survey(path, site).passings for path in recordings]
+    with progress_bar(console) as bar:
+        task = bar.add_task("reading", total=sum(map(len, seen)) or None)
+        begun: set[str] = set()
+
+        def say(text: str) -> None:
+            begun.add(text.partition(": ")[0])
+            bar.update(task, description=text, completed=len(begun) - 1)
+
+        yield say
 
 
 def _print(console: "Console", found: Results, site: Site) -> None:

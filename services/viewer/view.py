@@ -23,6 +23,7 @@ from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.common.errors import FailureError, InputError
+from services.common.progress import Offset, reading_bar, unwatched
 from services.drives.survey import survey
 from services.history.site_of_results import site_of_results
 from services.recordings.recording import Message, check_message
@@ -51,12 +52,14 @@ def view_command(*, target: str | Path, web: bool, console: Console) -> int:
         shown = path
         if path.suffix != ".rrd":
             shown = Path(folder) / f"{path.stem}.rrd"
-            with console.status(f"preparing {path.name}"):
-                convert(path, shown)
+            with reading_bar(f"preparing {path.name}", [path], console) as next_file:
+                convert(path, shown, progress=next_file())
         return _run_viewer(shown, web=web)
 
 
-def convert(target: Path, rrd: Path, *, site: Path | None = None) -> None:
+def convert(
+    target: Path, rrd: Path, *, site: Path | None = None, progress: Offset = unwatched
+) -> None:
     """Write the Rerun file of a recording (.mcap) or of results (.json).
 
     Results do not say where their bridge is: `site` does, or a recording in the same folder. The
@@ -82,7 +85,7 @@ def convert(target: Path, rrd: Path, *, site: Path | None = None) -> None:
         elif message.key.stream == "estimate":
             estimates.append(message)
 
-    found = survey(target, None if site is None else load_site(site), take)
+    found = survey(target, None if site is None else load_site(site), take, progress)
     if not found.info.messages:
         raise InputError(f"{target}: holds no driveby message; a recording of a truck is expected")
     crossings = crossings_of_messages(estimates)
