@@ -18,7 +18,9 @@ from services.viewer.crossing_view import CrossingView, FloatArray
 _NEEDED = ("d_1", "m_s", "m_s1", "m_s2", "m_u1", "m_u2")
 _PARTS = 6
 """Straight lines that an element is drawn with."""
-_FRAMES = 120
+_FRAMES = 160
+_BESIDE_S = 1.0
+"""Before and after, as long as the accelerations that are shown: a viewer begins there."""
 
 
 class Passage(NamedTuple):
@@ -53,7 +55,8 @@ def passage_of(crossing: CrossingView) -> Passage | None:
         [value["m_s1"] + value["m_u1"], value["m_s2"] + value["m_u2"]]
     )
     span, sign = crossing.span_m, 1.0 if crossing.forward else -1.0
-    way = np.linspace(-0.1 * span, 1.1 * span + wheelbase, _FRAMES)
+    beside = _BESIDE_S * crossing.speed_m_per_s
+    way = np.linspace(-beside, span + wheelbase + beside, _FRAMES)
     front = way if crossing.forward else span - way
     rear = front - sign * wheelbase
     fine = refine(beam, _PARTS)
