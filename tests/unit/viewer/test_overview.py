@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
@@ -12,8 +13,10 @@ from schemas.results import results_json
 from schemas.site import Site
 from schemas.site_file import load_site, site_toml
 from services.recordings.writer import write_recording
+from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import views_of_bridges
 from services.viewer.crossing_view import CrossingView, view_of_crossing
+from services.viewer.drawing import STYLE
 from services.viewer.layout import blueprint, crossing_root, tab_name
 from services.viewer.rerun_crossing import verdict_markdown
 from services.viewer.rerun_places import bridges_of_site
@@ -148,3 +151,33 @@ def origins(part: rrb.Container | rrb.View) -> Iterator[str]:
         return
     for child in part.contents:
         yield from origins(child)
+
+
+def test_a_baseline_that_the_site_file_names_is_drawn_and_compared_with(
+    tmp_path: Path, project: Path
+) -> None:
+    toml = (project / "docs/site.example.toml").read_text()
+    (tmp_path / "site.toml").write_text(
+        toml.replace("[bridge]\n", '[bridge]\nbaseline = "then.json"\n')
+    )
+    site = load_site(tmp_path / "site.toml")
+    before = results_of(site, some_crossing("b"), used="b", ratios=np.full(7, 0.8))
+    now = results_of(site, some_crossing("a"), used="a")
+    (tmp_path / "now.json").write_text(results_json(now))
+    drawn = {}
+    for named in (False, True):
+        if named:
+            (tmp_path / "then.json").write_text(results_json(before))
+        convert(tmp_path / "now.json", tmp_path / "now.rrd", site=tmp_path / "site.toml")
+        chunks = RrdReader(tmp_path / "now.rrd").stream().to_chunks()
+        drawn[named] = {chunk.entity_path: chunk for chunk in chunks}
+    line = "/crossing/a/pre/strip/baseline"
+    assert line in drawn[True]
+    assert line not in drawn[False]  # a warning, no error: the file need not be there
+    for path in ("/bridge/bridge-1/finding", "/crossing/a/pre/verdict"):
+        (text,) = value(drawn[True][path], "text")  # type: ignore[misc]
+        assert "50 % less stiff than the baseline" in text
+    (view,) = views_of_bridges(now, site, tmp_path)
+    with matplotlib.rc_context(STYLE):
+        legend = draw_bridge(view).axes[0].get_legend()
+    assert "baseline" in {text.get_text() for text in legend.get_texts()}
