@@ -95,7 +95,7 @@ def print_elements(
         table.add_column("95 % interval", justify="right")
     percents = list(next(iter(losses.values()))) if losses else []
     if losses:
-        table.add_column(f"lost {'/'.join(percents)} %", justify="right")
+        table.add_column(f"lost {'/'.join(percents)}", justify="right")
     start = 0.0
     for number, (length, sound) in enumerate(
         zip(bridge.lengths_m, bridge.nominal_flexural_rigidity_nm2, strict=True), start=1

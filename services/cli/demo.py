@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pre_core.paper import experiment
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing
+from schemas.results import Crossing, load_results
 from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import site_toml
@@ -52,7 +52,8 @@ _RESULT_S = 60.0
 """From the last message of the truck on; an identification takes seconds."""
 _STOP_S = 10.0
 """A service that is stopped finishes what it has begun; here nothing is under way."""
-_RECORDING, _RESULTS, _VIEWS, _FIGURE = "recording.mcap", "results.mcap", "demo.rrd", "demo.png"
+_RECORDING, _RESULTS, _TEXT = "recording.mcap", "results.mcap", "results.json"
+_VIEWS, _FIGURE = "demo.rrd", "demo.png"
 
 
 class _Services(NamedTuple):
@@ -272,6 +273,7 @@ def _check_recording(path: Path, sent: int) -> None:
 
 
 def _draw(folder: Path, crossing: Crossing, drive: Drive, site: Site) -> None:
+    from services.viewer.bridge_view import views_of_bridges
     from services.viewer.crossing_view import view_of_crossing
     from services.viewer.figure import crossing_figure
     from services.viewer.vehicle_signals import signals_of_messages
@@ -282,6 +284,7 @@ def _draw(folder: Path, crossing: Crossing, drive: Drive, site: Site) -> None:
         vehicles=signals_of_messages(read_messages(folder / _RECORDING)),
         crossings=[crossing],
         site=site,
+        overviews=views_of_bridges(load_results(folder / _TEXT), site),
     )
     crossing_figure(
         folder / _FIGURE,
@@ -342,7 +345,7 @@ def _say_where(console: "Console", folder: Path, seconds: float) -> None:
     lines = [
         f"\n{folder}/ ({seconds:.0f} s)",
         f"  {_RECORDING:<16} what the logger recorded; driveby identify {folder / _RECORDING}",
-        f"  {_RESULTS:<16} what the worker found; results.json is the same as text",
+        f"  {_RESULTS:<16} what the worker found; {_TEXT} is the same as text",
         f"  {_VIEWS:<16} everything in pictures; driveby view {folder / _VIEWS}",
         f"  {_FIGURE:<16} flexural rigidity and road profiles at a glance",
     ]

@@ -38,6 +38,7 @@ def add_export(commands: Any) -> None:
 
 def _export(options: argparse.Namespace) -> int:
     from services.common.files import check_folder_writable, write_atomically
+    from services.common.progress import reading_bar
     from services.drives.signals import signals_of_recording
     from services.drives.survey import survey
     from services.export.found import tables_of_results
@@ -54,7 +55,8 @@ def _export(options: argparse.Namespace) -> int:
     recordings = recordings_in(path for path in options.sources if path.suffix != ".json")
     results, results_path = _results(options.sources)
     site = _site(options.site, recordings, results, results_path)
-    runs = [run for path in recordings for run in signals_of_recording(path)]
+    with reading_bar("reading", recordings) as next_file:
+        runs = [run for path in recordings for run in signals_of_recording(path, next_file())]
     passings = []
     if results is None and site is not None:
         passings = [p for path in recordings for p in survey(path, site).passings]

@@ -1,7 +1,8 @@
 """`driveby identify`: identifies the crossings of recordings, prints and writes what was found."""
 
+import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,8 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
+from services.common.progress import progress_bar
+from services.drives.survey import survey
 from services.execution.offline import identify_recordings, site_of
 from services.history.baselines import baselines_of
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
@@ -71,9 +74,9 @@ def identify_command(
             "simulations without noise are for --method least-squares"
         )
     draws: dict[str, Draws] = {}
-    with console.status("reading", spinner="dots") as status:
+    with _crossings_bar(console, recordings, known) as say:
         found = identify_recordings(
-            recordings, known, settings, status.update, keep=draws.__setitem__, fusing=fusing
+            recordings, known, settings, say, keep=draws.__setitem__, fusing=fusing
         )
     _print(console, found, known)
     if json_path is not None:
@@ -81,7 +84,8 @@ def identify_command(
     if rrd_path is not None:
         from services.viewer.bridge_view import views_of_bridges
         from services.viewer.crossing_view import view_of_crossing
-        from services.viewer.rerun_file import bridges_of_site, write_rrd
+        from services.viewer.rerun_file import write_rrd
+        from services.viewer.rerun_places import bridges_of_site
         from services.viewer.vehicle_signals import signals_of_messages
 
         try:
@@ -95,7 +99,7 @@ def identify_command(
                     crossings=[
                         view_of_crossing(c, known.bridge(c.bridge)) for c in found.crossings
                     ],
-                    overviews=views_of_bridges(found, known),
+                    overviews=views_of_bridges(found, known, (site or recordings[0]).parent),
                 )
         except RuntimeError as error:  # so Rerun says that its file could not be written
             raise FailureError(f"{rrd_path}: could not be written: {error}") from error
@@ -111,6 +115,26 @@ def identify_command(
         )
         write_draws(draws_path, kept)
     return 0
+
+
+@contextlib.contextmanager
+def _crossings_bar(
+    console: "Console", recordings: list[Path], site: Site
+) -> Iterator[Callable[[str], None]]:
+    """A bar over all crossings that are seen in the recordings, with what is done at the moment."""
+    # Without a terminal nobody sees it, and the recordings need not be looked through for it.
+    seen = []
+    if console.is_terminal:
+        seen = [survey(path, site).passings for path in recordings]
+    with progress_bar(console) as bar:
+        task = bar.add_task("reading", total=sum(map(len, seen)) or None)
+        begun: set[str] = set()
+
+        def say(text: str) -> None:
+            begun.add(text.partition(": ")[0])
+            bar.update(task, description=text, completed=len(begun) - 1)
+
+        yield say
 
 
 def _print(console: "Console", found: Results, site: Site) -> None:

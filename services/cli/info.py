@@ -41,19 +41,22 @@ def add_info(commands: Any) -> None:
 
 def _info(options: argparse.Namespace) -> int:
     from schemas.site_file import load_site
+    from services.common.progress import reading_bar
     from services.drives.survey import survey
     from services.recordings.together import recordings_in
 
     site = None if options.site is None else load_site(options.site)
     found: list[Survey] = []
     unreadable: dict[Path, str] = {}
-    for path in recordings_in(options.paths):
-        try:
-            found.append(survey(path, site))
-        except InputError as error:
-            if path in options.paths:  # of a folder the others are of interest all the same
-                raise
-            unreadable[path] = str(error).removeprefix(f"{path}: ")
+    recordings = list(recordings_in(options.paths))
+    with reading_bar("reading", recordings) as next_file:
+        for path in recordings:
+            try:
+                found.append(survey(path, site, progress=next_file()))
+            except InputError as error:
+                if path in options.paths:  # of a folder the others are of interest all the same
+                    raise
+                unreadable[path] = str(error).removeprefix(f"{path}: ")
     if options.json:
         content = [as_json(one) for one in found]
         content += [{"path": str(path), "error": error} for path, error in unreadable.items()]

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import Final, NoReturn
 
 from services.cli.access import add_certs
+from services.cli.completion import SHELLS, completion
 from services.cli.export import add_export
 from services.cli.info import add_info
 from services.cli.live import (
@@ -109,6 +110,12 @@ def _parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
+    parser.add_argument(
+        "--print-completion",
+        action=_Completion,
+        choices=SHELLS,
+        help="print a script that completes commands and options in this shell, and leave",
+    )
     add_common(parser, suppressed=False)
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     for add in _COMMANDS:
@@ -127,6 +134,14 @@ class _Version(argparse.Action):
 def _say(line: str, code: int) -> int:
     print(f"driveby: {line}", file=sys.stderr)
     return code
+
+
+class _Completion(argparse.Action):
+    def __call__(
+        self, parser: argparse.ArgumentParser, _: object, value: object, __: object = None
+    ) -> NoReturn:
+        print(completion(parser, str(value)), end="")
+        sys.exit(0)
 
 
 class _JsonFormatter(logging.Formatter):

@@ -254,10 +254,12 @@ def add_import(commands: Any) -> None:
 
 
 def _import(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
     from services.drives.importing import import_command
 
-    print(
-        import_command(
+    with Console(stderr=True).status("importing"):
+        said = import_command(
             sources=options.sources,
             site=options.site,
             output=options.output,
@@ -265,7 +267,7 @@ def _import(options: argparse.Namespace) -> int:
             vehicle=options.vehicle,
             name=options.name,
         )
-    )
+    print(said)
     return 0
 
 

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from services.common.errors import InputError
+from services.common.progress import reading_bar
 from services.recordings.recovery import (
     Recovery,
     describe,
@@ -27,7 +28,8 @@ def recover_command(
     if set_aside and output is not None:
         raise InputError("--set-aside goes with the usual name beside the recording, not with -o")
     target = output or recovered_path(source)
-    recovery = recover_recording(source, target, force=force)
+    with reading_bar("recovering", [source]) as next_file:
+        recovery = recover_recording(source, target, force=force, progress=next_file())
     if set_aside:
         put_aside(source)
     plain = f"{target}: {describe(recovery)}"

@@ -35,6 +35,8 @@ def add_report(commands: Any) -> None:
 
 
 def _report(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
     from schemas.results import load_results
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
@@ -57,7 +59,8 @@ def _report(options: argparse.Namespace) -> int:
         files.append((path, results, site_of_results(path, results, options.site)))
     beside = None if options.site is None else options.site.parent
     reports = bridge_reports(files, options.baseline, beside)
-    write_atomically(output, page(reports))
+    with Console(stderr=True).status(f"drawing {output}"):
+        write_atomically(output, page(reports))
     for report in reports:
         print(f"{report.bridge.id}: {report.finding.headline} {' '.join(report.finding.sentences)}")
     if not reports:

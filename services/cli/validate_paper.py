@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pre_core.search import loop
-from services.cli.progress import progress_bar
 from services.common.files import check_writable, make_folder, write_atomically
+from services.common.progress import progress_bar
 from services.validation.paper import (
     Scenario,
     accuracy_of_paper,

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
-from services.cli.progress import progress_bar
 from services.common.files import check_writable, make_folder, write_atomically
+from services.common.progress import progress_bar
 from services.simulation.drawn import default_site
 from services.validation.calibration import Check, by_condition, ranks_of, scores
 from services.validation.uncertainty import (

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from schemas.signals import CHANNELS, AccelBatch, Channel, GnssFix, decode_accel, decode_gnss
 from schemas.site import Site
 from services.common.extras import check_installed
+from services.common.progress import Offset, unwatched
 from services.drives.importing import normalised_runs
 from services.drives.runs import Run
 from services.recordings.recording import read_messages
@@ -78,14 +79,14 @@ class Signals(NamedTuple):
         return pd.DataFrame(columns, index=_utc(time_ns)).rename_axis(index="time")
 
 
-def signals_of_recording(path: Path) -> list[Signals]:
+def signals_of_recording(path: Path, progress: Offset = unwatched) -> list[Signals]:
     """All runs of all trucks in a recording; InputError if it is none.
 
     Messages that came twice are taken once, those that cannot be decoded are left out.
     """
     accel: dict[tuple[str, str, int], dict[int, AccelBatch]] = {}
     gnss: dict[tuple[str, str, int], dict[int, GnssFix]] = {}
-    for message in read_messages(path):
+    for message in read_messages(path, progress):
         whose = (message.key.realm, message.key.identifier, message.boot_id)
         try:
             if message.key.stream == "accel":

@@ -17,6 +17,7 @@ from schemas.topics import Key, topic
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame
 from services.common.intervals import Intervals
+from services.common.progress import Offset, unwatched
 from services.identification.stays import Passage, stays_on
 from services.identification.streams import Boot, boot_of
 from services.recordings.recording import Message, RecordingInfo, read_info
@@ -92,12 +93,16 @@ class Survey(NamedTuple):
 
 
 def survey(
-    path: Path, site: Site | None = None, look: Callable[[Message], object] = lambda message: None
+    path: Path,
+    site: Site | None = None,
+    look: Callable[[Message], object] = lambda message: None,
+    progress: Offset = unwatched,
 ) -> Survey:
     """Read a recording and say what is in it; InputError if it is missing or not MCAP.
 
     `site` takes the place of the one that the recording carries; `look` is given every message of
-    a topic that is logged. What cannot be decoded is counted as a message and tells nothing else.
+    a topic that is logged, `progress` is told how far the file has been read. What cannot be
+    decoded is counted as a message and tells nothing else.
     """
     streams: dict[tuple[Key, int], _Heard] = {}
     fixes: dict[tuple[str, str, int], dict[int, GnssFix]] = {}
@@ -119,7 +124,7 @@ def survey(
             if not known and (batch := _decoded(decode_accel, message)) is not None:
                 known.update((name, channel.rate_hz) for name, channel in batch.channels.items())
 
-    info = read_info(path, note)
+    info = read_info(path, note, progress)
     known, site_error = (site, None) if site is not None else _own_site(path, info.site_toml)
     boots = {name: boot_of(of_boot) for name, of_boot in fixes.items()}
     times = [t for (where, _), h in streams.items() if not _is_latched(where) for t in h.times_ns]

@@ -20,12 +20,12 @@ def baselines_of(
     InputError if a file is no results file or tells nothing of the bridge.
     """
     if given is not None:
-        bridges = load_results(given).bridges
-        found = {b.id: bridges[b.id] for b in site.bridges if b.id in bridges}
+        there = load_results(given).bridges
+        found = {b.id: stored_state(given, b) for b in site.bridges if b.id in there}
         if not found:
             names = ", ".join(bridge.id for bridge in site.bridges)
             raise InputError(f"{given}: has no state of {names} to compare with")
-        return {b.id: _fitting(given, b, found.get(b.id)) for b in site.bridges if b.id in found}
+        return found
     out = {}
     for bridge in site.bridges:
         if bridge.baseline is None:
@@ -34,11 +34,13 @@ def baselines_of(
         if beside is None and not path.is_file():
             _log.warning("the baseline %s of %s is not there; see --baseline", path, bridge.id)
             continue
-        out[bridge.id] = _fitting(path, bridge, load_results(path).bridges.get(bridge.id))
+        out[bridge.id] = stored_state(path, bridge)
     return out
 
 
-def _fitting(path: Path, bridge: Bridge, state: BridgeResult | None) -> BridgeResult:
+def stored_state(path: Path, bridge: Bridge) -> BridgeResult:
+    """The state of a bridge in a results file; InputError if there is none with its elements."""
+    state = load_results(path).bridges.get(bridge.id)
     if state is None or len(state.elements) != bridge.elements:
         raise InputError(
             f"{path}: has no state of {bridge.id} with {bridge.elements} elements to compare with"

@@ -34,7 +34,8 @@ from schemas.topics import Key, key, parse_key, topic
 from services.common.errors import InputError
 from services.common.files import check_ordinary, is_held
 from services.common.intervals import Intervals
-from services.recordings.mcap_scan import Damage, RawMessage, last_metadata, scan
+from services.common.progress import Offset, unwatched
+from services.recordings.mcap_scan import Damage, Item, RawMessage, last_metadata, scan
 
 FORMAT = "1"
 ABOUT = "driveby"
@@ -83,8 +84,8 @@ class RecordingInfo(NamedTuple):
     """The file ends in the middle of a record or without MCAP's footer."""
 
 
-def read_messages(path: Path) -> Iterator[Message]:
-    """Yield the messages in the order of the file.
+def read_messages(path: Path, progress: Offset = unwatched) -> Iterator[Message]:
+    """Yield the messages in the order of the file; `progress` is told how far that is.
 
     A file that was cut off is read up to its last whole chunk, damaged places are left out; both
     are logged (and counted by `read_info`). InputError if the file is missing, is no MCAP file,
@@ -92,7 +93,7 @@ def read_messages(path: Path) -> Iterator[Message]:
     what fits the name of a message and nothing else can cost gigabytes.
     """
     found = False
-    for item in _scan(path):
+    for item in _scan(path, progress=progress):
         if isinstance(item, Message):
             found = True
             owner, stream = item.key.owner, item.key.stream
@@ -131,18 +132,20 @@ def read_site(path: Path) -> str | None:
 
 
 def read_info(
-    path: Path, look: Callable[[Message], object] = lambda message: None
+    path: Path,
+    look: Callable[[Message], object] = lambda message: None,
+    progress: Offset = unwatched,
 ) -> RecordingInfo:
     """Read the whole file and say what is in it; InputError if it is missing or not MCAP.
 
-    `look` is given every message of a topic that is logged.
+    `look` is given every message of a topic that is logged, `progress` is told how far it is.
     """
     sentinels: dict[str, dict[str, str]] = {}
     site_toml: str | None = None
     counts: Counter[str] = Counter()
     first_time_ns, last_time_ns = 0, 0
     damaged_chunks, truncated = 0, False
-    for item in _scan(path):
+    for item in _scan(path, progress=progress):
         match item:
             case Message():
                 if topic(item.key.owner, item.key.stream).logged:
@@ -231,7 +234,9 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         raise InputError(f"{path}: {why}") from None
 
 
-def _scan(path: Path, start: int = 0) -> Iterator[Message | Metadata | Attachment | Damage]:
+def _scan(
+    path: Path, start: int = 0, progress: Offset = unwatched
+) -> Iterator[Message | Metadata | Attachment | Damage]:
     """Yield all that is of use in a file, in its order, and what is damaged."""
     with _opened(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -241,7 +246,7 @@ def _scan(path: Path, start: int = 0) -> Iterator[Message | Metadata | Attachmen
             raise InputError(f"{path}: is not an MCAP file; a recording (.mcap) is expected")
         channels: dict[int, tuple[Key, int] | None] = {}
         has_looked = False
-        for item in scan(file, start):
+        for item in watched(scan(file, start), file, progress):
             if isinstance(item, RawMessage):
                 if item.channel_id not in channels and not has_looked:
                     has_looked = True
@@ -261,6 +266,16 @@ def _scan(path: Path, start: int = 0) -> Iterator[Message | Metadata | Attachmen
                     channels[item.id] = _our_channel(path, item)
             elif isinstance(item, (Metadata, Attachment, Damage)):
                 yield item
+
+
+def watched(items: Iterator[Item], file: BinaryIO, progress: Offset) -> Iterator[Item]:
+    """The same items; `progress` is told whenever more of the file has been read."""
+    before = -1
+    for item in items:
+        if (offset := file.tell()) > before:
+            progress(offset)
+            before = offset
+        yield item
 
 
 def find_channels(path: Path) -> dict[int, Channel]:

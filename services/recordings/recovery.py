@@ -14,6 +14,7 @@ from schemas.topics import Key, check_realm, key, parse_key, topic
 from services.common.errors import FailureError, InputError
 from services.common.files import check_ordinary, check_writable, replaced_atomically
 from services.common.intervals import Intervals
+from services.common.progress import Offset, unwatched
 from services.recordings.mcap_file import McapWriter
 from services.recordings.mcap_scan import Damage, Indexed, RawMessage, scan
 from services.recordings.recording import (
@@ -23,6 +24,7 @@ from services.recordings.recording import (
     RECOVERED,
     find_channels,
     program_version,
+    watched,
 )
 from services.recordings.writer import CHUNK_BYTES, identities_text
 
@@ -84,14 +86,19 @@ def is_name_taken(path: Path) -> bool:
 
 
 def recover_recording(
-    source: Path, target: Path, time_ns: int | None = None, *, force: bool = False
+    source: Path,
+    target: Path,
+    time_ns: int | None = None,
+    *,
+    force: bool = False,
+    progress: Offset = unwatched,
 ) -> Recovery:
     """Write what holds in `source` to `target`, beside it first and then renamed.
 
     Messages, channels, metadata and attachments are copied as they are, topics of others too. A
     schema that is lost is taken from our own tables. Damage behind the END sentinel costs only the
     index, which is made anew. Event and metadata `driveby.recovered` say in the file what was
-    done. Memory is bounded whatever the file holds.
+    done. Memory is bounded whatever the file holds. `progress` is told how far it is.
 
     InputError: `source` is missing, is no MCAP file, holds nothing that can be read, is being
     written, or is `target`; there is a recording at `target`, which only `force` replaces.
@@ -121,15 +128,15 @@ def recover_recording(
             library = f"driveby {program_version()}"
             writer = McapWriter(out.write, library=library, chunk_bytes=CHUNK_BYTES)
             copy = _Copy(source, writer)
-            for item in _read(source, file):
+            for item in _read(source, file, progress):
                 copy.take(item)
             return copy.finish(source, source.stat().st_size, now_ns)
 
 
-def _read(source: Path, file: BinaryIO) -> Iterable[object]:
+def _read(source: Path, file: BinaryIO, progress: Offset = unwatched) -> Iterable[object]:
     # An OSError of the source must not be taken for one of the file that is written.
     try:
-        yield from scan(file)
+        yield from watched(scan(file), file, progress)
     except OSError as error:
         raise FailureError(f"{source}: reading failed: {error.strerror}") from None
 

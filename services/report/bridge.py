@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -11,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.reasons import Reason
-from schemas.results import BridgeResult, Crossing, Results, load_results
+from schemas.results import BridgeResult, Crossing, Results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
-from services.identification.comparison import Estimate, compare, estimate_of_state, sentences
+from services.identification.comparison import Estimate, compare, sentences
+from services.viewer.baseline import named_baseline, stored_baseline
 from services.viewer.bridge_view import BridgeView, view_of_bridge
 
-_log = logging.getLogger(__name__)
 _LATEST_S = 7_258_118_400.0
 """The year 2200."""
 _LARGEST_DEVIATION = 4.0
@@ -159,21 +158,9 @@ def _latest_state(
 def _baseline(
     bridge: Bridge, given: Path | None, results: Path, beside: Path | None
 ) -> tuple[Estimate | None, str | None]:
-    path = given
-    if path is None and bridge.baseline is not None:
-        path = (beside or results.parent) / bridge.baseline
-        if beside is None and not path.is_file():
-            # A recording carries its site file to where the baseline need not be.
-            _log.warning("%s: the baseline %s is not there; see --baseline", results, path)
-            path = None
-    if path is None:
-        return None, None
-    state = load_results(path).bridges.get(bridge.id)
-    if state is None or len(state.elements) != bridge.elements:
-        raise InputError(
-            f"{path}: has no state of {bridge.id} with {bridge.elements} elements to compare with"
-        )
-    return estimate_of_state(state), path.name
+    if given is not None:
+        return stored_baseline(bridge, given)
+    return named_baseline(bridge, beside or results.parent, required=beside is not None)
 
 
 def _one_by_one(view: BridgeView, baseline: Estimate | None) -> Iterator[str]:

@@ -19,6 +19,7 @@ from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
     BANNERS,
     BAR_EDGE,
+    BASELINE_LINE,
     INK,
     LEFT,
     MUTED,
@@ -72,6 +73,10 @@ def _draw_panel(axes: Axes, bridge: BridgeView) -> None:
     axes.set_ylabel("EI (GN·m²)")
     axes.stairs(nominal, bridge.edges_m, baseline=None, label="nominal", **NOMINAL_LINE)
     highest = float(nominal.max())
+    if bridge.baseline is not None:
+        stored = bridge.baseline.mean / 1e9
+        axes.stairs(stored, bridge.edges_m, baseline=None, label="baseline", **BASELINE_LINE)
+        highest = max(highest, float(stored.max()))
     if bridge.estimate is None:
         write_centred(axes, _why_nothing(bridge))
     else:
@@ -141,7 +146,10 @@ def _draw_heading(figure: Figure, bridge: BridgeView) -> None:
     doubt = "DOUBTFUL: a crossing that was used is suspect. " if bridge.is_doubtful else ""
     said = " ".join(sentences(bridge.comparison))
     if bridge.estimate is None:
-        said = f"No finding: none of {len(bridge.crossings)} crossings could be used."
+        number = len(bridge.crossings)
+        said = f"No finding: none of {number} crossings could be used."
+        if number == 1:
+            said = "No finding: the only crossing could not be used."
     lines = textwrap.wrap(doubt + said, 112, max_lines=2, placeholder=" …")
     top = 1.0 - 0.47 / height
     banner = None

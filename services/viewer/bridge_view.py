@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from schemas.reasons import Reason
 from schemas.results import Crossing, Results
 from schemas.site import Bridge, Site
 from services.identification.comparison import Comparison, Estimate, compare, estimate_of_state
+from services.viewer.baseline import named_baseline
 from services.viewer.crossing_view import CrossingView, FloatArray, view_of_crossing
 
 
@@ -30,6 +32,8 @@ class BridgeView(NamedTuple):
     is_doubtful: bool
     """Whether a crossing that was used is suspect, or its method knows no intervals."""
     comparison: Comparison | None
+    baseline: Estimate | None = None
+    """What was stored of the bridge, to compare with."""
 
     @property
     def span_m(self) -> float:
@@ -37,10 +41,18 @@ class BridgeView(NamedTuple):
         return float(self.edges_m[-1])
 
 
-def views_of_bridges(results: Results, site: Site) -> list[BridgeView]:
-    """Every bridge of the site that was crossed, without a baseline."""
+def views_of_bridges(results: Results, site: Site, folder: Path | None = None) -> list[BridgeView]:
+    """Every bridge of the site that was crossed.
+
+    With a `folder` the baselines that the site file names are looked for there; InputError if one
+    does not fit.
+    """
     crossed = {crossing.bridge for crossing in results.crossings}
-    return [view_of_bridge(b, results, None) for b in site.bridges if b.id in crossed]
+    return [
+        view_of_bridge(b, results, None if folder is None else named_baseline(b, folder)[0])
+        for b in site.bridges
+        if b.id in crossed
+    ]
 
 
 def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) -> BridgeView:
@@ -69,6 +81,7 @@ def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) 
         estimate,
         is_doubtful,
         None if estimate is None else compare(estimate, nominal, edges, baseline),
+        baseline,
     )
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.results import Crossing
+from schemas.results import Crossing, Prior, resolution
 from schemas.site import Bridge
 
 FloatArray = NDArray[np.float64]
@@ -15,6 +15,33 @@ FloatArray = NDArray[np.float64]
 VEHICLE_COLOURS = {"front": "#0072B2", "rear": "#D55E00"}  # Okabe and Ito: told apart by all eyes
 TRUTH_COLOUR = "#000000"
 VERDICT_COLOURS = {"good": "#009E73", "suspect": "#B57A00", "rejected": "#C0392B"}
+
+
+class OnBridge(Protocol):
+    """Where a truck was on a bridge, and when: of a crossing, identified or not."""
+
+    @property
+    def forward(self) -> bool: ...  # noqa: D102
+    @property
+    def entry_time_s(self) -> float: ...  # noqa: D102
+    @property
+    def exit_time_s(self) -> float: ...  # noqa: D102
+    @property
+    def speed_m_per_s(self) -> float: ...  # noqa: D102
+    @property
+    def span_m(self) -> float: ...  # noqa: D102
+
+
+class PassingView(NamedTuple):
+    """A crossing that was seen in the positions and not identified; fields as in `CrossingView`."""
+
+    vehicle: str
+    bridge: str
+    forward: bool
+    entry_time_s: float
+    exit_time_s: float
+    speed_m_per_s: float
+    span_m: float
 
 
 class RoadView(NamedTuple):
@@ -33,6 +60,7 @@ class ParameterRow(NamedTuple):
     mean: float
     low: float
     high: float
+    prior: Prior | None = None
 
 
 class CrossingView(NamedTuple):
@@ -61,6 +89,10 @@ class CrossingView(NamedTuple):
     road: RoadView | None
     parameters: tuple[ParameterRow, ...]
     interior_supports_m: tuple[float, ...] = ()
+    scale_error: float = 0.0
+    """Relative standard deviation that all elements have in common (mass, gain)."""
+    resolution: str | None = None
+    """In words what the crossing could not tell; None where it resolves every element."""
 
     @property
     def span_m(self) -> float:
@@ -115,8 +147,10 @@ def view_of_crossing(crossing: Crossing, bridge: Bridge) -> CrossingView:
         if road is None or not road.x_m
         else RoadView(np.array(road.x_m), np.array(road.front_m), np.array(road.rear_m)),
         parameters=tuple(
-            ParameterRow(name, value.unit, value.mean, value.q025, value.q975)
+            ParameterRow(name, value.unit, value.mean, value.q025, value.q975, value.prior)
             for name, value in (parameters or {}).items()
         ),
         interior_supports_m=bridge.interior_supports_m,
+        scale_error=crossing.scale_error or 0.0,
+        resolution=resolution(crossing),
     )

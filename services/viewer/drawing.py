@@ -48,6 +48,7 @@ _CHARACTERS = 118
 """Of a line of reasons between the figure's edges."""
 
 NOMINAL_LINE: dict[str, Any] = {"color": MUTED, "linewidth": 1.0, "linestyle": (0, (4, 3))}
+BASELINE_LINE: dict[str, Any] = {"color": VERDICT_COLOURS["good"], "linewidth": 1.6, "zorder": 3}
 TRUTH_MARKER: dict[str, Any] = {
     "linestyle": "none",
     "marker": "D",
@@ -86,12 +87,12 @@ def write_figure(path: Path, figure: Figure) -> None:
     write_atomically(path, figure_bytes(figure, path.suffix.removeprefix(".")))
 
 
-def figure_bytes(figure: Figure, form: str) -> bytes:
+def figure_bytes(figure: Figure, form: str, *, dpi: int = DPI) -> bytes:
     """A figure as `png` or `svg`; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     metadata = dict.fromkeys(("Software",) if form == "png" else _SVG_METADATA)
     with matplotlib.rc_context(STYLE):
-        figure.savefig(buffer, format=form, dpi=DPI, metadata=metadata)
+        figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
     return buffer.getvalue()
 
 

@@ -23,12 +23,16 @@ from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.common.errors import FailureError, InputError
-from services.history.site_of_results import site_of_results, site_within
-from services.recordings.recording import Message, read_messages
+from services.common.progress import Offset, reading_bar, unwatched
+from services.drives.survey import survey
+from services.history.site_of_results import site_of_results
+from services.recordings.recording import Message, check_message
 from services.viewer.bridge_view import BridgeView, views_of_bridges
-from services.viewer.crossing_view import CrossingView, view_of_crossing
-from services.viewer.rerun_file import bridges_of_site, write_rrd
-from services.viewer.vehicle_signals import VehicleSignals, signals_of_messages
+from services.viewer.crossing_view import CrossingView, PassingView, view_of_crossing
+from services.viewer.recording_page import passings_of_survey, recording_page
+from services.viewer.rerun_file import write_rrd
+from services.viewer.rerun_places import bridges_of_site
+from services.viewer.vehicle_signals import Heard, VehicleSignals
 
 SUFFIXES = (".rrd", ".mcap", ".json")
 
@@ -48,15 +52,18 @@ def view_command(*, target: str | Path, web: bool, console: Console) -> int:
         shown = path
         if path.suffix != ".rrd":
             shown = Path(folder) / f"{path.stem}.rrd"
-            with console.status(f"preparing {path.name}"):
-                convert(path, shown)
+            with reading_bar(f"preparing {path.name}", [path], console) as next_file:
+                convert(path, shown, progress=next_file())
         return _run_viewer(shown, web=web)
 
 
-def convert(target: Path, rrd: Path, *, site: Path | None = None) -> None:
+def convert(
+    target: Path, rrd: Path, *, site: Path | None = None, progress: Offset = unwatched
+) -> None:
     """Write the Rerun file of a recording (.mcap) or of results (.json).
 
-    Results do not say where their bridge is: `site` does, or a recording in the same folder.
+    Results do not say where their bridge is: `site` does, or a recording in the same folder. The
+    crossings in a recording that nobody has identified yet are shown with what was measured.
     """
     if target.suffix == ".json":
         results = load_results(target)
@@ -66,15 +73,29 @@ def convert(target: Path, rrd: Path, *, site: Path | None = None) -> None:
             vehicles={},
             crossings=results.crossings,
             site=bridges,
-            overviews=views_of_bridges(results, bridges),
+            overviews=views_of_bridges(results, bridges, (site or target).parent),
         )
         return
-    messages = list(read_messages(target))
+    heard, estimates = Heard(), list[Message]()
+
+    def take(message: Message) -> None:
+        if message.key.owner == "vehicle":
+            check_message(target, message)
+            heard.add(message)
+        elif message.key.stream == "estimate":
+            estimates.append(message)
+
+    found = survey(target, None if site is None else load_site(site), take, progress)
+    if not found.info.messages:
+        raise InputError(f"{target}: holds no driveby message; a recording of a truck is expected")
+    crossings = crossings_of_messages(estimates)
     write_views(
         rrd,
-        vehicles=signals_of_messages(messages),
-        crossings=crossings_of_messages(messages),
-        site=load_site(site) if site is not None else site_within(target),
+        vehicles=heard.signals(),
+        crossings=crossings,
+        site=found.site,
+        passings=passings_of_survey(found, crossings),
+        about=recording_page(found),
     )
 
 
@@ -85,6 +106,8 @@ def write_views(
     crossings: Iterable[Crossing],
     site: Site | None,
     overviews: Sequence[BridgeView] = (),
+    passings: Sequence[PassingView] = (),
+    about: str | None = None,
 ) -> None:
     """Write a Rerun file of results and signals; without a site only the signals are drawn."""
     bridges = {} if site is None else {bridge.id: bridge for bridge in site.bridges}
@@ -94,7 +117,15 @@ def write_views(
         if crossing.bridge in bridges
     ]
     on_map = [] if site is None else bridges_of_site(site)
-    write_rrd(rrd, vehicles=vehicles, bridges=on_map, crossings=views, overviews=overviews)
+    write_rrd(
+        rrd,
+        vehicles=vehicles,
+        bridges=on_map,
+        crossings=views,
+        overviews=overviews,
+        passings=passings,
+        about=about,
+    )
 
 
 def crossings_of_messages(messages: Iterable[Message]) -> list[Crossing]:

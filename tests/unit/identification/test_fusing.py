@@ -211,7 +211,7 @@ def test_the_command_fuses_files(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert len(found.crossings) == 5
     assert len(found.bridges["bridge-1"].crossings_used) == 5
     assert main(["fuse", str(one), "--baseline", str(out)]) == 0
-    assert "lost 10/20/30 %" in capsys.readouterr().out
+    assert "lost 10/20/30" in capsys.readouterr().out
 
 
 def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,24 +1,31 @@
 """The Rerun file shows a bridge first, and what is doubtful is seen to be."""
 
-import io
+from collections.abc import Iterator
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
-from matplotlib.image import imread
+import rerun.blueprint as rrb
 from rerun.chunk import Chunk, RrdReader
 
 from schemas.results import results_json
 from schemas.site import Site
 from schemas.site_file import load_site, site_toml
 from services.recordings.writer import write_recording
+from services.viewer.bridge_figure import draw_bridge
+from services.viewer.bridge_view import views_of_bridges
 from services.viewer.crossing_view import CrossingView, view_of_crossing
-from services.viewer.layout import crossing_root, tab_name
-from services.viewer.rerun_file import verdict_markdown
+from services.viewer.drawing import STYLE
+from services.viewer.layout import blueprint, crossing_root, tab_name
+from services.viewer.rerun_crossing import verdict_markdown
+from services.viewer.rerun_places import bridges_of_site
 from services.viewer.strip import rigidity_strip
-from services.viewer.view import convert
+from services.viewer.vehicle_signals import signals_of_messages
+from services.viewer.view import convert, write_views
 from tests.unit.drives.recorded import drive
 from tests.unit.viewer.found import results_of, some_crossing
+from tests.viewer_screen import complaints, opened, picture, pixels, view_named
 
 
 @pytest.fixture
@@ -53,9 +60,8 @@ def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
     tmp_path: Path, site: Site
 ) -> None:
     found = converted(tmp_path, site, "good")
-    (blob,) = value(found["/bridge/bridge-1/picture"], "blob")  # type: ignore[misc]
-    picture = imread(io.BytesIO(bytes(blob)))
-    assert picture.shape[1] == 1800
+    (form,) = value(found["/bridge/bridge-1/picture"], "format")  # type: ignore[misc]
+    assert form["width"] == 990  # not larger than it is shown: Rerun does not smooth what shrinks
     (text,) = value(found["/bridge/bridge-1/finding"], "text")  # type: ignore[misc]
     assert "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements" in text
     assert "Doubtful" not in text
@@ -98,3 +104,80 @@ def test_the_verdict_says_doubt_first_and_the_misfit_once(site: Site) -> None:
     assert text.splitlines()[2] == "**Doubtful: to be looked at, not to be relied upon.**"
     assert text.count("χ²") == 1
     assert "Doubtful" not in verdict_markdown(view_of(site, "good"))
+
+
+@pytest.mark.process
+def test_the_overview_is_seen_also_before_the_bridge(tmp_path: Path, site: Site) -> None:
+    """Rerun 0.41 draws no picture in a file format while the chainage is negative, as at first."""
+    converted(tmp_path, site, "good")
+    with opened(tmp_path / "found.rrd", tmp_path, size="1400x850") as viewer:
+        viewer.set_time("chainage_mm", sequence=-1500, play_state="paused")
+        drawn = pixels(picture(viewer, view_named(viewer, "Stiffness")))
+        orange = np.abs(drawn - np.array([230, 159, 0]) / 255.0).max(axis=2) < 0.05
+        assert orange.sum() > 2_000  # the bar of element 4
+        assert complaints(viewer) == []
+
+
+@pytest.mark.parametrize("verdict", ["good", "suspect", "rejected"])
+def test_every_view_has_something_to_show(tmp_path: Path, site: Site, verdict: str) -> None:
+    """Without a viewer: what the layout names is in the file."""
+    reasons = () if verdict == "good" else ("position_outage",)
+    used = None if verdict == "rejected" else "a"
+    found = results_of(site, some_crossing("a", verdict=verdict, reasons=reasons), used=used)
+    signals = signals_of_messages(drive())
+    overviews = views_of_bridges(found, site)
+    write_views(
+        tmp_path / "found.rrd",
+        vehicles=signals,
+        crossings=found.crossings,
+        site=site,
+        overviews=overviews,
+    )
+    entities = {
+        chunk.entity_path for chunk in RrdReader(tmp_path / "found.rrd").stream().to_chunks()
+    }
+    views = [view_of_crossing(crossing, site.bridges[0]) for crossing in found.crossings]
+    on_map = bridges_of_site(site)
+    named = list(origins(blueprint(signals, views, overviews, bridges=on_map).root_container))
+    assert len(named) >= (5 if verdict == "rejected" else 8)
+    for origin in named:
+        assert any(path.startswith(f"/{origin}") for path in entities), origin
+
+
+def origins(part: rrb.Container | rrb.View) -> Iterator[str]:
+    if isinstance(part, rrb.View):
+        if part.origin != "/" and "acceleration" not in str(part.origin):
+            yield str(part.origin)
+        return
+    for child in part.contents:
+        yield from origins(child)
+
+
+def test_a_baseline_that_the_site_file_names_is_drawn_and_compared_with(
+    tmp_path: Path, project: Path
+) -> None:
+    toml = (project / "docs/site.example.toml").read_text()
+    (tmp_path / "site.toml").write_text(
+        toml.replace("[bridge]\n", '[bridge]\nbaseline = "then.json"\n')
+    )
+    site = load_site(tmp_path / "site.toml")
+    before = results_of(site, some_crossing("b"), used="b", ratios=np.full(7, 0.8))
+    now = results_of(site, some_crossing("a"), used="a")
+    (tmp_path / "now.json").write_text(results_json(now))
+    drawn = {}
+    for named in (False, True):
+        if named:
+            (tmp_path / "then.json").write_text(results_json(before))
+        convert(tmp_path / "now.json", tmp_path / "now.rrd", site=tmp_path / "site.toml")
+        chunks = RrdReader(tmp_path / "now.rrd").stream().to_chunks()
+        drawn[named] = {chunk.entity_path: chunk for chunk in chunks}
+    line = "/crossing/a/pre/strip/baseline"
+    assert line in drawn[True]
+    assert line not in drawn[False]  # a warning, no error: the file need not be there
+    for path in ("/bridge/bridge-1/finding", "/crossing/a/pre/verdict"):
+        (text,) = value(drawn[True][path], "text")  # type: ignore[misc]
+        assert "50 % less stiff than the baseline" in text
+    (view,) = views_of_bridges(now, site, tmp_path)
+    with matplotlib.rc_context(STYLE):
+        legend = draw_bridge(view).axes[0].get_legend()
+    assert "baseline" in {text.get_text() for text in legend.get_texts()}

@@ -1,18 +1,14 @@
 """The Rerun recording, read back: every series with all its samples, on the right timelines."""
 
-import io
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from matplotlib.image import imread
 from rerun.chunk import Chunk, RrdReader
-from rerun.experimental import View, ViewerClient
 
 from schemas.results import Crossing, Header, results, results_json
 from schemas.results_on_the_wire import crossing_to_protobuf
@@ -31,25 +27,21 @@ from schemas.topics import Key
 from services.common.errors import InputError
 from services.recordings.recording import Message
 from services.recordings.writer import write_recording
+from services.viewer import rerun_file
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.layout import crossing_root
-from services.viewer.rerun_file import (
-    acceleration_series,
-    bridges_near_tracks,
-    bridges_of_site,
-    front_axle_chainage,
-    verdict_markdown,
-)
+from services.viewer.rerun_crossing import front_axle_chainage, verdict_markdown
+from services.viewer.rerun_file import acceleration_series
+from services.viewer.rerun_places import bridges_near_tracks, bridges_of_site
 from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH, rigidity_strip
 from services.viewer.vehicle_signals import VehicleSignals, signals_of_messages
 from services.viewer.view import (
     convert,
     view_command,
     viewer_arguments,
-    viewer_program,
     write_views,
 )
-from tests.endpoints import free_port
+from tests.viewer_screen import complaints, open_tab, opened, picture, pixels, view_named
 from tests.waiting import LONGEST_S, until
 
 START_NS = 1_790_010_000_000_000_000
@@ -430,52 +422,6 @@ def test_viewer_ends_with_the_command_that_started_it(tmp_path: Path, while_it_s
         os.kill(int(started.read_text()), 0)
 
 
-def see(file: Path, folder: Path) -> tuple[list[View], np.ndarray]:
-    """Open a file in the viewer without a screen; what views it chose, and a picture (0 to 1)."""
-    drivers = [Path(root, "vulkan/icd.d") for root in ("/usr/share", "/etc", "/usr/local/share")]
-    if not any(any(found.glob("*.json")) for found in drivers if found.is_dir()):
-        pytest.skip("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)")
-    port = free_port()
-    arguments = viewer_arguments(file, web=False)
-    arguments[arguments.index("--port") + 1] = str(port)
-    arguments += ["--headless", "--renderer=vulkan", "--window-size=1000x700"]
-    own = {**os.environ, "HOME": str(folder), "XDG_CONFIG_HOME": str(folder / "config")}
-    subprocess.run([viewer_program(), "analytics", "disable"], env=own, check=True)
-    with subprocess.Popen(arguments, env=own, stderr=subprocess.DEVNULL) as viewer:
-        try:
-            client = _connected(port)
-            views = _views(client)
-            time.sleep(1.0)  # the map centres on its points over a few frames
-            only = views[0].view_id if len(views) == 1 else None
-            return views, imread(io.BytesIO(client.take_screenshot(only)))
-        finally:
-            viewer.terminate()
-
-
-def _connected(port: int) -> ViewerClient:
-    deadline = time.monotonic() + LONGEST_S
-    while True:
-        try:
-            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            client.get_state()
-        except Exception:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.2)
-        else:
-            return client
-
-
-def _views(client: ViewerClient) -> list[View]:
-    deadline = time.monotonic() + LONGEST_S
-    while time.monotonic() < deadline:
-        views = client.get_state().views
-        if any(view.view_class == "Map" for view in views):
-            return views
-        time.sleep(0.2)
-    pytest.fail(f"the viewer shows no map, only {[view.view_class for view in views]}")
-
-
 def coloured(picture: np.ndarray) -> int:
     """Number of pixels that are neither black nor grey."""
     rgb = picture[:, :, :3]
@@ -484,11 +430,13 @@ def coloured(picture: np.ndarray) -> int:
 
 @pytest.mark.process
 def test_recording_opened_directly_is_drawn_on_a_map(tmp_path: Path):
+    """By Rerun itself, from what the recording says of its messages."""
     recording = tmp_path / "run.mcap"
     write_recording(recording, messages(), site_toml=None, reason="test")
-    views, picture = see(recording, tmp_path)
-    assert [(view.view_class, view.reports) for view in views] == [("Map", [])]
-    assert coloured(picture) > 20
+    with opened(recording, tmp_path) as viewer:
+        view = view_named(viewer, "")
+        assert (view.view_class, view.reports) == ("Map", [])
+        assert coloured(pixels(picture(viewer, view))) > 20
 
 
 @pytest.mark.process
@@ -496,13 +444,56 @@ def test_rerun_file_has_its_layout_and_draws_without_complaint(tmp_path: Path, s
     path = tmp_path / "drive.rrd"
     vehicles = {"truck-1": VehicleSignals(accel(), gnss())}
     write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
-    views, picture = see(path, tmp_path)
-    assert {view.view_class for view in views} == {
-        "BarChart",
-        "2D",
-        "Map",
-        "TextDocument",
-        "TimeSeries",
-    }
-    assert [report for view in views for report in view.reports] == []
-    assert coloured(picture) > 20_000  # the bars
+    with opened(path, tmp_path) as viewer:
+        assert {view.view_class for view in viewer.get_state().views} == {
+            "BarChart",
+            "2D",
+            "Map",
+            "TextDocument",
+            "TimeSeries",
+        }
+        assert complaints(viewer) == []
+        open_tab(viewer, "EI (GN·m²)")
+        assert coloured(pixels(picture(viewer, view_named(viewer, "EI (GN·m²)")))) > 20_000  # bars
+
+
+@pytest.mark.process
+def test_a_recording_is_shown_with_its_channels_places_and_crossings(tmp_path: Path):
+    recording, rrd = tmp_path / "run.mcap", tmp_path / "run.rrd"
+    write_recording(recording, messages(), site_toml=SITE_TOML, reason="test")
+    convert(recording, rrd)
+    with opened(rrd, tmp_path) as viewer:
+        names = {view.name for view in viewer.get_state().views}
+        assert {
+            "What was recorded",
+            "truck-1: Body accelerations (m/s²)",
+            "truck-1: Axle accelerations (m/s²)",
+            "truck-1: Speed (m/s)",
+            "Plan of the drive (m, north up)",
+            "Map (tiles need a network)",
+        } <= names
+        assert complaints(viewer) == []
+        for name, least in (("truck-1: Body", 500), ("truck-1: Speed", 100), ("Plan of", 100)):
+            drawn = pixels(picture(viewer, view_named(viewer, name)))
+            assert coloured(drawn) > least, name
+
+
+def test_a_long_drive_is_sent_in_pieces_with_every_sample_and_gap(
+    tmp_path: Path, site: Site, monkeypatch: pytest.MonkeyPatch
+):
+    batches = accel(40)
+    del batches[19:21]  # a gap between two pieces, and one inside
+    del batches[5]
+    whole = acceleration_series(batches)
+    monkeypatch.setattr(rerun_file, "_PIECE", 9)
+    path = tmp_path / "drive.rrd"
+    vehicles = {"truck-1": VehicleSignals(batches, gnss())}
+    write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
+    chunks = RrdReader(path).stream().to_chunks()
+    for channel in CHANNELS:
+        found = rows(chunks, f"vehicle/truck-1/acceleration/{channel}")
+        order = np.argsort(times_ns(found), kind="stable")
+        time_ns, samples = whole[channel]
+        assert times_ns(found)[order].tolist() == time_ns.tolist()
+        assert scalars(found)[order] == pytest.approx(samples, nan_ok=True)
+    assert np.isnan(whole["sprung_front"][1]).sum() == 2

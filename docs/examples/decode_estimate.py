@@ -1,0 +1,21 @@
+"""Says what estimates in a recording found: `python decode_estimate.py RESULTS.mcap`.
+
+Knows Protocol Buffers and MCAP only; of this program it takes the messages' definition, from which
+`protoc` makes the same for any language.
+"""
+
+import sys
+
+from mcap.reader import make_reader
+
+from schemas.proto import driveby_pb2 as pb
+
+with open(sys.argv[1], "rb") as file:  # noqa: PTH123 - as short as it can be
+    for _, channel, message in make_reader(file).iter_messages():
+        if not channel.topic.endswith("/estimate"):
+            continue
+        estimate = pb.Estimate.FromString(message.data)
+        print(estimate.crossing_id, pb.Verdict.Name(estimate.verdict), *estimate.reasons)
+        for name, value in sorted(estimate.parameters.items()):
+            if name.startswith("EI_"):
+                print(f"  {name} {value.mean:.4g} ({value.q025:.4g} to {value.q975:.4g}) N·m²")

@@ -1,0 +1,101 @@
+"""What a recording holds, before anything in it is identified: a page and the crossings in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+
+from schemas.results import Crossing
+from services.drives.survey import Passing, Survey, Truck
+from services.identification.stays import MERGE_S, Passage
+from services.viewer.crossing_view import PassingView
+
+MOST_SHOWN = 12
+"""Crossings that have a tab of their own; the newest of more."""
+_MOST_GAPS = 8
+_S = 1e-9
+
+
+def passings_of_survey(found: Survey, identified: Iterable[Crossing] = ()) -> list[PassingView]:
+    """The crossings that were seen and not identified, the newest; in order of time."""
+    if found.site is None:
+        return []
+    done = [(c.vehicle, c.bridge, c.entry_time) for c in identified]
+    wheelbase = {vehicle.id: vehicle.wheelbase_m for vehicle in found.site.vehicles}
+    views = []
+    for one in found.passings:
+        entry, leave = one.entry_ns * _S, one.exit_ns * _S
+        known = any(
+            vehicle == one.vehicle and bridge == one.bridge and abs(entry - time) < MERGE_S
+            for vehicle, bridge, time in done
+        )
+        if known or one.passage is not Passage.THROUGH or leave <= entry:
+            continue
+        span = found.site.bridge(one.bridge).span_m
+        speed = (span + wheelbase[one.vehicle]) / (leave - entry)
+        views.append(PassingView(one.vehicle, one.bridge, one.forward, entry, leave, speed, span))
+    return views[-MOST_SHOWN:]
+
+
+def recording_page(found: Survey) -> str:
+    """Trucks, bridges, crossings and gaps of a recording, as Markdown."""
+    seconds = (found.last_ns - found.first_ns) * _S
+    lines = [f"# {found.path.name}", ""]
+    lines += [f"{_moment(found.first_ns)} UTC, {_length(seconds)}{_state(found)}.", ""]
+    lines += [f"- {_truck(truck)}" for truck in found.trucks]
+    if found.site is None:
+        lines.append(f"- {found.site_error or 'No site file in it: its bridges are not known.'}")
+    else:
+        lines += [
+            f"- Bridge **{bridge.owner_id or bridge.id}**: {bridge.span_m:g} m, "
+            f"{bridge.elements} elements"
+            for bridge in found.site.bridges
+        ]
+        lines += ["", *_crossings(found.passings)]
+    if found.gaps:
+        lines += ["", f"**Gaps: {len(found.gaps)}**", ""]
+        lines += [
+            f"- {_moment(gap.begin_ns)} {gap.vehicle} {gap.stream}: nothing for "
+            f"{(gap.end_ns - gap.begin_ns) * _S:.1f} s"
+            for gap in found.gaps[:_MOST_GAPS]
+        ]
+        if len(found.gaps) > _MOST_GAPS:
+            lines.append(f"- and {len(found.gaps) - _MOST_GAPS} more")
+    lines += ["", f"What was measured, not what it means: `driveby identify {found.path.name}`."]
+    return "\n".join(lines)
+
+
+def _crossings(passings: Sequence[Passing]) -> Iterator[str]:
+    yield f"**Crossings seen: {len(passings)}**" if passings else "No crossing of a known bridge."
+    yield ""
+    for one in passings[-MOST_SHOWN:]:
+        way = "→" if one.forward else "←"
+        through = one.passage is Passage.THROUGH
+        how = f"{(one.exit_ns - one.entry_ns) * _S:.1f} s on it" if through else one.passage.value
+        yield f"- {_moment(one.entry_ns)} {one.vehicle} {way} {one.bridge}, {how}"
+    if len(passings) > MOST_SHOWN:
+        yield f"- and {len(passings) - MOST_SHOWN} earlier"
+
+
+def _truck(truck: Truck) -> str:
+    rates = truck.channel_rates_hz
+    hertz = ", ".join(f"{rate:g} Hz" for rate in sorted(set(rates.values())))
+    channels = f"{len(rates)} accelerometers at {hertz}" if rates else "no accelerometers"
+    missing = sum(stream.missing for stream in truck.streams.values())
+    lost = f", **{missing} messages missing**" if missing else ""
+    return f"Truck **{truck.vehicle}** ({truck.realm}): {channels}{lost}"
+
+
+def _state(found: Survey) -> str:
+    cut = ", **cut off**" if found.info.truncated else ""
+    damaged = found.info.damaged_chunks
+    return f"{cut}, **{damaged} damaged places**" if damaged else cut
+
+
+def _moment(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns * _S, UTC):%Y-%m-%d %H:%M:%S}"
+
+
+def _length(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60.0)
+    return f"{minutes:.0f} min {rest:.0f} s" if minutes else f"{rest:.1f} s"

@@ -1,0 +1,126 @@
+"""What the parts of a Rerun file have in common: timelines, series, labels, colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
+
+TIME, CHAINAGE = "time", "chainage_mm"
+"""The two timelines."""
+
+IntArray = NDArray[np.int64]
+Rgb = tuple[int, int, int]
+
+CHANNEL_COLOURS = {
+    "sprung_front": "#56B4E9",
+    "sprung_rear": "#E69F00",
+    "unsprung_front": VEHICLE_COLOURS["front"],
+    "unsprung_rear": VEHICLE_COLOURS["rear"],
+}
+MUTED = "#9AA5B1"
+WEAK, BASELINE = "#E69F00", "#009E73"
+UNKNOWN = "#CC79A7"
+"""Of a bridge of which nothing is known: none of the colours that say something."""
+_RATIO_COLOURS = ((0.5, (213, 94, 0)), (0.75, (240, 228, 66)), (1.0, (86, 180, 233)))
+RATIO_LEGEND = "blue 1, yellow 0.75, orange 0.5 of nominal"
+
+
+def rgb(colour: str) -> Rgb:
+    """Red, green and blue, 0 to 255, of #RRGGBB."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return red, green, blue
+
+
+def ratio_colours(ratios: FloatArray | None, count: int, *, doubtful: bool) -> list[Rgb]:
+    """A colour for each of `count` elements by its ratio to nominal; grey where doubtful."""
+    if ratios is None:
+        return [rgb(UNKNOWN)] * count
+    if doubtful:
+        return [rgb(MUTED)] * count
+    at = [ratio for ratio, _ in _RATIO_COLOURS]
+    channels = np.array([colour for _, colour in _RATIO_COLOURS], dtype=np.float64).T
+    mixed = np.rint([np.interp(ratios, at, channel) for channel in channels]).astype(int).T
+    return [(int(red), int(green), int(blue)) for red, green, blue in mixed]
+
+
+def time_column(time_ns: IntArray) -> rr.TimeColumn:
+    """Wall time, ns since 1970 UTC."""
+    return rr.TimeColumn(TIME, timestamp=time_ns.astype("datetime64[ns]"))
+
+
+def chainage_column(chainage_m: FloatArray) -> rr.TimeColumn:
+    """Chainage of the front axle: a timeline has whole numbers, so it is in millimetres."""
+    return rr.TimeColumn(CHAINAGE, sequence=np.rint(1e3 * chainage_m).astype(np.int64))
+
+
+def columns_of(time_ns: IntArray, chainage_m: FloatArray | None) -> list[rr.TimeColumn]:
+    """On both timelines, or without a chainage on that of time."""
+    indexes = [time_column(time_ns)]
+    if chainage_m is not None:
+        indexes.append(chainage_column(chainage_m))
+    return indexes
+
+
+def log_line(
+    recording: rr.RecordingStream, entity: str, name: str, colour: str, *, width: float = 1.3
+) -> None:
+    """How the line of a time series looks."""
+    recording.log(
+        entity,
+        rr.SeriesLines(
+            colors=[rgb(colour)],
+            names=name,
+            widths=width,
+            # Averaging when zoomed out would hide the peaks of an acceleration.
+            aggregation_policy=rr.components.AggregationPolicy.MinMax,
+        ),
+        static=True,
+    )
+
+
+def send_scalars(
+    recording: rr.RecordingStream,
+    entity: str,
+    values: FloatArray,
+    *,
+    time_ns: IntArray,
+    chainage_m: FloatArray | None = None,
+) -> None:
+    """A time series, if it has any samples."""
+    if len(values):
+        indexes = columns_of(time_ns, chainage_m)
+        recording.send_columns(entity, indexes, rr.Scalars.columns(scalars=values))
+
+
+def log_labels(
+    recording: rr.RecordingStream,
+    entity: str,
+    labels: Sequence[str],
+    across: FloatArray,
+    down: FloatArray,
+    *,
+    colour: str = MUTED,
+) -> None:
+    """Words in a 2-D view, each centred a little below its place."""
+    recording.log(
+        entity,
+        rr.Points2D(
+            np.column_stack((across, down)),
+            labels=list(labels),
+            show_labels=True,
+            radii=0.0,
+            colors=[rgb(colour)],
+        ),
+        static=True,
+    )
+
+
+def log_markdown(recording: rr.RecordingStream, entity: str, text: str) -> None:
+    """A page of text."""
+    document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+    recording.log(entity, document, static=True)

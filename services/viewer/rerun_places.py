@@ -1,0 +1,333 @@
+"""Where bridges and trucks are, in a Rerun file: on the map, and on a plan that needs no network.
+
+The map's tiles come from the internet. The plan of a bridge is drawn in the bridge's own
+coordinates, chainage across and to the left of it upwards, both in metres; that of a drive has east
+across and north upwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import rerun as rr
+
+from schemas.signals import GnssFix
+from schemas.site import Site
+from services.common.geodesy import bridge_frame, heading_deg, to_chainage
+from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
+from services.viewer.rerun_parts import (
+    MUTED,
+    UNKNOWN,
+    IntArray,
+    Rgb,
+    columns_of,
+    log_labels,
+    log_line,
+    ratio_colours,
+    rgb,
+    send_scalars,
+)
+from services.viewer.vehicle_signals import VehicleSignals
+
+NEAR_M = 20_000.0
+"""A bridge and a track that one map can show."""
+M_PER_DEGREE = 111_200.0
+"""Of latitude, as a mean: for what is drawn, not for numbers."""
+PLAN_MARGIN = 0.3
+"""Of the span, that the plan of a bridge shows before and behind it."""
+_HALF_WIDTH = 0.02
+"""Of the span, with which the plan draws a bridge: nobody has said how wide it is."""
+
+
+class BridgeOnMap(NamedTuple):
+    """Where a bridge is: its ends are (latitude, longitude) in degrees."""
+
+    identifier: str
+    start: tuple[float, float]
+    end: tuple[float, float]
+    edges_m: tuple[float, ...]
+    """Chainage of the n + 1 ends of its elements."""
+    supports_m: tuple[float, ...]
+
+    @property
+    def start_latitude_deg(self) -> float:
+        """With the three below: the ends, as a frame wants them."""
+        return self.start[0]
+
+    @property
+    def start_longitude_deg(self) -> float:
+        """See above."""
+        return self.start[1]
+
+    @property
+    def end_latitude_deg(self) -> float:
+        """See above."""
+        return self.end[0]
+
+    @property
+    def end_longitude_deg(self) -> float:
+        """See above."""
+        return self.end[1]
+
+    @property
+    def span_m(self) -> float:
+        """Length between the outer bearings."""
+        return self.edges_m[-1]
+
+
+def bridges_of_site(site: Site) -> list[BridgeOnMap]:
+    """The bridges of a site file as the map draws them."""
+    return [
+        BridgeOnMap(
+            bridge.id,
+            (bridge.start_latitude_deg, bridge.start_longitude_deg),
+            (bridge.end_latitude_deg, bridge.end_longitude_deg),
+            (0.0, *np.cumsum(bridge.lengths_m).tolist()),
+            (0.0, *bridge.interior_supports_m, bridge.span_m),
+        )
+        for bridge in site.bridges
+    ]
+
+
+def bridges_near_tracks(
+    bridges: Sequence[BridgeOnMap], vehicles: Iterable[VehicleSignals]
+) -> list[BridgeOnMap]:
+    """The bridges within about 20 km of where a truck was; all of them if no truck was anywhere.
+
+    The map shows all that is on it: one bridge at the other end of a country, and a track is a dot.
+    """
+    fixes = [fix for signals in vehicles for fix in signals.gnss]
+    if not fixes:
+        return list(bridges)
+    track = _positions(fixes)
+    return [
+        bridge
+        for bridge in bridges
+        if np.hypot(*_east_north_m(track, np.array(bridge.start)).T).min() < NEAR_M
+    ]
+
+
+def plan_root(identifier: str) -> str:
+    """Entity path of the plan of a bridge."""
+    return f"plan/{rr.escape_entity_path_part(identifier)}"
+
+
+def log_bridge(
+    recording: rr.RecordingStream,
+    bridge: BridgeOnMap,
+    ratios: FloatArray | None,
+    *,
+    doubtful: bool,
+    map_entity: str,
+    plan_entity: str,
+) -> None:
+    """The elements of a bridge on map and plan, coloured by their ratio to nominal.
+
+    `ratios` (n,) is None where nothing is known of the bridge.
+    """
+    count = len(bridge.edges_m) - 1
+    colours = ratio_colours(ratios, count, doubtful=doubtful)
+    _log_on_map(recording, map_entity, bridge, colours)
+    edges, half = np.array(bridge.edges_m), _HALF_WIDTH * bridge.span_m
+    recording.log(
+        f"{plan_entity}/line",
+        rr.LineStrips2D(
+            [[(left, 0.0), (right, 0.0)] for left, right in pairwise(edges)],
+            colors=colours,
+            radii=half,
+        ),
+        static=True,
+    )
+    if ratios is not None:
+        words = [f"EI_{n} {ratio:.2f}" for n, ratio in enumerate(ratios, start=1)]
+        centres = (edges[:-1] + edges[1:]) / 2.0
+        # Two rows: elements of a short bridge are narrower than words.
+        down = half + np.where(np.arange(count) % 2 == 0, 0.0, 0.09 * bridge.span_m)
+        log_labels(recording, f"{plan_entity}/name", words, centres, down)
+
+
+def log_surroundings(
+    recording: rr.RecordingStream, bridge: BridgeOnMap, vehicles: Mapping[str, VehicleSignals]
+) -> None:
+    """What the plan of a bridge has beside its elements: bearings, scale, north, and tracks."""
+    root, span = plan_root(bridge.identifier), bridge.span_m
+    frame = bridge_frame(bridge)
+    recording.log(
+        f"{root}/bearings",
+        rr.LineStrips2D(
+            [[(x, -0.06 * span), (x, 0.06 * span)] for x in bridge.supports_m],
+            colors=[rgb(MUTED)],
+            radii=rr.Radius.ui_points(1.0),
+        ),
+        static=True,
+    )
+    length = _round_length(0.3 * span)
+    down = 0.29 * span
+    recording.log(
+        f"{root}/scale",
+        rr.LineStrips2D(
+            [[(0.0, down), (length, down)]],
+            colors=[rgb(MUTED)],
+            radii=rr.Radius.ui_points(1.0),
+            labels=[f"{length:g} m"],
+            show_labels=True,
+        ),
+        static=True,
+    )
+    north = np.radians(heading_deg(frame))  # clockwise from north to the right of the plan
+    reach = 0.06 * span
+    recording.log(
+        f"{root}/north",
+        rr.Arrows2D(
+            origins=[(0.93 * span, down)],
+            vectors=[(reach * np.cos(north), -reach * np.sin(north))],
+            colors=[rgb(MUTED)],
+            radii=rr.Radius.ui_points(1.0),
+            labels=["N"],
+            show_labels=True,
+        ),
+        static=True,
+    )
+    for vehicle, signals in vehicles.items():
+        if not signals.gnss:
+            continue
+        chainage, left = to_chainage(frame, *_positions(signals.gnss).T)
+        near = (chainage > -PLAN_MARGIN * span) & (chainage < (1.0 + PLAN_MARGIN) * span)
+        near &= np.abs(left) < 0.5 * span
+        places = np.column_stack((chainage, -left))
+        if near.any():
+            log_track_on_plan(recording, f"{root}/track/{vehicle}", places[near])
+            time_ns = np.array([fix.wall_time_ns for fix in signals.gnss])[near]
+            log_truck_on_plan(recording, f"{root}/truck/{vehicle}", places[near], time_ns)
+
+
+def log_track_on_plan(recording: rr.RecordingStream, entity: str, places_m: FloatArray) -> None:
+    """All places at which the receiver said that a truck was (f, 2), in the plan's coordinates."""
+    recording.log(
+        entity,
+        rr.Points2D(places_m, radii=rr.Radius.ui_points(1.5), colors=[rgb(MUTED)]),
+        static=True,
+    )
+
+
+def log_truck_on_plan(
+    recording: rr.RecordingStream,
+    entity: str,
+    places_m: FloatArray,
+    time_ns: IntArray,
+    chainage_m: FloatArray | None = None,
+) -> None:
+    """Where the receiver said that the truck was (f, 2), in the plan's coordinates, over time."""
+    recording.log(
+        entity,
+        rr.Points2D.from_fields(
+            radii=rr.Radius.ui_points(6.0), colors=[rgb(VEHICLE_COLOURS["rear"])]
+        ),
+        static=True,
+    )
+    recording.send_columns(
+        entity, columns_of(time_ns, chainage_m), rr.Points2D.columns(positions=places_m)
+    )
+
+
+def log_vehicle(recording: rr.RecordingStream, vehicle: str, fixes: Sequence[GnssFix]) -> None:
+    """The track of a truck on the map, where it is at a time, and how fast."""
+    if not fixes:
+        return
+    positions = _positions(fixes)
+    time_ns = np.array([fix.wall_time_ns for fix in fixes])
+    recording.log(
+        f"map/track/{vehicle}",
+        rr.GeoLineStrings(lat_lon=[positions], radii=rr.Radius.ui_points(1.0), colors=[rgb(MUTED)]),
+        static=True,
+    )
+    recording.log(
+        f"map/fixes/{vehicle}",
+        rr.GeoPoints(lat_lon=positions, radii=rr.Radius.ui_points(2.0), colors=[rgb(MUTED)]),
+        static=True,
+    )
+    entity = f"map/position/{vehicle}"
+    log_marker(recording, entity)
+    columns = rr.GeoPoints.columns(positions=positions)
+    recording.send_columns(entity, columns_of(time_ns, None), columns)
+    speed = f"vehicle/{vehicle}/speed"
+    log_line(recording, speed, "speed", "#009E73")
+    send_scalars(recording, speed, np.array([fix.speed_m_per_s for fix in fixes]), time_ns=time_ns)
+
+
+def log_drive_plan(
+    recording: rr.RecordingStream,
+    bridges: Sequence[BridgeOnMap],
+    vehicles: Mapping[str, VehicleSignals],
+) -> None:
+    """All tracks and the bridges near them, east across and north upwards."""
+    tracks = {name: _positions(signals.gnss) for name, signals in vehicles.items() if signals.gnss}
+    if not tracks:
+        return
+    middle = np.concatenate(list(tracks.values())).mean(axis=0)
+
+    def on_plan(lat_lon: FloatArray) -> FloatArray:
+        return _east_north_m(lat_lon, middle) * (1.0, -1.0)
+
+    for name, track in tracks.items():
+        places = on_plan(track)
+        log_track_on_plan(recording, f"plan_of_drive/track/{name}", places)
+        time_ns = np.array([fix.wall_time_ns for fix in vehicles[name].gnss])
+        log_truck_on_plan(recording, f"plan_of_drive/truck/{name}", places, time_ns)
+    if bridges:
+        ends = [on_plan(np.array((bridge.start, bridge.end))) for bridge in bridges]
+        recording.log(
+            "plan_of_drive/bridges",
+            rr.LineStrips2D(
+                ends,
+                colors=[rgb(UNKNOWN)],
+                radii=rr.Radius.ui_points(5.0),
+                labels=[bridge.identifier for bridge in bridges],
+                show_labels=True,
+            ),
+            static=True,
+        )
+
+
+def log_marker(recording: rr.RecordingStream, entity: str) -> None:
+    """How a truck looks on the map."""
+    look = rr.GeoPoints.from_fields(
+        radii=rr.Radius.ui_points(7.0), colors=[rgb(VEHICLE_COLOURS["front"])]
+    )
+    recording.log(entity, look, static=True)
+
+
+def _log_on_map(
+    recording: rr.RecordingStream, entity: str, bridge: BridgeOnMap, colours: list[Rgb]
+) -> None:
+    start, end = np.array(bridge.start), np.array(bridge.end)
+    share = np.array(bridge.edges_m) / bridge.span_m
+    edges = start + share[:, None] * (end - start)
+    recording.log(
+        entity,
+        rr.GeoLineStrings(
+            lat_lon=[[a, b] for a, b in pairwise(edges)],
+            radii=rr.Radius.ui_points(7.0),
+            colors=colours,
+        ),
+        static=True,
+    )
+
+
+def _positions(fixes: Sequence[GnssFix]) -> FloatArray:
+    return np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes])
+
+
+def _east_north_m(lat_lon: FloatArray, origin: FloatArray) -> FloatArray:
+    """Metres (m, 2) to the east and to the north of the origin."""
+    north, east = ((lat_lon - origin) * M_PER_DEGREE).T
+    return np.column_stack((east * np.cos(np.radians(origin[0])), north))
+
+
+def _round_length(length: float) -> float:
+    """The largest of 1, 2, 5, 10, 20, … m that is not longer."""
+    decade = 10.0 ** np.floor(np.log10(length))
+    return float(max(step for step in (1.0, 2.0, 5.0) if step * decade <= length) * decade)

@@ -1,0 +1,197 @@
+"""Every shell command on README and the pages of docs/: it is run here, or listed with a reason.
+
+Of what is listed it is still looked at whether the program would take it: options that are gone,
+targets of make, modules and files that are not there.
+"""
+
+import importlib.util
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from services.cli import main as cli
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SAMPLE = "recordings/sample/crossing.mcap"
+
+LONG = "takes minutes to hours; `make test-all`, `make faults` or a person runs it"
+WINDOW = "opens a window until somebody closes it; tests/unit/viewer opens it without a screen"
+SERVICE = "runs until it is stopped; tests/process_replay starts it as a process"
+MACHINES = "is for machines that are not here; tests/process_replay and tests/faults do it on one"
+NETWORK = "needs a network"
+ITSELF = "runs the tests, of which this is one"
+
+NOT_RUN = {
+    "make install": "installs what this test runs in; .ci/run begins with it",
+    "make demo": "tests/process_replay/test_demo.py runs the command of the target",
+    "make test": ITSELF,
+    "make test-all": ITSELF,
+    "make faults": ITSELF,
+    "make soak": LONG,
+    "make validate": LONG,
+    "make bench": LONG,
+    "make mutants MUTANTS=30 SEED=1": LONG,
+    "make up": "needs a container engine; tests/contract/test_compose.py reads its files",
+    "make docs": "needs a network the first time; tests/contract/test_site.py builds the site",
+    'pip install ".[notebook]"': NETWORK,
+    'pip install "driveby[notebook]"': NETWORK,
+    'pip install "arviz<1"': NETWORK,
+    "driveby view crossing.rrd": WINDOW,
+    "driveby view drive.rrd": WINDOW,
+    f"driveby view {SAMPLE}": WINDOW,
+    "driveby logger --realm '*'": SERVICE,
+    "driveby logger --realm 'replay-*'": SERVICE,
+    "driveby worker --site site.toml": SERVICE,
+    "driveby worker --realm replay-drive --site docs/site.example.toml": SERVICE,
+    "driveby replay drive.mcap": SERVICE,
+    f"driveby replay {SAMPLE} --speed 4": SERVICE,
+    "driveby truck drive.mcap --spool spool/truck-1": SERVICE,
+    "driveby truck FOLDER --site site.toml --spool spool/truck-1": SERVICE,
+    "python docs/examples/decode_estimate.py recordings/replay-drive/results-TIME.mcap": (
+        "its file has another name each time; tests/contract/test_site.py runs the example"
+    ),
+    "driveby logger --listen tls/0.0.0.0:7447 --tls certs/logger --site site.toml": MACHINES,
+    "driveby worker --endpoint tls/logger.example.org:7447 --tls certs/worker --site site.toml": (
+        MACHINES
+    ),
+    "driveby truck run.mcap --endpoint tls/logger.example.org:7447 --tls tls": MACHINES,
+    "scp -rp certs/truck-1 truck-1.example.org:tls": MACHINES,
+    "scp -rp certs/viewer laptop.example.org:tls": MACHINES,
+    "driveby validate --json validation.json --figures figures/": LONG,
+    "driveby validate --scenarios 1,6,12 --noise 25": LONG,
+    "driveby validate --method pre --crossings 200 --control 20 --worlds 64 "
+    "--page docs/validation.md": LONG,
+    "driveby validate --method pre --crossings 0 --control 0 --scenarios 1 --worlds 200 "
+    "--effects free,sprung": LONG,
+    "driveby simulate --scenario 6 --road A --seed 3 --noise 10 --road-surface --tyres twin "
+    "--rear-offset 0.005 --wander 0.12 --runs 4 --gps-noise -o twin.mcap": LONG,
+    "driveby identify twin.mcap": LONG,
+    "driveby report drive.json -o report.html --pdf": (
+        "needs a browser; tests/unit/report prints where there is one"
+    ),
+    "python tests/numerics/table.py": LONG,
+    "python docs/scripts/reproduction.py frequencies": LONG,
+    "python -m pytest -m slow tests/unit/validation/test_validation.py": LONG,
+    "python -m tests.verdicts.measure": LONG,
+    "python -m tests.verdicts.measure signals 300": LONG,
+    "python -m tests.verdicts.measure sound 14": LONG,
+    "pytest tests/verdicts -m slow": LONG,
+    "pytest tests/numerics/test_fusion.py -m slow": LONG,
+    "pytest tests/numerics/test_pre_posterior.py -k rows_up": ITSELF,
+    "pytest tests/faults/test_security.py -m faults -k noise -s": LONG,
+    "python -m tests.mutants.run --help": "tests/mutants/test_mutants.py reads its options",
+    "python -m tests.benchmarks.logger_load": LONG,
+    "python -m tests.benchmarks.logger_load --trucks 100 --seconds 300": LONG,
+    "python -m tests.benchmarks.recordings": LONG,
+    "python -m tests.benchmarks.replay_speed": LONG,
+    "python -m tests.benchmarks.view": LONG,
+    "python -m tests.screenshots": "tests/unit/viewer/test_screenshots.py takes them",
+    "python -m schemas.topics_page": "tests/contract/test_topics_page.py compares what it writes",
+}
+
+ALTERNATIVES = {"logger.md"}
+"""Pages whose commands are no sequence: each runs by itself."""
+_PROGRAMS = r"(?:driveby|make|python|pip|pytest|scp)"
+_COMMENT = re.compile(r"\s+#.*$|\s*&$")
+
+
+def normal(line: str) -> str:
+    """A command without comment, `&` and the folder of the environment."""
+    return _COMMENT.sub("", line).strip().removeprefix(".venv/bin/").rstrip("&").strip()
+
+
+def commands_of(page: Path) -> list[str]:
+    """In their order, each once: blocks of shell, indented ones, and those in a sentence.
+
+    The bare name of a subcommand in a sentence is no command, but a name.
+    """
+    found = []
+    text = page.read_text()
+    for block in re.finditer(r"```(\w*)\n(.*?)```", text, re.DOTALL):
+        if block[1] == "sh":
+            found += [(block.start(2) + n, line) for n, line in enumerate(block[2].splitlines())]
+    prose = re.sub(r"```.*?```", lambda m: " " * len(m[0]), text, flags=re.DOTALL)
+    for pattern in (rf"^    +((?:\.venv/bin/)?{_PROGRAMS} .*)$", rf"`({_PROGRAMS} [^`\n]+)`"):
+        found += [(m.start(1), m[1]) for m in re.finditer(pattern, prose, re.MULTILINE)]
+    ordered = [normal(line) for _, line in sorted(found)]
+    return list(dict.fromkeys(c for c in ordered if c and not is_a_name(c)))
+
+
+def is_a_name(command: str) -> bool:
+    """`driveby view`, `driveby simulate --road-surface`: what is spoken of and not meant to run."""
+    return bool(re.fullmatch(r"driveby (--help|[a-z]+( --[a-z-]+)?)", command))
+
+
+def runnable(page: Path) -> list[str]:
+    return [command for command in commands_of(page) if command not in NOT_RUN]
+
+
+def test_what_is_listed_stands_on_a_page() -> None:
+    everywhere = {command for page in PAGES for command in commands_of(page)}
+    assert len(everywhere) > 60
+    assert set(NOT_RUN) - everywhere == set()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_would_be_taken(page: Path) -> None:
+    rules = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for command in commands_of(page):
+        program, *arguments = shlex.split(command)
+        match program:
+            case "driveby":
+                cli._parser().parse_args(arguments)
+            case "make":
+                assert arguments[0] in rules, command
+            case "python" if arguments[0] == "-m":
+                assert importlib.util.find_spec(arguments[1]) is not None, command
+            case "python":
+                assert (ROOT / arguments[0]).is_file(), command
+            case "pytest":
+                assert (ROOT / arguments[0]).exists(), command
+
+
+def marked() -> Iterator[object]:
+    for page in PAGES:
+        commands = runnable(page)
+        if commands:
+            identifies = any(command.startswith("driveby identify") for command in commands)
+            marks = [pytest.mark.slow] if identifies and page.name != "README.md" else []
+            each = [[one] for one in commands] if page.name in ALTERNATIVES else [commands]
+            for number, some in enumerate(each, start=1):
+                yield pytest.param(some, marks=marks, id=f"{page.name}-{number}")
+
+
+@pytest.mark.parametrize("commands", list(marked()))
+def test_the_other_commands_run_in_the_order_of_the_page(
+    commands: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where somebody has what the page speaks of: a checkout, a drive, its results."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(ROOT / "recordings/sample", "recordings/sample")
+    shutil.copytree(ROOT / "docs", "docs", ignore=shutil.ignore_patterns("images"))
+    assert cli.main(["export", SAMPLE, "--to", "FOLDER"]) == 0
+    shutil.copy("FOLDER/site.toml", "site.toml")
+    made = {word for c in commands for flag, word in pairs(c) if flag in ("-o", "--json")}
+    if "drive.mcap" not in made:
+        shutil.copy(SAMPLE, "drive.mcap")
+    if "drive.json" not in made and any("drive.json" in command for command in commands):
+        quick = ["identify", "drive.mcap", "--method", "least-squares", "--json", "drive.json"]
+        assert cli.main(quick) == 0
+    for command in commands:
+        program, *arguments = shlex.split(command)
+        assert program == "driveby", f"{command}: list it in NOT_RUN with a reason, or run it"
+        code = cli.main(arguments)
+        assert code == 0, command
+        for flag, word in pairs(command):
+            if flag in ("-o", "--json", "--rrd", "--draws", "--to", "--figures"):
+                assert word.startswith("-") or Path(word).exists(), command
+
+
+def pairs(command: str) -> list[tuple[str, str]]:
+    return list(pairwise(shlex.split(command)))

@@ -1,0 +1,91 @@
+"""The pictures of docs/viewer.md, from recordings/sample: python -m tests.screenshots
+
+Needs a Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-drivers).
+"""
+
+import io
+import re
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from PIL import Image
+
+from services.cli import main as cli
+from services.recordings.recording import read_site
+from services.viewer.view import convert
+from tests.viewer_screen import complaints, has_driver, open_tab, opened, picture
+
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / "recordings/sample/crossing.mcap"
+FOLDER = ROOT / "docs/images"
+MOST_BYTES = 150_000
+
+
+class Shot(NamedTuple):
+    """A picture: of which file, with which tabs in front, and where the front axle is."""
+
+    name: str
+    file: str
+    tabs: tuple[str, ...]
+    chainage_mm: int | None
+
+
+SHOTS = (
+    Shot("view-recording", "recording.rrd", ("Recording",), None),
+    Shot("view-bridge", "good.rrd", ("Bridge",), 15_000),
+    Shot("view-crossing", "good.rrd", ("2026-01-01",), 15_000),
+    Shot("view-told", "good.rrd", ("2026-01-01", "Told", "Map"), 15_000),
+    Shot("view-suspect", "suspect.rrd", ("2026-01-01",), 9_000),
+)
+
+
+def main() -> int:
+    if not has_driver():
+        print("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)", file=sys.stderr)
+        return 1
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        make_files(folder)
+        for shot in SHOTS:
+            path = FOLDER / f"{shot.name}.png"
+            path.write_bytes(smaller(take(shot, folder)))
+            print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
+    return 0
+
+
+def make_files(folder: Path) -> None:
+    """The sample as it was recorded, as it is identified, and with noise declared too large."""
+    convert(SAMPLE, folder / "recording.rrd")
+    toml = read_site(SAMPLE)
+    assert toml is not None
+    louder = folder / "louder.toml"
+    louder.write_text(re.sub(r"(?m)^noise_density_.*$", "noise_density_ug_per_rthz = 60.0", toml))
+    for name, options in (("good", ()), ("suspect", ("--site", str(louder)))):
+        arguments = ["identify", str(SAMPLE), "--rrd", str(folder / f"{name}.rrd"), *options]
+        assert cli.main(arguments) == 0
+
+
+def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
+    """A screenshot as PNG; AssertionError if the viewer complains of anything."""
+    with opened(folder / shot.file, folder, size=size) as viewer:
+        open_tab(viewer, *shot.tabs)
+        if shot.chainage_mm is not None:
+            viewer.set_time("chainage_mm", sequence=shot.chainage_mm, play_state="paused")
+        taken = picture(viewer)
+        assert complaints(viewer) == []
+        return taken
+
+
+def smaller(png: bytes) -> bytes:
+    """With 128 colours, which is all that lines and words need."""
+    written = io.BytesIO()
+    few = Image.open(io.BytesIO(png)).convert("RGB").quantize(128, dither=Image.Dither.NONE)
+    few.save(written, "png", optimize=True)
+    assert len(written.getvalue()) < MOST_BYTES
+    return written.getvalue()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

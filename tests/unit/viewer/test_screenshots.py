@@ -1,0 +1,30 @@
+"""The pictures of docs/viewer.md, and that they can still be made."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests import screenshots
+from tests.viewer_screen import has_driver, pixels
+
+
+def test_every_picture_is_there_small_and_named_on_the_page(project: Path) -> None:
+    page = (project / "docs/viewer.md").read_text()
+    for shot in screenshots.SHOTS:
+        path = screenshots.FOLDER / f"{shot.name}.png"
+        assert path.stat().st_size < screenshots.MOST_BYTES
+        assert f"(images/{path.name})" in page
+    assert page.count("(images/") == len(screenshots.SHOTS)
+
+
+@pytest.mark.slow
+@pytest.mark.process
+def test_every_picture_can_be_made_and_shows_something(tmp_path: Path) -> None:
+    if not has_driver():
+        pytest.skip("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)")
+    screenshots.make_files(tmp_path)
+    for shot in screenshots.SHOTS:
+        taken = pixels(screenshots.smaller(screenshots.take(shot, tmp_path)))
+        lit = (np.abs(taken - taken[-1, -1]).max(axis=2) > 0.2).mean()
+        assert lit > 0.02, shot.name
