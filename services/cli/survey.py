@@ -35,7 +35,7 @@ def add_survey(commands: Any) -> None:
         "say, before anyone drives, how well each element will be known and what helps most",
         "driveby survey --site site.toml --loss 0.2 --crossings 12 --figure plan.png",
     )
-    add_site(p, "truck, bridge and sensors, as they are known before", required=True)
+    add_site(p, "truck, bridge and sensors; its first vehicle over its first bridge", required=True)
     p.add_argument(
         "--loss",
         type=number("a share of EI", low=0.01, high=0.95),

@@ -35,8 +35,8 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[Finding]:
         "axle_loads",
         f"{name}: axles carry {front / 1e3:.2f} and {rear / 1e3:.2f} t, "
         f"they differ by {share:.0%} of the total",
-        f"load one axle more: with less than {ALIKE_LOADS:.0%} both press the bridge alike, "
-        "and what the road does cannot be told from what the bridge does",
+        f"load one axle more: with less than {ALIKE_LOADS:.0%} both press the bridge nearly alike, "
+        "and what the road does can hardly be told from what the bridge does",
         is_wrong=share < ALIKE_LOADS,
     )
     low, high = _AXLE_LOADS_KG

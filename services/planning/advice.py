@@ -55,7 +55,9 @@ def _ends(outlook: Outlook) -> str:
 
 def _of_the_others(found: Survey) -> str:
     planned = found.planned
-    same = [one for one in found.others if one.middle == planned.middle]
+    # A loss in one of fewer, longer elements is more damage: no help, but another question.
+    elements = planned.plan.site.bridges[0].elements
+    same = [one for one in found.others if one.plan.site.bridges[0].elements == elements]
     better = sorted((one for one in same if _helps(one, planned)), key=_rank)
     if not better:
         return "Nothing else that was tried here helps by much."

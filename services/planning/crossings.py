@@ -78,8 +78,8 @@ class Simulated:
             except ValueError:
                 continue
         raise FailureError(
-            f"at {crossings[0].speed_m_per_s:g} m/s the noise of these sensors on this road is too "
-            "little to compute with, try another speed or --noise"
+            f"at {crossings[0].speed_m_per_s:g} m/s the noise of the rows cannot be computed, "
+            "drive faster or try another --noise"
         )
 
     def known(self, crossing: Crossing) -> Known:

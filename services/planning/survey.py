@@ -1,6 +1,7 @@
 """A survey's expectation: what so many crossings will tell, and what would help most."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from pre_core.survey import detection
 from pre_core.survey.plan import Track, spreads, together
 from schemas.site import Bridge, Site
+from services.common.errors import FailureError
 from services.planning.alternatives import Plan, alternatives, as_planned
 from services.planning.crossings import Crossing, Road, Simulated, scale_error
 
@@ -105,9 +107,11 @@ def survey(
         others.append(_outlook(simulated, plan, asked))
         progress(1 + len(others), jobs)
     at_speeds = []
-    for speed in speeds:
-        at_speeds.append(_at_speed(simulated, site, speed, asked))
-        progress(1 + len(others) + len(at_speeds), jobs)
+    for number, speed in enumerate(speeds, start=1):
+        # A speed that is only looked at beside the plan may be one that tells nothing.
+        with suppress(FailureError):
+            at_speeds.append(_at_speed(simulated, site, speed, asked))
+        progress(1 + len(others) + number, jobs)
     growth = _growth(simulated, planned.plan, asked)
     crossing = planned.plan.tracks[0][0]
     found = Survey(
