@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pre_core.crossing.whittle import likeliest_levels
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
-from pre_core.physics.surface import Footprint, common_spectrum, spectra
+from pre_core.physics.surface import Footprint, common_spectrum, spectra, surface_density
 
 FloatArray = NDArray[np.float64]
 
@@ -110,6 +110,19 @@ def common_shapes(front: Footprint, rear: Footprint, wander_m: float) -> FloatAr
             for one, other in _pairs(front, rear)
         ]
     )
+
+
+def levels_on(front: Footprint, rear: Footprint, road_class: str) -> FloatArray:
+    """Levels (s,) in m³ that a surface of an ISO 8608 class has under these axles.
+
+    Tyres that are alike differ by nothing: `shapes_of` takes them for worn ones only because no run
+    can tell that they are not.
+    """
+    at = np.array([REFERENCE_CYCLES_PER_M])
+    single, unlike = front._replace(offset_m=0.0), rear._replace(offset_m=0.0)
+    beside = single._replace(offset_m=rear.offset_m - front.offset_m)
+    density = surface_density(road_class)
+    return density * np.array([spectra(single, other, at)[3][0] for other in (unlike, beside)])
 
 
 def _above_zero() -> FloatArray:

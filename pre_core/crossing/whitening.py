@@ -88,6 +88,11 @@ _RIDGES = (1e-10, 1e-7, 1e-5, 1e-3)
 yet found seem to differ by so much that the sensors' noise is lost in the covariance's rounding."""
 
 
+_ALIKE = 0.05
+"""Tyres of which so little of the mismatch is seen that unlike ones make are alike, and what is
+seen is an axle's offset, whose long waves are twice as large: short ones hardly tell them apart."""
+
+
 class RowFilter(NamedTuple):
     """Low-pass, decimation and second difference in one: row k sees samples from k `every` on."""
 
@@ -431,7 +436,12 @@ def mismatch_levels(
     surface, _ = _mismatch.levels(whole)
     usual = np.array([np.inf, surface[0] * shapes.expected_m[1]])
     parts = [_mismatch.segment(one, of_sensors, of_shapes[:-1]) for one in stretches]
-    return _mismatch.levels(parts, usual)
+    level, gain = _mismatch.levels(parts, usual)
+    if level[0] >= _ALIKE * surface[0] * shapes.expected_m[0]:
+        return level, gain
+    alike = [part._replace(shapes=part.shapes[1:]) for part in parts]
+    level, gain = _mismatch.levels(alike, usual[1:])
+    return np.concatenate([[0.0], level]), gain
 
 
 def force_noise(

@@ -8,7 +8,7 @@ Thresholds stand where verdicts are made.
 """
 
 from itertools import permutations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,6 +180,34 @@ def pairing(
     )
 
 
+def stiffness_per_mass(
+    acceleration_m_per_s2: FloatArray,
+    step_s: float,
+    known_stiffness: FloatArray,
+    known_damping: FloatArray,
+) -> tuple[float, float]:
+    """k/m in 1/s² of front and rear by the body equations of accelerations (4, n).
+
+    Within a factor of 4 of what is known, as in `pairing`.
+    """
+    spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
+    found = [
+        float(known_stiffness[w])
+        * float(
+            _constants(
+                spectrum[w],
+                spectrum[2 + w],
+                spectrum[1 - w],
+                omega,
+                float(known_stiffness[w]),
+                float(known_damping[w]),
+            ).x[0]
+        )
+        for w in (0, 1)
+    ]
+    return found[0], found[1]
+
+
 def _spectrum(
     signals: FloatArray, step_s: float, band_hz: tuple[float, float]
 ) -> tuple[NDArray[np.complex128], FloatArray]:
@@ -201,6 +229,22 @@ def _unexplained(
     damping_per_mass: float,
 ) -> float:
     """Smallest |residual|^2 of the body equation over |body|^2, constants within their bounds."""
+    power = float(np.vdot(body, body).real)
+    if not power > 0.0:
+        return 1.0
+    found = _constants(body, axle, other, omega, stiffness_per_mass, damping_per_mass)
+    return 2.0 * float(found.cost) / power
+
+
+def _constants(
+    body: NDArray[np.complex128],
+    axle: NDArray[np.complex128],
+    other: NDArray[np.complex128],
+    omega: FloatArray,
+    stiffness_per_mass: float,
+    damping_per_mass: float,
+) -> Any:
+    """The fit of the body equation: factors of k/m and c/m, and the coupling."""
     from scipy.optimize import lsq_linear  # slow to import, seldom needed
 
     stroke = body - axle
@@ -214,13 +258,9 @@ def _unexplained(
     )
     matrix = np.concatenate([columns.real, columns.imag])
     right = -np.concatenate([body.real, body.imag])
-    power = float(right @ right)
-    if not power > 0.0:
-        return 1.0
     low = [1.0 / _BODY_FACTOR, 0.0, -_LARGEST_COUPLING]
     high = [_BODY_FACTOR, _BODY_FACTOR, _LARGEST_COUPLING]
-    found = lsq_linear(matrix, right, (low, high), method="bvls")
-    return 2.0 * float(found.cost) / power
+    return lsq_linear(matrix, right, (low, high), method="bvls")
 
 
 def lead(

@@ -3,7 +3,8 @@
 Each crossing's compliances are set beside those that all others give together. Their difference has
 the covariance of both, and that of a bridge that changes between crossings. What changes it is not
 known before the odd one is out, which would pass for change: so crossings are first judged by a
-usual change, and those that stand out then by the change that the others show.
+usual change, and those that stand out then, a third of all at most, by the change that the others
+show.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ _SUSPICIOUS, _INCOMPATIBLE = 1e-3, 1e-4
 """Probabilities that one of all crossings is as far off as this by chance: to be looked at with the
 change that the others show, and then to be left out."""
 _FEWEST = 3
-"""Of two that disagree nobody knows which is wrong."""
+"""Of two that disagree nobody knows which is wrong; of more, a third may be."""
 
 
 class Judged(NamedTuple):
@@ -37,44 +38,29 @@ class Judged(NamedTuple):
 
 def judge(parts: Sequence[Part], priors: BridgePriors) -> Judged:
     """Which crossings to fuse."""
-    kept = sorted(parts, key=lambda part: part.name)
-    out: list[Part] = []
-    while len(kept) > 1:
-        joint = join(kept, priors)
-        chances = _chances(joint, priors, _USUAL_CHANGE)
-        worst = int(np.argmin(chances))
-        if chances[worst] > _SUSPICIOUS / len(kept):
-            break
-        if len(kept) < _FEWEST:
-            break
-        out.append(kept.pop(worst))
-    out = _taken_back(kept, out, priors)
-    kept = sorted([part for part in parts if part not in out], key=lambda part: part.name)
-    left_out = tuple(sorted(part.name for part in out))
-    return Judged(tuple(part.name for part in kept), left_out, _disagree(kept, priors))
-
-
-def _disagree(kept: list[Part], priors: BridgePriors) -> bool:
-    if not 1 < len(kept) < _FEWEST:
-        return False
-    chances = _chances(join(kept, priors), priors, _USUAL_CHANGE)
-    return bool(chances.min() < _SUSPICIOUS / len(kept))
-
-
-def _taken_back(kept: list[Part], out: list[Part], priors: BridgePriors) -> list[Part]:
-    """Those of `out` that stay out when the change between the others is taken for what it is."""
-    if not out:
-        return out
-    joint = join(kept, priors)
-    between = between_of(joint, priors)
-    change = float(np.sqrt(between.weight @ between.tau**2))
-    stay = []
-    for part in out:
-        joint = join([*kept, part], priors)
-        chance = _chances(joint, priors, max(change, _USUAL_CHANGE))[joint.names.index(part.name)]
-        if chance < _INCOMPATIBLE / (len(kept) + len(out)):
-            stay.append(part)
-    return stay
+    parts = sorted(parts, key=lambda part: part.name)
+    names = tuple(part.name for part in parts)
+    if len(parts) == 1:
+        return Judged(names, (), False)
+    joint = join(parts, priors)
+    chances = _chances(joint, priors, _USUAL_CHANGE)
+    if len(parts) < _FEWEST:
+        return Judged(names, (), bool(chances.min() < _SUSPICIOUS / len(parts)))
+    worst = np.argsort(chances)[: len(parts) // _FEWEST]
+    odd = [i for i in worst if chances[i] < _SUSPICIOUS / len(parts)]
+    if not odd:
+        return Judged(names, (), False)
+    sound = [part for i, part in enumerate(parts) if i not in odd]
+    between = between_of(join(sound, priors), priors)
+    change = max(float(np.sqrt(between.weight @ between.tau**2)), _USUAL_CHANGE)
+    left_out = []
+    for i in odd:
+        beside = join([*sound, parts[i]], priors)
+        chance = _chances(beside, priors, change)[beside.names.index(names[i])]
+        if chance < _INCOMPATIBLE / len(parts):
+            left_out.append(names[i])
+    agree = tuple(name for name in names if name not in left_out)
+    return Judged(agree, tuple(sorted(left_out)), False)
 
 
 def _chances(joint: Joint, priors: BridgePriors, change: float) -> FloatArray:

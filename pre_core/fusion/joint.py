@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pre_core.crossing.compliances import Compliances, draws, marginal, of_normal
 from pre_core.crossing.mismatch import LONG_CYCLES_PER_M, Mismatch, common_shapes, shapes_of
 from pre_core.fusion.likelihood import (
+    KNOT_M,
     OFF_BRIDGE_STEP_M,
     Coordinates,
     Likelihood,
@@ -99,6 +100,15 @@ class Between(NamedTuple):
     weight: FloatArray
 
 
+class _Key(NamedTuple):
+    """Of a track: runs along which other stretches of road were seen share no waves."""
+
+    truck: str
+    direction: int
+    first_knot: int
+    knots: int
+
+
 class _Layout(NamedTuple):
     """Where among all unknowns stand those of the bridge, of each truck, of each track."""
 
@@ -106,7 +116,7 @@ class _Layout(NamedTuple):
     elements: NDArray[np.int64]
     trucks: dict[str, NDArray[np.int64]]
     """The truck's coordinates, the error of its mass last."""
-    tracks: dict[tuple[str, int], NDArray[np.int64]]
+    tracks: dict[_Key, NDArray[np.int64]]
     size: int
 
 
@@ -178,9 +188,7 @@ def join(parts: Sequence[Part], priors: BridgePriors) -> Joint:
     return joint._replace(centre=centre)
 
 
-def _layout_of(
-    parts: Sequence[Part], tracks: dict[tuple[str, int], _Track], priors: BridgePriors
-) -> _Layout:
+def _layout_of(parts: Sequence[Part], tracks: dict[_Key, _Track], priors: BridgePriors) -> _Layout:
     b = len(priors.coordinates.names)
     size, trucks, places = b, {}, {}
     for part in parts:
@@ -188,7 +196,7 @@ def _layout_of(
             own = len(part.likelihood.truck.names) + 1
             trucks[part.truck] = size + np.arange(own)
             size += own
-        key = (part.truck, part.direction)
+        key = _key(part)
         if key not in places and key in tracks and tracks[key].common is not None:
             q = part.likelihood.knots_m.size
             places[key] = size + np.arange(q)
@@ -196,33 +204,42 @@ def _layout_of(
     return _Layout(b, np.arange(b - priors.elements, b), trucks, places, size)
 
 
-def _tracks(parts: Sequence[Part]) -> dict[tuple[str, int], _Track]:
+def _tracks(parts: Sequence[Part]) -> dict[_Key, _Track]:
     """Of every truck in each direction in which its axles feel different roads."""
-    runs: dict[tuple[str, int], list[Part]] = {}
+    runs: dict[_Key, list[Part]] = {}
     for part in parts:
         if part.likelihood.knots_m.size:
-            runs.setdefault((part.truck, part.direction), []).append(part)
+            runs.setdefault(_key(part), []).append(part)
     return {key: _track(key, some) for key, some in runs.items()}
 
 
-def _track(key: tuple[str, int], runs: list[Part]) -> _Track:
+def _track(key: _Key, runs: list[Part]) -> _Track:
     shapes = shapes_of(*runs[0].footprints)
     level = np.mean([run.likelihood.level_m3 for run in runs], axis=0)
     whole = level @ shapes.density
     knots = runs[0].likelihood.knots_m
     everything = covariance_of_coefficients(knots, shapes.cycles_per_m, whole)
     if len(runs) == 1:
-        return _Track(Shared(*key, 0.0, None, level), _root(everything), None)
+        return _Track(Shared(key.truck, key.direction, 0.0, None, level), root_of(everything), None)
     share = common_share([run.likelihood.off_bridge for run in runs])
     wander_m = wander(Mismatch(shapes, level, 1.0), share)
     density = level @ common_shapes(*shapes.footprints, wander_m)
     common = covariance_of_coefficients(knots, shapes.cycles_per_m, density)
     at_long = np.searchsorted(shapes.cycles_per_m, LONG_CYCLES_PER_M)
-    shared = Shared(*key, float(density[at_long] / whole[at_long]), wander_m, level)
-    return _Track(shared, _root(everything - common), common)
+    shared = Shared(
+        key.truck, key.direction, float(density[at_long] / whole[at_long]), wander_m, level
+    )
+    return _Track(shared, root_of(everything - common), common)
 
 
-def _root(covariance: FloatArray) -> FloatArray:
+def _key(part: Part) -> _Key:
+    knots_m = part.likelihood.knots_m
+    first = round(float(knots_m[0]) / KNOT_M) if knots_m.size else 0
+    return _Key(part.truck, part.direction, first, knots_m.size)
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """(q, r) of which root root' is the covariance (q, q), what is rounding left out."""
     values, vectors = np.linalg.eigh(covariance)
     kept = values > _NOTHING * values[-1]
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
@@ -231,7 +248,7 @@ def _root(covariance: FloatArray) -> FloatArray:
 def _ready(
     part: Part,
     layout: _Layout,
-    tracks: dict[tuple[str, int], _Track],
+    tracks: dict[_Key, _Track],
     priors: BridgePriors,
     centre: FloatArray,
 ) -> _Ready:
@@ -248,7 +265,7 @@ def _ready(
     )
     precision, linear = root.T @ root, root.T @ of.target
     places = np.concatenate([np.arange(b), truck])
-    key = (part.truck, part.direction)
+    key = _key(part)
     if key in tracks:
         q = of.knots_m.size
         along = np.zeros((linear.size, q))

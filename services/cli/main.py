@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import Final, NoReturn
 
 from services.cli.access import add_certs
+from services.cli.check import add_check
 from services.cli.completion import SHELLS, completion
 from services.cli.export import add_export
 from services.cli.info import add_info
@@ -37,10 +38,13 @@ from services.cli.offline import (
 from services.cli.parsing import Handler, Parser, add_common
 from services.cli.replay import add_replay
 from services.cli.report import add_report
+from services.cli.survey import add_survey
 from services.cli.validation import add_validate
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 
 _COMMANDS: Final = (
+    add_survey,
+    add_check,
     add_simulate,
     add_import,
     add_identify,

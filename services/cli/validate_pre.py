@@ -129,9 +129,9 @@ def print_outcome(console: "Console", outcome: Outcome, all_checks: list[Check])
         console.print(shown)
     if outcome.worlds:
         console.print("[bold]more physics than the method has[/]", highlight=False)
-        shown = table(*HEADINGS[:-1])
+        shown = table(*HEADINGS[:-2])
         for world in lines_of(outcome.worlds):
-            shown.add_row(*(cell.replace(" %", "%") for cell in cells(world)[:-1]))
+            shown.add_row(*(cell.replace(" %", "%") for cell in cells(world)[:-2]))
         console.print(shown)
     for line in outcome.judged:
         worst = largest_z(line)

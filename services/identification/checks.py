@@ -19,20 +19,20 @@ from schemas.site import Vehicle
 from services.identification.crossing_data import CrossingData, Floats
 
 # Before the fit. Sound: 300 drawn crossings, none accused (docs/verdicts.md).
-_LONGEST_HOLD_S = 0.2
+LONGEST_HOLD_S = 0.2
 """Noise and motion change every sample; a coarse converter (12 bits) holds one for 0.03 s."""
-_ALIKE = 1e-3
+ALIKE = 1e-3
 """Two channels that differ by less than this part of what they show are one."""
 _PILE_UP = 8.0
 _PILE_VISITS = 3
 """Sound: at most 5.8 over three visits; a range of half of what is needed: 12 to 67."""
 _REPEATS = 4
 """An extreme that comes exactly so often is the end of a range: noise repeats none."""
-_SPIKE_HEIGHT = 20.0
+SPIKE_HEIGHT = 20.0
 """Over the typical distance from the neighbours. Sound: at most 7."""
-_LARGEST_MEAN_M_PER_S2 = 0.3 * STANDARD_GRAVITY_M_PER_S2
+LARGEST_MEAN_M_PER_S2 = 0.3 * STANDARD_GRAVITY_M_PER_S2
 """No truck falls for seconds: a mean of this size is gravity or a broken sensor."""
-_UNEXPLAINED = 0.3
+UNEXPLAINED = 0.3
 _BETTER = 0.5
 """Part of the body's motion that the body equations leave over. Sound: at most 0.10; two channels
 exchanged or one inverted: at least 0.36, and then at most 0.10 once they are put right."""
@@ -51,7 +51,7 @@ _SLACK = (1.35, 1.35, 1.35, 1.15)
 1/f noise of a sensor is not declared."""
 _SLACK_OF_TWO_ROADS = 1.6
 """The level of the roads' mismatch is read off some ten waves: so much is three deviations."""
-_SHORTEST_APPROACH_M = 12.0
+SHORTEST_APPROACH_M = 12.0
 """Fewer metres off the bridge tell the level no better than to a factor of 1.4."""
 _NOISY = 1.2
 """From here on a kind of residual is called noisier than declared, if it is white."""
@@ -63,7 +63,7 @@ _LARGEST_VEHICLE_Z = 4.0
 """No unknown of a truck is by chance so many standard deviations from its prior."""
 _LARGEST_POSITION_Z = 4.0
 """Nor is the receiver's slow error."""
-_ALIKE_LOADS = 0.1
+ALIKE_LOADS = 0.1
 """Axles whose loads differ by less than this share of their sum press the bridge alike: what the
 road does to both cannot be told from what the bridge does."""
 _UNINFORMED = 0.8
@@ -101,13 +101,13 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
     """What the fit says against its own answer, the most telling first; empty if nothing does."""
     reasons = _of_the_rows(data, fit)
     is_unexplained = bool({Reason.MODEL_MISFIT, Reason.RESIDUALS_COLOURED} & set(reasons))
-    if fit.off_bridge_m < _SHORTEST_APPROACH_M and (fit.has_two_roads or is_unexplained):
+    if fit.off_bridge_m < SHORTEST_APPROACH_M and (fit.has_two_roads or is_unexplained):
         reasons.append(Reason.APPROACH_TOO_SHORT)
     if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > _LARGEST_VEHICLE_Z:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
     if abs(fit.position_z) > _LARGEST_POSITION_Z:
         reasons.append(Reason.POSITION_INCONSISTENT)
-    if fit.rigidity_spread.min() > _UNINFORMED and _loads_are_alike(data.vehicle):
+    if fit.rigidity_spread.min() > _UNINFORMED and loads_are_alike(data.vehicle):
         reasons.append(Reason.AXLES_ALIKE)
     return reasons
 
@@ -164,11 +164,19 @@ def _is_only_noise(fit: Fit, found: dict[tuple[int, int, int], quality.Cell]) ->
     return max(powers) > _NOISY
 
 
-def _loads_are_alike(vehicle: Vehicle) -> bool:
+def axle_loads_kg(vehicle: Vehicle) -> tuple[float, float]:
+    """Static loads of the front and the rear axle, nominally."""
     share = vehicle.front_axle_to_cg_m / vehicle.wheelbase_m
-    front = vehicle.sprung_mass_kg * (1.0 - share) + vehicle.unsprung_mass_kg[0]
-    rear = vehicle.sprung_mass_kg * share + vehicle.unsprung_mass_kg[1]
-    return abs(front - rear) < _ALIKE_LOADS * (front + rear)
+    return (
+        vehicle.sprung_mass_kg * (1.0 - share) + vehicle.unsprung_mass_kg[0],
+        vehicle.sprung_mass_kg * share + vehicle.unsprung_mass_kg[1],
+    )
+
+
+def loads_are_alike(vehicle: Vehicle) -> bool:
+    """Whether both axles press the bridge alike."""
+    front, rear = axle_loads_kg(vehicle)
+    return abs(front - rear) < ALIKE_LOADS * (front + rear)
 
 
 def reasons_before_fit(
@@ -178,48 +186,53 @@ def reasons_before_fit(
 
     `motion` is where the front axle was at every sample.
     """
-    return _broken(acceleration, step_s) or _order_and_signs(
+    return _broken(acceleration, step_s) or order_and_signs(
         vehicle, acceleration, step_s, motion, direction
     )
 
 
 def _broken(acceleration: Floats, step_s: float) -> list[Reason]:
     """The most plain of what is wrong with single channels: it makes the others show as well."""
-    if any(quality.longest_hold(values) * step_s > _LONGEST_HOLD_S for values in acceleration):
+    if any(quality.longest_hold(values) * step_s > LONGEST_HOLD_S for values in acceleration):
         return [Reason.CHANNEL_STUCK]
-    if quality.smallest_difference(acceleration) < _ALIKE:
+    if quality.smallest_difference(acceleration) < ALIKE:
         return [Reason.CHANNELS_ALIKE]
-    if np.abs(acceleration.mean(axis=1)).max() > _LARGEST_MEAN_M_PER_S2:
+    if np.abs(acceleration.mean(axis=1)).max() > LARGEST_MEAN_M_PER_S2:
         return [Reason.CHANNEL_BIASED]
-    if any(_is_saturated(values) for values in acceleration):
+    if any(is_saturated(values) for values in acceleration):
         return [Reason.SENSOR_SATURATED]
-    if any(quality.spikes(values, _SPIKE_HEIGHT) > 0 for values in acceleration):
+    if any(quality.spikes(values, SPIKE_HEIGHT) > 0 for values in acceleration):
         return [Reason.SIGNAL_SPIKES]
     return []
 
 
-def _is_saturated(values: Floats) -> bool:
+def is_saturated(values: Floats) -> bool:
+    """Whether a signal (n,) stays where a sensor's range ends."""
     rail = quality.pile_up(values)
     piled_up = rail.ratio > _PILE_UP and rail.visits >= _PILE_VISITS
     return piled_up or quality.repeated_extremes(values) >= _REPEATS
 
 
-def _order_and_signs(
-    vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion, direction: int
-) -> list[Reason]:
+def body_constants(vehicle: Vehicle) -> tuple[Floats, Floats]:
+    """Springs and dampers over the masses that they carry, front and rear: (2,) each, nominally."""
     d_1, wheelbase = vehicle.front_axle_to_cg_m, vehicle.wheelbase_m
     body = vehicle.sprung_mass_kg * np.array([wheelbase - d_1, d_1]) / wheelbase
-    found = quality.pairing(
-        acceleration,
-        step_s,
+    return (
         np.array(vehicle.suspension_stiffness_n_per_m) / body,
         np.array(vehicle.suspension_damping_ns_per_m) / body,
     )
-    if found.recorded > _UNEXPLAINED:
+
+
+def order_and_signs(
+    vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion, direction: int
+) -> list[Reason]:
+    """Whether channels (4, n) are exchanged or inverted; `motion` is the front axle's."""
+    found = quality.pairing(acceleration, step_s, *body_constants(vehicle))
+    if found.recorded > UNEXPLAINED:
         turned = [
             reversed_ < _BETTER * upright
             for upright, reversed_ in zip(found.upright, found.reversed_, strict=True)
-            if upright > _UNEXPLAINED
+            if upright > UNEXPLAINED
         ]
         if all(turned) and min(found.reversed_) < found.best:
             return [Reason.CHANNEL_INVERTED]
@@ -229,7 +242,9 @@ def _order_and_signs(
     travelled = direction * (motion.position_m - motion.position_m[0])
     if np.any(np.diff(travelled) <= 0.0):
         return []
-    right, exchanged = quality.lead(acceleration[2], acceleration[3], step_s, travelled, wheelbase)
+    right, exchanged = quality.lead(
+        acceleration[2], acceleration[3], step_s, travelled, vehicle.wheelbase_m
+    )
     if right < -_LEAD:
         return [Reason.CHANNEL_INVERTED]
     if exchanged > _LEAD > 2.0 * right:

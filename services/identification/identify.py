@@ -53,7 +53,7 @@ class Identify(Protocol):
     ) -> results.Crossing: ...
 
 
-_SLOWEST_M_PER_S = 3.0
+SLOWEST_M_PER_S = 3.0
 """Below this the wheels feel next to nothing of the bridge's stiffness."""
 _JUDGED_ASIDE_S = 1.0
 """Signals are judged so far before and behind the bridge, where thresholds were found."""
@@ -230,7 +230,7 @@ def _unusable(
     speed = data.stay.direction * trajectory.spline.derivative()(times)
     if speed.min() < STANDING_M_PER_S:
         reasons.append(Reason.STOPPED_ON_BRIDGE)
-    elif np.median(speed) < _SLOWEST_M_PER_S:
+    elif np.median(speed) < SLOWEST_M_PER_S:
         reasons.append(Reason.SPEED_TOO_LOW)
     return reasons
 

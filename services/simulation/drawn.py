@@ -19,23 +19,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
+from pre_core.crossing.preparation import Inputs
 from pre_core.physics.bridge import Beam, natural_frequencies_hz
 from pre_core.physics.models import from_models
 from pre_core.physics.road import Profile
 from pre_core.physics.sensors import Accelerometer, Receiver
 from pre_core.physics.simulate import Motion
 from pre_core.physics.vehicle import HalfCar
+from schemas.reasons import Reason
 from schemas.results import Crossing, Header
 from schemas.settings import IdentificationSettings
+from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
 from schemas.site_file import site_hash
 from services.drives.runs import Run, run_to_messages
 from services.execution.dispatch import feed_all
 from services.execution.here import Here
-from services.identification.crossing_data import CrossingData
+from services.identification.crossing_data import CrossingData, Passing, rejected
 from services.identification.engine import Engine
-from services.identification.identify import identify
-from services.identification.pre_method import absence
+from services.identification.identify import Identify, identify
+from services.identification.pre_method import absence, inputs_of
 from services.recordings.recording import program_version
 from services.simulation.drive import (
     LONGEST_STEP_S,
@@ -329,7 +332,12 @@ def _motion(truth: Truth, bridge: Bridge, step_s: float, every: int) -> Motion:
     return Motion(position[:stop], sign * speed[:stop], acceleration[:stop])
 
 
-def see(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[Seen]:
+def see(
+    runs: list[Run],
+    site: Site,
+    settings: IdentificationSettings,
+    identify: Identify = identify,
+) -> list[Seen]:
     """Identify all crossings of the site's first truck through the engine, as from a recording."""
     kept: dict[str, CrossingData] = {}
     draws: dict[str, dict[str, Floats]] = {}
@@ -362,6 +370,27 @@ def see(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[S
         for result in found
         if result is not None
     ]
+
+
+def data_alone(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[Seen]:
+    """What the engine would give to a method of every crossing; nothing is identified.
+
+    The results are rejections without a reason that means anything.
+    """
+
+    def nothing(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+        passing = Passing(data.stay.entry_s, data.stay.exit_s, 0.0)
+        return rejected(data, settings, passing, [Reason.FAILED])
+
+    return see(runs, site, settings, nothing)
+
+
+def inputs_of_seen(seen: Seen) -> Inputs:
+    """A crossing as method `pre` takes it: all samples that the engine gave."""
+    samples = seen.data.samples
+    assert samples is not None  # noqa: S101 - a recording without any has no crossings
+    acceleration = np.stack([samples.channels[name] for name in CHANNELS])
+    return inputs_of(seen.data, seen.settings, acceleration, samples.start_s)
 
 
 def _flat(draws: dict[str, Floats] | None) -> dict[str, Floats] | None:

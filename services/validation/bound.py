@@ -6,8 +6,13 @@ initial states) free: the inverse of J'J, of which J is the Jacobian by central 
 support spring cannot be negative, which the inverse does not know: its variance is replaced by
 that of a normal about the true value cut off at zero, and what follows for the others is taken
 along (`without_negative`).
+
+Where the axles run over a surface their roads differ, and that is noise of the level which the
+class of the road and the tyres have: no run knows it better. What several runs in one track have in
+common of it is an unknown of all of them (`bound_of_runs`).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,12 +21,14 @@ from numpy.typing import NDArray
 from pre_core import unknowns
 from pre_core.crossing import posterior
 from pre_core.crossing.bound import DIFFERENCE, central_jacobian, settle
+from pre_core.crossing.compliances import in_compliances
+from pre_core.crossing.mismatch import levels_on, shapes_of
 from pre_core.crossing.preparation import prepare, with_noise_at
 from pre_core.diagnostics.calibration import without_negative
 from pre_core.physics.vehicle import total_mass_kg
-from schemas.signals import CHANNELS
-from services.identification.pre_method import inputs_of
-from services.simulation.drawn import Drawn, Seen, true_values
+from pre_core.survey.plan import Spreads, known_before, spreads, together, track_of
+from pre_core.survey.plan import Truth as AtTruth
+from services.simulation.drawn import Drawn, Seen, Truth, inputs_of_seen, true_values
 
 Floats = NDArray[np.float64]
 
@@ -86,7 +93,18 @@ def at_truth(seen: Seen, drawn: Drawn) -> tuple[posterior.Problem, Floats]:
         drawn.motion.position_m,
     )
     y[where.trajectory] = np.linalg.lstsq(problem.basis_position, true_m, rcond=None)[0]
-    return _settled(problem, y)
+    return _settled(_on_its_road(problem, y, drawn.truth), y)
+
+
+def _on_its_road(problem: posterior.Problem, y: Floats, truth: Truth) -> posterior.Problem:
+    """The problem with the noise of roads that differ, where the truth's do."""
+    if truth.paths is None:
+        return problem
+    front, rear = truth.paths.front, truth.paths.rear
+    mismatch = problem.mismatch._replace(shapes=shapes_of(front, rear._replace(offset_m=0.0)))
+    level = levels_on(front, rear, truth.conditions.road_class)
+    # Springs are believed until the nuisances have settled: what they leave is read off the rows.
+    return with_noise_at(problem._replace(mismatch=mismatch), y, problem.force, mismatch=level)
 
 
 def _settled(problem: posterior.Problem, y: Floats) -> tuple[posterior.Problem, Floats]:
@@ -98,9 +116,10 @@ def _settled(problem: posterior.Problem, y: Floats) -> tuple[posterior.Problem, 
     where = posterior.layout(problem)
     y[where.offset] = _best_offset(problem, y)
     nuisances = np.arange(where.gains.start, where.size)
+    level = problem.mismatch.level_m3
     # What springs leave over is read off the rows: first without what the nuisances put there.
     y = settle(problem, y, nuisances)
-    problem = with_noise_at(problem, y)
+    problem = with_noise_at(problem, y, mismatch=level)
     return problem, settle(problem, y, nuisances)
 
 
@@ -134,6 +153,24 @@ def bound_of(
     return Bound(full, alone, _chi2_per_dof(problem, y))
 
 
+def bound_of_runs(
+    truths: Sequence[AtTruth], wander_m: float, lengths_m: Floats, scale_error: float
+) -> Spreads:
+    """Standard deviations of ln EI by several crossings in one track, at their truth.
+
+    Tracks lie beside each other by `wander_m` (standard deviation); what they share of the
+    mismatch is an unknown of all. By draws in 1/EI (`pre_core.survey.plan`), with `scale_error`.
+    """
+    problem, y = truths[0]
+    track = track_of(truths, problem.mismatch, wander_m)
+    known = known_before(problem)
+    precision = together([track], len(truths), known.log_odds.size)
+    where = posterior.layout(problem)
+    centre, _ = in_compliances(problem, y, np.zeros((1, y.size)))
+    found = spreads(known, precision, lengths_m, centre[where.bridge])
+    return Spreads(np.hypot(found.elements, scale_error), float(np.hypot(found.level, scale_error)))
+
+
 def _chi2_per_dof(problem: posterior.Problem, y: Floats) -> float:
     """Mean square of the white data; only the nuisances were fitted to them."""
     where = posterior.layout(problem)
@@ -161,10 +198,7 @@ def problem_of(seen: Seen) -> tuple[posterior.Problem, Floats, Floats]:
 
     Times are of the rows of `basis_position`, on the truck's clock.
     """
-    samples = seen.data.samples
-    assert samples is not None  # noqa: S101 - the crossing was identified
-    acceleration = np.stack([samples.channels[name] for name in CHANNELS])
-    inputs = inputs_of(seen.data, seen.settings, acceleration, samples.start_s)
+    inputs = inputs_of_seen(seen)
     problem, y = prepare(inputs)
     return problem, y, _times(problem, inputs.fixes)
 

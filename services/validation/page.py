@@ -113,7 +113,8 @@ in `services/simulation/worlds.py`; no range is a prior of the method. Answered 
 rejected; covered is the share of the 95 % intervals of EI that hold the truth, of all that were
 answered and of those that are `good`; z is the error over the standard deviation: its mean over all
 elements and that of the worst element, its root mean square (rms), and its largest size where the
-verdict is `good` (max); std is the median relative standard deviation of EI.
+verdict is `good` (max); std is the median relative standard deviation of EI, for the surface also
+over the Cramér-Rao bound at the truth with the roads' mismatch in its noise (of bound).
 
 | {headings} |
 | --- |{rules}

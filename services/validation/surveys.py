@@ -154,6 +154,7 @@ def _truth(site: Site, kind: Kind, survey: int, number: int, truck: int) -> tupl
             element_lengths_m=bridge.element_lengths_m,
             mass_per_length_kg_per_m=bridge.mass_per_length_kg_per_m,
             interior_supports=bridge.interior_supports,
+            support_rotational_stiffness_nm_per_rad=(0.0, 0.0),
         )
     change = kind.changes * (
         rng.standard_normal() * np.ones_like(bridge.flexural_rigidity_nm2)

@@ -21,7 +21,8 @@ from schemas.site_file import site_hash
 from services.common.errors import InputError
 from services.recordings.recording import program_version
 from services.simulation.drawn import drive, see
-from services.simulation.worlds import draw_world
+from services.simulation.worlds import SURFACE, draw_world
+from services.validation.bound import bound_at_truth
 from services.validation.calibration import Check, Record, in_processes, record
 
 _COVERAGE = (0.93, 0.99)
@@ -52,6 +53,8 @@ class Line(NamedTuple):
     largest_z_good: float | None
     std: float | None
     """Median of the relative standard deviation of EI."""
+    over_bound: float | None = None
+    """Median of that over the Cramér-Rao bound at the truth, with the mismatch in its noise."""
 
 
 def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettings) -> Record:
@@ -61,7 +64,9 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
     drawn = drive(world.site, world.truth, seed)
     found = see([drawn.run], drawn.site, settings)
     seen = found[0] if len(found) == 1 else None
-    line = record(seed, drawn, seen, {})
+    # Only there does the truth tell of noise that a model of one road has not.
+    is_comparable = effect == SURFACE and seen is not None and seen.result.parameters is not None
+    line = record(seed, drawn, seen, bound_at_truth(seen, drawn) if seen and is_comparable else {})
     derived = seen.result.derived if seen is not None else None
     return line | {
         "identity": _identity(site, settings),
@@ -185,6 +190,7 @@ def _line(effect: str, records: list[Record]) -> Line:
         float(np.sqrt(np.mean(pooled**2))) if z else None,
         max(float(np.abs(_z(line)).max()) for line in good) if good else None,
         float(np.median([s for line in answered for s in _stds(line)])) if z else None,
+        _over_bound(answered),
     )
 
 
@@ -204,6 +210,16 @@ def _z(line: Record) -> NDArray[np.float64]:
 
 def _stds(line: Record) -> list[float]:
     return [line["estimates"][n]["std"] / line["truth"][n] for n in _rigidities(line)]
+
+
+def _over_bound(records: list[Record]) -> float | None:
+    ratios = [
+        std / line["bound"]["std"][name]
+        for line in records
+        if line.get("bound")
+        for name, std in zip(_rigidities(line), _stds(line), strict=True)
+    ]
+    return float(np.median(ratios)) if ratios else None
 
 
 def _coverage(records: list[Record]) -> float | None:
@@ -245,6 +261,7 @@ HEADINGS = (
     "rms",
     "max",
     "std",
+    "of bound",
 )
 
 
@@ -269,4 +286,5 @@ def cells(line: Line) -> list[str]:
         number(line.rms_z, ""),
         number(line.largest_z_good, ""),
         percent(line.std, 1),
+        number(line.over_bound, ""),
     ]

@@ -4,23 +4,30 @@ import numpy as np
 import pytest
 
 from pre_core.crossing import posterior
-from schemas.reasons import Reason
-from schemas.results import Crossing
+from pre_core.survey.plan import Truth
 from schemas.settings import IdentificationSettings
-from services.identification.crossing_data import CrossingData, Passing, rejected
-from services.simulation import drawn as drawn_crossings
-from services.simulation.drawn import Drawn, Seen, default_site, draw_truth, drive, see, true_values
-from services.validation.bound import at_truth, bound_at, bound_at_truth, bound_of, settle
+from services.simulation.drawn import (
+    Drawn,
+    Seen,
+    data_alone,
+    default_site,
+    draw_truth,
+    drive,
+    true_values,
+)
+from services.simulation.worlds import draw_world
+from services.validation.bound import (
+    at_truth,
+    bound_at,
+    bound_at_truth,
+    bound_of,
+    bound_of_runs,
+    settle,
+)
 
 SITE = default_site()
 SETTINGS = IdentificationSettings(method="pre", threads=1)
 SEED = 29
-
-
-def _not_identified(
-    data: CrossingData, settings: IdentificationSettings, **others: object
-) -> Crossing:
-    return rejected(data, settings, Passing(0.0, 1.0, 1.0), [Reason.FAILED])
 
 
 def plain_drive(noise_ug: float = 40.0, **conditions: float) -> Drawn:
@@ -40,16 +47,15 @@ def plain_drive(noise_ug: float = 40.0, **conditions: float) -> Drawn:
     return drive(SITE, truth._replace(car=car, channels=errors, conditions=how), SEED)
 
 
-def data_of(drawn: Drawn, monkeypatch: pytest.MonkeyPatch) -> Seen:
-    monkeypatch.setattr(drawn_crossings, "identify", _not_identified)
-    (seen,) = see([drawn.run], drawn.site, SETTINGS)
+def data_of(drawn: Drawn) -> Seen:
+    (seen,) = data_alone([drawn.run], drawn.site, SETTINGS)
     return seen
 
 
-def test_the_model_is_right_at_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_model_is_right_at_the_truth() -> None:
     """No search has been there: a generator or a model that were wrong would show here."""
     drawn = plain_drive()
-    found = bound_at_truth(data_of(drawn, monkeypatch), drawn)
+    found = bound_at_truth(data_of(drawn), drawn)
     assert 0.9 < found["at_truth"]["chi2_per_dof"] < 1.08
     rigidities = [found["std"][f"EI_{e + 1}"] for e in range(7)]
     assert 0.01 < min(rigidities) < max(rigidities) < 0.4
@@ -59,18 +65,18 @@ def test_the_model_is_right_at_the_truth(monkeypatch: pytest.MonkeyPatch) -> Non
         assert found["std"][name] ** 2 - found["std_without_scale"][name] ** 2 > 0.99 * 0.01**2
 
 
-def test_the_bound_grows_with_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bound_grows_with_the_noise() -> None:
     quiet, loud = (
-        bound_at_truth(data_of(drawn, monkeypatch), drawn)["std_without_scale"]
+        bound_at_truth(data_of(drawn), drawn)["std_without_scale"]
         for drawn in (plain_drive(25.0), plain_drive(50.0))
     )
     # The third element is known by the data: its bound is nearly proportional to their noise.
     assert loud["EI_3"] / quiet["EI_3"] == pytest.approx(2.0, rel=0.15)
 
 
-def test_a_truth_known_by_its_entry_gives_the_same_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_truth_known_by_its_entry_gives_the_same_bound() -> None:
     drawn = plain_drive()
-    seen = data_of(drawn, monkeypatch)
+    seen = data_of(drawn)
     full = bound_at_truth(seen, drawn)
     near = 0.0 if drawn.truth.conditions.forward else SITE.bridges[0].span_m
     entry = drawn.start_s + drawn.step_s * np.argmin(np.abs(drawn.motion.position_m - near))
@@ -83,9 +89,9 @@ def test_a_truth_known_by_its_entry_gives_the_same_bound(monkeypatch: pytest.Mon
         assert part["std"][name] == pytest.approx(full["std"][name], rel=0.03)
 
 
-def test_differences_are_fine_enough_and_nuisances_settle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_differences_are_fine_enough_and_nuisances_settle() -> None:
     drawn = plain_drive()
-    problem, y = at_truth(data_of(drawn, monkeypatch), drawn)
+    problem, y = at_truth(data_of(drawn), drawn)
     where = posterior.layout(problem)
     nuisances = np.arange(where.gains.start, where.size)
     moved = y.copy()
@@ -100,3 +106,26 @@ def test_differences_are_fine_enough_and_nuisances_settle(monkeypatch: pytest.Mo
     coarse, fine = (bound_of(problem, y, 0.0, step=step).std for step in (1e-4, 5e-5))
     for name, value in fine.items():
         assert coarse[name] == pytest.approx(value, rel=1e-3), name
+
+
+def test_roads_that_differ_are_noise_at_the_truth() -> None:
+    """On a drawn surface the rows are white by its class and the tyres; without that, far off."""
+    world = draw_world(SITE, "surface", 1)
+    drawn = drive(world.site, world.truth, 1)
+    seen = data_of(drawn)
+    problem, y = at_truth(seen, drawn)
+    assert problem.mismatch.level_m3[0] > 1e-8
+    with_noise = bound_of(problem, y, 0.0)
+    assert 0.8 < with_noise.chi2_per_dof < 1.25
+    one_road = drawn._replace(truth=drawn.truth._replace(paths=None))
+    assert bound_of(*at_truth(seen, one_road), 0.0).chi2_per_dof > 10.0
+    # Twin tyres tell hardly anything of the elements; several runs in one track more, and less
+    # more than as many independent ones would.
+    lengths_m = np.array(world.site.bridges[0].lengths_m)
+    once, often, apart = (
+        bound_of_runs([Truth(problem, y)] * runs, wander_m, lengths_m, 0.01)
+        for runs, wander_m in ((1, 0.12), (16, 0.12), (16, 1.0))
+    )
+    assert 0.08 < once.level < 0.2
+    assert np.median(apart.elements) < np.median(often.elements) < np.median(once.elements)
+    assert np.median(once.elements / [with_noise.std[f"EI_{e + 1}"] for e in range(7)]) < 1.2

@@ -229,6 +229,10 @@ def test_the_table_by_hand() -> None:
     assert swing.rms_z == pytest.approx(np.sqrt(14.0 / 4.0))
     assert swing.largest_z_good == pytest.approx(3.0)
     assert swing.std == pytest.approx(0.05)
+    assert swing.over_bound is None
+    bounds = {"std": {"EI_1": 0.04, "EI_2": 0.025}}
+    (surface,) = lines_of([made_up("surface", 0, (0.0, 0.0)) | {"bound": bounds}])
+    assert surface.over_bound == pytest.approx(0.5 * (0.05 / 0.04 + 0.05 / 0.025))
     assert air.coverage == 0.0
     checks = {check.name: check for check in world_checks(records)}
     assert checks["swing: largest |z| among good"].is_met

@@ -1,0 +1,1 @@
+"""How well a bridge will be known, and what damage will be seen, before anyone drives."""

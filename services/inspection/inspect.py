@@ -1,0 +1,210 @@
+"""Everything that is looked at before a survey: the site file, and what a truck has recorded."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.physics.simulate import Motion
+from schemas.signals import CHANNELS
+from schemas.site import Site, Vehicle
+from schemas.site_file import load_site, parse_site
+from services.common.errors import InputError
+from services.identification.streams import Samples
+from services.inspection.channels import alive, gaps, in_place, masses, present, rates, wheelbase
+from services.inspection.finding import Finding, State
+from services.inspection.noise import Still, noise_of
+from services.inspection.place import place_of
+from services.inspection.receiver import clocks, receiver_of, standing
+from services.inspection.recorded import Recorded, recorded_runs
+from services.inspection.site import findings_of_site
+from services.recordings.recording import read_info
+
+Floats = NDArray[np.float64]
+
+_SHORTEST_STANDSTILL_S: Final = 10.0
+_SHORTEST_DRIVE_S: Final = 6.0
+_DRIVE_S: Final = 12.0
+"""Signals are judged over about as long as a crossing takes, where thresholds were found."""
+_DRIVING_M_PER_S: Final = 3.0
+_SLOW: Final = 0.9
+_SETTLE_S: Final = 1.0
+"""After stopping a body swings on its springs."""
+
+
+class Report(NamedTuple):
+    """What was found of one source: a site file, or a run of a recording."""
+
+    source: str
+    findings: tuple[Finding, ...]
+    is_run: bool = True
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether anything is."""
+        return any(_is_wrong(finding) for finding in self.findings)
+
+
+def inspect(paths: list[Path]) -> Iterator[Report]:
+    """Check a site file and recordings; InputError if one cannot be read, or none names a site."""
+    sites = [path for path in paths if path.suffix == ".toml"]
+    recordings = [path for path in paths if path.suffix != ".toml"]
+    if len(sites) > 1:
+        raise InputError(f"{sites[1]}: a second site file, give one and recordings")
+    given = load_site(sites[0]) if sites else None
+    if given is not None:
+        yield _of_site(str(sites[0]), given)
+    for path in recordings:
+        site, name = (given, str(sites[0])) if given is not None else site_beside(path)
+        if given is None:
+            yield _of_site(name, site)
+        for number, run in enumerate(recorded_runs(path, site, name)):
+            yield Report(f"{path}, run {number + 1} of {run.vehicle}", tuple(of_run(run, site)))
+
+
+def site_beside(path: Path) -> tuple[Site, str]:
+    """The site file in a recording or a folder, and its name; InputError if there is none."""
+    if path.is_dir():
+        beside = path / "site.toml"
+        if not beside.is_file():
+            raise InputError(f"{path}: holds no site.toml, give a site file before it")
+        return load_site(beside), str(beside)
+    text = read_info(path, lambda message: None).site_toml
+    if text is None:
+        raise InputError(f"{path}: holds no site file, give one before it")
+    name = f"{path}: site.toml"
+    return parse_site(text, name), name
+
+
+def _of_site(name: str, site: Site) -> Report:
+    found = [finding for vehicle in site.vehicles for finding in findings_of_site(site, vehicle)]
+    return Report(name, tuple(dict.fromkeys(found)), is_run=False)
+
+
+def of_run(run: Recorded, site: Site) -> Iterator[Finding]:
+    """Everything that one run says."""
+    known = {vehicle.id: vehicle for vehicle in site.vehicles}
+    if run.vehicle not in known:
+        yield Finding(
+            "vehicle",
+            State.WRONG,
+            f"{run.vehicle} is not in the site file",
+            f"it knows {', '.join(known)}: name the truck as there",
+        )
+        return
+    vehicle = known[run.vehicle]
+    yield present(run)
+    if run.samples is not None and run.samples.channels:
+        yield from rates(run, site.sensor)
+        yield gaps(run)
+        yield from _of_signals(run, site, vehicle, run.samples)
+    yield from receiver_of(run, site.receiver)
+    yield from clocks(run)
+    if run.fixes.time_s.size > 1:
+        for bridge in site.bridges:
+            yield from place_of(run, bridge, vehicle, site.receiver)
+    if run.is_cut:
+        yield Finding(
+            "length", State.OPEN, "accelerations of the first half hour were looked at", ""
+        )
+
+
+def _of_signals(run: Recorded, site: Site, vehicle: Vehicle, samples: Samples) -> Iterator[Finding]:
+    stood, drove = _standstill(run, samples), _drive(run, samples)
+    names = tuple(name for name in CHANNELS if name in samples.channels)
+    part = np.stack([samples.channels[name][drove or stood or slice(0, None)] for name in names])
+    part = part[:, np.isfinite(part).all(axis=0)]
+    broken: set[str] = set()
+    if part.shape[1] > 2:
+        for finding in alive(names, part, 1.0 / samples.rate_hz):
+            if finding.name == "channels_alike":
+                broken |= set(names)
+            elif _is_wrong(finding):
+                broken |= {name for name in names if finding.text.startswith(f"{name}:")}
+            yield finding
+    declared = dict(zip(CHANNELS, site.sensor.noise_density_ug_per_rthz, strict=True))
+    for name in names:
+        if name in broken:
+            continue
+        quiet = samples.channels[name][stood or drove or slice(0, None)]
+        # Of a channel that was interpolated nothing is left where its noise is.
+        is_slow = run.rates_hz.get(name, samples.rate_hz) < _SLOW * samples.rate_hz
+        still = Still(quiet, samples.rate_hz, stood is not None)
+        yield noise_of(name, None if is_slow else still, declared[name])
+    if len(names) < len(CHANNELS) or broken:
+        return
+    if drove is None:
+        yield Finding(
+            "channels_in_place",
+            State.OPEN,
+            f"order and signs of the channels: no {_SHORTEST_DRIVE_S:g} s of driving without gaps",
+            "check again with ten seconds of driving",
+        )
+    else:
+        yield from _of_motion(run, vehicle, samples, drove, part)
+
+
+def _is_wrong(finding: Finding) -> bool:
+    return finding.state is State.WRONG
+
+
+def _of_motion(
+    run: Recorded, vehicle: Vehicle, samples: Samples, drove: slice, part: Floats
+) -> Iterator[Finding]:
+    """What a drive without gaps says of order, signs, wheelbase and masses."""
+    step_s = 1.0 / samples.rate_hz
+    time_s = samples.start_s + step_s * np.arange(drove.start, drove.stop)
+    speed = np.interp(time_s, run.fixes.time_s, run.fixes.speed_m_per_s)
+    travelled = np.concatenate([[0.0], np.cumsum(0.5 * step_s * (speed[1:] + speed[:-1]))])
+    motion = Motion(travelled, speed, np.gradient(speed, step_s))
+    place = in_place(vehicle, part, step_s, motion)
+    yield place
+    if place.state is State.OK:
+        yield wheelbase(vehicle, part, step_s, travelled)
+        yield from masses(vehicle, part, step_s)
+
+
+def _standstill(run: Recorded, samples: Samples) -> slice | None:
+    """Samples of the longest standstill."""
+    if run.fixes.time_s.size < 2:
+        return None
+    stood = standing(run)
+    if stood is None or stood[1] - stood[0] < _SHORTEST_STANDSTILL_S:
+        return None
+    return _between(samples, stood[0] + _SETTLE_S, stood[1] - _SETTLE_S)
+
+
+def _drive(run: Recorded, samples: Samples) -> slice | None:
+    """Samples of the stretch, as long as a crossing, that is driven most steadily."""
+    time_s, speed = run.fixes.time_s, run.fixes.speed_m_per_s
+    holes = _holes(samples)
+    best: tuple[float, slice] | None = None
+    for begin_s in time_s.tolist():
+        inside = (time_s >= begin_s) & (time_s <= begin_s + _DRIVE_S)
+        if inside.sum() < 3 or speed[inside].min() < _DRIVING_M_PER_S:
+            continue
+        end_s = float(time_s[inside][-1])
+        part = _between(samples, begin_s, end_s)
+        if part.stop - part.start < _SHORTEST_DRIVE_S * samples.rate_hz:
+            continue
+        if np.any((holes >= part.start) & (holes < part.stop)):
+            continue
+        change = float(np.ptp(speed[inside]) / speed[inside].mean()) - (end_s - begin_s) / _DRIVE_S
+        if best is None or change < best[0]:
+            best = (change, part)
+    return None if best is None else best[1]
+
+
+def _holes(samples: Samples) -> NDArray[np.int64]:
+    values = np.stack(list(samples.channels.values()))
+    return np.flatnonzero(~np.isfinite(values).all(axis=0))
+
+
+def _between(samples: Samples, begin_s: float, end_s: float) -> slice:
+    count = max(values.size for values in samples.channels.values())
+    first = round((begin_s - samples.start_s) * samples.rate_hz)
+    last = round((end_s - samples.start_s) * samples.rate_hz)
+    first = min(max(first, 0), count)
+    return slice(first, min(max(last, first), count))

@@ -1,0 +1,128 @@
+"""What else could be done at a site: other tyres, loads, lanes, speeds, sensors, elements.
+
+Each alternative is the plan with one thing changed, so that its gain can be read beside it.
+"""
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from schemas.site import Bridge, Site, Vehicle
+from services.identification.checks import axle_loads_kg, loads_are_alike
+from services.planning.crossings import Crossing, axles_of
+
+SPREAD: Final = 0.15
+"""Speeds of a survey lie so far about the planned one, to either side."""
+_LIGHTER, _HEAVIER = 0.4, 1.5
+"""What the springs carry of an emptied and of a loaded truck, over what they carry as planned."""
+_QUIETER: Final = 0.25
+_ELEMENTS: Final = (5, 3)
+_MOVED: Final = 0.12
+"""Of the wheelbase: so far the load goes to the heavier axle where both carry alike."""
+
+
+class Plan(NamedTuple):
+    """Crossings of equal number each; those of one tuple run in one track."""
+
+    name: str
+    tracks: tuple[tuple[Crossing, ...], ...]
+
+    @property
+    def site(self) -> Site:
+        """Whose elements and tyres are those of the plan."""
+        return self.tracks[0][0].site
+
+
+def as_planned(site: Site, speed_m_per_s: float) -> Plan:
+    """One truck in one lane and one direction, at speeds about the planned one."""
+    return Plan("as planned", (_spread(site, speed_m_per_s),))
+
+
+def alternatives(site: Site, speed_m_per_s: float) -> Iterator[Plan]:
+    """Each with one thing changed, as far as this site leaves it open."""
+    vehicle, bridge = site.vehicles[0], site.bridges[0]
+    front, rear = axles_of(vehicle)
+    planned = _spread(site, speed_m_per_s)
+    is_equal = rear._replace(offset_m=front.offset_m) == front
+    if not is_equal or front.twin_distance_m > 0.0:
+        yield Plan(
+            "equal single tyres on both axles",
+            (_spread(with_tyres(site, "single"), speed_m_per_s),),
+        )
+    for factor in (_LIGHTER, _HEAVIER):
+        loaded = _with_vehicle(site, _carrying(vehicle, factor))
+        other = loaded.vehicles[0].total_mass_kg / 1e3
+        yield Plan(
+            f"half of the runs at {other:.1f} t", ((*planned, *_spread(loaded, speed_m_per_s)),)
+        )
+    if loads_are_alike(vehicle):
+        yield Plan(
+            "load moved to the heavier axle",
+            (_spread(_with_vehicle(site, _moved(vehicle)), speed_m_per_s),),
+        )
+    yield Plan(
+        "half of the runs the other way",
+        (planned, tuple(crossing._replace(forward=False) for crossing in planned)),
+    )
+    quiet = tuple(_QUIETER * density for density in site.sensor.noise_density_ug_per_rthz)
+    yield Plan(
+        "sensors of a quarter of the noise", (_spread(with_noise(site, quiet), speed_m_per_s),)
+    )
+    for elements in _ELEMENTS:
+        if len(bridge.lengths_of_spans_m) <= elements < bridge.elements:
+            coarser = site.model_copy(update={"bridges": (_coarser(bridge, elements),)})
+            yield Plan(f"{elements} elements", (_spread(coarser, speed_m_per_s),))
+
+
+def with_tyres(site: Site, behind: str) -> Site:
+    """Single tyres in front, and `behind` single ones like them or usual twins."""
+    vehicle = site.vehicles[0]
+    width = (vehicle.tyre_width_m or (0.25, 0.25))[0]
+    twin = behind == "twin"
+    changed = {
+        "twin_tyre_distance_m": (0.0, 0.33 if twin else 0.0),
+        "tyre_width_m": (width, 0.22 if twin else width),
+    }
+    return _with_vehicle(site, vehicle.model_copy(update=changed))
+
+
+def with_noise(site: Site, densities_ug_per_rthz: tuple[float, ...]) -> Site:
+    """Other sensors."""
+    changed = {"noise_density_ug_per_rthz": densities_ug_per_rthz}
+    return site.model_copy(update={"sensor": site.sensor.model_copy(update=changed)})
+
+
+def _spread(site: Site, speed_m_per_s: float) -> tuple[Crossing, ...]:
+    return tuple(
+        Crossing(site, round(factor * speed_m_per_s, 2)) for factor in (1.0 - SPREAD, 1.0 + SPREAD)
+    )
+
+
+def _with_vehicle(site: Site, vehicle: Vehicle) -> Site:
+    return site.model_copy(update={"vehicles": (vehicle, *site.vehicles[1:])})
+
+
+def _carrying(vehicle: Vehicle, factor: float) -> Vehicle:
+    """The truck with so many times the load on its springs, its place unchanged."""
+    total = sum(vehicle.unsprung_mass_kg) + factor * vehicle.sprung_mass_kg
+    return vehicle.model_copy(update={"total_mass_kg": round(total, 1)})
+
+
+def _moved(vehicle: Vehicle) -> Vehicle:
+    front, rear = axle_loads_kg(vehicle)
+    sign = 1.0 if rear >= front else -1.0
+    place = vehicle.front_axle_to_cg_m + sign * _MOVED * vehicle.wheelbase_m
+    place = min(max(place, 0.05 * vehicle.wheelbase_m), 0.95 * vehicle.wheelbase_m)
+    return vehicle.model_copy(update={"front_axle_to_cg_m": round(place, 3)})
+
+
+def _coarser(bridge: Bridge, elements: int) -> Bridge:
+    """The same bridge with fewer elements, alike within each span."""
+    rigidity = sum(bridge.nominal_flexural_rigidity_nm2) / bridge.elements
+    return bridge.model_copy(
+        update={
+            "elements": elements,
+            "element_lengths_m": None,
+            "flexural_rigidity_nm2": rigidity,
+            "flexural_rigidity_per_element_nm2": None,
+        }
+    )

@@ -1,0 +1,81 @@
+"""`driveby check` from its arguments to its exit codes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from services.cli import main as cli
+
+
+def test_the_sample_is_in_order(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", str(project / "recordings/sample/crossing.mcap")]) == 0
+    out = capsys.readouterr().out
+    lines = out.splitlines()
+    assert lines[0].endswith("crossing.mcap: site.toml")
+    assert [line for line in lines if line.startswith("  wrong")] == []
+    assert "unsprung_rear: noise 25" in out
+    assert "bridge-1, start to end: 27 m recorded before it" in out
+    assert lines[-1] == "0 wrong, 1 open"
+
+
+def test_another_site_file_and_json(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (project / "docs/site.example.toml").read_text(encoding="utf-8")
+    site = tmp_path / "site.toml"
+    site.write_text(text.replace("wheelbase_m = 4.4", "wheelbase_m = 5.2"), encoding="utf-8")
+    sample = str(project / "recordings/sample/crossing.mcap")
+    assert cli.main(["check", str(site), sample, "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["is_wrong"]
+    assert [report["source"] for report in found["reports"]] == [
+        str(site),
+        f"{sample}, run 1 of truck-1",
+    ]
+    wrong = [
+        finding["name"]
+        for report in found["reports"]
+        for finding in report["findings"]
+        if finding["state"] == "wrong"
+    ]
+    assert wrong == ["wheelbase"]
+
+
+def test_a_folder_of_csv_files(csv_example: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = cli.main(["check", str(csv_example)])
+    out = capsys.readouterr().out
+    assert code == int("  wrong" in out)
+    assert f"{csv_example}/site.toml" in out
+    assert f"{csv_example}, run 1 of" in out
+
+
+def test_many_runs_are_told_briefly(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = shared / "crossings" / "d3_edge_damage_4_runs"
+    assert cli.main(["check", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert out.count("others (--json has all)") == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.mcap"], "nowhere.mcap"),
+        (["{site}", "{site}"], "a second site file"),
+        (["{empty}"], "holds no site.toml"),
+        (["{site}", "{empty}"], "holds no accel_NN.csv"),
+        ([], "are required"),
+    ],
+)
+def test_bad_input(
+    arguments: list[str],
+    message: str,
+    project: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    names = {"site": str(project / "docs/site.example.toml"), "empty": str(tmp_path)}
+    assert cli.main(["check", *(a.format(**names) for a in arguments)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1

@@ -1,0 +1,145 @@
+"""`driveby survey` from its arguments to its files: one plan, and what is refused."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+
+from services.cli import main as cli
+from services.cli.survey import lines_of
+from services.planning import survey as planning
+from services.planning.advice import advice, warnings
+from services.planning.alternatives import as_planned, with_noise
+from services.planning.crossings import Road
+from services.planning.figure import draw_survey
+from services.planning.survey import Asked, Expected, Outlook, Survey
+from services.simulation.drive import paper_site
+from services.viewer.drawing import STYLE
+from tests.unit.words import assert_words_apart
+
+
+def test_a_plan_of_the_example(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Twin tyres on the best class of road: blind at midspan, and single ones are what helps."""
+    found, picture = tmp_path / "plan.json", tmp_path / "plan.png"
+    arguments = ["survey", "--site", str(project / "docs/site.example.toml"), "--speed", "10"]
+    assert cli.main([*arguments, "--json", str(found), "--figure", str(picture)]) == 0
+    out = capsys.readouterr().out
+    plan = json.loads(found.read_text(encoding="utf-8"))
+    assert picture.stat().st_size > 10_000
+    planned = plan["planned"]["all_crossings"]
+    assert 0.06 < planned["level_std"] < 0.16
+    assert planned["probability_seen"][3] < 0.2
+    assert plan["planned"]["crossings_needed"]["middle"] is None
+    single = {one["name"]: one for one in plan["alternatives"]}["equal single tyres on both axles"]
+    assert single["all_crossings"]["probability_seen"][3] > 0.9
+    assert single["crossings_needed"]["middle"] < 30
+    once, whole = (plan["planned"][key]["std_ln_ei"] for key in ("one_crossing", "all_crossings"))
+    assert np.median(whole) < np.median(once)
+    assert "What helps most: equal single tyres on both axles" in plan["advice"]
+    assert plan["advice"] in out
+    assert "nothing is known of the tyres" in out
+    assert plan["speeds"] == []
+    table = [line for line in out.splitlines() if not line.startswith(("warning", "Not even"))]
+    assert max(len(line) for line in table) <= 80
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--speed", "20:5"], "SLOWEST:FASTEST"),
+        (["--loss", "1.5"], "a share of EI from 0.01 to 0.95"),
+        (["--crossings", "0"], "a number of crossings"),
+        (["--figure", "plan.gif"], ".png or .svg"),
+        (["--road", "F"], "invalid choice"),
+    ],
+)
+def test_what_is_refused(
+    project: Path, arguments: Sequence[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = str(project / "docs/site.example.toml")
+    assert cli.main(["survey", "--site", site, *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def expected(std: float, crossings: int = 12) -> Expected:
+    wide = np.full(7, std)
+    return Expected(crossings, wide, std / 3.0, wide, wide, np.minimum(0.9, 3.0 * wide))
+
+
+def made_up(needed: int | None, others: dict[str, float], speed: float = 10.0) -> Survey:
+    site = with_noise(paper_site(), (25.0,) * 4)
+    plan = as_planned(site, speed)
+    planned = Outlook(plan, expected(0.3, 1), expected(0.2), 3, needed, None)
+    return Survey(
+        Asked(0.2, 12, speed, (speed, speed)),
+        Road("A", 0.12),
+        planned,
+        tuple(
+            Outlook(plan._replace(name=name), expected(std, 1), expected(std), 3, 4, 60)
+            for name, std in others.items()
+        ),
+        (),
+        None,
+        tuple(expected(0.3 / np.sqrt(n), n) for n in (1, 12, 300)),
+        40.0,
+    )
+
+
+def test_the_advice_names_what_helps_most() -> None:
+    found = made_up(9, {"a trailer": 0.19, "two trucks": 0.1, "a slower truck": 0.15})
+    text = advice(found)
+    assert text.startswith("9 crossings at 10 m/s with twin tyres behind show a 20% loss")
+    assert "the ends would take more than 300" in text
+    assert "What helps most: two trucks; then 4 crossings do, and the ends need 60." in text
+    assert "Next: a slower truck" in text
+    assert "a trailer" not in text
+    # Fewer elements are another question, not a better truck.
+    coarse = made_up(9, {"a trailer": 0.15, "3 elements": 0.05})
+    bridge = coarse.planned.plan.site.bridges[0].model_copy(update={"elements": 3})
+    site = coarse.planned.plan.site.model_copy(update={"bridges": (bridge,)})
+    few = coarse.others[1]._replace(plan=as_planned(site, 10.0))
+    assert "most: a trailer" in advice(coarse._replace(others=(coarse.others[0], few)))
+    blind = advice(made_up(None, {"a trailer": 0.199}))
+    assert blind.startswith("Not even 300 crossings")
+    assert "60% or more" in blind
+    assert blind.endswith("Nothing else that was tried here helps by much.")
+
+
+def test_what_makes_a_survey_blind_is_warned_of() -> None:
+    usual = list(warnings(made_up(9, {})))
+    assert not [line for line in usual if "3 m/s" in line and "rejected" in line]
+    slow = list(warnings(made_up(9, {}, 2.5)))
+    assert [line for line in slow if "below 3 m/s a crossing is rejected" in line]
+    short = list(warnings(made_up(9, {})._replace(compared_m=8.0)))
+    assert [line for line in short if "8 m of road beside the bridge" in line]
+
+
+def test_every_word_of_the_picture_can_be_read() -> None:
+    with matplotlib.rc_context(STYLE):
+        assert_words_apart(draw_survey(made_up(9, {})))
+
+
+def test_lines_fit_on_a_terminal() -> None:
+    found = made_up(None, {"half of the runs the other way": 0.2})
+    tables = [line for line in lines_of(found) if not line.startswith(("warning", "Not even"))]
+    assert max(map(len, tables)) <= 80
+
+
+def test_needed_is_the_fewest() -> None:
+    def errors_of(crossings: int) -> planning.detection.Errors:
+        std = np.full(3, 0.5 / np.sqrt(crossings))
+        return planning.detection.Errors(std, std)
+
+    needed = planning._needed(errors_of, 0.2, (1,))
+    assert needed is not None
+    probability = planning.detection.probability
+    assert probability(0.2, errors_of(needed).of_nominal)[1] >= 0.95
+    assert probability(0.2, errors_of(needed - 1).of_nominal)[1] < 0.95
+    assert planning._needed(errors_of, 0.01, (1,)) is None

@@ -1,0 +1,80 @@
+"""What else could be done at a site, and that nothing else is changed by it."""
+
+import pytest
+
+from schemas.site import Bridge, Site
+from services.identification.checks import axle_loads_kg
+from services.planning.alternatives import Plan, alternatives, as_planned, with_noise, with_tyres
+from services.planning.crossings import axles_of
+from services.planning.survey import middle_element
+from services.simulation.drive import paper_site
+
+
+def named(site: Site) -> dict[str, Plan]:
+    return {plan.name: plan for plan in alternatives(site, 10.0)}
+
+
+def test_the_plan_drives_at_speeds_about_the_one_asked_for() -> None:
+    ((slow, fast),) = as_planned(paper_site(), 10.0).tracks
+    assert (slow.speed_m_per_s, fast.speed_m_per_s) == (8.5, 11.5)
+    assert slow.site == paper_site()
+
+
+def test_single_tyres_are_proposed_only_where_there_are_others() -> None:
+    name = "equal single tyres on both axles"
+    single = named(paper_site())[name].site
+    front, rear = axles_of(single.vehicles[0])
+    assert rear._replace(offset_m=front.offset_m) == front
+    assert name not in named(single)
+    assert name in named(with_tyres(paper_site(), "twin"))
+
+
+def test_other_loads_change_nothing_but_the_mass() -> None:
+    site = paper_site()
+    plans = [plan for name, plan in named(site).items() if name.startswith("half of the runs at")]
+    masses = []
+    for plan in plans:
+        (crossings,) = plan.tracks  # one track: the mismatch does not depend on the load
+        assert [one.site == site for one in crossings] == [True, True, False, False]
+        other = crossings[2].site.vehicles[0]
+        masses.append(other.total_mass_kg)
+        same = other.model_copy(update={"total_mass_kg": site.vehicles[0].total_mass_kg})
+        assert same == site.vehicles[0]
+    assert masses == pytest.approx([1220.0 + 0.4 * 8310.0, 1220.0 + 1.5 * 8310.0])
+
+
+def test_the_way_back_is_in_another_track() -> None:
+    there, back = named(paper_site())["half of the runs the other way"].tracks
+    assert [one.forward for one in (*there, *back)] == [True, True, False, False]
+
+
+def test_alike_axles_are_loaded_otherwise() -> None:
+    site = paper_site()
+    assert "load moved to the heavier axle" not in named(site)
+    alike = site.vehicles[0].model_copy(update={"front_axle_to_cg_m": 2.1})
+    plan = named(site.model_copy(update={"vehicles": (alike,)}))["load moved to the heavier axle"]
+    front, rear = axle_loads_kg(plan.site.vehicles[0])
+    assert abs(front - rear) > 0.1 * (front + rear)
+
+
+def test_fewer_elements_end_at_the_supports_all_the_same() -> None:
+    bridge = paper_site().bridges[0]
+    spans = Bridge.model_validate(
+        bridge.model_dump() | {"interior_supports_m": (12.0,), "elements": 8}
+    )
+    site = paper_site().model_copy(update={"bridges": (spans,)})
+    coarse = named(site)["3 elements"].site.bridges[0]
+    assert coarse.elements == len(coarse.lengths_m) == 3
+    assert any(abs(sum(coarse.lengths_m[:k]) - 12.0) < 1e-9 for k in (1, 2))
+    assert middle_element(bridge) == 3
+    assert middle_element(coarse) == 1
+    small = spans.model_copy(update={"elements": 3})
+    few = named(site.model_copy(update={"bridges": (small,)}))
+    assert not [name for name in few if name.endswith("elements")]
+
+
+def test_quieter_sensors() -> None:
+    quiet = named(with_noise(paper_site(), (8.0, 8.0, 4.0, 4.0)))[
+        "sensors of a quarter of the noise"
+    ]
+    assert quiet.site.sensor.noise_density_ug_per_rthz == (2.0, 2.0, 1.0, 1.0)
