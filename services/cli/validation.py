@@ -40,6 +40,34 @@ EFFECTS: Final = (
 """As in `simulation.worlds`, which is not imported for a line of help."""
 
 
+KINDS: Final = (
+    "steady",
+    "changing-2",
+    "changing-5",
+    "twin",
+    "single-5",
+    "single-10",
+    "loaded-and-empty",
+    "two-trucks",
+    "both-ways",
+    "five-elements",
+    "three-elements",
+    "everything",
+)
+"""As in `validation.surveys`, which is not imported for a line of help."""
+
+
+def _kinds(text: str) -> tuple[str, ...]:
+    if text == "all":
+        return KINDS
+    for name in names(text):
+        if name not in KINDS:
+            raise argparse.ArgumentTypeError(
+                f'is "{text}", it must be all or some of {", ".join(KINDS)}'
+            )
+    return tuple(dict.fromkeys(names(text)))
+
+
 def _effects(text: str) -> tuple[str, ...]:
     if text == "all":
         return EFFECTS
@@ -111,7 +139,22 @@ def add_validate(commands: Any) -> None:
         type=Path,
         default=Path("build/worlds.jsonl"),
         metavar="FILE.jsonl",
-        help="what --worlds has run is kept here and not run again (default: build/worlds.jsonl)",
+        help="what --worlds or --surveys has run is kept here and not run again "
+        "(default: build/worlds.jsonl)",
+    )
+    p.add_argument(
+        "--surveys",
+        type=whole("a number of surveys", 0),
+        default=0,
+        help="of 8 to 16 crossings, of each of --kinds, fused; nothing else is run then "
+        "(default: 0)",
+    )
+    p.add_argument(
+        "--kinds",
+        type=_kinds,
+        default=KINDS,
+        metavar="all|twin,steady,…",
+        help=f"of {', '.join(KINDS)} (default: all)",
     )
     p.add_argument(
         "--truth",
@@ -125,6 +168,17 @@ def add_validate(commands: Any) -> None:
 
 
 def _validate(options: argparse.Namespace) -> int:
+    if options.method == "pre" and options.surveys:
+        from services.cli.validate_surveys import validate_surveys_command
+
+        return validate_surveys_command(
+            surveys=options.surveys,
+            kinds=options.kinds,
+            records=options.records,
+            site=options.site,
+            processes=options.processes,
+            console=a_console(),
+        )
     if options.method == "pre":
         from services.cli.validate_pre import validate_pre_command
 

@@ -1,0 +1,57 @@
+"""`driveby validate --method pre --surveys N`: whole surveys driven, fused, beside the truth."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from schemas.site_file import load_site
+from services.common.files import make_folder
+from services.common.progress import progress_bar
+from services.simulation.drawn import default_site
+from services.validation.surveys import HEADINGS, fused_surveys, rows, run_surveys, survey_checks
+from services.validation.worlds import read_records
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def validate_surveys_command(
+    *,
+    surveys: int,
+    kinds: tuple[str, ...],
+    records: Path,
+    site: Path | None,
+    processes: int,
+    console: "Console",
+) -> int:
+    """Drive what the records lack, fuse, print a line for each kind; 1 if an aim was missed."""
+    from rich.table import Table
+
+    read_records(records)
+    make_folder(records.parent)
+    known = default_site() if site is None else load_site(site)
+    with progress_bar(console) as bar:
+        task = bar.add_task("crossings", total=None)
+        found = run_surveys(
+            known,
+            kinds,
+            surveys,
+            records,
+            processes,
+            lambda done, jobs: bar.update(task, completed=done, total=jobs),
+        )
+    fused = fused_surveys(found)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for k, heading in enumerate(HEADINGS):
+        table.add_column(heading, justify="left" if k == 0 else "right", no_wrap=True)
+    for row in rows(fused):
+        table.add_row(*row)
+    console.print(table)
+    checks = survey_checks(fused)
+    for check in checks:
+        if not check.is_met:
+            measured = "none" if check.measured is None else f"{check.measured:.2f}"
+            console.print(
+                f"missed: {check.name} {measured}, {check.low:g} to {check.high:g} was aimed at",
+                highlight=False,
+            )
+    return 0 if all(check.is_met for check in checks) else 1
