@@ -10,6 +10,9 @@ put half a metre too far can be explained almost as well by other rigidities. So
    downhill to the right place;
 3. frees everything from the best place, and from the next best ones if that does not fit, unless
    it fits so badly that no place would.
+
+Longer than other modules: the steps are one way, and every threshold that was measured stands above
+the step that it decides.
 """
 
 from collections.abc import Callable
@@ -73,7 +76,7 @@ _ENOUGH_ON_TWO_ROADS = 0.5
 """A gain in the sum of squares that is not worth another step there: what is left to find is far
 within the width of what is hardly known."""
 _UNTOLD = 0.3
-"""Of what a data sheet leaves open: a direction that is not known better tells nothing."""
+"""A direction that is not known to this share of what a data sheet leaves open tells nothing."""
 _SAME_LEVEL = 0.1
 """A level of noise that changes by less than this part is settled."""
 _WALK_TEMPERATURE = 3.0
