@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 _GRID_M = 0.1
 _APART_M = 0.5
-"""Of the second difference by which the common share is read: waves of half a metre to two."""
+"""Step of the second difference by which the common share is read: waves of half a metre to two."""
 _WANDERS_M, _HALVINGS = (0.01, 1.0), 12
 _LAG_M = 0.01
 _JITTER = 1e-6
@@ -34,7 +34,7 @@ class Fused(NamedTuple):
 
     draws: FloatArray  # (n, chains, b): the bridge's, elements last
     common_share: float
-    """Of the mismatch's power at waves of 20 m."""
+    """What all runs have in common of the mismatch's power at waves of 20 m."""
     wander_m: float | None
     """How far the runs' tracks lie beside each other; None where that does not matter."""
     level_m3: FloatArray  # (s,)

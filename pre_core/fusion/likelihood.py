@@ -45,7 +45,10 @@ def knots(begin_m: float, end_m: float) -> FloatArray:
 
 
 def likelihood(found: Optimum, own: Mismatch, knots_m: FloatArray | None = None) -> Likelihood:
-    """Of a crossing at its optimum, `own` being its own part of the mismatch at its own speed."""
+    """Return that of a crossing at its optimum.
+
+    `own` is its own part of the mismatch, at its own speed.
+    """
     y = found.state.y
     apart = found.problem._replace(mismatch=own)
     problem = with_noise_at(apart, y, found.problem.force, mismatch=own.level_m3)
