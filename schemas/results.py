@@ -105,7 +105,8 @@ class RoadMismatch(_Fields):
     A_m3: Annotated[Finite, Field(gt=0)]
     n_0_per_m: Annotated[Finite, Field(gt=0)]
     common_share: Annotated[Finite, Field(ge=0, le=1)] | None = None
-    """Of its power, what all runs of the truck in one track have in common; of one run unknown."""
+    """What all runs of the truck in one track have in common, a share of its power; of one run
+    unknown."""
 
 
 class Road(_Fields):

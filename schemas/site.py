@@ -112,7 +112,7 @@ class Vehicle(_Spreadable):
     tyre_damping_ns_per_m: NotNegativePair = (0.0, 0.0)
     """Zero: not known (see `scale_at_zero`)."""
     tyre_width_m: PositivePair | None = None
-    """Of the tread; with the next four, by how much the road differs from axle to axle."""
+    """Widths of the tread; with the next four, by how much the road differs from axle to axle."""
     tyre_contact_length_m: PositivePair | None = None
     twin_tyre_distance_m: NotNegativePair | None = None
     """Between the middles of twin tyres; 0 for single ones."""

@@ -30,8 +30,8 @@ _SETTLING = 500
 _SWEEPS = 60
 """From one draw to the next: an element is known by what its neighbours are not."""
 LEANING_SPREAD = 0.25
-"""Of what is taken off the slope for the mismatch: its level is known to 15 %, the tyres' widths
-and distance as little."""
+"""What is taken off the slope for the mismatch is known to this share: its level to 15 %, the
+tyres' widths and distance as little."""
 _SLICE_WIDTH = 1.0
 _MOST_WIDENINGS = 12
 
@@ -78,7 +78,7 @@ def compliances(found: Optimum, inflation: float) -> Compliances:
 
 
 def without_priors(problem: Problem, rows: int, places: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of so many `rows` of the posterior those that are not the priors of some places in y."""
+    """Return which of so many `rows` of the posterior are not the priors of some places in y."""
     # Rows of the priors come last, in the order of y up to the trajectory.
     return np.setdiff1d(np.arange(rows), rows - layout(problem).trajectory.start + places)
 
@@ -119,7 +119,7 @@ def of_normal(
     centre: FloatArray,
     leaning: FloatArray,
 ) -> Compliances:
-    """Of a normal (f,) with c at `elements`, times their priors, cut off at zero at `cut_off`.
+    """Return those of a normal (f,), c at `elements`, times their priors, cut off at `cut_off`.
 
     `log_odds` (f,) as in `posterior.log_odds_of_absence`.
     """

@@ -53,7 +53,7 @@ class Shapes(NamedTuple):
 
     cycles_per_m: FloatArray
     density: FloatArray
-    """Of d, windowed."""
+    """The spectrum of d, windowed."""
     leaning: FloatArray
     """Cross spectrum of what the front axle feels with d: (s, g). The rear's is that less d's."""
     footprints: tuple[Footprint, Footprint]
@@ -74,7 +74,7 @@ class Mismatch(NamedTuple):
 
 @lru_cache(maxsize=8)
 def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
-    """Of tyres unlike each other, and of one axle beside the other."""
+    """Return what tyres unlike each other leave, and one axle beside the other."""
     grid = _above_zero()
     density, leaning, expected = [], [], []
     for (one, other), larger in zip(

@@ -10,6 +10,9 @@ put half a metre too far can be explained almost as well by other rigidities. So
    downhill to the right place;
 3. frees everything from the best place, and from the next best ones if that does not fit, unless
    it fits so badly that no place would.
+
+Longer than other modules: the steps are one way, and every threshold that was measured stands above
+the step that it decides.
 """
 
 from collections.abc import Callable

@@ -96,7 +96,7 @@ class Problem(NamedTuple):
     force: FloatArray
     """(2, shapes) noise of springs and dampers, N²/Hz; see whitening.py."""
     mismatch: Mismatch
-    """Of the roads under both axles; without level where they are taken for the same."""
+    """How the roads under both axles differ; without level where they are taken for the same."""
     basis_position: FloatArray  # (n, b): trajectory = basis @ coefficients
     basis_acceleration: FloatArray  # (n, b), positive when speeding up
     receiver_rows: FloatArray  # (r, b + 1): rows of (coefficients, offset)

@@ -7,6 +7,9 @@ road under the front wheel when it was at the same place; the front body equatio
 moment too, so that the noise of all three residuals of a row meets at no delay. All of it happens
 at the model's own rate (channels.py), in which every signal is smooth; the rows are then made white
 (whitening.py).
+
+Longer than other modules: an evaluation is a chain of kernels over the same work arrays, and numba
+sees that a kernel has changed only where it stands in the same file.
 """
 
 from collections.abc import Callable

@@ -23,6 +23,9 @@ that the rows' covariance vanishes beyond it and the filter's length.
 
 Where the two axles do not feel the same road, their difference is noise of the mismatch alone
 (`crossing.mismatch`).
+
+Longer than other modules: filter, levels of noise and covariance are all made of the responses
+above, which stand once.
 """
 
 from typing import NamedTuple
@@ -70,7 +73,7 @@ _FORCE_MEMORY_S = 0.3
 """Its covariance ends here, which is what makes the bumps as wide as they are."""
 """Rounds of the multiplicative fit of the spectrum, a fixed number."""
 _MIDDLE_BAND, _TOP_BAND = (0.22, 0.54), (0.65, 0.757)
-"""Of half the rows' rate: 12 to 30 and 36 to 42 Hz of sensors of 250 Hz and more."""
+"""Shares of half the rows' rate: 12 to 30 and 36 to 42 Hz of sensors of 250 Hz and more."""
 _EVENLY = 3.0
 """Noise of two to ten times the declared density has up to 1.6 times as much in the middle as at
 the top before the truck is found; springs that rub, bilinear dampers and roads that differ 4 to

@@ -2,8 +2,10 @@
 
 A `Lanes` is a tuple of four floats, one for each of four particles (or four modes). Written this
 way, numba's compiler keeps each tuple in one 256-bit register, which it does not manage for short
-inner loops over arrays. All functions are inlined; none allocates.
+inner loops over arrays. None of the functions allocates.
 """
+
+from functools import partial
 
 import numpy as np
 from numba import njit
@@ -14,12 +16,17 @@ Lanes = tuple[float, float, float, float]
 
 LANES = 4
 
+# A kernel that calls another one holds a copy of it, optimised once more with it: rounded otherwise
+# than the first one. Which of them is run, where it is not inlined, depends on which was loaded
+# first; a process that compiled gave other last digits than one that loaded. So all are inlined.
+_compiled = partial(njit, error_model="numpy", cache=True, nogil=True, forceinline=True)
+
 # Contraction allows fused multiply-add; no other reordering of the arithmetic is allowed, so that
 # results depend only to rounding on which particles are evaluated together.
-kernel = njit(fastmath={"contract", "nsz"}, error_model="numpy", cache=True, nogil=True)
+kernel = _compiled(fastmath={"contract", "nsz"})
 
 # For sums over many terms, which may be taken in any order.
-summing = njit(fastmath={"contract", "nsz", "reassoc"}, error_model="numpy", cache=True, nogil=True)
+summing = _compiled(fastmath={"contract", "nsz", "reassoc"})
 
 
 @kernel

@@ -34,11 +34,11 @@ class Footprint(NamedTuple):
     """Where an axle stands on the road, in m."""
 
     width_m: float = 0.25
-    """Of a tyre's tread."""
+    """Width of a tyre's tread."""
     twin_distance_m: float = 0.0
     """Between the middles of twin tyres; 0 for single ones."""
     length_m: float = 0.2
-    """Of the contact patch."""
+    """Length of the contact patch."""
     track_m: float = 1.9
     """Between the middles of the wheels of both sides."""
     offset_m: float = 0.0

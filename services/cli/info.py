@@ -14,9 +14,9 @@ from services.common.errors import InputError
 if TYPE_CHECKING:
     from services.drives.survey import Gap, Passing, Survey, Truck
 
-_NS_PER_S: Final = 1_000_000_000
+_NS_PER_S: Final = 1_000_000_000  # schemas.signals has it too, and takes numpy to import
 _MOST_LINES: Final = 20
-"""Of gaps and of crossings of one recording, for people."""
+"""So many gaps and crossings of one recording are listed for people."""
 
 
 def add_info(commands: Any) -> None:

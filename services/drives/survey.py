@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple, TypeVar
 
-from schemas.signals import GnssFix, decode_accel, decode_gnss
+from schemas.signals import NS_PER_S, GnssFix, decode_accel, decode_gnss
 from schemas.site import Site
 from schemas.site_file import parse_site
 from schemas.topics import Key, topic
@@ -24,7 +24,6 @@ from services.recordings.recording import Message, RecordingInfo, read_info
 
 LONGEST_SILENCE_S = 1.0
 """A truck sends batches of 50 to 100 ms: a stream that says nothing for longer has a gap."""
-_NS_PER_S = 1_000_000_000
 
 T = TypeVar("T")
 
@@ -84,7 +83,7 @@ class Survey(NamedTuple):
     site_error: str | None
     """Why the site file in it cannot be used, in one line."""
     first_ns: int
-    """Of what was measured: a latched message may be hours older than the file."""
+    """When the first thing was measured: a latched message may be hours older than the file."""
     last_ns: int
     trucks: tuple[Truck, ...]
     gaps: tuple[Gap, ...]
@@ -203,7 +202,7 @@ def _stream(name: str, heards: list[_Heard]) -> Stream:
     return Stream(
         sum(heard.sequences.size for heard in heards),
         sum(b - a + 1 for heard in heards for a, b in heard.sequences.holes()),
-        _NS_PER_S / median(steps) if has_rate else None,
+        NS_PER_S / median(steps) if has_rate else None,
     )
 
 
@@ -217,7 +216,7 @@ def _gaps(streams: dict[tuple[Key, int], _Heard]) -> tuple[Gap, ...]:
         found += [
             Gap(where.identifier, where.stream, before, after)
             for before, after in pairwise(times)
-            if after - before > LONGEST_SILENCE_S * _NS_PER_S
+            if after - before > LONGEST_SILENCE_S * NS_PER_S
         ]
     return tuple(sorted(found, key=lambda gap: (gap.begin_ns, gap.vehicle, gap.stream)))
 

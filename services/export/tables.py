@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.signals import NS_PER_S
 from services.common.files import replaced_atomically, write_atomically
 
 Format = Literal["csv", "parquet"]
@@ -49,7 +50,7 @@ def _csv_text(table: Table) -> str:
 def _cells(name: str, column: Column) -> list[Any]:
     values = column.tolist() if isinstance(column, np.ndarray) else list(column)
     if name.endswith("_ns"):
-        return [f"{ns // 1_000_000_000}.{ns % 1_000_000_000:09d}" for ns in values]
+        return [f"{ns // NS_PER_S}.{ns % NS_PER_S:09d}" for ns in values]
     if isinstance(column, np.ndarray) and column.dtype.kind == "f":
         return ["" if value != value else value for value in values]
     return ["" if value is None else value for value in values]

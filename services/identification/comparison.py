@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.constants import NORMAL_975
 from schemas.results import BridgeResult
 
 Floats = NDArray[np.float64]
@@ -19,8 +20,7 @@ Floats = NDArray[np.float64]
 CLEAR_LOSS = 0.1
 """An element is called weak if its whole interval lies below 1 less this."""
 _FEWEST_ELEMENTS = 3
-"""Of two elements nobody can say which one is the sound one."""
-_NORMAL_975 = 1.959963984540054
+"""With two elements nobody can say which one is the sound one."""
 
 
 class Estimate(NamedTuple):
@@ -113,7 +113,7 @@ def compare(
     else:
         others = np.array([np.delete(relative, n) for n in range(count)])
         ratio = relative / np.median(others, axis=1)
-        common = _NORMAL_975 * estimate.scale_error
+        common = NORMAL_975 * estimate.scale_error
         below, above = _without(below, common), _without(above, common)
         widths = np.array([np.delete(np.maximum(below, above), n) for n in range(count)])
         more = 1.25 * np.median(widths, axis=1) / np.sqrt(count - 1)

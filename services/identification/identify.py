@@ -58,7 +58,7 @@ SLOWEST_M_PER_S = 3.0
 _JUDGED_ASIDE_S = 1.0
 """Signals are judged so far before and behind the bridge, where thresholds were found."""
 _SLOW_SHARE = 0.4
-"""Of the speed on the bridge: slower than this the road on either side is not looked at."""
+"""Slower than this share of the speed on the bridge the road on either side is not looked at."""
 _LONGEST_OUTAGE_S = 8.0
 """So long without a fix the trajectory may be found from the axles' signals, by method `pre`."""
 

@@ -43,7 +43,7 @@ class Statistics(NamedTuple):
     """Under the names that they were given."""
     rounds: int
     drive_s: float
-    """Of the drive, all rounds together."""
+    """How much of the drive was published, all rounds together."""
     took_s: float
     jumped_over: int
     """Messages left out by jumps to a crossing."""

@@ -5,12 +5,11 @@ from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
+from schemas.signals import NS_PER_S
 from schemas.topics import Key, topic
 from services.common.errors import InputError
 from services.common.naming import checked_identifier
 from services.recordings.together import Timed
-
-_NS_PER_S = 1_000_000_000
 
 
 class Choice(NamedTuple):
@@ -44,7 +43,7 @@ def window_of(choice: Choice, first_ns: int, last_ns: int) -> Window:
     begin_ns = _moment("--start", choice.start, first_ns, last_ns) or first_ns
     end_ns = _moment("--end", choice.end, first_ns, last_ns)
     if choice.duration_s is not None:
-        end_ns = begin_ns + round(choice.duration_s * _NS_PER_S)
+        end_ns = begin_ns + round(choice.duration_s * NS_PER_S)
     if end_ns is None:
         end_ns = last_ns + 1
     if end_ns <= begin_ns:
@@ -142,12 +141,12 @@ def _moment(option: str, text: str | None, first_ns: int, last_ns: int) -> int |
     if text is None:
         return None
     try:
-        moment_ns = first_ns + round(float(text) * _NS_PER_S)
+        moment_ns = first_ns + round(float(text) * NS_PER_S)
     except (ValueError, OverflowError):
         moment_ns = _utc_ns(option, text)
     if not first_ns <= moment_ns <= last_ns + 1 and (option == "--start" or moment_ns < first_ns):
         raise InputError(
-            f"{option}: is {text}, but the drive lasts {(last_ns - first_ns) / _NS_PER_S:.1f} s, "
+            f"{option}: is {text}, but the drive lasts {(last_ns - first_ns) / NS_PER_S:.1f} s, "
             f"from {utc_text(first_ns)} to {utc_text(last_ns)}"
         )
     return moment_ns
@@ -167,5 +166,5 @@ def _utc_ns(option: str, text: str) -> int:
 
 def utc_text(time_ns: int) -> str:
     """A time in UTC to the millisecond, as `--start` takes it."""
-    moment = datetime.fromtimestamp(time_ns / _NS_PER_S, UTC)
+    moment = datetime.fromtimestamp(time_ns / NS_PER_S, UTC)
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -10,6 +10,7 @@ from enum import Enum
 from math import inf
 from typing import Final, NamedTuple
 
+from schemas.signals import NS_PER_S
 from schemas.topics import topic
 from services.recordings.recording import Message
 from services.recordings.together import Timed
@@ -22,7 +23,6 @@ GAP_S: Final = 2.0
 """A silence of the drive that is longer is passed over where gaps are skipped."""
 REFRESH_S: Final = 0.1
 """So soon a key has its effect and the display follows."""
-_NS_PER_S = 1_000_000_000
 
 
 class Command(Enum):
@@ -70,7 +70,7 @@ class Played(NamedTuple):
     """What came of it."""
 
     covered_ns: int
-    """Of the drive, jumps and skipped gaps included."""
+    """How far in the drive it came, jumps and skipped gaps included."""
     jumped_over: int
     """Messages left out by jumps to a crossing."""
     skipped_ns: int
@@ -148,7 +148,7 @@ class _Tape:
     def take_into_view(self, due_ns: int) -> None:
         """Go to the next message at once if it is the first, behind a gap, or the end of a jump."""
         silence_ns = due_ns - self.position_ns
-        skips = self._course.skip_gaps and silence_ns > GAP_S * _NS_PER_S
+        skips = self._course.skip_gaps and silence_ns > GAP_S * NS_PER_S
         if self.is_new or due_ns >= self.target_ns > 0 or skips:
             if skips and not self.is_new and not self.target_ns:
                 self.skipped_ns += silence_ns
@@ -167,7 +167,7 @@ class _Tape:
             return inf
         if self.speed == 0.0:
             return 0.0
-        due_s = self._anchor_s + (due_ns - self._anchor_ns) / _NS_PER_S / self.speed
+        due_s = self._anchor_s + (due_ns - self._anchor_ns) / NS_PER_S / self.speed
         return due_s - self._clock()
 
     def is_stale(self) -> bool:
@@ -199,7 +199,7 @@ class _Tape:
         if self.is_paused or self.speed == 0.0 or self.is_new:
             return self.position_ns
         gone_s = self._clock() - self._anchor_s
-        return self._anchor_ns + round(gone_s * self.speed * _NS_PER_S)
+        return self._anchor_ns + round(gone_s * self.speed * NS_PER_S)
 
     def status(self) -> Status:
         """What there is to show."""
@@ -211,7 +211,7 @@ class _Tape:
 
     def _jump(self) -> None:
         here_ns = max(self.position_ns, self.target_ns)  # two jumps at once go past two crossings
-        before = [ns - round(LEAD_S * _NS_PER_S) for ns in self._course.crossings_ns]
+        before = [ns - round(LEAD_S * NS_PER_S) for ns in self._course.crossings_ns]
         ahead = [ns for ns in before if ns > here_ns]
         if ahead:
             self.target_ns = ahead[0]

@@ -18,7 +18,7 @@ from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.figure import draw_crossing
 
 _MOST_PICTURES = 12
-"""Of single crossings of a bridge; the others have their numbers."""
+"""So many crossings of a bridge have pictures; the others have their numbers."""
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 _NOT_MEANT = (
     (

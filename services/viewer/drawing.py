@@ -45,7 +45,7 @@ _NOTES = {
 }
 _SVG_METADATA = ("Date", "Creator", "Format", "Type")
 _CHARACTERS = 118
-"""Of a line of reasons between the figure's edges."""
+"""So long a line of reasons may be between the figure's edges."""
 
 NOMINAL_LINE: dict[str, Any] = {"color": MUTED, "linewidth": 1.0, "linestyle": (0, (4, 3))}
 BASELINE_LINE: dict[str, Any] = {"color": VERDICT_COLOURS["good"], "linewidth": 1.6, "zorder": 3}

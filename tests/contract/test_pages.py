@@ -1,5 +1,6 @@
 """The repository's pages: links lead somewhere, every command named is there."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -15,6 +16,8 @@ ROOT = Path(__file__).parents[2]
 PAGES = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").glob("**/*.md"), ROOT / "recordings/README.md"]
 )
+LONGEST_MODULE = 450
+"""Lines: what is longer is two modules, or says why not."""
 
 
 def slug(heading: str) -> str:
@@ -58,6 +61,34 @@ def test_ci_runs_the_commands_of_the_readme():
     assert script.stat().st_mode & 0o111
     assert "make test" in script.read_text()
     assert "make test" in (ROOT / "README.md").read_text()
+
+
+def test_tests_that_pages_name_are_there():
+    paths = [*(ROOT / "tests").glob("**/*.py")]
+    tests = {name for path in paths for name in re.findall(r"def (test_\w+)", path.read_text())}
+    files = {str(path) for path in paths}
+    named = 0
+    for page in PAGES:
+        for name, is_begun in re.findall(r"`(test_\w+)(…?)`", page.read_text()):
+            named += 1
+            assert name in tests or (is_begun and any(one.startswith(name) for one in tests)), name
+        for name in re.findall(r"`(?:tests/)?((?:\w+/)*test_\w+\.py)`", page.read_text()):
+            named += 1
+            assert any(file.endswith(f"/{name}") for file in files), name
+    assert named > 50, "or it looks in the wrong place"
+
+
+def test_a_long_module_says_why_it_is_one():
+    long = [
+        path
+        for package in ("driveby", "pre_core", "schemas", "services")
+        for path in (ROOT / package).glob("**/*.py")
+        if not path.stem.endswith("_pb2") and path.read_text().count("\n") > LONGEST_MODULE
+    ]
+    assert long, "or it looks in the wrong place"
+    for path in long:
+        head = (ast.get_docstring(ast.parse(path.read_text())) or "").replace("\n", " ")
+        assert "Longer than other modules" in head, path
 
 
 def test_version_is_the_same_everywhere():

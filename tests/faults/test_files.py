@@ -100,7 +100,7 @@ def test_a_disk_that_stalls_for_10_s_loses_nothing_of_100_trucks(tmp_path: Path)
     def write(file: BinaryIO, data: memoryview) -> int:
         if not go.is_set():
             stalled.set()
-            go.wait(120)
+            go.wait(LONGEST_S)
         return file.write(data)
 
     rng = np.random.default_rng(1)
@@ -129,7 +129,7 @@ def test_a_disk_that_stalls_for_10_s_loses_nothing_of_100_trucks(tmp_path: Path)
     wait_for(lambda: writer.open_files() == 100)
     go.clear()
     sent += send(range(2, 4))
-    assert stalled.wait(30)
+    assert stalled.wait(LONGEST_S)
     sent += send(range(4, 204))
     assert writer.waiting() > 39_000
     assert writer.waiting_bytes() < QUEUE_BYTES / 2
@@ -152,7 +152,7 @@ def test_a_longer_stall_is_counted_and_takes_no_more_memory(tmp_path: Path, limi
     go = threading.Event()
 
     def write(file: BinaryIO, data: memoryview) -> int:
-        go.wait(60)
+        go.wait(LONGEST_S)
         return file.write(data)
 
     backlog = Backlog(messages=50) if limit == "messages" else Backlog(size=30_000)

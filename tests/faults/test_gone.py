@@ -15,6 +15,7 @@ from schemas.topics import Key
 from services.logger.places import Place
 from services.logger.writer import FileWriter
 from services.recordings.recording import Message, read_info, read_messages
+from tests.waiting import LONGEST_S
 
 NOW_NS = 1_700_000_000_000_000_000
 
@@ -29,7 +30,7 @@ def info() -> Message:
     return Message(Key("live", "vehicle", "truck-1", "info"), payload, 1, 0, NOW_NS, NOW_NS)
 
 
-def wait_for(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+def wait_for(condition: Callable[[], object], timeout_s: float = LONGEST_S) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline
@@ -150,5 +151,5 @@ def test_a_deleted_recording_of_a_truck_that_has_gone_is_a_failure(
     path.unlink()
     assert one.logger is not None
     one.logger.terminate()
-    assert one.logger.wait(timeout=20) == 1, one.logs()
+    assert one.logger.wait(timeout=LONGEST_S) == 1, one.logs()
     assert "was deleted by somebody else while it was being written" in one.logs()

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.parent import PARENT_ENV
+from tests.waiting import LONGEST_S
 
 
 def arguments_of(project: Path, target: str) -> list[str]:
@@ -27,7 +28,7 @@ def arguments_of(project: Path, target: str) -> list[str]:
 def collected(project: Path, arguments: list[str]) -> set[str]:
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *arguments, "--collect-only", "-q"],
-        cwd=project, capture_output=True, text=True, timeout=120, check=False,
+        cwd=project, capture_output=True, text=True, timeout=LONGEST_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
     return {line for line in done.stdout.splitlines() if "::" in line}
@@ -83,7 +84,7 @@ def test_what_interrupts_the_tests_ends_their_processes(
             os.killpg(tests.pid, signal.SIGINT)
         else:
             tests.kill()
-        tests.wait(timeout=60)
+        tests.wait(timeout=LONGEST_S)
         while left := list(session_of(tests.pid)):
             assert time.monotonic() < deadline, left
             time.sleep(0.05)

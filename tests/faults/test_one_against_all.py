@@ -18,6 +18,7 @@ from services.logger.drops import Drop
 from services.logger.places import MAX_FILES_OF_ONE, Place
 from services.logger.writer import FileWriter
 from services.recordings.recording import Message, read_messages
+from tests.waiting import LONGEST_S
 
 NOW_NS = 1_700_000_000_000_000_000
 
@@ -70,7 +71,7 @@ def test_a_truck_in_300_realms_costs_another_one_nothing(fleet: Callable[..., An
     """889 of 1,669 messages of others were lost, because 256 files were open; nobody was told."""
     one = fleet()
     one.start_logger()
-    with open_session(connect=one.logger_endpoint, timeout_s=10.0) as session:
+    with open_session(connect=one.logger_endpoint, timeout_s=LONGEST_S) as session:
         publishers = [Publisher(session, f"sim-{number}") for number in range(300)]
         for sequence in range(3):
             for publisher in publishers:
@@ -83,7 +84,7 @@ def test_a_truck_in_300_realms_costs_another_one_nothing(fleet: Callable[..., An
         for publisher in publishers:
             publisher.close()
     one.logger.terminate()
-    assert one.logger.wait(timeout=20) == 1  # something was dropped, and is told
+    assert one.logger.wait(timeout=LONGEST_S) == 1  # something was dropped, and is told
     numbers, twice = one.recorded()
     assert twice == 0
     for (vehicle, _, _), found in numbers.items():

@@ -1,6 +1,7 @@
 """Who has warmed up never waits for a compiler again."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -48,3 +49,36 @@ def test_an_identification_compiles_nothing_after_the_warm_up(project: Path) -> 
     # What comes from the cache brings its caller's signature only, so there may be few.
     assert any(kernel.startswith("pre_core.crossing.") for kernel in said["warm"])
     assert said["new"] == []
+
+
+ROWS = """
+import sys
+from pre_core.crossing import posterior
+from services.execution import warm_up
+
+def told(problem, y):
+    rows = real(problem, y)
+    sys.stdout.write(rows.tobytes().hex())
+    raise SystemExit
+
+real, posterior.all_rows = posterior.all_rows, told
+warm_up.warm_up()
+"""
+
+
+def test_who_compiles_gets_the_digits_of_who_loads(project: Path, tmp_path: Path) -> None:
+    """The rows of method `pre`, bit for bit, with an empty cache and with what that has left."""
+    first, second = (
+        subprocess.run(
+            [sys.executable, "-c", ROWS],
+            check=True,
+            capture_output=True,
+            text=True,
+            cwd=project,
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        ).stdout
+        for _ in range(2)
+    )
+    assert list(tmp_path.glob("**/*.nbc")), "nothing was compiled"
+    assert len(first) > 1000
+    assert first == second
