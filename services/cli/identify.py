@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from schemas.results import AtEnds, Crossing, Derived, Results, resolution, results_json
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
-from services.common.errors import FailureError
+from services.cli.parsing import CERTIFICATES
+from services.common.errors import FailureError, InputError
 from services.common.files import (
     check_folder_writable,
     check_writable,
@@ -16,6 +17,7 @@ from services.common.files import (
     write_atomically,
 )
 from services.execution.offline import identify_recordings, site_of
+from services.history.certificates import found_in
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.recordings.recording import read_messages
 
@@ -35,13 +37,17 @@ def identify_command(
     rrd_path: Path | None,
     draws_path: Path | None,
     figures: Path | None,
+    certificates: Path | None = None,
     seed: int,
     console: "Console",
 ) -> int:
     """Identify every crossing in the recordings, print a table and write what was asked for.
 
-    InputError: a file that cannot be read or written, or has no accelerations or positions.
+    InputError: a file that cannot be read or written, or has no accelerations or positions; a
+    folder of certificates that is none.
     """
+    if certificates is not None and not certificates.is_dir():
+        raise InputError(f"--certificates: {certificates} is no folder of certificates")
     if draws_path is not None:
         check_draws(draws_path, method)
     for path in (json_path, rrd_path, draws_path):
@@ -59,7 +65,12 @@ def identify_command(
     draws: dict[str, Draws] = {}
     with console.status("reading", spinner="dots") as status:
         found = identify_recordings(
-            recordings, known, settings, status.update, keep=draws.__setitem__
+            recordings,
+            known,
+            settings,
+            status.update,
+            keep=draws.__setitem__,
+            certificates=found_in(certificates or CERTIFICATES, known, settings),
         )
     _print(console, found, known)
     if json_path is not None:

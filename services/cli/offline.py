@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from services.cli.parsing import (
+    CERTIFICATES,
     a_console,
+    add_certificates,
     add_file,
     add_force,
     add_method,
@@ -287,6 +289,9 @@ def add_identify(commands: Any) -> None:
         p, "--draws", "OUT.npz|OUT.nc", "write the Markov chains of method pre here, for ArviZ"
     )
     add_file(p, "--figures", "DIR", "draw every crossing and bridge here, as PNG and SVG")
+    add_certificates(
+        p, f"certificates that results name where there are such (default: {CERTIFICATES})"
+    )
     add_seed(p)
 
 
@@ -301,6 +306,7 @@ def _identify(options: argparse.Namespace) -> int:
         rrd_path=options.rrd,
         draws_path=options.draws,
         figures=options.figures,
+        certificates=options.certificates,
         seed=options.seed,
         console=a_console(),
     )
