@@ -24,7 +24,7 @@ _ANSWER_S = 5.0
 def health_command(
     *, service: str, endpoint: str, tls: Path | None, realm: str, patience_s: float = _ANSWER_S
 ) -> str:
-    """Return a line that says how a service is.
+    """Return a line that says how a service is, with what it says of itself, if anything.
 
     InputError: a bad realm or name. FailureError: no router answers, the service says nothing, has
     said nothing for `OLDEST_S`, or says itself that it is not well.
@@ -47,7 +47,8 @@ def health_command(
         raise FailureError(
             f"{service} in realm {realm} is not well: {latest.note or 'see its log'}"
         )
-    return f"{service} in realm {realm} is well, {max(age_s, 0.0):.0f} s ago"
+    note = f"; {latest.note}" if latest.note else ""
+    return f"{service} in realm {realm} is well, {max(age_s, 0.0):.0f} s ago{note}"
 
 
 def _latest(subscription: Subscription, patience_s: float) -> pb.Health | None:

@@ -17,7 +17,8 @@ from schemas.results import (
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.cli.bridge_table import print_bridge, print_elements
-from services.common.errors import FailureError
+from services.cli.parsing import CERTIFICATES
+from services.common.errors import FailureError, InputError
 from services.common.files import (
     check_folder_writable,
     check_writable,
@@ -28,6 +29,7 @@ from services.common.progress import progress_bar
 from services.drives.survey import survey
 from services.execution.offline import identify_recordings, site_of
 from services.history.baselines import baselines_of
+from services.history.certificates import found_in
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.identification.bridge_state import Fusing
 from services.recordings.recording import read_messages
@@ -48,6 +50,7 @@ def identify_command(
     rrd_path: Path | None,
     draws_path: Path | None,
     figures: Path | None,
+    certificates: Path | None = None,
     seed: int,
     baseline: Path | None,
     fuse_suspect: bool,
@@ -55,8 +58,11 @@ def identify_command(
 ) -> int:
     """Identify every crossing in the recordings, print a table and write what was asked for.
 
-    InputError: a file that cannot be read or written, or has no accelerations or positions.
+    InputError: a file that cannot be read or written, or has no accelerations or positions; a
+    folder of certificates that is none.
     """
+    if certificates is not None and not certificates.is_dir():
+        raise InputError(f"--certificates: {certificates} is no folder of certificates")
     if draws_path is not None:
         check_draws(draws_path, method)
     for path in (json_path, rrd_path, draws_path):
@@ -76,7 +82,13 @@ def identify_command(
     draws: dict[str, Draws] = {}
     with _crossings_bar(console, recordings, known) as say:
         found = identify_recordings(
-            recordings, known, settings, say, keep=draws.__setitem__, fusing=fusing
+            recordings,
+            known,
+            settings,
+            say,
+            keep=draws.__setitem__,
+            fusing=fusing,
+            certificates=found_in(certificates or CERTIFICATES, known, settings),
         )
     _print(console, found, known)
     if json_path is not None:

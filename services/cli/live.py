@@ -6,6 +6,7 @@ from typing import Any, Final
 
 from services.cli.parsing import (
     a_console,
+    add_certificates,
     add_endpoint,
     add_file,
     add_folder,
@@ -151,6 +152,19 @@ def add_worker(commands: Any) -> None:
         help="identify so many crossings at once, beside the process that listens (default: 1)",
     )
     add_id(p, "worker")
+    first = p.add_mutually_exclusive_group()
+    first.add_argument(
+        "--validate-first",
+        action="store_true",
+        help="identify nothing before simulated crossings of the same truck on the same bridge "
+        "have shown that the method works there (always so in realm live)",
+    )
+    first.add_argument(
+        "--no-certificates",
+        action="store_true",
+        help="identify at once in realm live, too: for those who know what they do",
+    )
+    add_certificates(p, "where certificates are kept (default: certificates in --folder)")
 
 
 def _worker(options: argparse.Namespace) -> int:
@@ -167,6 +181,8 @@ def _worker(options: argparse.Namespace) -> int:
         ready=lambda: print(f"ready, waiting for crossings in realm {options.realm}", flush=True),
         tls=options.tls,
         processes=options.processes,
+        certificates=options.certificates,
+        validate=True if options.validate_first else False if options.no_certificates else None,
     )
 
 

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from services.cli.parsing import (
+    CERTIFICATES,
     a_console,
+    add_certificates,
     add_file,
     add_force,
     add_method,
@@ -290,6 +292,9 @@ def add_identify(commands: Any) -> None:
     )
     add_file(p, "--figures", "DIR", "draw every crossing and bridge here, as PNG and SVG")
     _add_fusing(p)
+    add_certificates(
+        p, f"certificates that results name where there are such (default: {CERTIFICATES})"
+    )
     add_seed(p)
 
 
@@ -344,6 +349,7 @@ def _identify(options: argparse.Namespace) -> int:
         rrd_path=options.rrd,
         draws_path=options.draws,
         figures=options.figures,
+        certificates=options.certificates,
         seed=options.seed,
         baseline=options.baseline,
         fuse_suspect=options.fuse_suspect,

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 RECORDINGS: Final = Path("recordings")
 SCENARIOS: Final = range(1, 13)
+CERTIFICATES: Final = RECORDINGS / "certificates"
 METHODS: Final = ("pre", "least-squares", "random-walk")
 
 Handler = Callable[[argparse.Namespace], int]
@@ -102,6 +103,11 @@ def add_folder(p: argparse.ArgumentParser, text: str) -> None:
         metavar="DIR",
         help=f"{text} (default: recordings)",
     )
+
+
+def add_certificates(p: Any, text: str) -> None:
+    """`--certificates`: a folder of them."""
+    p.add_argument("--certificates", type=Path, metavar="DIR", help=text)
 
 
 def add_seed(p: argparse.ArgumentParser) -> None:

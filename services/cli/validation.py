@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from services.cli.parsing import (
+    CERTIFICATES,
     SCENARIOS,
     a_console,
+    add_certificates,
     add_file,
     add_noise,
     add_seed,
@@ -16,6 +18,7 @@ from services.cli.parsing import (
     scenario,
     whole,
 )
+from services.common.errors import InputError
 
 
 def _scenarios(text: str) -> tuple[int, ...]:
@@ -68,6 +71,19 @@ def _kinds(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names(text)))
 
 
+_OF_METHODS: Final = {
+    "scenarios": tuple(SCENARIOS),
+    "noise": 0.0,
+    "worlds": 0,
+    "surveys": 0,
+    "json": None,
+    "figures": None,
+    "page": None,
+}
+_OF_CERTIFICATES: Final = {"truck": None, "bridge": None, "certificates": None}
+"""Options that belong to one kind of validation only, with their defaults."""
+
+
 def _effects(text: str) -> tuple[str, ...]:
     if text == "all":
         return EFFECTS
@@ -96,7 +112,11 @@ def add_validate(commands: Any) -> None:
         help="(default: all)",
     )
     add_noise(p, "accelerometers' noise density in µg/√Hz (default: 0)")
-    add_site(p, "validate this truck and bridge (default: those of the paper)")
+    add_site(
+        p,
+        "truck and bridge (default: those of the paper); without --method: makes a certificate "
+        "for every pair of them (exit code 1 if one fails)",
+    )
     add_file(p, "--json", "OUT.json", "write the table here")
     p.add_argument("--figures", type=Path, metavar="DIR", help="write figures to this folder")
     p.add_argument("--particles", type=whole("particles", 1), default=500, help="(default: 500)")
@@ -105,10 +125,14 @@ def add_validate(commands: Any) -> None:
     p.add_argument(
         "--method",
         choices=("paper", "pre"),
-        default="paper",
         help="paper: its search and least squares, without sensors; pre: is its uncertainty true "
-        "(exit code 1 if an aim is missed; the options below) (default: paper)",
+        "(exit code 1 if an aim is missed; the options below) (default: paper, and with --site "
+        "neither, but certificates)",
     )
+    of_site = p.add_argument_group("certificates of --site, see docs/certificates.md")
+    of_site.add_argument("--truck", metavar="ID", help="this vehicle only (default: each)")
+    of_site.add_argument("--bridge", metavar="ID", help="this bridge only (default: each)")
+    add_certificates(of_site, f"folder to write them to (default: {CERTIFICATES})")
     p.add_argument(
         "--crossings",
         type=whole("a number of crossings", 0),
@@ -167,7 +191,34 @@ def add_validate(commands: Any) -> None:
     add_file(p, "--page", "PAGE.md", "write what was found as a page")
 
 
+def _validate_site(options: argparse.Namespace) -> int:
+    from services.cli.validate_site import validate_site_command
+
+    return validate_site_command(
+        site=options.site,
+        truck=options.truck,
+        bridge=options.bridge,
+        certificates=options.certificates or CERTIFICATES,
+        seed=options.seed,
+        processes=options.processes,
+        console=a_console(),
+    )
+
+
+def _check_one_kind(options: argparse.Namespace) -> None:
+    """InputError if an option belongs to another kind of validation than the one asked for."""
+    makes_certificates = options.site is not None and options.method is None
+    others = _OF_METHODS if makes_certificates else _OF_CERTIFICATES
+    what = "only with --method" if makes_certificates else "only with --site, no --method"
+    for name, default in others.items():
+        if getattr(options, name) != default:
+            raise InputError(f"--{name}: {what}, it has nothing to do with what is asked for")
+
+
 def _validate(options: argparse.Namespace) -> int:
+    _check_one_kind(options)
+    if options.site is not None and options.method is None:
+        return _validate_site(options)
     if options.method == "pre" and options.surveys:
         from services.cli.validate_surveys import validate_surveys_command
 

@@ -4,15 +4,16 @@ The engine's messages come through in their order; a crossing is handed to an `E
 the engine says of its result follows when it has come.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple, Protocol
 
+from schemas.certificates import Pair
 from schemas.reasons import Reason
 from schemas.results import Crossing
 from schemas.topics import Key
 from services.identification.crossing_data import Passing, rejected
 from services.identification.engine import Engine
-from services.identification.outputs import Output, Work
+from services.identification.outputs import Output, Said, Wanted, Work
 
 _LOOK_AGAIN_S = 0.1
 """A wait is cut into pieces, so that Python hears signals between them."""
@@ -48,12 +49,21 @@ class Execution(Protocol):
 
 
 def dispatched(
-    engine: Engine, execution: Execution, said: Iterable[Output | Work]
+    engine: Engine,
+    execution: Execution,
+    said: Iterable[Said],
+    want: Callable[[Pair], None] = lambda pair: None,
 ) -> Iterator[Output]:
-    """What the engine says, its works executed; what comes back meanwhile is told, too."""
+    """What the engine says, its works executed; what comes back meanwhile is told, too.
+
+    `want` is told of the pairs whose certificates are wanted.
+    """
     for one in said:
         if isinstance(one, Output):
             yield one
+            continue
+        if isinstance(one, Wanted):
+            want(one.pair)
             continue
         execution.start(one)
         yield from collected(engine, execution)

@@ -2,10 +2,11 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 
+from schemas.certificates import Pair
 from schemas.results import Header, Results, results
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
@@ -17,7 +18,7 @@ from services.execution.here import Here
 from services.identification.bridge_state import NOTHING_STORED, Fusing, with_common_shares
 from services.identification.engine import Engine
 from services.identification.identify import Keep
-from services.identification.outputs import Output, Work
+from services.identification.outputs import Said
 from services.identification.streams import device_time_ns
 from services.recordings.recording import Message, program_version, read_messages, read_site
 
@@ -42,11 +43,15 @@ def identify_recordings(
     say: Callable[[str], None] = lambda text: None,
     keep: Keep = lambda crossing_id, draws: None,
     fusing: Fusing = NOTHING_STORED,
+    certificates: Mapping[Pair, str] | None = None,
 ) -> Results:
-    """Results of all crossings in the recordings, in order of time; `keep` is given their draws."""
+    """Results of all crossings in the recordings, in order of time; `keep` is given their draws.
+
+    They name the `certificates` of their vehicles and bridges, where there are such.
+    """
     messages = (message for path in recordings for message in read_messages(path))
     name = ", ".join(str(path) for path in recordings)
-    return identify_messages(messages, name, site, settings, say, keep, fusing)
+    return identify_messages(messages, name, site, settings, say, keep, fusing, certificates)
 
 
 def identify_messages(
@@ -57,6 +62,7 @@ def identify_messages(
     say: Callable[[str], None] = lambda text: None,
     keep: Keep = lambda crossing_id, draws: None,
     fusing: Fusing = NOTHING_STORED,
+    certificates: Mapping[Pair, str] | None = None,
 ) -> Results:
     """Results of all crossings in the messages, which errors call `name`; they may be unordered.
 
@@ -69,7 +75,7 @@ def identify_messages(
         settings=settings.model_dump(mode="json"),
         seed=settings.seed,
     )
-    engine = Engine(site, settings, header, fusing, tells_states=False)
+    engine = Engine(site, settings, header, fusing, certificates=certificates, tells_states=False)
     execution = Here(
         report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"), keep=keep
     )
@@ -124,7 +130,7 @@ def _as_it_happened(name: str, messages: list[Message]) -> list[Message]:
     return sorted(messages, key=moment)
 
 
-def _said(name: str, engine: Engine, message: Message) -> Iterator[Output | Work]:
+def _said(name: str, engine: Engine, message: Message) -> Iterator[Said]:
     try:
         return engine.feed(message.key, message.payload)
     except ValueError as error:

@@ -4,6 +4,9 @@ Every process is warm (its kernels are loaded before its first crossing) and wor
 at a time. If it dies, for want of memory or in a library, its crossing is tried once more in a new
 one and then rejected as `failed`: no crossing can end who asked for it, nor another crossing.
 
+What else is to be computed (`Aside`) is computed in the same processes, when no crossing waits for
+one: so a crossing waits for one aside at most.
+
 They are spawned: numba's and OpenBLAS's threads would not survive a fork. Signals are for the
 process that started them, and they end with it, however it ends.
 """
@@ -17,7 +20,7 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from schemas.results import Crossing
 from services.common.errors import FailureError
@@ -38,9 +41,27 @@ _LONGEST_END_S = 5.0
 """A process ends as soon as its interpreter has a turn, which a kernel may hold up for a while."""
 
 
+class Aside(NamedTuple):
+    """What is computed when no crossing waits. To be pickled: a function of a module, applied."""
+
+    name: str
+    run: Callable[[], object]
+
+
+class Aftermath(NamedTuple):
+    """An aside that is over, and what it gave; None if it raised or its process died twice."""
+
+    aside: Aside
+    outcome: object | None
+
+
 class _Job(NamedTuple):
-    work: Work
+    task: Work | Aside
     tries: int = 0
+
+    @property
+    def name(self) -> str:
+        return self.task.crossing_id if isinstance(self.task, Work) else self.task.name
 
 
 class Processes:
@@ -63,6 +84,8 @@ class Processes:
         self._places = [_Place(report, identify, prepare) for _ in range(number)]
         self._waiting: deque[_Job] = deque()
         self._finished: list[Finished] = []
+        self._asides: deque[_Job] = deque()
+        self._aftermaths: list[Aftermath] = []
 
     def wait_until_warm(self) -> None:
         """Wait until all processes can begin. FailureError if one of them cannot."""
@@ -77,7 +100,8 @@ class Processes:
     @property
     def is_busy(self) -> bool:
         """Whether there are works that `finished` has not given back yet."""
-        return bool(self._waiting or self._finished or any(p.job for p in self._places))
+        under_way = any(p.job and isinstance(p.job.task, Work) for p in self._places)
+        return bool(self._waiting or self._finished or under_way)
 
     @property
     def is_full(self) -> bool:
@@ -101,6 +125,26 @@ class Processes:
         finished, self._finished = self._finished, []
         return finished
 
+    def start_aside(self, aside: Aside) -> None:
+        """Compute something in a process that no crossing waits for."""
+        self._asides.append(_Job(aside))
+        self._fill()
+
+    @property
+    def wants_aside(self) -> bool:
+        """Whether a process may be free for an aside that is not waiting yet."""
+        begun = sum(1 for p in self._places if p.job and isinstance(p.job.task, Aside))
+        return len(self._asides) + begun < len(self._places)
+
+    def aftermaths(self) -> list[Aftermath]:
+        """The asides that have been over since the last call; `finished` looks after them."""
+        aftermaths, self._aftermaths = self._aftermaths, []
+        return aftermaths
+
+    def forget_asides(self) -> None:
+        """Begin no more of those that wait."""
+        self._asides.clear()
+
     def close(self) -> None:
         """End the processes, in the middle of whatever they do."""
         for place in self._places:
@@ -114,28 +158,36 @@ class Processes:
 
     def _fill(self) -> None:
         for place in self._places:
-            if self._waiting and place.job is None:
-                job = self._waiting.popleft()
-                place.begin(job, max(1, job.work.settings.threads // len(self._places)))
+            first = self._waiting or self._asides
+            if first and place.job is None:
+                place.begin(first.popleft(), len(self._places))
 
-    def _take(self, place: "_Place", future: Future[Crossing]) -> None:
+    def _take(self, place: "_Place", future: Future[Any]) -> None:
         job = place.job
         assert job is not None  # noqa: S101 - it has a future
         place.job = place.future = None
-        name = job.work.crossing_id
         try:
-            self._finished.append(Finished(job.work, future.result()))
+            self._is_over(job.task, future.result())
         except BrokenExecutor:
             place.renew()
             if job.tries + 1 < _TRIES:
-                _log.warning("the process that identified %s died; tried once more", name)
-                self._waiting.appendleft(_Job(job.work, job.tries + 1))
+                _log.warning("the process that worked on %s died; tried once more", job.name)
+                queue = self._waiting if isinstance(job.task, Work) else self._asides
+                queue.appendleft(_Job(job.task, job.tries + 1))
             else:
-                _log.error("the process that identified %s died again; it is rejected", name)
-                self._finished.append(Finished(job.work, failed(job.work)))
+                _log.error("the process that worked on %s died again; it has failed", job.name)
+                self._is_over(job.task, None)
         except Exception:  # whatever it is, another process would meet it, too
-            _log.exception("identification of %s failed", name)
-            self._finished.append(Finished(job.work, failed(job.work)))
+            _log.exception("work on %s failed", job.name)
+            self._is_over(job.task, None)
+
+    def _is_over(self, task: Work | Aside, outcome: Any) -> None:
+        """Keep what a task gave; None: nothing."""
+        if isinstance(task, Work):
+            result = failed(task) if outcome is None else outcome
+            self._finished.append(Finished(task, result))
+        else:
+            self._aftermaths.append(Aftermath(task, outcome))
 
 
 class _Place:
@@ -145,15 +197,20 @@ class _Place:
         self._report = report
         self._begin = identify, prepare
         self.job: _Job | None = None
-        self.future: Future[Crossing] | None = None
+        self.future: Future[Any] | None = None
         self._open()
 
-    def begin(self, job: _Job, threads: int) -> None:
-        """Work on a crossing."""
-        settings = job.work.settings.model_copy(update={"threads": threads})
+    def begin(self, job: _Job, places: int) -> None:
+        """Work on a crossing, with the share of its threads that one of `places` has; or aside."""
         self.job = job
+        task = job.task
         try:
-            self.future = self._executor.submit(_identified, job.work._replace(settings=settings))
+            if isinstance(task, Aside):
+                self.future = self._executor.submit(task.run)
+            else:
+                threads = max(1, task.settings.threads // places)
+                settings = task.settings.model_copy(update={"threads": threads})
+                self.future = self._executor.submit(_identified, task._replace(settings=settings))
         except BrokenExecutor as error:  # it died while it had nothing to do
             self.future = Future()
             self.future.set_exception(error)

@@ -7,11 +7,13 @@ through it gives the same bytes every time.
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 
 import numpy as np
 
+from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
 from schemas.reasons import Reason
 from schemas.results import BridgeResult, Crossing, Header
@@ -33,8 +35,15 @@ from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
 from services.identification.bridge_state import Fusing, against, count_in, state_of, usable
 from services.identification.crossing_data import CrossingData, Window, window
 from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
-from services.identification.outputs import Output, Work, crossing_output, state_output
-from services.identification.remembered import BridgeCrossings, TruckBoot, UnderWay
+from services.identification.outputs import (
+    Output,
+    Said,
+    Wanted,
+    Work,
+    crossing_output,
+    state_output,
+)
+from services.identification.remembered import BridgeCrossings, TruckBoot, UnderWay, Waiting
 from services.identification.stays import MERGE_S, Passage, Stay, least_depth_m, stays_on
 from services.identification.streams import PATIENCE_S
 from services.identification.traffic import Traffic
@@ -46,6 +55,8 @@ _SILENCE_S = 120.0
 """So long may positions come without accelerations, as when both are fetched after an outage."""
 _FORGET_EVERY_S = 10.0
 """To forget takes time, which is spent this often."""
+MOST_WAITING = 100
+"""Crossings that are kept while they wait for a certificate: half a megabyte each, or more."""
 _ROUNDING_S = 1e-6
 """More than is lost when a time in nanoseconds becomes one in seconds."""
 _REACH_M = 50.0
@@ -68,6 +79,10 @@ class Engine:
     to be given to `done`, at any later time and in any order. `services.execution` does that.
     `header` says what goes into every estimate, `fusing` how those of a bridge become one. Whoever
     asks for `bridges` at the end only may do without their states on the way (`tells_states`).
+
+    `certificates` are the hashes of those that are known; results name them. If they `are_required`
+    a crossing of a pair without one waits: a `Wanted` is yielded, once for a pair, the certificate
+    is told to `certify`, and `release` then yields the crossings that waited.
     """
 
     def __init__(
@@ -77,6 +92,8 @@ class Engine:
         header: Header,
         fusing: Fusing | None = None,
         *,
+        certificates: Mapping[Pair, str] | None = None,
+        are_required: bool = False,
         tells_states: bool = True,
     ) -> None:
         self._fusing = Fusing() if fusing is None else fusing
@@ -96,6 +113,11 @@ class Engine:
         """How many there have been."""
         self._known: dict[tuple[str, str, str], list[Known]] = {}
         """By realm, vehicle and bridge: what earlier runs told."""
+        self._certificates = dict(certificates or {})
+        self._are_required = are_required
+        self._wanted: set[Pair] = set()
+        self._waiting: deque[Waiting] = deque()
+        """In the order in which they were found."""
         self.unknown_vehicles: set[str] = set()
         """Trucks that the site file does not know; nothing of theirs can be identified."""
 
@@ -142,7 +164,7 @@ class Engine:
                 fix = decode_gnss(payload)
                 self._traffic.note(key.realm, key.identifier, fix, for_ever=for_ever)
 
-    def feed(self, key: Key, payload: bytes) -> Iterator[Output | Work]:
+    def feed(self, key: Key, payload: bytes) -> Iterator[Said]:
         """Take one message of a vehicle that `expect` has had; other streams are ignored.
 
         ValueError, at once: malformed. What follows from the message comes from the iterator, as
@@ -158,7 +180,7 @@ class Engine:
 
     def _take(
         self, key: Key, vehicle: Vehicle, message: AccelBatch | GnssFix | VehicleInfo
-    ) -> Iterator[Output | Work]:
+    ) -> Iterator[Said]:
         if message.boot_id < self._newest_boot.get((key.realm, key.identifier), 0):
             return  # its crossings have been decided
         truck = self._truck(key, message.boot_id, vehicle)
@@ -172,12 +194,12 @@ class Engine:
             truck.boot.add_fix(message)
             yield from self._settle(key.realm, truck)
 
-    def finish(self) -> Iterator[Output | Work]:
+    def finish(self) -> Iterator[Said]:
         """No more messages will come: decide all crossings with what there is."""
         for (realm, _, _), truck in list(self._trucks.items()):
             yield from self._finish(realm, truck)
 
-    def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Output | Work]:
+    def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Said]:
         """A truck has gone silent: decide the crossings that it has finished.
 
         It may only have lost its connection, and bring what is missing when it has it again. So
@@ -205,7 +227,7 @@ class Engine:
 
     def _settle(
         self, realm: str, truck: TruckBoot, *, all_there_is: bool = False
-    ) -> Iterator[Output | Work]:
+    ) -> Iterator[Said]:
         """Look once at every fix: what is found does not depend on which came together."""
         for fix in truck.boot.settle(all_there_is=all_there_is):
             truck.latest_s = max(truck.latest_s, fix.device_time_ns * 1e-9)
@@ -213,7 +235,7 @@ class Engine:
             yield from self._look(realm, truck, bridges, truck.latest_s)
             self._forget(truck, truck.latest_s)
 
-    def _finish(self, realm: str, truck: TruckBoot) -> Iterator[Output | Work]:
+    def _finish(self, realm: str, truck: TruckBoot) -> Iterator[Said]:
         yield from self._settle(realm, truck, all_there_is=True)
         yield from self._look(realm, truck, self._frames, np.inf)
 
@@ -238,7 +260,7 @@ class Engine:
             truck = self._trucks[name] = TruckBoot(vehicle)
         return truck
 
-    def _finish_older_boots(self, key: Key, boot_id: int) -> Iterator[Output | Work]:
+    def _finish_older_boots(self, key: Key, boot_id: int) -> Iterator[Said]:
         """A truck that has started anew says nothing more of its boots before."""
         for name in [n for n in self._trucks if n[:2] == (key.realm, key.identifier)]:
             if name[2] < boot_id:
@@ -263,7 +285,7 @@ class Engine:
         bridges: list[tuple[Bridge, BridgeFrame]],
         now_s: float,
         wait: _Wait | None = None,
-    ) -> Iterator[Output | Work]:
+    ) -> Iterator[Said]:
         """Find crossings in the fixes that are known, and identify those that are complete.
 
         A crossing that is over waits while `wait` says so.
@@ -285,7 +307,7 @@ class Engine:
         stay: Stay,
         now_s: float,
         wait: _Wait,
-    ) -> Iterator[Output | Work]:
+    ) -> Iterator[Said]:
         begins = stay.passage is Passage.BEGINS_ON_BRIDGE
         if begins and stay.entry_s < truck.forgotten_s + _FORGET_EVERY_S:
             return  # what was before has been forgotten; this had been decided before that
@@ -311,14 +333,72 @@ class Engine:
                 return
         truck.done.add(crossing_id)
         truck.decided.append((bridge.id, *_fixes_around(truck, stay), crossing_id))
-        for begun in (pb.COMPLETE, pb.IDENTIFYING):
-            if begun not in said:
-                yield told(begun, stay.exit_s)
+        if pb.COMPLETE not in said:
+            yield told(pb.COMPLETE, stay.exit_s)
         self._works += 1
         data = self._data(realm, truck, bridge, stay, crossing_id)
-        work = Work(self._works, data, self._settings)
-        done = told(pb.DONE, stay.exit_s)
-        self._bridge(realm, bridge.id).under_way.append(UnderWay(work, done))
+        waiting = Waiting(
+            Work(self._works, data, self._settings),
+            told(pb.IDENTIFYING, stay.exit_s) if pb.IDENTIFYING not in said else None,
+            told(pb.DONE, stay.exit_s),
+        )
+        pair = Pair(truck.vehicle.id, bridge.id)
+        if self._is_certified(pair) and pair not in self.waiting():
+            yield from self._begun(waiting)
+            return
+        if not self._is_certified(pair) and pb.WAITING_NOT_VALIDATED not in said:
+            yield told(pb.WAITING_NOT_VALIDATED, stay.exit_s)
+        self._keep(waiting)
+        if not self._is_certified(pair) and pair not in self._wanted:
+            self._wanted.add(pair)
+            yield Wanted(pair)
+
+    def _is_certified(self, pair: Pair) -> bool:
+        """Whether its crossings may be identified."""
+        return not self._are_required or pair in self._certificates
+
+    def _keep(self, waiting: Waiting) -> None:
+        self._waiting.append(waiting)
+        if len(self._waiting) > MOST_WAITING:
+            _log.warning(
+                "%s has waited too long for a certificate and is given up here: `driveby identify` "
+                "gives its result from the logger's recording",
+                self._waiting.popleft().work.crossing_id,
+            )
+
+    def waiting(self) -> dict[Pair, list[str]]:
+        """Ids of the crossings that wait, by pair, in the order in which they were found."""
+        found: dict[Pair, list[str]] = {}
+        for one in self._waiting:
+            found.setdefault(_pair(one.work), []).append(one.work.crossing_id)
+        return found
+
+    def certify(self, pair: Pair, certificate: str) -> None:
+        """Take the hash of a pair's certificate, which has passed: `release` its crossings."""
+        self._certificates[pair] = certificate
+
+    @property
+    def has_released(self) -> bool:
+        """Whether a crossing that waited may go on."""
+        return any(self._is_certified(_pair(one.work)) for one in self._waiting)
+
+    def release(self) -> Iterator[Said]:
+        """Let the first crossing go on that has waited and need not any more, if there is one.
+
+        One at a time: who asks goes on listening in between.
+        """
+        for place, one in enumerate(self._waiting):
+            if self._is_certified(_pair(one.work)):
+                del self._waiting[place]
+                yield from self._begun(one)
+                return
+
+    def _begun(self, waiting: Waiting) -> Iterator[Said]:
+        if waiting.identifying is not None:
+            yield waiting.identifying
+        work = waiting.work._replace(certificate=self._certificates.get(_pair(waiting.work)))
+        bridge = self._bridge(work.data.realm, work.data.bridge.id)
+        bridge.under_way.append(UnderWay(work, waiting.done))
         yield work
 
     def done(self, work: Work, result: Crossing) -> Iterator[Output]:
@@ -341,6 +421,8 @@ class Engine:
     ) -> Iterator[Output]:
         realm, name = found.work.data.realm, found.work.data.bridge.id
         result = against(result, self._fusing.baselines.get(name))
+        if found.work.certificate is not None:
+            result = result.model_copy(update={"certificate": found.work.certificate})
         counts = usable(result)
         if counts is not None:  # who asks for the state together with the result has it
             bridge.counted = count_in(bridge.counted, [counts])
@@ -456,6 +538,10 @@ class Engine:
         """The latest state of every bridge that has one, for the results file."""
         states = {name: self._state(realm, name) for realm, name in self._of_bridge}
         return {name: state for name, state in states.items() if state is not None}
+
+
+def _pair(work: Work) -> Pair:
+    return Pair(work.data.vehicle.id, work.data.bridge.id)
 
 
 def _fixes_around(truck: TruckBoot, stay: Stay) -> tuple[float, float]:

@@ -1,7 +1,8 @@
-"""What the engine yields: messages to publish, and crossings to be identified."""
+"""What the engine yields: messages to publish, crossings to be identified, certificates wanted."""
 
 from typing import NamedTuple
 
+from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import BridgeResult, Crossing
 from schemas.results_on_the_wire import bridge_to_protobuf, direction_to_protobuf
@@ -27,11 +28,22 @@ class Work(NamedTuple):
     """Tells the works of one engine apart."""
     data: CrossingData
     settings: IdentificationSettings
+    certificate: str | None = None
+    """The hash of the certificate of its vehicle and bridge, where one is known."""
 
     @property
     def crossing_id(self) -> str:
         """The crossing that it is about."""
         return self.data.crossing_id
+
+
+class Wanted(NamedTuple):
+    """A crossing waits for the certificate of its vehicle and bridge."""
+
+    pair: Pair
+
+
+Said = Output | Work | Wanted
 
 
 def crossing_output(

@@ -72,6 +72,15 @@ class UnderWay(NamedTuple):
     """What is told when it is: the truck's clock may have been forgotten by then."""
 
 
+class Waiting(NamedTuple):
+    """A crossing that is complete and waits for a certificate, or behind one that did."""
+
+    work: Work
+    identifying: Output | None
+    """What is told when it goes on; None if an earlier run has told it."""
+    done: Output
+
+
 @dataclass
 class BridgeCrossings:
     """What has been found on one bridge, in one realm."""

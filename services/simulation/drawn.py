@@ -252,8 +252,17 @@ def _draw_conditions(vehicle: Vehicle, rng: np.random.Generator) -> Conditions:
     )
 
 
-def drive(site: Site, truth: Truth, seed: int) -> Drawn:
-    """Drive and measure one crossing; `seed` is that of noise and receiver."""
+def drive(
+    site: Site,
+    truth: Truth,
+    seed: int,
+    *,
+    noise_ug_per_rthz: tuple[float, float, float, float] | None = None,
+) -> Drawn:
+    """Drive and measure one crossing; `seed` is that of noise and receiver.
+
+    The noise is that of the conditions, unless that of each channel is given.
+    """
     vehicle, bridge, how = site.vehicles[0], site.bridges[0], truth.conditions
     every = max(1, int(np.ceil(1.0 / (how.rate_hz * LONGEST_STEP_S))))
     step_s = 1.0 / (how.rate_hz * every)
@@ -262,7 +271,7 @@ def drive(site: Site, truth: Truth, seed: int) -> Drawn:
     errors = truth.channels
     axles = how.noise_ug_per_rthz
     body = axles if how.body_noise_ug_per_rthz is None else how.body_noise_ug_per_rthz
-    densities = (body, body, axles, axles)
+    densities = noise_ug_per_rthz or (body, body, axles, axles)
     sensors = [
         Accelerometer(
             how.rate_hz,

@@ -6,6 +6,9 @@ those of the runs before: what the bus may not have got it publishes again as it
 all; what was about to be said it says; and a crossing that has a result is not identified again.
 One that has none is found again in what its truck still keeps (`cache` in the table of topics: the
 last five minutes).
+
+Real crossings (realm `live`) are identified only where simulated ones of the same truck on the same
+bridge have shown that the method recovers what was put in: until then they wait (`certificates`).
 """
 
 import contextlib
@@ -20,6 +23,7 @@ from pathlib import Path
 
 import zenoh
 
+from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Header
 from schemas.settings import IdentificationSettings
@@ -43,6 +47,7 @@ from services.common.files import check_folder_writable
 from services.execution.dispatch import Execution, awaited, collected, dispatched
 from services.execution.processes import Processes
 from services.history.baselines import baselines_of
+from services.history.certificates import found_in
 from services.history.result_files import Earlier, ResultFiles, read_earlier
 from services.identification.bridge_state import Fusing
 from services.identification.engine import Engine
@@ -50,6 +55,7 @@ from services.identification.known import search_hash
 from services.identification.outputs import Output
 from services.recordings.recording import Message, program_version
 from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
+from services.worker.certificates import Certificates
 
 __all__ = ["run"]
 
@@ -59,6 +65,9 @@ _POLL_S = 0.1
 """So late a stop, a token or a result is seen where no message comes."""
 _LONGEST_QUEUE = 200_000
 """Messages: two hours of one truck, or a minute of a hundred. Then publishers wait."""
+_LONGEST_NOTE = 1000
+_MOST_NAMED = 10
+"""Crossings in one line of the log."""
 _CONNECT_S = 1.0
 """An attempt is so short that a signal is heard between two."""
 
@@ -75,6 +84,8 @@ def run(
     ready: Callable[[], None] | None = None,
     tls: Path | None = None,
     processes: int = 1,
+    certificates: Path | None = None,
+    validate: bool | None = None,
 ) -> int:
     """Identify all crossings of a realm until SIGINT or SIGTERM; return 0.
 
@@ -83,10 +94,21 @@ def run(
     the realm is one of replays. Waits for the router for ever. `ready` is called once, when the
     worker listens. `tls` is a folder of credentials, see `open_session`. Crossings are identified
     in so many `processes` beside this one.
-    InputError: a bad site file, realm or id. FailureError: a result cannot be written.
+
+    A crossing whose vehicle and bridge have no certificate in the folder `certificates` (by default
+    one in `folder`) waits for one, which is made meanwhile: if `validate` says so, or says nothing
+    and the realm is `live`.
+    InputError: a bad site file, realm or id, or a method that has no certificates. FailureError: a
+    result or a certificate cannot be written.
     """
     _check_names(realm, service_id)
     check_speaks_for(tls, "worker", service_id)
+    are_required = realm == "live" if validate is None else validate
+    if are_required and method != "pre":
+        raise InputError(
+            f"--method {method.replace('_', '-')}: has no certificates, which realm live and "
+            "--validate-first ask for; take pre, or --no-certificates"
+        )
     text = read_site_text(site)
     known = parse_site(text, str(site))
     settings = IdentificationSettings.model_validate({"method": method})
@@ -107,6 +129,12 @@ def run(
     check_folder_writable(file.parent)
     if file.exists():
         raise InputError(f"{file}: exists, and results are never overwritten; give another name")
+    if certificates is None:
+        certificates = folder / "certificates"
+    if are_required:
+        check_folder_writable(certificates)
+    elif realm == "live":
+        _log.warning("--no-certificates: crossings count that nobody has validated")
     files = ResultFiles(file, text, header, earlier.previous)
     # A second signal: what was published is on the disk, and the next run takes it up.
     with stopped_by_signals(leave_at_once) as stop, contextlib.ExitStack() as stack:
@@ -120,7 +148,15 @@ def run(
             return 0
         stack.enter_context(bus)
         publisher = Publisher(bus, realm)
-        engine = Engine(known, settings, header, fusing)
+        engine = Engine(
+            known,
+            settings,
+            header,
+            fusing,
+            certificates=found_in(certificates, known, settings),
+            are_required=are_required,
+        )
+        certified = Certificates(certificates, known, settings, execution)
         execution.wait_until_warm()
         arrivals: _Queue = queue.Queue(_LONGEST_QUEUE)
         closing, failed = threading.Event(), threading.Event()
@@ -136,7 +172,9 @@ def run(
             _resume(engine, earlier, publisher, files)
             del earlier  # of two days
             receiver.start()
-            _serve(engine, execution, arrivals, publisher, service_id, files, stop, ready)
+            _serve(
+                engine, execution, certified, arrivals, publisher, service_id, files, stop, ready
+            )
         except BaseException:
             files.abandon()
             raise
@@ -251,11 +289,24 @@ def _resume(engine: Engine, earlier: Earlier, publisher: Publisher, files: Resul
             "%d messages of earlier runs, the last in %s; published again %d, finished %d",
             *(len(earlier.said), earlier.previous, len(again), len(finished)),
         )
+    waited = [
+        known.crossing_id
+        for known in earlier.crossings
+        if pb.WAITING_NOT_VALIDATED in known.states and not known.is_identified
+    ]
+    if waited:
+        _log.warning(
+            "%d crossings waited for a certificate when an earlier run ended (%s): those that "
+            "their trucks still have go on, for the others `driveby identify` reads the logger's "
+            "recording",
+            *(len(waited), ", ".join(waited[-_MOST_NAMED:])),
+        )
 
 
 def _serve(
     engine: Engine,
     execution: Execution,
+    certificates: Certificates,
     queued: _Queue,
     publisher: Publisher,
     service_id: str,
@@ -271,6 +322,8 @@ def _serve(
     told: set[str] = set()
     next_health_s = 0.0
     leave_at_s = math.inf
+    want = certificates.want
+    progress: tuple[Pair, float] | None = None
     now_s = time.monotonic()
     if ready is not None:
         ready()
@@ -278,9 +331,10 @@ def _serve(
     while now_s < leave_at_s and (
         not stop.is_set() or not queued.empty() or _may_lose(engine, arrivals)
     ):
-        if time.monotonic() >= next_health_s:
+        if time.monotonic() >= next_health_s or certificates.has_news:
             next_health_s = time.monotonic() + HEALTH_PERIOD_S
-            _say_health(publisher, service_id, queued.qsize())
+            certificates.has_news = False
+            _say_health(publisher, service_id, queued.qsize(), certificates.note)
         batch: list[Arrived] = []
         one = _next(queued)
         # After a long identification the queue holds what came meanwhile: whether a truck has gone
@@ -301,18 +355,36 @@ def _serve(
             except ValueError as error:
                 _log.warning("refused %s: %s", name, error)
                 continue
-            _publish(dispatched(engine, execution, outputs), engine, publisher, files)
+            _publish(dispatched(engine, execution, outputs, want), engine, publisher, files)
         if stop.is_set():
             leave_at_s = min(leave_at_s, time.monotonic() + GONE_AFTER_S)
             arrivals.hurry()
+            certificates.end()
         for gone in arrivals.gone(now_s):
             said = engine.gone(gone.realm, gone.vehicle, for_good=gone.for_good)
-            _publish(dispatched(engine, execution, said), engine, publisher, files)
+            _publish(dispatched(engine, execution, said, want), engine, publisher, files)
         _publish(collected(engine, execution), engine, publisher, files)
+        if not stop.is_set():
+            for pair, digest in certificates.advance(time.monotonic()).items():
+                engine.certify(pair, digest)
+            if certificates.progress not in (None, progress):
+                progress = certificates.progress
+                pair, share = progress
+                _say_progress(publisher, service_id, "", f"validating {pair}", share)
+            if engine.has_released and not execution.is_full:
+                released = dispatched(engine, execution, engine.release(), want)
+                _publish(released, engine, publisher, files)
         for vehicle in engine.unknown_vehicles - told:
             told.add(vehicle)
             _log.warning("%s drives, but the site file has no such vehicle", vehicle)
     _publish(awaited(engine, execution), engine, publisher, files)
+    waiting = [name for names in engine.waiting().values() for name in names]
+    if waiting:
+        _log.warning(
+            "%d crossings still wait for a certificate (%s): the next run gets them if their "
+            "trucks still have them, else `driveby identify` reads the logger's recording",
+            *(len(waiting), ", ".join(waiting[-_MOST_NAMED:])),
+        )
 
 
 def _next(queued: _Queue) -> Arrived | Token | None:
@@ -369,12 +441,13 @@ def _say_progress(
     publisher.put("service", service_id, "progress", progress.SerializeToString())
 
 
-def _say_health(publisher: Publisher, service_id: str, waiting: int) -> None:
+def _say_health(publisher: Publisher, service_id: str, waiting: int, note: str) -> None:
     health = pb.Health(
         schema_version=1,
         time_ns=time.time_ns(),
         service=service_id,
         ok=True,
         figures={"queue": float(waiting)},
+        note=note[:_LONGEST_NOTE],
     )
     publisher.put("service", service_id, "health", health.SerializeToString())

@@ -17,6 +17,7 @@ import pytest
 from rich.console import Console
 
 from pre_core.paper.experiment import scenario_ratios
+from schemas.certificates import Pair, pair_hash
 from schemas.results import Crossing, Results, load_results
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
@@ -29,9 +30,11 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.importing import import_command
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.execution.offline import identify_recordings, site_of
+from services.history.certificates import save
 from services.recordings.recording import Message, read_messages, read_site
 from services.recordings.writer import write_recording
 from services.simulation.drive import Drive, paper_site, simulate_drive, write_drive
+from tests.unit.schemas.test_certificates import certificate
 
 SOUND_NM2 = 1.56e10
 LEAST_SQUARES = IdentificationSettings(method="least_squares")
@@ -391,3 +394,21 @@ def test_method_and_seed_reach_the_search(recording: Path) -> None:
     ]
     assert answers[0] == answers[1]
     assert answers[0] != answers[2]
+
+
+def test_a_certificate_that_there_is_is_named(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site, folder, out = paper_site(), tmp_path / "certificates", tmp_path / "out.json"
+    identify = ["identify", str(recording), "--method", "least-squares", "--json", str(out)]
+    made = certificate(site, hash=pair_hash(site, Pair("truck-1", "bridge-1"), LEAST_SQUARES))
+    save(folder, made)
+    assert cli.main([*identify, "--certificates", str(folder)]) == 0
+    assert only(load_results(out)).certificate == made.hash
+    save(folder, made.model_copy(update={"passed": False}))
+    assert cli.main([*identify, "--certificates", str(folder)]) == 0
+    assert only(load_results(out)).certificate is None
+    capsys.readouterr()
+    assert cli.main([*identify, "--certificates", str(tmp_path / "none")]) == 2
+    line = capsys.readouterr().err
+    assert line == f"driveby: --certificates: {tmp_path / 'none'} is no folder of certificates\n"

@@ -5,7 +5,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from schemas.results import Crossing
 from schemas.settings import IdentificationSettings
 from services.common.errors import FailureError
 from services.execution.dispatch import Finished, feed_all
-from services.execution.processes import Processes
+from services.execution.processes import Aftermath, Aside, Processes
 from services.identification.crossing_data import CrossingData
 from services.identification.engine import Engine
 from services.identification.outputs import Work
@@ -233,3 +234,75 @@ def test_results_may_come_back_in_any_order() -> None:
             list(engine.done(found[0], result))
     first, *others = orders.values()
     assert all(other == first for other in others)
+
+
+# What is computed aside
+
+
+def two_of(number: int) -> int:
+    return 2 * number
+
+
+def no_answer() -> None:
+    raise np.linalg.LinAlgError("singular")
+
+
+def until_over(processes: Processes, number: int) -> list[Aftermath]:
+    found: list[Aftermath] = []
+    deadline = time.monotonic() + LONGEST_S
+    while len(found) < number and time.monotonic() < deadline:
+        assert processes.finished(0.1) == []
+        found += processes.aftermaths()
+    assert len(found) == number
+    return found
+
+
+def test_what_is_computed_aside_comes_back_and_keeps_nobody_waiting() -> None:
+    with Processes(2, identify=quick, prepare=nothing) as processes:
+        assert processes.wants_aside
+        processes.start_aside(Aside("one", partial(two_of, 1)))
+        processes.start_aside(Aside("other", partial(two_of, 2)))
+        assert not processes.wants_aside
+        assert not processes.is_busy  # nobody waits for it at the end
+        assert not processes.is_full
+        found = until_over(processes, 2)
+        assert processes.wants_aside
+    assert {(aside.name, outcome) for aside, outcome in found} == {("one", 2), ("other", 4)}
+
+
+@pytest.mark.parametrize("run", [die, no_answer])
+def test_what_cannot_be_computed_aside_costs_nothing_else(run: Callable[[], None]) -> None:
+    (work, _) = works()
+    with Processes(1, identify=quick, prepare=nothing) as processes:
+        processes.start_aside(Aside("bad", run))
+        ((aside, outcome),) = until_over(processes, 1)
+        assert (aside.name, outcome) == ("bad", None)
+        processes.start(work)
+        (finished,) = all_of(processes)
+    assert finished.result.verdict == "good"
+
+
+def wait_for(path: str) -> str:
+    deadline = time.monotonic() + LONGEST_S
+    while not Path(path).exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return path
+
+
+def test_a_crossing_comes_before_whatever_waits_aside(tmp_path: Path) -> None:
+    """Three wait; the crossing that comes then waits for the first only."""
+    (work, _) = works()
+    marks = [str(tmp_path / name) for name in "abc"]
+    with Processes(1, identify=quick, prepare=nothing) as processes:
+        for mark in marks:
+            processes.start_aside(Aside(mark, partial(wait_for, mark)))
+        processes.start(work)
+        Path(marks[0]).touch()
+        (finished,) = all_of(processes)
+        assert finished.result.verdict == "good"
+        assert [aside.name for aside, _ in processes.aftermaths()] == marks[:1]
+        processes.forget_asides()
+        Path(marks[1]).touch()
+        assert [aside.name for aside, _ in until_over(processes, 1)] == marks[1:2]
+        assert processes.finished(0.1) == []
+        assert processes.wants_aside

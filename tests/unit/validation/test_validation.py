@@ -196,7 +196,7 @@ def test_bad_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str
     )
     path = tmp_path / "site.toml"
     path.write_text(site_toml(site.model_copy(update={"bridges": (shorter,)})))
-    message = refused(capsys, "--site", str(path))
+    message = refused(capsys, "--method", "paper", "--site", str(path))
     assert f"{path}: bridge {shorter.id} has 5 elements" in message
 
 

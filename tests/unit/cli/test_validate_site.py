@@ -1,0 +1,123 @@
+"""`driveby validate --site`: what it prints, writes and refuses; the crossings are made up."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.certificates import load_certificate, pair_hash
+from schemas.settings import IdentificationSettings
+from schemas.site_file import load_site, site_toml
+from services.cli import main as cli
+from services.cli import validate_site
+from services.simulation.certificate import Trial
+from services.simulation.drive import paper_site
+from tests.unit.simulation.test_certificate import made_up
+
+SETTINGS = IdentificationSettings()
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """Two trucks, two bridges."""
+    paper = paper_site()
+    truck, bridge = paper.vehicles[0], paper.bridges[0]
+    two = paper.model_copy(
+        update={
+            "vehicles": (truck, truck.model_copy(update={"id": "truck-2"})),
+            "bridges": (bridge, bridge.model_copy(update={"id": "bridge-2"})),
+        }
+    )
+    path = tmp_path / "site.toml"
+    path.write_text(site_toml(two))
+    return path
+
+
+@pytest.fixture(autouse=True)
+def made_up_crossings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those on bridge-2 are all rejected."""
+
+    def tried(trial: Trial, *_: Any) -> Iterator[float]:
+        verdict = "good" if trial.pair.bridge == "bridge-1" else "rejected"
+        while trial.judgement is None:
+            run = trial.next_run()
+            assert run is not None
+            trial.add(run.number, made_up(run.number, verdict=verdict))
+            yield trial.share
+
+    monkeypatch.setattr(validate_site, "tried_in_processes", tried)
+
+
+def validate(*arguments: object) -> int:
+    return cli.main(["validate", *map(str, arguments)])
+
+
+def test_every_pair_gets_a_line_and_a_file(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "made" / "here"
+    assert validate("--site", site, "--certificates", folder, "--seed", 4) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines] == [
+        "truck-1 on bridge-1",
+        "truck-1 on bridge-2",
+        "truck-2 on bridge-1",
+        "truck-2 on bridge-2",
+    ]
+    assert "passed (of 12, the rest not needed): 8 of 8 crossings are good" in lines[0]
+    assert "EI ± 10 %" in lines[0]
+    assert "FAILED (of 12, the rest not needed): 0 of 5 crossings are good" in lines[1]
+    found = {path: load_certificate(path) for path in folder.iterdir()}
+    assert len(found) == 4
+    assert {one.seed for one in found.values()} == {4}
+    known = load_site(site)
+    for path, one in found.items():
+        assert path.stem == pair_hash(known, one.pair, SETTINGS)
+        assert one.passed == (one.bridge == "bridge-1")
+        assert any(str(path) in line for line in lines)
+
+
+def test_one_pair_may_be_asked_for(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "certificates"
+    chosen = ("--truck", "truck-2", "--bridge", "bridge-1")
+    assert validate("--site", site, "--certificates", folder, *chosen) == 0
+    assert capsys.readouterr().out.startswith("truck-2 on bridge-1: passed")
+    assert len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--truck", "truck-9"), "--truck: {site} has no truck-9, it has truck-1, truck-2"),
+        (("--bridge", "b"), "--bridge: {site} has no b, it has bridge-1, bridge-2"),
+        (("--json", "x.json"), "--json: only with --method"),
+        (("--scenarios", "1"), "--scenarios: only with --method"),
+        (("--noise", "25"), "--noise: only with --method"),
+        (("--method", "pre", "--truck", "truck-1"), "--truck: only with --site, no --method"),
+        (("--certificates", "{site}"), "{site}: cannot be made a folder"),
+    ],
+)
+def test_bad_input_is_one_line(
+    site: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    words: str,
+) -> None:
+    given = [argument.format(site=site) for argument in arguments]
+    where = () if "--certificates" in given else ("--certificates", tmp_path / "c")
+    if "--method" in given:
+        where = ()
+    assert validate("--site", site, *given, *where) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"driveby: {words.format(site=site)}")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "c").exists()
+
+
+def test_without_a_site_there_is_nothing_to_certify(capsys: pytest.CaptureFixture[str]) -> None:
+    assert validate("--bridge", "bridge-1") == 2
+    assert "--bridge: only with --site" in capsys.readouterr().err

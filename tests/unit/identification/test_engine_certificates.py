@@ -1,0 +1,217 @@
+"""Crossings that wait for a certificate, and what becomes of them."""
+
+import logging
+from collections.abc import Iterable
+
+import pytest
+
+from schemas.certificates import Pair
+from schemas.proto import driveby_pb2 as pb
+from services.execution.dispatch import dispatched
+from services.execution.here import Here
+from services.history.store import known_crossings
+from services.identification import engine as under_test
+from services.identification.engine import Engine
+from services.identification.known import search_hash
+from services.identification.outputs import Output, Wanted, Work
+from services.recordings.recording import Message
+from tests.unit.identification.test_engine_resume import (
+    HEADER,
+    SETTINGS,
+    SITE,
+    THERE_AND_BACK,
+    TWO,
+    WHOLE,
+    Identifications,
+    Said,
+    messages_of,
+    said_by,
+)
+
+PAIR = Pair("truck-1", "bridge-1")
+DIGEST = "0123456789abcdef"
+FIVE = messages_of(
+    *THERE_AND_BACK, (60.0, -60.0), (80.0, 140.0), (90.0, 140.0), (110.0, -60.0),
+    (120.0, -60.0), (140.0, 140.0),
+)  # fmt: skip
+
+
+class Asking:
+    """An engine that asks for certificates, whose works are done at once."""
+
+    def __init__(self, certificates: dict[Pair, str] | None = None) -> None:
+        self.engine = Engine(SITE, SETTINGS, HEADER, certificates=certificates, are_required=True)
+        self.here = Here(identify=Identifications(), stopwatch=lambda: 0.0)
+        self.wanted: list[Pair] = []
+
+    def fed(self, messages: Iterable[Message]) -> list[Output]:
+        return [o for m in messages for o in self.told(self.engine.feed(m.key, m.payload))]
+
+    def told(self, said: Iterable[Output | Work | Wanted]) -> list[Output]:
+        return list(dispatched(self.engine, self.here, said, self.wanted.append))
+
+    def released(self) -> list[Output]:
+        found = []
+        while self.engine.has_released:
+            found += self.told(self.engine.release())
+        return found
+
+
+def names(outputs: Iterable[Output]) -> list[tuple[str, str]]:
+    """By crossing: what was told of its states, and its estimate."""
+    found = []
+    for output in outputs:
+        if output.result is not None:
+            found.append((output.result.crossing_id, "estimate"))
+        elif output.key.stream == "crossing":
+            message = pb.Crossing.FromString(output.payload)
+            found.append((message.crossing_id, pb.CrossingState.Name(message.state)))
+    return found
+
+
+def of_one(crossing_id: str, *what: str) -> list[tuple[str, str]]:
+    return [(crossing_id, one) for one in what]
+
+
+WAITS = ("DETECTED", "COMPLETE", "WAITING_NOT_VALIDATED")
+GOES_ON = ("IDENTIFYING", "estimate", "DONE")
+ONE, OTHER = list(dict.fromkeys(name for name, _ in names(WHOLE)))
+
+
+def test_without_a_certificate_all_wait_and_it_is_wanted_once() -> None:
+    asking = Asking()
+    outputs = asking.fed(TWO)
+    assert names(outputs) == of_one(ONE, *WAITS) + of_one(OTHER, *WAITS)
+    assert asking.wanted == [PAIR]
+    assert asking.engine.waiting() == {PAIR: [ONE, OTHER]}
+    assert not asking.engine.has_released
+    assert asking.released() == []
+    assert asking.told(asking.engine.release()) == []
+    assert not asking.engine.has_undecided(*("sim-test", "truck-1"))
+
+
+def test_with_one_they_go_on_in_order_and_name_it() -> None:
+    asking = Asking()
+    waiting = asking.fed(TWO)
+    asking.engine.certify(PAIR, DIGEST)
+    outputs = asking.released()
+    assert names(outputs) == of_one(ONE, *GOES_ON) + of_one(OTHER, *GOES_ON)
+    results = [output.result for output in outputs if output.result is not None]
+    assert [result.certificate for result in results] == [DIGEST, DIGEST]
+    on_the_wire = [
+        pb.Estimate.FromString(o.payload).certificate for o in outputs if o.key.stream == "estimate"
+    ]
+    assert on_the_wire == [DIGEST, DIGEST]
+    assert asking.engine.waiting() == {}
+    # Nothing else differs from what was told where nobody asks.
+    waited = pb.WAITING_NOT_VALIDATED
+    told = [
+        o
+        for o in [*waiting, *outputs]
+        if o.key.stream != "crossing" or pb.Crossing.FromString(o.payload).state != waited
+    ]
+    assert sorted(payload_but_certificate(o) for o in told) == sorted(
+        payload_but_certificate(o) for o in WHOLE
+    )
+
+
+def payload_but_certificate(output: Output) -> tuple[str, bytes]:
+    if output.key.stream != "estimate":
+        return output.key.stream, output.payload
+    estimate = pb.Estimate.FromString(output.payload)
+    estimate.certificate = ""
+    return output.key.stream, estimate.SerializeToString(deterministic=True)
+
+
+def test_one_that_is_known_before_holds_up_nothing() -> None:
+    asking = Asking({PAIR: DIGEST})
+    outputs = asking.fed(TWO)
+    assert [o.key.stream for o in outputs] == [o.key.stream for o in WHOLE]
+    assert asking.wanted == []
+    assert {o.result.certificate for o in outputs if o.result} == {DIGEST}
+
+
+def test_where_nobody_asks_results_name_one_that_is_known() -> None:
+    engine = Engine(SITE, SETTINGS, HEADER, certificates={PAIR: DIGEST})
+    here = Here(identify=Identifications())
+    outputs = [o for m in TWO for o in dispatched(engine, here, engine.feed(m.key, m.payload))]
+    assert {o.result.certificate for o in outputs if o.result} == {DIGEST}
+    assert {o.result.certificate for o in WHOLE if o.result} == {None}
+
+
+def test_one_at_a_time_and_none_overtakes_another() -> None:
+    """The third comes while the second still waits behind the first: it waits, but untold."""
+    asking = Asking()
+    first = asking.fed(m for m in FIVE if m.log_time_ns < TWO[-1].log_time_ns)
+    assert names(first)[-1] == (OTHER, "WAITING_NOT_VALIDATED")
+    asking.engine.certify(PAIR, DIGEST)
+    assert names(asking.told(asking.engine.release())) == of_one(ONE, *GOES_ON)
+    rest = asking.fed(m for m in FIVE if m.log_time_ns >= TWO[-1].log_time_ns)
+    assert {what for _, what in names(rest)} == {"DETECTED", "COMPLETE"}
+    after = names(asking.released())
+    assert [name for name, what in after if what == "estimate"] == [
+        OTHER, *dict.fromkeys(name for name, _ in names(rest))
+    ]  # fmt: skip
+    assert asking.engine.waiting() == {}
+
+
+def test_another_pair_is_not_held_up() -> None:
+    """A second truck on the same bridge, which has its certificate."""
+    second = SITE.vehicles[0].model_copy(update={"id": "truck-2"})
+    site = SITE.model_copy(update={"vehicles": (*SITE.vehicles, second)})
+    other = Pair("truck-2", "bridge-1")
+    asking = Asking()
+    asking.engine = Engine(site, SETTINGS, HEADER, certificates={other: DIGEST}, are_required=True)
+    asking.fed(TWO)
+    theirs = [m._replace(key=m.key._replace(identifier="truck-2")) for m in TWO]
+    outputs = asking.fed(theirs)
+    assert [o.result.vehicle for o in outputs if o.result] == ["truck-2"] * 2
+    assert asking.engine.waiting() == {PAIR: [ONE, OTHER]}
+
+
+@pytest.mark.parametrize("number", range(7))
+def test_a_run_that_was_cut_off_while_they_waited_goes_on(number: int) -> None:
+    """Whatever was told of them before: no state is told twice, none is left out."""
+    before = Asking().fed(TWO)[:number]
+    asking = Asking()
+    list(asking.engine.resume(known(said_by(before))))
+    again = asking.fed(TWO)
+    assert said_by(before) + said_by(again) == said_by(Asking().fed(TWO))
+    assert asking.wanted == [PAIR]
+    asking.engine.certify(PAIR, DIGEST)
+    assert names(asking.released()) == of_one(ONE, *GOES_ON) + of_one(OTHER, *GOES_ON)
+
+
+@pytest.mark.parametrize("number", range(13))
+def test_a_run_that_was_cut_off_while_they_went_on_goes_on(number: int) -> None:
+    """The certificate is in the folder by now."""
+
+    def whole() -> list[Output]:
+        asking = Asking()
+        outputs = asking.fed(TWO)
+        asking.engine.certify(PAIR, DIGEST)
+        return outputs + asking.released()
+
+    before = whole()[: 6 + number]
+    asking = Asking({PAIR: DIGEST})
+    after = [*asking.engine.resume(known(said_by(before))), *asking.fed(TWO)]
+    assert sorted(said_by(before) + said_by(after)) == sorted(said_by(whole()))
+
+
+def known(said: Said) -> list[under_test.Known]:
+    return known_crossings(said, search_hash(HEADER))
+
+
+def test_those_that_have_waited_too_long_are_told_to_be_given_up(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(under_test, "MOST_WAITING", 3)
+    asking = Asking()
+    with caplog.at_level(logging.WARNING):
+        told = names(asking.fed(FIVE))
+    crossings = list(dict.fromkeys(name for name, _ in told))
+    assert len(crossings) == 5
+    assert asking.engine.waiting() == {PAIR: crossings[2:]}
+    lines = [record.getMessage() for record in caplog.records]
+    assert [line.split(" ")[0] for line in lines] == crossings[:2]
+    assert all("driveby identify" in line for line in lines)

@@ -1,0 +1,203 @@
+"""Certificates as files, and what their hash depends on."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from schemas import certificates
+from schemas.certificates import (
+    Certificate,
+    Pair,
+    Tried,
+    certificate_json,
+    certificate_path,
+    load_certificate,
+    pair_hash,
+)
+from schemas.errors import InputError
+from schemas.settings import IdentificationSettings
+from schemas.site import Site
+from schemas.site_file import parse_site, site_toml
+from services.simulation.drive import paper_site
+
+SITE = paper_site()
+PAIR = Pair("truck-1", "bridge-1")
+SETTINGS = IdentificationSettings()
+
+
+def changed(part: str, **values: Any) -> Site:
+    """The paper's site with other values in one table."""
+    if part in ("sensor", "receiver"):
+        return SITE.model_copy(update={part: getattr(SITE, part).model_copy(update=values)})
+    one = getattr(SITE, part)[0].model_copy(update=values)
+    return SITE.model_copy(update={part: (one,)})
+
+
+def tried(number: int = 0, **values: Any) -> Tried:
+    fields: dict[str, Any] = {
+        "seed": number,
+        "direction": "start_to_end",
+        "ei_ratio": (1.0, 1.0),
+        "verdict": "good",
+        "ei_ratio_q025": (0.8, 0.8),
+        "ei_ratio_q50": (1.0, 1.0),
+        "ei_ratio_q975": (1.25, 1.25),
+    }
+    return Tried.model_validate(fields | values)
+
+
+def certificate(site: Site = SITE, pair: Pair = PAIR, **values: Any) -> Certificate:
+    """One that passed, of nothing: for who only asks whether there is one."""
+    fields: dict[str, Any] = {
+        "version": "0",
+        "created": 0.0,
+        "hash": pair_hash(site, pair, SETTINGS),
+        "method_edition": certificates.METHOD_EDITION,
+        "vehicle": pair.vehicle,
+        "bridge": pair.bridge,
+        "settings": SETTINGS.model_dump(mode="json"),
+        "seed": 1,
+        "conditions": {
+            "speed_m_per_s": 10.0,
+            "road_class": "B",
+            "road": "groove",
+            "rate_hz": 1000.0,
+            "noise_density_ug_per_rthz": (25.0,) * 4,
+        },
+        "planned": 12,
+        "crossings": (tried(),),
+        "figures": {
+            "crossings": 1,
+            "good": 1,
+            "intervals": 2,
+            "covered": 2,
+            "weak": 0,
+            "weak_found": 0,
+            "evaluations": 0,
+        },
+        "passed": True,
+        "reason": "made up",
+    }
+    return Certificate.model_validate(fields | values)
+
+
+@pytest.mark.parametrize(
+    ("part", "values"),
+    [
+        ("vehicles", {"total_mass_kg": 9531.0}),
+        ("vehicles", {"total_mass_kg_spread": 0.02}),
+        ("vehicles", {"twin_tyre_distance_m": (0.0, 0.33)}),
+        ("bridges", {"span_m": 30.1}),
+        ("bridges", {"elements": 6}),
+        ("bridges", {"flexural_rigidity_nm2_spread": 0.5}),
+        ("bridges", {"survey_speed_m_per_s": 12.0}),
+        ("bridges", {"road_class": "C"}),
+        ("bridges", {"bearings": ("free", "free")}),
+        ("sensor", {"rate_hz": (500.0,) * 4}),
+        ("sensor", {"noise_density_ug_per_rthz": (25.0, 25.0, 25.0, 26.0)}),
+        ("receiver", {"position_noise_m": 0.5}),
+    ],
+)
+def test_what_matters_changes_the_hash(part: str, values: dict[str, Any]) -> None:
+    assert pair_hash(changed(part, **values), PAIR, SETTINGS) != pair_hash(SITE, PAIR, SETTINGS)
+
+
+@pytest.mark.parametrize("values", [{"owner_id": "B 17/4"}, {"baseline": "before.json"}])
+def test_what_is_only_said_of_a_bridge_does_not(values: dict[str, Any]) -> None:
+    assert pair_hash(changed("bridges", **values), PAIR, SETTINGS) == pair_hash(
+        SITE, PAIR, SETTINGS
+    )
+
+
+def test_neither_order_nor_others_change_the_hash() -> None:
+    tables = f"\n{site_toml(SITE)}".split("\n[")[1:]
+    turned = "".join(
+        "[" + lines[0] + "\n" + "\n".join(lines[:0:-1]) + "\n"
+        for lines in (table.strip().split("\n") for table in reversed(tables))
+    )
+    other = parse_site(turned, "turned.toml")
+    assert other == SITE
+    more = SITE.model_copy(
+        update={
+            "vehicles": (SITE.vehicles[0].model_copy(update={"id": "truck-2"}), *SITE.vehicles),
+            "bridges": (SITE.bridges[0].model_copy(update={"id": "bridge-2"}), *SITE.bridges),
+        }
+    )
+    assert {pair_hash(site, PAIR, SETTINGS) for site in (SITE, other, more)} == {
+        pair_hash(SITE, PAIR, SETTINGS)
+    }
+    assert pair_hash(more, Pair("truck-2", "bridge-1"), SETTINGS) != pair_hash(SITE, PAIR, SETTINGS)
+
+
+def test_another_method_needs_another_certificate(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = pair_hash(SITE, PAIR, SETTINGS)
+    for values in ({"draws": 1300}, {"parts": 3}, {"method": "least_squares"}):
+        assert pair_hash(SITE, PAIR, SETTINGS.model_copy(update=values)) != one
+    for values in ({"seed": 2}, {"threads": 1}):
+        assert pair_hash(SITE, PAIR, SETTINGS.model_copy(update=values)) == one
+    monkeypatch.setattr(certificates, "METHOD_EDITION", certificates.METHOD_EDITION + 1)
+    assert pair_hash(SITE, PAIR, SETTINGS) != one
+
+
+def test_a_pair_that_the_site_has_not_is_an_error() -> None:
+    with pytest.raises(KeyError):
+        pair_hash(SITE, Pair("truck-1", "bridge-9"), SETTINGS)
+
+
+def test_a_file_comes_back_as_it_was(tmp_path: Path) -> None:
+    whole = certificate(crossings=(tried(weak_element=2), tried(1, verdict="suspect")))
+    path = certificate_path(tmp_path, whole.hash)
+    path.write_text(certificate_json(whole))
+    assert load_certificate(path) == whole
+
+
+def test_what_is_no_certificate_is_told_in_one_line(tmp_path: Path) -> None:
+    good = json.loads(certificate_json(certificate()))
+    path = certificate_path(tmp_path, good["hash"])
+    for content, what in (
+        ("{", "not a certificate"),
+        (json.dumps(good | {"passed": None}), "passed"),
+        (json.dumps(good | {"more": 1}), "more"),
+        (json.dumps(good | {"hash": "0" * 16}), "hash: is 0000000000000000"),
+    ):
+        path.write_text(content)
+        with pytest.raises(InputError, match=what) as error:
+            load_certificate(path)
+        assert str(error.value).startswith(str(path))
+    with pytest.raises(InputError, match="no such file"):
+        load_certificate(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"verdict": "rejected"},
+        {"ei_ratio_q50": (1.0,)},
+        {"ei_ratio_q025": (0.8, 0.0)},
+        {"ei_ratio": (1.0, float("nan"))},
+        {"weak_element": 3},
+    ],
+)
+def test_a_crossing_that_does_not_fit_together_is_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        tried(**values)
+
+
+EI_OF_EDITION_1 = (1.80565, 1.5202, 1.55585, 0.63085, 1.57542, 1.56293, 1.57473)
+"""Means of the elements of the sample's reference estimate, over 1e10 N·m²."""
+
+
+def test_another_answer_is_another_edition(project: Path) -> None:
+    """Who moves the reference estimate by a tenth of a standard deviation makes another method.
+
+    Then raise METHOD_EDITION, and put the new numbers here.
+    """
+    text = (project / "tests" / "data" / "reference_estimate.json").read_text()
+    estimates = json.loads(text)["sample"]["estimates"]
+    assert certificates.METHOD_EDITION == 1
+    for number, mean in enumerate(EI_OF_EDITION_1, start=1):
+        now = estimates[f"EI_{number}"]
+        assert abs(now["mean"] / 1e10 - mean) < 0.1 * now["std"] / 1e10
