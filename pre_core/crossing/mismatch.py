@@ -41,6 +41,7 @@ LONG_CYCLES_PER_M = 0.05
 _EVERY_LONG, _OTHERS = 30, 50
 """Of the grid's waves the common part is computed for so many, the longest, and for so many of the
 others: it has no detail."""
+_SURFACE_CYCLES_PER_M = (0.5, 4.0)
 _ENOUGH = 1e-4
 _NOTHING = 1e-12
 
@@ -59,6 +60,9 @@ class Shapes(NamedTuple):
     footprints: tuple[Footprint, Footprint]
     road: FloatArray
     """What the front axle feels of a surface of Phi k^3 = 1 m²: (g,), windowed."""
+    road_spread: FloatArray
+    """(g,) how many times the road itself that is: the window spreads its longest waves, which
+    are by far the highest, over all others."""
     expected_m: FloatArray
     """(s,) m³ that a level is over Phi k^3: of tyres unlike each other as they are, of an offset of
     `_LARGE_OFFSET_M`."""
@@ -86,9 +90,16 @@ def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
         leaning.append((of_front - common) / at)
         expected.append(at * larger**2)
     road = _windowed(of_front)
+    spread = road / of_front
     grid[0] = 0.0
     return Shapes(
-        grid, np.stack(density), np.stack(leaning), (front, rear), road, np.array(expected)
+        grid,
+        np.stack(density),
+        np.stack(leaning),
+        (front, rear),
+        road,
+        spread,
+        np.array(expected),
     )
 
 
@@ -225,6 +236,23 @@ def segment(values: FloatArray, sensors: FloatArray, shapes: FloatArray) -> Segm
         return np.maximum(power, _NOTHING * power.max())
 
     return Segment(seen, expected(sensors), np.stack([expected(row) for row in shapes]))
+
+
+def surface_level(shapes: Shapes, roads: list[Segment], lengths_m: list[float]) -> float:
+    """Phi k^3 in m² of the surface, by periodograms of what an axle felt on stretches of it.
+
+    By the median, over waves of a quarter of a metre to two: what is longer is what the window of
+    `road` has spread. Zero if no stretch has such waves.
+    """
+    found = []
+    for one, length in zip(roads, lengths_m, strict=True):
+        n = np.arange(1, one.seen.size + 1) / length
+        inside = (n > _SURFACE_CYCLES_PER_M[0]) & (n < _SURFACE_CYCLES_PER_M[1])
+        spread = np.interp(n[inside], shapes.cycles_per_m, shapes.road_spread)
+        found.append(one.seen[inside] / one.shapes[0, inside] * spread)
+    ratio = np.concatenate(found)
+    # The median of an exponential is ln 2 of its mean.
+    return float(np.median(ratio) / np.log(2.0)) if ratio.size else 0.0
 
 
 def levels(segments: list[Segment], usual: FloatArray | None = None) -> tuple[FloatArray, float]:

@@ -436,11 +436,12 @@ def mismatch_levels(
     sensors = _spectrum(truck, density, linear_springs(), None, omega)[0, 0].real * rows.power
     of_sensors, of_shapes = (sensors @ turn).real, (shape @ turn).real
     whole = [_mismatch.segment(one, of_sensors, of_shapes[-1:]) for one in roads]
-    surface, _ = _mismatch.levels(whole)
-    usual = np.array([np.inf, surface[0] * shapes.expected_m[1]])
+    metres = rows.every * rows.step_s * road.speed_m_per_s
+    surface = _mismatch.surface_level(shapes, whole, [metres * one.size for one in roads])
+    usual = np.array([np.inf, surface * shapes.expected_m[1]])
     parts = [_mismatch.segment(one, of_sensors, of_shapes[:-1]) for one in stretches]
     level, gain = _mismatch.levels(parts, usual)
-    if level[0] >= _ALIKE * surface[0] * shapes.expected_m[0]:
+    if level[0] >= _ALIKE * surface * shapes.expected_m[0]:
         return level, gain
     alike = [part._replace(shapes=part.shapes[1:]) for part in parts]
     level, gain = _mismatch.levels(alike, usual[1:])
