@@ -67,6 +67,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="on the disk to try (default: a new one)")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--rotate-minutes", type=float, default=DEFAULT_MINUTES)
+    parser.add_argument("--freeze", type=float, default=0.0, help="the logger for so many seconds")
     parser.add_argument("--plain", action="store_true", help="try a recorder of 30 lines instead")
     parser.add_argument("--role", choices=("logger", "plain", "fleet"), help=argparse.SUPPRESS)
     parser.add_argument("--endpoint", help=argparse.SUPPRESS)
@@ -87,6 +88,7 @@ def main() -> None:
             options.seconds,
             options.rotate_minutes,
             recorder="plain" if options.plain else "logger",
+            freeze_s=options.freeze,
         )
     for name, value in figures.items():
         print(f"{name:40} {value}", flush=True)
@@ -101,8 +103,13 @@ def measure(
     rotate_minutes: float = DEFAULT_MINUTES,
     warm_up_s: float = 10.0,
     recorder: str = "logger",
+    freeze_s: float = 0.0,
 ) -> dict[str, float | str]:
-    """Let the trucks drive for so long, and return what was measured."""
+    """Let the trucks drive for so long, and return what was measured.
+
+    After two fifths of it the logger is frozen for `freeze_s`: what it leaves of a burst is seen in
+    its memory.
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -123,6 +130,11 @@ def measure(
     loads = []
     while fleet.poll() is None and usages[-1].at_s - usages[0].at_s < seconds:
         time.sleep(1.0)
+        if freeze_s and usages[-1].at_s - usages[0].at_s > 0.4 * seconds:
+            logger.send_signal(signal.SIGSTOP)
+            time.sleep(freeze_s)
+            logger.send_signal(signal.SIGCONT)
+            freeze_s = 0.0
         usages.append(usage(logger.pid))
         loads.append(os.getloadavg()[0])
     fleet_after = usage(fleet.pid)

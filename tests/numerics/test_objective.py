@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh, lu_factor, lu_solve
 from scipy.optimize import brentq
 
-from pre_core.kernels.jacobi import diagonalise
+from pre_core.kernels.jacobi import diagonalise, diagonalise_one
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate, spline_integrate
 from pre_core.paper.residual import (
@@ -504,3 +504,14 @@ def test_jacobi_against_lapack(size: int, seed: int, off: float) -> None:
         np.testing.assert_allclose(vectors @ vectors.T, np.eye(size), atol=1e-12)
         again = (vectors.T * values) @ vectors
         np.testing.assert_allclose(again, lanes[:, :, lane], atol=1e-12 * exact[-1])
+
+
+@pytest.mark.parametrize("off", [1e-12, 1e-9, 1e-3])
+def test_one_matrix_that_is_all_but_diagonal_is_turned_the_short_way(off: float) -> None:
+    """The long way round divides by the difference of two numbers that are alike."""
+    matrix = np.array([[1.0, off], [off, 2.0]])
+    a, v = matrix.copy(), np.empty((2, 2))
+    assert diagonalise_one(a, v)
+    np.testing.assert_allclose(np.diag(a), [1.0 - off**2, 2.0 + off**2], atol=2 * off**4 + 1e-15)
+    np.testing.assert_allclose(np.diag(v), [1.0, 1.0], atol=off**2 + 1e-15)
+    np.testing.assert_allclose((v.T * np.diag(a)) @ v, matrix, atol=1e-15)

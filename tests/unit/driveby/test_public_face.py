@@ -374,6 +374,22 @@ def test_simulate_is_the_command(tmp_path: Path) -> None:
     assert mine.read_bytes() == theirs.read_bytes()
 
 
+def test_simulate_is_exact_unless_told_otherwise(
+    scenario_6: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, object] = {}
+
+    def spy(*_: object, **options: object) -> Drive:
+        asked.update(options)
+        return scenario_6
+
+    monkeypatch.setattr(simulating, "simulate_drive", spy)
+    simulation = driveby.simulate(scenario=6)
+    assert (asked["noise_ug_per_rthz"], asked["receiver_errors"]) == (0.0, False)
+    assert simulation.site == driveby.simulate(scenario=6, noise=0.0).site
+    assert simulation.site != driveby.simulate(scenario=6, noise=1.0).site
+
+
 def test_simulate_computes_with_one_thread_of_blas(
     scenario_6: Drive, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,6 +55,12 @@ def test_every_missing_number_is_fetched_confirmed_or_lost(
     assert flat(found.lost) == missing - safe - held
 
 
+def test_near_holes_are_asked_for_at_once_from_the_first_to_the_last() -> None:
+    near = [(5, 9), (20, 30), (200, 210)]
+    assert spool_recovery._joined([*near, (411, 420)]) == [(5, 210), (411, 420)]
+    assert spool_recovery._joined([*near, (410, 420)]) == [(5, 420)]
+
+
 @given(
     st.lists(
         st.builds(

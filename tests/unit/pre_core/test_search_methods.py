@@ -392,6 +392,20 @@ def test_no_particle_of_the_random_walk_ever_climbs(window: Window):
     assert moved.all()
 
 
+def test_a_descent_ends_with_the_first_step_that_gains_too_little() -> None:
+    """Where the bottom lies far above zero, too: gain is what is left over, less."""
+
+    def rows(y: np.ndarray) -> np.ndarray:
+        return np.column_stack([np.sinh(y[:, 0]), np.full(y.shape[0], 100.0)])
+
+    found = levenberg_marquardt.minimised(rows, np.array([3.0]), 200, 1.0)
+    assert found.ending is Ending.CONVERGED
+    objectives = [info.objective for info in found.infos]
+    gains = -np.diff([np.sinh(3.0) ** 2 + 1e4, *objectives])
+    assert np.all(gains[:-1] >= 1.0)
+    assert gains[-1] < 1.0
+
+
 def test_the_random_walk_begins_in_the_papers_prior(window: Window):
     bound = random_walk.problem(window, NOMINAL, FREE, 0)
     ratios = random_walk.init(bound, 2000).ratios

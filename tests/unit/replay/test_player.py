@@ -7,7 +7,7 @@ import pytest
 from schemas.topics import Key
 from services.recordings.recording import Message
 from services.recordings.together import Timed
-from services.replay.player import Command, Controls, Course, Played, Status, play
+from services.replay.player import LEAD_S, Command, Controls, Course, Played, Status, play
 
 S = 1_000_000_000
 START_NS = 1_700_000_000 * S
@@ -147,6 +147,15 @@ def test_two_jumps_at_once_pass_two_crossings_and_a_third_says_that_there_is_non
     _, came = lost.played(recorded(0.0, 1.0), Course(1.0, crossings_ns=()))
     assert came == [(0, 0.0), (1, 1.0)]
     assert "no crossing ahead" in {status.note for status in lost.shown}
+
+
+def test_a_jump_from_where_a_jump_ended_goes_on() -> None:
+    """There is a message in the very moment that lies `LEAD_S` before the crossing."""
+    crossings = tuple(START_NS + s * S for s in (100, 200))
+    user = User(NEXT_CROSSING_1=1.0, NEXT_CROSSING_2=1.0)
+    times_s = (0.0, 50.0, 100.0 - LEAD_S, 150.0, 196.0)
+    _, came = user.played(recorded(*times_s), Course(1.0, crossings_ns=crossings))
+    assert came == [(0, 0.0), (2, 1.0), (4, 1.0)]
 
 
 def test_a_jump_into_a_silence_ends_at_what_follows_it() -> None:

@@ -260,6 +260,21 @@ def test_the_baseline_of_the_site_file_lies_beside_it(
     assert "unchanged within 1 %" in (tmp_path / "r.html").read_text()
 
 
+def test_the_baseline_of_a_recording_lies_beside_its_results(
+    site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The site file that a recording carries has no folder of its own."""
+    bridge = site.bridges[0].model_copy(update={"baseline": "then.json"})
+    named = site.model_copy(update={"bridges": (bridge,)})
+    now = results_of(site, some_crossing("b"), used="b")
+    files = [(tmp_path / "now.json", now, named)]
+    assert "No baseline is stored" in Seen(page(bridge_reports(files, None))).text
+    assert "the baseline" in caplog.text
+    then = results_of(site, some_crossing("a"), used="a")
+    (tmp_path / "then.json").write_text(results_json(then))
+    assert "Compared with the baseline then.json" in Seen(page(bridge_reports(files, None))).text
+
+
 def test_what_cannot_be_reported_is_one_line_and_leaves_nothing(
     capsys: pytest.CaptureFixture[str], written: tuple[Path, Path], tmp_path: Path
 ) -> None:

@@ -181,6 +181,9 @@ def test_conditions_and_distributions_count_what_they_say() -> None:
     seconds = distribution(records, "seconds")
     assert seconds is not None
     assert seconds["median"] == 4.0
+    spread = distribution([{"seconds": float(n)} for n in (3, 1, 2)], "seconds")
+    assert spread is not None
+    assert (spread["least"], spread["median"], spread["most"]) == (1.0, 2.0, 3.0)
     assert distribution(records, "starts") is None
 
 
