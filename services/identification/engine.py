@@ -3,6 +3,9 @@
 It finds crossings in the positions, waits for the samples that belong to them, has them identified
 and says so. It opens nothing, reads no clock and asks nobody, so that a recording that is replayed
 through it gives the same bytes every time.
+
+Longer than other modules, because its class holds the one state that messages, results and
+certificates change in turn.
 """
 
 import contextlib

@@ -1,6 +1,9 @@
 """What a Rerun file holds of one crossing: what was found, what it was found from, how sure it is.
 
 Rerun has no plot of y over x: what stands along the span is drawn as lines and pictures.
+
+Longer than other modules, because each of its many views is a dozen lines, and no other room uses
+any of them.
 """
 
 from __future__ import annotations

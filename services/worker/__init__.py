@@ -9,6 +9,8 @@ last five minutes).
 
 Real crossings (realm `live`) are identified only where simulated ones of the same truck on the same
 bridge have shown that the method recovers what was put in: until then they wait (`certificates`).
+
+Longer than other modules, because what is told, kept and published of one message has one order.
 """
 
 import contextlib

@@ -25,6 +25,8 @@ WINDOW = "opens a window until somebody closes it; tests/unit/viewer opens it wi
 SERVICE = "runs until it is stopped; tests/process_replay starts it as a process"
 MACHINES = "is for machines that are not here; tests/process_replay and tests/faults do it on one"
 NETWORK = "needs a network"
+FUSES = "is of many drives; tests/unit/identification/test_fusing.py runs the commands"
+CERTIFIES = "takes a minute; tests/process_replay and tests/unit/validation run it"
 ITSELF = "runs the tests, of which this is one"
 
 NOT_RUN = {
@@ -35,6 +37,24 @@ NOT_RUN = {
     "make faults": ITSELF,
     "make soak": LONG,
     "make validate": LONG,
+    "driveby identify monday.mcap tuesday.mcap --json week.json": FUSES,
+    "driveby fuse week.json lastweek.json --json both.json": FUSES,
+    "driveby fuse both.json --baseline lastyear.json": FUSES,
+    "pytest tests/numerics/test_fusion.py": ITSELF,
+    "pytest tests/unit/inspection": ITSELF,
+    "driveby validate --method pre --surveys 15 --records build/surveys.jsonl": LONG,
+    "driveby validate --site site.toml": CERTIFIES,
+    "driveby validate --site site.toml --certificates recordings/certificates": CERTIFIES,
+    "driveby health worker": "asks a worker; tests/process_replay does, of one that runs",
+    "driveby survey --site SITE": "one of those above it, of a site of one's own",
+    "driveby survey --site site.toml": LONG,
+    "driveby survey --site docs/site.example.toml": LONG,
+    "driveby survey --site docs/site.example.toml --tyres single --speed 10 --figure survey.png": (
+        LONG
+    ),
+    "python -m tests.survey.achieved 5": LONG,
+    "python -m tests.survey.sound 60": LONG,
+    "python -m tests.benchmarks.logger_load --trucks 100 --seconds 200 --freeze 8": LONG,
     "make bench": LONG,
     "make mutants MUTANTS=30 SEED=1": LONG,
     "make up": "needs a container engine; tests/contract/test_compose.py reads its files",
