@@ -18,6 +18,7 @@ import numpy as np
 
 from pre_core import unknowns
 from pre_core.crossing import posterior
+from pre_core.crossing.compliances import draws, of_normal
 from pre_core.crossing.preparation import Inputs, prepare
 from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
@@ -56,7 +57,17 @@ def warm_up() -> None:
     For who must not wait for a compiler when the first truck comes.
     """
     _warm_up_pre()
+    _warm_up_fusing()
     _warm_up_paper()
+
+
+def _warm_up_fusing() -> None:
+    """The sampler of a bridge of one element, without supports that might be absent."""
+    one, nowhere = np.ones(1), np.zeros(0, dtype=np.int64)
+    density = of_normal(
+        np.eye(2), np.ones(2), np.ones(1, dtype=np.int64), nowhere, one, np.zeros(2), 1.0, one, one
+    )
+    draws(density, 1, 0, 0)
 
 
 def _warm_up_pre() -> None:

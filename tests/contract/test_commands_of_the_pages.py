@@ -180,8 +180,7 @@ def marked() -> Iterator[object]:
     for page in PAGES:
         commands = runnable(page)
         if commands:
-            identifies = any(command.startswith("driveby identify") for command in commands)
-            marks = [pytest.mark.slow] if identifies and page.name != "README.md" else []
+            marks = [] if page.name == "README.md" else [pytest.mark.slow]
             each = [[one] for one in commands] if page.name in ALTERNATIVES else [commands]
             for number, some in enumerate(each, start=1):
                 yield pytest.param(some, marks=marks, id=f"{page.name}-{number}")
