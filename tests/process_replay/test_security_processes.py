@@ -105,7 +105,7 @@ def test_a_crossing_is_identified_under_access_control(
     folder = tmp_path / "r"
     driveby("logger", "--listen", tls_endpoint, "--tls", credentials / "logger", "--folder", folder)
     worker = driveby(
-        *("worker", "--site", site, "--method", "least-squares"),
+        *("worker", "--site", site, "--method", "least-squares", "--no-certificates"),
         *("--file", tmp_path / "results.mcap", *bus, credentials / "worker"),
     )
     with (
