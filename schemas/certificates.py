@@ -9,9 +9,10 @@ import json
 from pathlib import Path
 from typing import Annotated, Final, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
 from schemas.errors import InputError
+from schemas.json_file import load_json
 from schemas.results import Finite
 from schemas.settings import NOT_OF_THE_RESULT, IdentificationSettings
 from schemas.site import Site
@@ -169,17 +170,7 @@ def certificate_json(certificate: Certificate) -> str:
 
 def load_certificate(path: Path) -> Certificate:
     """Read a certificate; InputError with one line if it is none or is not what its name says."""
-    try:
-        found = Certificate.model_validate_json(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file, a certificate (JSON) is expected") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in problem["loc"])
-        message = problem["msg"].removeprefix("Value error, ")
-        raise InputError(f"{path}: {place or 'not a certificate'}: {message}") from error
+    found = load_json(Certificate, path, "a certificate")
     if found.hash != path.stem:
         raise InputError(f"{path}: hash: is {found.hash}, it must be the name of its file")
     return found

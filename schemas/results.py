@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
-from schemas.errors import InputError
 from schemas.fusion import FusionLikelihood
+from schemas.json_file import load_json
 from schemas.reasons import BRIDGE_REASON_TEXTS, BridgeReason, Reason, texts
 
 SCHEMA_VERSION: Final = 1
@@ -304,7 +304,7 @@ class Header(NamedTuple):
     program: str = "driveby"
 
 
-_RESOLVED = 0.25
+RESOLVED = 0.25
 """Relative standard deviation of EI up to which an element is called resolved: a loss of half of it
 is then beyond chance."""
 
@@ -314,7 +314,7 @@ def resolution(crossing: Crossing) -> str | None:
     if crossing.parameters is None or crossing.derived is None or crossing.derived.ei_level is None:
         return None
     elements = [p for name, p in crossing.parameters.items() if name.startswith("EI_")]
-    open_ones = sum(p.std > _RESOLVED * abs(p.mean) for p in elements)
+    open_ones = sum(p.std > RESOLVED * abs(p.mean) for p in elements)
     if open_ones == 0:
         return None
     level = crossing.derived.ei_level
@@ -335,14 +335,4 @@ def results_json(content: Results) -> str:
 
 def load_results(path: Path) -> Results:
     """Read a results file; raise InputError with one line if it is none."""
-    try:
-        return Results.model_validate_json(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file, a results file (JSON) is expected") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in problem["loc"])
-        message = problem["msg"].removeprefix("Value error, ")
-        raise InputError(f"{path}: {place or 'not a results file'}: {message}") from error
+    return load_json(Results, path, "a results file")

@@ -259,12 +259,12 @@ def _crossing(message: pb.Estimate) -> Crossing:
         "verdict": pb.Verdict.Name(message.verdict).lower(),
         "reasons": tuple(message.reasons),
         "reason_texts": tuple(message.reason_texts),
-        "chi2_per_dof": message.chi2_per_dof if message.HasField("chi2_per_dof") else None,
+        "chi2_per_dof": _or_none(message, "chi2_per_dof"),
         "diagnostics": dict(message.diagnostics),
         "parameters": (
             None if rejected else {n: _parameter(p) for n, p in message.parameters.items()}
         ),
-        "scale_error": message.scale_error if message.HasField("scale_error") else None,
+        "scale_error": _or_none(message, "scale_error"),
         "covariance": _covariance(message.covariance) if message.HasField("covariance") else None,
         "derived": _derived(message.derived) if message.HasField("derived") else None,
         "road": _road(message.road) if message.HasField("road") else None,
@@ -343,9 +343,7 @@ def _derived(message: pb.Derived) -> dict[str, object]:
         "max_deflection_m": _parameter(message.max_deflection_m),
         "probability_sprung": _ends(message, "probability_sprung"),
         "probability_giving": _ends(message, "probability_giving"),
-        "springs_believed": (
-            message.springs_believed if message.HasField("springs_believed") else None
-        ),
+        "springs_believed": _or_none(message, "springs_believed"),
         "ei_level": _parameter(message.ei_level) if message.HasField("ei_level") else None,
         "ei_thirds": (
             {name: _parameter(getattr(message.ei_thirds, name)) for name in _THIRDS}
@@ -365,7 +363,7 @@ def _road(message: pb.RoadResult) -> dict[str, object]:
         "rear_m": tuple(message.rear_m),
         "mean_m": tuple(message.mean_m),
         "std_m": tuple(message.std_m) or None,
-        "iri_m_per_km": message.iri_m_per_km if message.HasField("iri_m_per_km") else None,
+        "iri_m_per_km": _or_none(message, "iri_m_per_km"),
         "iso_class": message.iso_class or None,
         "mismatch": _mismatch(message.mismatch) if message.HasField("mismatch") else None,
     }
@@ -375,7 +373,7 @@ def _mismatch(message: pb.RoadMismatch) -> dict[str, float | None]:
     return {
         "A_m3": message.a_m3,
         "n_0_per_m": message.n_0_per_m,
-        "common_share": message.common_share if message.HasField("common_share") else None,
+        "common_share": _or_none(message, "common_share"),
     }
 
 

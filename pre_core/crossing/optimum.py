@@ -358,12 +358,7 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
         problem = with_noise_at(problem, y, force, mismatch=levels_at(problem, y))
     for temperature, steps in _COARSE_ON_TWO_ROADS if way.differs else _COARSE:
         report("finding the truck", 0.05)
-        if problem.mismatch.level_m3.any():
-            problem, y, _, used = _followed(
-                problem, y, whole, temperature, steps, with_force, is_free=True
-            )
-        else:
-            y, _, _, used = _descend(problem, y, whole, temperature, steps, 0.5, is_free=True)
+        problem, y, _, used = _searched(problem, y, whole, (temperature, steps, 0.5), with_force)
         evaluations += used
         problem = with_noise_at(problem, y, force)
     power = noise_floor(problem, y)
@@ -473,16 +468,8 @@ def _freed(problem: Problem, y: FloatArray, way: Way) -> tuple[Optimum | _Wrong,
     start[layout(problem).swing] = 0.0
     free = np.eye(start.size)
     first = np.delete(free, _at_rest(problem, way), axis=1)
-    temperature, few, little = _FREE[0]
     believing = with_noise_at(problem, start, linear_springs())
-    if believing.mismatch.level_m3.any():
-        believing, y, ending, evaluations = _followed(
-            believing, start, first, temperature, few, believed, is_free=True
-        )
-    else:
-        y, _, ending, evaluations = _descend(
-            believing, start, first, temperature, few, little, is_free=True
-        )
+    believing, y, ending, evaluations = _searched(believing, start, first, _FREE[0], believed)
     believing = with_noise_at(believing, y, linear_springs())
     problem = with_noise_at(believing, y)
     rubs = problem.force.any() and belief_in_springs(problem, y) < _PLAINLY_RUBS
@@ -492,14 +479,7 @@ def _freed(problem: Problem, y: FloatArray, way: Way) -> tuple[Optimum | _Wrong,
         return _Wrong.LOST, evaluations
     if rubs:
         problem = with_noise_at(believing, start)
-        if problem.mismatch.level_m3.any():
-            problem, y, ending, used = _followed(
-                problem, start, free, temperature, few, with_noise_at, is_free=True
-            )
-        else:
-            y, _, ending, used = _descend(
-                problem, start, free, temperature, few, little, is_free=True
-            )
+        problem, y, ending, used = _searched(problem, start, free, _FREE[0], with_noise_at)
         evaluations += used
     else:
         for is_free, rounds in ((True, _ROUNDS_ON_THE_WAY), (False, _MOST_ROUNDS)):
@@ -555,6 +535,24 @@ def _in_rounds(
         if abs(before.force.sum() - problem.force.sum()) <= _SAME_LEVEL * before.force.sum():
             break
     return problem, y, ending, evaluations
+
+
+def _searched(
+    problem: Problem,
+    y: FloatArray,
+    directions: FloatArray,
+    how: tuple[float, int, float],
+    again: Again,
+) -> tuple[Problem, FloatArray, Ending, int]:
+    """Least squares on the way: `how` is temperature, steps, and the gain not worth a step.
+
+    Where the roads differ the noise is told anew by `again` before every step.
+    """
+    temperature, steps, enough = how
+    if problem.mismatch.level_m3.any():
+        return _followed(problem, y, directions, temperature, steps, again, is_free=True)
+    y, _, ending, used = _descend(problem, y, directions, temperature, steps, enough, is_free=True)
+    return problem, y, ending, used
 
 
 def _followed(

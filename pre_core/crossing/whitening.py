@@ -71,7 +71,6 @@ FORCE_SHAPES = _FORCE_CENTRES_HZ.size
 of dry friction falls by six decades from the body's bounce to the rows' highest frequency."""
 _FORCE_MEMORY_S = 0.3
 """Its covariance ends here, which is what makes the bumps as wide as they are."""
-"""Rounds of the multiplicative fit of the spectrum, a fixed number."""
 _MIDDLE_BAND, _TOP_BAND = (0.22, 0.54), (0.65, 0.757)
 """Shares of half the rows' rate: 12 to 30 and 36 to 42 Hz of sensors of 250 Hz and more."""
 _EVENLY = 3.0

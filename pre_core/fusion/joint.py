@@ -292,12 +292,18 @@ def sum_of(
 ) -> tuple[FloatArray, FloatArray]:
     """Precision and linear part of all unknowns, with normal priors of the bridge's."""
     layout = joint.layout
-    precision, linear = joint.prior.copy(), np.zeros(layout.size)
+    precision, linear = _told(joint, ready)
     single = np.arange(layout.bridge - priors.elements)
     precision[single, single] += 1.0
     rough = _ROUGH_SPREAD**-2
     precision[layout.elements, layout.elements] += rough
     linear[layout.elements] += rough
+    return precision, linear
+
+
+def _told(joint: Joint, ready: Sequence[_Ready]) -> tuple[FloatArray, FloatArray]:
+    """Precision and linear part of all unknowns, without priors of the bridge's."""
+    precision, linear = joint.prior.copy(), np.zeros(joint.layout.size)
     for one in ready:
         precision[np.ix_(one.places, one.places)] += one.precision
         linear[one.places] += one.linear
@@ -386,11 +392,7 @@ def _drawn(
 def _posterior(joint: Joint, priors: BridgePriors, ready: Sequence[_Ready]) -> Compliances:
     """All crossings times the priors, each once, with what is not the bridge's integrated out."""
     layout, of = joint.layout, priors.coordinates
-    precision, linear = joint.prior.copy(), np.zeros(layout.size)
-    for one in ready:
-        precision[np.ix_(one.places, one.places)] += one.precision
-        linear[one.places] += one.linear
-    precision, linear = marginal(precision, linear, np.arange(layout.bridge))
+    precision, linear = marginal(*_told(joint, ready), np.arange(layout.bridge))
     single = np.arange(layout.bridge - priors.elements)
     precision[single, single] += 1.0
     return of_normal(

@@ -22,7 +22,7 @@ _SMALLEST_DAMPING = 1e-14
 _GIVE_UP_DAMPING = 1e8
 """Steps that are so short and do not help: the search is stuck."""
 _CONVERGED_STEP = 1e-9  # in logarithms
-LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
+_LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
 
 
 class Differences(NamedTuple):
@@ -120,9 +120,9 @@ def move(rows: Rows, state: State, lower: FloatArray | None = None) -> Move | tu
         change = np.zeros(f)
         change[free] = _damped(triangle, projected, damping) / scale
         size = float(np.abs(change).max())
-        if size > LARGEST_STEP:
-            change *= LARGEST_STEP / size
-            size = LARGEST_STEP
+        if size > _LARGEST_STEP:
+            change *= _LARGEST_STEP / size
+            size = _LARGEST_STEP
         trial = state.y + change
         if lower is not None:
             trial = np.maximum(trial, lower)

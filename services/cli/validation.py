@@ -1,6 +1,7 @@
 """The command that asks whether the answers are true: validate."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -60,17 +61,6 @@ KINDS: Final = (
 """As in `validation.surveys`, which is not imported for a line of help."""
 
 
-def _kinds(text: str) -> tuple[str, ...]:
-    if text == "all":
-        return KINDS
-    for name in names(text):
-        if name not in KINDS:
-            raise argparse.ArgumentTypeError(
-                f'is "{text}", it must be all or some of {", ".join(KINDS)}'
-            )
-    return tuple(dict.fromkeys(names(text)))
-
-
 _OF_METHODS: Final = {
     "scenarios": tuple(SCENARIOS),
     "noise": 0.0,
@@ -84,15 +74,20 @@ _OF_CERTIFICATES: Final = {"truck": None, "bridge": None, "certificates": None}
 """Options that belong to one kind of validation only, with their defaults."""
 
 
-def _effects(text: str) -> tuple[str, ...]:
-    if text == "all":
-        return EFFECTS
-    for name in names(text):
-        if name not in EFFECTS:
-            raise argparse.ArgumentTypeError(
-                f'is "{text}", it must be all or some of {", ".join(EFFECTS)}'
-            )
-    return tuple(dict.fromkeys(names(text)))
+def _some_of(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
+    """Take all or some of the known names, each once."""
+
+    def parse(text: str) -> tuple[str, ...]:
+        if text == "all":
+            return known
+        for name in names(text):
+            if name not in known:
+                raise argparse.ArgumentTypeError(
+                    f'is "{text}", it must be all or some of {", ".join(known)}'
+                )
+        return tuple(dict.fromkeys(names(text)))
+
+    return parse
 
 
 def add_validate(commands: Any) -> None:
@@ -153,7 +148,7 @@ def add_validate(commands: Any) -> None:
     )
     p.add_argument(
         "--effects",
-        type=_effects,
+        type=_some_of(EFFECTS),
         default=EFFECTS,
         metavar="all|swing,friction,…",
         help=f"of {', '.join(EFFECTS)} (default: all)",
@@ -175,7 +170,7 @@ def add_validate(commands: Any) -> None:
     )
     p.add_argument(
         "--kinds",
-        type=_kinds,
+        type=_some_of(KINDS),
         default=KINDS,
         metavar="all|twin,steady,…",
         help=f"of {', '.join(KINDS)} (default: all)",

@@ -22,8 +22,8 @@ from services.identification.bridge_state import (
     NOTHING_STORED,
     Counted,
     Fusing,
+    States,
     count_in,
-    state_of,
     usable,
 )
 from services.identification.known import Known, search_hash
@@ -141,7 +141,7 @@ class _Read:
     """What has been read of the files so far; of the messages only those that are needed."""
 
     def __init__(self, search: str, fusing: Fusing) -> None:
-        self.fusing = fusing
+        self._states = States(fusing)
         self.store = Store(search)
         self.said: dict[MessageName, None] = {}
         self.states: dict[Key, Message] = {}
@@ -167,7 +167,7 @@ class _Read:
     def bridges(self, search: str) -> dict[str, BridgeResult]:
         """The states of all bridges after what has been read, by a search."""
         states = {
-            name: state_of(counted, name, self.fusing)
+            name: self._states.of(counted, name, (search, name))
             for name, counted in self.counted[search].items()
         }
         return {name: state for name, state in states.items() if state is not None}

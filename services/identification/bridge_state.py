@@ -5,7 +5,7 @@ the first did.
 """
 
 from bisect import insort
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from pre_core.constants import NORMAL_975
 from schemas.reasons import BridgeReason, LeftOutReason
 from schemas.results import (
     LOSSES_PERCENT,
+    RESOLVED,
     BridgeResult,
     Crossing,
     ElementState,
@@ -31,8 +32,6 @@ LISTED_AT_MOST = 100
 """So many crossings are fused, the newest, and as many that are left out are named: the state stays
 below 20 kB, while a message on the bus may have 1 MiB. The others are counted."""
 _MANY = 1.0 / 3.0
-_RESOLVED = 0.25
-"""Relative standard deviation up to which an element is called resolved."""
 
 
 class Usable(NamedTuple):
@@ -43,7 +42,6 @@ class Usable(NamedTuple):
     exit_time: float
     crossing_id: str
     verdict: Verdict
-    method: str
     elements: dict[str, ElementState]
     source: Source | None
 
@@ -108,7 +106,6 @@ def usable(result: Crossing) -> Usable | None:
         result.exit_time,
         result.crossing_id,
         result.verdict,
-        result.method,
         elements,
         source_of(result),
     )
@@ -189,6 +186,21 @@ def state_of(counted: Counted, bridge: str, fusing: Fusing = NOTHING_STORED) -> 
     return state.model_copy(update={"finding": _finding(found, state, baseline)})
 
 
+class States:
+    """States of bridges, each made only when crossings have come since: it costs up to a second."""
+
+    def __init__(self, fusing: Fusing) -> None:
+        self.fusing = fusing
+        self._made: dict[Hashable, tuple[Counted, BridgeResult | None]] = {}
+
+    def of(self, counted: Counted, bridge: str, key: Hashable) -> BridgeResult | None:
+        """As `state_of`; `key` tells apart bridges of one name."""
+        made = self._made.get(key)
+        if made is None or made[0] is not counted:
+            made = self._made[key] = (counted, state_of(counted, bridge, self.fusing))
+        return made[1]
+
+
 def with_common_shares(
     crossings: Iterable[Crossing], bridges: Mapping[str, BridgeResult]
 ) -> list[Crossing]:
@@ -266,7 +278,7 @@ def _finding(found: FusedBridge, state: BridgeResult, baseline: BridgeResult | N
     stored = None if baseline is None else estimate_of_state(baseline)
     common = float(np.log(found.ei_nm2).mean(axis=1).std())
     said = sentences(compare(of._replace(scale_error=common), found.nominal_nm2, edges, stored))
-    open_ones = sum(one.std > _RESOLVED * one.mean for one in state.elements.values())
+    open_ones = sum(one.std > RESOLVED * one.mean for one in state.elements.values())
     if open_ones and state.level is not None:
         spread = 100.0 * state.level.std / state.level.mean
         which = f"{open_ones} of {of.mean.size} elements are"

@@ -22,9 +22,9 @@ Floats = NDArray[np.float64]
 
 _MARGIN_S = 1.0
 """Samples are needed at least this long before the entry and after the exit."""
-_APPROACH_M, _BEHIND_M = 40.0, 25.0
+APPROACH_M, BEHIND_M = 40.0, 25.0
 """Off the bridge the axles tell by how much their roads differ: to 15 % of its power on 50 m."""
-_LONGEST_MARGIN_S = 4.0
+LONGEST_MARGIN_S = 4.0
 _ROAD_SPACING_M = 0.05
 """Finer than a tyre feels: its patch is some 0.2 m long."""
 _LARGEST_ACCELERATION_M_PER_S2 = 0.3
@@ -81,8 +81,8 @@ def window(stay: Stay, bridge: Bridge, vehicle: Vehicle, method: str) -> Window:
         return Window(stay.entry_s - _MARGIN_S, stay.exit_s + _MARGIN_S)
     seconds_per_m = (stay.exit_s - stay.entry_s) / (bridge.span_m + vehicle.wheelbase_m)
     before, behind = (
-        min(max(metres * seconds_per_m, _MARGIN_S), _LONGEST_MARGIN_S)
-        for metres in (_APPROACH_M, _BEHIND_M)
+        min(max(metres * seconds_per_m, _MARGIN_S), LONGEST_MARGIN_S)
+        for metres in (APPROACH_M, BEHIND_M)
     )
     return Window(stay.entry_s - before, stay.exit_s + behind)
 

@@ -35,7 +35,14 @@ from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
 from schemas.vehicle_info import differences
 from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
-from services.identification.bridge_state import Fusing, against, count_in, state_of, usable
+from services.identification.bridge_state import (
+    NOTHING_STORED,
+    Fusing,
+    States,
+    against,
+    count_in,
+    usable,
+)
 from services.identification.crossing_data import CrossingData, Window, window
 from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
 from services.identification.outputs import (
@@ -99,7 +106,7 @@ class Engine:
         are_required: bool = False,
         tells_states: bool = True,
     ) -> None:
-        self._fusing = Fusing() if fusing is None else fusing
+        self._states = States(NOTHING_STORED if fusing is None else fusing)
         self._tells_states = tells_states
         self._site = site
         self._settings = settings
@@ -423,7 +430,7 @@ class Engine:
         self, bridge: BridgeCrossings, found: UnderWay, result: Crossing
     ) -> Iterator[Output]:
         realm, name = found.work.data.realm, found.work.data.bridge.id
-        result = against(result, self._fusing.baselines.get(name))
+        result = against(result, self._states.fusing.baselines.get(name))
         if found.work.certificate is not None:
             result = result.model_copy(update={"certificate": found.work.certificate})
         counts = usable(result)
@@ -535,7 +542,7 @@ class Engine:
         return self._of_bridge.setdefault((realm, bridge), BridgeCrossings())
 
     def _state(self, realm: str, bridge: str) -> BridgeResult | None:
-        return state_of(self._bridge(realm, bridge).counted, bridge, self._fusing)
+        return self._states.of(self._bridge(realm, bridge).counted, bridge, (realm, bridge))
 
     def bridges(self) -> dict[str, BridgeResult]:
         """The latest state of every bridge that has one, for the results file."""

@@ -1,6 +1,6 @@
 """Likelihoods of crossings between results and `pre_core.fusion`, and a bridge fused from them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -141,7 +141,7 @@ def fused(sources: Sequence[Source]) -> FusedBridge:
         np.array(last.element_lengths_m),
         found.between.ravel(),
         found.between_may_be_zero,
-        _tracks(found),
+        _tracks(found, {p.truck: one.vehicle for p, one in zip(parts, alike, strict=True)}),
         judged.agree,
         judged.left_out,
         tuple(one.crossing_id for one in others),
@@ -149,10 +149,11 @@ def fused(sources: Sequence[Source]) -> FusedBridge:
     )
 
 
-def _tracks(found: Fused) -> tuple[Track, ...]:
+def _tracks(found: Fused, vehicles: Mapping[str, str]) -> tuple[Track, ...]:
+    """What runs share; `vehicles` are the trucks' names by their keys in the fusion."""
     return tuple(
         Track(
-            vehicle=one.truck.split(" ", 1)[0],
+            vehicle=vehicles[one.truck],
             direction="start_to_end" if one.direction > 0 else "end_to_start",
             common_share=one.common_share,
             wander_m=one.wander_m,

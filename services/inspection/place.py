@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from schemas.site import Bridge, Receiver, Vehicle
 from services.common.geodesy import bridge_frame, to_chainage
+from services.identification.crossing_data import APPROACH_M, BEHIND_M, LONGEST_MARGIN_S
 from services.identification.identify import SLOWEST_M_PER_S
 from services.identification.stays import CORRIDOR_M, Passage, Stay, stays_on
 from services.inspection.finding import Finding, State, judged
@@ -15,10 +16,6 @@ from services.inspection.recorded import Recorded
 
 Floats = NDArray[np.float64]
 
-BEFORE_M: Final = 40.0
-BEHIND_M: Final = 25.0
-_LONGEST_S: Final = 4.0
-"""More road than this is not used (`crossing_data.window`)."""
 _SHORT: Final = 0.4
 _NEAR_M: Final = 300.0
 _LANE_M: Final = 6.0
@@ -154,9 +151,10 @@ def _of_passing(bridge: Bridge, receiver: Receiver, passing: Passing) -> Iterato
         "drive at 5 m/s or more",
         is_wrong=passing.speed_m_per_s < SLOWEST_M_PER_S,
     )
-    reach_m = _LONGEST_S * passing.speed_m_per_s
+    # More road than this is not used (`crossing_data.window`).
+    reach_m = LONGEST_MARGIN_S * passing.speed_m_per_s
     for side, have_m, want_m in (
-        ("before", passing.before_m, min(BEFORE_M, reach_m)),
+        ("before", passing.before_m, min(APPROACH_M, reach_m)),
         ("behind", passing.behind_m, min(BEHIND_M, reach_m)),
     ):
         yield judged(

@@ -9,7 +9,6 @@ of a survey are fused, as a worker does.
 Records are kept as in `services.validation.worlds`: what is in the file is not driven again.
 """
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -21,14 +20,12 @@ from numpy.typing import NDArray
 from schemas.results import BridgeResult, Crossing
 from schemas.settings import IdentificationSettings
 from schemas.site import Site, Vehicle
-from schemas.site_file import site_hash
 from services.identification.bridge_state import Counted, count_in, state_of, usable
-from services.recordings.recording import program_version
 from services.simulation.drawn import Truth, draw_truth, drive, see
 from services.simulation.wheel_paths import OnSurface, wheel_paths_of
 from services.simulation.worlds import draw_world
-from services.validation.calibration import Check, Record, in_processes
-from services.validation.worlds import append_record, read_records
+from services.validation.calibration import Check, Record
+from services.validation.worlds import completed, identity_of, read_records
 
 Floats = NDArray[np.float64]
 
@@ -96,7 +93,7 @@ def one_crossing(
             }
         )
     return {
-        "identity": _identity(site, settings),
+        "identity": identity_of(site, settings),
         "effect": kind,
         "seed": survey,
         "number": number,
@@ -104,10 +101,6 @@ def one_crossing(
         "truth": _survey_truth(site, of, survey).tolist(),
         "result": None if crossing is None else crossing.model_dump(mode="json"),
     }
-
-
-def _identity(site: Site, settings: IdentificationSettings) -> str:
-    return f"{program_version()} {site_hash(site)} {settings.model_dump_json()}"
 
 
 def _site_of(site: Site, kind: Kind, truck: int) -> Site:
@@ -204,7 +197,7 @@ def run_surveys(
         for number in range(KINDS[kind].crossings)
     ]
     identities = {
-        (kind, truck): _identity(_site_of(site, KINDS[kind], truck), settings)
+        (kind, truck): identity_of(_site_of(site, KINDS[kind], truck), settings)
         for kind in kinds
         for truck in range(len(KINDS[kind].masses_kg))
     }
@@ -220,16 +213,15 @@ def run_surveys(
         for line in read_records(path)
         if is_ours(line)
     }
-    missing = [key for key in wanted if key not in known]
-
-    def keep(line: Record) -> None:
-        append_record(path, line)
-        known[line["effect"], line["seed"], line["number"]] = json.loads(json.dumps(line))
-        progress(sum(key in known for key in wanted), len(wanted))
-
-    progress(len(wanted) - len(missing), len(wanted))
-    in_processes([partial(one_crossing, site, *key, settings) for key in missing], processes, keep)
-    return [known[key] for key in wanted]
+    return completed(
+        path,
+        wanted,
+        known,
+        lambda line: (line["effect"], line["seed"], line["number"]),
+        lambda key: partial(one_crossing, site, *key, settings),
+        processes,
+        progress,
+    )
 
 
 class Fused(NamedTuple):

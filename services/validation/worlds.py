@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from services.simulation.worlds import SURFACE, draw_world
 from services.validation.bound import bound_at_truth
 from services.validation.calibration import Check, Record, in_processes, record
 
+KeyT = TypeVar("KeyT")
 _COVERAGE = (0.93, 0.99)
 _LARGEST_MEAN_Z = 0.4
 _LARGEST_Z = 5.0
@@ -69,7 +70,7 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
     line = record(seed, drawn, seen, bound_at_truth(seen, drawn) if seen and is_comparable else {})
     derived = seen.result.derived if seen is not None else None
     return line | {
-        "identity": _identity(site, settings),
+        "identity": identity_of(site, settings),
         "effect": effect,
         "world": world.beyond._asdict()
         | {
@@ -88,7 +89,7 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
     }
 
 
-def _identity(site: Site, settings: IdentificationSettings) -> str:
+def identity_of(site: Site, settings: IdentificationSettings) -> str:
     """What has to be the same for a record not to be run again."""
     return f"{program_version()} {site_hash(site)} {settings.model_dump_json()}"
 
@@ -104,22 +105,43 @@ def run_worlds(
 ) -> list[Record]:
     """The records of seeds 0 to crossings - 1 of these effects; those that `path` lacks are run."""
     wanted = [(effect, seed) for seed in range(crossings) for effect in effects]
-    identity = _identity(site, settings)
+    identity = identity_of(site, settings)
     known = {
         (line["effect"], line["seed"]): line
         for line in read_records(path)
         if line.get("identity") == identity
     }
+    return completed(
+        path,
+        wanted,
+        known,
+        lambda line: (line["effect"], line["seed"]),
+        lambda key: partial(one_world, site, *key, settings),
+        processes,
+        progress,
+    )
+
+
+def completed(
+    path: Path,
+    wanted: Sequence[KeyT],
+    known: dict[KeyT, Record],
+    key_of: Callable[[Record], KeyT],
+    job_of: Callable[[KeyT], Callable[[], Record]],
+    processes: int,
+    progress: Callable[[int, int], None],
+) -> list[Record]:
+    """The wanted records; those that are not `known` are made, and appended to `path` at once."""
     missing = [key for key in wanted if key not in known]
 
     def keep(line: Record) -> None:
         append_record(path, line)
         # As the file has them: lists, where tuples were.
-        known[line["effect"], line["seed"]] = json.loads(json.dumps(line))
-        progress(len(wanted) - sum(key not in known for key in wanted), len(wanted))
+        known[key_of(line)] = json.loads(json.dumps(line))
+        progress(sum(key in known for key in wanted), len(wanted))
 
     progress(len(wanted) - len(missing), len(wanted))
-    in_processes([partial(one_world, site, *key, settings) for key in missing], processes, keep)
+    in_processes([job_of(key) for key in missing], processes, keep)
     return [known[key] for key in wanted]
 
 

@@ -13,6 +13,7 @@ from services.identification.bridge_state import (
     NOTHING_STORED,
     Counted,
     Fusing,
+    States,
     against,
     count_in,
     state_of,
@@ -180,6 +181,20 @@ def test_other_methods_and_older_results_are_not_fused() -> None:
     assert found.crossings_used == (old[2].crossing_id,)
     found = state([*old[:2], crossing(5)])
     assert [one.reason for one in found.crossings_left_out] == [LeftOutReason.NO_LIKELIHOOD] * 2
+
+
+def test_a_state_is_made_anew_only_when_crossings_have_come() -> None:
+    """A worker asks for all its bridges after every result."""
+    states = States(NOTHING_STORED)
+    counted = count_in(Counted(), [one for one in map(usable, [crossing(0), crossing(1)]) if one])
+    first = states.of(counted, "bridge-1", "here")
+    assert first == state_of(counted, "bridge-1")
+    assert states.of(counted, "bridge-1", "here") is first
+    third = usable(crossing(2))
+    assert third is not None
+    after = states.of(count_in(counted, [third]), "bridge-1", "here")
+    assert after is not None
+    assert len(after.crossings_used) == 3
 
 
 def test_nothing_is_fused_from_nothing() -> None:

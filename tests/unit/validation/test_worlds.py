@@ -267,7 +267,7 @@ def test_what_is_there_is_not_run_again(tmp_path: Path, monkeypatch: pytest.Monk
 
     def quick(site: Any, effect: str, seed: int, settings: Any) -> dict[str, Any]:
         ran.append((effect, seed))
-        identity = validation._identity(site, settings)
+        identity = validation.identity_of(site, settings)
         return made_up(effect, seed, (0.5,)) | {"identity": identity}
 
     monkeypatch.setattr(validation, "one_world", quick)
