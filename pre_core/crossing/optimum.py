@@ -88,6 +88,11 @@ _STRIDE_M = 0.6
 """Places that the walk along the road looks at are so far apart."""
 _REFINED_M = (0.3, 0.15)
 """And so much closer about the best one."""
+_BESIDE_M, _BESIDE = 0.1, 6
+"""Where the roads differ so many places to either side of an optimum are looked at: minima lie 0.2 m
+apart there, and what the walk knows of the truck does not tell the right one from the next."""
+_MOST_MOVES = 4
+"""From an optimum to one beside it."""
 _PATIENCE = 1.5  # strides beyond the best place
 _REACH = 3.0  # of the offset's spread
 _APART_M = 0.2
@@ -245,8 +250,12 @@ class _Place(NamedTuple):
     """Where in y these unknowns are."""
 
 
-def _walk(problem: Problem, y: FloatArray, way: Way) -> tuple[list[_Place], int]:
-    """Places along the road, best first, and the evaluations that they took."""
+Look = Callable[[float, FloatArray], tuple[_Place, int]]
+"""From a shift in m and the bridge's unknowns there to start with, to the place and evaluations."""
+
+
+def _looking(problem: Problem, y: FloatArray, way: Way) -> Look:
+    """Fits the bridge alone at places along the road, all else held to first order about y."""
     where = layout(problem)
     places = where.bridge
     free = np.eye(y.size)
@@ -255,11 +264,8 @@ def _walk(problem: Problem, y: FloatArray, way: Way) -> tuple[list[_Place], int]
     ).jacobian
     held = np.union1d(places, _at_rest(problem, way))
     others, _ = np.linalg.qr(np.delete(here, held, axis=1))
-    evaluations = y.size + 1
-    seen: list[_Place] = []
 
-    def look(shift: float, start: FloatArray) -> None:
-        nonlocal evaluations
+    def look(shift: float, start: FloatArray) -> tuple[_Place, int]:
         moved = y.copy()
         moved[where.trajectory] += shift
         rows = _tempered(problem, moved, free[:, places], _WALK_TEMPERATURE)
@@ -270,20 +276,35 @@ def _walk(problem: Problem, y: FloatArray, way: Way) -> tuple[list[_Place], int]
 
         lower = _lower(problem, moved, free[:, places], is_free=True)
         found = minimised(projected, start, _WALK_STEPS, _WALK_ENOUGH, lower)
-        state = found.state
-        evaluations += _evaluations(found)
-        if np.isfinite(state.objective):
-            seen.append(_Place(state.objective, shift, state.y, places))
+        place = _Place(found.state.objective, shift, found.state.y, places)
+        return place, _evaluations(found)
+
+    return look
+
+
+def _walk(problem: Problem, y: FloatArray, way: Way) -> tuple[list[_Place], int]:
+    """Places along the road, best first, and the evaluations that they took."""
+    looking = _looking(problem, y, way)
+    nothing = np.zeros(layout(problem).bridge.size)
+    evaluations = y.size + 1
+    seen: list[_Place] = []
+
+    def look(shift: float, start: FloatArray) -> None:
+        nonlocal evaluations
+        place, used = looking(shift, start)
+        evaluations += used
+        if np.isfinite(place.objective):
+            seen.append(place)
 
     def best() -> _Place:
         return min(seen, key=lambda place: place.objective)
 
-    look(0.0, np.zeros(places.size))
+    look(0.0, nothing)
     reach = _STRIDE_M + _REACH / problem.receiver_rows[-1, -1]
     for sign in (1.0, -1.0):
         shift = sign * _STRIDE_M
         while abs(shift) <= reach:
-            look(shift, np.zeros(places.size))
+            look(shift, nothing)
             if seen and sign * (shift - best().shift_m) > _PATIENCE * _STRIDE_M:
                 break
             shift += sign * _STRIDE_M
@@ -292,6 +313,22 @@ def _walk(problem: Problem, y: FloatArray, way: Way) -> tuple[list[_Place], int]
         for sign in (1.0, -1.0):
             look(centre.shift_m + sign * stride, centre.bridge)
     return sorted(seen, key=lambda place: place.objective), evaluations
+
+
+def _beside(found: Optimum, way: Way) -> tuple[_Place | None, int]:
+    """The best place beside an optimum, if it fits better than that; and the evaluations."""
+    y = found.state.y
+    looking = _looking(found.problem, y, way)
+    nothing = np.zeros(layout(found.problem).bridge.size)
+    here, evaluations = looking(0.0, nothing)
+    evaluations += y.size + 1
+    best = here
+    for number in range(-_BESIDE, _BESIDE + 1):
+        if number:
+            place, used = looking(_BESIDE_M * number, nothing)
+            evaluations += used
+            best = min(best, place, key=lambda one: one.objective)
+    return (best if best.objective < here.objective - _WALK_ENOUGH else None), evaluations
 
 
 def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) -> Optimum:
@@ -382,11 +419,11 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
             continue
         tried.append(place.shift_m)
         report(f"freeing the elements, start {len(tried)}", 0.3 + 0.05 * len(tried))
-        z = y.copy()
-        z[layout(problem).trajectory] += place.shift_m
-        z[place.places] += place.bridge
-        found, used = _freed(problem, z, way)
+        found, used = _freed(problem, _moved(problem, y, place), way)
         evaluations += used
+        if isinstance(found, Optimum) and found.problem.mismatch.level_m3.any():
+            found, used = _settled(found, way)
+            evaluations += used
         if not isinstance(found, Optimum):
             rubs = found is _Wrong.RUBS
             break
@@ -404,6 +441,30 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
         rubs=rubs,
         noise_power=power * _left_noise(best),
     )
+
+
+def _moved(problem: Problem, y: FloatArray, place: _Place) -> FloatArray:
+    """y with the bridge put where a place is."""
+    moved = y.copy()
+    moved[layout(problem).trajectory] += place.shift_m
+    moved[place.places] += place.bridge
+    return moved
+
+
+def _settled(found: Optimum, way: Way) -> tuple[Optimum, int]:
+    """The best of an optimum and those beside it on a road that differs, and the evaluations."""
+    evaluations = 0
+    for _ in range(_MOST_MOVES):
+        place, used = _beside(found, way)
+        evaluations += used
+        if place is None:
+            break
+        other, used = _freed(found.problem, _moved(found.problem, found.state.y, place), way)
+        evaluations += used
+        if not isinstance(other, Optimum) or other.chi2_per_dof >= found.chi2_per_dof:
+            break
+        found = other
+    return found, evaluations
 
 
 def _left_noise(found: Optimum) -> float:

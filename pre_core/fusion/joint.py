@@ -8,7 +8,7 @@ relative standard deviation tau of which a share rho is common to all elements. 
 is integrated out; tau and rho are looked at on a grid.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -138,18 +138,6 @@ class _Track(NamedTuple):
     """(q, q) mm²; None where there is one run: what it would share with others is its own."""
 
 
-def fuse(parts: Sequence[Part], priors: BridgePriors, count: int, seed: int) -> Fused:
-    """Draws of a bridge, `count` of each chain, from crossings with the coordinates of `priors`.
-
-    The order of the parts does not matter. ValueError without parts.
-    """
-    if not parts:
-        raise ValueError("no crossings to fuse")
-    joint = join(parts, priors)
-    between = between_of(joint, priors)
-    return Fused(*_drawn(joint, priors, between, count, seed), _may_be_zero(between), joint.shared)
-
-
 class Joint(NamedTuple):
     """Crossings that are ready to be added."""
 
@@ -162,9 +150,37 @@ class Joint(NamedTuple):
     """(b,) about which the bridge's unknowns are: changes of compliances are relative to it."""
     shared: tuple[Shared, ...]
 
+    def of(self, names: Collection[str] | None) -> tuple[_Ready, ...]:
+        """The crossings of these names; None: all."""
+        if names is None:
+            return self.ready
+        ready = zip(self.names, self.ready, strict=True)
+        return tuple(one for name, one in ready if name in names)
 
-def join(parts: Sequence[Part], priors: BridgePriors) -> Joint:
-    """Crossings with what is their own integrated out, but for the change of the bridge."""
+
+def fuse(parts: Sequence[Part], priors: BridgePriors, count: int, seed: int) -> Fused:
+    """Draws of a bridge, `count` of each chain, from crossings with the coordinates of `priors`.
+
+    The order of the parts does not matter. ValueError without parts.
+    """
+    if not parts:
+        raise ValueError("no crossings to fuse")
+    return fuse_joined(join(parts, priors), priors, count, seed)
+
+
+def fuse_joined(joint: Joint, priors: BridgePriors, count: int, seed: int) -> Fused:
+    """As `fuse`, of crossings that are ready."""
+    between = between_of(joint, priors)
+    return Fused(*_drawn(joint, priors, between, count, seed), _may_be_zero(between), joint.shared)
+
+
+def join(
+    parts: Sequence[Part], priors: BridgePriors, trusted: Collection[str] | None = None
+) -> Joint:
+    """Crossings with what is their own integrated out, but for the change of the bridge.
+
+    Changes are relative to what all give together, or the `trusted` of them by name.
+    """
     parts = sorted(parts, key=lambda part: part.name)
     tracks = _tracks(parts)
     layout = _layout_of(parts, tracks, priors)
@@ -182,7 +198,7 @@ def join(parts: Sequence[Part], priors: BridgePriors) -> Joint:
     for _ in range(_PASSES):
         ready = tuple(_ready(part, layout, tracks, priors, centre) for part in parts)
         joint = Joint(names, layout, ready, prior, centre, shared)
-        precision, linear = sum_of(joint, priors, joint.ready)
+        precision, linear = sum_of(joint, priors, joint.of(trusted))
         centre = np.asarray(np.linalg.solve(precision, linear)[: layout.bridge])
         centre[layout.elements] = np.clip(centre[layout.elements], *_ROUGH_COMPLIANCE)
     return joint._replace(centre=centre)

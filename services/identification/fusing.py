@@ -11,7 +11,7 @@ from pre_core.crossing.optimum import Optimum
 from pre_core.crossing.posterior import log_odds
 from pre_core.fusion import likelihood as of_crossing
 from pre_core.fusion.disagreement import judge
-from pre_core.fusion.joint import BridgePriors, Fused, Part, fuse
+from pre_core.fusion.joint import BridgePriors, Fused, Part, fuse_joined, join
 from pre_core.physics.surface import Footprint
 from schemas import fusion
 from schemas.results import Crossing, Track
@@ -129,9 +129,11 @@ def fused(sources: Sequence[Source]) -> FusedBridge:
     alike = [one for one in sources if _is_like(one.likelihood, last)]
     priors = _priors(last)
     parts = [_part(one, priors.coordinates) for one in alike]
-    judged = judge(parts, priors)
-    kept = [part for part in parts if part.name in judged.agree]
-    found = fuse(kept, priors, _DRAWS_PER_CHAIN, _SEED)
+    joint = join(parts, priors)
+    judged = judge(parts, joint, priors)
+    if judged.left_out:
+        joint = join([part for part in parts if part.name in judged.agree], priors)
+    found = fuse_joined(joint, priors, _DRAWS_PER_CHAIN, _SEED)
     nominal = priors.coordinates.location[-priors.elements :]
     spread = priors.coordinates.scale[-priors.elements :]
     y = found.draws.reshape(-1, found.draws.shape[2])[:, -priors.elements :]

@@ -2,17 +2,22 @@
 
 import numpy as np
 
-from pre_core.fusion.disagreement import judge
-from pre_core.fusion.joint import Part
+from pre_core.fusion.disagreement import Judged
+from pre_core.fusion.disagreement import judge as judge_joined
+from pre_core.fusion.joint import BridgePriors, Part, join
 from tests.numerics.test_fusion import PRIORS, crossing_of, root
 
 
-def survey(count: int, tau: float, seed: int) -> list[Part]:
+def judge(parts: list[Part], priors: BridgePriors) -> Judged:
+    return judge_joined(parts, join(parts, priors), priors)
+
+
+def survey(count: int, tau: float, seed: int, std: float = 0.03) -> list[Part]:
     rng = np.random.default_rng(seed)
     parts = []
     for i in range(count):
         c = np.exp(tau * rng.standard_normal(3))
-        parts.append(crossing_of(i, np.concatenate([[0.0, 0.4], c, [0.0]]), root(), rng))
+        parts.append(crossing_of(i, np.concatenate([[0.0, 0.4], c, [0.0]]), root(std), rng))
     return parts
 
 
@@ -42,6 +47,16 @@ def test_sound_crossings_stay_also_of_a_bridge_that_changes() -> None:
         for seed in range(25)
     ]
     assert sum(left_out) <= 2  # of 600
+
+
+def test_sound_crossings_that_tell_less_than_the_bridge_changes_stay() -> None:
+    left_out = [judge(survey(16, 0.06, seed, 0.005), PRIORS).left_out for seed in range(20)]
+    assert not any(left_out)
+
+
+def test_one_foreign_crossing_beside_a_bridge_that_changes() -> None:
+    parts = [*survey(15, 0.06, 5, 0.005), foreign(15, 0.8)]
+    assert judge(parts, PRIORS).left_out == ("crossing-015",)
 
 
 def test_of_two_that_disagree_none_is_left_out() -> None:
