@@ -1,8 +1,9 @@
 """What a crossing's result keeps for fusion: its likelihood about what crossings have in common.
 
 -|R x - z|²/2 is the logarithm of the likelihood up to a constant, of x: the bridge's unknowns, the
-truck's, and coefficients in mm of the long waves of the mismatch of its axles' roads. No prior of
-these is in it, nor the truck's total mass, to which all rigidities are proportional.
+truck's, and coefficients in mm of the long waves of the mismatch of its axles' roads; where there
+are `bends`, then the crossing's place in m from where it was found, and the bends. No prior of the
+first three is in it, nor the truck's total mass, to which all rigidities are proportional.
 """
 
 from typing import Annotated
@@ -46,6 +47,17 @@ class Stretch(_Fields):
     values: tuple[Finite, ...]
 
 
+class Bends(_Fields):
+    """What is of second order: sums of products of what bridge and place move from `about`."""
+
+    about: tuple[Finite, ...]
+    """x of the bridge's unknowns at the crossing's own optimum."""
+    size: tuple[Annotated[Finite, Field(gt=0)], ...]
+    """Units of the moves: of the bridge's unknowns, and in m of the place."""
+    shapes: tuple[Finite, ...]
+    """Of one bend after the other the factors of all products of two moves, i <= j row by row."""
+
+
 class FusionLikelihood(_Fields):
     """See the module's text."""
 
@@ -67,13 +79,26 @@ class FusionLikelihood(_Fields):
     """Of the mismatch, as the crossing told it."""
     off_bridge_m: tuple[Stretch, ...] = ()
     """The mismatch before and behind the bridge."""
+    bends: Bends | None = None
 
     @model_validator(mode="after")
     def _has_its_size(self) -> "FusionLikelihood":
         m = len(self.target)
         if len(self.root) != m * (m + 1) // 2:
             raise ValueError(f"root must have {m * (m + 1) // 2} numbers, as target has {m}")
-        told = len(self.bridge) + len(self.truck)
+        told = len(self.bridge) + len(self.truck) + self._of_bends()
         if m < told or (m > told) != (self.first_knot_m is not None):
-            raise ValueError("target must have a place for each coordinate and knot")
+            raise ValueError("target must have a place for each coordinate, knot and bend")
         return self
+
+    def _of_bends(self) -> int:
+        """How many places bends take, with the crossing's place."""
+        if self.bends is None:
+            return 0
+        moves = len(self.bends.size)
+        if len(self.bends.about) != len(self.bridge) or moves != len(self.bridge) + 1:
+            raise ValueError("bends must be of the bridge's coordinates and the place")
+        count, left = divmod(len(self.bends.shapes), moves * (moves + 1) // 2)
+        if left:
+            raise ValueError("shapes must have a factor for each product of two moves")
+        return 1 + count

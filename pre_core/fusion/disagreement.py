@@ -1,11 +1,11 @@
 """Which of several crossings of a bridge cannot be of the same bridge as the others.
 
-Each crossing's compliances are set beside those that all others give together. Their difference has
-the covariance of both, and that of a bridge that changes between crossings. What changes it is not
-known before the odd one is out, which would pass for change: so crossings are first judged by a
-usual change. Those that stand out then, a third of all at most, come back if the change that those
-inside show explains them; and as those that agree best show too little change, and each that comes
-back shows more of it, this goes on until none comes back. The rest is left out.
+Each crossing is given a change of the bridge's compliances of its own, all else as all others say.
+What it tells of that change is as sure as it and they are, and a bridge changes between crossings.
+By how much is not known before the odd one is out, which would pass for change: so crossings are
+first judged by a usual one. Those that stand out then, a third of all at most, come back if the
+change that those inside show explains them; and as those that agree best show too little change,
+and each that comes back shows more of it, this goes on until none comes back. The rest is left out.
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from pre_core.crossing.compliances import marginal
-from pre_core.fusion.joint import Between, BridgePriors, Joint, Part, between_of, join, sum_of
+from pre_core.fusion.joint import BridgePriors, Joint, Part, Ready, between_of, join, sum_of
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +25,7 @@ _SUSPICIOUS, _INCOMPATIBLE = 1e-3, 1e-4
 change that the others show, and then to be left out."""
 _FEWEST = 3
 """Of two that disagree nobody knows which is wrong; of more, a third may be."""
-_USUAL = Between(np.array([_USUAL_CHANGE]), np.zeros(1), np.ones(1))
+_ROUNDED, _UNLIKELY = 1e-10, 1e-6
 
 
 class Judged(NamedTuple):
@@ -43,7 +42,8 @@ def judge(parts: Sequence[Part], joint: Joint, priors: BridgePriors) -> Judged:
     names = joint.names
     if len(names) == 1:
         return Judged(names, (), False)
-    chances = np.array(_chances(joint, priors, names, names, _USUAL))
+    nothing_more = np.array([[0.0, 0.0, 1.0]])
+    chances = np.array(_chances(joint, priors, names, names, nothing_more))
     if len(names) < _FEWEST:
         return Judged(names, (), bool(chances.min() < _SUSPICIOUS / len(names)))
     worst = np.argsort(chances)[: len(names) // _FEWEST]
@@ -54,10 +54,9 @@ def judge(parts: Sequence[Part], joint: Joint, priors: BridgePriors) -> Judged:
     back = odd
     while odd and back:
         inside = [name for name in names if name not in odd]
-        between = between_of(joint._replace(ready=joint.of(inside)), priors)
-        # A usual change is never held against a crossing, however little the others show.
-        between = between._replace(tau=np.maximum(between.tau, _USUAL_CHANGE))
-        chances = _chances(joint, priors, sorted(odd), inside, between)
+        found = between_of(joint._replace(ready=joint.of(inside)), priors)
+        changes = np.column_stack([found.tau, found.rho, found.weight])[found.weight > _UNLIKELY]
+        chances = _chances(joint, priors, sorted(odd), inside, changes)
         of = zip(sorted(odd), chances, strict=True)
         back = {name for name, chance in of if chance >= _INCOMPATIBLE / len(names)}
         odd = odd - back
@@ -70,26 +69,43 @@ def _chances(
     priors: BridgePriors,
     names: Sequence[str],
     beside: Sequence[str],
-    between: Between,
+    changes: FloatArray,
 ) -> list[float]:
-    """Of each of `names`, how likely it is to be so far or farther from `beside`, itself apart."""
+    """Of each of `names`, how likely it is to be so far or farther from `beside`, itself apart.
+
+    `changes` (k, 3): tau, rho, and how likely these are. A usual change, each element's own, comes
+    to them and is never held against a crossing, however little the others show.
+    """
     elements = joint.layout.elements
     precision, linear = sum_of(joint, priors, joint.of(beside))
     at = np.diag(joint.centre[elements])
     out = []
     for name, one in zip(names, joint.of(names), strict=True):
-        rest, pull = precision.copy(), linear.copy()
-        if name in beside:
-            rest[np.ix_(one.places, one.places)] -= one.precision
-            pull[one.places] -= one.linear
-        alone = marginal(*sum_of(joint, priors, [one]), elements)
-        others = marginal(rest, pull, elements)
-        apart = np.linalg.solve(*others) - np.linalg.solve(*alone)
-        spread = np.linalg.inv(others[0]) + np.linalg.inv(alone[0])
+        whole, pull = precision, linear
+        if name not in beside:
+            whole, pull = sum_of(joint, priors, [*joint.of(beside), one])
+        told, need = _own_change(one, whole, pull, elements)
         chance = 0.0
-        for tau, rho, weight in zip(*between, strict=True):
-            own_change = tau**2 * ((1.0 - rho) * np.eye(elements.size) + rho)
-            distance = apart @ np.linalg.solve(spread + at @ own_change @ at, apart)
+        for tau, rho, weight in changes:
+            own = _USUAL_CHANGE**2 + (1.0 - rho) * tau**2
+            change = at @ (own * np.eye(elements.size) + rho * tau**2) @ at
+            spread = told + told @ change @ told
+            distance = float(need @ np.linalg.pinv(spread, _ROUNDED, hermitian=True) @ need)
             chance += float(weight * chi2.sf(distance, elements.size))
         out.append(chance)
     return out
+
+
+def _own_change(
+    one: Ready, precision: FloatArray, linear: FloatArray, elements: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """Precision (e, e) and linear part (e,) of how a crossing's compliances differ from all others'.
+
+    From the sum of all, this one included. Trucks, tracks and the bridge's other unknowns are what
+    all others say, so that what is hardly told by one crossing alone is not held against it.
+    """
+    across = np.zeros((linear.size, elements.size))
+    across[one.places] = one.precision[:, elements]
+    explained = np.linalg.solve(precision, np.column_stack([across, linear]))
+    told = one.precision[np.ix_(elements, elements)] - across.T @ explained[:, :-1]
+    return 0.5 * (told + told.T), one.linear[elements] - across.T @ explained[:, -1]

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from pre_core.crossing.compliances import Compliances, draws, marginal, of_normal
 from pre_core.crossing.mismatch import LONG_CYCLES_PER_M, Mismatch, common_shapes, shapes_of
@@ -24,6 +25,7 @@ from pre_core.fusion.likelihood import (
     OffBridge,
     covariance_of_coefficients,
     loosened,
+    straightened,
 )
 from pre_core.physics.surface import Footprint
 from pre_core.search.crank_nicolson import CHAINS
@@ -35,15 +37,24 @@ _APART_STEPS = 2
 _WANDERS_M, _HALVINGS = (0.01, 1.0), 12
 BETWEEN_SCALE = 0.04
 """Of the half-normal prior of tau: temperature changes a concrete bridge's EI by some per cent."""
-_TAUS = BETWEEN_SCALE * np.array([0.0, 0.07, 0.15, 0.25, 0.4, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0])
-_RHOS = (0.1, 0.5, 0.9)
+_TAUS = BETWEEN_SCALE * np.array(
+    [0.0, 0.05, 0.1, 0.15, 0.2, 0.27, 0.36, 0.48, 0.64, 0.85, 1.1, 1.45, 1.9, 2.5, 3.2]
+)
+_RHOS = (0.0, 0.3, 0.7, 0.93, 0.99)
+_USUAL = (0.03, 0.3)
+"""tau and rho by which the bridge is found about which it changes."""
+_FINER = 12
+"""Parts of a cell of tau: crossings tell it more closely than one has time to look."""
+_FIRST_TAU = 0.002
+"""What is added to tau before its logarithm, in which the evidence is smooth."""
 _ROUGH_COMPLIANCE = (0.2, 5.0)
 """Outside, a compliance that is hardly known is not taken for the size of its own changes."""
 _ROUGH_SPREAD = 0.6
 """A normal prior of c that stands for the log-normal one where evidence is compared."""
 _AS_LIKELY = np.exp(-0.5 * 1.96**2)
 """Of a normal's density, at the ends of its 95 % interval."""
-_PASSES = 2
+_PASSES = 8
+"""Of finding the bridge about which it changes, and crossings' likelihoods are normal."""
 _NOTHING = 1e-9
 """Of the largest variance of a sum of waves: a smaller one is rounding."""
 
@@ -93,11 +104,15 @@ class Fused(NamedTuple):
 
 
 class Between(NamedTuple):
-    """tau and rho with their posterior weights, (k,) each."""
+    """tau and rho with their posterior weights, (k,) each: the middles of cells."""
 
     tau: FloatArray
     rho: FloatArray
     weight: FloatArray
+    fine: FloatArray
+    """(cells, f) places within the cells of tau."""
+    within: FloatArray
+    """(k, f) weights there."""
 
 
 class _Key(NamedTuple):
@@ -120,7 +135,7 @@ class _Layout(NamedTuple):
     size: int
 
 
-class _Ready(NamedTuple):
+class Ready(NamedTuple):
     """A crossing's likelihood with what is its own of the long waves integrated out."""
 
     precision: FloatArray
@@ -134,6 +149,8 @@ class _Track(NamedTuple):
 
     shared: Shared
     own_root: FloatArray
+    whole: FloatArray
+    """Precision (q, q) of all of them, own and shared."""
     common: FloatArray | None
     """(q, q) mm²; None where there is one run: what it would share with others is its own."""
 
@@ -143,14 +160,14 @@ class Joint(NamedTuple):
 
     names: tuple[str, ...]
     layout: _Layout
-    ready: tuple[_Ready, ...]
+    ready: tuple[Ready, ...]
     prior: FloatArray
     """Precision (n, n) of trucks and tracks before any crossing."""
     centre: FloatArray
     """(b,) about which the bridge's unknowns are: changes of compliances are relative to it."""
     shared: tuple[Shared, ...]
 
-    def of(self, names: Collection[str] | None) -> tuple[_Ready, ...]:
+    def of(self, names: Collection[str] | None) -> tuple[Ready, ...]:
         """The crossings of these names; None: all."""
         if names is None:
             return self.ready
@@ -195,13 +212,30 @@ def join(
     names = tuple(part.name for part in parts)
     centre = np.zeros(layout.bridge)
     centre[layout.elements] = 1.0
+    bridge: FloatArray | None = None
     for _ in range(_PASSES):
-        ready = tuple(_ready(part, layout, tracks, priors, centre) for part in parts)
+        ready = tuple(
+            _ready(_about(part, tracks, bridge), layout, tracks, priors, centre) for part in parts
+        )
         joint = Joint(names, layout, ready, prior, centre, shared)
-        precision, linear = sum_of(joint, priors, joint.of(trusted))
-        centre = np.asarray(np.linalg.solve(precision, linear)[: layout.bridge])
+        # Without a change crossings that are surer than the bridge is steady lead each other astray.
+        of = _of_change(joint._replace(ready=joint.of(trusted)))
+        told = _with_priors(joint, priors, *_changed(joint, of, *_USUAL)[:2])
+        centre = np.asarray(np.linalg.solve(*told)[: layout.bridge])
         centre[layout.elements] = np.clip(centre[layout.elements], *_ROUGH_COMPLIANCE)
+        # What must not be negative.
+        least = np.where(priors.coordinates.is_log, -np.inf, 0.0)
+        bridge = np.maximum(centre, least)
     return joint._replace(centre=centre)
+
+
+def _about(part: Part, tracks: dict[_Key, _Track], bridge: FloatArray | None) -> Part:
+    """The crossing with a likelihood that is normal about a `bridge` (b,); None: the crossing's."""
+    told = part.likelihood
+    if told.bends is None:
+        return part
+    at = told.bends.about if bridge is None else bridge
+    return part._replace(likelihood=straightened(told, at, tracks[_key(part)].whole))
 
 
 def _layout_of(parts: Sequence[Part], tracks: dict[_Key, _Track], priors: BridgePriors) -> _Layout:
@@ -236,7 +270,8 @@ def _track(key: _Key, runs: list[Part]) -> _Track:
     knots = runs[0].likelihood.knots_m
     everything = covariance_of_coefficients(knots, shapes.cycles_per_m, whole)
     if len(runs) == 1:
-        return _Track(Shared(key.truck, key.direction, 0.0, None, level), root_of(everything), None)
+        shared = Shared(key.truck, key.direction, 0.0, None, level)
+        return _Track(shared, root_of(everything), np.linalg.inv(everything), None)
     share = common_share([run.likelihood.off_bridge for run in runs])
     wander_m = wander(Mismatch(shapes, level, 1.0), share)
     density = level @ common_shapes(*shapes.footprints, wander_m)
@@ -245,7 +280,8 @@ def _track(key: _Key, runs: list[Part]) -> _Track:
     shared = Shared(
         key.truck, key.direction, float(density[at_long] / whole[at_long]), wander_m, level
     )
-    return _Track(shared, root_of(everything - common), common)
+    own = root_of(everything - common)
+    return _Track(shared, own, np.linalg.inv(everything), common)
 
 
 def _key(part: Part) -> _Key:
@@ -267,7 +303,7 @@ def _ready(
     tracks: dict[_Key, _Track],
     priors: BridgePriors,
     centre: FloatArray,
-) -> _Ready:
+) -> Ready:
     of, b = part.likelihood, layout.bridge
     truck = layout.trucks[part.truck]
     # The mass scales truck and bridge alike: what is found of the bridge lies aside of what it is.
@@ -291,7 +327,7 @@ def _ready(
             places = np.concatenate([places, layout.tracks[key]])
         else:  # nothing else moves these waves
             precision, linear = precision[:-q, :-q], linear[:-q]
-    return _Ready(precision, linear, places)
+    return Ready(precision, linear, places)
 
 
 def _with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
@@ -304,11 +340,18 @@ def _with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
 
 
 def sum_of(
-    joint: Joint, priors: BridgePriors, ready: Sequence[_Ready]
+    joint: Joint, priors: BridgePriors, ready: Sequence[Ready]
 ) -> tuple[FloatArray, FloatArray]:
     """Precision and linear part of all unknowns, with normal priors of the bridge's."""
+    return _with_priors(joint, priors, *_told(joint, ready))
+
+
+def _with_priors(
+    joint: Joint, priors: BridgePriors, precision: FloatArray, linear: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """A sum of crossings with normal priors of the bridge's unknowns."""
     layout = joint.layout
-    precision, linear = _told(joint, ready)
+    precision, linear = precision.copy(), linear.copy()
     single = np.arange(layout.bridge - priors.elements)
     precision[single, single] += 1.0
     rough = _ROUGH_SPREAD**-2
@@ -317,7 +360,7 @@ def sum_of(
     return precision, linear
 
 
-def _told(joint: Joint, ready: Sequence[_Ready]) -> tuple[FloatArray, FloatArray]:
+def _told(joint: Joint, ready: Sequence[Ready]) -> tuple[FloatArray, FloatArray]:
     """Precision and linear part of all unknowns, without priors of the bridge's."""
     precision, linear = joint.prior.copy(), np.zeros(joint.layout.size)
     for one in ready:
@@ -326,49 +369,101 @@ def _told(joint: Joint, ready: Sequence[_Ready]) -> tuple[FloatArray, FloatArray
     return precision, linear
 
 
-def _changing(joint: Joint, tau: float, rho: float) -> tuple[list[_Ready], float]:
-    """The crossings, each with a bridge of its own, and what that adds to ln of the evidence."""
+class _Alike(NamedTuple):
+    """Crossings (k) with the same places among all unknowns."""
+
+    places: NDArray[np.int64]
+    across: FloatArray  # (k, e, p) rows of their precisions at the elements
+    linear: FloatArray  # (k, e)
+
+
+class _Changing(NamedTuple):
+    """The sum of all crossings, and what is needed to give each a bridge of its own."""
+
+    precision: FloatArray
+    linear: FloatArray
+    alike: tuple[_Alike, ...]
+
+
+def _of_change(joint: Joint) -> _Changing:
+    elements = joint.layout.elements
+    alike: dict[bytes, list[Ready]] = {}
+    for one in joint.ready:
+        alike.setdefault(one.places.tobytes(), []).append(one)
+    return _Changing(
+        *_told(joint, joint.ready),
+        tuple(
+            _Alike(
+                some[0].places,
+                np.stack([one.precision[elements] for one in some]),
+                np.stack([one.linear[elements] for one in some]),
+            )
+            for some in alike.values()
+        ),
+    )
+
+
+def _changed(
+    joint: Joint, of: _Changing, tau: float, rho: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Precision and linear part of all unknowns where each crossing has a bridge of its own.
+
+    And what that adds to the logarithm of the evidence.
+    """
     if tau == 0.0:
-        return list(joint.ready), 0.0
+        return of.precision, of.linear, 0.0
     elements = joint.layout.elements
     e = elements.size
     root = np.linalg.cholesky((1.0 - rho) * np.eye(e) + rho) * tau
     root = joint.centre[elements][:, None] * root
-    evidence, out = 0.0, []
-    for one in joint.ready:
-        across = one.precision[:, elements] @ root
-        pull = root.T @ one.linear[elements]
-        factor = np.linalg.cholesky(np.eye(e) + root.T @ across[elements])
-        moved = np.linalg.solve(factor, np.column_stack([across.T, pull]))
-        evidence += 0.5 * float(moved[:, -1] @ moved[:, -1]) - float(np.log(np.diag(factor)).sum())
-        out.append(
-            one._replace(
-                precision=one.precision - moved[:, :-1].T @ moved[:, :-1],
-                linear=one.linear - moved[:, :-1].T @ moved[:, -1],
-            )
-        )
-    return out, evidence
+    precision, linear, evidence = of.precision.copy(), of.linear.copy(), 0.0
+    for some in of.alike:
+        across = root.T @ some.across
+        pull = some.linear @ root
+        factor = np.linalg.cholesky(np.eye(e) + across[:, :, elements] @ root)
+        moved = np.linalg.solve(factor, np.concatenate([across, pull[:, :, None]], axis=2))
+        rows = moved.reshape(-1, moved.shape[2])
+        evidence += 0.5 * float(rows[:, -1] @ rows[:, -1])
+        evidence -= float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
+        precision[np.ix_(some.places, some.places)] -= rows[:, :-1].T @ rows[:, :-1]
+        linear[some.places] -= rows[:, :-1].T @ rows[:, -1]
+    return precision, linear, evidence
 
 
 def between_of(joint: Joint, priors: BridgePriors) -> Between:
     """Posterior of tau and rho; of one crossing it is the prior."""
     tau, rho = (grid.ravel() for grid in np.meshgrid(_TAUS, _RHOS, indexing="ij"))
     log = np.empty(tau.size)
+    of = _of_change(joint)
     for k in range(tau.size):
-        ready, log[k] = _changing(joint, float(tau[k]), float(rho[k]))
-        precision, linear = sum_of(joint, priors, ready)
+        precision, linear, log[k] = _changed(joint, of, float(tau[k]), float(rho[k]))
+        precision, linear = _with_priors(joint, priors, precision, linear)
         factor = np.linalg.cholesky(precision)
         at = np.linalg.solve(factor, linear)
         log[k] += 0.5 * float(at @ at) - float(np.log(np.diag(factor)).sum())
-    log -= 0.5 * (tau / BETWEEN_SCALE) ** 2
-    weight = np.exp(log - log.max()) * np.diff(_edges())[np.searchsorted(_TAUS, tau)]
-    return Between(tau, rho, weight / weight.sum())
+    fine, within = _fine_taus(log.reshape(_TAUS.size, -1))
+    return Between(tau, rho, within.sum(axis=2).ravel(), fine, within.reshape(tau.size, -1))
+
+
+def _fine_taus(log: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places in each cell of tau (t, f), and the weights (t, r, f) there for each rho, sum one.
+
+    From the logarithm of the evidence (t, r), which is smooth between the cells.
+    """
+    edges = _edges()
+    part = (np.arange(_FINER) + 0.5) / _FINER
+    fine = edges[:-1, None] + np.diff(edges)[:, None] * part
+    smooth = CubicSpline(np.log(_TAUS + _FIRST_TAU), log, axis=0)
+    density = smooth(np.log(fine.ravel() + _FIRST_TAU)).reshape(*fine.shape, -1)
+    density -= 0.5 * (fine[:, :, None] / BETWEEN_SCALE) ** 2
+    weight = np.exp(density - density.max()) * np.diff(edges)[:, None, None]
+    return fine, np.moveaxis(weight / weight.sum(), 2, 1)
 
 
 def _may_be_zero(between: Between) -> bool:
-    of_tau = np.array([between.weight[between.tau == tau].sum() for tau in _TAUS])
-    density = of_tau / np.diff(_edges())
-    return bool(density[0] > _AS_LIKELY * density.max())
+    density = between.within.reshape(_TAUS.size, len(_RHOS), _FINER).sum(axis=1)
+    density /= np.diff(_edges())[:, None]
+    return bool(density[0, 0] > _AS_LIKELY * density.max())
 
 
 def _edges() -> FloatArray:
@@ -384,12 +479,12 @@ def _drawn(
     # As many of each as its weight says, but for chance: systematic sampling.
     at = (np.arange(count) + rng.random()) / count
     chosen = np.minimum(np.searchsorted(np.cumsum(between.weight), at), between.weight.size - 1)
-    edges = _edges()
+    of = _of_change(joint)
     out, taus = [], []
     for k in np.unique(chosen):
         some = int((chosen == k).sum())
         tau, rho = float(between.tau[k]), float(between.rho[k])
-        density = _posterior(joint, priors, _changing(joint, tau, rho)[0])
+        density = _posterior(joint, priors, *_changed(joint, of, tau, rho)[:2])
         out.append(
             np.stack(
                 [
@@ -399,16 +494,18 @@ def _drawn(
                 axis=1,
             )
         )
-        cell = int(np.searchsorted(_TAUS, tau))
-        taus.append(rng.uniform(edges[cell], edges[cell + 1], (some, CHAINS)))
+        share = between.within[k] / between.within[k].sum()
+        taus.append(rng.choice(between.fine[k // len(_RHOS)], (some, CHAINS), p=share))
     order = rng.permutation(count)
     return np.concatenate(out)[order], np.concatenate(taus)[order]
 
 
-def _posterior(joint: Joint, priors: BridgePriors, ready: Sequence[_Ready]) -> Compliances:
-    """All crossings times the priors, each once, with what is not the bridge's integrated out."""
+def _posterior(
+    joint: Joint, priors: BridgePriors, precision: FloatArray, linear: FloatArray
+) -> Compliances:
+    """A sum of crossings times the priors, with what is not the bridge's integrated out."""
     layout, of = joint.layout, priors.coordinates
-    precision, linear = marginal(*_told(joint, ready), np.arange(layout.bridge))
+    precision, linear = marginal(precision, linear, np.arange(layout.bridge))
     single = np.arange(layout.bridge - priors.elements)
     precision[single, single] += 1.0
     return of_normal(

@@ -8,6 +8,9 @@ The likelihood alone, so that each prior counts once however many crossings are 
   cubic splines along the road. Part of them is the same in all runs of a truck in one track, which
   no crossing can tell by itself.
 
+Where the roads differ also in its place along the road, and in the bends that it and the bridge
+make together (`fusion.bends`).
+
 Everything else of this crossing - trajectory, delays, gains, how the bridge swung, the mismatch's
 short waves - is integrated out. What is left is small and is stored with the crossing's result.
 """
@@ -33,6 +36,8 @@ from pre_core.crossing.optimum import Optimum
 from pre_core.crossing.preparation import off_bridge, with_mismatch_alone
 from pre_core.crossing.residuals import Crossing, Points, evaluate
 from pre_core.crossing.whitening import RESIDUALS, filter_rows, row_count, solve
+from pre_core.fusion.bends import Bends, bends_of
+from pre_core.fusion.bends import straightened as straightened_about
 from pre_core.physics.simulate import rear_position_m
 from pre_core.search import levenberg_marquardt
 
@@ -84,6 +89,8 @@ class Likelihood(NamedTuple):
     """(q,) knots of the long waves of d; none where both axles feel one road."""
     level_m3: FloatArray  # (s,) levels of the mismatch that the crossing told
     off_bridge: OffBridge | None
+    bends: Bends | None = None
+    """If there are, x goes on with the place along the road in m, and with them."""
 
 
 def long_share(cycles_per_m: FloatArray) -> FloatArray:
@@ -131,17 +138,25 @@ def likelihood(found: Optimum) -> Likelihood:
     slope = np.zeros(centre.size + grid.size)
     slope[: problem.noise_slope.size] = problem.noise_slope
     slope[np.setdiff1d(np.arange(slope.size), truck)] = 0.0
+    bends = None
     if differs:
         splines = np.zeros((rows.size, grid.size))
         white = _white_knots(problem, y, grid)
         splines[: white.shape[0]] = white
-        jacobian = np.hstack([jacobian, splines])
-        told = np.concatenate([told, centre.size + inner])
-        centre = np.concatenate([centre, np.zeros(grid.size)])
+        bends, bent = bends_of(found, problem, rows)
+        # The trajectory as a whole, from the optimum on, and the rest of it beside the whole.
+        place = where.trajectory.start
+        jacobian[:, place] = jacobian[:, where.trajectory].sum(axis=1)
+        centre[where.trajectory] = 0.0
+        jacobian = np.hstack([jacobian, splines, bent])
+        of_bends = centre.size + grid.size + np.arange(bent.shape[1])
+        told = np.concatenate([told, centre.size + inner, [place], of_bends])
+        slope = np.concatenate([slope, np.zeros(bent.shape[1])])
+        centre = np.concatenate([centre, np.zeros(grid.size + bent.shape[1])])
     precision = jacobian.T @ jacobian
     linear = precision @ centre - jacobian.T @ state.residual[rows] + slope
     if differs:
-        _beside(precision, found.problem.mismatch, grid, inner)
+        _beside(precision, found.problem.mismatch, grid, inner, y.size)
     precision, linear = marginal(precision, linear, told)
     if differs:
         led = np.zeros(linear.size)
@@ -154,7 +169,24 @@ def likelihood(found: Optimum) -> Likelihood:
         grid[inner],
         found.problem.mismatch.level_m3,
         _off_bridge(found) if differs else None,
+        bends,
     )
+
+
+def straightened(of: Likelihood, at: FloatArray, mismatch: FloatArray) -> Likelihood:
+    """The normal about a bridge `at` (b,) in its coordinates, without place and bends.
+
+    `mismatch` is the precision (q, q) of the coefficients of d, of which the place depends.
+    """
+    if of.bends is None:
+        return of
+    truck = len(of.truck.names)
+    q = of.knots_m.size
+    priors = np.zeros((truck + q, truck + q))
+    priors[:truck, :truck] = np.eye(truck)
+    priors[truck:, truck:] = np.linalg.cholesky(mismatch).T
+    root, target = straightened_about(of.root, of.target, of.bends, at, priors)
+    return of._replace(root=root, target=target, bends=None)
 
 
 def in_coordinates(of: Likelihood, coordinates: Coordinates, elements: int) -> Likelihood:
@@ -173,7 +205,13 @@ def in_coordinates(of: Likelihood, coordinates: Coordinates, elements: int) -> L
     aside[b - elements :] = 0.0
     root = of.root.copy()
     root[:, :b] *= factor
-    return of._replace(root=root, target=of.target - of.root[:, :b] @ aside, bridge=coordinates)
+    target = of.target - of.root[:, :b] @ aside
+    bends = of.bends
+    if bends is not None:
+        bends = bends._replace(
+            about=(bends.about - aside) / factor, size=bends.size / np.append(factor, 1.0)
+        )
+    return of._replace(root=root, target=target, bridge=coordinates, bends=bends)
 
 
 def loosened(
@@ -212,18 +250,23 @@ def _knots(problem: posterior.Problem, y: FloatArray) -> tuple[FloatArray, NDArr
 
 
 def _beside(
-    precision: FloatArray, mismatch: Mismatch, grid: FloatArray, inner: NDArray[np.int64]
+    precision: FloatArray,
+    mismatch: Mismatch,
+    grid: FloatArray,
+    inner: NDArray[np.int64],
+    first: int,
 ) -> None:
     """Add what is known of the coefficients beside the bridge given those on it; in place.
 
+    They are from `first` on.
     The prior of those on the bridge is left for where crossings are fused.
     """
     shapes = mismatch.shapes
     of_all = covariance_of_coefficients(
         grid, shapes.cycles_per_m, mismatch.level_m3 @ shapes.density
     )
-    first = precision.shape[0] - grid.size
-    precision[first:, first:] += np.linalg.inv(of_all)
+    places = first + np.arange(grid.size)
+    precision[np.ix_(places, places)] += np.linalg.inv(of_all)
     precision[np.ix_(first + inner, first + inner)] -= np.linalg.inv(of_all[np.ix_(inner, inner)])
 
 

@@ -301,8 +301,18 @@ class Stretch(_message.Message):
     values: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, begin_m: _Optional[float] = ..., step_m: _Optional[float] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class Bends(_message.Message):
+    __slots__ = ("about", "size", "shapes")
+    ABOUT_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    SHAPES_FIELD_NUMBER: _ClassVar[int]
+    about: _containers.RepeatedScalarFieldContainer[float]
+    size: _containers.RepeatedScalarFieldContainer[float]
+    shapes: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, about: _Optional[_Iterable[float]] = ..., size: _Optional[_Iterable[float]] = ..., shapes: _Optional[_Iterable[float]] = ...) -> None: ...
+
 class FusionLikelihood(_message.Message):
-    __slots__ = ("bridge", "truck", "root", "target", "element_lengths_m", "mass_spread", "footprints", "first_knot_m", "knot_spacing_m", "level_m3", "off_bridge_m")
+    __slots__ = ("bridge", "truck", "root", "target", "element_lengths_m", "mass_spread", "footprints", "first_knot_m", "knot_spacing_m", "level_m3", "off_bridge_m", "bends")
     BRIDGE_FIELD_NUMBER: _ClassVar[int]
     TRUCK_FIELD_NUMBER: _ClassVar[int]
     ROOT_FIELD_NUMBER: _ClassVar[int]
@@ -314,6 +324,7 @@ class FusionLikelihood(_message.Message):
     KNOT_SPACING_M_FIELD_NUMBER: _ClassVar[int]
     LEVEL_M3_FIELD_NUMBER: _ClassVar[int]
     OFF_BRIDGE_M_FIELD_NUMBER: _ClassVar[int]
+    BENDS_FIELD_NUMBER: _ClassVar[int]
     bridge: _containers.RepeatedCompositeFieldContainer[Coordinate]
     truck: _containers.RepeatedCompositeFieldContainer[Coordinate]
     root: _containers.RepeatedScalarFieldContainer[float]
@@ -325,7 +336,8 @@ class FusionLikelihood(_message.Message):
     knot_spacing_m: float
     level_m3: _containers.RepeatedScalarFieldContainer[float]
     off_bridge_m: _containers.RepeatedCompositeFieldContainer[Stretch]
-    def __init__(self, bridge: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., truck: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., root: _Optional[_Iterable[float]] = ..., target: _Optional[_Iterable[float]] = ..., element_lengths_m: _Optional[_Iterable[float]] = ..., mass_spread: _Optional[float] = ..., footprints: _Optional[_Iterable[_Union[Footprint, _Mapping]]] = ..., first_knot_m: _Optional[float] = ..., knot_spacing_m: _Optional[float] = ..., level_m3: _Optional[_Iterable[float]] = ..., off_bridge_m: _Optional[_Iterable[_Union[Stretch, _Mapping]]] = ...) -> None: ...
+    bends: Bends
+    def __init__(self, bridge: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., truck: _Optional[_Iterable[_Union[Coordinate, _Mapping]]] = ..., root: _Optional[_Iterable[float]] = ..., target: _Optional[_Iterable[float]] = ..., element_lengths_m: _Optional[_Iterable[float]] = ..., mass_spread: _Optional[float] = ..., footprints: _Optional[_Iterable[_Union[Footprint, _Mapping]]] = ..., first_knot_m: _Optional[float] = ..., knot_spacing_m: _Optional[float] = ..., level_m3: _Optional[_Iterable[float]] = ..., off_bridge_m: _Optional[_Iterable[_Union[Stretch, _Mapping]]] = ..., bends: _Optional[_Union[Bends, _Mapping]] = ...) -> None: ...
 
 class Estimate(_message.Message):
     __slots__ = ("schema_version", "program", "version", "created_ns", "site_hash", "settings_json", "seed", "crossing_id", "realm", "vehicle", "bridge", "direction", "entry_time_ns", "exit_time_ns", "speed_m_per_s", "method", "certificate", "verdict", "reasons", "reason_texts", "chi2_per_dof", "diagnostics", "parameters", "scale_error", "covariance", "derived", "road", "fusion_likelihood")

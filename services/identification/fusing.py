@@ -10,6 +10,7 @@ from pre_core import unknowns
 from pre_core.crossing.optimum import Optimum
 from pre_core.crossing.posterior import log_odds
 from pre_core.fusion import likelihood as of_crossing
+from pre_core.fusion.bends import Bends
 from pre_core.fusion.disagreement import judge
 from pre_core.fusion.joint import BridgePriors, Fused, Part, fuse_joined, join
 from pre_core.physics.surface import Footprint
@@ -21,6 +22,7 @@ Floats = NDArray[np.float64]
 
 _DIGITS = 9
 """Of a likelihood's numbers: what is left out moves an estimate by 1e-6 of its uncertainty."""
+_DIGITS_OF_BENDS = 4
 _DRAWS_PER_CHAIN = 250
 _SEED = 1
 
@@ -78,7 +80,15 @@ def stored(data: CrossingData, found: Optimum) -> fusion.FusionLikelihood:
         knot_spacing_m=of_crossing.KNOT_M,
         level_m3=_rounded(told.level_m3),
         off_bridge_m=_stretches(told.off_bridge),
+        bends=_stored_bends(told.bends),
     )
+
+
+def _stored_bends(of: Bends | None) -> fusion.Bends | None:
+    if of is None:
+        return None
+    shapes = tuple(float(f"{value:.{_DIGITS_OF_BENDS}e}") for value in of.shapes.ravel())
+    return fusion.Bends(about=_rounded(of.about), size=_rounded(of.size), shapes=shapes)
 
 
 def _rounded(values: Floats) -> tuple[float, ...]:
@@ -209,6 +219,7 @@ def _part(source: Source, coordinates: of_crossing.Coordinates) -> Part:
         _knots(of, m),
         np.array(of.level_m3),
         _off_bridge(of),
+        _bends(of),
     )
     told = of_crossing.in_coordinates(told, coordinates, len(of.element_lengths_m))
     # Of a truck whose site file has changed nobody knows whether it is the same.
@@ -221,8 +232,19 @@ def _part(source: Source, coordinates: of_crossing.Coordinates) -> Part:
 def _knots(of: fusion.FusionLikelihood, m: int) -> Floats:
     if of.first_knot_m is None:
         return np.zeros(0)
+    bends = _bends(of)
     count = m - len(of.bridge) - len(of.truck)
+    if bends is not None:
+        count -= 1 + bends.shapes.shape[0]
     return of.first_knot_m + of.knot_spacing_m * np.arange(count, dtype=np.float64)
+
+
+def _bends(of: fusion.FusionLikelihood) -> Bends | None:
+    if of.bends is None:
+        return None
+    moves = len(of.bends.size)
+    shapes = np.array(of.bends.shapes).reshape(-1, moves * (moves + 1) // 2)
+    return Bends(np.array(of.bends.about), np.array(of.bends.size), shapes)
 
 
 def _off_bridge(of: fusion.FusionLikelihood) -> of_crossing.OffBridge | None:

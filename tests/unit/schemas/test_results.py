@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from schemas.errors import InputError
-from schemas.fusion import Axle, Coordinate, FusionLikelihood, Stretch
+from schemas.fusion import Axle, Bends, Coordinate, FusionLikelihood, Stretch
 from schemas.proto import driveby_pb2 as pb
 from schemas.reasons import REASON_TEXTS, Reason, texts
 from schemas.results import (
@@ -133,7 +133,9 @@ def likelihoods(draw: st.DrawFn) -> FusionLikelihood:
     bridge = draw(st.lists(coordinate, min_size=1, max_size=3))
     truck = draw(st.lists(coordinate, max_size=2))
     knots = draw(st.integers(0, 2))
-    m = len(bridge) + len(truck) + knots
+    count = draw(st.integers(0, 2)) if knots else 0
+    m = len(bridge) + len(truck) + knots + (1 + count if knots else 0)
+    moves = len(bridge) + 1
     axle = Axle(width_m=0.25, twin_distance_m=0.0, length_m=0.2, track_m=1.9, offset_m=0.0)
 
     def some(count: int) -> tuple[float, ...]:
@@ -154,6 +156,13 @@ def likelihoods(draw: st.DrawFn) -> FusionLikelihood:
             Stretch(begin_m=draw(numbers), step_m=draw(sizes), values=some(draw(st.integers(0, 3))))
             for _ in range(draw(st.integers(0, 2)))
         ),
+        bends=Bends(
+            about=some(len(bridge)),
+            size=tuple(draw(st.lists(sizes, min_size=moves, max_size=moves))),
+            shapes=some(count * moves * (moves + 1) // 2),
+        )
+        if knots
+        else None,
     )
 
 
