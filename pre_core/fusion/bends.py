@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from pre_core.crossing import posterior
 from pre_core.crossing.optimum import Optimum, normal_approximation
@@ -82,7 +83,7 @@ def straightened(
     """Root (m, p) and target (m,) of the normal about a bridge `at` (b,), the place integrated out.
 
     Those given are of x = (bridge, p - b others, place, bends), |root x - target|²/2. `priors` is
-    a root (r, p - b) of the others' precision, by which the place is found that goes with `at`.
+    the others' precision (p - b, p - b), by which the place is found that goes with `at`.
     """
     b = bends.about.size
     k = bends.shapes.shape[0]
@@ -91,14 +92,14 @@ def straightened(
     far = _FARTHEST * bends.size
     at = bends.about + np.clip(at - bends.about, -far[:b], far[:b])
     place = 0.0
-    beside = np.zeros((priors.shape[0], 1 + of_others.shape[1]))
-    beside[:, 1:] = priors
+    others = cho_factor(of_others.T @ of_others + priors)
     for _ in range(_PLACE_STEPS):
         bend, slope = _bent(bends, at, place)
         left = target - of_bridge @ at - of_place * place - of_bends @ bend
         along = of_place + of_bends @ slope[:, b]
-        rows = np.vstack([np.column_stack([along, of_others]), beside])
-        step = np.linalg.lstsq(rows, np.concatenate([left, np.zeros(priors.shape[0])]))[0][0]
+        # What is left of it when the others have taken their part.
+        free = along - of_others @ cho_solve(others, of_others.T @ along)
+        step = float(free @ left) / float(free @ along)
         place += float(np.clip(step, -bends.size[b], bends.size[b]))
         place = float(np.clip(place, -far[b], far[b]))
     bend, slope = _bent(bends, at, place)

@@ -43,6 +43,8 @@ _TAUS = BETWEEN_SCALE * np.array(
 _RHOS = (0.0, 0.3, 0.7, 0.93, 0.99)
 _USUAL = (0.03, 0.3)
 """tau and rho by which the bridge is found about which it changes."""
+_SETTLED = 0.002
+"""Of a compliance and of the other unknowns' coordinates: far within what is known of them."""
 _FINER = 12
 """Parts of a cell of tau: crossings tell it more closely than one has time to look."""
 _FIRST_TAU = 0.002
@@ -221,11 +223,13 @@ def join(
         # Without a change crossings that are surer than the bridge is steady lead each other astray.
         of = _of_change(joint._replace(ready=joint.of(trusted)))
         told = _with_priors(joint, priors, *_changed(joint, of, *_USUAL)[:2])
-        centre = np.asarray(np.linalg.solve(*told)[: layout.bridge])
+        before, centre = centre, np.asarray(np.linalg.solve(*told)[: layout.bridge])
         centre[layout.elements] = np.clip(centre[layout.elements], *_ROUGH_COMPLIANCE)
         # What must not be negative.
         least = np.where(priors.coordinates.is_log, -np.inf, 0.0)
         bridge = np.maximum(centre, least)
+        if np.all(np.abs(centre - before) < _SETTLED):
+            break
     return joint._replace(centre=centre)
 
 

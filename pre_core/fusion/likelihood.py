@@ -184,7 +184,7 @@ def straightened(of: Likelihood, at: FloatArray, mismatch: FloatArray) -> Likeli
     q = of.knots_m.size
     priors = np.zeros((truck + q, truck + q))
     priors[:truck, :truck] = np.eye(truck)
-    priors[truck:, truck:] = np.linalg.cholesky(mismatch).T
+    priors[truck:, truck:] = mismatch
     root, target = straightened_about(of.root, of.target, of.bends, at, priors)
     return of._replace(root=root, target=target, bends=None)
 
