@@ -22,13 +22,13 @@ from pre_core.crossing import posterior
 from pre_core.crossing.compliances import draws, marginal, of_normal
 from pre_core.crossing.mismatch import Mismatch, common_shapes
 from pre_core.crossing.optimum import Optimum
-from pre_core.fusion.joint import root_of
 from pre_core.fusion.likelihood import (
     Likelihood,
     covariance_of_coefficients,
     likelihood,
     loosened,
 )
+from pre_core.fusion.tracks import root_of
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Ending
 from pre_core.unknowns import EI_1

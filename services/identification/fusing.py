@@ -12,7 +12,9 @@ from pre_core.crossing.posterior import log_odds
 from pre_core.fusion import likelihood as of_crossing
 from pre_core.fusion.bends import Bends
 from pre_core.fusion.disagreement import judge
-from pre_core.fusion.joint import BridgePriors, Fused, Part, fuse_joined, join
+from pre_core.fusion.joint import Fused, fuse_joined, join
+from pre_core.fusion.sums import BridgePriors
+from pre_core.fusion.tracks import Part
 from pre_core.physics.surface import Footprint
 from schemas import fusion
 from schemas.results import Crossing, Track

@@ -4,7 +4,9 @@ import numpy as np
 
 from pre_core.fusion.disagreement import Judged
 from pre_core.fusion.disagreement import judge as judge_joined
-from pre_core.fusion.joint import BridgePriors, Part, join
+from pre_core.fusion.joint import join
+from pre_core.fusion.sums import BridgePriors
+from pre_core.fusion.tracks import Part
 from tests.numerics.test_fusion import PRIORS, crossing_of, root
 
 

@@ -12,8 +12,8 @@ from scipy.interpolate import BSpline
 from pre_core.crossing import mismatch as mm
 from pre_core.crossing.optimum import Optimum
 from pre_core.crossing.posterior import layout, log_odds_of_absence
-from pre_core.fusion import joint
-from pre_core.fusion.joint import BETWEEN_SCALE, BridgePriors, Fused, Part, fuse
+from pre_core.fusion.between import BETWEEN_SCALE
+from pre_core.fusion.joint import Fused, fuse
 from pre_core.fusion.likelihood import (
     KNOT_M,
     Coordinates,
@@ -22,6 +22,8 @@ from pre_core.fusion.likelihood import (
     likelihood,
     long_share,
 )
+from pre_core.fusion.sums import BridgePriors
+from pre_core.fusion.tracks import Part, wander
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
 from pre_core.physics.surface import COMMON_LORRY, felt_by, random_surface, spectra, surface_density
 from pre_core.unknowns import EI_1, mass_powers
@@ -88,7 +90,7 @@ def test_the_wander_is_found_by_its_share() -> None:
         seen = np.sin(0.5 * np.pi * n) ** 4
         common = mm.common_shapes(FRONT, REAR, wander_m)[0]
         share = float(common @ seen / (mismatch.shapes.density[0] @ seen))
-        assert joint.wander(mismatch, share) == pytest.approx(wander_m, rel=0.02)
+        assert wander(mismatch, share) == pytest.approx(wander_m, rel=0.02)
 
 
 def coordinates() -> Coordinates:

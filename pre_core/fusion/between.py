@@ -1,0 +1,153 @@
+"""How a bridge changes from crossing to crossing, beyond what each of them can tell.
+
+Every crossing has a bridge of its own: its compliances differ from those that all are about by a
+relative standard deviation tau, of which a share rho is common to all elements. These changes are
+integrated out; tau and rho are looked at on a grid.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from pre_core.fusion.sums import BridgePriors, Joint, Ready, told, with_priors
+
+FloatArray = NDArray[np.float64]
+
+BETWEEN_SCALE = 0.04
+"""Of the half-normal prior of tau: temperature changes a concrete bridge's EI by some per cent."""
+_TAUS = BETWEEN_SCALE * np.array(
+    [0.0, 0.05, 0.1, 0.15, 0.2, 0.27, 0.36, 0.48, 0.64, 0.85, 1.1, 1.45, 1.9, 2.5, 3.2]
+)
+_RHOS = (0.0, 0.3, 0.7, 0.93, 0.99)
+_FINER = 12
+"""Parts of a cell of tau: crossings tell it more closely than one has time to look."""
+_FIRST_TAU = 0.002
+"""What is added to tau before its logarithm, in which the evidence is smooth."""
+_AS_LIKELY = np.exp(-0.5 * 1.96**2)
+"""Of a normal's density, at the ends of its 95 % interval."""
+
+
+class Between(NamedTuple):
+    """tau and rho with their posterior weights, (k,) each: the middles of cells."""
+
+    tau: FloatArray
+    rho: FloatArray
+    weight: FloatArray
+    fine: FloatArray
+    """(cells, f) places within the cells of tau."""
+    within: FloatArray
+    """(k, f) weights there."""
+
+
+class _Alike(NamedTuple):
+    """Crossings (k) with the same places among all unknowns."""
+
+    places: NDArray[np.int64]
+    across: FloatArray  # (k, e, p) rows of their precisions at the elements
+    linear: FloatArray  # (k, e)
+
+
+class Changing(NamedTuple):
+    """The sum of all crossings, and what is needed to give each a bridge of its own."""
+
+    precision: FloatArray
+    linear: FloatArray
+    alike: tuple[_Alike, ...]
+
+
+def of_change(joint: Joint) -> Changing:
+    """The crossings of `joint`, those with the same places together."""
+    elements = joint.layout.elements
+    alike: dict[bytes, list[Ready]] = {}
+    for one in joint.ready:
+        alike.setdefault(one.places.tobytes(), []).append(one)
+    return Changing(
+        *told(joint, joint.ready),
+        tuple(
+            _Alike(
+                some[0].places,
+                np.stack([one.precision[elements] for one in some]),
+                np.stack([one.linear[elements] for one in some]),
+            )
+            for some in alike.values()
+        ),
+    )
+
+
+def changed(
+    joint: Joint, of: Changing, tau: float, rho: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Precision and linear part of all unknowns where each crossing has a bridge of its own.
+
+    And what that adds to the logarithm of the evidence.
+    """
+    if tau == 0.0:
+        return of.precision, of.linear, 0.0
+    elements = joint.layout.elements
+    e = elements.size
+    root = np.linalg.cholesky((1.0 - rho) * np.eye(e) + rho) * tau
+    root = joint.centre[elements][:, None] * root
+    precision, linear, evidence = of.precision.copy(), of.linear.copy(), 0.0
+    for some in of.alike:
+        across = root.T @ some.across
+        pull = some.linear @ root
+        factor = np.linalg.cholesky(np.eye(e) + across[:, :, elements] @ root)
+        moved = np.linalg.solve(factor, np.concatenate([across, pull[:, :, None]], axis=2))
+        rows = moved.reshape(-1, moved.shape[2])
+        evidence += 0.5 * float(rows[:, -1] @ rows[:, -1])
+        evidence -= float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
+        precision[np.ix_(some.places, some.places)] -= rows[:, :-1].T @ rows[:, :-1]
+        linear[some.places] -= rows[:, :-1].T @ rows[:, -1]
+    return precision, linear, evidence
+
+
+def between_of(joint: Joint, priors: BridgePriors) -> Between:
+    """Posterior of tau and rho; of one crossing it is the prior."""
+    tau, rho = (grid.ravel() for grid in np.meshgrid(_TAUS, _RHOS, indexing="ij"))
+    log = np.empty(tau.size)
+    of = of_change(joint)
+    for k in range(tau.size):
+        precision, linear, log[k] = changed(joint, of, float(tau[k]), float(rho[k]))
+        precision, linear = with_priors(joint, priors, precision, linear)
+        factor = np.linalg.cholesky(precision)
+        at = np.linalg.solve(factor, linear)
+        log[k] += 0.5 * float(at @ at) - float(np.log(np.diag(factor)).sum())
+    fine, within = _fine_taus(log.reshape(_TAUS.size, -1))
+    return Between(tau, rho, within.sum(axis=2).ravel(), fine, within.reshape(tau.size, -1))
+
+
+def _fine_taus(log: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places in each cell of tau (t, f), and the weights (t, r, f) there for each rho, sum one.
+
+    From the logarithm of the evidence (t, r), which is smooth between the cells.
+    """
+    edges = _edges()
+    part = (np.arange(_FINER) + 0.5) / _FINER
+    fine = edges[:-1, None] + np.diff(edges)[:, None] * part
+    smooth = CubicSpline(np.log(_TAUS + _FIRST_TAU), log, axis=0)
+    density = smooth(np.log(fine.ravel() + _FIRST_TAU)).reshape(*fine.shape, -1)
+    density -= 0.5 * (fine[:, :, None] / BETWEEN_SCALE) ** 2
+    weight = np.exp(density - density.max()) * np.diff(edges)[:, None, None]
+    return fine, np.moveaxis(weight / weight.sum(), 2, 1)
+
+
+def may_be_zero(between: Between) -> bool:
+    """Whether no change at all is about as likely as the likeliest."""
+    density = between.within.reshape(_TAUS.size, len(_RHOS), _FINER).sum(axis=1)
+    density /= np.diff(_edges())[:, None]
+    return bool(density[0, 0] > _AS_LIKELY * density.max())
+
+
+def _edges() -> FloatArray:
+    """Between the cells of tau of which the grid's are inside."""
+    return np.concatenate([[0.0], 0.5 * (_TAUS[1:] + _TAUS[:-1]), [_TAUS[-1]]])
+
+
+def tau_draws(
+    between: Between, k: int, shape: tuple[int, int], rng: np.random.Generator
+) -> FloatArray:
+    """Draws of tau within cell k."""
+    share = between.within[k] / between.within[k].sum()
+    return np.asarray(rng.choice(between.fine[k // len(_RHOS)], shape, p=share))
