@@ -23,8 +23,10 @@ from pre_core.physics.surface import Footprint
 
 FloatArray = NDArray[np.float64]
 
-_APART_STEPS = 2
-"""Of the second difference by which the common share is read: waves of half a metre to two."""
+_APART_STEPS = 4
+"""Of the second difference by which the common share is read: waves of one metre to four."""
+_MOST_STEPS_BESIDE, _ALIGNMENTS, _FEWEST_RUNS = 6, 3, 2
+_LAGS = sorted(range(-_MOST_STEPS_BESIDE, _MOST_STEPS_BESIDE + 1), key=abs)
 _WANDERS_M, _HALVINGS = (0.01, 1.0), 12
 _NOTHING = 1e-9
 """Of the largest variance of a sum of waves: a smaller one is rounding."""
@@ -119,16 +121,27 @@ def root_of(covariance: FloatArray) -> FloatArray:
 
 
 def common_share(runs: Sequence[OffBridge | None]) -> float:
-    """Which part of the mismatch's short waves the runs have in common, by rows off the bridge."""
+    """Which part of the mismatch's short waves the runs have in common, by rows off the bridge.
+
+    A receiver puts runs beside each other by half a metre, as long as the waves: so each run is
+    first moved to where it is most like the others.
+    """
     known = [run for run in runs if run is not None]
-    first = min(round(run.begin_m / OFF_BRIDGE_STEP_M) for run in known)
+    if len(known) < _FEWEST_RUNS:
+        return 0.0
+    first = min(round(run.begin_m / OFF_BRIDGE_STEP_M) for run in known) - _MOST_STEPS_BESIDE
     last = max(round(run.begin_m / OFF_BRIDGE_STEP_M) + run.value_m.size for run in known)
-    step, bent = _APART_STEPS, []
-    for run in known:
-        d = np.full(last - first, np.nan)
+    heights = np.full((len(known), last - first + _MOST_STEPS_BESIDE), np.nan)
+    for run, height in zip(known, heights, strict=True):
         begin = round(run.begin_m / OFF_BRIDGE_STEP_M) - first
-        d[begin : begin + run.value_m.size] = run.value_m
-        bent.append(d[2 * step :] - 2.0 * d[step:-step] + d[: -2 * step])
+        height[begin : begin + run.value_m.size] = run.value_m
+    step = _APART_STEPS
+    bent = heights[:, 2 * step :] - 2.0 * heights[:, step:-step] + heights[:, : -2 * step]
+    for _ in range(_ALIGNMENTS):
+        for i in range(len(known)):
+            others = _mean_known(np.delete(bent, i, axis=0))
+            moved = [np.roll(bent[i], lag) for lag in _LAGS]
+            bent[i] = moved[int(np.argmax([_likeness(one, others) for one in moved]))]
     together = power = 0.0
     for i in range(len(bent)):
         for j in range(i):
@@ -136,6 +149,21 @@ def common_share(runs: Sequence[OffBridge | None]) -> float:
             together += float(bent[i][both] @ bent[j][both])
             power += 0.5 * float(bent[i][both] @ bent[i][both] + bent[j][both] @ bent[j][both])
     return float(np.clip(together / power, 0.0, 1.0)) if power > 0.0 else 0.0
+
+
+def _mean_known(bent: FloatArray) -> FloatArray:
+    """The mean (n,) of those of the runs (k, n) that tell something there; nothing: NaN."""
+    told = np.isfinite(bent)
+    count = told.sum(axis=0)
+    total = np.where(told, bent, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _likeness(one: FloatArray, other: FloatArray) -> float:
+    """The correlation of what both tell."""
+    both = np.isfinite(one) & np.isfinite(other)
+    size = float(np.sqrt((one[both] @ one[both]) * (other[both] @ other[both])))
+    return float(one[both] @ other[both]) / size if size > 0.0 else 0.0
 
 
 def wander(mismatch: Mismatch, share: float) -> float:
