@@ -43,11 +43,12 @@ from pre_core.search import levenberg_marquardt
 
 FloatArray = NDArray[np.float64]
 
-KNOT_M = 1.25
+KNOT_M, ALIKE_KNOT_M = 1.25, 0.5
 """Between knots of the mismatch's long waves, cubic between."""
-_LONG_CYCLES_PER_M = 0.2
-"""Waves longer than this in round numbers are told apart: 80 to 97 % of what is told of a bridge
-lies below half of it."""
+_LONG_OF_KNOT = 0.25
+"""Waves longer than four knots in round numbers are told apart. Where tyres differ 80 to 97 % of
+what is told of a bridge lies below half of these. Tyres that are alike and run aside of each other
+leave short waves as large as long ones, so that much is told by waves of two metres too."""
 _LONG_SHARE = 0.97
 """Of the power of the longest waves; the rest stays noise of the crossing's own, for the rows'
 covariance must be positive."""
@@ -93,31 +94,38 @@ class Likelihood(NamedTuple):
     """If there are, x goes on with the place along the road in m, and with them."""
 
 
-def long_share(cycles_per_m: FloatArray) -> FloatArray:
+def knot_spacing_m(mismatch: Mismatch) -> float:
+    """How far apart the knots are by which waves of a mismatch with levels are told."""
+    return KNOT_M if mismatch.level_m3[0] > 0.0 else ALIKE_KNOT_M
+
+
+def long_share(cycles_per_m: FloatArray, knot_m: float) -> FloatArray:
     """Which share of the mismatch's power counts as long waves: (g,)."""
-    return np.asarray(_LONG_SHARE * np.exp(-((cycles_per_m / _LONG_CYCLES_PER_M) ** 2)))
+    return np.asarray(_LONG_SHARE * np.exp(-((cycles_per_m * knot_m / _LONG_OF_KNOT) ** 2)))
 
 
 def covariance_of_coefficients(
     knots_m: FloatArray, cycles_per_m: FloatArray, density: FloatArray
 ) -> FloatArray:
     """Covariance (q, q) in mm² of the splines' coefficients, for long waves of a density in m³."""
-    seen = np.sinc(cycles_per_m * KNOT_M) ** (2 * (_CUBIC + 1))
-    within = cycles_per_m < 0.5 / KNOT_M
-    of = np.where(within, long_share(cycles_per_m) * density, 0.0) / np.where(within, seen, 1.0)
+    knot_m = float(knots_m[1] - knots_m[0])
+    seen = np.sinc(cycles_per_m * knot_m) ** (2 * (_CUBIC + 1))
+    within = cycles_per_m < 0.5 / knot_m
+    told = long_share(cycles_per_m, knot_m) * density
+    of = np.where(within, told, 0.0) / np.where(within, seen, 1.0)
     step = cycles_per_m[1] - cycles_per_m[0]
     weight = np.full(cycles_per_m.size, step)
     weight[0] *= 0.5
-    lags = np.arange(knots_m.size) * KNOT_M
+    lags = np.arange(knots_m.size) * knot_m
     row = 1e6 * np.cos(2.0 * np.pi * np.outer(lags, cycles_per_m)) @ (weight * of)
-    row[lags > MEMORY_M + 3.0 / _LONG_CYCLES_PER_M] = 0.0
+    row[lags > MEMORY_M + 3.0 * knot_m / _LONG_OF_KNOT] = 0.0
     row[0] *= 1.0 + 1e-6
     places = np.arange(knots_m.size)
     return np.asarray(row[np.abs(places[:, None] - places[None, :])])
 
 
-def likelihood(found: Optimum) -> Likelihood:
-    """Of a crossing at its optimum."""
+def likelihood(found: Optimum, *, with_bends: bool = True) -> Likelihood:
+    """Of a crossing at its optimum; without bends and place where that is the truth."""
     problem, y = found.problem, found.state.y
     where = posterior.layout(problem)
     state = found.state
@@ -143,16 +151,19 @@ def likelihood(found: Optimum) -> Likelihood:
         splines = np.zeros((rows.size, grid.size))
         white = _white_knots(problem, y, grid)
         splines[: white.shape[0]] = white
+        jacobian = np.hstack([jacobian, splines])
+        told = np.concatenate([told, centre.size + inner])
+        centre = np.concatenate([centre, np.zeros(grid.size)])
+    if differs and with_bends:
         bends, bent = bends_of(found, problem, rows)
         # The trajectory as a whole, from the optimum on, and the rest of it beside the whole.
         place = where.trajectory.start
         jacobian[:, place] = jacobian[:, where.trajectory].sum(axis=1)
         centre[where.trajectory] = 0.0
-        jacobian = np.hstack([jacobian, splines, bent])
-        of_bends = centre.size + grid.size + np.arange(bent.shape[1])
-        told = np.concatenate([told, centre.size + inner, [place], of_bends])
+        jacobian = np.hstack([jacobian, bent])
+        told = np.concatenate([told, [place], centre.size + np.arange(bent.shape[1])])
         slope = np.concatenate([slope, np.zeros(bent.shape[1])])
-        centre = np.concatenate([centre, np.zeros(grid.size + bent.shape[1])])
+        centre = np.concatenate([centre, np.zeros(bent.shape[1])])
     precision = jacobian.T @ jacobian
     linear = precision @ centre - jacobian.T @ state.residual[rows] + slope
     if differs:
@@ -233,7 +244,8 @@ def loosened(
 
 def _short_waves(mismatch: Mismatch) -> Mismatch:
     shapes = mismatch.shapes
-    density = shapes.density * (1.0 - long_share(shapes.cycles_per_m))
+    told = long_share(shapes.cycles_per_m, knot_spacing_m(mismatch))
+    density = shapes.density * (1.0 - told)
     return mismatch._replace(shapes=shapes._replace(density=density))
 
 
@@ -242,9 +254,10 @@ def _knots(problem: posterior.Problem, y: FloatArray) -> tuple[FloatArray, NDArr
     at = posterior.points(problem, y[None, :])
     rear = _rear_m(problem.crossing, at)
     # From the bridge's start on, so that all crossings have the same.
-    first = int(np.floor(rear.min() / KNOT_M)) - 2
-    last = int(np.ceil(rear.max() / KNOT_M)) + 2
-    grid = KNOT_M * np.arange(first, last + 1)
+    knot_m = knot_spacing_m(problem.mismatch)
+    first = int(np.floor(rear.min() / knot_m)) - 2
+    last = int(np.ceil(rear.max() / knot_m)) + 2
+    grid = knot_m * np.arange(first, last + 1)
     near = (grid > -_BESIDE_M) & (grid < problem.crossing.span_m + _BESIDE_M)
     return np.asarray(grid), np.asarray(np.flatnonzero(near), dtype=np.int64)
 
@@ -312,7 +325,7 @@ def _white_knots(problem: posterior.Problem, y: FloatArray, grid: FloatArray) ->
     crossing, rows = problem.crossing, problem.rows
     at = posterior.points(problem, y[None, :])
     rear = _rear_m(crossing, at)
-    aside = KNOT_M * np.arange(1, _CUBIC)
+    aside = float(grid[1] - grid[0]) * np.arange(1, _CUBIC)
     padded = np.concatenate([grid[0] - aside[::-1], grid, grid[-1] + aside])
     basis = BSpline(padded, np.eye(grid.size), _CUBIC, extrapolate=False)
     shape = 1e-3 * np.nan_to_num(np.asarray(basis(rear)))

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from pre_core.crossing.mismatch import LONG_CYCLES_PER_M, Mismatch, common_shapes, shapes_of
 from pre_core.fusion.likelihood import (
-    KNOT_M,
     OFF_BRIDGE_STEP_M,
     Likelihood,
     OffBridge,
@@ -57,7 +56,7 @@ class Shared(NamedTuple):
 
 
 class Key(NamedTuple):
-    """Of a track: runs along which other stretches of road were seen share no waves."""
+    """Of a track: runs that tell other stretches of road, or by other knots, share no waves."""
 
     truck: str
     direction: int
@@ -109,7 +108,7 @@ def _track(key: Key, runs: list[Part]) -> Track:
 def key_of(part: Part) -> Key:
     """The track of a crossing."""
     knots_m = part.likelihood.knots_m
-    first = round(float(knots_m[0]) / KNOT_M) if knots_m.size else 0
+    first = round(float(knots_m[0] / (knots_m[1] - knots_m[0]))) if knots_m.size else 0
     return Key(part.truck, part.direction, first, knots_m.size)
 
 

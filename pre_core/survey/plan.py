@@ -101,7 +101,7 @@ def _told(truth: Truth, whole: Mismatch) -> Likelihood:
     mismatch = whole._replace(speed_m_per_s=problem.mismatch.speed_m_per_s)
     problem = problem._replace(mismatch=mismatch)
     state = levenberg_marquardt.begin(lambda at: posterior.all_rows(problem, at), y)
-    return likelihood(Optimum(problem, state, Ending.CONVERGED, 1.0, 0, 1))
+    return likelihood(Optimum(problem, state, Ending.CONVERGED, 1.0, 0, 1), with_bends=False)
 
 
 def _of_bridge(told: Likelihood, own: FloatArray | None) -> FloatArray:

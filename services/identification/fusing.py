@@ -79,7 +79,7 @@ def stored(data: CrossingData, found: Optimum) -> fusion.FusionLikelihood:
         mass_spread=data.vehicle.spread("total_mass_kg"),
         footprints=(front, rear),
         first_knot_m=float(told.knots_m[0]) if told.knots_m.size else None,
-        knot_spacing_m=of_crossing.KNOT_M,
+        knot_spacing_m=of_crossing.knot_spacing_m(found.problem.mismatch),
         level_m3=_rounded(told.level_m3),
         off_bridge_m=_stretches(told.off_bridge),
         bends=_stored_bends(told.bends),
@@ -182,9 +182,9 @@ def _is_like(one: fusion.FusionLikelihood, other: fusion.FusionLikelihood) -> bo
 
     def what(of: fusion.FusionLikelihood) -> object:
         names = tuple((c.name, c.is_log) for c in of.bridge)
-        return names, of.element_lengths_m, of.knot_spacing_m
+        return names, of.element_lengths_m
 
-    return what(one) == what(other) and one.knot_spacing_m == of_crossing.KNOT_M
+    return what(one) == what(other)
 
 
 def _priors(of: fusion.FusionLikelihood) -> BridgePriors:

@@ -18,12 +18,13 @@ from pre_core.fusion.likelihood import (
     KNOT_M,
     Coordinates,
     Likelihood,
+    OffBridge,
     covariance_of_coefficients,
     likelihood,
     long_share,
 )
 from pre_core.fusion.sums import BridgePriors
-from pre_core.fusion.tracks import Part, wander
+from pre_core.fusion.tracks import Part, common_share, wander
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
 from pre_core.physics.surface import COMMON_LORRY, felt_by, random_surface, spectra, surface_density
 from pre_core.unknowns import EI_1, mass_powers
@@ -56,7 +57,7 @@ def test_the_long_waves_of_splines() -> None:
     at = np.asarray(spline(places))
     found = 1e-6 * at @ covariance @ at.T
     n = shapes.cycles_per_m
-    long_waves = density * long_share(n)
+    long_waves = density * long_share(n, KNOT_M)
     expected = np.array(
         [trapezoid(long_waves * np.cos(2.0 * np.pi * n * apart), n) for apart in places - places[0]]
     )
@@ -87,10 +88,24 @@ def test_the_wander_is_found_by_its_share() -> None:
     mismatch = whole()
     for wander_m in (0.05, 0.12, 0.3):
         n = mismatch.shapes.cycles_per_m
-        seen = np.sin(0.5 * np.pi * n) ** 4
+        seen = np.sin(np.pi * n) ** 4
         common = mm.common_shapes(FRONT, REAR, wander_m)[0]
         share = float(common @ seen / (mismatch.shapes.density[0] @ seen))
         assert wander(mismatch, share) == pytest.approx(wander_m, rel=0.02)
+
+
+def test_runs_that_are_put_beside_their_place_are_moved_back() -> None:
+    """Of equal powers shared and own, each run up to a metre from where it was driven."""
+    rng = np.random.default_rng(3)
+    shared = rng.standard_normal(240)
+    runs = []
+    for lag in rng.integers(-4, 5, 10):
+        value = np.roll(shared, lag) + rng.standard_normal(240)
+        value[100:160] = np.nan  # the bridge
+        runs.append(OffBridge(-30.0 + 0.5 * float(rng.integers(0, 3)), value))
+    assert common_share(runs) == pytest.approx(0.5, abs=0.1)
+    alone = [run._replace(value_m=rng.standard_normal(240)) for run in runs]
+    assert common_share(alone) < 0.2
 
 
 def coordinates() -> Coordinates:
