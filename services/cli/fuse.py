@@ -56,8 +56,10 @@ def fuse_command(
     for name in sorted({crossing.bridge for crossing in crossings.values()}):
         of = sorted((c for c in crossings.values() if c.bridge == name), key=lambda c: c.entry_time)
         counts = [one for one in map(usable, of) if one is not None]
-        state = state_of(count_in(Counted(), counts), name, fusing)
         elements = _elements(name, of)
+        if baseline is not None and elements is not None and name in fusing.baselines:
+            _check_baseline(baseline, fusing.baselines[name], elements)
+        state = state_of(count_in(Counted(), counts), name, fusing)
         if state is None or elements is None:
             console.print(f"{name}: none of {len(of)} crossings can be fused", highlight=False)
             continue
@@ -74,6 +76,15 @@ def fuse_command(
         every = results(header, with_common_shares(ordered, found), found)
         write_atomically(json_path, results_json(every))
     return 0
+
+
+def _check_baseline(path: Path, baseline: BridgeResult, elements: _Elements) -> None:
+    stored, now = len(baseline.elements), len(elements.lengths_m)
+    if stored != now:
+        raise InputError(
+            f"{path}: {elements.id} has {stored} elements there and {now} in the results, "
+            "the baseline must have the same"
+        )
 
 
 def _elements(name: str, crossings: list[Crossing]) -> _Elements | None:

@@ -237,3 +237,14 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFi
     both = write(tmp_path / "both.json", [crossing(0), live])
     assert main(["fuse", str(both)]) == 2
     assert "one realm at a time" in capsys.readouterr().err
+
+
+def test_a_baseline_of_other_elements_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.json"
+    three = write(tmp_path / "three.json", [crossing(0, (1.0, 1.0, 1.0))])
+    assert main(["fuse", str(three), "--json", str(out)]) == 0
+    five = write(tmp_path / "five.json", [crossing(0)])
+    assert main(["fuse", str(five), "--baseline", str(out)]) == 2
+    assert "out.json: bridge-1 has 3 elements there and 5 in the results" in capsys.readouterr().err
