@@ -203,17 +203,10 @@ def join(
     parts = sorted(parts, key=lambda part: part.name)
     tracks = _tracks(parts)
     layout = _layout_of(parts, tracks, priors)
-    prior = np.zeros((layout.size, layout.size))
-    for places in layout.trucks.values():
-        prior[places, places] = 1.0
-    for key, places in layout.tracks.items():
-        common = tracks[key].common
-        assert common is not None  # noqa: S101 - it has a place among the unknowns
-        prior[np.ix_(places, places)] = np.linalg.inv(common)
+    prior = _prior(layout, tracks)
     shared = tuple(track.shared for track in tracks.values())
     names = tuple(part.name for part in parts)
-    centre = np.zeros(layout.bridge)
-    centre[layout.elements] = 1.0
+    centre = _nominal(layout)
     bridge: FloatArray | None = None
     for _ in range(_PASSES):
         ready = tuple(
@@ -231,6 +224,35 @@ def join(
         if np.all(np.abs(centre - before) < _SETTLED):
             break
     return joint._replace(centre=centre)
+
+
+def alone(part: Part, priors: BridgePriors) -> Joint:
+    """One crossing by itself, about what it says of the bridge; its waves are its own."""
+    tracks = _tracks([part])
+    layout = _layout_of([part], tracks, priors)
+    centre = _nominal(layout)
+    ready = _ready(_about(part, tracks, None), layout, tracks, priors, centre)
+    shared = tuple(track.shared for track in tracks.values())
+    return Joint((part.name,), layout, (ready,), _prior(layout, tracks), centre, shared)
+
+
+def _nominal(layout: _Layout) -> FloatArray:
+    """(b,) of a bridge as the site file has it."""
+    centre = np.zeros(layout.bridge)
+    centre[layout.elements] = 1.0
+    return centre
+
+
+def _prior(layout: _Layout, tracks: dict[_Key, _Track]) -> FloatArray:
+    """Precision (n, n) of trucks and tracks before any crossing."""
+    prior = np.zeros((layout.size, layout.size))
+    for places in layout.trucks.values():
+        prior[places, places] = 1.0
+    for key, places in layout.tracks.items():
+        common = tracks[key].common
+        assert common is not None  # noqa: S101 - it has a place among the unknowns
+        prior[np.ix_(places, places)] = np.linalg.inv(common)
+    return prior
 
 
 def _about(part: Part, tracks: dict[_Key, _Track], bridge: FloatArray | None) -> Part:
