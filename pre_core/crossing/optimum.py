@@ -89,8 +89,8 @@ _STRIDE_M = 0.6
 _REFINED_M = (0.3, 0.15)
 """And so much closer about the best one."""
 _BESIDE_M, _BESIDE = 0.1, 6
-"""Where the roads differ so many places to either side of an optimum are looked at: minima lie 0.2 m
-apart there, and what the walk knows of the truck does not tell the right one from the next."""
+"""Where the roads differ so many places beside an optimum are looked at: minima lie 0.2 m apart
+there, and what the walk knows of the truck does not tell the right one from the next."""
 _MOST_MOVES = 4
 """From an optimum to one beside it."""
 _PATIENCE = 1.5  # strides beyond the best place

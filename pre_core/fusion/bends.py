@@ -125,7 +125,7 @@ def _bent(bends: Bends, at: FloatArray, place: float) -> tuple[FloatArray, Float
 
 
 def _sizes(found: Optimum) -> FloatArray:
-    """How far the bridge's coordinates and the place are likely to be from the optimum: (b + 1,)."""
+    """(b + 1,) how far the bridge's coordinates and the place are likely to be from the optimum."""
     problem, y = found.problem, found.state.y
     where = posterior.layout(problem)
     _, covariance = normal_approximation(found)

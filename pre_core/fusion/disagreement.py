@@ -56,8 +56,7 @@ def judge(parts: Sequence[Part], joint: Joint, priors: BridgePriors) -> Judged:
         inside = [name for name in names if name not in odd]
         found = between_of(joint._replace(ready=joint.of(inside)), priors)
         changes = np.column_stack([found.tau, found.rho, found.weight])[found.weight > _UNLIKELY]
-        chances = _chances(joint, priors, sorted(odd), inside, changes)
-        of = zip(sorted(odd), chances, strict=True)
+        of = zip(sorted(odd), _chances(joint, priors, sorted(odd), inside, changes), strict=True)
         back = {name for name, chance in of if chance >= _INCOMPATIBLE / len(names)}
         odd = odd - back
     agree = tuple(name for name in names if name not in odd)
@@ -99,7 +98,7 @@ def _chances(
 def _own_change(
     one: Ready, precision: FloatArray, linear: FloatArray, elements: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Precision (e, e) and linear part (e,) of how a crossing's compliances differ from all others'.
+    """Precision (e, e), linear part (e,) of how a crossing's compliances differ from the others'.
 
     From the sum of all, this one included. Trucks, tracks and the bridge's other unknowns are what
     all others say, so that what is hardly told by one crossing alone is not held against it.

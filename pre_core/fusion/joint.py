@@ -6,6 +6,8 @@ averages out. A crossing has of its own the rest of those waves, and a change of
 compliance: between crossings EI changes with temperature and with what the model lacks, by a
 relative standard deviation tau of which a share rho is common to all elements. All that is normal
 is integrated out; tau and rho are looked at on a grid.
+
+Longer than other modules: all of it goes by one layout of all unknowns.
 """
 
 from collections.abc import Collection, Sequence
@@ -213,7 +215,7 @@ def join(
             _ready(_about(part, tracks, bridge), layout, tracks, priors, centre) for part in parts
         )
         joint = Joint(names, layout, ready, prior, centre, shared)
-        # Without a change crossings that are surer than the bridge is steady lead each other astray.
+        # Without a change crossings surer than the bridge is steady lead each other astray.
         of = _of_change(joint._replace(ready=joint.of(trusted)))
         told = _with_priors(joint, priors, *_changed(joint, of, *_USUAL)[:2])
         before, centre = centre, np.asarray(np.linalg.solve(*told)[: layout.bridge])
@@ -297,7 +299,7 @@ def _track(key: _Key, runs: list[Part]) -> _Track:
     everything = covariance_of_coefficients(knots, shapes.cycles_per_m, whole)
     if len(runs) == 1:
         shared = Shared(key.truck, key.direction, 0.0, None, level)
-        return _Track(shared, root_of(everything), np.linalg.inv(everything), None)
+        return _Track(shared, root_of(everything), _inverse(everything), None)
     share = common_share([run.likelihood.off_bridge for run in runs])
     wander_m = wander(Mismatch(shapes, level, 1.0), share)
     density = level @ common_shapes(*shapes.footprints, wander_m)
@@ -307,7 +309,11 @@ def _track(key: _Key, runs: list[Part]) -> _Track:
         key.truck, key.direction, float(density[at_long] / whole[at_long]), wander_m, level
     )
     own = root_of(everything - common)
-    return _Track(shared, own, np.linalg.inv(everything), common)
+    return _Track(shared, own, _inverse(everything), common)
+
+
+def _inverse(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(covariance))
 
 
 def _key(part: Part) -> _Key:

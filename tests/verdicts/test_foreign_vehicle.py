@@ -4,7 +4,6 @@ All are of one bridge over one road, with noise and a receiver's errors. The own
 site file's truck.
 """
 
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
