@@ -28,6 +28,7 @@ from pre_core.fusion.likelihood import (
     covariance_of_coefficients,
     likelihood,
     loosened,
+    straightened,
 )
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Ending
@@ -90,6 +91,8 @@ def track_of(truths: Sequence[Truth], whole: Mismatch, wander_m: float) -> Track
     # The crossings' own knots stand at the same places on the bridge and near it.
     knots_m = told[0].knots_m
     of_all = covariance_of_coefficients(knots_m, n, whole.level_m3 @ shapes.density)
+    before = np.asarray(np.linalg.inv(of_all))
+    told = [_at_truth(one, before) for one in told]
     common = covariance_of_coefficients(knots_m, n, shared)
     own = root_of(of_all - common)
     return Track(tuple(_of_bridge(one, own) for one in told), np.asarray(np.linalg.inv(common)))
@@ -102,6 +105,11 @@ def _told(truth: Truth, whole: Mismatch) -> Likelihood:
     problem = problem._replace(mismatch=mismatch)
     state = levenberg_marquardt.begin(lambda at: posterior.all_rows(problem, at), y)
     return likelihood(Optimum(problem, state, Ending.CONVERGED, 1.0, 0, 1))
+
+
+def _at_truth(told: Likelihood, before: FloatArray) -> Likelihood:
+    """The normal about the truth; `before` (k, k) is the precision of the mismatch's knots."""
+    return told if told.bends is None else straightened(told, told.bends.about, before)
 
 
 def _of_bridge(told: Likelihood, own: FloatArray | None) -> FloatArray:
