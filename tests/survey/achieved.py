@@ -15,13 +15,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from pre_core.crossing.optimum import Optimum
-from pre_core.fusion import joint
 from pre_core.survey.plan import Spreads, spreads, together
-from pre_core.unknowns import EI_1
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
-from services.identification import pre_method
+from services.identification import fusing
 from services.planning.alternatives import with_noise
 from services.planning.crossings import Crossing, Road, Simulated, scale_error
 from services.simulation.drawn import default_site, see
@@ -58,7 +55,7 @@ class Achieved(NamedTuple):
     level_std: np.ndarray  # (runs,)
     level_error: np.ndarray
     verdicts: list[str]
-    optima: list[Optimum]
+    sources: list[fusing.Source]
 
 
 def site_of(row: Row) -> Site:
@@ -93,38 +90,27 @@ def achieved(row: Row, runs: int) -> Achieved:
     lengths = np.array(site.bridges[0].lengths_m)
     asked = None if row.surface is None else row.surface._replace(tyres=None)
     paths = None if asked is None else wheel_paths_of(site.vehicles[0], asked)
-    optima: list[Optimum] = []
-    real = pre_method.optimum.find_optimum
-
-    def keeping(*arguments: object) -> Optimum:
-        optima.append(real(*arguments))  # type: ignore[arg-type]
-        return optima[-1]
-
-    pre_method.optimum.find_optimum = keeping
-    try:
-        seen = [
-            see(
-                [
-                    simulate_drive(
-                        site,
-                        np.ones(7),
-                        road_class="A",
-                        seed=100 if paths else 100 + run,
-                        noise_ug_per_rthz=row.noise_ug,
-                        speed_m_per_s=(row.speed_m_per_s,) * 2,
-                        receiver_errors=True,
-                        rate_hz=RATE_HZ,
-                        paths=paths,
-                        drive_seed=(7, run),
-                    ).run
-                ],
-                site,
-                SETTINGS,
-            )[0]
-            for run in range(runs)
-        ]
-    finally:
-        pre_method.optimum.find_optimum = real
+    seen = [
+        see(
+            [
+                simulate_drive(
+                    site,
+                    np.ones(7),
+                    road_class="A",
+                    seed=100 if paths else 100 + run,
+                    noise_ug_per_rthz=row.noise_ug,
+                    speed_m_per_s=(row.speed_m_per_s,) * 2,
+                    receiver_errors=True,
+                    rate_hz=RATE_HZ,
+                    paths=paths,
+                    drive_seed=(7, run),
+                ).run
+            ],
+            site,
+            SETTINGS,
+        )[0]
+        for run in range(runs)
+    ]
     answered = [one for one in seen if one.draws is not None]
     nominal = np.array(site.bridges[0].nominal_flexural_rigidity_nm2)
     ln_ei = [
@@ -138,16 +124,17 @@ def achieved(row: Row, runs: int) -> Achieved:
         np.array([draws.std() for draws in level]),
         np.array([draws.mean() for draws in level]),
         [one.result.verdict for one in seen],
-        optima,
+        [
+            source._replace(crossing_id=f"run-{run}")
+            for run, source in enumerate(fusing.source_of(one.result) for one in seen)
+            if source is not None
+        ],
     )
 
 
 def fused(found: Achieved, lengths: np.ndarray) -> tuple[np.ndarray, float]:
-    """Standard deviations of ln EI and of its mean when all runs are one; scale apart."""
-    together_ = joint.fuse(found.optima, 150, 1)
-    priors = found.optima[0].problem.priors
-    b = together_.draws.shape[2]
-    ln_ei = priors.spread[EI_1:] * together_.draws.reshape(-1, b)[:, -7:]
+    """Standard deviations of ln EI and of its mean when all runs are one."""
+    ln_ei = np.log(fusing.fused(found.sources).ei_nm2)
     return ln_ei.std(axis=0), float((ln_ei @ lengths / lengths.sum()).std())
 
 
