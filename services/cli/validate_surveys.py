@@ -68,7 +68,8 @@ def validate_surveys_command(
 def _table(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> "Table":
     from rich.table import Table
 
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    # One space between columns: all of them stand within 80 characters.
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     for k, heading in enumerate(headings):
         table.add_column(heading, justify="left" if k == 0 else "right", no_wrap=True)
     for line in lines:

@@ -113,7 +113,7 @@ def _share(those: Sequence[bool]) -> float | None:
     return float(np.mean(those)) if those else None
 
 
-HEADINGS = ("survey", "crossings", "groups", "named", "below", "loss", "accused", "sound below")
+HEADINGS = ("survey", "fused", "groups", "named", "below", "loss", "accused", "of sound")
 
 
 def cells(line: Detected) -> list[str]:

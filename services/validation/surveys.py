@@ -342,14 +342,14 @@ class Forecast(NamedTuple):
 HEADINGS = (
     "survey",
     "n",
-    "crossings",
+    "used",
     "covered",
     "rms z",
     "max z",
     "element",
-    "forecast",
+    "plan",
     "level",
-    "forecast",
+    "plan",
     "spread",
 )
 
