@@ -6,6 +6,8 @@ averages out. A crossing has of its own the rest of those waves, and a change of
 compliance: between crossings EI changes with temperature and with what the model lacks, by a
 relative standard deviation tau of which a share rho is common to all elements. All that is normal
 is integrated out; tau and rho are looked at on a grid.
+
+Longer than other modules: all of it goes by one layout of all unknowns.
 """
 
 from collections.abc import Collection, Sequence
@@ -17,19 +19,19 @@ from numpy.typing import NDArray
 from pre_core.crossing.compliances import Compliances, draws, marginal, of_normal
 from pre_core.fusion.between import Between, between_of, changed, may_be_zero, of_change, tau_draws
 from pre_core.fusion.likelihood import loosened, straightened
-from pre_core.fusion.sums import BridgePriors, Joint, Layout, Ready, with_priors
+from pre_core.fusion.sums import BridgePriors, Joint, Layout, Ready
 from pre_core.fusion.tracks import Key, Part, Shared, Track, key_of, tracks_of
 from pre_core.search.crank_nicolson import CHAINS
+from pre_core.search.levenberg_marquardt import minimised
 
 FloatArray = NDArray[np.float64]
 
 _USUAL = (0.03, 0.3)
 """tau and rho by which the bridge is found about which it changes."""
-_SETTLED = 0.002
+_SETTLED = 0.01
 """Of a compliance and of the other unknowns' coordinates: far within what is known of them."""
-_ROUGH_COMPLIANCE = (0.2, 5.0)
-"""Outside, a compliance that is hardly known is not taken for the size of its own changes."""
-_PASSES = 8
+_MOST_STEPS, _ENOUGH = 60, 1e-6
+_PASSES = 12
 """Of finding the bridge about which it changes, and crossings' likelihoods are normal."""
 
 
@@ -70,17 +72,10 @@ def join(
     parts = sorted(parts, key=lambda part: part.name)
     tracks = tracks_of(parts)
     layout = _layout_of(parts, tracks, priors)
-    prior = np.zeros((layout.size, layout.size))
-    for places in layout.trucks.values():
-        prior[places, places] = 1.0
-    for key, places in layout.tracks.items():
-        common = tracks[key].common
-        assert common is not None  # noqa: S101 - it has a place among the unknowns
-        prior[np.ix_(places, places)] = np.linalg.inv(common)
+    prior = _prior(layout, tracks)
     shared = tuple(track.shared for track in tracks.values())
     names = tuple(part.name for part in parts)
-    centre = np.zeros(layout.bridge)
-    centre[layout.elements] = 1.0
+    centre = _nominal(layout)
     bridge: FloatArray | None = None
     for _ in range(_PASSES):
         ready = tuple(
@@ -89,15 +84,66 @@ def join(
         joint = Joint(names, layout, ready, prior, centre, shared)
         # Without a change crossings surer than the bridge is steady would lead it astray.
         of = of_change(joint._replace(ready=joint.of(trusted)))
-        told = with_priors(joint, priors, *changed(joint, of, *_USUAL)[:2])
-        before, centre = centre, np.asarray(np.linalg.solve(*told)[: layout.bridge])
-        centre[layout.elements] = np.clip(centre[layout.elements], *_ROUGH_COMPLIANCE)
-        # What must not be negative.
-        least = np.where(priors.coordinates.is_log, -np.inf, 0.0)
-        bridge = np.maximum(centre, least)
+        before, centre = centre, _most_likely(layout, priors, *changed(joint, of, *_USUAL)[:2])
+        bridge = centre
         if np.all(np.abs(centre - before) < _SETTLED):
             break
     return joint._replace(centre=centre)
+
+
+def _most_likely(
+    layout: Layout, priors: BridgePriors, precision: FloatArray, linear: FloatArray
+) -> FloatArray:
+    """The likeliest bridge (b,) by a sum of crossings and its own priors, log-normal in EI.
+
+    Where crossings hardly tell elements apart normal priors of c would let neighbours take turns at
+    being stiff; likelihoods that are made normal there say little of the bridge.
+    """
+    told, pull = marginal(precision, linear, np.arange(layout.bridge))
+    root = np.linalg.cholesky(told).T
+    target = np.linalg.solve(root.T, pull)
+    sigma = priors.coordinates.scale[layout.elements]
+
+    def bridge(y: FloatArray) -> FloatArray:
+        x = y.copy()
+        x[:, layout.elements] = np.exp(-sigma * y[:, layout.elements])
+        return x
+
+    def rows(y: FloatArray) -> FloatArray:
+        return np.concatenate([bridge(y) @ root.T - target, y], axis=1)
+
+    lower = np.where(priors.coordinates.is_log, -np.inf, 0.0)
+    found = minimised(rows, np.zeros(layout.bridge), _MOST_STEPS, _ENOUGH, lower)
+    return bridge(found.state.y[None, :])[0]
+
+
+def alone(part: Part, priors: BridgePriors) -> Joint:
+    """One crossing by itself, about what it says of the bridge; its waves are its own."""
+    tracks = tracks_of([part])
+    layout = _layout_of([part], tracks, priors)
+    centre = _nominal(layout)
+    ready = _ready(_about(part, tracks, None), layout, tracks, priors, centre)
+    shared = tuple(track.shared for track in tracks.values())
+    return Joint((part.name,), layout, (ready,), _prior(layout, tracks), centre, shared)
+
+
+def _nominal(layout: Layout) -> FloatArray:
+    """(b,) of a bridge as the site file has it."""
+    centre = np.zeros(layout.bridge)
+    centre[layout.elements] = 1.0
+    return centre
+
+
+def _prior(layout: Layout, tracks: dict[Key, Track]) -> FloatArray:
+    """Precision (n, n) of trucks and tracks before any crossing."""
+    prior = np.zeros((layout.size, layout.size))
+    for places in layout.trucks.values():
+        prior[places, places] = 1.0
+    for key, places in layout.tracks.items():
+        common = tracks[key].common
+        assert common is not None  # noqa: S101 - it has a place among the unknowns
+        prior[np.ix_(places, places)] = np.linalg.inv(common)
+    return prior
 
 
 def _about(part: Part, tracks: dict[Key, Track], bridge: FloatArray | None) -> Part:

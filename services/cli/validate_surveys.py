@@ -1,17 +1,21 @@
 """`driveby validate --method pre --surveys N`: whole surveys driven, fused, beside the truth."""
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.site_file import load_site
+from services.cli.survey_forecasts import forecasts_of
 from services.common.files import make_folder
 from services.common.progress import progress_bar
 from services.simulation.drawn import default_site
+from services.validation import detection
 from services.validation.surveys import HEADINGS, fused_surveys, rows, run_surveys, survey_checks
 from services.validation.worlds import read_records
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 
 def validate_surveys_command(
@@ -23,9 +27,11 @@ def validate_surveys_command(
     processes: int,
     console: "Console",
 ) -> int:
-    """Drive what the records lack, fuse, print a line for each kind; 1 if an aim was missed."""
-    from rich.table import Table
+    """Drive what the records lack, fuse, print a line for each kind; 1 if an aim was missed.
 
+    Beside what is achieved stands the forecast of `driveby survey`; for kinds with a weak element a
+    second table says how many crossings it takes to see it.
+    """
     read_records(records)
     make_folder(records.parent)
     known = default_site() if site is None else load_site(site)
@@ -39,13 +45,15 @@ def validate_surveys_command(
             processes,
             lambda done, jobs: bar.update(task, completed=done, total=jobs),
         )
-    fused = fused_surveys(found)
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for k, heading in enumerate(HEADINGS):
-        table.add_column(heading, justify="left" if k == 0 else "right", no_wrap=True)
-    for row in rows(fused):
-        table.add_row(*row)
-    console.print(table)
+    with console.status("fusing", spinner="dots"):
+        fused = fused_surveys(found)
+        forecasts = forecasts_of(known, fused)
+    console.print(_table(HEADINGS, rows(fused, forecasts)))
+    with console.status("fusing groups of crossings", spinner="dots"):
+        detected = detection.detection(detection.groups_of(found, known.bridges[0]))
+    if detected:
+        console.print()
+        console.print(_table(detection.HEADINGS, map(detection.cells, detected)))
     checks = survey_checks(fused)
     for check in checks:
         if not check.is_met:
@@ -55,3 +63,15 @@ def validate_surveys_command(
                 highlight=False,
             )
     return 0 if all(check.is_met for check in checks) else 1
+
+
+def _table(headings: Sequence[str], lines: Iterable[Sequence[str]]) -> "Table":
+    from rich.table import Table
+
+    # One space between columns: all of them stand within 80 characters.
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    for k, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if k == 0 else "right", no_wrap=True)
+    for line in lines:
+        table.add_row(*line)
+    return table

@@ -57,6 +57,11 @@ KINDS: Final = (
     "five-elements",
     "three-elements",
     "everything",
+    "scenario-1",
+    "scenario-4",
+    "scenario-10",
+    "scenario-5",
+    "scenario-11",
 )
 """As in `validation.surveys`, which is not imported for a line of help."""
 

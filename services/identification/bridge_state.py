@@ -24,7 +24,12 @@ from schemas.results import (
     ThirdsState,
     Verdict,
 )
-from services.identification.comparison import compare, estimate_of_state, sentences
+from services.identification.comparison import (
+    Comparison,
+    compare,
+    estimate_of_state,
+    sentences,
+)
 from services.identification.crossing_data import part_of_elements
 from services.identification.fusing import Floats, FusedBridge, Source, fused, source_of
 
@@ -221,6 +226,19 @@ def _with_common_share(crossing: Crossing, bridge: BridgeResult | None) -> Cross
     return crossing
 
 
+def compared(
+    state: BridgeResult,
+    nominal_nm2: Floats,
+    element_lengths_m: Floats,
+    baseline: BridgeResult | None = None,
+) -> Comparison | None:
+    """What a fused state says of each element, as its `finding` does; see `compare`."""
+    edges = np.concatenate([[0.0], np.cumsum(element_lengths_m)])
+    common = 0.0 if state.level is None else state.level.std / state.level.mean
+    stored = None if baseline is None else estimate_of_state(baseline)
+    return compare(estimate_of_state(state, common), nominal_nm2, edges, stored)
+
+
 def _latest(counted: Counted) -> BridgeResult:
     *others, last = counted.newest
     return BridgeResult(
@@ -273,15 +291,11 @@ def _summary(draws: Floats) -> ElementState:
 
 def _finding(found: FusedBridge, state: BridgeResult, baseline: BridgeResult | None) -> str:
     """The bridge in words: what is told of its elements, and what is not."""
-    edges = np.concatenate([[0.0], np.cumsum(found.element_lengths_m)])
-    of = estimate_of_state(state)
-    stored = None if baseline is None else estimate_of_state(baseline)
-    common = float(np.log(found.ei_nm2).mean(axis=1).std())
-    said = sentences(compare(of._replace(scale_error=common), found.nominal_nm2, edges, stored))
+    said = sentences(compared(state, found.nominal_nm2, found.element_lengths_m, baseline))
     open_ones = sum(one.std > RESOLVED * one.mean for one in state.elements.values())
     if open_ones and state.level is not None:
         spread = 100.0 * state.level.std / state.level.mean
-        which = f"{open_ones} of {of.mean.size} elements are"
+        which = f"{open_ones} of {len(state.elements)} elements are"
         said.append(
             f"{which} not resolved; the mean level is {state.level.mean:.2f} of nominal "
             f"± {spread:.0f} %."

@@ -15,6 +15,7 @@ from pre_core.fusion.disagreement import judge
 from pre_core.fusion.joint import Fused, fuse_joined, join
 from pre_core.fusion.sums import BridgePriors
 from pre_core.fusion.tracks import Part
+from pre_core.fusion.trucks import compare_trucks
 from pre_core.physics.surface import Footprint
 from schemas import fusion
 from schemas.results import Crossing, Track
@@ -141,10 +142,14 @@ def fused(sources: Sequence[Source]) -> FusedBridge:
     alike = [one for one in sources if _is_like(one.likelihood, last)]
     priors = _priors(last)
     parts = [_part(one, priors.coordinates) for one in alike]
+    vehicles = {part.truck: one.vehicle for part, one in zip(parts, alike, strict=True)}
+    compared = compare_trucks(parts, priors)
+    parts = [part for part in parts if part.name not in compared.strangers]
     joint = join(parts, priors)
     judged = judge(parts, joint, priors)
     if judged.left_out:
-        joint = join([part for part in parts if part.name in judged.agree], priors)
+        parts = [part for part in parts if part.name in judged.agree]
+        joint = join(parts, priors)
     found = fuse_joined(joint, priors, _DRAWS_PER_CHAIN, _SEED)
     nominal = priors.coordinates.location[-priors.elements :]
     spread = priors.coordinates.scale[-priors.elements :]
@@ -155,11 +160,11 @@ def fused(sources: Sequence[Source]) -> FusedBridge:
         np.array(last.element_lengths_m),
         found.between.ravel(),
         found.between_may_be_zero,
-        _tracks(found, {p.truck: one.vehicle for p, one in zip(parts, alike, strict=True)}),
+        _tracks(found, vehicles),
         judged.agree,
-        judged.left_out,
+        tuple(sorted([*compared.strangers, *judged.left_out])),
         tuple(one.crossing_id for one in others),
-        judged.disagree,
+        compared.disagree or judged.disagree,
     )
 
 

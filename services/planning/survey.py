@@ -1,6 +1,6 @@
 """A survey's expectation: what so many crossings will tell, and what would help most."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final, NamedTuple
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.survey import detection
-from pre_core.survey.plan import Track, spreads, together
+from pre_core.survey.plan import Known, Spreads, Track, spreads, together
 from schemas.site import Bridge, Site
 from services.common.errors import FailureError
 from services.planning.alternatives import Plan, alternatives, as_planned
@@ -128,6 +128,20 @@ def survey(
     return found
 
 
+def forecasts(road: Road, plan: Plan, crossings: int, ratios: Iterable[Floats]) -> list[Spreads]:
+    """What a plan's crossings tell of bridges whose EI (e,) is so many times the nominal one."""
+    simulated = Simulated(road)
+    tracks = [simulated.track(some) for some in plan.tracks]
+    precision = _precision(simulated, plan, tracks, crossings)
+    known = simulated.known(plan.tracks[0][0])
+    found = []
+    for ratio in ratios:
+        truth = np.zeros(precision.shape[0])
+        truth[truth.size - ratio.size :] = 1.0 / ratio
+        found.append(_spreads(known, precision, plan.site, truth))
+    return found
+
+
 def _speeds(asked: Asked) -> list[float]:
     """Speeds to compare, from the slowest to the fastest; none where there is no choice."""
     low, high = asked.speeds_m_per_s
@@ -176,16 +190,23 @@ def _expected(
 ) -> Expected:
     precision = _precision(simulated, plan, tracks, crossings)
     known, scale = simulated.known(plan.tracks[0][0]), scale_error(plan.site)
-    wide = spreads(known, precision, np.array(plan.site.bridges[0].lengths_m))
+    wide = _spreads(known, precision, plan.site)
     errors = detection.errors(known, precision, scale)
     return Expected(
         crossings,
-        np.hypot(wide.elements, scale),
-        float(np.hypot(wide.level, scale)),
+        wide.elements,
+        wide.level,
         detection.probability(loss, errors.of_nominal),
         detection.probability(loss, errors.of_others),
         detection.smallest_loss(errors.of_nominal),
     )
+
+
+def _spreads(known: Known, precision: Floats, site: Site, truth: Floats | None = None) -> Spreads:
+    """Of ln EI, with what is common to all."""
+    wide = spreads(known, precision, np.array(site.bridges[0].lengths_m), truth)
+    scale = scale_error(site)
+    return Spreads(np.hypot(wide.elements, scale), float(np.hypot(wide.level, scale)))
 
 
 def _growth(simulated: Simulated, plan: Plan, asked: Asked) -> tuple[Expected, ...]:

@@ -9,7 +9,7 @@ of a survey are fused, as a worker does.
 Records are kept as in `services.validation.worlds`: what is in the file is not driven again.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -17,11 +17,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.physics.bridge import Beam
 from schemas.results import BridgeResult, Crossing
 from schemas.settings import IdentificationSettings
 from schemas.site import Site, Vehicle
 from services.identification.bridge_state import Counted, count_in, state_of, usable
 from services.simulation.drawn import Truth, draw_truth, drive, see
+from services.simulation.drive import declared, ratios_of
 from services.simulation.wheel_paths import OnSurface, wheel_paths_of
 from services.simulation.worlds import draw_world
 from services.validation.calibration import Check, Record
@@ -29,10 +31,15 @@ from services.validation.worlds import completed, identity_of, read_records
 
 Floats = NDArray[np.float64]
 
-_SPEED_M_PER_S, _FASTER = 10.0, 0.15
+SPEED_M_PER_S, _FASTER = 10.0, 0.15
+_RATE_HZ = 500.0
+_BODY_NOISE_UG = 10.0
+"""Of the sensors on the body, where everything is to happen."""
 _FEWEST = 15
 """Surveys of a kind whose coverage is an aim in full."""
 _LORRY_KG, _EMPTY_KG, _LOADED_KG = 16_300.0, 7_300.0, 24_000.0
+_LEVEL_SPREAD = 0.15
+"""Of ln EI common to all elements of a scenario: a nominal value is a guess."""
 
 
 class Kind(NamedTuple):
@@ -52,6 +59,10 @@ class Kind(NamedTuple):
     elements: int | None = None
     everything: bool = False
     """Springs that rub, bearings that give, damped tyres, a lorry that has just left."""
+    scenario: int | None = None
+    """EI is that of this scenario of the paper, all elements at one level that is drawn; None: each
+    element's is drawn."""
+    noise_ug_per_rthz: float = 25.0
 
 
 KINDS = {
@@ -67,6 +78,11 @@ KINDS = {
     "five-elements": Kind(12, tyres="twin", masses_kg=(_LORRY_KG,), elements=5),
     "three-elements": Kind(12, tyres="twin", masses_kg=(_LORRY_KG,), elements=3),
     "everything": Kind(16, tyres="twin", masses_kg=(_LORRY_KG,), everything=True),
+    "scenario-1": Kind(16, scenario=1, noise_ug_per_rthz=100.0),
+    "scenario-4": Kind(16, scenario=4, noise_ug_per_rthz=100.0),
+    "scenario-10": Kind(16, scenario=10, noise_ug_per_rthz=100.0),
+    "scenario-5": Kind(16, scenario=5, noise_ug_per_rthz=100.0),
+    "scenario-11": Kind(16, scenario=11, noise_ug_per_rthz=100.0),
 }
 
 
@@ -114,6 +130,16 @@ def _site_of(site: Site, kind: Kind, truck: int) -> Site:
     return site.model_copy(update={"vehicles": (vehicle,), "bridges": (bridge,)})
 
 
+def sites_of(site: Site, kind: Kind) -> list[Site]:
+    """What the owner declares of each truck of a survey, and of its sensors."""
+    axles = kind.noise_ug_per_rthz
+    body = _BODY_NOISE_UG if kind.everything else axles
+    return [
+        declared(_site_of(site, kind, truck), (body, body, axles, axles), _RATE_HZ)
+        for truck in range(len(kind.masses_kg))
+    ]
+
+
 def _of_mass(vehicle: Vehicle, mass: float) -> Vehicle:
     """A lorry of this mass, sprung for it; its rear axle carries three fifths."""
     ratio = mass / vehicle.total_mass_kg
@@ -137,7 +163,7 @@ def _truth(site: Site, kind: Kind, survey: int, number: int, truck: int) -> tupl
     """What is behind a crossing, and the seed of its noise."""
     same = draw_truth(site, 1000 * survey + truck)
     rng = np.random.default_rng(np.random.SeedSequence([survey, number, 0x5E7]))
-    bridge = draw_truth(site, 1000 * survey).beam
+    bridge = _bridge(site, kind, survey)
     car, left = same.car, None
     if kind.everything:
         world = draw_world(site, "everything", 1000 * survey)
@@ -154,17 +180,17 @@ def _truth(site: Site, kind: Kind, survey: int, number: int, truck: int) -> tupl
         if survey % 2
         else rng.standard_normal(bridge.flexural_rigidity_nm2.size)
     )
-    speed = _SPEED_M_PER_S * (1.0 + _FASTER * (2.0 * rng.uniform() - 1.0))
+    speed = SPEED_M_PER_S * (1.0 + _FASTER * (2.0 * rng.uniform() - 1.0))
     conditions = same.conditions._replace(
         road_class="A",
         road_seed=survey,
         speed_m_per_s=float(speed),
         change_m_per_s=0.05,
         forward=number % 2 == 0 or not kind.both_ways,
-        rate_hz=500.0,
+        rate_hz=_RATE_HZ,
         fix_rate_hz=10.0,
-        noise_ug_per_rthz=25.0,
-        body_noise_ug_per_rthz=10.0 if kind.everything else None,
+        noise_ug_per_rthz=kind.noise_ug_per_rthz,
+        body_noise_ug_per_rthz=_BODY_NOISE_UG if kind.everything else None,
     )
     paths = None
     if kind.tyres is not None:
@@ -177,7 +203,19 @@ def _truth(site: Site, kind: Kind, survey: int, number: int, truck: int) -> tupl
 
 def _survey_truth(site: Site, kind: Kind, survey: int) -> Floats:
     """EI (n,) of the bridge about which it changes."""
-    return np.asarray(draw_truth(site, 1000 * survey).beam.flexural_rigidity_nm2)
+    return np.asarray(_bridge(site, kind, survey).flexural_rigidity_nm2)
+
+
+def _bridge(site: Site, kind: Kind, survey: int) -> Beam:
+    """The bridge about which it changes."""
+    drawn = draw_truth(site, 1000 * survey).beam
+    if kind.scenario is None:
+        return drawn
+    rng = np.random.default_rng(np.random.SeedSequence([survey, 0x1E7E1]))
+    level = np.exp(_LEVEL_SPREAD * rng.standard_normal())
+    nominal = np.array(site.bridges[0].nominal_flexural_rigidity_nm2)
+    ratios = ratios_of(site.bridges[0], kind.scenario, None)
+    return drawn._replace(flexural_rigidity_nm2=level * nominal * ratios)
 
 
 def run_surveys(
@@ -224,11 +262,21 @@ def run_surveys(
     )
 
 
+def by_survey(records: Iterable[Record]) -> dict[tuple[str, int], list[Record]]:
+    """Records by kind and number of the survey, in the order in which they were driven."""
+    surveys: dict[tuple[str, int], list[Record]] = {}
+    for line in records:
+        surveys.setdefault((line["effect"], line["seed"]), []).append(line)
+    return {key: sorted(lines, key=lambda line: line["number"]) for key, lines in surveys.items()}
+
+
 class Fused(NamedTuple):
     """A survey's estimate beside the truth."""
 
     kind: str
     survey: int
+    truth: Floats
+    """(n,) EI in N·m²."""
     z: Floats
     """(n,) errors of ln EI over their standard deviations, read off the intervals."""
     inside: NDArray[np.bool_]
@@ -243,12 +291,8 @@ class Fused(NamedTuple):
 
 def fused_surveys(records: Iterable[Record], crossings: int | None = None) -> list[Fused]:
     """Each survey of which all crossings are there, fused; the first `crossings` of them alone."""
-    surveys: dict[tuple[str, int], list[Record]] = {}
-    for line in records:
-        surveys.setdefault((line["effect"], line["seed"]), []).append(line)
     found = []
-    for (kind, survey), lines in surveys.items():
-        lines.sort(key=lambda line: line["number"])
+    for (kind, survey), lines in by_survey(records).items():
         results = [
             Crossing.model_validate(line["result"])
             for line in lines[:crossings]
@@ -276,6 +320,7 @@ def _beside(kind: str, survey: int, truth: Floats, state: BridgeResult) -> Fused
     return Fused(
         kind,
         survey,
+        truth,
         z,
         (low <= truth) & (truth <= high),
         spread,
@@ -287,14 +332,35 @@ def _beside(kind: str, survey: int, truth: Floats, state: BridgeResult) -> Fused
     )
 
 
-HEADINGS = ("survey", "n", "crossings", "covered", "rms z", "max z", "element", "level", "spread")
+class Forecast(NamedTuple):
+    """What was to be expected of a kind before it was driven: medians of standard deviations."""
+
+    element: float
+    level: float
 
 
-def rows(found: Sequence[Fused]) -> list[list[str]]:
+HEADINGS = (
+    "survey",
+    "n",
+    "used",
+    "covered",
+    "rms z",
+    "max z",
+    "element",
+    "plan",
+    "level",
+    "plan",
+    "spread",
+)
+
+
+def rows(found: Sequence[Fused], forecasts: Mapping[str, Forecast]) -> list[list[str]]:
     """A row of the table for each kind under HEADINGS."""
     out = []
     for kind in dict.fromkeys(one.kind for one in found):
         some = [one for one in found if one.kind == kind]
+        forecast = forecasts.get(kind)
+        element, level = ("–", "–") if forecast is None else map(_percent, forecast)
         z = np.concatenate([one.z for one in some])
         out.append(
             [
@@ -304,12 +370,18 @@ def rows(found: Sequence[Fused]) -> list[list[str]]:
                 f"{100.0 * np.mean(np.concatenate([one.inside for one in some])):.1f} %",
                 f"{np.sqrt(np.mean(z**2)):.2f}",
                 f"{np.abs(z).max():.1f}",
-                f"{100.0 * np.median(np.concatenate([one.std for one in some])):.1f} %",
-                f"{100.0 * np.median([one.level_std for one in some]):.1f} %",
+                _percent(float(np.median(np.concatenate([one.std for one in some])))),
+                element,
+                _percent(float(np.median([one.level_std for one in some]))),
+                level,
                 f"{100.0 * np.mean([one.spread_inside for one in some]):.0f} %",
             ]
         )
     return out
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f} %"
 
 
 def survey_checks(found: Sequence[Fused]) -> list[Check]:

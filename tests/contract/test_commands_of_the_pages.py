@@ -43,6 +43,8 @@ NOT_RUN = {
     "pytest tests/numerics/test_fusion.py": ITSELF,
     "pytest tests/unit/inspection": ITSELF,
     "driveby validate --method pre --surveys 15 --records build/surveys.jsonl": LONG,
+    "driveby validate --method pre --surveys 3 --kinds scenario-1,scenario-4,scenario-10 "
+    "--records build/detection.jsonl": LONG,
     "driveby validate --site site.toml": CERTIFIES,
     "driveby validate --site site.toml --certificates recordings/certificates": CERTIFIES,
     "driveby health worker": "asks a worker; tests/process_replay does, of one that runs",

@@ -19,7 +19,6 @@ from pre_core.survey.plan import Spreads, spreads, together
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.identification import fusing
-from services.identification.fusing import Source, source_of
 from services.planning.alternatives import with_noise
 from services.planning.crossings import Crossing, Road, Simulated, scale_error
 from services.simulation.drawn import default_site, see
@@ -56,7 +55,7 @@ class Achieved(NamedTuple):
     level_std: np.ndarray  # (runs,)
     level_error: np.ndarray
     verdicts: list[str]
-    sources: list[Source]
+    sources: list[fusing.Source]
 
 
 def site_of(row: Row) -> Site:
@@ -125,14 +124,17 @@ def achieved(row: Row, runs: int) -> Achieved:
         np.array([draws.std() for draws in level]),
         np.array([draws.mean() for draws in level]),
         [one.result.verdict for one in seen],
-        [source for one in seen if (source := source_of(one.result)) is not None],
+        [
+            source._replace(crossing_id=f"run-{run}")
+            for run, source in enumerate(fusing.source_of(one.result) for one in seen)
+            if source is not None
+        ],
     )
 
 
 def fused(found: Achieved, lengths: np.ndarray) -> tuple[np.ndarray, float]:
     """Standard deviations of ln EI and of its mean when all runs are one."""
-    bridge = fusing.fused(found.sources)
-    ln_ei = np.log(bridge.ei_nm2 / bridge.nominal_nm2)
+    ln_ei = np.log(fusing.fused(found.sources).ei_nm2)
     return ln_ei.std(axis=0), float((ln_ei @ lengths / lengths.sum()).std())
 
 

@@ -8,12 +8,13 @@ import pytest
 from schemas.settings import IdentificationSettings
 from services.cli import validation
 from services.common.errors import InputError
-from services.simulation.drawn import default_site
+from services.simulation.drawn import default_site, draw_truth
 from services.validation import surveys
 from services.validation.calibration import Record
 from services.validation.surveys import (
     HEADINGS,
     KINDS,
+    Forecast,
     Fused,
     fused_surveys,
     rows,
@@ -52,6 +53,37 @@ def test_trucks_take_turns() -> None:
     assert len(three.bridges[0].lengths_m) == 3
 
 
+def test_a_scenario_is_at_a_level_of_its_own_in_every_survey() -> None:
+    site, kind = default_site(), KINDS["scenario-11"]
+    nominal = np.array(site.bridges[0].nominal_flexural_rigidity_nm2)
+    levels = set()
+    for survey in range(4):
+        truth, _ = surveys._truth(site, kind, survey, 5, 0)
+        ratio = truth.beam.flexural_rigidity_nm2 / nominal
+        assert np.array_equal(
+            truth.beam.flexural_rigidity_nm2, surveys._survey_truth(site, kind, survey)
+        )
+        assert ratio / ratio[0] == pytest.approx([1.0] * 6 + [0.7])
+        assert truth.conditions.noise_ug_per_rthz == 100.0
+        levels.add(float(ratio[0]))
+    assert len(levels) == 4
+    # The same truck, bearings and road as with another scenario: only EI differs.
+    other, _ = surveys._truth(site, KINDS["scenario-1"], 3, 5, 0)
+    assert other.car == truth.car
+    assert other.conditions == truth.conditions
+    assert surveys.sites_of(site, kind)[0].sensor.noise_density_ug_per_rthz == (100.0,) * 4
+
+
+def test_what_was_driven_before_has_its_truth_still() -> None:
+    """Of kinds without a scenario EI comes from the seeds it always came from."""
+    site = default_site()
+    for name, kind in KINDS.items():
+        if kind.scenario is None and not kind.elements:
+            of = surveys._site_of(site, kind, 0)
+            drawn = draw_truth(of, 3000).beam.flexural_rigidity_nm2
+            assert np.array_equal(surveys._survey_truth(of, kind, 3), drawn), name
+
+
 def record(kind: str, survey: int, number: int) -> Record:
     return {
         "effect": kind,
@@ -69,9 +101,12 @@ def test_surveys_are_fused_beside_their_truth() -> None:
     assert (one.used, one.out, one.verdict) == (4, 0, "good")
     assert one.inside.sum() >= ELEMENTS - 1
     assert np.abs(one.z).max() < 3.0
-    ((name, *cells),) = rows(found)
+    ((name, *cells),) = rows(found, {})
     assert name == "steady"
     assert len(cells) == len(HEADINGS) - 1
+    ((*_, element, _, level, _),) = rows(found, {"steady": Forecast(0.123, 0.045)})
+    assert (element, level) == ("12.3 %", "4.5 %")
+    assert np.array_equal(one.truth, record("steady", 0, 0)["truth"])
     assert all(check.is_met for check in survey_checks(found))
     wrong = Fused(*one._replace(z=one.z + 5.0, inside=np.zeros(ELEMENTS, dtype=np.bool_)))
     assert not any(check.is_met for check in survey_checks([wrong]))
