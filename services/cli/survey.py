@@ -182,7 +182,7 @@ def _expected_json(one: "Expected") -> dict[str, Any]:
 def lines_of(found: "Survey") -> Iterator[str]:
     """All that is said, at most 80 characters a line but for warnings and advice."""
     from pre_core.survey.detection import FALSE_ALARM, SURE
-    from services.planning.advice import advice, tyres_of, warnings
+    from services.planning.advice import advice, tracks_of, tyres_of, warnings
     from services.planning.survey import MOST_CROSSINGS
 
     asked, planned = found.asked, found.planned
@@ -195,6 +195,8 @@ def lines_of(found: "Survey") -> Iterator[str]:
         f"{found.road.road_class}, {asked.crossings} crossings at {speeds[0]:.1f} to "
         f"{speeds[-1]:.1f} m/s"
     )
+    if found.road.is_surface:
+        yield tracks_of(found)
     yield f"a loss of {asked.loss:.0%} is to be seen; false alarms: {FALSE_ALARM:.0%} an element"
     yield ""
     yield from _aligned(_elements(found))

@@ -29,6 +29,15 @@ def tyres_of(outlook: Outlook) -> str:
     return "equal single tyres" if is_equal else "single tyres"
 
 
+def tracks_of(found: Survey) -> str:
+    """What decides how much the axles' roads differ, and whether it was given."""
+    vehicle = found.planned.plan.site.vehicles[0]
+    front, rear = axles_of(vehicle)
+    given = "" if vehicle.rear_axle_offset_m is not None else " (no rear_axle_offset_m)"
+    aside = 1e3 * abs(rear.offset_m - front.offset_m)
+    return f"rear axle {aside:g} mm aside{given}, tracks ± {found.road.wander_m:g} m"
+
+
 def _of_the_plan(found: Survey) -> str:
     planned, asked = found.planned, found.asked
     how = f"at {asked.speed_m_per_s:g} m/s with {tyres_of(planned)}"
@@ -65,7 +74,8 @@ def _of_the_others(found: Survey) -> str:
     if best.needed_middle is None:
         gain = f"then {found.asked.crossings} show {best.expected.smallest_loss[best.middle]:.0%}"
     else:
-        gain = f"then {_crossings(best.needed_middle)} do, and {_ends(best)}"
+        verb = "does" if best.needed_middle == 1 else "do"
+        gain = f"then {_crossings(best.needed_middle)} {verb}, and {_ends(best)}"
     sentence = f"What helps most: {best.plan.name}; {gain}."
     if len(better) > 1:
         next_best = better[1]
@@ -107,4 +117,4 @@ def warnings(found: Survey) -> Iterator[str]:
             f"bridge are compared, {SHORTEST_APPROACH_M:g} m are needed: drive faster"
         )
     if vehicle.cg_height_m is None:
-        yield f"{vehicle.id}: without cg_height_m keep the speed to 0.3 m/s² on the bridge"
+        yield f"{vehicle.id}: without cg_height_m do not brake or accelerate on the bridge"

@@ -16,6 +16,7 @@ from services.planning.crossings import Crossing, Road, Simulated, scale_error
 
 Floats = NDArray[np.float64]
 
+_JOINED_M: Final = 1e-6
 MOST_CROSSINGS: Final = 300
 """Nobody drives more often."""
 _COUNTS: Final = (1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200, 300)
@@ -56,7 +57,7 @@ class Outlook(NamedTuple):
     once: Expected
     expected: Expected
     middle: int
-    """The element at the middle of the longest span."""
+    """The element at the middle of the longest span; of two, the one that is told less."""
     needed_middle: int | None
     """Crossings by which the loss is seen there for sure; None: more than MOST_CROSSINGS."""
     needed_ends: int | None
@@ -157,20 +158,26 @@ def _on_rougher_road(plan: Plan, road: Road, asked: Asked) -> Outlook | None:
 
 def _outlook(simulated: Simulated, plan: Plan, asked: Asked) -> Outlook:
     tracks = [simulated.track(crossings) for crossings in plan.tracks]
-    middle = middle_element(plan.site.bridges[0])
+    middles = middle_elements(plan.site.bridges[0])
     last = plan.site.bridges[0].elements - 1
 
     def errors_of(crossings: int) -> detection.Errors:
         return _errors(simulated, plan, tracks, crossings)
 
+    expected = _expected(simulated, plan, tracks, asked.crossings, asked.loss)
     return Outlook(
         plan,
         _expected(simulated, plan, tracks, 1, asked.loss),
-        _expected(simulated, plan, tracks, asked.crossings, asked.loss),
-        middle,
-        _needed(errors_of, asked.loss, (middle,)),
+        expected,
+        _told_less(plan.site.bridges[0], expected),
+        _needed(errors_of, asked.loss, middles),
         _needed(errors_of, asked.loss, (0, last)),
     )
+
+
+def _told_less(bridge: Bridge, expected: Expected) -> int:
+    """Which element at the middle is told less."""
+    return max(middle_elements(bridge), key=lambda element: expected.smallest_loss[element])
 
 
 def _precision(simulated: Simulated, plan: Plan, tracks: list[Track], crossings: float) -> Floats:
@@ -219,7 +226,7 @@ def _at_speed(simulated: Simulated, site: Site, speed: float, asked: Asked) -> A
     plan = Plan(f"at {speed:g} m/s", ((Crossing(site, speed),),))
     tracks = [simulated.track(crossings) for crossings in plan.tracks]
     expected = _expected(simulated, plan, tracks, asked.crossings, asked.loss)
-    middle = middle_element(site.bridges[0])
+    middle = _told_less(site.bridges[0], expected)
     return AtSpeed(
         speed,
         float(expected.std[middle]),
@@ -248,10 +255,12 @@ def _needed(
     return enough
 
 
-def middle_element(bridge: Bridge) -> int:
-    """Which element, from 0, lies at the middle of the longest span."""
+def middle_elements(bridge: Bridge) -> tuple[int, ...]:
+    """Which elements, from 0, lie at the middle of the longest span: two where they meet there."""
     spans = bridge.lengths_of_spans_m
     longest = spans.index(max(spans))
     at = sum(spans[:longest]) + 0.5 * spans[longest]
     ends = np.cumsum(bridge.lengths_m)
-    return min(int(np.searchsorted(ends, at)), bridge.elements - 1)
+    first = min(int(np.searchsorted(ends, at - _JOINED_M)), bridge.elements - 1)
+    meets_next = bool(abs(ends[first] - at) <= _JOINED_M) and first + 1 < bridge.elements
+    return (first, first + 1) if meets_next else (first,)

@@ -6,7 +6,7 @@ from schemas.site import Bridge, Site
 from services.identification.checks import axle_loads_kg
 from services.planning.alternatives import Plan, alternatives, as_planned, with_noise, with_tyres
 from services.planning.crossings import axles_of
-from services.planning.survey import middle_element
+from services.planning.survey import middle_elements
 from services.simulation.drive import paper_site
 
 
@@ -66,8 +66,9 @@ def test_fewer_elements_end_at_the_supports_all_the_same() -> None:
     coarse = named(site)["3 elements"].site.bridges[0]
     assert coarse.elements == len(coarse.lengths_m) == 3
     assert any(abs(sum(coarse.lengths_m[:k]) - 12.0) < 1e-9 for k in (1, 2))
-    assert middle_element(bridge) == 3
-    assert middle_element(coarse) == 1
+    assert middle_elements(bridge) == (3,)
+    assert middle_elements(coarse) == (1, 2)  # that meet in the middle of the longer span
+    assert middle_elements(bridge.model_copy(update={"elements": 6})) == (2, 3)
     small = spans.model_copy(update={"elements": 3})
     few = named(site.model_copy(update={"bridges": (small,)}))
     assert not [name for name in few if name.endswith("elements")]
