@@ -58,6 +58,11 @@ def session_of(number: int) -> Iterator[tuple[int, str]]:
             yield int(stat.parent.name), program
 
 
+def hear_ctrl_c() -> None:
+    """What a shell starts in the background ignores Ctrl-C, and hands that on."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.process
 @pytest.mark.faults
 @pytest.mark.parametrize("how", ["Ctrl-C", "kill -9"])
@@ -70,7 +75,7 @@ def test_what_interrupts_the_tests_ends_their_processes(
     tests = subprocess.Popen(
         [sys.executable, "-m", "pytest", "-m", "not soak", f"--basetemp={tmp_path / 'run'}", test],
         cwd=project, env=environment, start_new_session=True,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, preexec_fn=hear_ctrl_c,
     )  # fmt: skip
     try:
         deadline = time.monotonic() + 120.0
