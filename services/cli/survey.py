@@ -35,7 +35,11 @@ def add_survey(commands: Any) -> None:
         "say, before anyone drives, how well each element will be known and what helps most",
         "driveby survey --site site.toml --loss 0.2 --crossings 12 --figure plan.png",
     )
-    add_site(p, "truck, bridge and sensors; its first vehicle over its first bridge", required=True)
+    add_site(
+        p,
+        "truck, bridge and sensors, as docs/site.example.toml; the first vehicle and bridge count",
+        required=True,
+    )
     p.add_argument(
         "--loss",
         type=number("a share of EI", low=0.01, high=0.95),
@@ -65,7 +69,8 @@ def add_survey(commands: Any) -> None:
     p.add_argument(
         "--tyres",
         choices=("single", "twin"),
-        help="of the rear axle; single: like those in front (default: the site's, or twin)",
+        help="of the rear axle; single: like those in front (default: by twin_tyre_distance_m in "
+        "the site file, or twin)",
     )
     p.add_argument(
         "--noise",
@@ -78,7 +83,8 @@ def add_survey(commands: Any) -> None:
         type=number("a standard deviation in m", low=0.01, high=1),
         default=0.12,
         metavar="M",
-        help="of the truck's place across the lane from run to run (default: 0.12)",
+        help="standard deviation of the truck's place across the lane from run to run; runs beside "
+        "each other tell more (default: 0.12)",
     )
     add_file(p, "--figure", "OUT.png|OUT.svg", "draw probabilities over the number of crossings")
     add_file(p, "--json", "OUT.json", "write everything here")
