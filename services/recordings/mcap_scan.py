@@ -308,7 +308,8 @@ def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Rec
     if head[0] == Opcode.CHUNK and name_bytes == 0:
         begin = at + _ZSTD_AT + 4 + _LENGTH.size
         attempts.append((False, begin, begin + _LENGTH.unpack_from(head, _ZSTD_AT + 4)[0]))
-    elif head[_FRAME_AT:] == _FRAME or head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD:
+    # Also where the length of the compression's name is damaged and says that there is none.
+    if head[_FRAME_AT:] == _FRAME or head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD:
         begin = at + _FRAME_AT
         inner_end = begin + _LENGTH.unpack_from(head, _FRAME_AT - _LENGTH.size)[0]
         # The shorter first: what is compressed says itself where it ends, so that too many bytes
