@@ -134,7 +134,7 @@ def is_quiet(one: Fleet) -> bool:
     """Whether every recording has its end or is one that the logger of now writes."""
     try:
         return all(is_closed(path) or is_new(path, one) for path in files(one))
-    except InputError:  # renamed between the listing and the look
+    except (InputError, FileNotFoundError):  # renamed or closed between the listing and the look
         return False
 
 
