@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky
 
 from pre_core.crossing.optimum import Optimum
-from pre_core.crossing.posterior import Problem, layout, log_odds_of_absence
+from pre_core.crossing.posterior import Problem, layout, log_odds_of_absence, rigidity_spread
 from pre_core.crossing.preparation import slope_of_mismatch
 from pre_core.kernels.lanes import kernel
-from pre_core.unknowns import EI_1
 
 FloatArray = NDArray[np.float64]
 
@@ -69,7 +68,7 @@ def compliances(found: Optimum, inflation: float) -> Compliances:
         linear,
         where.elements,
         where.half_normal,
-        problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]],
+        rigidity_spread(problem.priors),
         log_odds_of_absence(problem, inflation),
         inflation,
         centre[where.elements],
@@ -88,7 +87,7 @@ def in_compliances(
 ) -> tuple[FloatArray, FloatArray]:
     """The point y (f,) and a Jacobian (m, f) there with c in place of the elements' coordinates."""
     elements = layout(problem).elements
-    sigma = problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]]
+    sigma = rigidity_spread(problem.priors)
     centre, changed = y.copy(), jacobian.copy()
     centre[elements] = np.exp(-sigma * y[elements])
     changed[:, elements] /= -sigma * centre[elements]

@@ -32,6 +32,7 @@ from pre_core.crossing.posterior import (
     noise_floor,
     points,
     precision_root,
+    rigidity_spread,
 )
 from pre_core.crossing.preparation import (
     Inputs,
@@ -47,7 +48,7 @@ from pre_core.physics.bridge import FloatArray
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import Rows, minimised
 from pre_core.search.loop import Ending, Report, Solution
-from pre_core.unknowns import EI_1, F
+from pre_core.unknowns import F
 
 _COARSE = ((300.0, 4), (100.0, 4), (30.0, 4))
 """Temperatures and the steps at each on the way to the truck, the bridge taken as a whole."""
@@ -674,7 +675,7 @@ def bends(problem: Problem) -> FloatArray:
     """
     where = layout(problem)
     bend = np.zeros(where.size)
-    bend[where.elements] = _BEND * problem.priors.spread[EI_1:][problem.priors.estimated[EI_1:]]
+    bend[where.elements] = _BEND * rigidity_spread(problem.priors)
     return bend
 
 

@@ -202,6 +202,11 @@ def common_gain_spread(priors: Priors) -> float:
     return float(np.hypot(priors.common_gain_spread, 0.5 * priors.gain_spread))
 
 
+def rigidity_spread(priors: Priors) -> FloatArray:
+    """Spreads of ln EI of the elements that are estimated, (elements,)."""
+    return np.asarray(priors.spread[EI_1:][priors.estimated[EI_1:]])
+
+
 def points(problem: Problem, y: FloatArray) -> Points:
     """What the points y (k, size) mean."""
     where = layout(problem)

@@ -50,7 +50,10 @@ def bends_of(
     """
     y = found.state.y
     where = posterior.layout(problem)
-    size = _sizes(found)
+    sigma = posterior.rigidity_spread(problem.priors)
+    about = y[where.bridge].copy()
+    about[-sigma.size :] = np.exp(-sigma * y[where.elements])
+    size = _sizes(found, about[-sigma.size :])
     b = where.bridge.size
     number = b + 1
     first, second = np.triu_indices(number)
@@ -58,12 +61,9 @@ def bends_of(
     steps[1 + number :] += np.eye(number)[second]
     points = np.repeat(y[None, :], steps.shape[0], axis=0)
     moved = _STEP * steps * size
-    elements = where.elements
-    single = b - elements.size
+    single = b - sigma.size
     points[:, where.bridge[:single]] += moved[:, :single]
-    sigma = _sigma(problem)
-    compliance = np.exp(-sigma * y[elements]) + moved[:, single:b]
-    points[:, elements] = -np.log(compliance) / sigma
+    points[:, where.elements] = -np.log(about[single:] + moved[:, single:b]) / sigma
     points[:, where.trajectory] += moved[:, b:]
     values = posterior.all_rows(problem, points)[:, rows]
     here, once, twice = values[0], values[1 : 1 + number], values[1 + number :]
@@ -72,8 +72,6 @@ def bends_of(
     weight, shapes = np.linalg.eigh(differences @ differences.T)
     kept = np.flatnonzero(weight > _PLAIN**2)[::-1][:_MOST_BENDS]
     shapes = shapes[:, kept].T
-    about = y[where.bridge].copy()
-    about[single:] = np.exp(-sigma * y[elements])
     return Bends(about, size, shapes), differences.T @ shapes.T
 
 
@@ -124,23 +122,14 @@ def _bent(bends: Bends, at: FloatArray, place: float) -> tuple[FloatArray, Float
     return bend, (bends.shapes @ slope.T) / bends.size
 
 
-def _sizes(found: Optimum) -> FloatArray:
+def _sizes(found: Optimum, compliance: FloatArray) -> FloatArray:
     """How far bridge and place are likely to be from the optimum: (b + 1,)."""
-    problem, y = found.problem, found.state.y
-    where = posterior.layout(problem)
+    where = posterior.layout(found.problem)
     _, covariance = normal_approximation(found)
     spread = np.sqrt(np.diag(covariance))
     size = np.minimum(spread, _LARGEST)
-    sigma = _sigma(problem)
-    relative = np.minimum(sigma * spread[where.elements], _LARGEST_COMPLIANCE)
-    size[where.elements] = relative * np.exp(-sigma * y[where.elements])
+    relative = posterior.rigidity_spread(found.problem.priors) * spread[where.elements]
+    size[where.elements] = np.minimum(relative, _LARGEST_COMPLIANCE) * compliance
     along = covariance[where.trajectory, where.trajectory]
     place = float(np.sqrt(along.mean()))
     return np.append(size[where.bridge], min(place, _LARGEST))
-
-
-def _sigma(problem: posterior.Problem) -> FloatArray:
-    """Spreads of ln EI, (elements,)."""
-    priors = problem.priors
-    elements = posterior.layout(problem).elements.size
-    return np.asarray(priors.spread[priors.estimated][-elements:])

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from pre_core.fusion.between import between_of
 from pre_core.fusion.joint import join
-from pre_core.fusion.sums import BridgePriors, Joint, Ready, sum_of
+from pre_core.fusion.sums import BridgePriors, Joint, Ready, own_change, squared_distance, sum_of
 from pre_core.fusion.tracks import Part
 
 FloatArray = NDArray[np.float64]
@@ -28,7 +28,7 @@ _SUSPICIOUS, _INCOMPATIBLE = 1e-3, 1e-4
 change that the others show, and then to be left out."""
 _FEWEST = 3
 """Of two that disagree nobody knows which is wrong; of more, a third may be."""
-_ROUNDED, _UNLIKELY = 1e-10, 1e-6
+_UNLIKELY = 1e-6
 
 
 class Judged(NamedTuple):
@@ -92,8 +92,7 @@ def _chances(
             own = _USUAL_CHANGE**2 + (1.0 - rho) * tau**2
             change = at @ (own * np.eye(elements.size) + rho * tau**2) @ at
             spread = told + told @ change @ told
-            distance = float(need @ np.linalg.pinv(spread, _ROUNDED, hermitian=True) @ need)
-            chance += float(weight * chi2.sf(distance, elements.size))
+            chance += float(weight * chi2.sf(squared_distance(need, spread), elements.size))
         out.append(chance)
     return out
 
@@ -108,6 +107,5 @@ def _own_change(
     """
     across = np.zeros((linear.size, elements.size))
     across[one.places] = one.precision[:, elements]
-    explained = np.linalg.solve(precision, np.column_stack([across, linear]))
-    told = one.precision[np.ix_(elements, elements)] - across.T @ explained[:, :-1]
-    return 0.5 * (told + told.T), one.linear[elements] - across.T @ explained[:, -1]
+    own = one.precision[np.ix_(elements, elements)]
+    return own_change(across, own, one.linear[elements], (precision, linear))

@@ -76,8 +76,8 @@ def join(
     shared = tuple(track.shared for track in tracks.values())
     names = tuple(part.name for part in parts)
     centre = _nominal(layout)
-    bridge: FloatArray | None = None
-    for _ in range(_PASSES):
+    for number in range(_PASSES):
+        bridge = centre if number else None
         ready = tuple(
             _ready(_about(part, tracks, bridge), layout, tracks, priors, centre) for part in parts
         )
@@ -85,7 +85,6 @@ def join(
         # Without a change crossings surer than the bridge is steady would lead it astray.
         of = of_change(joint._replace(ready=joint.of(trusted)))
         before, centre = centre, _most_likely(layout, priors, *changed(joint, of, *_USUAL)[:2])
-        bridge = centre
         if np.all(np.abs(centre - before) < _SETTLED):
             break
     return joint._replace(centre=centre)

@@ -13,6 +13,7 @@ FloatArray = NDArray[np.float64]
 
 _ROUGH_SPREAD = 0.6
 """A normal prior of c that stands for the log-normal one where evidence is compared."""
+_ROUNDED = 1e-10
 
 
 class BridgePriors(NamedTuple):
@@ -92,3 +93,24 @@ def told(joint: Joint, ready: Sequence[Ready]) -> tuple[FloatArray, FloatArray]:
         precision[np.ix_(one.places, one.places)] += one.precision
         linear[one.places] += one.linear
     return precision, linear
+
+
+def own_change(
+    across: FloatArray,
+    precision: FloatArray,
+    linear: FloatArray,
+    whole: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Precision (e, e) and linear part (e,) of how coordinates of one crossing differ from all.
+
+    Of it alone they are `precision` and `linear`, and `across` (n, e) is how all n unknowns go with
+    them; `whole` are precision and linear part of the sum of all, this one included.
+    """
+    explained = np.linalg.solve(whole[0], np.column_stack([across, whole[1]]))
+    told = precision - across.T @ explained[:, :-1]
+    return 0.5 * (told + told.T), linear - across.T @ explained[:, -1]
+
+
+def squared_distance(linear: FloatArray, spread: FloatArray) -> float:
+    """Squared distance from zero of a linear part (e,) with the covariance `spread` (e, e)."""
+    return float(linear @ np.linalg.pinv(spread, _ROUNDED, hermitian=True) @ linear)

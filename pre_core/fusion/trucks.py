@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from pre_core.crossing.compliances import marginal
 from pre_core.fusion.joint import alone
-from pre_core.fusion.sums import BridgePriors, sum_of
+from pre_core.fusion.sums import BridgePriors, own_change, squared_distance, sum_of
 from pre_core.fusion.tracks import Part
 
 FloatArray = NDArray[np.float64]
@@ -29,7 +29,6 @@ _INCOMPATIBLE = 1e-4
 """Probability that one of all crossings is as far off as this by chance."""
 _FEWEST = 3
 """Of two that disagree nobody knows which is wrong; of more, a third may be."""
-_ROUNDED = 1e-10
 
 
 class Compared(NamedTuple):
@@ -100,10 +99,7 @@ def _farthest(told: dict[str, _Told]) -> tuple[str, float]:
     before = whole.precision + np.eye(whole.linear.size)
     distances = {}
     for name, one in told.items():
-        explained = np.linalg.solve(before, np.column_stack([one.precision, whole.linear]))
-        own = one.precision - one.precision @ explained[:, :-1]
-        need = one.linear - one.precision @ explained[:, -1]
-        spread = 0.5 * (own + own.T)
-        distances[name] = float(need @ np.linalg.pinv(spread, _ROUNDED, hermitian=True) @ need)
+        own, need = own_change(one.precision, *one, (before, whole.linear))
+        distances[name] = squared_distance(need, own)
     name = max(distances, key=distances.__getitem__)
     return name, distances[name]

@@ -31,7 +31,6 @@ from pre_core.fusion.likelihood import (
 from pre_core.fusion.tracks import root_of
 from pre_core.search import levenberg_marquardt
 from pre_core.search.loop import Ending
-from pre_core.unknowns import EI_1
 
 FloatArray = NDArray[np.float64]
 
@@ -72,7 +71,7 @@ def known_before(problem: posterior.Problem) -> Known:
     absence = priors.absence[priors.estimated][where.bridge]
     e = where.elements.size
     return Known(
-        priors.spread[EI_1:][priors.estimated[EI_1:]],
+        posterior.rigidity_spread(priors),
         np.searchsorted(where.bridge, np.intersect1d(where.half_normal, where.bridge)),
         posterior.log_odds_of_absence(problem)[where.bridge],
         np.maximum(1.0 - absence[: absence.size - e], 1e-9),
