@@ -292,8 +292,9 @@ def test_history_and_latched_topics_work_under_access_control(
         assert len(history(router, f"{V1}/**", 201)) == 201
         assert len(history(worker, vehicles, 200)) == 200
         assert [one.payload for one in history(viewer, bridges, 1)] == [b"weak"]
-        assert get_latest(viewer, selector("live", "bridge", "state")) == [b"weak"]
-        assert get_latest(truck, selector("live", "service", "durable")) == [b"safe"]
+        states, written = selector("live", "bridge", "state"), selector("live", "service", "durable")
+        until(lambda: get_latest(viewer, states) == [b"weak"], "the state")
+        until(lambda: get_latest(truck, written) == [b"safe"], "what is on disk")
         assert history(viewer, vehicles, 0) == []
         assert history(truck, bridges, 0) == []
         for publisher in (sensors, results, logger):
@@ -457,7 +458,8 @@ def test_a_router_between_trucks_and_logger_filters_both(credentials: Path, endp
         assert found == {(ACCEL, b"%d" % number) for number in range(100)}
         announcements = Publisher(logger, "live")
         announcements.put("service", "logger", "durable", b"safe")
-        assert get_latest(truck, selector("live", "service", "durable")) == [b"safe"]
+        written = selector("live", "service", "durable")
+        until(lambda: get_latest(truck, written) == [b"safe"], "what is on disk")
         # The logger says nothing in a truck's name, not even from inside its own process.
         heard = listen_to(truck, [f"{V1}/live/service/logger/durable"])
         settle(truck)

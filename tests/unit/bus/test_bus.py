@@ -18,7 +18,7 @@ from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.bus.subscription import Received, Seen, Subscription, get_latest, subscribe_latest
 from services.common.errors import FailureError, InputError
-from tests.waiting import LONGEST_S
+from tests.waiting import LONGEST_S, until
 
 ACCEL = Key("live", "vehicle", "truck-1", "accel")
 
@@ -43,7 +43,7 @@ def test_messages_come_in_order_with_their_identity(
 ) -> None:
     publisher = Publisher(client, "live", boot_id=5)
     with Subscription(router, selector("live", "vehicle")) as subscription:
-        assert publisher.wait_for_subscriber("vehicle", "truck-1", "accel", 5.0)
+        assert publisher.wait_for_subscriber("vehicle", "truck-1", "accel", LONGEST_S)
         payloads = [b"%d" % number for number in range(1000)]
         put_all(publisher, payloads)
         found = receive(subscription, 1000)
@@ -104,12 +104,14 @@ def test_a_latched_topic_reaches_late_subscribers_and_answers_queries(
     for number in range(3):
         publisher.put("bridge", "b-1", "state", b"%d" % number)
     publisher.put("bridge", "b-2", "state", b"other")
-    assert sorted(get_latest(router, selector("live", "bridge", "state"))) == [b"2", b"other"]
+    states = selector("live", "bridge", "state")
+    # The router hears of who answers, and that they left, when it hears of it.
+    until(lambda: sorted(get_latest(router, states)) == [b"2", b"other"], "both states")
     assert get_latest(router, "driveby/v1/live/bridge/b-1/state") == [b"2"]
     with Subscription(router, selector("live", "bridge")) as subscription:
         assert sorted(received.payload for received in receive(subscription, 2)) == [b"2", b"other"]
     publisher.close()
-    assert get_latest(router, selector("live", "bridge", "state"), timeout_s=1.0) == []
+    until(lambda: get_latest(router, states, timeout_s=1.0) == [], "silence")
 
 
 def test_a_live_display_sees_the_newest_and_holds_nobody_up(

@@ -361,7 +361,7 @@ def test_a_thousand_boots_take_turns(
 
     end = answering(client, answer)
     logger = Logger(router)
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + LONGEST_S
     while len(compared) < len(boots):
         assert time.monotonic() < deadline, len(compared)
         in_step.append(0)
