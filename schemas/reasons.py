@@ -84,7 +84,7 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
     Reason.POSITION_INCONSISTENT: "The position that fits disagrees with the receiver.",
     Reason.NOT_CONVERGED: "The search did not converge.",
-    Reason.SAMPLER_DIAGNOSTICS: "The Markov chain did not pass its own checks.",
+    Reason.SAMPLER_DIAGNOSTICS: "The draws did not pass their own checks.",
     Reason.FAILED: "The identification failed.",
     Reason.CONTINUOUS_BRIDGE: (
         "The bridge has supports between its ends, and the method is for a single span."

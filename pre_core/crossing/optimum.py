@@ -668,7 +668,7 @@ def _followed(
 
 
 def bends(problem: Problem) -> FloatArray:
-    """How much each coordinate is to be bent for the chains (`crank_nicolson`): those of ln EI are.
+    """How much each coordinate is to be bent for the draws (`approximation`): those of ln EI are.
 
     The deflection of a statically determinate beam is linear in 1/EI; a little less, for the prior
     is normal in ln EI.

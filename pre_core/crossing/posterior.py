@@ -7,14 +7,14 @@ its place. The sum of squares of all rows is then -2 log posterior up to a const
 Gauss-Newton curvature the precision of the normal that the Markov chains are steered by.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 from scipy.linalg import qr, solve_triangular
 
-from pre_core.crossing import whitening
+from pre_core.crossing import splines, whitening
 from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.residuals import (
     SWING_MODES,
@@ -166,18 +166,17 @@ def trajectory_basis(
     last = max(float(time[-1]), float(fixes.time_s[-1]))
     spans = max(2, round((last - first) / knot_s))
     inner = np.linspace(first, last, spans + 1)
-    knots = np.concatenate([np.full(_DEGREE, first), inner, np.full(_DEGREE, last)])
-    b = knots.size - _DEGREE - 1
-    spline = BSpline(knots, np.eye(b), _DEGREE)
+    of = partial(splines.basis, splines.clamped_knots(inner, _DEGREE), _DEGREE)
     # The third derivative is a parabola between knots: two points of Gauss integrate its square
     # well enough for a prior.
     apart = np.diff(inner)
     middles, aside = 0.5 * (inner[1:] + inner[:-1]), apart / np.sqrt(12.0)
     at = np.concatenate([middles - aside, middles + aside])
     weight = np.sqrt(0.5 * np.concatenate([apart, apart])) / _JERK_M_PER_S3
-    jerk = spline.derivative(3)(at) * weight[:, None]
-    position = spline(fixes.time_s) / fixes.position_noise_m
-    velocity = spline.derivative()(fixes.time_s) / fixes.speed_noise_m_per_s
+    jerk = of(at, 3) * weight[:, None]
+    position = of(fixes.time_s) / fixes.position_noise_m
+    velocity = of(fixes.time_s, 1) / fixes.speed_noise_m_per_s
+    b = position.shape[1]
     rows = np.zeros((position.shape[0] + velocity.shape[0] + jerk.shape[0] + 1, b + 1))
     m = fixes.time_s.size
     rows[:m, :b] = position
@@ -193,8 +192,7 @@ def trajectory_basis(
         ]
     )
     best = np.linalg.lstsq(rows, values, rcond=None)[0]
-    acceleration = direction * spline.derivative(2)(time)
-    return np.asarray(spline(time)), np.asarray(acceleration), rows, values, best
+    return of(time), direction * of(time, 2), rows, values, best
 
 
 def common_gain_spread(priors: Priors) -> float:
@@ -207,8 +205,16 @@ def rigidity_spread(priors: Priors) -> FloatArray:
     return np.asarray(priors.spread[EI_1:][priors.estimated[EI_1:]])
 
 
-def points(problem: Problem, y: FloatArray) -> Points:
-    """What the points y (k, size) mean."""
+class Values(NamedTuple):
+    """What points mean but for the drive and each channel's own errors."""
+
+    theta: FloatArray  # (k, p)
+    wheelbase_m: FloatArray  # (k,)
+    common_gain: FloatArray  # (k,)
+
+
+def values_of(problem: Problem, y: FloatArray) -> Values:
+    """Truck, bridge and common gain of the points y (k, size)."""
     where = layout(problem)
     priors = problem.priors
     k = y.shape[0]
@@ -220,16 +226,28 @@ def points(problem: Problem, y: FloatArray) -> Points:
     theta[:, logs] = priors.theta[logs] * np.exp(priors.spread[logs] * values[:, logs])
     zero = np.flatnonzero(priors.estimated & priors.half_normal)
     theta[:, zero] = priors.spread[zero] * values[:, zero]
-    coefficients = y[:, where.trajectory]
-    return Points(
+    return Values(
         theta,
         priors.wheelbase_m * np.exp(priors.wheelbase_spread * y[:, where.wheelbase]),
+        np.exp(common_gain_spread(priors) * y[:, where.common_gain]),
+    )
+
+
+def points(problem: Problem, y: FloatArray) -> Points:
+    """What the points y (k, size) mean, the truck's place at every sample included."""
+    where = layout(problem)
+    priors = problem.priors
+    told = values_of(problem, y)
+    coefficients = y[:, where.trajectory]
+    return Points(
+        told.theta,
+        told.wheelbase_m,
         coefficients @ problem.basis_position.T,
         coefficients @ problem.basis_acceleration.T,
         priors.gain_spread * (y[:, where.gains] @ _CONTRASTS),
-        np.exp(common_gain_spread(priors) * y[:, where.common_gain]),
+        told.common_gain,
         priors.delay_spread_s * y[:, where.delays],
-        (y[:, where.initial].reshape(k, CHANNELS, 3) * _INITIAL_SPREAD),
+        (y[:, where.initial].reshape(-1, CHANNELS, 3) * _INITIAL_SPREAD),
         y[:, where.swing] * np.repeat(_SWING_M / np.arange(1, SWING_MODES + 1) ** 2, 2),
     )
 

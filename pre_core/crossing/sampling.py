@@ -1,4 +1,4 @@
-"""Draws from the posterior of one crossing, by chains that run until they agree."""
+"""Draws from the posterior of one crossing: weighted ones or, where those fail, chains."""
 
 from functools import partial
 from typing import NamedTuple
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing import compliances, optimum, posterior
-from pre_core.search import crank_nicolson
+from pre_core.search import approximation, crank_nicolson, importance
 from pre_core.search.loop import Ending, Report, run
 from pre_core.unknowns import element_count, table
 
@@ -24,10 +24,23 @@ _WELL_ACCEPTED = 0.3
 """From here on the approximation is good enough, and nothing more is learnt."""
 _MOST_RUNS = 14
 """So many times the draws that are asked for may be drawn before the chains are given up."""
+_BATCH_SHARE = 0.25
+"""Weighted draws come in batches of this share of those that are asked for, in such numbers:"""
+_FEWEST_BATCHES, _MOST_BATCHES = 4, 10
+_TAME_BATCHES = 6
+"""Weights whose tail is still too heavy by then are given up: the fit of few scatters."""
+_LARGEST_PARETO_K = 0.7
+_WORTH = 1.0 / 3.0
+"""Weighted draws are enough if they are worth this share of those that are asked for. It is more
+than is asked of chains: what weights are worth is an estimate from the weights themselves."""
 
 
 class Sampled(NamedTuple):
-    """What the chains found: draws (n, chains, f) in the coordinates of the posterior."""
+    """Draws (n, chains, f) in the coordinates of the posterior; `pareto_k` of weighted ones.
+
+    Weighted ones are drawn again by their weights and dealt out; their `acceptance` is what each is
+    worth.
+    """
 
     draws: FloatArray
     r_hat: float
@@ -35,6 +48,7 @@ class Sampled(NamedTuple):
     acceptance: float
     evaluations: int
     ending: Ending
+    pareto_k: float | None = None
 
 
 def sample(
@@ -52,24 +66,115 @@ def sample(
     problem = found.problem
     if problem.mismatch.level_m3.any():
         return _sampled_on_two_roads(found, draws, seed, inflation)
-    where = posterior.layout(problem)
-    centre, covariance = optimum.normal_approximation(found)
-    mixed = crank_nicolson.mixture(
-        centre,
-        inflation**2 * covariance,
-        where.half_normal,
-        optimum.bends(problem),
-        seed,
-        posterior.log_odds_of_absence(problem, inflation),
-    )
+    mixed = _approximation(found, inflation, seed)
 
     def target(points: FloatArray) -> FloatArray:
         rows = posterior.all_rows(problem, points)
         return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
 
+    where = posterior.layout(problem)
+    delays = np.arange(where.delays.start, where.delays.stop)
+    mixed = approximation.probed(target, mixed, delays)
+    spent = approximation.probes(mixed, delays)
+    weighted, mixed, drawn = _weighted(target, mixed, draws, report)
+    spent += drawn
+    if weighted is not None:
+        return _dealt_out(weighted, _told(problem), draws, seed, spent)
+    return _by_chains(target, mixed, draws, _told(problem), spent, report)
+
+
+def _approximation(found: optimum.Optimum, inflation: float, seed: int) -> approximation.Mixture:
+    problem = found.problem
+    centre, covariance = optimum.normal_approximation(found)
+    return approximation.mixture(
+        centre,
+        inflation**2 * covariance,
+        posterior.layout(problem).half_normal,
+        optimum.bends(problem),
+        seed,
+        posterior.log_odds_of_absence(problem, inflation),
+    )
+
+
+def _weighted(
+    target: approximation.LogDensity, mixed: approximation.Mixture, draws: int, report: Report
+) -> tuple[importance.Draws | None, approximation.Mixture, int]:
+    """Weighted draws that are worth enough or none, the approximation, the evaluations.
+
+    Where the first are not, the approximation is fitted to what they show, they are thrown away,
+    and others are drawn.
+    """
+    first, worth = _worth_enough(target, mixed, draws, 0, report)
+    if _is_enough(worth, draws):
+        return first, mixed, first.log_weight.size
+    fitted = approximation.learnt(mixed, first.part, first.v, first.log_weight)
+    second, worth_now = _worth_enough(target, fitted, draws, _MOST_BATCHES, report)
+    spent = first.log_weight.size + second.log_weight.size
+    if _is_enough(worth_now, draws):
+        return second, fitted, spent
+    per_draw = worth.ess / first.log_weight.size, worth_now.ess / second.log_weight.size
+    return None, fitted if per_draw[1] > per_draw[0] else mixed, spent
+
+
+def _is_enough(worth: importance.Smoothed, draws: int) -> bool:
+    return worth.pareto_k <= _LARGEST_PARETO_K and worth.ess >= _WORTH * draws
+
+
+def _worth_enough(
+    target: approximation.LogDensity,
+    mixed: approximation.Mixture,
+    draws: int,
+    number: int,
+    report: Report,
+) -> tuple[importance.Draws, importance.Smoothed]:
+    """Weighted draws in batches from `number` on, until they are enough or will not be."""
+    batches: list[importance.Draws] = []
+    while True:
+        report("weighting draws of the posterior", 0.5 + 0.02 * (number + len(batches)))
+        count = round(_BATCH_SHARE * draws)
+        batches.append(importance.draw(target, mixed, count, number + len(batches)))
+        together = importance.Draws(*map(np.concatenate, zip(*batches, strict=True)))
+        if len(batches) < _FEWEST_BATCHES:
+            continue
+        worth = importance.smoothed(together.log_weight)
+        hopeless = worth.ess * _MOST_BATCHES / len(batches) < _WORTH * draws
+        if worth.pareto_k > _LARGEST_PARETO_K and len(batches) >= _TAME_BATCHES:
+            hopeless = True
+        if _is_enough(worth, draws) or hopeless or len(batches) >= _MOST_BATCHES:
+            return together, worth
+
+
+def _dealt_out(
+    weighted: importance.Draws, told: NDArray[np.int64], draws: int, seed: int, evaluations: int
+) -> Sampled:
+    """Weighted draws, each as often as its weight says, as if chains had drawn them."""
+    worth = importance.smoothed(weighted.log_weight)
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
+    count = -(-max(draws, weighted.log_weight.size) // crank_nicolson.CHAINS)
+    chosen = importance.evenly(worth.weight, count * crank_nicolson.CHAINS, rng)
+    dealt = weighted.y[chosen].reshape(count, crank_nicolson.CHAINS, -1)
+    return Sampled(
+        dealt,
+        float(crank_nicolson.split_r_hat(dealt[:, :, told]).max()),
+        worth.ess,
+        worth.ess / weighted.log_weight.size,
+        evaluations,
+        Ending.STEPS_DONE,
+        worth.pareto_k,
+    )
+
+
+def _by_chains(
+    target: approximation.LogDensity,
+    mixed: approximation.Mixture,
+    draws: int,
+    told: NDArray[np.int64],
+    spent: int,
+    report: Report,
+) -> Sampled:
+    """Chains that are run until they agree; STEPS_EXHAUSTED if they do not."""
     wanted = draws // crank_nicolson.CHAINS
     state, mixed, steps = _learnt(target, mixed, round(_LEARNING_SHARE * wanted), report)
-    told = _told(problem)
     kept: list[FloatArray] = []
     acceptance: list[float] = []
     r_hat, ess, ending = np.inf, 0.0, Ending.STEPS_EXHAUSTED
@@ -92,7 +197,7 @@ def sample(
         r_hat, ess, ending = _agreement(np.stack(kept)[:, :, told])
         if ending is Ending.STEPS_DONE:
             break
-    evaluations = crank_nicolson.CHAINS * (1 + crank_nicolson.MOVES * steps)
+    evaluations = spent + crank_nicolson.CHAINS * (1 + crank_nicolson.MOVES * steps)
     return Sampled(np.stack(kept), r_hat, ess, float(np.mean(acceptance)), evaluations, ending)
 
 
@@ -135,10 +240,9 @@ def _begun(state: crank_nicolson.State) -> crank_nicolson.State:
 
 
 def _learnt(
-    target: crank_nicolson.LogDensity, mixed: crank_nicolson.Mixture, count: int, report: Report
-) -> tuple[crank_nicolson.State, crank_nicolson.Mixture, int]:
+    target: approximation.LogDensity, mixed: approximation.Mixture, count: int, report: Report
+) -> tuple[crank_nicolson.State, approximation.Mixture, int]:
     """A state and an approximation that is accepted often enough, and the steps it took."""
-    mixed = crank_nicolson.probed(target, mixed)
     state = crank_nicolson.init(target, mixed)
     before, best, steps = mixed, 0.0, 0
     for stage in range(_LEARNING_STAGES):
@@ -155,7 +259,7 @@ def _learnt(
         if accepted > _WELL_ACCEPTED or stage == _LEARNING_STAGES - 1:
             break
         best, before = accepted, mixed
-        mixed = crank_nicolson.adapted(mixed, np.stack(seen[count // 3 :]))
+        mixed = approximation.adapted(mixed, np.stack(seen[count // 3 :]))
         state = crank_nicolson.moved(target, before, mixed, state)
     return state, mixed, steps
 

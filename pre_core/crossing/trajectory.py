@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 from scipy.linalg import lstsq
 
+from pre_core.crossing.splines import Spline, basis, clamped_knots, value_at
 from pre_core.physics.simulate import Motion
 
 FloatArray = NDArray[np.float64]
@@ -26,7 +26,7 @@ _JERK_M_PER_S3 = 0.3
 class Trajectory(NamedTuple):
     """A fitted curve; `misfit` is the root mean square of the fixes' standardised residuals."""
 
-    spline: BSpline
+    spline: Spline
     misfit: float
 
 
@@ -51,13 +51,11 @@ def fit_trajectory(
     last = max(stop_s, float(time_s[-1]))
     spans = max(1, round((last - first) / _KNOT_SPACING_S))
     inner = np.linspace(first, last, spans + 1)
-    knots = np.concatenate([np.full(degree, first), inner, np.full(degree, last)])
-    count = knots.size - degree - 1
-    basis = BSpline(knots, np.eye(count), degree)
+    knots = clamped_knots(inner, degree)
     # The third derivative of a cubic spline is constant between knots.
     middles = 0.5 * (inner[1:] + inner[:-1])
-    jerk = basis.derivative(3)(middles) * np.sqrt(np.diff(inner))[:, None]
-    fixes = np.vstack([basis(time_s), basis.derivative()(time_s)])
+    jerk = basis(knots, degree, middles, 3) * np.sqrt(np.diff(inner))[:, None]
+    fixes = np.vstack([basis(knots, degree, time_s, order) for order in (0, 1)])
     weight = np.concatenate(
         [
             np.full(time_s.size, 1.0 / position_noise_m),
@@ -71,8 +69,8 @@ def fit_trajectory(
     right = np.concatenate([measured * weight, np.zeros(jerk.shape[0])])
     coefficients = lstsq(system, right)[0]
     residual = (fixes @ coefficients - measured) * weight
-    greville = np.array([knots[i + 1 : i + 1 + degree].mean() for i in range(count)])
-    spline = BSpline(knots, coefficients + line(greville), degree)
+    greville = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree).mean(axis=1)
+    spline = Spline(knots, coefficients + line(greville), degree)
     return Trajectory(spline, float(np.sqrt(np.mean(residual**2))))
 
 
@@ -80,9 +78,9 @@ def motion_at(trajectory: Trajectory, time_s: FloatArray, direction: int) -> Mot
     """Position, speed and acceleration (positive when speeding up) of the front axle at times."""
     spline = trajectory.spline
     return Motion(
-        np.asarray(spline(time_s)),
-        np.asarray(spline.derivative(1)(time_s)),
-        direction * np.asarray(spline.derivative(2)(time_s)),
+        value_at(spline, time_s),
+        value_at(spline, time_s, 1),
+        direction * value_at(spline, time_s, 2),
     )
 
 
@@ -91,7 +89,7 @@ def passing_time_s(
 ) -> float:
     """The first time at which the front axle has reached a chainage; NaN if it does not."""
     t = np.linspace(start_s, stop_s, max(2, round((stop_s - start_s) / 0.01) + 1))
-    beyond = direction * (trajectory.spline(t) - position_m) >= 0.0
+    beyond = direction * (value_at(trajectory.spline, t) - position_m) >= 0.0
     first = int(np.argmax(beyond))
     if not beyond[first]:
         return float("nan")
@@ -100,7 +98,7 @@ def passing_time_s(
     low, high = float(t[first - 1]), float(t[first])
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if direction * (float(trajectory.spline(middle)) - position_m) >= 0.0:
+        if direction * (value_at(trajectory.spline, np.array([middle]))[0] - position_m) >= 0.0:
             high = middle
         else:
             low = middle

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from pre_core.fusion.sums import BridgePriors, Joint, Ready, told, with_priors
 
@@ -123,6 +122,8 @@ def _fine_taus(log: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     From the logarithm of the evidence (t, r), which is smooth between the cells.
     """
+    from scipy.interpolate import CubicSpline  # slow to import, seldom needed
+
     edges = _edges()
     part = (np.arange(_FINER) + 0.5) / _FINER
     fine = edges[:-1, None] + np.diff(edges)[:, None] * part

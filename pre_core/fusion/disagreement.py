@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from pre_core.fusion.between import between_of
 from pre_core.fusion.joint import join
@@ -92,7 +92,7 @@ def _chances(
             own = _USUAL_CHANGE**2 + (1.0 - rho) * tau**2
             change = at @ (own * np.eye(elements.size) + rho * tau**2) @ at
             spread = told + told @ change @ told
-            chance += float(weight * chi2.sf(squared_distance(need, spread), elements.size))
+            chance += float(weight * chdtrc(elements.size, squared_distance(need, spread)))
         out.append(chance)
     return out
 

@@ -222,19 +222,17 @@ def _drawn(
     chosen = np.minimum(np.searchsorted(np.cumsum(between.weight), at), between.weight.size - 1)
     of = of_change(joint)
     out, taus = [], []
+    last: list[FloatArray | None] = [None] * CHAINS  # from one change to the next little moves
     for k in np.unique(chosen):
         some = int((chosen == k).sum())
         tau, rho = float(between.tau[k]), float(between.rho[k])
         density = _posterior(joint, priors, *changed(joint, of, tau, rho)[:2])
-        out.append(
-            np.stack(
-                [
-                    draws(density, some, seed, (int(k) + 1) * CHAINS + chain)
-                    for chain in range(CHAINS)
-                ],
-                axis=1,
-            )
-        )
+        of_chains = [
+            draws(density, some, seed, (int(k) + 1) * CHAINS + chain, last[chain])
+            for chain in range(CHAINS)
+        ]
+        last = [one[-1] for one in of_chains]
+        out.append(np.stack(of_chains, axis=1))
         taus.append(tau_draws(between, int(k), (some, CHAINS), rng))
     order = rng.permutation(count)
     return np.concatenate(out)[order], np.concatenate(taus)[order]

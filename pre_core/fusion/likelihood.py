@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve, qr
 
 from pre_core import unknowns
@@ -35,6 +34,7 @@ from pre_core.crossing.mismatch import MEMORY_M, Mismatch
 from pre_core.crossing.optimum import Optimum
 from pre_core.crossing.preparation import off_bridge, with_mismatch_alone
 from pre_core.crossing.residuals import Crossing, Points, evaluate
+from pre_core.crossing.splines import basis
 from pre_core.crossing.whitening import RESIDUALS, filter_rows, row_count, solve
 from pre_core.fusion.bends import Bends, bends_of
 from pre_core.fusion.bends import straightened as straightened_about
@@ -327,8 +327,8 @@ def _white_knots(problem: posterior.Problem, y: FloatArray, grid: FloatArray) ->
     rear = _rear_m(crossing, at)
     aside = float(grid[1] - grid[0]) * np.arange(1, _CUBIC)
     padded = np.concatenate([grid[0] - aside[::-1], grid, grid[-1] + aside])
-    basis = BSpline(padded, np.eye(grid.size), _CUBIC, extrapolate=False)
-    shape = 1e-3 * np.nan_to_num(np.asarray(basis(rear)))
+    shape = 1e-3 * basis(padded, _CUBIC, rear)
+    shape[(rear < padded[_CUBIC]) | (rear > padded[-_CUBIC - 1])] = 0.0
     out = np.zeros((problem.noise.reciprocal.size, grid.size))
     filtered = np.empty(row_count(rows, rear.size))
     for k in range(grid.size):

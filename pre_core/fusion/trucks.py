@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from pre_core.crossing.compliances import marginal
 from pre_core.fusion.joint import alone
@@ -60,7 +60,7 @@ def compare_trucks(parts: Sequence[Part], priors: BridgePriors) -> Compared:
     disagree = False
     for told in trucks.values():
         most = len(told) // _FEWEST
-        limit = float(chi2.isf(_INCOMPATIBLE / len(parts), _sum(told.values()).linear.size))
+        limit = float(chdtri(_sum(told.values()).linear.size, _INCOMPATIBLE / len(parts)))
         inside = dict(told)
         odd: list[str] = []
         while len(inside) > 1:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 FloatArray = NDArray[np.float64]
 
@@ -42,6 +41,8 @@ def newmark_integrate(acceleration: FloatArray, step_s: float) -> Integrated:
 
 def spline_integrate(acceleration: FloatArray, step_s: float) -> Integrated:
     """Integrate rows of evenly spaced samples (channels, n) twice through a cubic spline."""
+    from scipy.interpolate import CubicSpline  # slow to import, of the paper's method alone
+
     t = step_s * np.arange(acceleration.shape[1])
     spline = CubicSpline(t, acceleration, axis=1)
     return Integrated(

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 
 from pre_core.physics.simulate import Motion, WheelRoad, rear_position_m
@@ -77,6 +76,8 @@ def contact_patch_average(profile: Profile, length_m: float) -> Profile:
     """
     if length_m <= 0.0:
         return profile
+    from scipy.interpolate import CubicSpline  # slow to import, of drawn roads alone
+
     x, height = profile.x_m, profile.height_m
     first, last = float(x[0]), float(x[-1])
     area = CubicSpline(x, height).antiderivative()
@@ -103,6 +104,8 @@ def under_axles(
     front: Profile, rear: Profile, motion: Motion, wheelbase_m: float, direction: int
 ) -> WheelRoad:
     """The same where each axle has a profile of its own."""
+    from scipy.interpolate import CubicSpline  # slow to import, of drawn roads alone
+
     behind_m = rear_position_m(motion.position_m, wheelbase_m, direction)
     heights, slopes = [], []
     for profile, wheel in ((front, motion.position_m), (rear, behind_m)):

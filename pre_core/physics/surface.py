@@ -23,11 +23,12 @@ ComplexArray = NDArray[np.complex128]
 
 _WIDEST_CYCLES_PER_M = 40.0
 """Waves across the road that are shorter no tyre feels."""
-_ACROSS, _FINE = 400, 8000
-"""Waves across: of a drawn surface, and of the integral."""
+_ACROSS, _FINE = 400, 4000
+"""Waves across: of a drawn surface, and of the integral to one side."""
 _SHORTEST_WAVE_M, _LONGEST_WAVE_M = 0.05, 100.0
 _SCALE = 0.02
 """Cycles/m across from which on waves stand apart by a share of themselves."""
+_STEP = float(np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)) / _FINE
 
 
 class Footprint(NamedTuple):
@@ -51,9 +52,14 @@ COMMON_LORRY = (Footprint(), Footprint(width_m=0.22, twin_distance_m=0.33))
 
 def response(axle: Footprint, n_x: FloatArray, n_y: FloatArray) -> ComplexArray:
     """H of the module's text for waves (…,) along and across the road, in cycles/m."""
+    return np.asarray(np.sinc(axle.length_m * n_x) * _strips(axle, n_y))
+
+
+def _strips(axle: Footprint, n_y: FloatArray) -> ComplexArray:
+    """The part of H across the road."""
     strips = np.cos(np.pi * axle.track_m * n_y) * np.cos(np.pi * axle.twin_distance_m * n_y)
-    patch = np.sinc(axle.width_m * n_y) * np.sinc(axle.length_m * n_x)
-    return np.asarray(patch * strips * np.exp(2j * np.pi * axle.offset_m * n_y))
+    width = np.sinc(axle.width_m * n_y)
+    return np.asarray(width * strips * np.exp(2j * np.pi * axle.offset_m * n_y))
 
 
 def surface_density(road_class: str) -> float:
@@ -67,13 +73,22 @@ def spectra(front: Footprint, rear: Footprint, n: FloatArray) -> tuple[FloatArra
     Front axle, rear axle, the real part of their cross spectrum, and their difference front less
     rear.
     """
-    n_x, n_y, density = _across(n)
-    h_front, h_rear = response(front, n_x, n_y), response(rear, n_x, n_y)
+    at_front, at_rear, n_y = _patches_and_waves(front, rear, n)
+    of_front, of_rear = _strips(front, n_y), _strips(rear, n_y)
+    apart = of_front - of_rear
+    powers = (
+        np.abs(of_front) ** 2,
+        np.abs(of_rear) ** 2,
+        (of_front * of_rear.conj()).real,
+        np.abs(apart) ** 2,
+        (apart * of_rear.conj()).real,
+    )
+    front_front, rear_rear, front_rear, apart_apart, apart_rear = _integrals(n, n_y, powers)
     return (
-        np.sum(density * np.abs(h_front) ** 2, axis=1),
-        np.sum(density * np.abs(h_rear) ** 2, axis=1),
-        np.sum(density * (h_front * h_rear.conj()).real, axis=1),
-        np.sum(density * np.abs(h_front - h_rear) ** 2, axis=1),
+        at_front**2 * front_front,
+        at_rear**2 * rear_rear,
+        at_front * at_rear * front_rear,
+        _difference(at_front, at_rear, apart_apart, apart_rear, rear_rear),
     )
 
 
@@ -85,22 +100,54 @@ def common_spectrum(
     The track of each run lies beside the line by a normal of standard deviation `wander_m`, so that
     two are apart by sqrt(2) of it: waves across the road are multiplied by exp(-(2 pi n_y w)²).
     """
-    n_x, n_y, density = _across(n)
-    density = density * np.exp(-((2.0 * np.pi * n_y * wander_m) ** 2))
-    difference = response(front, n_x, n_y) - response(rear, n_x, n_y)
-    return np.asarray(np.sum(density * np.abs(difference) ** 2, axis=1))
+    at_front, at_rear, n_y = _patches_and_waves(front, rear, n)
+    both = np.exp(-((2.0 * np.pi * n_y * wander_m) ** 2))
+    of_rear = _strips(rear, n_y)
+    apart = _strips(front, n_y) - of_rear
+    powers = (np.abs(apart) ** 2, (apart * of_rear.conj()).real, np.abs(of_rear) ** 2)
+    return _difference(at_front, at_rear, *_integrals(n, n_y, tuple(both * one for one in powers)))
 
 
-def _across(n: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Waves along (f, 1) and across (q,), and k^-3 times the weights (f, q) of the integral.
+def _patches_and_waves(
+    front: Footprint, rear: Footprint, n: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What the contact lengths of both axles leave of waves (f,) along; waves (q,) across."""
+    patches = (np.asarray(np.sinc(axle.length_m * np.asarray(n))) for axle in (front, rear))
+    return *patches, _SCALE * np.sinh(_STEP * np.arange(_FINE + 1))
 
-    Trapezoids in asinh(n_y/scale); the integrands fall off like a power.
+
+def _difference(
+    at_front: FloatArray,
+    at_rear: FloatArray,
+    apart_apart: FloatArray,
+    apart_rear: FloatArray,
+    rear_rear: FloatArray,
+) -> FloatArray:
+    """Integral of |a F - b R|² with D = F - R apart: where the patches are alike, a² |D|² alone.
+
+    Not a² |F|² - 2 a b Re(F conj R) + b² |R|²: long waves differ by a millionth of what they are.
     """
-    longest = np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)
-    t = np.linspace(-longest, longest, _FINE + 1)
-    n_y, weight = _SCALE * np.sinh(t), _SCALE * np.cosh(t) * (t[1] - t[0])
-    n_x = np.asarray(n)[:, None]
-    return n_x, n_y, weight * (n_x**2 + n_y**2) ** -1.5
+    more = at_front - at_rear
+    return at_front**2 * apart_apart + 2.0 * at_front * more * apart_rear + more**2 * rear_rear
+
+
+def _integrals(
+    n: FloatArray, n_y: FloatArray, powers: tuple[FloatArray, ...]
+) -> tuple[FloatArray, ...]:
+    """Integrals (f,) over all n_y of k^-3 times each of `powers` (q,), even and given at n_y >= 0.
+
+    A sum of even steps in asinh(n_y/scale); the integrands fall off like a power. One wave along at
+    a time: together they would take a hundred megabytes.
+    """
+    weight = 2.0 * _STEP * np.hypot(_SCALE, n_y)
+    weight[0] *= 0.5
+    weighted = np.stack([weight * one for one in powers], axis=1)
+    squares = n_y**2
+    out = np.empty((np.asarray(n).size, len(powers)))
+    for row, one in enumerate(np.asarray(n).ravel()):
+        square = squares + one**2
+        out[row] = (1.0 / (square * np.sqrt(square))) @ weighted
+    return tuple(out.T)
 
 
 class Surface(NamedTuple):

@@ -287,9 +287,7 @@ def add_identify(commands: Any) -> None:
     add_method(p)
     add_file(p, "--json", "OUT.json", "write the results here")
     add_file(p, "--rrd", "OUT.rrd", "write a Rerun recording here")
-    add_file(
-        p, "--draws", "OUT.npz|OUT.nc", "write the Markov chains of method pre here, for ArviZ"
-    )
+    add_file(p, "--draws", "OUT.npz|OUT.nc", "write the draws of method pre here, for ArviZ")
     add_file(p, "--figures", "DIR", "draw every crossing and bridge here, as PNG and SVG")
     _add_fusing(p)
     add_certificates(

@@ -9,7 +9,7 @@ from collections.abc import Hashable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from pre_core.constants import NORMAL_975
 from schemas.reasons import BridgeReason, LeftOutReason
@@ -94,7 +94,7 @@ def _probability_below(share: float, now: Parameter, before: ElementState) -> fl
     """Of two log-normals with independent errors."""
     spread = np.hypot(now.std / now.mean, before.std / before.mean)
     apart = np.log(share * before.mean / now.mean)
-    return float(norm.cdf(apart / spread)) if spread > 0.0 else float(apart > 0.0)
+    return float(ndtr(apart / spread)) if spread > 0.0 else float(apart > 0.0)
 
 
 def usable(result: Crossing) -> Usable | None:

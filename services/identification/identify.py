@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from pre_core.crossing.splines import value_at
 from pre_core.crossing.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
 from pre_core.physics.simulate import Motion
 from pre_core.search.loop import Report
@@ -227,7 +228,7 @@ def _unusable(
     if trajectory is None or outage_s > longest_s:
         return [*reasons, Reason.POSITION_OUTAGE]
     times = np.linspace(entry_s, exit_s, 200)
-    speed = data.stay.direction * trajectory.spline.derivative()(times)
+    speed = data.stay.direction * value_at(trajectory.spline, times, 1)
     if speed.min() < STANDING_M_PER_S:
         reasons.append(Reason.STOPPED_ON_BRIDGE)
     elif np.median(speed) < SLOWEST_M_PER_S:

@@ -1,6 +1,6 @@
 """Method `pre` on one crossing: posterior, verdict, and the result with its uncertainty.
 
-What the numbers are is in `pre_core.crossing.optimum` and `pre_core.search.crank_nicolson`; this is
+What the numbers are is in `pre_core.crossing.optimum` and `pre_core.crossing.sampling`; this is
 where a site file becomes priors, draws become parameters, and diagnostics become a verdict
 (docs/contract.md).
 """
@@ -217,6 +217,8 @@ def identify_pre(
         "draws": float(chain.draws.shape[0] * chain.draws.shape[1]),
         "chain_evaluations": float(chain.evaluations),
     }
+    if chain.pareto_k is not None:
+        diagnostics["pareto_k"] = chain.pareto_k
     if chain.ending is not Ending.STEPS_DONE:
         reasons.append(Reason.SAMPLER_DIAGNOSTICS)
     reasons += caveats(data, motion)
@@ -273,7 +275,7 @@ def _values(
 ) -> dict[str, Any]:
     """Scale error, parameters, covariance, derived quantities and road from the draws."""
     flat = chain.draws.reshape(-1, chain.draws.shape[2])
-    at = posterior.points(problem, flat)
+    at = posterior.values_of(problem, flat)
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(10**9,)))
     # The total mass scales every force and stiffness of truck and bridge alike; no residual shows
     # its error. That of the common gain is among the unknowns.

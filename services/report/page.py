@@ -272,8 +272,8 @@ def _numbers(crossing: Crossing) -> Iterator[tuple[str, str, str]]:
     if road is not None and (road.iri_m_per_km is not None or road.iso_class is not None):
         yield "road", _one_road(crossing) or "", "International Roughness Index, ISO 8608 class"
     meanings = {
-        "r_hat": ("R-hat", "agreement of the Markov chains; below 1.05"),
-        "ess": ("effective draws", "at least 100"),
+        "r_hat": ("R-hat", "agreement of the draws; below 1.05"),
+        "ess": ("effective draws", "at least 100; 400 of weighted ones"),
         "position_shift_m": ("shift of positions (m)", "slow error of the receiver that fits"),
         "iterations": ("evaluations", "of the model"),
     }

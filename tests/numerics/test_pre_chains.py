@@ -9,7 +9,7 @@ from scipy.integrate import dblquad, quad
 from scipy.special import digamma, gammaln, polygamma
 from scipy.stats import loggamma, multivariate_normal, truncnorm
 
-from pre_core.search import crank_nicolson
+from pre_core.search import approximation, crank_nicolson
 from pre_core.search.loop import Ending
 
 FloatArray = NDArray[np.float64]
@@ -21,12 +21,12 @@ DEVIATIONS = 4.5
 
 def straight(
     centre: FloatArray, matrix: FloatArray, positive: NDArray[np.int64], seed: int
-) -> crank_nicolson.Mixture:
+) -> approximation.Mixture:
     """Without any bent coordinate."""
-    return crank_nicolson.mixture(centre, matrix, positive, np.zeros(centre.size), seed)
+    return approximation.mixture(centre, matrix, positive, np.zeros(centre.size), seed)
 
 
-def changed(mixed: crank_nicolson.Mixture, **fields: FloatArray) -> crank_nicolson.Mixture:
+def changed(mixed: approximation.Mixture, **fields: FloatArray) -> approximation.Mixture:
     """The same with other fields in its only part."""
     (part,) = mixed.parts
     return mixed._replace(parts=(part._replace(**fields),))
@@ -39,8 +39,8 @@ class Run(NamedTuple):
 
 
 def run(
-    target: crank_nicolson.LogDensity,
-    normal: crank_nicolson.Mixture,
+    target: approximation.LogDensity,
+    normal: approximation.Mixture,
     *,
     steps: int = STEPS,
     adapt: int = 0,
@@ -51,7 +51,7 @@ def run(
         for _ in range(adapt):
             state, _ = crank_nicolson.step(target, normal, state)
             seen.append(state.v)
-        better = crank_nicolson.adapted(normal, np.stack(seen[adapt // 3 :]))
+        better = approximation.adapted(normal, np.stack(seen[adapt // 3 :]))
         assert np.any(better.parts[0].shift != 0.0) or np.any(better.parts[0].scale != 1.0)
         state = crank_nicolson.moved(target, normal, better, state)
         normal = better
@@ -72,7 +72,7 @@ def misses(draws: FloatArray, mean: FloatArray, variance: FloatArray) -> FloatAr
     return np.asarray((both.mean(axis=(0, 1)) - expected) / error)
 
 
-def gaussian(centre: FloatArray, matrix: FloatArray) -> crank_nicolson.LogDensity:
+def gaussian(centre: FloatArray, matrix: FloatArray) -> approximation.LogDensity:
     precision = np.linalg.inv(matrix)
 
     def log_density(y: FloatArray) -> FloatArray:
@@ -82,8 +82,8 @@ def gaussian(centre: FloatArray, matrix: FloatArray) -> crank_nicolson.LogDensit
 
 
 def positive_only(
-    target: crank_nicolson.LogDensity, places: NDArray[np.int64]
-) -> crank_nicolson.LogDensity:
+    target: approximation.LogDensity, places: NDArray[np.int64]
+) -> approximation.LogDensity:
     return lambda y: np.where(np.all(y[:, places] >= 0.0, axis=1), target(y), -np.inf)
 
 
@@ -191,7 +191,7 @@ def test_how_often_a_coordinate_is_nothing(stretch: float) -> None:
     """Both of two correlated ones, one of them, or none; with a right and a poor approximation."""
     matrix = some_covariance(3)
     centre, odds = np.array([0.6, -0.2, 0.4]), np.array([0.8, 2.0])
-    mixed = crank_nicolson.mixture(
+    mixed = approximation.mixture(
         centre + 0.2 * (stretch - 1.0),
         stretch * matrix,
         np.array([0, 1]),
@@ -215,7 +215,7 @@ def test_how_often_a_coordinate_is_nothing(stretch: float) -> None:
 def test_what_is_always_nothing_and_what_never_is() -> None:
     matrix = some_covariance(3)
     centre = np.array([0.6, -0.2, 0.4])
-    mixed = crank_nicolson.mixture(
+    mixed = approximation.mixture(
         centre, matrix, np.array([0, 1]), np.zeros(3), 3, np.array([np.inf, -np.inf, -np.inf])
     )
     assert len(mixed.parts) == 1
@@ -242,11 +242,11 @@ def log_gamma_times_normal(y: FloatArray) -> FloatArray:
     return np.asarray(SHAPE * y[:, 0] - np.exp(y[:, 0]) - 0.5 * (y[:, 1] - 0.5 * y[:, 0]) ** 2)
 
 
-def skewed_approximation(seed: int = 9, bend: float = 0.0) -> crank_nicolson.Mixture:
+def skewed_approximation(seed: int = 9, bend: float = 0.0) -> approximation.Mixture:
     """The curvature at the optimum log(shape), as method `pre` would take it."""
     mode = np.log(SHAPE)
     precision = np.array([[SHAPE + 0.25, -0.5], [-0.5, 1.0]])
-    return crank_nicolson.mixture(
+    return approximation.mixture(
         np.array([mode, 0.5 * mode]), np.linalg.inv(precision), NONE, np.array([bend, 0.0]), seed
     )
 
@@ -263,7 +263,7 @@ def test_the_bent_approximation_itself_is_always_accepted(bend: float) -> None:
         w = np.stack([-np.expm1(slope) / bend, w[:, 1]], axis=1)
         return np.asarray(-0.5 * np.einsum("ki,ij,kj->k", w, precision, w) + slope)
 
-    normal = crank_nicolson.mixture(centre, matrix, NONE, np.array([bend, 0.0]), 6)
+    normal = approximation.mixture(centre, matrix, NONE, np.array([bend, 0.0]), 6)
     assert run(target, normal, steps=200).acceptance == 1.0
     assert run(target, straight(centre, matrix, NONE, 6), steps=200).acceptance < 0.98
 
@@ -314,7 +314,7 @@ def test_a_target_moved_by_a_third_of_its_spread_is_caught(dimension: int) -> No
 def test_wrong_weights_would_be_caught() -> None:
     """Negative control: chains that take every proposal give the approximation, not the target."""
 
-    def flat(normal: crank_nicolson.Mixture) -> crank_nicolson.LogDensity:
+    def flat(normal: approximation.Mixture) -> approximation.LogDensity:
         # The approximation's own density as target: everything is accepted.
         (part,) = normal.parts
         return gaussian(part.centre, part.factor @ part.factor.T)
@@ -340,7 +340,7 @@ def test_adapting_never_changes_a_point() -> None:
     normal = skewed_approximation()
     done = run(target, normal, steps=50)
     v = np.random.default_rng(0).normal(0.6, 1.4, (100, crank_nicolson.CHAINS, 2))
-    better = crank_nicolson.adapted(normal, v)
+    better = approximation.adapted(normal, v)
     part = better.parts[0]
     assert part.shift == pytest.approx(np.full(2, 0.6), abs=0.3)
     assert part.scale == pytest.approx(np.full(2, 1.4), abs=0.2)
@@ -357,7 +357,7 @@ def test_adapting_never_changes_a_point() -> None:
 def test_little_that_stands_out_is_not_learnt() -> None:
     normal = skewed_approximation()
     v = np.random.default_rng(0).standard_normal((200, crank_nicolson.CHAINS, 2))
-    same = crank_nicolson.adapted(normal, v)
+    same = approximation.adapted(normal, v)
     assert not same.parts[0].shift.any()
     np.testing.assert_array_equal(same.parts[0].scale, 1.0)
 

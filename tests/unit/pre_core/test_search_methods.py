@@ -17,7 +17,7 @@ from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.residual import Window
 from pre_core.physics.models import from_models
-from pre_core.search import crank_nicolson, levenberg_marquardt, loop
+from pre_core.search import approximation, crank_nicolson, levenberg_marquardt, loop
 from pre_core.search.loop import Ending
 from services.validation.paper import DERIVED, NAMES, table_columns
 
@@ -84,7 +84,7 @@ def bind_chains(window: Window, seed: int, threads: int) -> tuple[Callable[[], S
     def target(y: np.ndarray) -> np.ndarray:
         return -0.5 * np.sum(rows(y) ** 2, axis=1)
 
-    mixed = crank_nicolson.mixture(
+    mixed = approximation.mixture(
         np.array([0.6, 0.3, 0.0]),
         np.diag([0.2, 0.6, 0.1]),
         np.array([2]),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pre_core.crossing.splines import value_at
 from pre_core.crossing.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
 
 Floats = NDArray[np.float64]
@@ -87,7 +88,7 @@ def test_the_error_under_noise_is_that_of_the_best_estimate() -> None:
         drawn = noise * rng.standard_normal(noise.size)
         position = 12.0 * fixes + drawn[: fixes.size]
         trajectory = fitted(fixes, position, 12.0 + drawn[fixes.size :])
-        error[:] = trajectory.spline(queries) - 12.0 * queries
+        error[:] = value_at(trajectory.spline, queries) - 12.0 * queries
     # The standard error of a standard deviation of 400 draws is 3.5 %.
     np.testing.assert_allclose(errors.std(axis=0), expected_m, rtol=0.12)
     assert np.all(np.abs(errors.mean(axis=0)) < 4.0 * expected_m / np.sqrt(400))
@@ -105,7 +106,7 @@ def test_the_misfit_says_whether_the_declared_noise_is_true() -> None:
 
 def test_two_fixes_are_enough_and_one_is_not() -> None:
     trajectory = fitted(np.array([1.0, 3.0]), np.array([10.0, 20.0]), np.array([5.0, 5.0]))
-    assert float(trajectory.spline(2.0)) == pytest.approx(15.0, abs=1e-6)
+    assert float(value_at(trajectory.spline, np.array([2.0]))[0]) == pytest.approx(15.0, abs=1e-6)
     with pytest.raises(ValueError, match="at least two fixes"):
         fitted(np.array([1.0]), np.array([10.0]), np.array([5.0]))
 
