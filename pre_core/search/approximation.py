@@ -217,6 +217,8 @@ def learnt(
     taken over, and what is never negative stays.
     """
     seen = np.isfinite(log_weight)
+    if seen.sum() <= v.shape[1]:  # too few to show anything
+        return mixed
     v, log_weight = v[seen], log_weight[seen]
     in_part = which[seen, None] == np.unique(which[seen])
     rest = log_weight - in_part @ (in_part.T @ log_weight / in_part.sum(axis=0))

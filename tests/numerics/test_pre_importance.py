@@ -169,3 +169,11 @@ def test_weighted_draws_give_up_where_tails_are_heavy() -> None:
     drawn, _, spent = sampling._weighted(target, narrow, 1200, silent)
     assert drawn is None
     assert 2 * 1200 <= spent <= 2 * 3000
+
+
+def test_from_hardly_any_possible_draw_nothing_is_learnt() -> None:
+    plain = straight(np.zeros(4), np.eye(4), NONE, 5)
+    drawn = importance.draw(gaussian(np.zeros(4), np.eye(4)), plain, 40, 0)
+    log_weight = np.full(40, -np.inf)
+    log_weight[:3] = 1.0
+    assert approximation.learnt(plain, drawn.part, drawn.v, log_weight) is plain
