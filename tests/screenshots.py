@@ -37,6 +37,7 @@ SHOTS = (
     Shot("view-bridge", "good.rrd", ("Bridge",), 15_000),
     Shot("view-crossing", "good.rrd", ("2026-01-01",), 15_000),
     Shot("view-told", "good.rrd", ("2026-01-01", "Told", "Map"), 15_000),
+    Shot("view-left-over", "suspect.rrd", ("2026-01-01", "Left over", "Map"), 15_000),
     Shot("view-suspect", "suspect.rrd", ("2026-01-01",), 9_000),
 )
 

@@ -25,14 +25,14 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
-from services.common.progress import progress_bar
+from services.common.progress import progress_bar, reading_bar
 from services.drives.survey import survey
 from services.execution.offline import identify_recordings, site_of
 from services.history.baselines import baselines_of
 from services.history.certificates import found_in
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.identification.bridge_state import Fusing
-from services.recordings.recording import read_messages
+from services.recordings.recording import Message, read_messages
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -94,27 +94,7 @@ def identify_command(
     if json_path is not None:
         write_atomically(json_path, results_json(found))
     if rrd_path is not None:
-        from services.viewer.bridge_view import views_of_bridges
-        from services.viewer.crossing_view import view_of_crossing
-        from services.viewer.rerun_file import write_rrd
-        from services.viewer.rerun_places import bridges_of_site
-        from services.viewer.vehicle_signals import signals_of_messages
-
-        try:
-            with replaced_atomically(rrd_path) as temporary:
-                write_rrd(
-                    temporary,
-                    vehicles=signals_of_messages(
-                        message for path in recordings for message in read_messages(path)
-                    ),
-                    bridges=bridges_of_site(known),
-                    crossings=[
-                        view_of_crossing(c, known.bridge(c.bridge)) for c in found.crossings
-                    ],
-                    overviews=views_of_bridges(found, known, (site or recordings[0]).parent),
-                )
-        except RuntimeError as error:  # so Rerun says that its file could not be written
-            raise FailureError(f"{rrd_path}: could not be written: {error}") from error
+        _write_rerun(rrd_path, recordings, found, known, (site or recordings[0]).parent, console)
     if figures is not None:
         from services.viewer.pictures import write_pictures
 
@@ -127,6 +107,40 @@ def identify_command(
         )
         write_draws(draws_path, kept)
     return 0
+
+
+def _write_rerun(
+    path: Path,
+    recordings: list[Path],
+    found: Results,
+    site: Site,
+    beside: Path,
+    console: "Console",
+) -> None:
+    """The Rerun file of what was found; baselines are looked for `beside`."""
+    from services.viewer.bridge_view import views_of_bridges
+    from services.viewer.residuals import residual_cells
+    from services.viewer.vehicle_signals import signals_of_messages
+    from services.viewer.view import write_views
+
+    def messages(description: str) -> Iterator[Message]:
+        with reading_bar(description, recordings, console) as next_file:
+            for one in recordings:
+                yield from read_messages(one, next_file())
+
+    left = residual_cells(found.crossings, messages("what fits leave over"), site)
+    try:
+        with replaced_atomically(path) as temporary:
+            write_views(
+                temporary,
+                vehicles=signals_of_messages(messages(f"drawing {path.name}")),
+                crossings=found.crossings,
+                site=site,
+                overviews=views_of_bridges(found, site, beside),
+                residuals=left,
+            )
+    except RuntimeError as error:  # so Rerun says that its file could not be written
+        raise FailureError(f"{path}: could not be written: {error}") from error
 
 
 @contextlib.contextmanager

@@ -63,6 +63,18 @@ class ParameterRow(NamedTuple):
     prior: Prior | None = None
 
 
+class ResidualCells(NamedTuple):
+    """What a fit left over, in multiples of what the declared noise explains: 1 is expected."""
+
+    mean_square: FloatArray
+    """(3, 3, b): roads, front and rear body; before, on and behind the bridge; bands. NaN where
+    there are no rows."""
+    excess_std: FloatArray
+    """(3, 3, b): how many standard deviations of chance that lies above 1."""
+    edges_hz: tuple[float, ...]
+    """b + 1, the last infinite."""
+
+
 class CrossingView(NamedTuple):
     """One crossing as it is drawn.
 
@@ -93,6 +105,8 @@ class CrossingView(NamedTuple):
     """Relative standard deviation that all elements have in common (mass, gain)."""
     resolution: str | None = None
     """In words what the crossing could not tell; None where it resolves every element."""
+    residuals: ResidualCells | None = None
+    """None where the samples are not at hand."""
 
     @property
     def span_m(self) -> float:

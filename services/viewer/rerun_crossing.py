@@ -47,6 +47,7 @@ from services.viewer.rerun_places import (
     log_track_on_plan,
     log_truck_on_plan,
 )
+from services.viewer.rerun_residuals import log_residuals
 from services.viewer.strip import (
     STRIP_HEIGHT,
     STRIP_WIDTH,
@@ -78,6 +79,7 @@ def log_crossing(
     log_markdown(recording, f"{root}/verdict", verdict_markdown(crossing, compared))
     _log_rigidity(recording, root, crossing, compared, baseline)
     _log_learned(recording, root, crossing, compared)
+    log_residuals(recording, root, crossing)
     passage = passage_of(crossing)
     if passage is not None:
         _log_passage(recording, root, crossing, passage)

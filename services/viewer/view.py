@@ -10,7 +10,7 @@ import signal
 import subprocess
 import tempfile
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -26,12 +26,13 @@ from services.common.errors import FailureError, InputError
 from services.common.progress import Offset, reading_bar, unwatched
 from services.drives.survey import survey
 from services.history.site_of_results import site_of_results
-from services.recordings.recording import Message, check_message
+from services.recordings.recording import Message, check_message, read_messages
 from services.viewer.bridge_view import BridgeView, views_of_bridges
-from services.viewer.crossing_view import CrossingView, PassingView, view_of_crossing
+from services.viewer.crossing_view import CrossingView, PassingView, ResidualCells, view_of_crossing
 from services.viewer.recording_page import passings_of_survey, recording_page
 from services.viewer.rerun_file import write_rrd
 from services.viewer.rerun_places import bridges_of_site
+from services.viewer.residuals import residual_cells
 from services.viewer.vehicle_signals import Heard, VehicleSignals
 
 SUFFIXES = (".rrd", ".mcap", ".json")
@@ -89,12 +90,16 @@ def convert(
     if not found.info.messages:
         raise InputError(f"{target}: holds no driveby message; a recording of a truck is expected")
     crossings = crossings_of_messages(estimates)
+    residuals: dict[str, ResidualCells] = {}
+    if crossings and found.site is not None:
+        residuals = residual_cells(crossings, read_messages(target), found.site)
     write_views(
         rrd,
         vehicles=heard.signals(),
         crossings=crossings,
         site=found.site,
         passings=passings_of_survey(found, crossings),
+        residuals=residuals,
         about=recording_page(found),
     )
 
@@ -107,12 +112,19 @@ def write_views(
     site: Site | None,
     overviews: Sequence[BridgeView] = (),
     passings: Sequence[PassingView] = (),
+    residuals: Mapping[str, ResidualCells] | None = None,
     about: str | None = None,
 ) -> None:
-    """Write a Rerun file of results and signals; without a site only the signals are drawn."""
+    """Write a Rerun file of results and signals; without a site only the signals are drawn.
+
+    `residuals` are by crossing_id.
+    """
     bridges = {} if site is None else {bridge.id: bridge for bridge in site.bridges}
+    left = residuals or {}
     views: list[CrossingView] = [
-        view_of_crossing(crossing, bridges[crossing.bridge])
+        view_of_crossing(crossing, bridges[crossing.bridge])._replace(
+            residuals=left.get(crossing.crossing_id)
+        )
         for crossing in crossings
         if crossing.bridge in bridges
     ]
