@@ -1,12 +1,16 @@
-"""The pictures of docs/viewer.md, from recordings/sample: python -m tests.screenshots
+"""The pictures of docs/viewer.md and docs/report.md: python -m tests.screenshots [NAME …]
 
-Needs a Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-drivers).
+From recordings/sample. Needs a Vulkan driver, be it one that draws with the processor (Debian:
+mesa-vulkan-drivers), and for the report a browser.
 """
 
 import io
+import os
 import re
+import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,8 +18,10 @@ from PIL import Image
 
 from services.cli import main as cli
 from services.recordings.recording import read_site
+from services.report.pdf import find_browser
 from services.viewer.view import convert
 from tests.viewer_screen import complaints, has_driver, open_tab, opened, picture
+from tests.waiting import LONGEST_S
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "recordings/sample/crossing.mcap"
@@ -49,9 +55,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         make_files(folder)
-        for shot in SHOTS:
-            path = FOLDER / f"{shot.name}.png"
-            path.write_bytes(smaller(take(shot, folder)))
+        takers = {shot.name: partial(take, shot, folder) for shot in SHOTS}
+        takers["report"] = partial(take_report, folder)
+        for wanted in sys.argv[1:] or takers:
+            path = FOLDER / f"{wanted}.png"
+            path.write_bytes(smaller(takers[wanted]()))
             print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
     return 0
 
@@ -64,8 +72,8 @@ def make_files(folder: Path) -> None:
     louder = folder / "louder.toml"
     louder.write_text(re.sub(r"(?m)^noise_density_.*$", "noise_density_ug_per_rthz = 60.0", toml))
     for name, options in (("good", ()), ("suspect", ("--site", str(louder)))):
-        arguments = ["identify", str(SAMPLE), "--rrd", str(folder / f"{name}.rrd"), *options]
-        assert cli.main(arguments) == 0
+        outputs = ("--rrd", f"{folder / name}.rrd", "--json", f"{folder / name}.json")
+        assert cli.main(["identify", str(SAMPLE), *outputs, *options]) == 0
 
 
 def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
@@ -77,6 +85,21 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
         taken = picture(viewer)
         assert complaints(viewer) == []
         return taken
+
+
+def take_report(folder: Path, size: str = "794,1123") -> bytes:
+    """The first page of the sample's report as a browser shows it, A4 at 96 pixels an inch."""
+    html, png = folder / "report.html", folder / "report.png"
+    site = folder / "site.toml"
+    site.write_text(read_site(SAMPLE) or "")
+    found = ["report", str(folder / "good.json"), "--site", str(site), "-o", str(html)]
+    assert cli.main(found) == 0
+    options = ["--headless", "--disable-gpu", "--no-first-run", "--hide-scrollbars"]
+    options += [f"--user-data-dir={folder / 'profile'}", f"--window-size={size}"]
+    options += ["--no-sandbox"] if os.geteuid() == 0 else []
+    command = [find_browser(), *options, f"--screenshot={png}", html.as_uri()]
+    subprocess.run(command, check=True, capture_output=True, timeout=LONGEST_S)
+    return png.read_bytes()
 
 
 def smaller(png: bytes) -> bytes:

@@ -20,6 +20,11 @@ from services.viewer.figure import draw_crossing
 _MOST_PICTURES = 12
 """So many crossings of a bridge have pictures; the others have their numbers."""
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+_HOW_TO_READ = (
+    "EI is the flexural rigidity: how hard the bridge is to bend at a place. A 95 % interval holds "
+    "the truth in 95 of 100 cases, if what is declared of truck and sensors is true. Nominal is "
+    "what the owner wrote down of the sound bridge."
+)
 _NOT_MEANT = (
     (
         "It is a hint where to look at the next inspection, never a condition rating. It says "
@@ -77,7 +82,7 @@ def _bridge(report: BridgeReport, prefix: str) -> Html:
     )
     newest_first = list(reversed(report.crossings))
     heading = joined(tag("h2", "Evidence, crossing by crossing"))
-    if finding.kind == "doubtful":
+    if finding.kind == "doubtful" and report.view.estimate is not None:
         heading = joined(*_what_to_do(report.crossings), heading)
     evidence, pictures = [], 0
     for n, crossing in enumerate(newest_first):
@@ -88,9 +93,10 @@ def _bridge(report: BridgeReport, prefix: str) -> Html:
 
 
 def _not_meant(report: BridgeReport) -> Sequence[str]:
-    if report.finding.kind == "nothing":
-        text = "It means neither that the bridge is sound nor that it is damaged: nothing was "
-        return (text + "measured that could tell.",)
+    if report.view.estimate is None:
+        text = "It means neither that the bridge is sound nor that it is damaged"
+        no_number = report.finding.kind == "nothing"
+        return (text + (": nothing was measured that could tell." if no_number else "."),)
     return _NOT_MEANT
 
 
@@ -123,7 +129,7 @@ def _facts(report: BridgeReport) -> Html:
 def _result(report: BridgeReport, prefix: str) -> Iterator[Html]:
     view = report.view
     if view.estimate is None:
-        yield tag("h2", "Why nothing can be said")
+        yield tag("h2", "Why")
         counted: dict[str, int] = {}
         for crossing in report.crossings:
             for text in crossing.reason_texts:
@@ -155,6 +161,8 @@ def _elements(report: BridgeReport) -> Html:
             element = compared[n]
             change = f"{_signed(element.ratio)} ({_signed(element.low)} to {_signed(element.high)})"
             remark = "weaker" if element.is_weak else "stiffer" if element.is_stiff else ""
+        if n + 1 in view.unresolved and not remark:
+            remark = "not resolved"
         rows.append(
             [
                 str(n + 1),
@@ -163,7 +171,7 @@ def _elements(report: BridgeReport) -> Html:
                 f"{low:.2f}–{high:.2f}",
                 f"{mean / view.nominal_nm2[n]:.3f}",
                 change,
-                remark + ("?" if remark and view.is_doubtful else ""),
+                remark + ("?" if remark in ("weaker", "stiffer") and view.is_doubtful else ""),
             ]
         )
         classes.append("" if view.is_doubtful else {"weaker": "weak"}.get(remark, ""))
@@ -172,6 +180,7 @@ def _elements(report: BridgeReport) -> Html:
 
 def _caveats(report: BridgeReport) -> Iterator[Html]:
     comparison = report.view.comparison
+    yield tag("p", _HOW_TO_READ, class_="note")
     if comparison is None:
         return
     if comparison.reference == "others":

@@ -13,8 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from services.identification.comparison import sentences
-from services.viewer.bridge_view import BridgeView
+from services.viewer.bridge_view import BridgeView, told
 from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
     BANNERS,
@@ -83,7 +82,14 @@ def _draw_panel(axes: Axes, bridge: BridgeView) -> None:
         mean, low, high = (column / 1e9 for column in bridge.estimate[:3])
         weak = () if bridge.comparison is None else bridge.comparison.weak
         numbers = {element.number for element in weak}
-        draw_bars(axes, bridge.edges_m, mean, numbers, doubtful=bridge.is_doubtful)
+        draw_bars(
+            axes,
+            bridge.edges_m,
+            mean,
+            numbers,
+            doubtful=bridge.is_doubtful,
+            unresolved=bridge.unresolved,
+        )
         colour = MUTED if bridge.is_doubtful else BAR_EDGE
         draw_intervals(axes, bridge.edges_m, low, high, colour=colour, label="95 % interval")
         highest = max(highest, float(high.max()), _draw_crossings(axes, bridge))
@@ -143,8 +149,8 @@ def _draw_heading(figure: Figure, bridge: BridgeView) -> None:
     title = textwrap.shorten(f"Bridge {name}, {bridge.span_m:g} m", width=52, placeholder=" …")
     large: dict[str, Any] = {"fontsize": 14, "fontweight": "bold", "va": "top"}
     figure.text(LEFT, 1.0 - 0.18 / height, title, parse_math=False, **large)
-    doubt = "DOUBTFUL: a crossing that was used is suspect. " if bridge.is_doubtful else ""
-    said = " ".join(sentences(bridge.comparison))
+    doubt = f"DOUBTFUL: {_doubt(bridge)} " if bridge.is_doubtful else ""
+    said = " ".join(told(bridge))
     if bridge.estimate is None:
         number = len(bridge.crossings)
         said = f"No finding: none of {number} crossings could be used."
@@ -158,6 +164,13 @@ def _draw_heading(figure: Figure, bridge: BridgeView) -> None:
         banner = {"boxstyle": "round,pad=0.35", "linewidth": 1.4} | colours
     words = "\n".join(lines)
     figure.text(LEFT + 0.006, top, words, fontsize=9.5, color=INK, va="top", bbox=banner)
+
+
+def _doubt(bridge: BridgeView) -> str:
+    """Why what is shown is doubtful, in a sentence."""
+    if bridge.state is not None and bridge.state.reason_texts:
+        return bridge.state.reason_texts[0]
+    return "a crossing that was used is suspect."
 
 
 def _why_nothing(bridge: BridgeView) -> str:

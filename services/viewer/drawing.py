@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import textwrap
+from collections.abc import Set
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyBboxPatch
+from matplotlib.patches import FancyBboxPatch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from services.common.files import write_atomically
@@ -125,9 +126,18 @@ def draw_verdict(figure: Figure, verdict: str, reasons: tuple[str, ...], top: fl
 
 
 def draw_bars(
-    axes: Axes, edges_m: FloatArray, heights: FloatArray, weak: set[int], *, doubtful: bool
+    axes: Axes,
+    edges_m: FloatArray,
+    heights: FloatArray,
+    weak: set[int],
+    *,
+    doubtful: bool,
+    unresolved: Set[int] = frozenset(),
 ) -> None:
-    """A bar for each element: the weak ones stand out, doubtful ones are grey and hatched."""
+    """A bar for each element: the weak ones stand out, doubtful ones are grey and hatched.
+
+    Those that are `unresolved` are empty, with a dashed edge.
+    """
     centres, lengths = (edges_m[:-1] + edges_m[1:]) / 2.0, np.diff(edges_m)
     bars = axes.bar(
         centres,
@@ -140,9 +150,27 @@ def draw_bars(
         zorder=2,
         label="estimate, doubtful" if doubtful else "estimate",
     )
+    if doubtful:
+        return
     for number, bar in enumerate(bars, start=1):
-        if number in weak and not doubtful:
+        if number in unresolved:
+            bar.set(facecolor="white", linestyle="--")
+        if number in weak:
             bar.set(facecolor=WEAK_BAR, edgecolor=WEAK_EDGE, linewidth=1.8)
+    if unresolved:  # a legend would show the first bar, whatever that is
+        bars.set_label("")
+        for name, fill, line in (("estimate", BAR, "-"), ("not resolved", "white", "--")):
+            axes.add_patch(
+                Rectangle(
+                    (0.0, 0.0),
+                    0.0,
+                    0.0,
+                    facecolor=fill,
+                    edgecolor=BAR_EDGE,
+                    linestyle=line,
+                    label=name,
+                )
+            )
 
 
 def draw_intervals(

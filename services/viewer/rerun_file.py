@@ -18,9 +18,8 @@ from matplotlib.image import imread
 from schemas.signals import AccelBatch
 from services.common.files import replaced_atomically
 from services.drives.signals import series_of_batches
-from services.identification.comparison import sentences
 from services.viewer.bridge_figure import draw_bridge
-from services.viewer.bridge_view import BridgeView
+from services.viewer.bridge_view import BridgeView, told
 from services.viewer.crossing_view import CrossingView, FloatArray, OnBridge, PassingView
 from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.layout import blueprint, bridge_root, passing_root
@@ -190,12 +189,14 @@ def _log_overview(recording: rr.RecordingStream, bridge: BridgeView) -> None:
     recording.log(f"{root}/picture", rr.Image(pixels), static=True)
     said = "None of the crossings could be used."
     if bridge.estimate is not None:
-        said = " ".join(sentences(bridge.comparison))
+        said = " ".join(told(bridge))
     doubt = "**Doubtful: to be looked at, not to be relied upon.** " if bridge.is_doubtful else ""
     lines = [f"# {bridge.owner_id or bridge.bridge}", "", f"{doubt}{said}", ""]
     verdicts = [crossing.verdict for crossing in bridge.crossings]
     counted = [f"{verdicts.count(v)} {v}" for v in dict.fromkeys(sorted(verdicts))]
     lines += [f"Crossings: {', '.join(counted)}; used: {len(bridge.used)}.", ""]
-    reasons = dict.fromkeys(text for c in bridge.crossings for text in c.reason_texts)
+    of_state = () if bridge.state is None else bridge.state.reason_texts
+    of_crossings = (text for c in bridge.crossings for text in c.reason_texts)
+    reasons = dict.fromkeys((*of_state, *of_crossings))
     lines += [f"- {text}" for text in reasons]
     log_markdown(recording, f"{root}/finding", "\n".join(lines))

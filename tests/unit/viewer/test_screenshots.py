@@ -5,6 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.cli import main as cli
+from services.common.errors import FailureError
+from services.report.pdf import find_browser
 from tests import screenshots
 from tests.viewer_screen import has_driver, pixels
 
@@ -28,3 +31,18 @@ def test_every_picture_can_be_made_and_shows_something(tmp_path: Path) -> None:
         taken = pixels(screenshots.smaller(screenshots.take(shot, tmp_path)))
         lit = (np.abs(taken - taken[-1, -1]).max(axis=2) > 0.2).mean()
         assert lit > 0.02, shot.name
+
+
+@pytest.mark.slow
+@pytest.mark.process
+def test_the_report_can_be_photographed_and_names_the_weak_element(tmp_path: Path) -> None:
+    try:
+        find_browser()
+    except FailureError:
+        pytest.skip("no browser (Debian: apt install chromium)")
+    assert (screenshots.FOLDER / "report.png").stat().st_size < screenshots.MOST_BYTES
+    outputs = ["--json", str(tmp_path / "good.json")]
+    assert cli.main(["identify", str(screenshots.SAMPLE), *outputs]) == 0
+    taken = pixels(screenshots.smaller(screenshots.take_report(tmp_path)))
+    box = np.array([0xFD, 0xF0, 0xD5]) / 255.0  # of a finding that names an element
+    assert (np.abs(taken - box).max(axis=2) < 0.02).mean() > 0.03
