@@ -1,7 +1,8 @@
-"""The pictures of docs/viewer.md and docs/report.md: python -m tests.screenshots [NAME …]
+"""The pictures of the README, docs/viewer.md and docs/report.md: python -m tests.screenshots
 
-From recordings/sample. Needs a Vulkan driver, be it one that draws with the processor (Debian:
-mesa-vulkan-drivers), and for the report a browser.
+From recordings/sample and the demo; one from crossings that are not in the repository. Needs a
+Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-drivers), and for the
+report a browser.
 """
 
 import io
@@ -10,6 +11,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -48,6 +50,11 @@ SHOTS = (
 )
 
 
+SHARED = ROOT.parent / "shared/crossings/d9_everything_16_runs"
+"""Crossings of an independent simulator, which are not in the repository."""
+OF_MANY = Shot("view-many", "many.rrd", ("Bridge",), 15_000)
+
+
 def main() -> int:
     if not has_driver():
         print("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)", file=sys.stderr)
@@ -55,8 +62,14 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         make_files(folder)
-        takers = {shot.name: partial(take, shot, folder) for shot in SHOTS}
+        takers: dict[str, Callable[[], bytes]] = {
+            shot.name: partial(take, shot, folder) for shot in SHOTS
+        }
         takers["report"] = partial(take_report, folder)
+        takers["demo"] = partial(take_demo, folder)
+        if SHARED.is_dir():
+            make_many(folder)
+            takers[OF_MANY.name] = partial(take, OF_MANY, folder)
         for wanted in sys.argv[1:] or takers:
             path = FOLDER / f"{wanted}.png"
             path.write_bytes(smaller(takers[wanted]()))
@@ -74,6 +87,20 @@ def make_files(folder: Path) -> None:
     for name, options in (("good", ()), ("suspect", ("--site", str(louder)))):
         outputs = ("--rrd", f"{folder / name}.rrd", "--json", f"{folder / name}.json")
         assert cli.main(["identify", str(SAMPLE), *outputs, *options]) == 0
+
+
+def make_many(folder: Path) -> None:
+    """Sixteen crossings with everything at once: twin tyres, bearings that give, friction."""
+    drive = str(folder / "many.mcap")
+    imported = ["import", str(SHARED), "--site", str(SHARED / "site.toml"), "-o", drive]
+    assert cli.main(imported) == 0
+    assert cli.main(["identify", drive, "--rrd", str(folder / "many.rrd")]) == 0
+
+
+def take_demo(folder: Path) -> bytes:
+    """The picture that the demo leaves."""
+    assert cli.main(["demo", "--out", str(folder / "demo")]) == 0
+    return (folder / "demo/demo.png").read_bytes()
 
 
 def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
@@ -107,7 +134,7 @@ def smaller(png: bytes) -> bytes:
     written = io.BytesIO()
     few = Image.open(io.BytesIO(png)).convert("RGB").quantize(128, dither=Image.Dither.NONE)
     few.save(written, "png", optimize=True)
-    assert len(written.getvalue()) < MOST_BYTES
+    assert len(written.getvalue()) < MOST_BYTES, f"{len(written.getvalue())} bytes"
     return written.getvalue()
 
 

@@ -19,7 +19,12 @@ from services.identification.comparison import (
     sentences,
 )
 from services.viewer.baseline import named_baseline
-from services.viewer.crossing_view import CrossingView, FloatArray, view_of_crossing
+from services.viewer.crossing_view import (
+    CrossingView,
+    FloatArray,
+    unresolved_elements,
+    view_of_crossing,
+)
 
 
 class BridgeView(NamedTuple):
@@ -54,8 +59,7 @@ class BridgeView(NamedTuple):
         """Numbers of the elements of which too little is known to tell a loss of half of them."""
         if self.state is None or self.estimate is None:
             return frozenset()
-        elements = enumerate(self.state.elements.values(), start=1)
-        return frozenset(n for n, one in elements if one.std > RESOLVED * abs(one.mean))
+        return unresolved_elements(self.state.elements.values())
 
     @property
     def elsewhere(self) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from matplotlib.patches import FancyBboxPatch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from services.common.files import write_atomically
+from services.identification.comparison import Element
 from services.viewer.crossing_view import (
     TRUTH_COLOUR,
     VEHICLE_COLOURS,
@@ -97,12 +98,20 @@ def figure_bytes(figure: Figure, form: str, *, dpi: int = DPI) -> bytes:
     return buffer.getvalue()
 
 
-def draw_verdict(figure: Figure, verdict: str, reasons: tuple[str, ...], top: float) -> None:
-    """The verdict below a heading: a word if it is good, a banner with the reasons if not."""
+def draw_verdict(
+    figure: Figure, verdict: str, reasons: tuple[str, ...], top: float, told: Sequence[str] = ()
+) -> None:
+    """The verdict below a heading: a word if it is good, a banner with the reasons if not.
+
+    Of what was `told` the first sentence stands beside a good one.
+    """
     words: dict[str, Any] = {"fontsize": 9.5, "va": "top"}
     if verdict == "good":
         colour = VERDICT_COLOURS["good"]
         figure.text(LEFT, top, "verdict: good", color=colour, fontweight="bold", **words)
+        if told:
+            short = textwrap.shorten(told[0], width=100, placeholder=" …")
+            figure.text(LEFT + 0.12, top, short, color=INK, parse_math=False, **words)
         return
     height = 0.40 / figure.get_figheight()
     figure.add_artist(
@@ -182,6 +191,22 @@ def draw_intervals(
     for end in (low, high):
         left, right = centres - 0.09 * lengths, centres + 0.09 * lengths
         axes.hlines(end, left, right, color=colour, zorder=5)
+
+
+def label_loss(
+    axes: Axes, element: Element, top: float, *, small: bool, doubt: str = "", up: float = 8.0
+) -> None:
+    """What an element has lost, over its interval that ends at `top`."""
+    axes.annotate(
+        f"{100.0 * (1.0 - element.ratio):.0f} % less{doubt}",
+        ((element.from_m + element.to_m) / 2.0, top),
+        xytext=(0, up),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8 if small else 9.5,
+        fontweight="bold",
+        zorder=8,
+    )
 
 
 def label_bars(
