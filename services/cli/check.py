@@ -33,9 +33,12 @@ def add_check(commands: Any) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
+    from services.common.progress import reading_bar
     from services.inspection.inspect import inspect
 
-    found = list(inspect(options.paths))
+    recordings = [path for path in options.paths if path.suffix != ".toml"]
+    with reading_bar("looking", recordings) as next_file:
+        found = list(inspect(options.paths, next_file))
     is_wrong = any(report.is_wrong for report in found)
     if options.json:
         content = {"is_wrong": is_wrong, "reports": [as_json(report) for report in found]}

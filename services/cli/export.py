@@ -38,7 +38,7 @@ def add_export(commands: Any) -> None:
 
 def _export(options: argparse.Namespace) -> int:
     from services.common.files import check_folder_writable, write_atomically
-    from services.common.progress import reading_bar
+    from services.common.progress import reading_bar, steps_bar
     from services.drives.signals import signals_of_recording
     from services.drives.survey import survey
     from services.export.found import tables_of_results
@@ -59,7 +59,10 @@ def _export(options: argparse.Namespace) -> int:
         runs = [run for path in recordings for run in signals_of_recording(path, next_file())]
     passings = []
     if results is None and site is not None:
-        passings = [p for path in recordings for p in survey(path, site).passings]
+        with reading_bar("looking for crossings", recordings) as next_file:
+            passings = [
+                p for path in recordings for p in survey(path, site, progress=next_file()).passings
+            ]
     tables: list[Table] = []
     if form == "parquet":
         tables += tables_of_runs(runs) if runs else []
@@ -69,9 +72,11 @@ def _export(options: argparse.Namespace) -> int:
         tables += tables_of_results(results, site)
     folder.mkdir(parents=True, exist_ok=True)
     _check_no_others(folder, {f"{table.name}.csv" for table in tables if form == "csv" and runs})
-    for table in tables:
-        path = write_table(folder, table, form)
-        print(f"{path}: {len(next(iter(table.columns.values())))} rows")
+    with steps_bar(f"writing into {folder}") as progress:
+        for number, table in enumerate(tables):
+            progress(number, len(tables))
+            path = write_table(folder, table, form)
+            print(f"{path}: {len(next(iter(table.columns.values())))} rows")
     if site is None:
         print("no site file: places of bridges are not known, so there is no GeoJSON")
         return 0

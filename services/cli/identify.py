@@ -3,6 +3,7 @@
 import contextlib
 import logging
 from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,14 +26,14 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
-from services.common.progress import progress_bar, reading_bar
+from services.common.progress import progress_bar, reading_bar, steps_bar
 from services.drives.survey import survey
 from services.execution.offline import identify_recordings, site_of
 from services.history.baselines import baselines_of
 from services.history.certificates import found_in
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.identification.bridge_state import Fusing
-from services.recordings.recording import Message, read_messages
+from services.recordings.recording import read_messages
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -98,7 +99,8 @@ def identify_command(
     if figures is not None:
         from services.viewer.pictures import write_pictures
 
-        written = write_pictures(figures, found, known)
+        with steps_bar(f"drawing into {figures}", console) as drawn:
+            written = write_pictures(figures, found, known, drawn)
         console.print(f"{len(written)} pictures in {figures}", highlight=False, soft_wrap=True)
     if draws_path is not None:
         kept = (
@@ -123,21 +125,26 @@ def _write_rerun(
     from services.viewer.vehicle_signals import signals_of_messages
     from services.viewer.view import write_views
 
-    def messages(description: str) -> Iterator[Message]:
-        with reading_bar(description, recordings, console) as next_file:
-            for one in recordings:
-                yield from read_messages(one, next_file())
-
-    left = residual_cells(found.crossings, messages("what fits leave over"), site)
+    messages = chain.from_iterable(map(read_messages, recordings))
+    with steps_bar("what fits leave over", console) as progress:
+        left = residual_cells(found.crossings, messages, site, progress)
+    with reading_bar("reading", recordings, console) as next_file:
+        vehicles = signals_of_messages(
+            message for one in recordings for message in read_messages(one, next_file())
+        )
     try:
-        with replaced_atomically(path) as temporary:
+        with (
+            replaced_atomically(path) as temporary,
+            steps_bar(f"drawing {path.name}", console) as drawing,
+        ):
             write_views(
                 temporary,
-                vehicles=signals_of_messages(messages(f"drawing {path.name}")),
+                vehicles=vehicles,
                 crossings=found.crossings,
                 site=site,
                 overviews=views_of_bridges(found, site, beside),
                 residuals=left,
+                drawing=drawing,
             )
     except RuntimeError as error:  # so Rerun says that its file could not be written
         raise FailureError(f"{path}: could not be written: {error}") from error

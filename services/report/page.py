@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 
 import matplotlib
 
 from schemas.results import Crossing
+from services.common.progress import Steps, unwatched_steps
 from services.identification.comparison import Comparison
 from services.report.bridge import BridgeReport, advice
 from services.report.html import Html, inlined_svg, joined, table, tag
@@ -45,8 +46,20 @@ _NOT_MEANT = (
 )
 
 
-def page(reports: Sequence[BridgeReport]) -> str:
-    """The whole report as one HTML file that needs nothing else, neither network nor scripts."""
+def page(reports: Sequence[BridgeReport], progress: Steps = unwatched_steps) -> str:
+    """The whole report as one HTML file that needs nothing else, neither network nor scripts.
+
+    `progress` is told of each picture.
+    """
+    steps = sum(map(_pictures, reports))
+    done = 0
+
+    def drawn() -> None:
+        nonlocal done
+        done += 1
+        progress(done, steps)
+
+    progress(0, steps)
     title = ", ".join(_name(report) for report in reports) or "no bridge"
     head = tag(
         "head",
@@ -56,13 +69,19 @@ def page(reports: Sequence[BridgeReport]) -> str:
         tag("title", f"Stiffness of {title}"),
         tag("style", Html(CSS)),
     )
-    bodies = [_bridge(report, f"b{n}-") for n, report in enumerate(reports)]
+    bodies = [_bridge(report, f"b{n}-", drawn) for n, report in enumerate(reports)]
     if not bodies:
         bodies = [joined(tag("h1", "No crossing"), tag("p", "No truck crossed a known bridge."))]
     return f"<!DOCTYPE html>\n{tag('html', head, tag('body', *bodies), lang='en')}\n"
 
 
-def _bridge(report: BridgeReport, prefix: str) -> Html:
+def _pictures(report: BridgeReport) -> int:
+    """How many there are of a bridge."""
+    shown = sum(crossing.parameters is not None for crossing in report.crossings)
+    return (report.view.estimate is not None) + min(shown, _MOST_PICTURES)
+
+
+def _bridge(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Html:
     finding = report.finding
     first = tag(
         "section",
@@ -75,7 +94,7 @@ def _bridge(report: BridgeReport, prefix: str) -> Html:
             class_=f"finding {finding.kind}",
         ),
         _facts(report),
-        *_result(report, prefix),
+        *_result(report, prefix, drawn),
         tag("h2", "What this does not mean"),
         tag("ul", *(tag("li", text) for text in _not_meant(report))),
         class_="first",
@@ -89,6 +108,8 @@ def _bridge(report: BridgeReport, prefix: str) -> Html:
         has_picture = crossing.parameters is not None and pictures < _MOST_PICTURES
         pictures += has_picture
         evidence.append(_crossing(report, crossing, f"{prefix}c{n}-" if has_picture else None))
+        if has_picture:
+            drawn()
     return joined(first, tag("section", heading, class_="break"), *evidence)
 
 
@@ -126,7 +147,7 @@ def _facts(report: BridgeReport) -> Html:
     )
 
 
-def _result(report: BridgeReport, prefix: str) -> Iterator[Html]:
+def _result(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Iterator[Html]:
     view = report.view
     if view.estimate is None:
         yield tag("h2", "Why")
@@ -141,6 +162,7 @@ def _result(report: BridgeReport, prefix: str) -> Iterator[Html]:
         return
     with matplotlib.rc_context(STYLE):
         svg = figure_bytes(draw_bridge(view, with_heading=False), "svg")
+    drawn()
     said = " ".join(report.finding.sentences)
     yield tag("figure", inlined_svg(svg, prefix, f"EI along the span. {said}"))
     yield _elements(report)

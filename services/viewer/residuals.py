@@ -19,6 +19,7 @@ from schemas.results import Crossing, Header
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.site import Site
+from services.common.progress import Steps, unwatched_steps
 from services.execution.blas import one_blas_thread
 from services.execution.dispatch import feed_all
 from services.execution.here import Here
@@ -47,12 +48,15 @@ class _Seen(NamedTuple):
 
 
 def residual_cells(
-    crossings: Iterable[Crossing], messages: Iterable[Message], site: Site
+    crossings: Iterable[Crossing],
+    messages: Iterable[Message],
+    site: Site,
+    progress: Steps = unwatched_steps,
 ) -> dict[str, ResidualCells]:
     """By crossing_id, of the newest crossings by method `pre` whose samples are in the messages.
 
     A crossing is left out if its chi2 does not come out again: its samples or its site file are not
-    those that it was identified from.
+    those that it was identified from. `progress` is told of each crossing.
     """
     fitted = [c for c in crossings if c.method == "pre" and c.parameters is not None]
     newest = sorted(fitted, key=lambda one: one.entry_time)[-_MOST:]
@@ -61,7 +65,9 @@ def residual_cells(
         return {}
     found = {}
     with one_blas_thread():
-        for data, result in _seen(wanted, messages, site):
+        seen = _seen(wanted, messages, site)
+        for number, (data, result) in enumerate(seen):
+            progress(number, len(seen))
             cells = _cells(data, result)
             if cells is not None:
                 found[result.crossing_id] = cells

@@ -23,7 +23,13 @@ from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.common.errors import FailureError, InputError
-from services.common.progress import Offset, reading_bar, unwatched
+from services.common.progress import (
+    Offset,
+    Steps,
+    progress_bar,
+    unwatched,
+    unwatched_steps,
+)
 from services.drives.survey import survey
 from services.history.site_of_results import site_of_results
 from services.recordings.recording import Message, check_message, read_messages
@@ -53,15 +59,31 @@ def view_command(*, target: str | Path, web: bool, console: Console) -> int:
         shown = path
         if path.suffix != ".rrd":
             shown = Path(folder) / f"{path.stem}.rrd"
-            with reading_bar(f"preparing {path.name}", [path], console) as next_file:
-                convert(path, shown, progress=next_file())
+            with progress_bar(console) as bar:
+                reading = bar.add_task(f"reading {path.name}", total=path.stat().st_size)
+                drawn = bar.add_task("drawing", total=None, visible=False)
+                convert(
+                    path,
+                    shown,
+                    progress=lambda offset: bar.update(reading, completed=offset),
+                    drawing=lambda done, steps: bar.update(
+                        drawn, completed=done, total=steps, visible=True
+                    ),
+                )
         return _run_viewer(shown, web=web)
 
 
 def convert(
-    target: Path, rrd: Path, *, site: Path | None = None, progress: Offset = unwatched
+    target: Path,
+    rrd: Path,
+    *,
+    site: Path | None = None,
+    progress: Offset = unwatched,
+    drawing: Steps = unwatched_steps,
 ) -> None:
     """Write the Rerun file of a recording (.mcap) or of results (.json).
+
+    `progress` is told how far the recording has been read, `drawing` how far that is written.
 
     Results do not say where their bridge is: `site` does, or a recording in the same folder. The
     crossings in a recording that nobody has identified yet are shown with what was measured.
@@ -75,6 +97,7 @@ def convert(
             crossings=results.crossings,
             site=bridges,
             overviews=views_of_bridges(results, bridges, (site or target).parent),
+            drawing=drawing,
         )
         return
     heard, estimates = Heard(), list[Message]()
@@ -101,6 +124,7 @@ def convert(
         passings=passings_of_survey(found, crossings),
         residuals=residuals,
         about=recording_page(found),
+        drawing=drawing,
     )
 
 
@@ -114,6 +138,7 @@ def write_views(
     passings: Sequence[PassingView] = (),
     residuals: Mapping[str, ResidualCells] | None = None,
     about: str | None = None,
+    drawing: Steps = unwatched_steps,
 ) -> None:
     """Write a Rerun file of results and signals; without a site only the signals are drawn.
 
@@ -137,6 +162,7 @@ def write_views(
         overviews=overviews,
         passings=passings,
         about=about,
+        drawing=drawing,
     )
 
 
