@@ -36,8 +36,6 @@ _SAME_CHI2 = 0.1
 _AROUND_NS = 30 * 10**9
 """Fixes and samples so long before and after a crossing are what its identification looked at."""
 _BELIEVED = 0.999
-_MOST = 12
-"""The newest so many crossings: each takes half a second."""
 
 
 class _Seen(NamedTuple):
@@ -52,14 +50,16 @@ def residual_cells(
     messages: Iterable[Message],
     site: Site,
     progress: Steps = unwatched_steps,
+    most: int = 12,
 ) -> dict[str, ResidualCells]:
-    """By crossing_id, of the newest crossings by method `pre` whose samples are in the messages.
+    """By crossing_id, of crossings by method `pre` whose samples are in the messages.
 
     A crossing is left out if its chi2 does not come out again: its samples or its site file are not
-    those that it was identified from. `progress` is told of each crossing.
+    those that it was identified from. Of more than `most` the newest count: each
+    takes half a second. `progress` is told of each.
     """
     fitted = [c for c in crossings if c.method == "pre" and c.parameters is not None]
-    newest = sorted(fitted, key=lambda one: one.entry_time)[-_MOST:]
+    newest = sorted(fitted, key=lambda one: one.entry_time)[-most:]
     wanted = {crossing.crossing_id: crossing for crossing in newest}
     if not wanted:
         return {}
