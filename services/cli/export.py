@@ -33,6 +33,11 @@ def add_export(commands: Any) -> None:
     p.add_argument(
         "--format", choices=("csv", "parquet"), default="csv", help="of the tables (default: csv)"
     )
+    p.add_argument(
+        "--sensorthings",
+        action="store_true",
+        help="results as entities of OGC SensorThings API 1.1 too",
+    )
     add_site(p, "where bridges are (default: as the recordings say)")
 
 
@@ -44,6 +49,7 @@ def _export(options: argparse.Namespace) -> int:
     from services.export.found import tables_of_results
     from services.export.geojson import crossings_geojson, elements_geojson
     from services.export.measured import as_measured, tables_of_run, tables_of_runs
+    from services.export.sensorthings import sensorthings
     from services.export.tables import write_table
     from services.recordings.together import recordings_in
 
@@ -55,6 +61,8 @@ def _export(options: argparse.Namespace) -> int:
     recordings = recordings_in(path for path in options.sources if path.suffix != ".json")
     results, results_path = _results(options.sources)
     site = _site(options.site, recordings, results, results_path)
+    if options.sensorthings and (results is None or site is None):
+        raise InputError("--sensorthings: wants a results file, and the site file of its bridges")
     with reading_bar("reading", recordings) as next_file:
         runs = [run for path in recordings for run in signals_of_recording(path, next_file())]
     passings = []
@@ -85,6 +93,8 @@ def _export(options: argparse.Namespace) -> int:
         "elements.geojson": elements_geojson(site, results),
         "crossings.geojson": crossings_geojson(site, crossings, passings),
     }
+    if options.sensorthings and results is not None:
+        texts["sensorthings.json"] = sensorthings(site, results)
     if form == "csv" and runs:
         texts["site.toml"] = as_measured(site)
     for name, text in texts.items():
