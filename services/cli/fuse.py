@@ -57,6 +57,13 @@ def fuse_command(
     with steps_bar("reading", console) as progress:
         files = sorted(_loaded(paths, progress), key=lambda one: one.created)
     crossings = {c.crossing_id: c for one in files for c in one.crossings}
+    again = sum(len(one.crossings) for one in files) - len(crossings)
+    if again:
+        console.print(
+            f"{again} result{'s' if again > 1 else ''} of crossings that another file has too: the "
+            "newest counts",
+            highlight=False,
+        )
     realms = sorted({crossing.realm for crossing in crossings.values()})
     if len(realms) > 1:
         raise InputError(f"{paths[0]}: crossings of {', '.join(realms)}; fuse one realm at a time")
@@ -93,6 +100,12 @@ def fuse_command(
 def _loaded(paths: list[Path], progress: Steps) -> Iterator[Results]:
     """The files, by their sizes as they are read."""
     sizes = [path.stat().st_size if path.is_file() else 0 for path in paths]
+    for path in paths:
+        if path.suffix == ".mcap":
+            raise InputError(
+                f"{path}: is a recording, results are expected: "
+                f"driveby identify {path} --json RESULTS.json makes them"
+            )
     for number, path in enumerate(paths):
         progress(sum(sizes[:number]), sum(sizes))
         yield load_results(path)
