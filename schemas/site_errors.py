@@ -50,11 +50,17 @@ def first_line(error: ValidationError, single: set[str], tables: Tables) -> str:
     """
     # A misspelt field is also a missing one: the spelling is what the user can see. And a list
     # whose entry is wrong is counted by Pydantic as too short as well.
+    line, *others = all_lines(error, single, tables)
+    return f"{line} (and {len(others)} more, driveby check lists them)" if others else line
+
+
+def all_lines(error: ValidationError, single: set[str], tables: Tables) -> list[str]:
+    """What to mend, a line each and the most telling first; arguments as above."""
     order = {"extra_forbidden": 0, "too_short": 2}
     problems = sorted(error.errors(include_url=False), key=lambda p: order.get(p["type"], 1))
-    line = _describe(problems[0], single, tables)
-    others = sum(p["type"] != "too_short" for p in problems) - 1
-    return f"{line} (and {others} more)" if others > 0 else line
+    first, *others = problems
+    told = [first, *(p for p in others if p["type"] != "too_short")]
+    return [_describe(problem, single, tables) for problem in told]
 
 
 def _describe(problem: Any, single: set[str], tables: Tables) -> str:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 
 from schemas.errors import InputError
 from schemas.site import MAX_ELEMENTS, MAX_TABLES, Bridge, Receiver, Sensor, Site, Vehicle
-from schemas.site_errors import Tables, first_line
+from schemas.site_errors import Tables, all_lines, first_line
 from schemas.toml_text import parse_toml, read_toml_text
 
 _MOST_FIELDS: Final = 100
@@ -45,6 +45,23 @@ def parse_site(toml_text: str, source_name: str) -> Site:
         return Site.model_validate(table)
     except ValidationError as error:
         raise InputError(f"{source_name}: {first_line(error, single, _TABLES)}") from error
+
+
+def faults_of_site(toml_text: str, source_name: str) -> list[str]:
+    """Everything that is wrong with a site file, a line each; none if it can be read.
+
+    What is told from several fields together is told once each of them is right.
+    """
+    try:
+        parse_site(toml_text, source_name)
+    except InputError as error:
+        cause = error.__cause__
+        if not isinstance(cause, ValidationError):
+            return [str(error)]
+        table = parse_toml(toml_text, source_name)
+        single = {name for name in ("vehicle", "bridge") if isinstance(table.get(name), dict)}
+        return [f"{source_name}: {line}" for line in all_lines(cause, single, _TABLES)]
+    return []
 
 
 def _too_many(table: dict[str, Any]) -> str | None:

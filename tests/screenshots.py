@@ -1,12 +1,18 @@
-"""The pictures of docs/viewer.md, from recordings/sample: python -m tests.screenshots
+"""The pictures of the README, docs/viewer.md and docs/report.md: python -m tests.screenshots
 
-Needs a Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-drivers).
+From recordings/sample and the demo; one from crossings that are not in the repository. Needs a
+Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-drivers), and for the
+report a browser.
 """
 
 import io
+import os
 import re
+import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,8 +20,10 @@ from PIL import Image
 
 from services.cli import main as cli
 from services.recordings.recording import read_site
+from services.report.pdf import find_browser
 from services.viewer.view import convert
 from tests.viewer_screen import complaints, has_driver, open_tab, opened, picture
+from tests.waiting import LONGEST_S
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "recordings/sample/crossing.mcap"
@@ -37,8 +45,14 @@ SHOTS = (
     Shot("view-bridge", "good.rrd", ("Bridge",), 15_000),
     Shot("view-crossing", "good.rrd", ("2026-01-01",), 15_000),
     Shot("view-told", "good.rrd", ("2026-01-01", "Told", "Map"), 15_000),
+    Shot("view-left-over", "suspect.rrd", ("2026-01-01", "Left over", "Map"), 15_000),
     Shot("view-suspect", "suspect.rrd", ("2026-01-01",), 9_000),
 )
+
+
+SHARED = ROOT.parent / "shared/crossings/d9_everything_16_runs"
+"""Crossings of an independent simulator, which are not in the repository."""
+OF_MANY = Shot("view-many", "many.rrd", ("Bridge",), 15_000)
 
 
 def main() -> int:
@@ -48,9 +62,17 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         make_files(folder)
-        for shot in SHOTS:
-            path = FOLDER / f"{shot.name}.png"
-            path.write_bytes(smaller(take(shot, folder)))
+        takers: dict[str, Callable[[], bytes]] = {
+            shot.name: partial(take, shot, folder) for shot in SHOTS
+        }
+        takers["report"] = partial(take_report, folder)
+        takers["demo"] = partial(take_demo, folder)
+        if SHARED.is_dir():
+            make_many(folder)
+            takers[OF_MANY.name] = partial(take, OF_MANY, folder)
+        for wanted in sys.argv[1:] or takers:
+            path = FOLDER / f"{wanted}.png"
+            path.write_bytes(smaller(takers[wanted]()))
             print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
     return 0
 
@@ -63,8 +85,22 @@ def make_files(folder: Path) -> None:
     louder = folder / "louder.toml"
     louder.write_text(re.sub(r"(?m)^noise_density_.*$", "noise_density_ug_per_rthz = 60.0", toml))
     for name, options in (("good", ()), ("suspect", ("--site", str(louder)))):
-        arguments = ["identify", str(SAMPLE), "--rrd", str(folder / f"{name}.rrd"), *options]
-        assert cli.main(arguments) == 0
+        outputs = ("--rrd", f"{folder / name}.rrd", "--json", f"{folder / name}.json")
+        assert cli.main(["identify", str(SAMPLE), *outputs, *options]) == 0
+
+
+def make_many(folder: Path) -> None:
+    """Sixteen crossings with everything at once: twin tyres, bearings that give, friction."""
+    drive = str(folder / "many.mcap")
+    imported = ["import", str(SHARED), "--site", str(SHARED / "site.toml"), "-o", drive]
+    assert cli.main(imported) == 0
+    assert cli.main(["identify", drive, "--rrd", str(folder / "many.rrd")]) == 0
+
+
+def take_demo(folder: Path) -> bytes:
+    """The picture that the demo leaves."""
+    assert cli.main(["demo", "--out", str(folder / "demo")]) == 0
+    return (folder / "demo/demo.png").read_bytes()
 
 
 def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
@@ -78,12 +114,27 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
         return taken
 
 
+def take_report(folder: Path, size: str = "794,1123") -> bytes:
+    """The first page of the sample's report as a browser shows it, A4 at 96 pixels an inch."""
+    html, png = folder / "report.html", folder / "report.png"
+    site = folder / "site.toml"
+    site.write_text(read_site(SAMPLE) or "")
+    found = ["report", str(folder / "good.json"), "--site", str(site), "-o", str(html)]
+    assert cli.main(found) == 0
+    options = ["--headless", "--disable-gpu", "--no-first-run", "--hide-scrollbars"]
+    options += [f"--user-data-dir={folder / 'profile'}", f"--window-size={size}"]
+    options += ["--no-sandbox"] if os.geteuid() == 0 else []
+    command = [find_browser(), *options, f"--screenshot={png}", html.as_uri()]
+    subprocess.run(command, check=True, capture_output=True, timeout=LONGEST_S)
+    return png.read_bytes()
+
+
 def smaller(png: bytes) -> bytes:
     """With 128 colours, which is all that lines and words need."""
     written = io.BytesIO()
     few = Image.open(io.BytesIO(png)).convert("RGB").quantize(128, dither=Image.Dither.NONE)
     few.save(written, "png", optimize=True)
-    assert len(written.getvalue()) < MOST_BYTES
+    assert len(written.getvalue()) < MOST_BYTES, f"{len(written.getvalue())} bytes"
     return written.getvalue()
 
 

@@ -58,6 +58,11 @@ def _of_state(state: BridgeResult) -> Iterator[str]:
         thirds = (state.thirds.left, state.thirds.middle, state.thirds.right)
         told = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
         yield f"EI of nominal: mean {state.level.mean:.2f} ± {state.level.std:.2f}; thirds {told}"
+    if state.between_crossing_std is not None and len(state.crossings_used) == 1:
+        yield (
+            "one crossing: intervals are wider than its own, for how a bridge changes from one "
+            "crossing to the next it cannot tell"
+        )
     if state.between_crossing_std is not None and len(state.crossings_used) > 1:
         low, high = state.between_crossing_std_q025, state.between_crossing_std_q975
         yield (

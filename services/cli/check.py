@@ -24,22 +24,48 @@ def add_check(commands: Any) -> None:
     p.add_argument(
         "paths",
         type=Path,
-        nargs="+",
+        nargs="*",
         metavar="SITE.toml|REC.mcap|DIR",
         help="a site file (default: the recordings' own), and recordings or folders of CSV "
         "files: a minute of standstill, or any drive",
+    )
+    p.add_argument(
+        "--template",
+        type=Path,
+        metavar="NEW.toml",
+        help="write a site file to start from, with what each key means, and check nothing",
     )
     p.add_argument("--json", action="store_true", help="everything, as JSON")
 
 
 def _check(options: argparse.Namespace) -> int:
+    from services.common.errors import InputError
+    from services.common.files import check_writable, write_atomically
+    from services.common.progress import reading_bar
     from services.inspection.inspect import inspect
 
-    found = list(inspect(options.paths))
+    if options.template is not None:
+        from services.inspection.template import TEMPLATE
+
+        if options.paths:
+            raise InputError(f"--template: checks nothing, give {options.paths[0]} without it")
+        if options.template.exists():
+            raise InputError(f"{options.template}: exists, give the name of a new site file")
+        check_writable(options.template)
+        write_atomically(options.template, TEMPLATE)
+        print(f"{options.template}: fill it in, then driveby check {options.template}")
+        return 0
+    if not options.paths:
+        raise InputError("a site file or recordings are expected, or --template NEW.toml")
+    for path in options.paths:
+        if path.suffix == ".toml":
+            _refuse_faults(path, wants_json=options.json)
+    recordings = [path for path in options.paths if path.suffix != ".toml"]
+    with reading_bar("looking", recordings) as next_file:
+        found = list(inspect(options.paths, next_file))
     is_wrong = any(report.is_wrong for report in found)
     if options.json:
-        content = {"is_wrong": is_wrong, "reports": [as_json(report) for report in found]}
-        print(json.dumps(content, indent=1, ensure_ascii=False))
+        _print_json(found)
         return int(is_wrong)
     runs = sum(report.is_run for report in found)
     for report in found:
@@ -54,6 +80,35 @@ def _check(options: argparse.Namespace) -> int:
         else "nothing is known against a survey"
     )
     return int(is_wrong)
+
+
+def _refuse_faults(path: Path, *, wants_json: bool) -> None:
+    """InputError if a site file cannot be read; of several faults all are printed before."""
+    from schemas.site_file import faults_of_site, read_site_text
+    from services.common.errors import InputError
+    from services.inspection.finding import Finding, State
+    from services.inspection.inspect import Report
+
+    faults = faults_of_site(read_site_text(path), str(path))
+    if not faults:
+        return
+    if len(faults) == 1:
+        raise InputError(faults[0])
+    texts = [fault.removeprefix(f"{path}: ") for fault in faults]
+    report = Report(
+        str(path), tuple(Finding("site_file", State.WRONG, text) for text in texts), is_run=False
+    )
+    if wants_json:
+        _print_json([report])
+    else:
+        print("\n".join(lines_of(report, is_brief=False)))
+    raise InputError(f"{path}: {len(faults)} things are wrong; nothing else was looked at")
+
+
+def _print_json(reports: "list[Report]") -> None:
+    is_wrong = any(report.is_wrong for report in reports)
+    content = {"is_wrong": is_wrong, "reports": [as_json(report) for report in reports]}
+    print(json.dumps(content, indent=1, ensure_ascii=False))
 
 
 def lines_of(report: "Report", *, is_brief: bool) -> Iterator[str]:

@@ -276,6 +276,7 @@ def _draw(folder: Path, crossing: Crossing, drive: Drive, site: Site) -> None:
     from services.viewer.bridge_view import views_of_bridges
     from services.viewer.crossing_view import view_of_crossing
     from services.viewer.figure import crossing_figure
+    from services.viewer.residuals import residual_cells
     from services.viewer.vehicle_signals import signals_of_messages
     from services.viewer.view import write_views
 
@@ -285,6 +286,7 @@ def _draw(folder: Path, crossing: Crossing, drive: Drive, site: Site) -> None:
         crossings=[crossing],
         site=site,
         overviews=views_of_bridges(load_results(folder / _TEXT), site),
+        residuals=residual_cells([crossing], read_messages(folder / _RECORDING), site),
     )
     crossing_figure(
         folder / _FIGURE,

@@ -33,17 +33,23 @@ def add_export(commands: Any) -> None:
     p.add_argument(
         "--format", choices=("csv", "parquet"), default="csv", help="of the tables (default: csv)"
     )
+    p.add_argument(
+        "--sensorthings",
+        action="store_true",
+        help="results as entities of OGC SensorThings API 1.1 too",
+    )
     add_site(p, "where bridges are (default: as the recordings say)")
 
 
 def _export(options: argparse.Namespace) -> int:
     from services.common.files import check_folder_writable, write_atomically
-    from services.common.progress import reading_bar
+    from services.common.progress import reading_bar, steps_bar
     from services.drives.signals import signals_of_recording
     from services.drives.survey import survey
     from services.export.found import tables_of_results
     from services.export.geojson import crossings_geojson, elements_geojson
     from services.export.measured import as_measured, tables_of_run, tables_of_runs
+    from services.export.sensorthings import sensorthings
     from services.export.tables import write_table
     from services.recordings.together import recordings_in
 
@@ -55,11 +61,16 @@ def _export(options: argparse.Namespace) -> int:
     recordings = recordings_in(path for path in options.sources if path.suffix != ".json")
     results, results_path = _results(options.sources)
     site = _site(options.site, recordings, results, results_path)
+    if options.sensorthings and (results is None or site is None):
+        raise InputError("--sensorthings: wants a results file, and the site file of its bridges")
     with reading_bar("reading", recordings) as next_file:
         runs = [run for path in recordings for run in signals_of_recording(path, next_file())]
     passings = []
     if results is None and site is not None:
-        passings = [p for path in recordings for p in survey(path, site).passings]
+        with reading_bar("looking for crossings", recordings) as next_file:
+            passings = [
+                p for path in recordings for p in survey(path, site, progress=next_file()).passings
+            ]
     tables: list[Table] = []
     if form == "parquet":
         tables += tables_of_runs(runs) if runs else []
@@ -69,9 +80,11 @@ def _export(options: argparse.Namespace) -> int:
         tables += tables_of_results(results, site)
     folder.mkdir(parents=True, exist_ok=True)
     _check_no_others(folder, {f"{table.name}.csv" for table in tables if form == "csv" and runs})
-    for table in tables:
-        path = write_table(folder, table, form)
-        print(f"{path}: {len(next(iter(table.columns.values())))} rows")
+    with steps_bar(f"writing into {folder}") as progress:
+        for number, table in enumerate(tables):
+            progress(number, len(tables))
+            path = write_table(folder, table, form)
+            print(f"{path}: {len(next(iter(table.columns.values())))} rows")
     if site is None:
         print("no site file: places of bridges are not known, so there is no GeoJSON")
         return 0
@@ -80,6 +93,8 @@ def _export(options: argparse.Namespace) -> int:
         "elements.geojson": elements_geojson(site, results),
         "crossings.geojson": crossings_geojson(site, crossings, passings),
     }
+    if options.sensorthings and results is not None:
+        texts["sensorthings.json"] = sensorthings(site, results)
     if form == "csv" and runs:
         texts["site.toml"] = as_measured(site)
     for name, text in texts.items():

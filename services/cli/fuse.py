@@ -1,13 +1,23 @@
 """`driveby fuse`: one estimate of each bridge from stored results."""
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from schemas.results import BridgeResult, Crossing, Header, load_results, results, results_json
+from schemas.results import (
+    BridgeResult,
+    Crossing,
+    Header,
+    Results,
+    load_results,
+    results,
+    results_json,
+)
 from services.cli.bridge_table import print_bridge
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
+from services.common.progress import Steps, steps_bar
 from services.identification.bridge_state import (
     NOTHING_STORED,
     Counted,
@@ -44,8 +54,16 @@ def fuse_command(
     """
     if json_path is not None:
         check_writable(json_path)
-    files = sorted((load_results(path) for path in paths), key=lambda one: one.created)
+    with steps_bar("reading", console) as progress:
+        files = sorted(_loaded(paths, progress), key=lambda one: one.created)
     crossings = {c.crossing_id: c for one in files for c in one.crossings}
+    again = sum(len(one.crossings) for one in files) - len(crossings)
+    if again:
+        console.print(
+            f"{again} result{'s' if again > 1 else ''} of crossings that another file has too: the "
+            "newest counts",
+            highlight=False,
+        )
     realms = sorted({crossing.realm for crossing in crossings.values()})
     if len(realms) > 1:
         raise InputError(f"{paths[0]}: crossings of {', '.join(realms)}; fuse one realm at a time")
@@ -59,7 +77,8 @@ def fuse_command(
         elements = _elements(name, of)
         if baseline is not None and elements is not None and name in fusing.baselines:
             _check_baseline(baseline, fusing.baselines[name], elements)
-        state = state_of(count_in(Counted(), counts), name, fusing)
+        with console.status(f"fusing {len(counts)} crossings of {name}"):
+            state = state_of(count_in(Counted(), counts), name, fusing)
         if state is None or elements is None:
             console.print(f"{name}: none of {len(of)} crossings can be fused", highlight=False)
             continue
@@ -76,6 +95,20 @@ def fuse_command(
         every = results(header, with_common_shares(ordered, found), found)
         write_atomically(json_path, results_json(every))
     return 0
+
+
+def _loaded(paths: list[Path], progress: Steps) -> Iterator[Results]:
+    """The files, by their sizes as they are read."""
+    sizes = [path.stat().st_size if path.is_file() else 0 for path in paths]
+    for path in paths:
+        if path.suffix == ".mcap":
+            raise InputError(
+                f"{path}: is a recording, results are expected: "
+                f"driveby identify {path} --json RESULTS.json makes them"
+            )
+    for number, path in enumerate(paths):
+        progress(sum(sizes[:number]), sum(sizes))
+        yield load_results(path)
 
 
 def _check_baseline(path: Path, baseline: BridgeResult, elements: _Elements) -> None:

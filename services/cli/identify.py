@@ -3,6 +3,7 @@
 import contextlib
 import logging
 from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,7 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
-from services.common.progress import progress_bar
+from services.common.progress import progress_bar, reading_bar, steps_bar
 from services.drives.survey import survey
 from services.execution.offline import identify_recordings, site_of
 from services.history.baselines import baselines_of
@@ -94,31 +95,12 @@ def identify_command(
     if json_path is not None:
         write_atomically(json_path, results_json(found))
     if rrd_path is not None:
-        from services.viewer.bridge_view import views_of_bridges
-        from services.viewer.crossing_view import view_of_crossing
-        from services.viewer.rerun_file import write_rrd
-        from services.viewer.rerun_places import bridges_of_site
-        from services.viewer.vehicle_signals import signals_of_messages
-
-        try:
-            with replaced_atomically(rrd_path) as temporary:
-                write_rrd(
-                    temporary,
-                    vehicles=signals_of_messages(
-                        message for path in recordings for message in read_messages(path)
-                    ),
-                    bridges=bridges_of_site(known),
-                    crossings=[
-                        view_of_crossing(c, known.bridge(c.bridge)) for c in found.crossings
-                    ],
-                    overviews=views_of_bridges(found, known, (site or recordings[0]).parent),
-                )
-        except RuntimeError as error:  # so Rerun says that its file could not be written
-            raise FailureError(f"{rrd_path}: could not be written: {error}") from error
+        _write_rerun(rrd_path, recordings, found, known, (site or recordings[0]).parent, console)
     if figures is not None:
         from services.viewer.pictures import write_pictures
 
-        written = write_pictures(figures, found, known)
+        with steps_bar(f"drawing into {figures}", console) as drawn:
+            written = write_pictures(figures, found, known, drawn)
         console.print(f"{len(written)} pictures in {figures}", highlight=False, soft_wrap=True)
     if draws_path is not None:
         kept = (
@@ -127,6 +109,45 @@ def identify_command(
         )
         write_draws(draws_path, kept)
     return 0
+
+
+def _write_rerun(
+    path: Path,
+    recordings: list[Path],
+    found: Results,
+    site: Site,
+    beside: Path,
+    console: "Console",
+) -> None:
+    """The Rerun file of what was found; baselines are looked for `beside`."""
+    from services.viewer.bridge_view import views_of_bridges
+    from services.viewer.residuals import residual_cells
+    from services.viewer.vehicle_signals import signals_of_messages
+    from services.viewer.view import write_views
+
+    messages = chain.from_iterable(map(read_messages, recordings))
+    with steps_bar("what fits leave over", console) as progress:
+        left = residual_cells(found.crossings, messages, site, progress)
+    with reading_bar("reading", recordings, console) as next_file:
+        vehicles = signals_of_messages(
+            message for one in recordings for message in read_messages(one, next_file())
+        )
+    try:
+        with (
+            replaced_atomically(path) as temporary,
+            steps_bar(f"drawing {path.name}", console) as drawing,
+        ):
+            write_views(
+                temporary,
+                vehicles=vehicles,
+                crossings=found.crossings,
+                site=site,
+                overviews=views_of_bridges(found, site, beside),
+                residuals=left,
+                drawing=drawing,
+            )
+    except RuntimeError as error:  # so Rerun says that its file could not be written
+        raise FailureError(f"{path}: could not be written: {error}") from error
 
 
 @contextlib.contextmanager

@@ -258,9 +258,12 @@ def add_import(commands: Any) -> None:
 def _import(options: argparse.Namespace) -> int:
     from rich.console import Console
 
+    from services.common.progress import progress_bar
     from services.drives.importing import import_command
 
-    with Console(stderr=True).status("importing"):
+    with progress_bar(Console(stderr=True)) as bar:
+        reading = bar.add_task("reading", total=None)
+        writing = bar.add_task(f"writing {options.output}", total=None, visible=False)
         said = import_command(
             sources=options.sources,
             site=options.site,
@@ -268,6 +271,10 @@ def _import(options: argparse.Namespace) -> int:
             force=options.force,
             vehicle=options.vehicle,
             name=options.name,
+            reading=lambda done, steps: bar.update(reading, completed=done, total=steps),
+            writing=lambda done, steps: bar.update(
+                writing, completed=done, total=steps, visible=True
+            ),
         )
     print(said)
     return 0

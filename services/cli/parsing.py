@@ -171,8 +171,8 @@ def add_id(p: argparse.ArgumentParser, default: str) -> None:
     p.add_argument("--id", default=default, help=f"name of this service (default: {default})")
 
 
-def number(what: str, *, low: float, high: float) -> Callable[[str], float]:
-    """Parse a number between two limits; `what` it must be stands in the error."""
+def number(what: str, *, low: float, high: float, hint: str = "") -> Callable[[str], float]:
+    """Parse a number between two limits; `what` it must be stands in the error, and a `hint`."""
 
     def parse(text: str) -> float:
         try:
@@ -182,6 +182,7 @@ def number(what: str, *, low: float, high: float) -> Callable[[str], float]:
         if not low <= value <= high:
             raise argparse.ArgumentTypeError(
                 f'is "{text}", it must be {what} from {low:g} to {high:g}'
+                + (f"; {hint}" if hint else "")
             )
         return value
 

@@ -40,6 +40,7 @@ def _report(options: argparse.Namespace) -> int:
     from schemas.results import load_results
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
+    from services.common.progress import steps_bar
     from services.history.site_of_results import site_of_results
     from services.report.bridge import bridge_reports
     from services.report.page import page
@@ -59,14 +60,16 @@ def _report(options: argparse.Namespace) -> int:
         files.append((path, results, site_of_results(path, results, options.site)))
     beside = None if options.site is None else options.site.parent
     reports = bridge_reports(files, options.baseline, beside)
-    with Console(stderr=True).status(f"drawing {output}"):
-        write_atomically(output, page(reports))
+    with steps_bar(f"drawing {output}") as progress:
+        text = page(reports, progress)
+    write_atomically(output, text)
     for report in reports:
         print(f"{report.bridge.id}: {report.finding.headline} {' '.join(report.finding.sentences)}")
     if not reports:
         print("no crossing of a known bridge")
     print(output)
     if options.pdf:
-        write_pdf(output, pdf, browser)
+        with Console(stderr=True).status(f"printing {pdf}, a few seconds"):
+            write_pdf(output, pdf, browser)
         print(pdf)
     return 0

@@ -42,7 +42,7 @@ def add_survey(commands: Any) -> None:
     )
     p.add_argument(
         "--loss",
-        type=number("a share of EI", low=0.01, high=0.95),
+        type=number("a share of EI", low=0.01, high=0.95, hint="20 % is 0.2"),
         default=0.2,
         metavar="SHARE",
         help="of its rigidity that an element has lost and that is to be seen (default: 0.2)",
@@ -210,12 +210,16 @@ def lines_of(found: "Survey") -> Iterator[str]:
         f"mean of all elements: ± {_percent(planned.once.level_std)} by 1 crossing, "
         f"± {_percent(planned.expected.level_std)} by {asked.crossings}"
     )
-    yield "±: standard deviation of EI; seen: probability, against the nominal value and"
-    yield f"the other elements; smallest: loss that is seen with {SURE:.0%}"
+    yield "±: standard deviation of EI, near 55% nothing is learnt; seen: probability that"
+    yield "the loss is seen, against the nominal value; by others: against the other"
+    yield f"elements; smallest: loss that is seen with {SURE:.0%}"
     yield ""
     yield from _aligned(_comparison(found))
-    yield f"needed: crossings until the loss is seen with {SURE:.0%}, at midspan, at both ends;"
-    yield f"–: more than {MOST_CROSSINGS}; the other way: in the other lane; elements: longer ones"
+    yield f"by {asked.crossings} crossings; mean ±: of what all elements share; mid ±, seen,"
+    yield f"smallest: at midspan; needed, ends: crossings until it is seen with {SURE:.0%} at"
+    yield f"midspan, at both ends (elsewhere between them); –: more than {MOST_CROSSINGS};"
+    yield "t: only if the law lets it weigh that; the other way: in the other lane;"
+    yield "elements: longer ones"
     yield ""
     for line in warnings(found):
         yield f"warning: {line}"

@@ -13,8 +13,16 @@ Offset = Callable[[int], object]
 """Is told how many bytes of a file have been read."""
 
 
+Steps = Callable[[int, int], object]
+"""Is told how many of how many steps have been done."""
+
+
 def unwatched(offset: int) -> None:
     """For who does not want to know."""
+
+
+def unwatched_steps(done: int, steps: int) -> None:
+    """For who does not want to know either."""
 
 
 def progress_bar(console: "Console") -> "Progress":
@@ -29,6 +37,20 @@ def progress_bar(console: "Console") -> "Progress":
         transient=True,
         disable=not console.is_terminal,
     )
+
+
+@contextlib.contextmanager
+def steps_bar(description: str, console: "Console | None" = None) -> Iterator[Steps]:
+    """A bar over steps of which each takes about as long; on standard error by default."""
+    from rich.console import Console
+
+    with progress_bar(console or Console(stderr=True)) as bar:
+        task = bar.add_task(description, total=None)
+
+        def show(done: int, steps: int) -> None:
+            bar.update(task, completed=done, total=max(1, steps))
+
+        yield show
 
 
 @contextlib.contextmanager

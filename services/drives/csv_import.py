@@ -20,6 +20,7 @@ from schemas.signals import (
 )
 from services.common.errors import InputError
 from services.common.files import read_text
+from services.common.progress import Steps, unwatched_steps
 from services.drives.runs import GnssTrack, Run, sampling_rate_hz
 
 Floats = NDArray[np.float64]
@@ -47,8 +48,11 @@ _LIMITS: Final[dict[str, _Limits]] = {
 }
 
 
-def read_folder(folder: Path) -> list[Run]:
-    """Read every pair of files in a folder, in order of time; InputError if there is none."""
+def read_folder(folder: Path, progress: Steps = unwatched_steps) -> list[Run]:
+    """Read every pair of files in a folder, in order of time; InputError if there is none.
+
+    `progress` is told of each pair.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, one with accel_NN.csv and gps_NN.csv expected")
     accel = {path.name.removeprefix("accel_"): path for path in folder.glob("accel_*.csv")}
@@ -60,7 +64,10 @@ def read_folder(folder: Path) -> list[Run]:
     for number in sorted(gps.keys() - accel.keys()):
         missing = folder / f"accel_{number}"
         raise InputError(f"{missing}: no such file, accelerations for {gps[number].name} expected")
-    runs = [read_pair(accel[number], folder / f"gps_{number}") for number in sorted(accel)]
+    runs: list[Run] = []
+    for number in sorted(accel):
+        progress(len(runs), len(accel))
+        runs.append(read_pair(accel[number], folder / f"gps_{number}"))
     runs.sort(key=lambda run: float(run.accel_time_s[0]))
     for before, after in pairwise(runs):
         if after.accel_time_s[0] <= before.accel_time_s[-1]:

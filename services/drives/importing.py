@@ -1,6 +1,7 @@
 """`driveby import`: files of a drive become a recording."""
 
-from collections.abc import Iterator
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from schemas.site import Site
@@ -8,6 +9,7 @@ from schemas.site_file import parse_site, read_site_text
 from services.common.errors import InputError
 from services.common.files import check_writable
 from services.common.naming import checked_identifier, identifier_from
+from services.common.progress import Steps, unwatched_steps
 from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_import import read_folder, read_pair
 from services.drives.runs import Run, normalised, run_to_messages
@@ -26,20 +28,23 @@ def import_command(
     vehicle: str | None,
     name: str | None,
     force: bool = False,
+    reading: Steps = unwatched_steps,
+    writing: Steps = unwatched_steps,
 ) -> str:
     """Write the recording of a folder, or of a pair of CSV files; return a line that says so.
 
-    Nothing is written if anything is wrong (InputError).
+    Nothing is written if anything is wrong (InputError). `reading` is told of the files that have
+    been read, `writing` of the seconds of the drive that have been written.
     """
     check_writable(output, force=force)
     text = read_site_text(site)
     parsed = parse_site(text, str(site))
     vehicle_id = vehicle_of(parsed, str(site), vehicle)
     realm = _realm(sources, name)
-    runs = normalised_runs(sources, parsed, str(site))
+    runs = normalised_runs(sources, parsed, str(site), reading)
     messages = write_recording(
         output,
-        run_to_messages(runs, parsed, realm, vehicle_id),
+        _watched(run_to_messages(runs, parsed, realm, vehicle_id), runs, writing),
         site_toml=text,
         reason="import complete",
         force=force,
@@ -67,7 +72,24 @@ def messages_of_folder(
     return run_to_messages(runs, site, _realm([folder], None), vehicle_id)
 
 
-def normalised_runs(sources: list[Path], site: Site | None, site_name: str) -> list[Run]:
+def _watched(messages: Iterable[Message], runs: list[Run], writing: Steps) -> Iterator[Message]:
+    """The messages; of each whole second of the drive it is told how many there have been."""
+    lengths = [float(run.accel_time_s[-1] - run.accel_time_s[0]) for run in runs]
+    begins = [float(run.accel_time_s[0]) for run in runs]
+    total, last = int(sum(lengths)), -1
+    for message in messages:
+        number = max(0, bisect_right(begins, message.log_time_ns / 1e9) - 1)
+        into = min(message.log_time_ns / 1e9 - begins[number], lengths[number])
+        done = int(sum(lengths[:number]) + into)
+        if done > last:
+            writing(done, total)
+            last = done
+        yield message
+
+
+def normalised_runs(
+    sources: list[Path], site: Site | None, site_name: str, reading: Steps = unwatched_steps
+) -> list[Run]:
     """The runs of a folder or of a pair of CSV files, upward and without gravity.
 
     Without a site nobody knows how a CSV file was measured: then it is as in the file.
@@ -77,7 +99,7 @@ def normalised_runs(sources: list[Path], site: Site | None, site_name: str) -> l
     if len(sources) == 1 and is_comma2k19(sources[0]):
         return [read_comma2k19(sources[0])]  # knows its axes and its rate itself
     if len(sources) == 1:
-        runs = read_folder(sources[0])
+        runs = read_folder(sources[0], reading)
     elif len(sources) == 2:
         runs = [read_pair(*sources)]
     else:

@@ -1,6 +1,7 @@
 """What trucks measured, as arrays: of recordings and of folders of CSV files."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -143,15 +144,18 @@ def series_of_batches(batches: Sequence[AccelBatch]) -> dict[str, Series]:
         parts = [(b.wall_time_ns, b.channels[name]) for b in batches if name in b.channels]
         if parts:
             series[name] = Series(
-                np.concatenate([_sample_times_ns(start_ns, c) for start_ns, c in parts]),
+                np.concatenate(list(_times_ns(parts))),
                 np.concatenate([c.samples for _, c in parts]),
             )
     return series
 
 
-def _sample_times_ns(start_ns: int, channel: Channel) -> Nanoseconds:
-    offsets = np.rint(np.arange(len(channel.samples)) * (1e9 / channel.rate_hz))
-    return np.asarray(start_ns + offsets.astype(np.int64))
+def _times_ns(parts: Iterable[tuple[int, Channel]]) -> Iterator[Nanoseconds]:
+    """Of all samples, of batches of one size at a time: an hour has 72,000."""
+    for (size, rate_hz), alike in groupby(parts, lambda p: (p[1].samples.size, p[1].rate_hz)):
+        offsets = np.rint(np.arange(size) * (1e9 / rate_hz)).astype(np.int64)
+        starts = np.array([start_ns for start_ns, _ in alike], dtype=np.int64)
+        yield np.add.outer(starts, offsets).reshape(-1)
 
 
 def _in_order(by_sequence: dict[int, T]) -> list[T]:

@@ -42,11 +42,16 @@ def _collection(features: Iterable[dict[str, Any]]) -> str:
 def _line(
     bridge: Bridge, begin_m: float, end_m: float, properties: dict[str, Any]
 ) -> dict[str, Any]:
+    geometry = geometry_of(bridge, begin_m, end_m)
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def geometry_of(bridge: Bridge, begin_m: float, end_m: float) -> dict[str, Any]:
+    """A line along a bridge, between two chainages."""
     latitude, longitude = to_lat_lon(bridge_frame(bridge), [begin_m, end_m])
     places = zip(longitude.tolist(), latitude.tolist(), strict=True)
     coordinates = [[round(lon, _DECIMALS), round(lat, _DECIMALS)] for lon, lat in places]
-    geometry = {"type": "LineString", "coordinates": coordinates}
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
+    return {"type": "LineString", "coordinates": coordinates}
 
 
 def _elements(bridge: Bridge, results: Results | None) -> Iterator[dict[str, Any]]:
@@ -78,8 +83,8 @@ def _crossing(bridge: Bridge, crossing: Crossing) -> dict[str, Any]:
     names = ("vehicle", "bridge", "direction", "speed_m_per_s", "method", "verdict", "chi2_per_dof")
     properties = {
         "crossing": crossing.crossing_id,
-        "entry_time": _utc(crossing.entry_time),
-        "exit_time": _utc(crossing.exit_time),
+        "entry_time": utc(crossing.entry_time),
+        "exit_time": utc(crossing.exit_time),
         "reasons": [reason.value for reason in crossing.reasons],
     } | {name: getattr(crossing, name) for name in names}
     return _along(bridge, properties, forward=crossing.direction == "start_to_end")
@@ -88,8 +93,8 @@ def _crossing(bridge: Bridge, crossing: Crossing) -> dict[str, Any]:
 def _seen(bridge: Bridge, passing: Passing) -> dict[str, Any]:
     properties = {
         "crossing": None,
-        "entry_time": _utc(passing.entry_ns * 1e-9),
-        "exit_time": _utc(passing.exit_ns * 1e-9),
+        "entry_time": utc(passing.entry_ns * 1e-9),
+        "exit_time": utc(passing.exit_ns * 1e-9),
         "vehicle": passing.vehicle,
         "bridge": passing.bridge,
         "direction": "start_to_end" if passing.forward else "end_to_start",
@@ -103,6 +108,7 @@ def _along(bridge: Bridge, properties: dict[str, Any], *, forward: bool) -> dict
     return _line(bridge, *ends, properties)
 
 
-def _utc(seconds: float) -> str:
+def utc(seconds: float) -> str:
+    """A time since 1970 as RFC 3339 writes it."""
     moment = datetime.fromtimestamp(seconds, UTC)
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

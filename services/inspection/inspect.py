@@ -1,6 +1,6 @@
 """Everything that is looked at before a survey: the site file, and what a truck has recorded."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -12,6 +12,7 @@ from schemas.signals import CHANNELS
 from schemas.site import Site, Vehicle
 from schemas.site_file import load_site, parse_site
 from services.common.errors import InputError
+from services.common.progress import Offset, unwatched
 from services.identification.streams import Samples
 from services.inspection.channels import alive, gaps, in_place, masses, present, rates, wheelbase
 from services.inspection.finding import Finding, State
@@ -47,8 +48,13 @@ class Report(NamedTuple):
         return any(_is_wrong(finding) for finding in self.findings)
 
 
-def inspect(paths: list[Path]) -> Iterator[Report]:
-    """Check a site file and recordings; InputError if one cannot be read, or none names a site."""
+def inspect(
+    paths: list[Path], next_file: Callable[[], Offset] = lambda: unwatched
+) -> Iterator[Report]:
+    """Check a site file and recordings; InputError if one cannot be read, or none names a site.
+
+    `next_file` is called before each recording, for who is told how far that has been read.
+    """
     sites = [path for path in paths if path.suffix == ".toml"]
     recordings = [path for path in paths if path.suffix != ".toml"]
     if len(sites) > 1:
@@ -60,7 +66,7 @@ def inspect(paths: list[Path]) -> Iterator[Report]:
         site, name = (given, str(sites[0])) if given is not None else site_beside(path)
         if given is None:
             yield _of_site(name, site)
-        for number, run in enumerate(recorded_runs(path, site, name)):
+        for number, run in enumerate(recorded_runs(path, site, name, next_file())):
             yield Report(f"{path}, run {number + 1} of {run.vehicle}", tuple(of_run(run, site)))
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from schemas.signals import NS_PER_S, AccelBatch, GnssFix, decode_accel, decode_gnss
 from schemas.site import Site
 from services.common.errors import InputError
+from services.common.progress import Offset, unwatched
 from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_import import read_folder
 from services.drives.importing import vehicle_of
@@ -54,9 +55,15 @@ class Recorded(NamedTuple):
     """Whether the run has more accelerations than were looked at."""
 
 
-def recorded_runs(path: Path, site: Site, site_name: str) -> list[Recorded]:
-    """All runs of all trucks in a recording or a folder; InputError if it is neither."""
-    messages = _of_folder(path, site, site_name) if path.is_dir() else read_messages(path)
+def recorded_runs(
+    path: Path, site: Site, site_name: str, progress: Offset = unwatched
+) -> list[Recorded]:
+    """All runs of all trucks in a recording or a folder; InputError if it is neither.
+
+    `progress` is told how far a recording has been read.
+    """
+    is_folder = path.is_dir()
+    messages = _of_folder(path, site, site_name) if is_folder else read_messages(path, progress)
     accel: dict[tuple[str, int], dict[int, AccelBatch]] = {}
     gnss: dict[tuple[str, int], dict[int, GnssFix]] = {}
     for message in messages:

@@ -6,6 +6,7 @@ from typing import Final
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
 from services.identification.checks import ALIKE_LOADS, axle_loads_kg
+from services.identification.identify import SLOWEST_M_PER_S
 from services.inspection.finding import Finding, State, judged
 
 SLOWEST_RATE_HZ: Final = 100.0
@@ -23,7 +24,7 @@ def findings_of_site(site: Site, vehicle: Vehicle) -> Iterator[Finding]:
     yield sampling(site.sensor.rate_hz)
     yield noise_declared(site)
     for bridge in site.bridges:
-        yield _ends(bridge)
+        yield from findings_of_bridge(bridge)
 
 
 def findings_of_truck(vehicle: Vehicle) -> Iterator[Finding]:
@@ -69,6 +70,15 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[Finding]:
         "much of a single element can be told",
     )
 
+    is_measured = vehicle.cg_height_m is not None
+    yield Finding(
+        "cg_height",
+        State.OK if is_measured else State.OPEN,
+        f"{name}: centre of gravity "
+        + (f"{vehicle.cg_height_m:g} m above the road" if is_measured else "of unknown height"),
+        "" if is_measured else "give cg_height_m, or do not brake or accelerate on the bridge",
+    )
+
 
 def tyres_in_words(vehicle: Vehicle) -> str:
     """What the site file says of the tyres, and what is taken for granted."""
@@ -101,6 +111,19 @@ def noise_declared(site: Site) -> Finding:
         "declare noise_density_ug_per_rthz of the data sheet: the fit is judged by it",
         is_wrong=bool(silent),
     )
+
+
+def findings_of_bridge(bridge: Bridge) -> Iterator[Finding]:
+    """What the site file says of one bridge."""
+    yield _ends(bridge)
+    speed = bridge.survey_speed_m_per_s
+    if speed is not None:
+        yield judged(
+            "survey_speed",
+            f"{bridge.id}: to be crossed at {speed:g} m/s",
+            f"below {SLOWEST_M_PER_S:g} m/s a crossing is rejected, drive at 5 m/s or more",
+            is_wrong=speed < SLOWEST_M_PER_S,
+        )
 
 
 def _ends(bridge: Bridge) -> Finding:

@@ -7,7 +7,12 @@ from pre_core.survey.detection import SURE
 from services.identification.checks import SHORTEST_APPROACH_M
 from services.identification.identify import SLOWEST_M_PER_S
 from services.inspection.finding import State
-from services.inspection.site import findings_of_truck, noise_declared, sampling
+from services.inspection.site import (
+    findings_of_bridge,
+    findings_of_truck,
+    noise_declared,
+    sampling,
+)
 from services.planning.crossings import axles_of
 from services.planning.survey import MOST_CROSSINGS, Outlook, Survey
 
@@ -102,7 +107,9 @@ def warnings(found: Survey) -> Iterator[str]:
     site = found.planned.plan.site
     vehicle = site.vehicles[0]
     of_site = [*findings_of_truck(vehicle), sampling(site.sensor.rate_hz), noise_declared(site)]
-    for finding in of_site:
+    # The bridge's speed is judged below, with that of the command line.
+    of_bridge = (f for f in findings_of_bridge(site.bridges[0]) if f.name != "survey_speed")
+    for finding in (*of_site, *of_bridge):
         if finding.state is not State.OK:
             yield f"{finding.text}: {finding.advice}"
     slowest = min(found.asked.speed_m_per_s, found.asked.speeds_m_per_s[0])
@@ -116,5 +123,3 @@ def warnings(found: Survey) -> Iterator[str]:
             f"at {found.asked.speed_m_per_s:g} m/s {found.compared_m:.0f} m of road beside the "
             f"bridge are compared, {SHORTEST_APPROACH_M:g} m are needed: drive faster"
         )
-    if vehicle.cg_height_m is None:
-        yield f"{vehicle.id}: without cg_height_m do not brake or accelerate on the bridge"

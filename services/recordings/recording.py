@@ -108,14 +108,28 @@ def read_messages(path: Path, progress: Offset = unwatched) -> Iterator[Message]
 
 def check_message(path: Path, message: Message) -> None:
     """InputError if the bus would not take a message, or no logger: what is wrong, in one line."""
-    _, owner, identifier, stream = message.key
     try:
-        check_stamp(topic(owner, stream), message.payload)
+        check_stamp(topic(message.key.owner, message.key.stream), message.payload)
+    except ValueError as error:
+        raise _wrong(path, message, error) from None
+    check_envelope(path, message)
+
+
+def check_envelope(path: Path, message: Message) -> None:
+    """The same of all but what is in a message, which whoever decodes it sees by that."""
+    most = topic(message.key.owner, message.key.stream).max_bytes
+    try:
+        if len(message.payload) > most:
+            raise ValueError(f"{len(message.payload)} bytes; at most {most}")
         check_wall_time(message.log_time_ns)
         encode_identity(message.boot_id, message.sequence)
     except ValueError as error:
-        where = f"message {message.sequence} of {identifier}"
-        raise InputError(f"{path}: {where}: {error}") from None
+        raise _wrong(path, message, error) from None
+
+
+def _wrong(path: Path, message: Message, error: ValueError) -> InputError:
+    where = f"message {message.sequence} of {message.key.identifier}"
+    return InputError(f"{path}: {where}: {error}")
 
 
 def read_site(path: Path) -> str | None:

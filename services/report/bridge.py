@@ -9,20 +9,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-from schemas.reasons import Reason
+from schemas.reasons import LEFT_OUT_TEXTS, Reason
 from schemas.results import BridgeResult, Crossing, Results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
-from services.identification.comparison import Estimate, compare, sentences
+from services.identification.comparison import Estimate, compare
 from services.viewer.baseline import named_baseline, stored_baseline
-from services.viewer.bridge_view import BridgeView, view_of_bridge
+from services.viewer.bridge_view import BridgeView, told, view_of_bridge
 
 _LATEST_S = 7_258_118_400.0
 """The year 2200."""
 _LARGEST_DEVIATION = 4.0
 """Standard deviations; crossings that differ by more do not agree."""
+_MOST_REASONS = 3
+"""In the box; all of them stand below it."""
 _ADVICE = {
     Reason.CHANNEL_MISSING: "Look at plugs and sensors: four accelerometers are needed.",
+    Reason.SENSOR_SATURATED: "Use accelerometers of a larger range, or drive more slowly.",
+    Reason.CHANNEL_SWAPPED: "Look at the wiring, and at the order of channels in the recording.",
+    Reason.CHANNEL_INVERTED: "Look at which way the sensors are mounted, and declare it.",
+    Reason.CHANNEL_STUCK: "Look at plugs and sensors: one of them does not measure.",
+    Reason.CHANNELS_ALIKE: "Look at the wiring: one sensor seems to be recorded twice.",
+    Reason.CHANNEL_BIASED: "Declare whether gravity is in the signals, or change the sensor.",
+    Reason.SIGNAL_SPIKES: "Look at cables and plugs, and at what else is on the sensors' supply.",
+    Reason.NOT_FINITE: "Look at the recording: it has values that are no numbers.",
     Reason.GAP_ON_BRIDGE: "Recover the missing samples from the truck's spool, or drive again.",
     Reason.INCOMPLETE_CROSSING: "Record a few seconds before and after the bridge.",
     Reason.STOPPED_ON_BRIDGE: "Drive again without stopping.",
@@ -35,12 +45,18 @@ _ADVICE = {
         "front and rear wheel may have felt different roads. Drive again."
     ),
     Reason.RESIDUALS_COLOURED: "Look at truck, span and other traffic; drive again.",
-    Reason.NOISE_ABOVE_DECLARED: "Measure the sensors' noise at standstill and declare it.",
-    Reason.NOISE_BELOW_DECLARED: "Declare the sensors' true noise.",
+    Reason.NOISE_ABOVE_DECLARED: (
+        "Measure the sensors' noise at standstill, declare it, and identify again."
+    ),
+    Reason.NOISE_BELOW_DECLARED: "Declare the sensors' true noise, and identify again.",
     Reason.IMPLAUSIBLE_VEHICLE: "Measure the wheelbase; make sure that it was this truck.",
     Reason.POSITION_INCONSISTENT: "Check the coordinates of the bearings and the antenna's place.",
+    Reason.APPROACH_TOO_SHORT: "Record from 40 m before the bridge to 25 m behind it.",
     Reason.AXLES_ALIKE: "Load one axle more than the other.",
     Reason.ACCELERATING_CG_UNKNOWN: "Keep the speed, or declare the height of the centre of mass.",
+    Reason.NOT_CONVERGED: "Look whether the site file is near the truth; drive again.",
+    Reason.SAMPLER_DIAGNOSTICS: "Identify again with another --seed, or drive again.",
+    Reason.FAILED: "Report it to who made the program, with the recording.",
     Reason.NO_NOISE_MODEL: "Identify with method pre.",
     Reason.CONTINUOUS_BRIDGE: "Identify with method pre.",
 }
@@ -51,7 +67,7 @@ class Finding(NamedTuple):
     """The answer, and how sure it is."""
 
     kind: str
-    """`weak`, `sound`, `doubtful` or `nothing`."""
+    """`weak`, `sound`, `open` (elements cannot be told), `doubtful` or `nothing`."""
     headline: str
     sentences: tuple[str, ...]
 
@@ -186,27 +202,58 @@ def _one_by_one(view: BridgeView, baseline: Estimate | None) -> Iterator[str]:
 
 def _finding(view: BridgeView, crossings: Sequence[Crossing], baseline: Estimate | None) -> Finding:
     if view.estimate is None:
-        number = len(view.crossings)
-        whole = "the one crossing" if number == 1 else f"any of the {number} crossings"
-        return Finding(
-            "nothing",
-            "Nothing can be said about this bridge.",
-            (f"No number of {whole} means anything; the reasons stand below.",),
-        )
-    said = (*sentences(view.comparison), *_one_by_one(view, baseline))
+        return _no_finding(crossings)
+    said = (*told(view), *_one_by_one(view, baseline))
     if view.is_doubtful:
+        of_state = () if view.state is None else view.state.reason_texts
         used = [crossing for crossing in crossings if crossing.crossing_id in view.used]
-        why = dict.fromkeys(text for crossing in used for text in crossing.reason_texts)
+        of_crossings = (text for crossing in used for text in crossing.reason_texts)
+        why = dict.fromkeys((*of_state, *of_crossings))
         because = ("The reasons: " + " ".join(why),) if why else ()
         headline = "Doubtful: to be looked at, not to be relied upon."
         return Finding("doubtful", headline, (*said, *because))
     if view.comparison is None:
         return Finding("sound", "The elements cannot be compared.", said)
-    if view.comparison.weak:
-        number = len(view.comparison.weak)
-        what = "One element is" if number == 1 else f"{number} elements are"
+    weak = view.comparison.weak
+    if weak and view.elsewhere:
+        numbers = " and ".join(str(one.number) for one in weak)
+        what = f"element {numbers}" if len(weak) == 1 else f"elements {numbers}"
+        return Finding("weak", f"Less stiff about {what}; which one is not certain.", said)
+    if weak:
+        what = "One element is" if len(weak) == 1 else f"{len(weak)} elements are"
         return Finding("weak", f"{what} clearly less stiff.", said)
+    if 2 * len(view.unresolved) > len(view.comparison.elements):
+        return Finding("open", "Single elements cannot be told, only the bridge as a whole.", said)
+    if view.unresolved:
+        headline = "No element is clearly less stiff, of those that can be told."
+        return Finding("sound", headline, said)
     return Finding("sound", "No element is clearly less stiff.", said)
+
+
+def _no_finding(crossings: Sequence[Crossing]) -> Finding:
+    """No crossing could be used: the commonest reasons, for who reads no further."""
+    counted = Counter(text for crossing in crossings for text in crossing.reason_texts)
+    why = " ".join(text for text, _ in counted.most_common(_MOST_REASONS))
+    suspect = sum(crossing.verdict == "suspect" for crossing in crossings)
+    which = (
+        "The only crossing was" if len(crossings) == 1 else f"All {len(crossings)} crossings were"
+    )
+    if not suspect:
+        said = f"{which} rejected, and no number of {'it' if len(crossings) == 1 else 'them'} means"
+        return Finding(
+            "nothing", "Nothing can be said about this bridge.", (f"{said} anything.", why)
+        )
+    if suspect < len(crossings):
+        which = f"None of the {len(crossings)} crossings is good, {suspect} {_are(suspect)}"
+    where = "What it says stands" if suspect == 1 else "What they say stands"
+    where += " in the evidence, to be looked at and not to be relied upon."
+    return Finding(
+        "doubtful", "Nothing can be relied upon yet.", (f"{which} suspect. {where}", why)
+    )
+
+
+def _are(number: int) -> str:
+    return "is" if number == 1 else "are"
 
 
 def _quality(view: BridgeView, crossings: Sequence[Crossing]) -> str:
@@ -215,8 +262,16 @@ def _quality(view: BridgeView, crossings: Sequence[Crossing]) -> str:
     said = f"{len(crossings)} crossing{'s' if len(crossings) != 1 else ''}: {', '.join(parts)}."
     if view.estimate is None:
         return f"{said} None could be used."
-    said += f" The numbers below are of {_used(view)}."
+    if view.state is not None and len(view.used) > 1:
+        return " ".join((said, *_together(view.state, len(crossings))))
     others = [c for c in crossings if c.verdict == "good" and c.crossing_id not in view.used]
+    which = "this one" if len(crossings) == 1 else "the newest usable one"
+    said += f" The numbers below are of {which}."
+    if view.state is not None and view.state.between_crossing_std is not None:
+        said += (
+            " Their intervals allow for how a bridge changes from one crossing to the next, which "
+            "a single one cannot tell."
+        )
     deviation = _largest_deviation(view.estimate, others)
     if deviation is None:
         return f"{said} No other good crossing confirms them."
@@ -227,10 +282,20 @@ def _quality(view: BridgeView, crossings: Sequence[Crossing]) -> str:
     return f"{said} {which} {agree}: at most {deviation:.1f} standard deviations apart."
 
 
-def _used(view: BridgeView) -> str:
-    if len(view.used) == 1:
-        return "the newest usable one" if len(view.crossings) > 1 else "this one"
-    return f"{len(view.used)} of them together"
+def _together(state: BridgeResult, crossings: int) -> Iterator[str]:
+    """What many crossings that were fused say of how good they are."""
+    used = len(state.crossings_used)
+    all_of = f"all {used}" if used == crossings else f"{used} of them"
+    yield f"The numbers below are of {all_of} together, a measurement that is {state.verdict}."
+    left = Counter(LEFT_OUT_TEXTS.get(one.reason, one.reason) for one in state.crossings_left_out)
+    if left:
+        yield f"Left out: {'; '.join(f'{n} {why}' for why, n in left.most_common())}."
+    low, high = state.between_crossing_std_q025, state.between_crossing_std_q975
+    if state.between_crossing_std is not None and low is not None and high is not None:
+        yield (
+            f"From crossing to crossing EI changes by {100.0 * state.between_crossing_std:.1f} % "
+            f"({100.0 * low:.1f} to {100.0 * high:.1f} %), beyond what each can tell."
+        )
 
 
 def _largest_deviation(estimate: Estimate, others: Sequence[Crossing]) -> float | None:

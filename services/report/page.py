@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 
 import matplotlib
 
 from schemas.results import Crossing
+from services.common.progress import Steps, unwatched_steps
 from services.identification.comparison import Comparison
 from services.report.bridge import BridgeReport, advice
 from services.report.html import Html, inlined_svg, joined, table, tag
@@ -20,6 +21,11 @@ from services.viewer.figure import draw_crossing
 _MOST_PICTURES = 12
 """So many crossings of a bridge have pictures; the others have their numbers."""
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+_HOW_TO_READ = (
+    "EI is the flexural rigidity: how hard the bridge is to bend at a place. A 95 % interval holds "
+    "the truth in 95 of 100 cases, if what is declared of truck and sensors is true. Nominal is "
+    "what the owner wrote down of the sound bridge."
+)
 _NOT_MEANT = (
     (
         "It is a hint where to look at the next inspection, never a condition rating. It says "
@@ -40,8 +46,20 @@ _NOT_MEANT = (
 )
 
 
-def page(reports: Sequence[BridgeReport]) -> str:
-    """The whole report as one HTML file that needs nothing else, neither network nor scripts."""
+def page(reports: Sequence[BridgeReport], progress: Steps = unwatched_steps) -> str:
+    """The whole report as one HTML file that needs nothing else, neither network nor scripts.
+
+    `progress` is told of each picture.
+    """
+    steps = sum(map(_pictures, reports))
+    done = 0
+
+    def drawn() -> None:
+        nonlocal done
+        done += 1
+        progress(done, steps)
+
+    progress(0, steps)
     title = ", ".join(_name(report) for report in reports) or "no bridge"
     head = tag(
         "head",
@@ -51,13 +69,19 @@ def page(reports: Sequence[BridgeReport]) -> str:
         tag("title", f"Stiffness of {title}"),
         tag("style", Html(CSS)),
     )
-    bodies = [_bridge(report, f"b{n}-") for n, report in enumerate(reports)]
+    bodies = [_bridge(report, f"b{n}-", drawn) for n, report in enumerate(reports)]
     if not bodies:
         bodies = [joined(tag("h1", "No crossing"), tag("p", "No truck crossed a known bridge."))]
     return f"<!DOCTYPE html>\n{tag('html', head, tag('body', *bodies), lang='en')}\n"
 
 
-def _bridge(report: BridgeReport, prefix: str) -> Html:
+def _pictures(report: BridgeReport) -> int:
+    """How many there are of a bridge."""
+    shown = sum(crossing.parameters is not None for crossing in report.crossings)
+    return (report.view.estimate is not None) + min(shown, _MOST_PICTURES)
+
+
+def _bridge(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Html:
     finding = report.finding
     first = tag(
         "section",
@@ -70,27 +94,30 @@ def _bridge(report: BridgeReport, prefix: str) -> Html:
             class_=f"finding {finding.kind}",
         ),
         _facts(report),
-        *_result(report, prefix),
+        *_result(report, prefix, drawn),
         tag("h2", "What this does not mean"),
         tag("ul", *(tag("li", text) for text in _not_meant(report))),
         class_="first",
     )
     newest_first = list(reversed(report.crossings))
     heading = joined(tag("h2", "Evidence, crossing by crossing"))
-    if finding.kind == "doubtful":
+    if finding.kind == "doubtful" and report.view.estimate is not None:
         heading = joined(*_what_to_do(report.crossings), heading)
     evidence, pictures = [], 0
     for n, crossing in enumerate(newest_first):
         has_picture = crossing.parameters is not None and pictures < _MOST_PICTURES
         pictures += has_picture
         evidence.append(_crossing(report, crossing, f"{prefix}c{n}-" if has_picture else None))
+        if has_picture:
+            drawn()
     return joined(first, tag("section", heading, class_="break"), *evidence)
 
 
 def _not_meant(report: BridgeReport) -> Sequence[str]:
-    if report.finding.kind == "nothing":
-        text = "It means neither that the bridge is sound nor that it is damaged: nothing was "
-        return (text + "measured that could tell.",)
+    if report.view.estimate is None:
+        text = "It means neither that the bridge is sound nor that it is damaged"
+        no_number = report.finding.kind == "nothing"
+        return (text + (": nothing was measured that could tell." if no_number else "."),)
     return _NOT_MEANT
 
 
@@ -120,10 +147,10 @@ def _facts(report: BridgeReport) -> Html:
     )
 
 
-def _result(report: BridgeReport, prefix: str) -> Iterator[Html]:
+def _result(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Iterator[Html]:
     view = report.view
     if view.estimate is None:
-        yield tag("h2", "Why nothing can be said")
+        yield tag("h2", "Why")
         counted: dict[str, int] = {}
         for crossing in report.crossings:
             for text in crossing.reason_texts:
@@ -135,6 +162,7 @@ def _result(report: BridgeReport, prefix: str) -> Iterator[Html]:
         return
     with matplotlib.rc_context(STYLE):
         svg = figure_bytes(draw_bridge(view, with_heading=False), "svg")
+    drawn()
     said = " ".join(report.finding.sentences)
     yield tag("figure", inlined_svg(svg, prefix, f"EI along the span. {said}"))
     yield _elements(report)
@@ -155,6 +183,8 @@ def _elements(report: BridgeReport) -> Html:
             element = compared[n]
             change = f"{_signed(element.ratio)} ({_signed(element.low)} to {_signed(element.high)})"
             remark = "weaker" if element.is_weak else "stiffer" if element.is_stiff else ""
+        if n + 1 in view.unresolved and not remark:
+            remark = "not resolved"
         rows.append(
             [
                 str(n + 1),
@@ -163,7 +193,7 @@ def _elements(report: BridgeReport) -> Html:
                 f"{low:.2f}–{high:.2f}",
                 f"{mean / view.nominal_nm2[n]:.3f}",
                 change,
-                remark + ("?" if remark and view.is_doubtful else ""),
+                remark + ("?" if remark in ("weaker", "stiffer") and view.is_doubtful else ""),
             ]
         )
         classes.append("" if view.is_doubtful else {"weaker": "weak"}.get(remark, ""))
@@ -172,6 +202,7 @@ def _elements(report: BridgeReport) -> Html:
 
 def _caveats(report: BridgeReport) -> Iterator[Html]:
     comparison = report.view.comparison
+    yield tag("p", _HOW_TO_READ, class_="note")
     if comparison is None:
         return
     if comparison.reference == "others":

@@ -15,6 +15,7 @@ ul { padding-left: 5mm; }
 .finding strong { font-size: 12.5pt; }
 .finding.weak { border-color: #8a4b00; background: #fdf0d5; }
 .finding.sound { border-color: #00694d; background: #eef7f3; }
+.finding.open { background: #f3f5f7; }
 .finding.doubtful { border-style: dashed; border-left-style: double; background: #f1f1f1; }
 .finding.nothing { border-style: dashed; border-color: #c0392b; background: #f6e1de; }
 table { border-collapse: collapse; width: 100%; margin: 1.5mm 0; font-size: 9pt; }
@@ -36,12 +37,12 @@ svg { width: 100%; height: auto; display: block; }
   .first + .break + .crossing { break-before: avoid; }
   .crossing + .first { break-before: page; }
   figure, tr, .finding { break-inside: avoid; }
-  .first figure svg { max-height: 62mm; }
+  .first figure svg { max-height: 55mm; }
   .crossing figure svg { max-height: 118mm; }
   .crossing { break-inside: avoid; }
   h2 { margin-top: 2mm; }
   .finding p { margin: 0.3mm 0; }
-  .note, .first ul { font-size: 8.2pt; line-height: 1.28; }
+  .note, .first ul { font-size: 8pt; line-height: 1.25; }
   .first table { font-size: 8.6pt; margin: 1mm 0; }
   * { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
 }

@@ -13,8 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from services.identification.comparison import sentences
-from services.viewer.bridge_view import BridgeView
+from services.viewer.bridge_view import BridgeView, told
 from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
     BANNERS,
@@ -31,6 +30,7 @@ from services.viewer.drawing import (
     draw_bars,
     draw_intervals,
     label_bars,
+    label_loss,
     legend_beside_title,
     mark_bridge,
     quieten,
@@ -53,7 +53,9 @@ def bridge_figure(path: Path, bridge: BridgeView) -> None:
 def draw_bridge(bridge: BridgeView, *, with_heading: bool = True) -> Figure:
     """The figure itself, to be drawn in `STYLE`; without heading and list it is one panel."""
     listed = min(len(bridge.crossings), _MOST_LISTED + 1) if with_heading else 0
-    panel_in, heading_in, list_in = 3.6, 1.15 if with_heading else 0.35, 0.2 * listed
+    lines = _heading(bridge) if with_heading else []
+    heading_in = 1.15 + 0.17 * max(0, len(lines) - 2) if with_heading else 0.35
+    panel_in, list_in = 3.6, 0.2 * listed
     list_in += 0.35 if listed else 0.0
     height = heading_in + panel_in + 0.5 + list_in
     figure = Figure(figsize=(WIDTH_IN, height), facecolor="white")
@@ -62,7 +64,7 @@ def draw_bridge(bridge: BridgeView, *, with_heading: bool = True) -> Figure:
     axes = figure.add_axes((LEFT, bottom, RIGHT - LEFT, panel_in / height))
     _draw_panel(axes, bridge)
     if with_heading:
-        _draw_heading(figure, bridge)
+        _draw_heading(figure, bridge, lines)
         _list_crossings(figure, bridge, (list_in - 0.1) / height, 0.2 / height)
     return figure
 
@@ -83,21 +85,26 @@ def _draw_panel(axes: Axes, bridge: BridgeView) -> None:
         mean, low, high = (column / 1e9 for column in bridge.estimate[:3])
         weak = () if bridge.comparison is None else bridge.comparison.weak
         numbers = {element.number for element in weak}
-        draw_bars(axes, bridge.edges_m, mean, numbers, doubtful=bridge.is_doubtful)
+        draw_bars(
+            axes,
+            bridge.edges_m,
+            mean,
+            numbers,
+            doubtful=bridge.is_doubtful,
+            unresolved=bridge.unresolved,
+        )
         colour = MUTED if bridge.is_doubtful else BAR_EDGE
         draw_intervals(axes, bridge.edges_m, low, high, colour=colour, label="95 % interval")
         highest = max(highest, float(high.max()), _draw_crossings(axes, bridge))
         label_bars(axes, bridge.edges_m, mean, low, [f"{r:.3f}" for r in mean / nominal])
         for element in weak:
-            axes.annotate(
-                f"{100.0 * (1.0 - element.ratio):.0f} % less{'?' if bridge.is_doubtful else ''}",
-                ((element.from_m + element.to_m) / 2.0, high[element.number - 1]),
-                xytext=(0, 14 if len(bridge.crossings) > 1 else 8),
-                textcoords="offset points",
-                ha="center",
-                fontsize=9.5 if mean.size <= 11 else 8,
-                fontweight="bold",
-                zorder=8,
+            label_loss(
+                axes,
+                element,
+                float(high[element.number - 1]),
+                small=mean.size > 11,
+                doubt="?" if bridge.is_doubtful else "",
+                up=14.0 if len(bridge.crossings) > 1 else 8.0,
             )
     axes.set_ylim(0.0, 1.1 * highest)
     legend_beside_title(axes)
@@ -137,20 +144,12 @@ def _draw_crossings(axes: Axes, bridge: BridgeView) -> float:
     return highest
 
 
-def _draw_heading(figure: Figure, bridge: BridgeView) -> None:
+def _draw_heading(figure: Figure, bridge: BridgeView, lines: list[str]) -> None:
     height = figure.get_figheight()
     name = bridge.bridge if bridge.owner_id is None else f"{bridge.owner_id} ({bridge.bridge})"
     title = textwrap.shorten(f"Bridge {name}, {bridge.span_m:g} m", width=52, placeholder=" …")
     large: dict[str, Any] = {"fontsize": 14, "fontweight": "bold", "va": "top"}
     figure.text(LEFT, 1.0 - 0.18 / height, title, parse_math=False, **large)
-    doubt = "DOUBTFUL: a crossing that was used is suspect. " if bridge.is_doubtful else ""
-    said = " ".join(sentences(bridge.comparison))
-    if bridge.estimate is None:
-        number = len(bridge.crossings)
-        said = f"No finding: none of {number} crossings could be used."
-        if number == 1:
-            said = "No finding: the only crossing could not be used."
-    lines = textwrap.wrap(doubt + said, 112, max_lines=2, placeholder=" …")
     top = 1.0 - 0.47 / height
     banner = None
     if bridge.is_doubtful:
@@ -158,6 +157,25 @@ def _draw_heading(figure: Figure, bridge: BridgeView) -> None:
         banner = {"boxstyle": "round,pad=0.35", "linewidth": 1.4} | colours
     words = "\n".join(lines)
     figure.text(LEFT + 0.006, top, words, fontsize=9.5, color=INK, va="top", bbox=banner)
+
+
+def _heading(bridge: BridgeView) -> list[str]:
+    """What is said above the picture, in lines."""
+    doubt = f"DOUBTFUL: {_doubt(bridge)} " if bridge.is_doubtful else ""
+    said = " ".join(told(bridge))
+    if bridge.estimate is None:
+        number = len(bridge.crossings)
+        said = f"No finding: none of {number} crossings could be used."
+        if number == 1:
+            said = "No finding: the only crossing could not be used."
+    return textwrap.wrap(doubt + said, 112, max_lines=3, placeholder=" …")
+
+
+def _doubt(bridge: BridgeView) -> str:
+    """Why what is shown is doubtful, in a sentence."""
+    if bridge.state is not None and bridge.state.reason_texts:
+        return bridge.state.reason_texts[0]
+    return "a crossing that was used is suspect."
 
 
 def _why_nothing(bridge: BridgeView) -> str:

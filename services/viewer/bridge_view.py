@@ -8,11 +8,23 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.reasons import Reason
-from schemas.results import Crossing, Results
+from schemas.results import RESOLVED, BridgeResult, Crossing, Results
 from schemas.site import Bridge, Site
-from services.identification.comparison import Comparison, Estimate, compare, estimate_of_state
+from services.identification.comparison import (
+    Comparison,
+    Element,
+    Estimate,
+    compare,
+    estimate_of_state,
+    sentences,
+)
 from services.viewer.baseline import named_baseline
-from services.viewer.crossing_view import CrossingView, FloatArray, view_of_crossing
+from services.viewer.crossing_view import (
+    CrossingView,
+    FloatArray,
+    unresolved_elements,
+    view_of_crossing,
+)
 
 
 class BridgeView(NamedTuple):
@@ -30,15 +42,35 @@ class BridgeView(NamedTuple):
     estimate: Estimate | None
     """None if no crossing could be used."""
     is_doubtful: bool
-    """Whether a crossing that was used is suspect, or its method knows no intervals."""
+    """Whether the state or a crossing in it is suspect, or its method knows no intervals."""
     comparison: Comparison | None
     baseline: Estimate | None = None
     """What was stored of the bridge, to compare with."""
+    state: BridgeResult | None = None
+    """What `estimate` is of."""
 
     @property
     def span_m(self) -> float:
         """Length of the bridge between its outer bearings."""
         return float(self.edges_m[-1])
+
+    @property
+    def unresolved(self) -> frozenset[int]:
+        """Numbers of the elements of which too little is known to tell a loss of half of them."""
+        if self.state is None or self.estimate is None:
+            return frozenset()
+        return unresolved_elements(self.state.elements.values())
+
+    @property
+    def elsewhere(self) -> tuple[int, ...]:
+        """Numbers of the unresolved neighbours of weak elements: the loss may be theirs.
+
+        What bends under an axle is the sum of what elements that lie side by side do, and between
+        them rigidity is traded.
+        """
+        weak = set() if self.comparison is None else {one.number for one in self.comparison.weak}
+        beside = {n + side for n in weak for side in (-1, 1)} - weak
+        return tuple(sorted(beside & self.unresolved))
 
 
 def views_of_bridges(results: Results, site: Site, folder: Path | None = None) -> list[BridgeView]:
@@ -55,6 +87,37 @@ def views_of_bridges(results: Results, site: Site, folder: Path | None = None) -
     ]
 
 
+def told(view: BridgeView) -> list[str]:
+    """What was found, in words: only of elements that are resolved is said that they agree."""
+    open_ones = view.unresolved
+    if view.comparison is None or not open_ones:
+        return sentences(view.comparison)
+    elements = view.comparison.elements
+    clear = tuple(one for one in elements if one.is_weak or one.is_stiff)
+    said = sentences(view.comparison._replace(elements=clear)) if clear else []
+    if view.elsewhere:
+        either = " or ".join(map(str, view.elsewhere))
+        said.append(f"The loss may as well be in element {either}, beside it and not resolved.")
+    which = _not_resolved(elements, open_ones)
+    said.append(f"{which} (standard deviation above {100.0 * RESOLVED:.0f} %).")
+    level = None if view.state is None else view.state.level
+    if level is not None:
+        said.append(
+            f"As a whole the bridge is at {level.mean:.2f} of nominal "
+            f"± {100.0 * level.std / level.mean:.0f} %."
+        )
+    return said
+
+
+def _not_resolved(elements: tuple[Element, ...], open_ones: frozenset[int]) -> str:
+    if len(open_ones) == len(elements):
+        return "No single element is resolved"
+    *others, last = sorted(open_ones)
+    if not others:
+        return f"Element {last} is not resolved"
+    return f"Elements {', '.join(map(str, others))} and {last} are not resolved"
+
+
 def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) -> BridgeView:
     """Take results of one bridge apart; `baseline` is what was stored of it."""
     crossings = sorted(
@@ -69,7 +132,11 @@ def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) 
         used = frozenset(state.crossings_used)
         estimate = estimate_of_state(state, _common_error(crossings, used))
     of_state = [crossing for crossing in crossings if crossing.crossing_id in used]
-    is_doubtful = estimate is not None and (not of_state or any(map(_is_doubtful, of_state)))
+    is_doubtful = (
+        estimate is not None
+        and state is not None
+        and (not of_state or state.verdict == "suspect" or any(map(_is_doubtful, of_state)))
+    )
     return BridgeView(
         bridge.id,
         bridge.owner_id,
@@ -82,6 +149,7 @@ def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) 
         is_doubtful,
         None if estimate is None else compare(estimate, nominal, edges, baseline),
         baseline,
+        state,
     )
 
 

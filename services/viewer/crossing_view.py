@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.results import Crossing, Prior, resolution
+from schemas.results import RESOLVED, Crossing, ElementState, Parameter, Prior, resolution
 from schemas.site import Bridge
+from services.identification.comparison import Comparison, Estimate, compare, sentences
 
 FloatArray = NDArray[np.float64]
 
@@ -63,6 +65,18 @@ class ParameterRow(NamedTuple):
     prior: Prior | None = None
 
 
+class ResidualCells(NamedTuple):
+    """What a fit left over, in multiples of what the declared noise explains: 1 is expected."""
+
+    mean_square: FloatArray
+    """(3, 3, b): roads, front and rear body; before, on and behind the bridge; bands. NaN where
+    there are no rows."""
+    excess_std: FloatArray
+    """(3, 3, b): how many standard deviations of chance that lies above 1."""
+    edges_hz: tuple[float, ...]
+    """b + 1, the last infinite."""
+
+
 class CrossingView(NamedTuple):
     """One crossing as it is drawn.
 
@@ -93,11 +107,27 @@ class CrossingView(NamedTuple):
     """Relative standard deviation that all elements have in common (mass, gain)."""
     resolution: str | None = None
     """In words what the crossing could not tell; None where it resolves every element."""
+    residuals: ResidualCells | None = None
+    """None where the samples are not at hand."""
+    unresolved: frozenset[int] = frozenset()
+    """Numbers of the elements of which too little is known to tell a loss of half of them."""
 
     @property
     def span_m(self) -> float:
         """Length of the bridge between its bearings."""
         return float(self.element_edges_m[-1])
+
+    @property
+    def resolved_ratio(self) -> FloatArray | None:
+        """EI over nominal (n,), NaN where an element is not resolved; None if rejected."""
+        if self.rigidity_nm2 is None:
+            return None
+        return np.array(
+            [
+                np.nan if number in self.unresolved else ratio
+                for number, ratio in enumerate(self.rigidity_nm2 / self.nominal_nm2, start=1)
+            ]
+        )
 
     @property
     def interval_has_meaning(self) -> bool:
@@ -117,14 +147,39 @@ def summary_line(view: CrossingView) -> str:
     return " · ".join(parts)
 
 
+def comparison_of(crossing: CrossingView, baseline: Estimate | None = None) -> Comparison | None:
+    """The elements of one crossing against the baseline or each other; None if it has none."""
+    if crossing.rigidity_nm2 is None or crossing.interval_nm2 is None:
+        return None
+    if not crossing.interval_has_meaning:
+        return None
+    low, high = crossing.interval_nm2.T
+    found = Estimate(crossing.rigidity_nm2, low, high, crossing.scale_error)
+    return compare(found, crossing.nominal_nm2, crossing.element_edges_m, baseline)
+
+
+def told_of_crossing(crossing: CrossingView, found: Comparison | None) -> list[str]:
+    """What one crossing found, in words: only of what is resolved is said that it agrees."""
+    if found is None:
+        return []
+    if crossing.resolution is None:
+        return sentences(found)
+    clear = tuple(one for one in found.elements if one.is_weak or one.is_stiff)
+    said = sentences(found._replace(elements=clear)) if clear else []
+    return [*said, f"Not all is resolved: {crossing.resolution}."]
+
+
 def view_of_crossing(crossing: Crossing, bridge: Bridge) -> CrossingView:
     """Gather what is drawn of a result; the bridge gives the lengths and nominal rigidities."""
     parameters = crossing.parameters
     rigidity = interval = None
+    unresolved = frozenset[int]()
     if parameters is not None:
         elements = [parameters[f"EI_{number}"] for number in range(1, bridge.elements + 1)]
         rigidity = np.array([element.mean for element in elements])
         interval = np.array([(element.q025, element.q975) for element in elements])
+        if crossing.derived is not None and crossing.derived.ei_level is not None:
+            unresolved = unresolved_elements(elements)
     road = crossing.road
     return CrossingView(
         crossing_id=crossing.crossing_id,
@@ -153,4 +208,11 @@ def view_of_crossing(crossing: Crossing, bridge: Bridge) -> CrossingView:
         interior_supports_m=bridge.interior_supports_m,
         scale_error=crossing.scale_error or 0.0,
         resolution=resolution(crossing),
+        unresolved=unresolved,
     )
+
+
+def unresolved_elements(elements: Iterable[Parameter | ElementState]) -> frozenset[int]:
+    """Numbers of those whose standard deviation is too large to tell a loss of half of them."""
+    counted = enumerate(elements, start=1)
+    return frozenset(n for n, one in counted if one.std > RESOLVED * abs(one.mean))

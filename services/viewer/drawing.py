@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import textwrap
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyBboxPatch
+from matplotlib.patches import FancyBboxPatch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from services.common.files import write_atomically
+from services.identification.comparison import Element
 from services.viewer.crossing_view import (
     TRUTH_COLOUR,
     VEHICLE_COLOURS,
@@ -96,12 +98,20 @@ def figure_bytes(figure: Figure, form: str, *, dpi: int = DPI) -> bytes:
     return buffer.getvalue()
 
 
-def draw_verdict(figure: Figure, verdict: str, reasons: tuple[str, ...], top: float) -> None:
-    """The verdict below a heading: a word if it is good, a banner with the reasons if not."""
+def draw_verdict(
+    figure: Figure, verdict: str, reasons: tuple[str, ...], top: float, told: Sequence[str] = ()
+) -> None:
+    """The verdict below a heading: a word if it is good, a banner with the reasons if not.
+
+    Of what was `told` the first sentence stands beside a good one.
+    """
     words: dict[str, Any] = {"fontsize": 9.5, "va": "top"}
     if verdict == "good":
         colour = VERDICT_COLOURS["good"]
         figure.text(LEFT, top, "verdict: good", color=colour, fontweight="bold", **words)
+        if told:
+            short = textwrap.shorten(told[0], width=100, placeholder=" …")
+            figure.text(LEFT + 0.12, top, short, color=INK, parse_math=False, **words)
         return
     height = 0.40 / figure.get_figheight()
     figure.add_artist(
@@ -125,9 +135,18 @@ def draw_verdict(figure: Figure, verdict: str, reasons: tuple[str, ...], top: fl
 
 
 def draw_bars(
-    axes: Axes, edges_m: FloatArray, heights: FloatArray, weak: set[int], *, doubtful: bool
+    axes: Axes,
+    edges_m: FloatArray,
+    heights: FloatArray,
+    weak: set[int],
+    *,
+    doubtful: bool,
+    unresolved: Set[int] = frozenset(),
 ) -> None:
-    """A bar for each element: the weak ones stand out, doubtful ones are grey and hatched."""
+    """A bar for each element: the weak ones stand out, doubtful ones are grey and hatched.
+
+    Those that are `unresolved` are empty, with a dashed edge.
+    """
     centres, lengths = (edges_m[:-1] + edges_m[1:]) / 2.0, np.diff(edges_m)
     bars = axes.bar(
         centres,
@@ -140,9 +159,27 @@ def draw_bars(
         zorder=2,
         label="estimate, doubtful" if doubtful else "estimate",
     )
+    if doubtful:
+        return
     for number, bar in enumerate(bars, start=1):
-        if number in weak and not doubtful:
+        if number in unresolved:
+            bar.set(facecolor="white", linestyle="--")
+        if number in weak:
             bar.set(facecolor=WEAK_BAR, edgecolor=WEAK_EDGE, linewidth=1.8)
+    if unresolved:  # a legend would show the first bar, whatever that is
+        bars.set_label("")
+        for name, fill, line in (("estimate", BAR, "-"), ("not resolved", "white", "--")):
+            axes.add_patch(
+                Rectangle(
+                    (0.0, 0.0),
+                    0.0,
+                    0.0,
+                    facecolor=fill,
+                    edgecolor=BAR_EDGE,
+                    linestyle=line,
+                    label=name,
+                )
+            )
 
 
 def draw_intervals(
@@ -154,6 +191,22 @@ def draw_intervals(
     for end in (low, high):
         left, right = centres - 0.09 * lengths, centres + 0.09 * lengths
         axes.hlines(end, left, right, color=colour, zorder=5)
+
+
+def label_loss(
+    axes: Axes, element: Element, top: float, *, small: bool, doubt: str = "", up: float = 8.0
+) -> None:
+    """What an element has lost, over its interval that ends at `top`."""
+    axes.annotate(
+        f"{100.0 * (1.0 - element.ratio):.0f} % less{doubt}",
+        ((element.from_m + element.to_m) / 2.0, top),
+        xytext=(0, up),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8 if small else 9.5,
+        fontweight="bold",
+        zorder=8,
+    )
 
 
 def label_bars(

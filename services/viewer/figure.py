@@ -12,13 +12,14 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from services.identification.comparison import Estimate, compare
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,
     FloatArray,
     RoadView,
+    comparison_of,
     summary_line,
+    told_of_crossing,
 )
 from services.viewer.drawing import (
     BAR_EDGE,
@@ -35,6 +36,7 @@ from services.viewer.drawing import (
     draw_intervals,
     draw_verdict,
     label_bars,
+    label_loss,
     legend_beside_title,
     mark_bridge,
     quieten,
@@ -117,7 +119,8 @@ def _draw_heading(figure: Figure, crossing: CrossingView) -> None:
     small: dict[str, Any] = {"fontsize": 9.5, "color": MUTED, "va": "top"}
     figure.text(LEFT, 1.0 - 0.455 * inch, summary, parse_math=False, **small)
     reasons = crossing.reason_texts
-    draw_verdict(figure, crossing.verdict, reasons, 1.0 - 0.65 * inch)
+    told = told_of_crossing(crossing, comparison_of(crossing))
+    draw_verdict(figure, crossing.verdict, reasons, 1.0 - 0.65 * inch, told)
 
 
 def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None) -> None:
@@ -147,28 +150,24 @@ def _draw_estimate(axes: Axes, crossing: CrossingView, estimate: FloatArray) -> 
     """Bars, intervals and labels, in GN·m²; returns the highest value drawn."""
     edges = crossing.element_edges_m
     doubtful = crossing.verdict != "good" or not crossing.interval_has_meaning
-    draw_bars(axes, edges, estimate, weak_elements(crossing), doubtful=doubtful)
-    lowest, highest = estimate, float(estimate.max())
+    compared = comparison_of(crossing)
+    weak = () if compared is None or doubtful else compared.weak
+    numbers = {one.number for one in weak}
+    open_ones = crossing.unresolved
+    draw_bars(axes, edges, estimate, numbers, doubtful=doubtful, unresolved=open_ones)
+    lowest, upper, highest = estimate, estimate, float(estimate.max())
     if crossing.interval_nm2 is not None:
         low, high = crossing.interval_nm2.T / 1e9
         colour = MUTED if doubtful else BAR_EDGE
         label = "95 % interval" if crossing.interval_has_meaning else "interval (without meaning)"
         draw_intervals(axes, edges, low, high, colour=colour, label=label)
-        lowest, highest = np.minimum(lowest, low), max(highest, float(high.max()))
+        lowest, upper, highest = np.minimum(lowest, low), high, max(highest, float(high.max()))
     ratios = estimate / (crossing.nominal_nm2 / 1e9)
     label_bars(axes, edges, estimate, lowest, [f"{ratio:.3f}" for ratio in ratios])
+    for element in weak:
+        over = max(estimate[element.number - 1], upper[element.number - 1])
+        label_loss(axes, element, float(over), small=ratios.size > 11)
     return highest
-
-
-def weak_elements(crossing: CrossingView) -> set[int]:
-    """Numbers of the elements that are clearly weaker than the others of this crossing."""
-    if crossing.rigidity_nm2 is None or crossing.interval_nm2 is None:
-        return set()
-    low, high = crossing.interval_nm2.T
-    found = compare(
-        Estimate(crossing.rigidity_nm2, low, high), crossing.nominal_nm2, crossing.element_edges_m
-    )
-    return set() if found is None else {element.number for element in found.weak}
 
 
 def _draw_profiles(

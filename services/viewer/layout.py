@@ -14,6 +14,7 @@ from services.viewer.deflection import passage_of
 from services.viewer.learned import learned_of
 from services.viewer.rerun_parts import CHAINAGE, RATIO_LEGEND, TIME
 from services.viewer.rerun_places import PLAN_MARGIN, BridgeOnMap, plan_root
+from services.viewer.rerun_residuals import RESIDUALS_BOUNDS
 from services.viewer.strip import STRIP_HEIGHT, STRIP_PAPER, STRIP_WIDTH
 from services.viewer.vehicle_signals import VehicleSignals
 
@@ -98,6 +99,8 @@ def _crossing_layout(
         evidence.append(rrb.Vertical(*plots, name="Road and signals"))
     if crossing.interval_has_meaning and learned_of(crossing.parameters):
         evidence.append(_learned_view(root, crossing))
+    if crossing.residuals is not None:
+        evidence.append(_residuals_view(root))
     if evidence:
         beside = rrb.Tabs(*evidence, active_tab=0) if len(evidence) > 1 else evidence[0]
         columns.append((beside, 5))
@@ -186,6 +189,16 @@ def _learned_view(root: str, crossing: CrossingView) -> rrb.View:
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-3.6, 4.2), y_range=(-2.0 * LEARNED_ROW, (rows + 1) * LEARNED_ROW)
         ),
+    )
+
+
+def _residuals_view(root: str) -> rrb.View:
+    x_range, y_range = RESIDUALS_BOUNDS
+    return rrb.Spatial2DView(
+        origin=f"{root}/residuals",
+        name="Left over by band",
+        background=STRIP_PAPER,
+        visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
     )
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from schemas.results import Results
 from schemas.site import Site
+from services.common.progress import Steps, unwatched_steps
 from services.viewer.bridge_figure import bridge_figure
 from services.viewer.bridge_view import views_of_bridges
 from services.viewer.crossing_view import view_of_crossing
@@ -13,24 +14,31 @@ from services.viewer.figure import crossing_figure
 FORMS = ("png", "svg")
 
 
-def write_pictures(folder: Path, results: Results, site: Site) -> list[Path]:
+def write_pictures(
+    folder: Path, results: Results, site: Site, progress: Steps = unwatched_steps
+) -> list[Path]:
     """Write `CROSSING.png`, `BRIDGE.png` and the same as `.svg`; return them.
 
-    The folder is made if it is not there, files of these names are replaced.
+    The folder is made if it is not there, files of these names are replaced. `progress` is told of
+    each picture.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
+    bridges = views_of_bridges(results, site)
+    steps = len(FORMS) * (len(results.crossings) + len(bridges))
+    written: list[Path] = []
     for crossing in results.crossings:
         view = view_of_crossing(crossing, site.bridge(crossing.bridge))
         for form in FORMS:
             path = folder / f"{_file_name(crossing.crossing_id)}.{form}"
             crossing_figure(path, crossing=view)
             written.append(path)
-    for bridge in views_of_bridges(results, site):
+            progress(len(written), steps)
+    for bridge in bridges:
         for form in FORMS:
             path = folder / f"{bridge.bridge}.{form}"
             bridge_figure(path, bridge)
             written.append(path)
+            progress(len(written), steps)
     return written
 
 

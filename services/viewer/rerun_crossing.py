@@ -14,13 +14,15 @@ import numpy as np
 import rerun as rr
 
 from services.common.geodesy import bridge_frame, to_chainage
-from services.identification.comparison import Comparison, Estimate, compare, sentences
+from services.identification.comparison import Comparison, Estimate
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
     CrossingView,
     FloatArray,
     OnBridge,
+    comparison_of,
     summary_line,
+    told_of_crossing,
 )
 from services.viewer.deflection import Passage, passage_of
 from services.viewer.layout import LEARNED_ROW, crossing_root, is_doubtful
@@ -47,6 +49,7 @@ from services.viewer.rerun_places import (
     log_track_on_plan,
     log_truck_on_plan,
 )
+from services.viewer.rerun_residuals import log_residuals
 from services.viewer.strip import (
     STRIP_HEIGHT,
     STRIP_WIDTH,
@@ -78,6 +81,7 @@ def log_crossing(
     log_markdown(recording, f"{root}/verdict", verdict_markdown(crossing, compared))
     _log_rigidity(recording, root, crossing, compared, baseline)
     _log_learned(recording, root, crossing, compared)
+    log_residuals(recording, root, crossing)
     passage = passage_of(crossing)
     if passage is not None:
         _log_passage(recording, root, crossing, passage)
@@ -85,7 +89,7 @@ def log_crossing(
         log_bridge(
             recording,
             bridge,
-            None if crossing.rigidity_nm2 is None else crossing.rigidity_nm2 / crossing.nominal_nm2,
+            crossing.resolved_ratio,
             doubtful=is_doubtful(crossing),
             map_entity=f"{root}/map",
             plan_entity=f"{root}/plan",
@@ -95,17 +99,6 @@ def log_crossing(
         log_position(recording, root, crossing, signals, bridge)
     if crossing.road is not None:
         _log_road(recording, root, crossing)
-
-
-def comparison_of(crossing: CrossingView, baseline: Estimate | None) -> Comparison | None:
-    """The elements of one crossing against the baseline or each other; None if it has none."""
-    if crossing.rigidity_nm2 is None or crossing.interval_nm2 is None:
-        return None
-    if not crossing.interval_has_meaning:
-        return None
-    low, high = crossing.interval_nm2.T
-    found = Estimate(crossing.rigidity_nm2, low, high, crossing.scale_error)
-    return compare(found, crossing.nominal_nm2, crossing.element_edges_m, baseline)
 
 
 def front_axle_chainage(crossing: OnBridge, time_s: FloatArray) -> FloatArray:
@@ -337,9 +330,9 @@ def _log_passage(
     columns = columns_of(np.rint(time_s * 1e9).astype(np.int64), chainage)
     entity = f"{root}/passage"
     _log_scene(recording, entity, crossing, passage, enlarged)
-    ratio = crossing.rigidity_nm2 / crossing.nominal_nm2
-    colours = ratio_colours(ratio, ratio.size, doubtful=is_doubtful(crossing))
-    ends = [int(np.flatnonzero(passage.element == n)[0]) for n in range(ratio.size)]
+    count = crossing.nominal_nm2.size
+    colours = ratio_colours(crossing.resolved_ratio, count, doubtful=is_doubtful(crossing))
+    ends = [int(np.flatnonzero(passage.element == n)[0]) for n in range(count)]
     ends.append(passage.x_m.size - 1)
     for n, colour in enumerate(colours):
         piece = slice(ends[n], ends[n + 1] + 1)
@@ -453,10 +446,9 @@ def verdict_markdown(crossing: CrossingView, compared: Comparison | None = None)
     lines += [f"- {text}" for text in crossing.reason_texts]
     if crossing.rigidity_nm2 is None:
         return "\n".join([*lines, "", "No estimate is given for a rejected crossing."])
-    if compared is not None:
-        lines += ["", " ".join(sentences(compared))]
-    if crossing.resolution is not None:
-        lines += ["", f"Not all is resolved: {crossing.resolution}."]
+    said = told_of_crossing(crossing, compared)
+    if said:
+        lines += ["", " ".join(said)]
     lines += ["", "| | estimate | 95 % interval | ratio to nominal |", "|---|---|---|---|"]
     for index, value in enumerate(crossing.rigidity_nm2):
         interval = "–"

@@ -17,10 +17,10 @@ from matplotlib.image import imread
 
 from schemas.signals import AccelBatch
 from services.common.files import replaced_atomically
+from services.common.progress import Steps, unwatched_steps
 from services.drives.signals import series_of_batches
-from services.identification.comparison import sentences
 from services.viewer.bridge_figure import draw_bridge
-from services.viewer.bridge_view import BridgeView
+from services.viewer.bridge_view import BridgeView, told
 from services.viewer.crossing_view import CrossingView, FloatArray, OnBridge, PassingView
 from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.layout import blueprint, bridge_root, passing_root
@@ -56,6 +56,18 @@ _PICTURE_DPI = 110
 """A picture that is larger than its view is drawn without smoothing, and cannot be read."""
 
 
+class _Count:
+    """How many steps have been done."""
+
+    def __init__(self, told: Steps, steps: int) -> None:
+        self._told, self._steps, self._done = told, steps, 0
+        told(0, steps)
+
+    def one_more(self) -> None:
+        self._done += 1
+        self._told(self._done, self._steps)
+
+
 def write_rrd(
     path: Path,
     *,
@@ -65,6 +77,7 @@ def write_rrd(
     overviews: Sequence[BridgeView] = (),
     passings: Sequence[PassingView] = (),
     about: str | None = None,
+    drawing: Steps = unwatched_steps,
 ) -> None:
     """Write a Rerun recording with its own layout; an existing file is replaced as a whole.
 
@@ -72,11 +85,14 @@ def write_rrd(
     signals by vehicle identifier. A crossing's accelerations are looked up in the signals of its
     vehicle; one without any, or with fewer channels, is drawn with what it has. `passings` are
     stays on a bridge that nobody has identified; `about` says in Markdown what was recorded.
+    `drawing` is told of each crossing, and of each piece of accelerations.
     """
     near = bridges_near_tracks(bridges, vehicles.values())
     default = blueprint(vehicles, crossings, overviews, passings, bridges=near, about=about)
     states = {view.bridge: view for view in overviews}
     places = {bridge.identifier: bridge for bridge in bridges}
+    pieces = sum(-(-len(signals.accel) // _PIECE) for signals in vehicles.values())
+    drawn = _Count(drawing, pieces + len(crossings))
     with (
         replaced_atomically(path) as temporary,
         rr.RecordingStream(APPLICATION, recording_id=_recording_id(crossings)) as recording,
@@ -90,7 +106,7 @@ def write_rrd(
         log_drive_plan(recording, near, vehicles)
         for vehicle, signals in vehicles.items():
             log_vehicle(recording, vehicle, signals.gnss)
-            _log_accelerations(recording, vehicle, signals)
+            _log_accelerations(recording, vehicle, signals, drawn)
         for view in overviews:
             _log_overview(recording, view)
         for crossing in crossings:
@@ -103,6 +119,7 @@ def write_rrd(
                 _series_around(crossing, vehicles.get(crossing.vehicle)),
                 None if state is None else state.baseline,
             )
+            drawn.one_more()
         for passing in passings:
             root = passing_root(passing)
             around = _series_around(passing, vehicles.get(passing.vehicle))
@@ -132,7 +149,7 @@ def acceleration_series(batches: Sequence[AccelBatch]) -> dict[str, tuple[IntArr
 
 
 def _log_accelerations(
-    recording: rr.RecordingStream, vehicle: str, signals: VehicleSignals
+    recording: rr.RecordingStream, vehicle: str, signals: VehicleSignals, drawn: _Count
 ) -> None:
     """All samples, a piece at a time: an hour at once takes a gigabyte more."""
     named: set[str] = set()
@@ -148,6 +165,7 @@ def _log_accelerations(
             known = piece[0].channels.get(channel) if first else None
             sent = 0 if known is None else known.samples.size
             send_scalars(recording, entity, samples[sent:], time_ns=time_ns[sent:])
+        drawn.one_more()
 
 
 def _series_around(passage: OnBridge, signals: VehicleSignals | None) -> Channels:
@@ -171,6 +189,7 @@ def _log_state(
     ratios = None
     if state is not None and state.estimate is not None:
         ratios = state.estimate.mean / state.nominal_nm2
+        ratios[[number - 1 for number in state.unresolved]] = np.nan
     log_bridge(
         recording,
         bridge,
@@ -190,12 +209,14 @@ def _log_overview(recording: rr.RecordingStream, bridge: BridgeView) -> None:
     recording.log(f"{root}/picture", rr.Image(pixels), static=True)
     said = "None of the crossings could be used."
     if bridge.estimate is not None:
-        said = " ".join(sentences(bridge.comparison))
+        said = " ".join(told(bridge))
     doubt = "**Doubtful: to be looked at, not to be relied upon.** " if bridge.is_doubtful else ""
     lines = [f"# {bridge.owner_id or bridge.bridge}", "", f"{doubt}{said}", ""]
     verdicts = [crossing.verdict for crossing in bridge.crossings]
     counted = [f"{verdicts.count(v)} {v}" for v in dict.fromkeys(sorted(verdicts))]
     lines += [f"Crossings: {', '.join(counted)}; used: {len(bridge.used)}.", ""]
-    reasons = dict.fromkeys(text for c in bridge.crossings for text in c.reason_texts)
+    of_state = () if bridge.state is None else bridge.state.reason_texts
+    of_crossings = (text for c in bridge.crossings for text in c.reason_texts)
+    reasons = dict.fromkeys((*of_state, *of_crossings))
     lines += [f"- {text}" for text in reasons]
     log_markdown(recording, f"{root}/finding", "\n".join(lines))

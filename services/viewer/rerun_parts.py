@@ -37,14 +37,20 @@ def rgb(colour: str) -> Rgb:
 
 
 def ratio_colours(ratios: FloatArray | None, count: int, *, doubtful: bool) -> list[Rgb]:
-    """A colour for each of `count` elements by its ratio to nominal; grey where doubtful."""
+    """A colour for each of `count` elements by its ratio to nominal.
+
+    Grey where doubtful, and where a ratio is NaN: not resolved.
+    """
     if ratios is None:
         return [rgb(UNKNOWN)] * count
     if doubtful:
         return [rgb(MUTED)] * count
     at = [ratio for ratio, _ in _RATIO_COLOURS]
     channels = np.array([colour for _, colour in _RATIO_COLOURS], dtype=np.float64).T
-    mixed = np.rint([np.interp(ratios, at, channel) for channel in channels]).astype(int).T
+    known = np.isfinite(ratios)
+    mixed = np.tile(rgb(MUTED), (count, 1))
+    for place, channel in enumerate(channels):
+        mixed[known, place] = np.rint(np.interp(ratios[known], at, channel))
     return [(int(red), int(green), int(blue)) for red, green, blue in mixed]
 
 

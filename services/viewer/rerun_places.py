@@ -126,7 +126,8 @@ def log_bridge(
 ) -> None:
     """The elements of a bridge on map and plan, coloured by their ratio to nominal.
 
-    `ratios` (n,) is None where nothing is known of the bridge.
+    `ratios` (n,) is None where nothing is known of the bridge, and NaN where an element is not
+    resolved.
     """
     count = len(bridge.edges_m) - 1
     colours = ratio_colours(ratios, count, doubtful=doubtful)
@@ -142,7 +143,8 @@ def log_bridge(
         static=True,
     )
     if ratios is not None:
-        words = [f"EI_{n} {ratio:.2f}" for n, ratio in enumerate(ratios, start=1)]
+        told = [f"{ratio:.2f}" if np.isfinite(ratio) else "?" for ratio in ratios]
+        words = [f"EI_{n} {ratio}" for n, ratio in enumerate(told, start=1)]
         centres = (edges[:-1] + edges[1:]) / 2.0
         # Two rows: elements of a short bridge are narrower than words.
         down = half + np.where(np.arange(count) % 2 == 0, 0.0, 0.09 * bridge.span_m)
@@ -208,7 +210,12 @@ def log_track_on_plan(recording: rr.RecordingStream, entity: str, places_m: Floa
     """All places at which the receiver said that a truck was (f, 2), in the plan's coordinates."""
     recording.log(
         entity,
-        rr.Points2D(places_m, radii=rr.Radius.ui_points(1.5), colors=[rgb(MUTED)]),
+        rr.Points2D(
+            places_m,
+            radii=rr.Radius.ui_points(1.5),
+            colors=[rgb(MUTED)],
+            draw_order=10.0,  # below the elements, which have 20: of many runs they are a carpet
+        ),
         static=True,
     )
 

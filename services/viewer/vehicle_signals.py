@@ -25,16 +25,19 @@ class Heard:
         self._accel: dict[str, dict[_Identity, AccelBatch]] = {}
         self._gnss: dict[str, dict[_Identity, GnssFix]] = {}
 
-    def add(self, message: Message) -> None:
-        """Take a message; what is of no sensor, or cannot be decoded, is left out."""
+    def add(self, message: Message) -> bool:
+        """Take a message; what is of no sensor, or cannot be decoded, is left out: False."""
         vehicle, identity = message.key.identifier, (message.boot_id, message.sequence)
         try:
             if message.key.stream == "accel":
                 self._accel.setdefault(vehicle, {})[identity] = decode_accel(message.payload)
             elif message.key.stream == "gnss":
                 self._gnss.setdefault(vehicle, {})[identity] = decode_gnss(message.payload)
+            else:
+                return False
         except ValueError:
-            return  # a picture shows what can be read; the logger has counted what cannot
+            return False  # a picture shows what can be read; the logger has counted what cannot
+        return True
 
     def signals(self) -> dict[str, VehicleSignals]:
         """By vehicle, in the order of time."""

@@ -6,11 +6,13 @@ come from the internet when there is one; tracks and bridges are drawn without.
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import signal
 import subprocess
 import tempfile
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -23,18 +25,27 @@ from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.common.errors import FailureError, InputError
-from services.common.progress import Offset, reading_bar, unwatched
+from services.common.progress import (
+    Offset,
+    Steps,
+    progress_bar,
+    unwatched,
+    unwatched_steps,
+)
 from services.drives.survey import survey
 from services.history.site_of_results import site_of_results
-from services.recordings.recording import Message, check_message
+from services.recordings.recording import Message, check_envelope, check_message, read_messages
 from services.viewer.bridge_view import BridgeView, views_of_bridges
-from services.viewer.crossing_view import CrossingView, PassingView, view_of_crossing
+from services.viewer.crossing_view import CrossingView, PassingView, ResidualCells, view_of_crossing
 from services.viewer.recording_page import passings_of_survey, recording_page
 from services.viewer.rerun_file import write_rrd
 from services.viewer.rerun_places import bridges_of_site
+from services.viewer.residuals import residual_cells
 from services.viewer.vehicle_signals import Heard, VehicleSignals
 
 SUFFIXES = (".rrd", ".mcap", ".json")
+_MOST_RESIDUALS = 3
+"""Whoever opens a recording waits for them; `identify` computes more."""
 
 
 def view_command(*, target: str | Path, web: bool, console: Console) -> int:
@@ -52,15 +63,31 @@ def view_command(*, target: str | Path, web: bool, console: Console) -> int:
         shown = path
         if path.suffix != ".rrd":
             shown = Path(folder) / f"{path.stem}.rrd"
-            with reading_bar(f"preparing {path.name}", [path], console) as next_file:
-                convert(path, shown, progress=next_file())
+            with progress_bar(console) as bar:
+                reading = bar.add_task(f"reading {path.name}", total=path.stat().st_size)
+                drawn = bar.add_task("drawing", total=None, visible=False)
+                convert(
+                    path,
+                    shown,
+                    progress=lambda offset: bar.update(reading, completed=offset),
+                    drawing=lambda done, steps: bar.update(
+                        drawn, completed=done, total=steps, visible=True
+                    ),
+                )
         return _run_viewer(shown, web=web)
 
 
 def convert(
-    target: Path, rrd: Path, *, site: Path | None = None, progress: Offset = unwatched
+    target: Path,
+    rrd: Path,
+    *,
+    site: Path | None = None,
+    progress: Offset = unwatched,
+    drawing: Steps = unwatched_steps,
 ) -> None:
     """Write the Rerun file of a recording (.mcap) or of results (.json).
+
+    `progress` is told how far the recording has been read, `drawing` how far that is written.
 
     Results do not say where their bridge is: `site` does, or a recording in the same folder. The
     crossings in a recording that nobody has identified yet are shown with what was measured.
@@ -74,29 +101,53 @@ def convert(
             crossings=results.crossings,
             site=bridges,
             overviews=views_of_bridges(results, bridges, (site or target).parent),
+            drawing=drawing,
         )
         return
     heard, estimates = Heard(), list[Message]()
 
     def take(message: Message) -> None:
         if message.key.owner == "vehicle":
-            check_message(target, message)
-            heard.add(message)
+            check_envelope(target, message)
+            if not heard.add(message):  # what can be decoded is right
+                check_message(target, message)
         elif message.key.stream == "estimate":
             estimates.append(message)
 
-    found = survey(target, None if site is None else load_site(site), take, progress)
+    with _nothing_collected():
+        found = survey(target, None if site is None else load_site(site), take, progress)
     if not found.info.messages:
         raise InputError(f"{target}: holds no driveby message; a recording of a truck is expected")
     crossings = crossings_of_messages(estimates)
+    residuals: dict[str, ResidualCells] = {}
+    if crossings and found.site is not None:
+        messages = read_messages(target)
+        residuals = residual_cells(crossings, messages, found.site, most=_MOST_RESIDUALS)
     write_views(
         rrd,
         vehicles=heard.signals(),
         crossings=crossings,
         site=found.site,
         passings=passings_of_survey(found, crossings),
+        residuals=residuals,
         about=recording_page(found),
+        drawing=drawing,
     )
+
+
+@contextlib.contextmanager
+def _nothing_collected() -> Iterator[None]:
+    """Python looks for circles among all that was read, again and again: a fifth of the time.
+
+    There are none in messages.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def write_views(
@@ -107,12 +158,20 @@ def write_views(
     site: Site | None,
     overviews: Sequence[BridgeView] = (),
     passings: Sequence[PassingView] = (),
+    residuals: Mapping[str, ResidualCells] | None = None,
     about: str | None = None,
+    drawing: Steps = unwatched_steps,
 ) -> None:
-    """Write a Rerun file of results and signals; without a site only the signals are drawn."""
+    """Write a Rerun file of results and signals; without a site only the signals are drawn.
+
+    `residuals` are by crossing_id.
+    """
     bridges = {} if site is None else {bridge.id: bridge for bridge in site.bridges}
+    left = residuals or {}
     views: list[CrossingView] = [
-        view_of_crossing(crossing, bridges[crossing.bridge])
+        view_of_crossing(crossing, bridges[crossing.bridge])._replace(
+            residuals=left.get(crossing.crossing_id)
+        )
         for crossing in crossings
         if crossing.bridge in bridges
     ]
@@ -125,6 +184,7 @@ def write_views(
         overviews=overviews,
         passings=passings,
         about=about,
+        drawing=drawing,
     )
 
 

@@ -12,6 +12,11 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
+from schemas.signals import CHANNELS, AccelBatch, Channel, GnssFix, encode_accel, encode_gnss
+from schemas.topics import Key
+from services.recordings.recording import Message
 from tests.benchmarks import recordings
 
 MINUTES = (10, 60)
@@ -22,11 +27,26 @@ def main() -> None:
         folder = Path(name)
         for minutes in MINUTES:
             path = folder / f"{minutes}.mcap"
-            messages = recordings.drive()[: minutes * 60 * 30]
-            recordings.write(path, messages)
-            del messages
+            recordings.write(path, drive(minutes))
             command = [sys.executable, "-m", "tests.benchmarks.view", str(path)]
             subprocess.run(command, check=True)
+
+
+def drive(minutes: int) -> list[Message]:
+    """A drive of which every message is another one, as the trucks' are."""
+    rng = np.random.default_rng(1)
+    accel, gnss = (Key("live", "vehicle", "truck-1", name) for name in ("accel", "gnss"))
+    messages = []
+    for n in range(1, minutes * 1200 + 1):
+        device_ns = n * 50_000_000
+        time_ns = recordings.NOW_NS + device_ns
+        channels = {name: Channel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+        batch = encode_accel(AccelBatch(1, n, device_ns, time_ns, channels))
+        messages.append(Message(accel, batch, 1, n, time_ns, time_ns))
+        if n % 2 == 0:
+            fix = GnssFix(1, n // 2, device_ns, time_ns, 50.0 + 5e-6 * n, 8.0, 100.0, 10.0)
+            messages.append(Message(gnss, encode_gnss(fix), 1, n // 2, time_ns, time_ns))
+    return messages
 
 
 def measure(path: Path) -> None:

@@ -16,7 +16,7 @@ def test_the_sample_is_in_order(project: Path, capsys: pytest.CaptureFixture[str
     assert [line for line in lines if line.startswith("  wrong")] == []
     assert "unsprung_rear: noise 25" in out
     assert "bridge-1, start to end: 27 m recorded before it" in out
-    assert lines[-1] == "0 wrong, 1 open"
+    assert lines[-1] == "0 wrong, 2 open"
 
 
 def test_another_site_file_and_json(
@@ -64,7 +64,7 @@ def test_many_runs_are_told_briefly(shared: Path, capsys: pytest.CaptureFixture[
         (["{site}", "{site}"], "a second site file"),
         (["{empty}"], "holds no site.toml"),
         (["{site}", "{empty}"], "holds no accel_NN.csv"),
-        ([], "are required"),
+        ([], "a site file or recordings are expected, or --template NEW.toml"),
     ],
 )
 def test_bad_input(

@@ -318,7 +318,7 @@ def test_a_failing_writer_leaves_the_files_of_yesterday(
         path.write_bytes(b"half")
         raise RuntimeError("broken")
 
-    monkeypatch.setattr("services.viewer.rerun_file.write_rrd", fail)
+    monkeypatch.setattr("services.viewer.view.write_rrd", fail)
     arguments = ["identify", str(recording), "--method", "least-squares", "--rrd", str(out)]
     assert cli.main(arguments) == 1
     assert out.read_text() == "of yesterday"

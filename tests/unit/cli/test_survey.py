@@ -53,6 +53,7 @@ def test_a_plan_of_the_example(
     [
         (["--speed", "20:5"], "SLOWEST:FASTEST"),
         (["--loss", "1.5"], "a share of EI from 0.01 to 0.95"),
+        (["--loss", "20"], "20 % is 0.2"),
         (["--crossings", "0"], "a number of crossings"),
         (["--figure", "plan.gif"], ".png or .svg"),
         (["--road", "F"], "invalid choice"),

@@ -6,13 +6,19 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from services.common.progress import reading_bar
+from schemas.site_file import load_site
+from services.common.progress import reading_bar, steps_bar
+from services.drives.importing import import_command
 from services.drives.signals import signals_of_recording
 from services.drives.survey import survey
 from services.recordings.recovery import recover_recording
 from services.recordings.writer import write_recording
+from services.report.bridge import bridge_reports
+from services.report.page import page
+from services.viewer.pictures import write_pictures
 from services.viewer.view import convert
 from tests.unit.drives.recorded import drive
+from tests.unit.viewer.found import results_of, some_crossing
 
 
 @pytest.fixture
@@ -62,3 +68,49 @@ def test_nothing_is_seen_where_there_is_no_terminal(tmp_path: Path) -> None:
     with reading_bar("reading", [tmp_path / "missing"], Console(file=shown)) as next_file:
         next_file()(10)
     assert shown.getvalue() == ""
+
+
+def test_steps_are_a_bar_with_the_time_that_is_left() -> None:
+    shown = io.StringIO()
+    terminal = Console(file=shown, force_terminal=True, width=80, color_system=None)
+    with steps_bar("drawing", terminal) as progress:
+        progress(0, 4)
+        progress(3, 4)
+    last = [line for line in shown.getvalue().split("\r") if "drawing" in line][-1]
+    assert last.count("━") == 30
+    assert ":" in last
+
+
+@pytest.mark.parametrize("work", ["view", "pictures", "report", "import"])
+def test_what_is_made_is_told_step_by_step_up_to_the_last(
+    work: str, recording: Path, tmp_path: Path, project: Path
+) -> None:
+    told: list[tuple[int, int]] = []
+
+    def progress(done: int, steps: int) -> None:
+        told.append((done, steps))
+
+    site = load_site(project / "docs/site.example.toml")
+    found = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="a")
+    match work:
+        case "view":
+            convert(recording, tmp_path / "r.rrd", drawing=progress)
+        case "pictures":
+            write_pictures(tmp_path, found, site, progress)
+        case "report":
+            page(bridge_reports([(tmp_path / "x.json", found, site)], None), progress)
+        case "import":
+            example = project / "tests/data/csv_example"
+            import_command(
+                sources=[example],
+                site=example / "site.toml",
+                output=tmp_path / "i.mcap",
+                vehicle=None,
+                name=None,
+                writing=progress,
+            )
+    done, steps = zip(*told, strict=True)
+    assert len(set(steps)) == 1
+    assert list(done) == sorted(set(done))
+    assert len(done) > 1
+    assert done[-1] == steps[0]

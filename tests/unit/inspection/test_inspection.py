@@ -262,6 +262,7 @@ def test_the_site_file_alone() -> None:
 
     usual = states(site)
     assert usual.pop("tyres") is State.OPEN
+    assert usual.pop("cg_height") is State.OPEN
     assert set(usual.values()) == {State.OK}
     assert states(with_vehicle(site, front_axle_to_cg_m=2.1))["axle_loads"] is State.WRONG
     assert states(with_vehicle(site, total_mass_kg_spread=0.1))["total_mass"] is State.WRONG
@@ -269,6 +270,9 @@ def test_the_site_file_alone() -> None:
     assert states(with_vehicle(site, wheelbase_m=15.0))["wheelbase_declared"] is State.WRONG
     known = with_vehicle(site, twin_tyre_distance_m=(0.0, 0.33))  # type: ignore[arg-type]
     assert states(known)["tyres"] is State.OK
+    assert states(with_vehicle(site, cg_height_m=1.1))["cg_height"] is State.OK
+    crawling = site.bridges[0].model_copy(update={"survey_speed_m_per_s": 2.0})
+    assert states(site.model_copy(update={"bridges": (crawling,)}))["survey_speed"] is State.WRONG
     slow = site.sensor.model_copy(
         update={"rate_hz": (50.0,) * 4, "noise_density_ug_per_rthz": (0.0,) * 4}
     )

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from schemas.reasons import Reason
 from schemas.results import Results, results_json
 from schemas.site import Site
 from schemas.site_file import load_site, site_toml
 from services.cli import main as cli
 from services.report import pdf
-from services.report.bridge import bridge_reports
+from services.report.bridge import _ADVICE, bridge_reports
 from services.report.html import Html, inlined_svg, joined, tag
 from services.report.page import page
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
@@ -353,3 +354,95 @@ def test_on_paper_a_bridge_of_one_crossing_has_two_pages(
     printed = (tmp_path / "r.pdf").read_bytes()
     assert printed.startswith(b"%PDF")
     assert len(re.findall(rb"/Type\s*/Page\b", printed)) == 2
+
+
+def fused(
+    site: Site, spreads: list[float], *, left_out: tuple[str, ...] = (), **state: Any
+) -> Results:
+    """Three good crossings and their state, each element with a relative standard deviation."""
+    names = "abc"
+    found = results_of(site, *(some_crossing(n, entry=60.0 * k) for k, n in enumerate(names)))
+    elements = {}
+    for n, (ratio, spread) in enumerate(zip(RATIOS, spreads, strict=True), start=1):
+        mean = ratio * site.bridges[0].nominal_flexural_rigidity_nm2[n - 1]
+        low, high = mean * np.exp(-1.96 * spread), mean * np.exp(1.96 * spread)
+        elements[f"EI_{n}"] = {"mean": mean, "std": spread * mean, "q025": low, "q975": high}
+    given = {
+        **elements, "verdict": "good", "crossings_used": list(names),
+        "level": {"mean": 0.97, "std": 0.097, "q025": 0.8, "q975": 1.2},
+        "between_crossing_std": 0.012, "between_crossing_std_q025": 0.0,
+        "between_crossing_std_q975": 0.04,
+        "crossings_left_out": [{"crossing_id": w, "reason": w} for w in left_out],
+    }  # fmt: skip
+    content = found.model_dump(mode="json")
+    content["bridges"] = {site.bridges[0].id: given | state}
+    return Results.model_validate(content)
+
+
+KNOWN = [0.02] * 7
+
+
+def test_crossings_that_were_fused_are_said_to_be_and_how_they_agree(site: Site) -> None:
+    text = reported(site, fused(site, KNOWN, left_out=("suspect", "disagrees"))).text
+    assert "One element is clearly less stiff." in text
+    assert "The numbers below are of all 3 together, a measurement that is good." in text
+    assert "Left out: 1 suspect; 1 disagrees with the others beyond its uncertainty." in text
+    assert "From crossing to crossing EI changes by 1.2 % (0.0 to 4.0 %)" in text
+    assert "confirms them" not in text
+
+
+def test_a_state_that_is_suspect_is_doubtful_though_its_crossings_are_good(site: Site) -> None:
+    reasons = {"verdict": "suspect", "reasons": ["crossings_disagree"]}
+    found = reported(site, fused(site, KNOWN, **reasons))
+    assert ("class", "finding doubtful") in found.attributes
+    assert "The reasons: Crossings disagree by more than their uncertainty" in found.text
+    assert "a measurement that is suspect" in found.text
+
+
+def test_a_loss_beside_unresolved_elements_may_be_theirs(site: Site) -> None:
+    text = reported(site, fused(site, [0.6, 0.4, 0.3, 0.05, 0.1, 0.1, 0.5])).text
+    assert "Less stiff about element 4; which one is not certain." in text
+    assert "The loss may as well be in element 3, beside it and not resolved." in text
+    assert (
+        "Elements 1, 2, 3 and 7 are not resolved (standard deviation above 25 %). "
+        "As a whole the bridge is at 0.97 of nominal ± 10 %." in text
+    )
+    assert "agree within" not in text  # of what is known to a factor nothing agrees
+    assert text.count("not resolved") == 2 + 4  # in words, and in the table
+
+
+def test_where_no_element_is_resolved_none_is_called_sound(site: Site) -> None:
+    found = reported(site, fused(site, [0.6] * 7))
+    assert ("class", "finding open") in found.attributes
+    assert "Single elements cannot be told, only the bridge as a whole." in found.text
+    assert "No single element is resolved" in found.text
+    assert "No element" not in found.text
+    few = reported(site, fused(site, [0.6, 0.05, 0.05, 0.5, 0.05, 0.05, 0.05])).text
+    assert "No element is clearly less stiff, of those that can be told." in few
+
+
+def test_suspect_crossings_that_were_not_used_are_not_called_nothing(site: Site) -> None:
+    suspect = some_crossing("a", verdict="suspect", reasons=("noise_below_declared",))
+    rejected = some_crossing("b", verdict="rejected", reasons=("sensor_saturated",), entry=60.0)
+    alone = reported(site, results_of(site, suspect))
+    assert ("class", "finding doubtful") in alone.attributes
+    assert "The only crossing was suspect. What it says stands in the evidence" in alone.text
+    assert "nothing was measured" not in alone.text
+    both = reported(site, results_of(site, suspect, rejected)).text
+    assert "None of the 2 crossings is good, 1 is suspect." in both
+    nothing = reported(site, results_of(site, rejected)).text
+    assert "The only crossing was rejected, and no number of it means anything." in nothing
+    assert nothing.index("An accelerometer reached") < nothing.index("Quality")
+
+
+def test_something_is_to_be_done_about_every_reason() -> None:
+    assert set(_ADVICE) == set(Reason)
+
+
+def test_a_single_crossing_in_a_state_is_said_to_have_wider_intervals(site: Site) -> None:
+    one = fused(site, KNOWN, crossings_used=["c"])
+    assert (
+        "allow for how a bridge changes from one crossing to the next" in reported(site, one).text
+    )
+    alone = results_of(site, some_crossing("a"), used="a")
+    assert "allow for how a bridge" not in reported(site, alone).text

@@ -298,14 +298,16 @@ def test_one_line_names_the_field_and_what_would_be_right(key: str, value: str, 
 
 def test_a_missing_table_and_a_text_that_is_no_toml() -> None:
     assert complaint(VEHICLE + BRIDGE) == "the table [sensor] is missing"
-    assert complaint("").startswith("the table [vehicle] is missing (and 2 more)")
+    assert complaint("").startswith(
+        "the table [vehicle] is missing (and 2 more, driveby check lists them)"
+    )
     assert complaint("vehicle = 3").startswith("vehicle is 3, it must be a table [vehicle]")
     assert complaint("[vehicle]\nid = '").startswith("line 2: is not TOML: ")
 
 
 def test_other_mistakes_are_counted() -> None:
     text = with_line("wheelbase_m", "-4", with_line("total_mass_kg", "-9"))
-    assert complaint(text).endswith("(and 1 more)")
+    assert complaint(text).endswith("(and 1 more, driveby check lists them)")
 
 
 def test_a_missing_or_unreadable_file(tmp_path: Path) -> None:

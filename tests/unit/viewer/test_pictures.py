@@ -12,16 +12,18 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.patches import Rectangle
 
-from schemas.results import Results
+from schemas.results import Crossing, Results
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.cli import main as cli
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.bridge_view import BridgeView, view_of_bridge
-from services.viewer.crossing_view import view_of_crossing
+from services.viewer.crossing_view import comparison_of, view_of_crossing
 from services.viewer.drawing import STYLE
 from services.viewer.figure import draw_crossing
 from services.viewer.pictures import write_pictures
+from services.viewer.rerun_crossing import verdict_markdown
+from services.viewer.rerun_parts import MUTED, ratio_colours, rgb
 from tests.unit.viewer.found import results_of, some_crossing
 from tests.unit.words import assert_words_apart, words
 
@@ -162,3 +164,41 @@ def test_results_of_a_bridge_without_its_state_are_drawn(site: Site) -> None:
     results = results_of(site, some_crossing("a"))
     assert isinstance(results, Results)
     assert view_of_bridge(site.bridges[0], results, None).estimate is None
+
+
+def test_a_good_crossing_says_what_is_weak_and_by_how_much(site: Site) -> None:
+    view = view_of_crossing(results_of(site, some_crossing("a")).crossings[0], site.bridges[0])
+    figure = draw_crossing(view, element_truth=None, road_truth=None)
+    text = written(figure)
+    assert "60 % less" in text
+    assert "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements" in text
+    assert_words_apart(figure)
+    sound = results_of(site, some_crossing("a"), ratios=np.ones(7)).crossings[0]
+    said = written(
+        draw_crossing(view_of_crossing(sound, site.bridges[0]), element_truth=None, road_truth=None)
+    )
+    assert "% less" not in said
+    assert "No element stands out: all agree within 1 %." in said
+
+
+def test_what_is_not_resolved_is_an_empty_bar_and_agrees_with_nothing(site: Site) -> None:
+    crossing = results_of(site, some_crossing("a")).crossings[0]
+    wide = crossing.model_dump(mode="json")
+    for n in (1, 7):
+        wide["parameters"][f"EI_{n}"] |= {"std": 0.5 * wide["parameters"][f"EI_{n}"]["mean"]}
+    level = {"unit": "1", "mean": 0.97, "std": 0.1, "q025": 0.8, "q50": 0.97, "q975": 1.2}
+    wide["derived"] |= {"ei_level": level}
+    view = view_of_crossing(Crossing.model_validate(wide), site.bridges[0])
+    assert view.unresolved == {1, 7}
+    figure = draw_crossing(view, element_truth=None, road_truth=None)
+    empty = [to_rgb(bar.get_facecolor()) == (1.0, 1.0, 1.0) for bar in bars(figure)]
+    assert empty == [True, False, False, False, False, False, True]
+    assert "not resolved" in written(figure)
+    assert "60 % less stiff" in written(figure)
+    assert "agree" not in verdict_markdown(view, comparison_of(view))
+    assert "2 of 7 elements not resolved" in verdict_markdown(view, comparison_of(view))
+    ratios = view.resolved_ratio
+    assert ratios is not None
+    colours = ratio_colours(ratios, 7, doubtful=False)
+    assert colours[0] == colours[6] == rgb(MUTED)
+    assert colours[1] != rgb(MUTED)

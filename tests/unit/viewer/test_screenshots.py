@@ -5,17 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.cli import main as cli
+from services.common.errors import FailureError
+from services.report.pdf import find_browser
 from tests import screenshots
 from tests.viewer_screen import has_driver, pixels
 
 
 def test_every_picture_is_there_small_and_named_on_the_page(project: Path) -> None:
     page = (project / "docs/viewer.md").read_text()
-    for shot in screenshots.SHOTS:
+    shots = (*screenshots.SHOTS, screenshots.OF_MANY)
+    for shot in shots:
         path = screenshots.FOLDER / f"{shot.name}.png"
         assert path.stat().st_size < screenshots.MOST_BYTES
         assert f"(images/{path.name})" in page
-    assert page.count("(images/") == len(screenshots.SHOTS)
+    assert page.count("(images/") == len(shots)
 
 
 @pytest.mark.slow
@@ -28,3 +32,42 @@ def test_every_picture_can_be_made_and_shows_something(tmp_path: Path) -> None:
         taken = pixels(screenshots.smaller(screenshots.take(shot, tmp_path)))
         lit = (np.abs(taken - taken[-1, -1]).max(axis=2) > 0.2).mean()
         assert lit > 0.02, shot.name
+
+
+@pytest.mark.slow
+@pytest.mark.process
+def test_many_crossings_can_be_shown_with_what_is_not_resolved(
+    shared: Path, tmp_path: Path
+) -> None:
+    assert screenshots.SHARED.is_relative_to(shared)
+    if not has_driver():
+        pytest.skip("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)")
+    screenshots.make_many(tmp_path)
+    taken = pixels(screenshots.smaller(screenshots.take(screenshots.OF_MANY, tmp_path)))
+    assert (taken.min(axis=2) > 0.95).mean() > 0.3  # the white picture of the bridge
+
+
+@pytest.mark.slow
+@pytest.mark.process
+def test_the_picture_of_the_demo_can_be_made_and_names_the_weak_element(tmp_path: Path) -> None:
+    kept = screenshots.FOLDER / "demo.png"
+    assert kept.stat().st_size < screenshots.MOST_BYTES
+    taken = pixels(screenshots.smaller(screenshots.take_demo(tmp_path)))
+    assert taken.shape == pixels(kept.read_bytes()).shape
+    orange = np.abs(taken - np.array([230, 159, 0]) / 255.0).max(axis=2) < 0.05
+    assert orange.mean() > 0.005
+
+
+@pytest.mark.slow
+@pytest.mark.process
+def test_the_report_can_be_photographed_and_names_the_weak_element(tmp_path: Path) -> None:
+    try:
+        find_browser()
+    except FailureError:
+        pytest.skip("no browser (Debian: apt install chromium)")
+    assert (screenshots.FOLDER / "report.png").stat().st_size < screenshots.MOST_BYTES
+    outputs = ["--json", str(tmp_path / "good.json")]
+    assert cli.main(["identify", str(screenshots.SAMPLE), *outputs]) == 0
+    taken = pixels(screenshots.smaller(screenshots.take_report(tmp_path)))
+    box = np.array([0xFD, 0xF0, 0xD5]) / 255.0  # of a finding that names an element
+    assert (np.abs(taken - box).max(axis=2) < 0.02).mean() > 0.03

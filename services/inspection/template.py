@@ -1,0 +1,86 @@
+"""A site file to start from: what is needed is `nan` and is asked for, the rest has its default."""
+
+from typing import Final
+
+TEMPLATE: Final = """\
+# A site file: truck, bridge and sensors as they are known before the drive. All SI.
+# Replace every nan. What begins with # may stay so: it shows its default, or may be unknown.
+# Nominal values are those of a data sheet or drawing. A value KEY may have KEY_spread, its relative
+# standard deviation: how far it may be off. Pairs are [front, rear].
+
+[vehicle]
+id = "truck-1"                        # a-z, 0-9, "-" and "_"
+total_mass_kg = nan                   # weighed with driver, fuel and load: EI is proportional to it
+wheelbase_m = nan                     # axle to axle, by tape
+front_axle_to_cg_m = nan              # centre of gravity of the body: wheelbase times the share of
+                                      # its weight on the rear axle
+suspension_damping_ns_per_m = [nan, nan]   # of a whole axle, both wheels together, as the next
+suspension_stiffness_n_per_m = [nan, nan]
+unsprung_mass_kg = [nan, nan]         # axle, wheels, brakes: what is below the springs
+tyre_stiffness_n_per_m = [nan, nan]   # of all tyres of an axle
+gps_antenna_to_front_axle_m = nan     # how far behind the front axle, negative if before it
+# cg_height_m = 1.1                   # wanted where the truck brakes or accelerates on the bridge
+# pitch_inertia_ratio = 1.0           # over mass times both distances of the axles from the centre
+# tyre_damping_ns_per_m = [0.0, 0.0]  # 0 is unknown
+# What decides how much of a single element can be told, where axles feel different roads:
+# twin_tyre_distance_m = [0.0, 0.33]  # middle to middle of twin tyres, 0 for single ones
+# tyre_width_m = [0.25, 0.22]         # of the tread
+# tyre_contact_length_m = [0.2, 0.2]
+# track_m = 2.0                       # between the wheels of both sides
+# rear_axle_offset_m = 0.005          # how far the rear axle runs to the left of the front one
+# total_mass_kg_spread = 0.01
+# wheelbase_m_spread = 0.002
+# front_axle_to_cg_m_spread = 0.15
+# suspension_damping_ns_per_m_spread = 0.15
+# suspension_stiffness_n_per_m_spread = 0.15
+# unsprung_mass_kg_spread = 0.15
+# tyre_stiffness_n_per_m_spread = 0.15
+# cg_height_m_spread = 0.15
+# pitch_inertia_ratio_spread = 0.15
+# tyre_damping_ns_per_m_spread = 0.15
+
+[bridge]
+id = "bridge-1"
+# owner_id = "B 317"                  # its owner's name, for reports
+span_m = nan                          # between the outer bearings, to a centimetre or so
+start_latitude_deg = nan              # where the outer bearings are, to a metre; the start is
+start_longitude_deg = nan             # where elements are counted from
+end_latitude_deg = nan
+end_longitude_deg = nan
+elements = nan                        # how many pieces are told apart; 5 to 7 on 30 m
+flexural_rigidity_nm2 = nan           # E times I of deck and girders, sound; may be off by 2
+mass_per_length_kg_per_m = nan        # with pavement and parapets
+rayleigh_alpha_per_s = nan            # damping, of the bridge or of one like it: alpha M + beta K;
+rayleigh_beta_s = nan                 # half as much or more is thought possible
+# interior_supports_m = [20.0]        # of a bridge over several spans, from its start
+# element_lengths_m = [10.0, 10.0]    # where elements are not alike; add up to span_m
+# flexural_rigidity_per_element_nm2 = [1.5e10, 1.4e10]
+# bearings = "unknown"                # "free" to turn, "sprung", or a pair [start, end] of these
+# support_rotational_stiffness_spread_nm_per_rad = 5.0e8   # default: EI over the span
+# support_compliance_spread_m_per_n = 1.0e-9
+# start_altitude_m = 100.0            # tell the bridge from one under it
+# end_altitude_m = 100.0
+# road_class = "A"                    # ISO 8608, for planning
+# survey_speed_m_per_s = 10.0         # for planning; below 3 m/s nothing is told
+# baseline = "first-survey.json"      # results to compare with, beside this file
+# flexural_rigidity_nm2_spread = 0.55
+# mass_per_length_kg_per_m_spread = 0.1
+# rayleigh_alpha_per_s_spread = 0.5
+# rayleigh_beta_s_spread = 0.5
+
+[sensor]                              # four: body above front and rear axle, both axles
+rate_hz = nan                         # one number or four values; 100 at least
+noise_density_ug_per_rthz = nan       # of the data sheet; driveby check compares it
+# gravity_included = false
+# up = [1, 1, 1, 1]                   # -1 where a sensor hangs upside down
+# gain_spread = 0.01                  # between channels
+# common_gain_spread = 0.01           # of all of them: in every EI
+# delay_spread_s = 0.0005
+
+[receiver]                            # the satellite receiver
+# position_spread_m = 1.5             # error that stays for minutes
+# position_noise_m = 0.4              # error from fix to fix
+# speed_noise_m_per_s = 0.07
+# latency_s = 0.0
+# latency_spread_s = 0.1
+"""

@@ -1,0 +1,41 @@
+"""What `driveby fuse` says beside its table."""
+
+from pathlib import Path
+
+import pytest
+
+from services.cli.main import main
+from tests.unit.identification.test_fusing import crossing, write
+
+
+def test_results_that_are_there_twice_are_counted_once_and_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = write(tmp_path / "one.json", [crossing(n) for n in range(3)])
+    other = write(tmp_path / "other.json", [crossing(n) for n in range(1, 4)])
+    assert main(["fuse", str(one), str(other)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "2 results of crossings that another file has too: the newest counts" in out
+    assert "bridge-1, 4 crossings together" in out
+    assert main(["fuse", str(one)]) == 0
+    assert "another file" not in capsys.readouterr().out
+
+
+def test_why_one_crossing_has_wider_intervals_is_said_of_one_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, said in ((1, True), (2, False)):
+        path = write(tmp_path / "r.json", [crossing(n) for n in range(number)])
+        assert main(["fuse", str(path)]) == 0
+        out = " ".join(capsys.readouterr().out.split())
+        assert ("one crossing: intervals are wider than its own" in out) is said
+
+
+def test_a_recording_is_refused_with_what_is_wanted(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = project / "recordings/sample/crossing.mcap"
+    assert main(["fuse", str(recording)]) == 2
+    error = capsys.readouterr().err
+    assert f"driveby identify {recording} --json RESULTS.json makes them" in error
+    assert error.count("\n") == 1

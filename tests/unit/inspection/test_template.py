@@ -1,0 +1,87 @@
+"""The site file to start from: it asks for all that is needed, and names all that there is."""
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from schemas.site import Bridge, Receiver, Sensor, Vehicle
+from schemas.site_file import faults_of_site, load_site, parse_site
+from services.cli import main as cli
+from services.inspection.template import TEMPLATE
+
+MODELS: dict[str, type[BaseModel]] = {
+    "vehicle": Vehicle, "bridge": Bridge, "sensor": Sensor, "receiver": Receiver,
+}  # fmt: skip
+NEEDED = re.compile(r"^(\w+) = (nan|\[nan, nan\])", re.MULTILINE)
+
+
+def parts() -> dict[str, str]:
+    """The text of each table."""
+    split = re.split(r"^\[(\w+)\]", TEMPLATE, flags=re.MULTILINE)
+    return dict(zip(split[1::2], split[2::2], strict=True))
+
+
+def test_every_key_that_there_is_stands_in_its_table_and_no_other() -> None:
+    assert parts().keys() == MODELS.keys()
+    for name, text in parts().items():
+        keys = re.findall(r"^(?:# )?([a-z]\w+) = ", text, re.MULTILINE)
+        assert sorted(keys) == sorted(MODELS[name].model_fields)
+
+
+def test_everything_that_is_needed_is_asked_for_at_once() -> None:
+    faults = faults_of_site(TEMPLATE, "new.toml")
+    for name, text in parts().items():
+        for key, _ in NEEDED.findall(text):
+            assert any(fault.startswith(f"new.toml: {name}.{key}") for fault in faults), key
+    assert all("it must be" in fault for fault in faults)
+
+
+def test_filled_in_it_is_the_site_that_was_meant(project: Path) -> None:
+    example = project / "docs/site.example.toml"
+    values = tomllib.loads(example.read_text())
+    filled = ""
+    for name, text in parts().items():
+        known = values.get(name, {})
+        filled += f"[{name}]" + NEEDED.sub(lambda m, of=known: f"{m[1]} = {of[m[1]]}", text)
+    assert parse_site(filled, "filled") == load_site(example)
+
+
+def test_defaults_that_it_shows_are_the_defaults(project: Path) -> None:
+    site = load_site(project / "docs/site.example.toml")
+    of = {
+        "vehicle": site.vehicles[0], "bridge": site.bridges[0], "sensor": site.sensor,
+        "receiver": site.receiver,
+    }  # fmt: skip
+    for name, text in parts().items():
+        for key, value in re.findall(r"^# (\w+_spread\w*) = ([0-9.e-]+)", text, re.MULTILINE):
+            if "support_rot" not in key:
+                assert getattr(of[name], key) == float(value), key
+
+
+def test_the_command_writes_it_and_spoils_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "new.toml"
+    assert cli.main(["check", "--template", str(new)]) == 0
+    assert new.read_text() == TEMPLATE
+    assert cli.main(["check", "--template", str(new)]) == 2
+    assert "exists" in capsys.readouterr().err
+    assert cli.main(["check", str(new)]) == 2
+    said = capsys.readouterr()
+    lines = [line for line in said.out.splitlines() if line.startswith("  wrong  ")]
+    assert lines[0].startswith("  wrong  vehicle.total_mass_kg is NaN, it must be a mass in kg")
+    assert said.err.endswith(f"{new}: {len(lines)} things are wrong; nothing else was looked at\n")
+    assert said.err.count("\n") == 1
+    assert len(lines) > 25
+    assert cli.main(["check", str(new), "--json"]) == 2
+    (report,) = json.loads(capsys.readouterr().out)["reports"]
+    assert [one["state"] for one in report["findings"]] == ["wrong"] * len(lines)
+    assert cli.main(["identify", "x.mcap", "--site", str(new)]) == 2
+    error = capsys.readouterr().err
+    assert f"(and {len(lines) - 1} more, driveby check lists them)" in error
+    assert cli.main(["check"]) == 2
+    assert "--template NEW.toml" in capsys.readouterr().err
