@@ -323,6 +323,24 @@ def resolution(crossing: Crossing) -> str | None:
     return f"mean level {level.mean:.2f} of nominal ± {spread:.0f} %, {which} not resolved"
 
 
+def lowest_element(crossing: Crossing) -> str | None:
+    """The element of least EI over nominal, with its interval, in words; None without any.
+
+    The nominal value is that of the prior. The interval is left out where the method has none.
+    """
+    ratios = {
+        name: (value.mean / nominal, value.q025 / nominal, value.q975 / nominal)
+        for name, value in (crossing.parameters or {}).items()
+        if name.startswith("EI_") and value.prior and (nominal := value.prior.location) > 0.0
+    }
+    if not ratios:
+        return None
+    name = min(ratios, key=lambda one: ratios[one][0])
+    ratio, low, high = ratios[name]
+    interval = "" if Reason.NO_NOISE_MODEL in crossing.reasons else f" ({low:.3f} to {high:.3f})"
+    return f"{name} {ratio:.3f} of nominal{interval}"
+
+
 def results(header: Header, crossings: list[Crossing], bridges: dict[str, BridgeResult]) -> Results:
     """Put a results file together."""
     return Results(**header._asdict(), crossings=tuple(crossings), bridges=bridges)

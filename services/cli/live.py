@@ -37,13 +37,19 @@ def add_demo(commands: Any) -> None:
     add_speed(p, 4.0)
     text = "accelerometers' noise density in µg/√Hz; 0: all exact, least squares (default: 25)"
     add_noise(p, text, 25.0)
+    p.add_argument("--live", action="store_true", help="watch it as it happens, in the viewer")
+    p.add_argument("--web", action="store_true", help="watch it in the browser")
 
 
 def _demo(options: argparse.Namespace) -> int:
     from services.cli.demo import demo_command
 
     return demo_command(
-        out=options.out, speed=options.speed, noise=options.noise, console=a_console()
+        out=options.out,
+        speed=options.speed,
+        noise=options.noise,
+        console=a_console(),
+        live="web" if options.web else "window" if options.live else None,
     )
 
 

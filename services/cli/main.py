@@ -33,13 +33,13 @@ from services.cli.offline import (
     add_import,
     add_recover,
     add_simulate,
-    add_view,
 )
 from services.cli.parsing import Handler, Parser, add_common
 from services.cli.replay import add_replay
 from services.cli.report import add_report
 from services.cli.survey import add_survey
 from services.cli.validation import add_validate
+from services.cli.view import add_view
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 
 _COMMANDS: Final = (

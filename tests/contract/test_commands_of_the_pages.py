@@ -67,6 +67,8 @@ NOT_RUN = {
     "driveby view crossing.rrd": WINDOW,
     "driveby view drive.rrd": WINDOW,
     f"driveby view {SAMPLE}": WINDOW,
+    "driveby view live": WINDOW,
+    "driveby view live --site site.toml": WINDOW,
     "driveby logger --realm '*'": SERVICE,
     "driveby logger --realm 'replay-*'": SERVICE,
     "driveby worker --site site.toml": SERVICE,
