@@ -1,20 +1,28 @@
-"""The pictures of docs/viewer.md, from recordings/sample: python -m tests.screenshots
+"""The pictures of docs/viewer.md and docs/watch.md: python -m tests.screenshots
 
-Needs a Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-drivers).
+Needs a Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-drivers), and a
+browser for the terminal (Debian: chromium).
 """
 
 import io
+import math
 import re
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
 from PIL import Image
+from rich.console import Console
 
+from schemas.site_file import load_site
 from services.cli import main as cli
+from services.cli.watch_page import page
 from services.recordings.recording import read_site
+from services.report.pdf import find_browser
 from services.viewer.view import convert
+from tests.unit.cli.watching import NOW_NS, NOW_S, Listened, a_morning
 from tests.viewer_screen import complaints, has_driver, open_tab, opened, picture
 
 ROOT = Path(__file__).parents[1]
@@ -52,6 +60,9 @@ def main() -> int:
             path = FOLDER / f"{shot.name}.png"
             path.write_bytes(smaller(take(shot, folder)))
             print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
+        path = FOLDER / "watch.png"
+        path.write_bytes(smaller(take_terminal(folder, columns=100)))
+        print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
     return 0
 
 
@@ -76,6 +87,28 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
         taken = picture(viewer)
         assert complaints(viewer) == []
         return taken
+
+
+def take_terminal(folder: Path, columns: int, lines: int = 30) -> bytes:
+    """A made-up morning on the page of `driveby watch`, as PNG, drawn by a browser."""
+    shown = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True)
+    listened = Listened(alive={"truck-1", "truck-2"})
+    watched = a_morning(load_site(ROOT / "docs/site.example.toml"))
+    where = "realm live at tcp/127.0.0.1:7447"
+    moment = {"now_s": NOW_S, "now_ns": NOW_NS}
+    shown.print(page(watched, where, listened, **moment, width=columns, height=lines))
+    svg = shown.export_svg(title="driveby watch")
+    width, height = (float(size) for size in re.findall(r'viewBox="0 0 (\S+) (\S+)"', svg)[0])
+    (folder / "terminal.svg").write_text(svg)
+    written = folder / "terminal.png"
+    command = [
+        find_browser(), "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+        f"--user-data-dir={folder / 'profile'}", f"--screenshot={written}",
+        f"--window-size={math.ceil(width)},{math.ceil(height)}",
+        (folder / "terminal.svg").absolute().as_uri(),
+    ]  # fmt: skip
+    subprocess.run(command, check=True, capture_output=True)
+    return written.read_bytes()
 
 
 def smaller(png: bytes) -> bytes:

@@ -40,6 +40,7 @@ from services.cli.report import add_report
 from services.cli.survey import add_survey
 from services.cli.validation import add_validate
 from services.cli.view import add_view
+from services.cli.watch import add_watch
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 
 _COMMANDS: Final = (
@@ -60,6 +61,7 @@ _COMMANDS: Final = (
     add_worker,
     add_truck,
     add_replay,
+    add_watch,
     add_health,
     add_certs,
 )

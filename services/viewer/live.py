@@ -18,12 +18,10 @@ from pathlib import Path
 from typing import Final, Literal
 
 import rerun as rr
-import zenoh
 
 from schemas.site_file import load_site
-from services.bus.listening import Listening, check_listenable, elsewhere_line
+from services.bus.listening import Listening, check_listenable, connected, elsewhere_line
 from services.bus.playback import leave_at_once, stopped_by_signals
-from services.bus.session import open_session
 from services.common.errors import FailureError, InputError
 from services.viewer.live_layout import WAITING, waiting_blueprint
 from services.viewer.live_picture import LivePicture
@@ -39,8 +37,6 @@ _PAST_S: Final = 60.0
 """Of what trucks measured before this command began, as far as they keep it."""
 _PERIOD_S: Final = 0.25
 """How often what has come is drawn."""
-_CONNECT_S: Final = 1.0
-"""An attempt is so short that a signal is heard between two."""
 
 Show = Literal["window", "web"]
 
@@ -81,7 +77,7 @@ def live_command(
         log_markdown(recording, WAITING, f"Waiting for a router at {endpoint}.")
         say(f"realm {realm}, live at {sink.uri}; more viewers: rerun {sink.uri}")
         with _viewer(sink.uri, show, address) as viewer:
-            session = _connected(endpoint, tls, lambda: stop.is_set() or _has_ended(viewer))
+            session = connected(endpoint, tls, lambda: stop.is_set() or _has_ended(viewer))
             if session is not None:
                 with session:
                     listening = Listening(session, realm, past_s=_PAST_S)
@@ -138,21 +134,6 @@ def _viewer(uri: str, show: Show | None, address: str) -> Iterator[subprocess.Po
 
 def _has_ended(viewer: subprocess.Popen[bytes] | None) -> bool:
     return viewer is not None and viewer.poll() is not None
-
-
-def _connected(
-    endpoint: str, tls: Path | None, is_over: Callable[[], bool]
-) -> zenoh.Session | None:
-    """A session as soon as a router answers; None if it is over before."""
-    is_told = False
-    while not is_over():
-        try:
-            return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
-        except FailureError as error:
-            if not is_told:
-                _log.warning("%s; trying on", error)
-            is_told = True
-    return None
 
 
 def _check_address(address: str) -> None:

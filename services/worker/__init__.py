@@ -27,7 +27,7 @@ import zenoh
 
 from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Header
+from schemas.results import Header, verdict_line
 from schemas.settings import IdentificationSettings
 from schemas.signals import Identity
 from schemas.site_file import parse_site, read_site_text, site_hash
@@ -418,7 +418,7 @@ def _publish(
             raise FailureError(f"{stream} of {identifier} cannot be published: {error}") from error
         if output.result is not None:
             result = output.result
-            _log.info("%s: %s %s", result.crossing_id, result.verdict, ", ".join(result.reasons))
+            _log.info("%s: %s", result.crossing_id, verdict_line(result))
 
 
 def _worked_out(outputs: Iterable[Output]) -> Iterator[Output]:

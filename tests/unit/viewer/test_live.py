@@ -285,7 +285,7 @@ def test_without_a_site_file_the_result_tells_the_elements(tmp_path: Path, site:
     assert drawn[name].to_pylist() == [
         ["1.000", "0.980", "1.010", "0.400", "1.020", "1.000", "0.990"]
     ]
-    assert lowest_element(told) == "EI_4 0.400 of nominal (0.377 to 0.424)"
+    assert str(lowest_element(told)) == "EI_4 0.400 of nominal (0.377 to 0.424)"
     assert elements_of_result(result(site)) is None  # no priors in it
     assert lowest_element(result(site)) is None
 
@@ -294,7 +294,7 @@ def test_an_interval_that_means_nothing_is_not_said(site: Site) -> None:
     given = result(site, reasons=("no_noise_model",), verdict="suspect").model_dump()
     for value in given["parameters"].values():
         value["prior"] = {"distribution": "uniform", "location": 1.56e10, "scale": 0.2}
-    assert lowest_element(Crossing.model_validate(given)) == "EI_4 0.400 of nominal"
+    assert str(lowest_element(Crossing.model_validate(given))) == "EI_4 0.400 of nominal"
 
 
 def test_of_many_trucks_all_have_positions_and_some_accelerations(live: Live) -> None:
