@@ -49,6 +49,61 @@ class Heard(NamedTuple):
     payload: bytes
 
 
+class Elsewhere:
+    """Which trucks are in a realm and in others: who hears nothing may be in the wrong one."""
+
+    def __init__(self, session: zenoh.Session, realm: str) -> None:
+        self.realm = realm
+        # A truck has a token while it drives, a replayed one none, but it says what it is.
+        self._named = subscribe_latest(session, selector(None, "vehicle", "info"), _OTHERS_WAITING)
+        self._tokens = session.liveliness().declare_subscriber(
+            selector(None, "vehicle", "alive"), handlers.RingChannel(_TOKENS_WAITING), history=True
+        )
+        self.alive: set[str] = set()
+        """The trucks of this realm that are there now."""
+        self.trucks: dict[str, set[str]] = {}
+        """Other realms and the trucks that were heard in them."""
+
+    def look(self) -> None:
+        """Take in what has come since the last call."""
+        while (token := self._tokens.try_recv()) is not None:
+            self._note(str(token.key_expr), is_there=token.kind == zenoh.SampleKind.PUT)
+        for _ in range(_OTHERS_WAITING):
+            said = next(self._named)
+            if said is None:
+                return
+            self._note(said.key_text, is_there=None)
+
+    def line(self) -> str | None:
+        """Who drives in other realms, for who hears nothing in this one; None if nobody does."""
+        return elsewhere_line(self.realm, self.trucks)
+
+    def close(self) -> None:
+        """Look no more."""
+        self._named.close()  # type: ignore[attr-defined]
+        self._tokens.undeclare()  # type: ignore[no-untyped-call]
+
+    def _note(self, key_text: str, *, is_there: bool | None) -> None:
+        """A truck has come (True), gone (False) or said what it is (None)."""
+        try:
+            key = parse_key(key_text)
+        except ValueError:
+            return
+        if key.realm == self.realm:
+            if is_there is True and len(self.alive) < _SIGNALS_WAITING:
+                self.alive.add(key.identifier)
+            elif is_there is False:
+                self.alive.discard(key.identifier)
+            return
+        if is_there is False:
+            trucks = self.trucks.get(key.realm, set())
+            trucks.discard(key.identifier)
+            if not trucks:
+                self.trucks.pop(key.realm, None)
+        elif sum(map(len, self.trucks.values())) < _MOST_NAMED:
+            self.trucks.setdefault(key.realm, set()).add(key.identifier)
+
+
 class Listening:
     """Hears one realm, and which trucks drive in others.
 
@@ -75,19 +130,21 @@ class Listening:
             )
             for owner, stream in _OTHERS
         ]
-        # A truck has a token while it drives, a replayed one none, but it says what it is.
-        self._named = subscribe_latest(session, selector(None, "vehicle", "info"), _OTHERS_WAITING)
-        self._tokens = session.liveliness().declare_subscriber(
-            selector(None, "vehicle", "alive"), handlers.RingChannel(_TOKENS_WAITING), history=True
-        )
-        self.alive: set[str] = set()
+        self._elsewhere = Elsewhere(session, realm)
+
+    @property
+    def alive(self) -> set[str]:
         """The trucks of this realm that are there now."""
-        self.elsewhere: dict[str, set[str]] = {}
+        return self._elsewhere.alive
+
+    @property
+    def elsewhere(self) -> dict[str, set[str]]:
         """Other realms and the trucks that were heard in them."""
+        return self._elsewhere.trucks
 
     def heard(self) -> Iterator[Heard]:
         """Yield what has come since the last call, each message once; return when there is none."""
-        self._note_trucks()
+        self._elsewhere.look()
         for stream in self._streams:
             for _ in range(_MOST_AT_ONCE):
                 received = next(stream)
@@ -99,9 +156,9 @@ class Listening:
 
     def close(self) -> None:
         """Stop listening."""
-        for stream in (*self._streams, self._named):
+        for stream in self._streams:
             stream.close()  # type: ignore[attr-defined]
-        self._tokens.undeclare()  # type: ignore[no-untyped-call]
+        self._elsewhere.close()
 
     def _new(self, received: Received) -> Heard | None:
         """The message if it is one of the table and has not come before."""
@@ -112,35 +169,6 @@ class Listening:
         if len(self._seen.streams) > _MOST_SEEN:
             self._seen = Seen()
         return Heard(key, identity, received.payload) if self._seen.add(key, identity) else None
-
-    def _note_trucks(self) -> None:
-        while (token := self._tokens.try_recv()) is not None:
-            self._note(str(token.key_expr), is_there=token.kind == zenoh.SampleKind.PUT)
-        for _ in range(_OTHERS_WAITING):
-            said = next(self._named)
-            if said is None:
-                return
-            self._note(said.key_text, is_there=None)
-
-    def _note(self, key_text: str, *, is_there: bool | None) -> None:
-        """A truck has come (True), gone (False) or said what it is (None)."""
-        try:
-            key = parse_key(key_text)
-        except ValueError:
-            return
-        if key.realm == self.realm:
-            if is_there is True and len(self.alive) < _SIGNALS_WAITING:
-                self.alive.add(key.identifier)
-            elif is_there is False:
-                self.alive.discard(key.identifier)
-            return
-        if is_there is False:
-            trucks = self.elsewhere.get(key.realm, set())
-            trucks.discard(key.identifier)
-            if not trucks:
-                self.elsewhere.pop(key.realm, None)
-        elif sum(map(len, self.elsewhere.values())) < _MOST_NAMED:
-            self.elsewhere.setdefault(key.realm, set()).add(key.identifier)
 
 
 def check_listenable(realm: str) -> str:

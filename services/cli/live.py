@@ -224,6 +224,11 @@ def add_truck(commands: Any) -> None:
     add_endpoint(p)
     add_realm(p)
     add_speed(p, 1.0)
+    p.add_argument(
+        "--skip-gaps",
+        action="store_true",
+        help="do not wait where nothing was recorded for over 2 s, as between runs",
+    )
     p.add_argument("--vehicle", metavar="ID", help="which one drives, if there are several")
 
 
@@ -240,6 +245,7 @@ def _truck(options: argparse.Namespace) -> int:
         spool=options.spool,
         spool_budget_bytes=options.spool_budget << 20,
         site=options.site,
+        skip_gaps=options.skip_gaps,
     )
 
 

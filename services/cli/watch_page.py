@@ -28,8 +28,11 @@ class Heard(Protocol):
     """What of a `Listening` is shown."""
 
     realm: str
-    alive: set[str]
-    elsewhere: dict[str, set[str]]
+
+    @property
+    def alive(self) -> set[str]: ...  # noqa: D102
+    @property
+    def elsewhere(self) -> dict[str, set[str]]: ...  # noqa: D102
 
 
 def page(
