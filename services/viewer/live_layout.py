@@ -16,6 +16,8 @@ from services.viewer.strip import STRIP_PAPER, STRIP_WIDTH
 
 WINDOW_S: Final = 45.0
 """Of accelerations and speed before the moment that is looked at."""
+LANES_S: Final = 120.0
+"""Of crossings."""
 WAITING = "waiting"
 """Entity of the page that stands alone until something is heard."""
 
@@ -69,10 +71,15 @@ def _where_and_when(on_map: Sequence[BridgeOnMap]) -> rrb.Container:
     plans = [bridge_places(bridge, coloured=False, name=bridge.identifier) for bridge in on_map]
     places = _tabs(plans) if plans else bridge_places(None, coloured=False)
     infinite = rrb.TimeRangeBoundary.infinite()
+    shown = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-LANES_S),
+        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
+    )
     lanes = rrb.StateTimelineView(
         origin="crossings",
         name="Crossings",
         time_ranges=[rrb.VisibleTimeRange(TIME, start=infinite, end=infinite)],
+        time_view=rrb.TimeAxis(view_range=shown),
     )
     return rrb.Vertical(places, lanes, row_shares=[2, 1])
 
@@ -98,6 +105,7 @@ def _bridge(bridge: str) -> rrb.Container:
     trend = rrb.TimeSeriesView(
         origin=trend_root(bridge),
         name="EI by all crossings so far, of nominal; orange: the lowest",
+        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=infinite, end=infinite)),
         axis_y=rrb.ScalarAxis(range=(0.0, 1.6)),
         time_ranges=[rrb.VisibleTimeRange(TIME, start=infinite, end=infinite)],
         plot_legend=rrb.PlotLegend(visible=False),

@@ -140,6 +140,8 @@ class LivePicture:
         """Those that are drawn, in the order in which they were met."""
         self._drawn: dict[str, tuple[float, str]] = {}
         """Of each bridge when the crossing was driven whose result is shown, and its text."""
+        self._below: dict[str, str] = {}
+        """Of each bridge, which crossing's numbers are shown: a rejected one has none."""
         self._findings: dict[str, str] = {}
         self._trends: set[str] = set()
         self._lanes: dict[tuple[str, str], int] = {}
@@ -225,7 +227,12 @@ class LivePicture:
         text = _result_text(crossing)
         if elements is not None:
             view = view_of_crossing(crossing, elements)
-            text += self._draw_result(view, moment_ns)
+            text += f"\n\n{summary_line(view)}"
+            if view.rigidity_nm2 is not None:
+                text += self._draw_result(view, moment_ns)
+                self._below[crossing.bridge] = _clock_text(crossing)
+        if crossing.verdict == "rejected" and crossing.bridge in self._below:
+            text += f"\n\nBelow: still the crossing of {self._below[crossing.bridge]}."
         self._drawn[crossing.bridge] = (crossing.entry_time, text)
         self._draw_text(crossing.bridge, moment_ns)
 
@@ -338,9 +345,7 @@ class LivePicture:
         if on_site is not None and view.rigidity_nm2 is not None:
             ratios = view.rigidity_nm2 / view.nominal_nm2
             self._draw_bridge(on_site.on_map, ratios, moment_ns, is_doubtful(view))
-        if compared is None:
-            return f"\n\n{summary_line(view)}"
-        return f"\n\n{' '.join(sentences(compared))}\n\n{summary_line(view)}"
+        return "" if compared is None else f"\n\n{' '.join(sentences(compared))}"
 
     def _draw_text(self, bridge: str, moment_ns: int) -> None:
         texts = (self._drawn.get(bridge, (0.0, ""))[1], self._findings.get(bridge, ""))
@@ -426,11 +431,15 @@ def _of_site(site: Site | None) -> dict[str, _OnSite]:
     }
 
 
-def _result_text(crossing: Crossing) -> str:
+def _clock_text(crossing: Crossing) -> str:
     moment = np.datetime64(round(crossing.entry_time), "s")
+    return f"{str(moment).replace('T', ' ')} UTC"
+
+
+def _result_text(crossing: Crossing) -> str:
     way = "→" if crossing.direction == "start_to_end" else "←"
     lines = [f"### {crossing.verdict.capitalize()}: {crossing.vehicle} {way} {crossing.bridge}"]
-    lines.append(f"{str(moment).replace('T', ' ')} UTC")
+    lines.append(_clock_text(crossing))
     if crossing.verdict == "suspect":
         lines.append("**Doubtful: to be looked at, not to be relied upon.**")
     lowest = lowest_element(crossing)

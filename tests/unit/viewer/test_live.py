@@ -241,17 +241,22 @@ def test_a_result_is_drawn_and_the_next_takes_its_place(live: Live, site: Site) 
     assert "No element stands out" in texts[2]
 
 
-def test_a_rejected_crossing_says_why_and_shows_no_number(live: Live, site: Site) -> None:
-    live.hears("bridge", "estimate", estimate(result(site)))
-    bad = result(site, verdict="rejected", reasons=("channel_missing",), entry=60.0)
+def test_a_rejected_crossing_says_why_and_whose_numbers_are_shown(live: Live, site: Site) -> None:
+    bad = result(site, verdict="rejected", reasons=("channel_missing",), entry=-60.0)
     live.hears("bridge", "estimate", estimate(bad))
+    live.hears("bridge", "estimate", estimate(result(site)))
+    again = result(site, verdict="rejected", reasons=("channel_missing",), entry=60.0)
+    live.hears("bridge", "estimate", estimate(again))
     chunks = live.drawn()
-    assert times_s(rows(chunks, "latest/bridge-1/strip/density")) == [4.0]
-    assert times_s(rows(chunks, "latest/bridge-1"))[-1] == pytest.approx(64.0, abs=1e-5)
-    text = values(rows(chunks, "said/bridge-1"), "TextDocument:text")[-1]
-    assert text.startswith("### Rejected: truck-1")
-    assert bad.reason_texts[0] in text
-    assert "EI_" not in text
+    for drawn in ("density", "ratio", "road/rear"):
+        assert times_s(rows(chunks, f"latest/bridge-1/strip/{drawn}")) == [4.0]
+    first, _, last = values(rows(chunks, "said/bridge-1"), "TextDocument:text")[1:]
+    for text in (first, last):
+        assert text.startswith("### Rejected: truck-1 → bridge-1\n")
+        assert bad.reason_texts[0] in text
+        assert "EI_" not in text
+    assert "Below" not in first
+    assert last.endswith("Below: still the crossing of 2026-09-21 14:13:20 UTC.")
 
 
 def test_the_state_of_a_bridge_over_the_day(live: Live, site: Site) -> None:
