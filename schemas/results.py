@@ -323,6 +323,41 @@ def resolution(crossing: Crossing) -> str | None:
     return f"mean level {level.mean:.2f} of nominal ± {spread:.0f} %, {which} not resolved"
 
 
+class Lowest(NamedTuple):
+    """The element of least EI over nominal, with its 95 % interval where the method knows one."""
+
+    name: str
+    ratio: float
+    low: float | None
+    high: float | None
+
+    def __str__(self) -> str:
+        """As EI_4 0.404 of nominal (0.394 to 0.415)."""
+        interval = "" if self.low is None else f" ({self.low:.3f} to {self.high:.3f})"
+        return f"{self.name} {self.ratio:.3f} of nominal{interval}"
+
+
+def lowest_element(crossing: Crossing) -> Lowest | None:
+    """The element of least EI over nominal, which is that of its prior; None without any."""
+    found = [
+        Lowest(name, value.mean / nominal, value.q025 / nominal, value.q975 / nominal)
+        for name, value in (crossing.parameters or {}).items()
+        if name.startswith("EI_") and value.prior and (nominal := value.prior.location) > 0.0
+    ]
+    if not found:
+        return None
+    lowest = min(found, key=lambda one: one.ratio)
+    has_interval = Reason.NO_NOISE_MODEL not in crossing.reasons
+    return lowest if has_interval else lowest._replace(low=None, high=None)
+
+
+def verdict_line(crossing: Crossing) -> str:
+    """Verdict, codes of its reasons and the lowest element: one line for logs and lists."""
+    against = f" ({', '.join(crossing.reasons)})" if crossing.reasons else ""
+    lowest = lowest_element(crossing)
+    return f"{crossing.verdict}{against}{'' if lowest is None else f', lowest {lowest}'}"
+
+
 def results(header: Header, crossings: list[Crossing], bridges: dict[str, BridgeResult]) -> Results:
     """Put a results file together."""
     return Results(**header._asdict(), crossings=tuple(crossings), bridges=bridges)

@@ -11,11 +11,9 @@ from schemas.topics import IDENTIFIER, PREFIX, TOPICS, Topic
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "topics.md"
 
 SUBSCRIBER = """\
-import json, sys
-import zenoh
+import json, sys, zenoh
 from schemas.messages import decode
 from schemas.topics import parse_key, topic
-
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))  # tcp/127.0.0.1:7447
@@ -25,7 +23,9 @@ with zenoh.open(config) as session:
     for sample in received:
         key = parse_key(str(sample.key_expr))
         message = decode(topic(key.owner, key.stream).message, sample.payload.to_bytes())
-        print(key.realm, key.identifier, key.stream, message.ByteSize(), "bytes", flush=True)
+        found = getattr(message, "parameters", {})  # of an estimate; none if it was rejected
+        said = (f"{n} {p.q025:.3g} to {p.q975:.3g}" for n, p in sorted(found.items()) if "EI_" in n)
+        print(key.realm, key.identifier, key.stream, *said, flush=True)
 """
 
 _HEAD = f"""\

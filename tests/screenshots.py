@@ -1,12 +1,15 @@
-"""The pictures of the README, docs/viewer.md and docs/report.md: python -m tests.screenshots
+"""The pictures of the README, docs/viewer.md, docs/watch.md and docs/report.md.
+
+python -m tests.screenshots [NAME …]
 
 From recordings/sample and the demo; one from crossings that are not in the repository. Needs a
 Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-drivers), and for the
-report a browser.
+report and the terminal a browser (Debian: chromium).
 """
 
 import io
 import os
+import math
 import re
 import subprocess
 import sys
@@ -17,11 +20,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from PIL import Image
+from rich.console import Console
 
+from schemas.site_file import load_site
 from services.cli import main as cli
+from services.cli.watch_page import page
 from services.recordings.recording import read_site
 from services.report.pdf import find_browser
 from services.viewer.view import convert
+from tests.unit.cli.watching import NOW_NS, NOW_S, Listened, a_morning
 from tests.viewer_screen import complaints, has_driver, open_tab, opened, picture
 from tests.waiting import LONGEST_S
 
@@ -67,6 +74,7 @@ def main() -> int:
         }
         takers["report"] = partial(take_report, folder)
         takers["demo"] = partial(take_demo, folder)
+        takers["watch"] = partial(take_terminal, folder, columns=100)
         if SHARED.is_dir():
             make_many(folder)
             takers[OF_MANY.name] = partial(take, OF_MANY, folder)
@@ -127,6 +135,28 @@ def take_report(folder: Path, size: str = "794,1123") -> bytes:
     command = [find_browser(), *options, f"--screenshot={png}", html.as_uri()]
     subprocess.run(command, check=True, capture_output=True, timeout=LONGEST_S)
     return png.read_bytes()
+
+
+def take_terminal(folder: Path, columns: int, lines: int = 30) -> bytes:
+    """A made-up morning on the page of `driveby watch`, as PNG, drawn by a browser."""
+    shown = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True)
+    listened = Listened(alive={"truck-1", "truck-2"})
+    watched = a_morning(load_site(ROOT / "docs/site.example.toml"))
+    where = "realm live at tcp/127.0.0.1:7447"
+    moment = {"now_s": NOW_S, "now_ns": NOW_NS}
+    shown.print(page(watched, where, listened, **moment, width=columns, height=lines))
+    svg = shown.export_svg(title="driveby watch")
+    width, height = (float(size) for size in re.findall(r'viewBox="0 0 (\S+) (\S+)"', svg)[0])
+    (folder / "terminal.svg").write_text(svg)
+    written = folder / "terminal.png"
+    command = [
+        find_browser(), "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+        f"--user-data-dir={folder / 'profile'}", f"--screenshot={written}",
+        f"--window-size={math.ceil(width)},{math.ceil(height)}",
+        (folder / "terminal.svg").absolute().as_uri(),
+    ]  # fmt: skip
+    subprocess.run(command, check=True, capture_output=True)
+    return written.read_bytes()
 
 
 def smaller(png: bytes) -> bytes:

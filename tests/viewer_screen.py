@@ -26,9 +26,9 @@ def has_driver() -> bool:
 
 
 @contextlib.contextmanager
-def opened(file: Path, folder: Path, *, size: str = "1000x700") -> Iterator[ViewerClient]:
-    """Open a file in a viewer of its own, which keeps its settings in `folder`; skips without
-    a driver."""
+def opened(file: Path | str, folder: Path, *, size: str = "1000x700") -> Iterator[ViewerClient]:
+    """Open a file, or what a server has, in a viewer of its own, which keeps its settings in
+    `folder`; skips without a driver."""
     if not has_driver():
         pytest.skip("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)")
     port = free_port()

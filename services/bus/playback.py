@@ -1,6 +1,7 @@
 """Publishing recorded messages at their own spacing, and leaving only when they have arrived."""
 
 import logging
+import math
 import os
 import signal
 import threading
@@ -22,6 +23,8 @@ _CHECK_EVERY = 1000
 """So many messages are sent between two looks at what has arrived."""
 DELIVERY_TIMEOUT_S = 30.0
 """A logger may have a slow disk; one that is silent for longer has gone."""
+GAP_S = 2.0
+"""A silence of a recording that is longer is passed over where gaps are skipped."""
 SETTLE_S = 0.3
 """For the queries that every subscriber sends to a new publisher."""
 
@@ -40,18 +43,22 @@ def play(
     *,
     speed: float,
     stop: threading.Event,
+    longest_gap_s: float = math.inf,
 ) -> int:
     """Put the messages with the spacing of their log times divided by `speed`; how many.
 
     A message whose log time is not later than that of the one before follows at once (recovered
-    messages stand late in a recording). Ends early when `stop` is set.
+    messages stand late in a recording), and so does one after a silence of the recording of more
+    than `longest_gap_s`. Ends early when `stop` is set.
     """
     number = 0
     began: tuple[float, int] | None = None
+    latest_ns = 0
     for message in messages:
         now = time.monotonic()
-        if began is None:
+        if began is None or message.log_time_ns - latest_ns > longest_gap_s * 1e9:
             began = (now, message.log_time_ns)
+        latest_ns = max(latest_ns, message.log_time_ns)
         if speed > 0.0:
             due = began[0] + (message.log_time_ns - began[1]) * 1e-9 / speed
             if due > now:

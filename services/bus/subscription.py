@@ -225,18 +225,19 @@ class Seen:
 
 
 def subscribe_latest(
-    session: zenoh.Session, key_expression: str, capacity: int = 100
+    session: zenoh.Session, key_expression: str, capacity: int = 100, past: int = 1
 ) -> Iterator[Received | None]:
     """Yield the newest messages for a live display, and None whenever there is none at the time.
 
-    It never holds anybody up: of more than `capacity` waiting messages the oldest are dropped.
+    It never holds anybody up: of more than `capacity` waiting messages the oldest are dropped. Of
+    what each publisher still keeps the last `past` come first.
     The consumer decides how long to sleep on None; closing the generator ends the subscription.
     """
     subscriber = ext.declare_advanced_subscriber(
         session,
         key_expression,
         handlers.RingChannel(capacity),
-        history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+        history=ext.HistoryConfig(detect_late_publishers=True, max_samples=past),
     )
     try:
         while True:

@@ -2,10 +2,11 @@
 
 A crossing of the paper's scenario 6 (element 4 at 40 %) is simulated, played as a truck that drives
 now, recorded by the logger, identified by the worker, received by this process as a subscriber to
-the live result, and drawn.
+the live result, and drawn. It can be watched as it happens (`--live`).
 """
 
 import contextlib
+import re
 import shutil
 import signal
 import socket
@@ -17,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 Floats = NDArray[np.float64]
+Live = Literal["window", "web"]
+"""Where a demo is watched as it happens."""
 
 SCENARIO = 6
 REALM = "sim-demo"
@@ -63,28 +66,31 @@ class _Services(NamedTuple):
     method: str
 
 
-def demo_command(*, out: Path | None, speed: float, noise: float, console: "Console") -> int:
+def demo_command(
+    *, out: Path | None, speed: float, noise: float, console: "Console", live: Live | None = None
+) -> int:
     """Run the demonstration; 0 only if the crossing was recorded, identified and received.
 
     With a `noise` in µg/√Hz the receiver errs as real ones do, too; with zero everything is exact,
-    and the method is the one that knows of no noise.
+    and the method is the one that knows of no noise. `live` shows it meanwhile, in a window or a
+    browser, and after it until somebody closes that.
 
     FailureError says which of them did not happen. InputError: the folder exists.
     """
     folder = _new_folder(out)
     try:
-        return _run(folder, speed, noise, console)
+        return _run(folder, speed, noise, console, live)
     except KeyboardInterrupt:
         shutil.rmtree(folder, ignore_errors=True)  # half a demo is of no use to anybody
         raise
 
 
-def _run(folder: Path, speed: float, noise: float, console: "Console") -> int:
+def _run(folder: Path, speed: float, noise: float, console: "Console", live: Live | None) -> int:
     began = time.monotonic()
-    with (
-        _terminated_as_interrupted(),
-        console.status("simulating a crossing of the paper's bridge", spinner="dots") as status,
-    ):
+    with _terminated_as_interrupted(), contextlib.ExitStack() as watching:
+        status = watching.enter_context(
+            console.status("simulating a crossing of the paper's bridge", spinner="dots")
+        )
         site = declared(paper_site(), noise, 1000.0)
         drive = simulate_drive(
             site,
@@ -94,20 +100,53 @@ def _run(folder: Path, speed: float, noise: float, console: "Console") -> int:
             noise_ug_per_rthz=noise,
             receiver_errors=noise > 0.0,
         )
-        with tempfile.TemporaryDirectory(prefix="driveby-demo-") as temporary:
-            source = Path(temporary) / "drive.mcap"
-            sent = write_drive(source, drive, site)
-            site_path = Path(temporary) / "site.toml"
-            write_atomically(site_path, site_toml(site))
-            method = "pre" if noise > 0.0 else "least-squares"
-            services = _Services(_free_endpoint(), site_path, folder, method)
-            crossing = _live(services, source, speed, status.update)
+        temporary = Path(
+            watching.enter_context(tempfile.TemporaryDirectory(prefix="driveby-demo-"))
+        )
+        source, site_path = temporary / "drive.mcap", temporary / "site.toml"
+        sent = write_drive(source, drive, site)
+        write_atomically(site_path, site_toml(site))
+        method = "pre" if noise > 0.0 else "least-squares"
+        services = _Services(_free_endpoint(), site_path, folder, method)
+        view = None if live is None else watching.enter_context(_view(services, live))
+        crossing = _live(services, source, speed, status.update)
         _check_recording(folder / _RECORDING, sent)
         status.update("drawing")
         _draw(folder, crossing, drive, site)
-    _print(console, crossing, drive, site)
-    _say_where(console, folder, time.monotonic() - began)
+        status.stop()
+        _print(console, crossing, drive, site)
+        _say_where(console, folder, time.monotonic() - began)
+        if view is not None:
+            _wait_until_closed(view, console)
     return 0
+
+
+@contextlib.contextmanager
+def _view(services: _Services, live: Live) -> Iterator["_Running"]:
+    """The live view, in a process of its own; it is told to end, for it has a viewer to close."""
+    where = ("--endpoint", services.endpoint, "--realm", REALM, "--site", str(services.site))
+    web = ("--web",) if live == "web" else ()
+    with _process(services.folder, "view", "live", *where, *web) as view:
+        try:
+            yield view
+        finally:
+            view.process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                view.process.wait(timeout=_STOP_S)
+
+
+def _wait_until_closed(view: "_Running", console: "Console") -> None:
+    """Until somebody closes the window, or ends the demo; what was found is printed by then."""
+    address = re.search(r"connect at (http://\S+)", view.log.read_text(errors="replace"))
+    said = "The live view stays until its window is closed, or Ctrl-C."
+    if address is not None:
+        said = f"The live view stays until Ctrl-C, at {address[1]}"
+    console.print(f"\n{said}", highlight=False, soft_wrap=True)
+    code: int | None = None
+    with contextlib.suppress(KeyboardInterrupt):
+        code = view.process.wait()
+    if code:
+        raise FailureError(f"the live view ended with {code}: {_last_line(view.log)}")
 
 
 @contextlib.contextmanager

@@ -37,13 +37,19 @@ def add_demo(commands: Any) -> None:
     add_speed(p, 4.0)
     text = "accelerometers' noise density in µg/√Hz; 0: all exact, least squares (default: 25)"
     add_noise(p, text, 25.0)
+    p.add_argument("--live", action="store_true", help="watch it as it happens, in the viewer")
+    p.add_argument("--web", action="store_true", help="watch it in the browser")
 
 
 def _demo(options: argparse.Namespace) -> int:
     from services.cli.demo import demo_command
 
     return demo_command(
-        out=options.out, speed=options.speed, noise=options.noise, console=a_console()
+        out=options.out,
+        speed=options.speed,
+        noise=options.noise,
+        console=a_console(),
+        live="web" if options.web else "window" if options.live else None,
     )
 
 
@@ -218,6 +224,11 @@ def add_truck(commands: Any) -> None:
     add_endpoint(p)
     add_realm(p)
     add_speed(p, 1.0)
+    p.add_argument(
+        "--skip-gaps",
+        action="store_true",
+        help="do not wait where nothing was recorded for over 2 s, as between runs",
+    )
     p.add_argument("--vehicle", metavar="ID", help="which one drives, if there are several")
 
 
@@ -234,6 +245,7 @@ def _truck(options: argparse.Namespace) -> int:
         spool=options.spool,
         spool_budget_bytes=options.spool_budget << 20,
         site=options.site,
+        skip_gaps=options.skip_gaps,
     )
 
 

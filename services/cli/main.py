@@ -33,13 +33,14 @@ from services.cli.offline import (
     add_import,
     add_recover,
     add_simulate,
-    add_view,
 )
 from services.cli.parsing import Handler, Parser, add_common
 from services.cli.replay import add_replay
 from services.cli.report import add_report
 from services.cli.survey import add_survey
 from services.cli.validation import add_validate
+from services.cli.view import add_view
+from services.cli.watch import add_watch
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 
 _COMMANDS: Final = (
@@ -60,6 +61,7 @@ _COMMANDS: Final = (
     add_worker,
     add_truck,
     add_replay,
+    add_watch,
     add_health,
     add_certs,
 )

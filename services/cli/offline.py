@@ -1,4 +1,4 @@
-"""Commands that work on files: simulate, import, identify, recover, view."""
+"""Commands that work on files: simulate, import, identify, recover."""
 
 import argparse
 from pathlib import Path
@@ -400,22 +400,3 @@ def _recover(options: argparse.Namespace) -> int:
     )
     print(line)
     return code
-
-
-def add_view(commands: Any) -> None:
-    """`driveby view`: look at a recording or a result."""
-    p = command(
-        commands,
-        "view",
-        _view,
-        "look at a recording or a result",
-        "driveby view run.mcap --web",
-    )
-    p.add_argument("target", metavar="REC|RESULT|RRD", help="a .mcap, .json or .rrd file")
-    p.add_argument("--web", action="store_true", help="in the browser")
-
-
-def _view(options: argparse.Namespace) -> int:
-    from services.viewer.view import view_command
-
-    return view_command(target=options.target, web=options.web, console=a_console())

@@ -67,7 +67,7 @@ def add_common(parser: argparse.ArgumentParser, *, suppressed: bool) -> None:
     )
 
 
-def add_site(p: argparse.ArgumentParser, text: str, *, required: bool = False) -> None:
+def add_site(p: Any, text: str, *, required: bool = False) -> None:
     """`--site`: a site file."""
     p.add_argument("--site", type=Path, required=required, metavar="SITE.toml", help=text)
 
@@ -144,13 +144,13 @@ def add_method(p: argparse.ArgumentParser) -> None:
     )
 
 
-def add_endpoint(p: argparse.ArgumentParser) -> None:
+def add_endpoint(p: Any) -> None:
     """`--endpoint` and `--tls`: where the bus is, and who one is there."""
     p.add_argument("--endpoint", help=f"where the logger listens (default: {DEFAULT_ENDPOINT})")
     add_tls(p)
 
 
-def add_tls(p: argparse.ArgumentParser) -> None:
+def add_tls(p: Any) -> None:
     """`--tls`: a folder of credentials."""
     p.add_argument(
         "--tls",
@@ -161,7 +161,7 @@ def add_tls(p: argparse.ArgumentParser) -> None:
     )
 
 
-def add_realm(p: argparse.ArgumentParser) -> None:
+def add_realm(p: Any) -> None:
     """`--realm`."""
     p.add_argument("--realm", default="live", help="(default: live)")
 

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Final
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+LOOPBACK: Final = "127.0.0.1"
 DEFAULT_TLS_ENDPOINT: Final = "tls/127.0.0.1:7447"
 
 

@@ -67,6 +67,8 @@ _GOODBYE_S = 0.2
 _DROPS_PERIOD_S = 60.0
 """What a source loses otherwise than by a full queue is an event once in this time, with a
 count."""
+_LONG_LAG_S = 60.0
+"""A lag that is longer is explained: the network is seldom why."""
 _MAX_DROPS_TOLD = 1000
 """So many sources are remembered as told of; with more, all are told of anew."""
 _EVENTS_LOGGED = 20
@@ -381,9 +383,12 @@ class _Announcements:
 def _health_line(figures: Mapping[str, float]) -> str:
     """What a person wants to know once a minute; everything else is on `health`."""
     known = defaultdict(float, figures)
+    why = ""
+    if known["lag_s"] > _LONG_LAG_S:
+        why = " (samples so old when they came: played faster than real, sent late, or a clock off)"
     return (
         f"{known['trucks_alive']:.0f} trucks, {known['rate_per_s']:.0f} messages/s, "
-        f"lag {known['lag_s']:.2f} s, queue {known['queue']:.0f}, lost {known['lost']:.0f}, "
+        f"lag {known['lag_s']:.2f} s{why}, queue {known['queue']:.0f}, lost {known['lost']:.0f}, "
         f"missing {known['missing']:.0f}, recovered {known['recovered']:.0f}, "
         f"duplicates {known['duplicates']:.0f}, refused {known['refused']:.0f}, "
         f"dropped {known['dropped']:.0f}, written {known['written']:.0f} to "

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 from schemas.signals import NS_PER_S
 from schemas.topics import topic
+from services.bus.playback import GAP_S
 from services.recordings.recording import Message
 from services.recordings.together import Timed
 
@@ -19,8 +20,6 @@ SPEEDS: Final = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 0.0)
 """What the keys for faster and slower go through; 0, as fast as possible, is the fastest."""
 LEAD_S: Final = 5.0
 """So long before a truck comes onto a bridge a jump ends: its road before the bridge is needed."""
-GAP_S: Final = 2.0
-"""A silence of the drive that is longer is passed over where gaps are skipped."""
 REFRESH_S: Final = 0.1
 """So soon a key has its effect and the display follows."""
 

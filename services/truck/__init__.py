@@ -5,12 +5,15 @@
 
 import contextlib
 import logging
+import math
 import time
 from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
 from functools import partial
 from heapq import merge
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -28,6 +31,7 @@ from schemas.signals import (
 from schemas.topics import check_realm
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import (
+    GAP_S,
     check_speed,
     confirm,
     play,
@@ -45,6 +49,10 @@ __all__ = ["Gateway", "run"]
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
 """A router that was started a moment before is there by then."""
+_LONG_WAIT_S = 10.0
+"""Who sees nothing for longer thinks that something is broken."""
+_OLD_S = 60.0
+"""Samples that are older when they are sent make others ask why."""
 SUBSCRIBER_TIMEOUT_S = 1.0
 """A truck does not wait for an audience: its cache serves those who come late."""
 
@@ -61,6 +69,7 @@ def run(
     spool: Path | None = None,
     spool_budget_bytes: int = DEFAULT_BUDGET_BYTES,
     site: Path | None = None,
+    skip_gaps: bool = False,
 ) -> int:
     """Play one vehicle of a recording as a truck that drives now; return 0.
 
@@ -68,7 +77,9 @@ def run(
     It is a new boot of that truck: new boot_id, sequences from 0, and times shifted as a whole
     so that the recording ends now (at `speed` 1 or less: begins now). **Only the publication is
     faster than real, not the data**: rates and the time between samples stay those of the
-    recording, because they are physics. Shifted to the end, no stamp lies in the future.
+    recording, because they are physics. Shifted to the end, no stamp lies in the future. With
+    `skip_gaps` silences of the recording (between runs) are not waited for; they stay in the data,
+    so the first samples are older by as much.
 
     `vehicle` chooses one of several; `tls` is a folder of its credentials, see `open_session`.
     With a folder `spool` every message goes to disk there first and stays until a logger has it
@@ -97,7 +108,9 @@ def run(
             bus = partial(open_session, connect=endpoint, timeout_s=0.0, tls=tls)
         gateway = Gateway(bus, realm, vehicle, _open_spool(spool, spool_budget_bytes))
         stack.callback(gateway.close)
-        messages = _driven_now(recording, streams, realm, gateway.boot_id, speed)
+        times = _times(streams, speed, skip_gaps=skip_gaps)
+        _tell(times)
+        messages = _driven_now(recording, streams, realm, gateway.boot_id, times)
         keys = [queue[0].key for queue in streams.values()]
         if gateway.is_online and not settle(gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S):
             # A real truck drives on as well; its cache serves those who come late.
@@ -107,7 +120,10 @@ def run(
             identity = Identity(message.boot_id, message.sequence)
             gateway.put(message.key.stream, message.payload, identity, patient=True)
 
-        sent = play(messages, put, gateway.delivery, speed=speed, stop=stop)
+        longest_gap_s = GAP_S if skip_gaps else math.inf
+        sent = play(
+            messages, put, gateway.delivery, speed=speed, stop=stop, longest_gap_s=longest_gap_s
+        )
         confirm(gateway.delivery, sent)
         if gateway.is_online:
             _log.info("%d messages of %s published in realm %s", sent, gateway.vehicle, realm)
@@ -160,21 +176,60 @@ def _messages(source: Path, vehicle: str | None, site: Path | None) -> Iterator[
     yield from messages_of(source, site, vehicle)
 
 
+class _Times(NamedTuple):
+    """When what was recorded is published."""
+
+    first_ns: int
+    ahead_ns: int
+    """By how much the last sample would run ahead of the clock: so old is the first one."""
+    takes_s: float
+    waits_s: float
+    """How much of that nothing is published in silences of the recording."""
+    longest_ns: tuple[int, int]
+    """Where its longest silence begins and ends."""
+
+
+def _times(streams: dict[str, list[Message]], speed: float, *, skip_gaps: bool) -> _Times:
+    recorded = sorted(message.log_time_ns for queue in streams.values() for message in queue)
+    gaps = [(a, b) for a, b in pairwise(recorded) if b - a > GAP_S * NS_PER_S]
+    silent_ns = sum(b - a for a, b in gaps)
+    duration_ns = recorded[-1] - recorded[0]
+    waited_ns = duration_ns - silent_ns if skip_gaps else duration_ns
+    takes_ns = round(waited_ns / speed) if speed else 0
+    waits_ns = 0 if skip_gaps or not speed else round(silent_ns / speed)
+    longest = max(gaps, key=lambda gap: gap[1] - gap[0], default=(recorded[0], recorded[0]))
+    ahead_ns = max(0, duration_ns - takes_ns)
+    return _Times(recorded[0], ahead_ns, takes_ns * 1e-9, waits_ns * 1e-9, longest)
+
+
+def _tell(times: _Times) -> None:
+    """What of a drive that is played may surprise who waits for it, or looks at its times."""
+    if times.waits_s > _LONG_WAIT_S:
+        begin_ns, end_ns = times.longest_ns
+        _log.warning(
+            "nothing was recorded for up to %.0f s (between runs): of the %.0f s that the drive "
+            "takes, %.0f s are spent waiting; --skip-gaps passes over them",
+            *((end_ns - begin_ns) * 1e-9, times.takes_s, times.waits_s),
+        )
+    if times.ahead_ns > _OLD_S * NS_PER_S:
+        begins = datetime.fromtimestamp(time.time() - times.ahead_ns * 1e-9, UTC)
+        _log.info(
+            "stamped so that it ends when all is published: it begins at %s UTC, its first samples "
+            "are %.0f s old when they are sent, and so are its crossings' times",
+            *(f"{begins:%Y-%m-%d %H:%M:%S}", times.ahead_ns * 1e-9),
+        )
+
+
 def _driven_now(
-    recording: Path, streams: dict[str, list[Message]], realm: str, boot_id: int, speed: float
+    recording: Path, streams: dict[str, list[Message]], realm: str, boot_id: int, times: _Times
 ) -> Iterator[Message]:
     """Yield all streams merged by time, with the times and identities of a drive that is now.
 
     InputError: the times of the recording lie so far apart that some would not be of this century.
     """
-    first_ns = min(message.log_time_ns for queue in streams.values() for message in queue)
-    last_ns = max(message.log_time_ns for queue in streams.values() for message in queue)
-    duration_ns = last_ns - first_ns
-    ahead_ns = 0  # by how much the last sample would run ahead of the clock
-    if speed == 0.0 or speed > 1.0:
-        ahead_ns = duration_ns - (round(duration_ns / speed) if speed else 0)
-    wall_shift_ns = time.time_ns() - first_ns - ahead_ns
-    device_start_ns = max(0, time.monotonic_ns() - ahead_ns)
+    first_ns = times.first_ns
+    wall_shift_ns = time.time_ns() - first_ns - times.ahead_ns
+    device_start_ns = max(0, time.monotonic_ns() - times.ahead_ns)
     device_shifts: dict[int, int] = {}
     for index, message in _merged(streams.values()):
         try:

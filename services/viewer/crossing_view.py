@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.results import RESOLVED, Crossing, ElementState, Parameter, Prior, resolution
-from schemas.site import Bridge
 from services.identification.comparison import Comparison, Estimate, compare, sentences
 
 FloatArray = NDArray[np.float64]
@@ -32,6 +31,32 @@ class OnBridge(Protocol):
     def speed_m_per_s(self) -> float: ...  # noqa: D102
     @property
     def span_m(self) -> float: ...  # noqa: D102
+
+
+class Elements(Protocol):
+    """What of a bridge stands along its span; `schemas.site.Bridge` has it."""
+
+    @property
+    def elements(self) -> int: ...  # noqa: D102
+    @property
+    def lengths_m(self) -> tuple[float, ...]: ...  # noqa: D102
+    @property
+    def nominal_flexural_rigidity_nm2(self) -> tuple[float, ...]: ...  # noqa: D102
+    @property
+    def interior_supports_m(self) -> tuple[float, ...]: ...  # noqa: D102
+
+
+class ToldElements(NamedTuple):
+    """The elements of a bridge as a result tells them, where there is no site file."""
+
+    lengths_m: tuple[float, ...]
+    nominal_flexural_rigidity_nm2: tuple[float, ...]
+    interior_supports_m: tuple[float, ...] = ()
+
+    @property
+    def elements(self) -> int:
+        """How many there are."""
+        return len(self.lengths_m)
 
 
 class PassingView(NamedTuple):
@@ -169,7 +194,7 @@ def told_of_crossing(crossing: CrossingView, found: Comparison | None) -> list[s
     return [*said, f"Not all is resolved: {crossing.resolution}."]
 
 
-def view_of_crossing(crossing: Crossing, bridge: Bridge) -> CrossingView:
+def view_of_crossing(crossing: Crossing, bridge: Elements) -> CrossingView:
     """Gather what is drawn of a result; the bridge gives the lengths and nominal rigidities."""
     parameters = crossing.parameters
     rigidity = interval = None
@@ -216,3 +241,23 @@ def unresolved_elements(elements: Iterable[Parameter | ElementState]) -> frozens
     """Numbers of those whose standard deviation is too large to tell a loss of half of them."""
     counted = enumerate(elements, start=1)
     return frozenset(n for n, one in counted if one.std > RESOLVED * abs(one.mean))
+
+
+def elements_of_result(crossing: Crossing) -> ToldElements | None:
+    """The elements of the bridge of a result, by its priors; None where it does not tell them.
+
+    Where it does not tell their lengths they are taken as equal, of the span that its road covers.
+    """
+    estimates = crossing.parameters or {}
+    found = [value for name, value in estimates.items() if name.startswith("EI_")]
+    nominal = tuple(value.prior.location for value in found if value.prior is not None)
+    if not nominal or len(nominal) != len(found) or min(nominal) <= 0.0:
+        return None
+    told = crossing.fusion_likelihood
+    lengths = () if told is None else tuple(told.element_lengths_m)
+    if len(lengths) != len(nominal):
+        road = crossing.road
+        # Its grid lies in the middle of the span.
+        span_m = float(len(nominal)) if road is None or not road.x_m else road.x_m[0] + road.x_m[-1]
+        lengths = (span_m / len(nominal),) * len(nominal)
+    return ToldElements(lengths, nominal)

@@ -81,7 +81,7 @@ def _crossing_layout(
 ) -> rrb.Container:
     """Verdict and place, what was found, and what it was found from; only what there is."""
     root = crossing_root(crossing)
-    plots = _acceleration_plots(f"{root}/acceleration", channels)
+    plots = acceleration_plots(f"{root}/acceleration", channels)
     if crossing.road is not None:
         plots = [
             _plot(f"{root}/road", "Road profile (mm)"),
@@ -124,7 +124,7 @@ def _when_and_where(crossing: CrossingView | PassingView) -> str:
 
 def _verdict_and_place(root: str, bridge: BridgeOnMap | None, *, coloured: bool) -> rrb.Container:
     verdict = rrb.TextDocumentView(origin=f"{root}/verdict", name="Verdict")
-    places = _places(bridge, root, coloured=coloured)
+    places = bridge_places(bridge, root, coloured=coloured)
     return rrb.Vertical(verdict, places, row_shares=[5, 3])
 
 
@@ -137,7 +137,7 @@ def _overview_layout(bridge: BridgeView, on_map: BridgeOnMap | None) -> rrb.Cont
     )
     side = rrb.Vertical(
         rrb.TextDocumentView(origin=f"{bridge_root(bridge)}/finding", name="Finding"),
-        _places(on_map, coloured=bridge.estimate is not None),
+        bridge_places(on_map, coloured=bridge.estimate is not None),
     )
     name = f"Bridge {bridge.owner_id or bridge.bridge}"
     return rrb.Horizontal(picture, side, column_shares=[5, 2], name=name)
@@ -207,10 +207,10 @@ def _passing_layout(
 ) -> rrb.Container:
     """The accelerations of a crossing that nobody has identified."""
     root = passing_root(passing)
-    plots = _acceleration_plots(f"{root}/acceleration", channels)
+    plots = acceleration_plots(f"{root}/acceleration", channels)
     return rrb.Vertical(
         *plots,
-        _places(bridge, root, has_elements=False, coloured=False),
+        bridge_places(bridge, root, has_elements=False, coloured=False),
         name=f"{_when_and_where(passing)}, not identified",
     )
 
@@ -220,7 +220,7 @@ def _drive_layout(
 ) -> rrb.Container:
     plots: list[rrb.View] = []
     for vehicle, known in channels.items():
-        plots += _acceleration_plots(f"vehicle/{vehicle}/acceleration", known, f"{vehicle}:")
+        plots += acceleration_plots(f"vehicle/{vehicle}/acceleration", known, f"{vehicle}:")
         plots.append(_plot(f"vehicle/{vehicle}/speed", f"{vehicle}: Speed (m/s)"))
     places = rrb.Tabs(
         rrb.Spatial2DView(origin="plan_of_drive", name="Plan of the drive (m, north up)"),
@@ -236,22 +236,31 @@ def _drive_layout(
     return rrb.Horizontal(side, rrb.Vertical(*plots), column_shares=[2, 3], name=name)
 
 
-def _acceleration_plots(origin: str, channels: Set[str], vehicle: str = "") -> list[rrb.View]:
-    """Body and axles apart: those of the axles are ten times larger. Only what the truck has."""
+def acceleration_plots(
+    origin: str, channels: Set[str], vehicle: str = "", *, window_s: float | None = None
+) -> list[rrb.View]:
+    """Body and axles apart: those of the axles are ten times larger. Only what the truck has.
+
+    All of it, or with `window_s` what lies so shortly before the moment that is looked at.
+    """
     return [
-        _plot(origin, f"{vehicle} {name} accelerations (m/s²)".strip(), part)
+        _plot(origin, f"{vehicle} {name} accelerations (m/s²)".strip(), part, window_s)
         for part, name in (("sprung", "Body"), ("unsprung", "Axle"))
         if f"{part}_front" in channels or f"{part}_rear" in channels
     ]
 
 
-def _plot(origin: str, name: str, only: str | None = None) -> rrb.View:
-    """A plot of all of a series, not only of what lies before the time cursor."""
-    infinite = rrb.TimeRangeBoundary.infinite()
-    whole = [
-        rrb.VisibleTimeRange(timeline, start=infinite, end=infinite)
-        for timeline in (TIME, CHAINAGE)
-    ]
+def _plot(
+    origin: str, name: str, only: str | None = None, window_s: float | None = None
+) -> rrb.View:
+    """A plot of all of a series, not only of what lies before the time cursor, or of a window."""
+    start = end = rrb.TimeRangeBoundary.infinite()
+    timelines = [TIME, CHAINAGE]
+    if window_s is not None:
+        start = rrb.TimeRangeBoundary.cursor_relative(seconds=-window_s)
+        end = rrb.TimeRangeBoundary.cursor_relative(seconds=0.0)
+        timelines = [TIME]
+    shown = [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline in timelines]
     contents = (
         "$origin/**" if only is None else [f"$origin/{only}_{axle}" for axle in ("front", "rear")]
     )
@@ -259,18 +268,19 @@ def _plot(origin: str, name: str, only: str | None = None) -> rrb.View:
         origin=origin,
         contents=contents,
         name=name,
-        time_ranges=whole,
-        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=infinite, end=infinite)),
+        time_ranges=shown,
+        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end)),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
     )
 
 
-def _places(
+def bridge_places(
     bridge: BridgeOnMap | None,
     root: str | None = None,
     *,
     has_elements: bool = True,
     coloured: bool,
+    name: str | None = None,
 ) -> rrb.Container | rrb.View:
     """The plan of a bridge and beside it the map, which needs a network for its background.
 
@@ -298,7 +308,7 @@ def _places(
             y_range=(-0.25 * span, 0.4 * span),
         ),
     )
-    return rrb.Tabs(view, on_map, active_tab=0)
+    return rrb.Tabs(view, on_map, active_tab=0, name=name)
 
 
 def _map(*contents: str, zoom: float | None = None) -> rrb.View:

@@ -33,6 +33,7 @@ from services.viewer.rerun_parts import (
     MUTED,
     WEAK,
     IntArray,
+    Stream,
     chainage_column,
     columns_of,
     log_labels,
@@ -68,7 +69,7 @@ _BENT_SHARE = 0.06
 
 
 def log_crossing(
-    recording: rr.RecordingStream,
+    recording: Stream,
     crossing: CrossingView,
     bridge: BridgeOnMap | None,
     signals: VehicleSignals | None,
@@ -79,7 +80,7 @@ def log_crossing(
     root = crossing_root(crossing)
     compared = comparison_of(crossing, baseline)
     log_markdown(recording, f"{root}/verdict", verdict_markdown(crossing, compared))
-    _log_rigidity(recording, root, crossing, compared, baseline)
+    log_rigidity(recording, root, crossing, compared, baseline)
     _log_learned(recording, root, crossing, compared)
     log_residuals(recording, root, crossing)
     passage = passage_of(crossing)
@@ -107,9 +108,7 @@ def front_axle_chainage(crossing: OnBridge, time_s: FloatArray) -> FloatArray:
     return travelled if crossing.forward else crossing.span_m - travelled
 
 
-def log_acceleration(
-    recording: rr.RecordingStream, root: str, crossing: OnBridge, channels: Channels
-) -> None:
+def log_acceleration(recording: Stream, root: str, crossing: OnBridge, channels: Channels) -> None:
     """The accelerations while the truck was on the bridge, and a second around, on both timelines.
 
     Nothing of a crossing of which there are no samples.
@@ -130,7 +129,7 @@ def log_acceleration(
 
 
 def log_position(
-    recording: rr.RecordingStream,
+    recording: Stream,
     root: str,
     crossing: OnBridge,
     signals: VehicleSignals,
@@ -161,13 +160,14 @@ def log_position(
         log_truck_on_plan(recording, f"{root}/plan/truck", places, time_ns, chainage)
 
 
-def _log_rigidity(
-    recording: rr.RecordingStream,
+def log_rigidity(
+    recording: Stream,
     root: str,
     crossing: CrossingView,
     compared: Comparison | None,
     baseline: Estimate | None,
 ) -> None:
+    """EI of each element as bars, and as a strip along the span; nothing of a rejected crossing."""
     if crossing.rigidity_nm2 is None:
         return
     edges = crossing.element_edges_m
@@ -213,7 +213,7 @@ def _log_rigidity(
 
 
 def _log_whiskers(
-    recording: rr.RecordingStream,
+    recording: Stream,
     entity: str,
     across: FloatArray,
     tips: FloatArray,
@@ -236,7 +236,7 @@ def _log_whiskers(
 
 
 def _log_level(
-    recording: rr.RecordingStream,
+    recording: Stream,
     entity: str,
     edges_m: FloatArray,
     rows: FloatArray,
@@ -259,7 +259,7 @@ def _log_level(
 
 
 def _log_learned(
-    recording: rr.RecordingStream, root: str, crossing: CrossingView, compared: Comparison | None
+    recording: Stream, root: str, crossing: CrossingView, compared: Comparison | None
 ) -> None:
     """A line for each unknown: its prior, wide and grey, and on it what is known now."""
     rows = learned_of(crossing.parameters) if crossing.interval_has_meaning else []
@@ -317,9 +317,7 @@ def _log_learned(
     log_labels(recording, f"{root}/learned/share", shares, np.full(len(rows), 3.3), up)
 
 
-def _log_passage(
-    recording: rr.RecordingStream, root: str, crossing: CrossingView, passage: Passage
-) -> None:
+def _log_passage(recording: Stream, root: str, crossing: CrossingView, passage: Passage) -> None:
     """The truck over the bending bridge, a picture for each place of the front axle."""
     assert crossing.rigidity_nm2 is not None  # noqa: S101 - there is no passage without
     span = crossing.span_m
@@ -379,7 +377,7 @@ def _body(front: FloatArray, rear: FloatArray, wheel: float) -> FloatArray:
 
 
 def _log_scene(
-    recording: rr.RecordingStream,
+    recording: Stream,
     entity: str,
     crossing: CrossingView,
     passage: Passage,
@@ -416,7 +414,7 @@ def _log_scene(
     log_labels(recording, f"{entity}/scale", [said], np.array([span / 2]), np.array([0.085 * span]))
 
 
-def _log_road(recording: rr.RecordingStream, root: str, crossing: CrossingView) -> None:
+def _log_road(recording: Stream, root: str, crossing: CrossingView) -> None:
     road = crossing.road
     if road is None:
         return

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 import rerun as rr
@@ -15,6 +16,19 @@ TIME, CHAINAGE = "time", "chainage_mm"
 
 IntArray = NDArray[np.int64]
 Rgb = tuple[int, int, int]
+
+
+class Stream(Protocol):
+    """Where it is logged: a recording, or one that dates what it gets (`live_parts.Dated`)."""
+
+    def log(self, entity_path: str, entity: Any, *, static: bool = False) -> None:
+        """Log one thing: for all times, or for that at which the recording is."""
+
+    def send_columns(
+        self, entity_path: str, indexes: Iterable[Any], columns: Iterable[Any]
+    ) -> None:
+        """Log a series with the times of its values."""
+
 
 CHANNEL_COLOURS = {
     "sprung_front": "#56B4E9",
@@ -72,9 +86,7 @@ def columns_of(time_ns: IntArray, chainage_m: FloatArray | None) -> list[rr.Time
     return indexes
 
 
-def log_line(
-    recording: rr.RecordingStream, entity: str, name: str, colour: str, *, width: float = 1.3
-) -> None:
+def log_line(recording: Stream, entity: str, name: str, colour: str, *, width: float = 1.3) -> None:
     """How the line of a time series looks."""
     recording.log(
         entity,
@@ -90,7 +102,7 @@ def log_line(
 
 
 def send_scalars(
-    recording: rr.RecordingStream,
+    recording: Stream,
     entity: str,
     values: FloatArray,
     *,
@@ -104,7 +116,7 @@ def send_scalars(
 
 
 def log_labels(
-    recording: rr.RecordingStream,
+    recording: Stream,
     entity: str,
     labels: Sequence[str],
     across: FloatArray,
@@ -126,7 +138,7 @@ def log_labels(
     )
 
 
-def log_markdown(recording: rr.RecordingStream, entity: str, text: str) -> None:
+def log_markdown(recording: Stream, entity: str, text: str) -> None:
     """A page of text."""
     document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
     recording.log(entity, document, static=True)

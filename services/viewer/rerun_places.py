@@ -23,6 +23,7 @@ from services.viewer.rerun_parts import (
     UNKNOWN,
     IntArray,
     Rgb,
+    Stream,
     columns_of,
     log_labels,
     log_line,
@@ -116,7 +117,7 @@ def plan_root(identifier: str) -> str:
 
 
 def log_bridge(
-    recording: rr.RecordingStream,
+    recording: Stream,
     bridge: BridgeOnMap,
     ratios: FloatArray | None,
     *,
@@ -152,7 +153,7 @@ def log_bridge(
 
 
 def log_surroundings(
-    recording: rr.RecordingStream, bridge: BridgeOnMap, vehicles: Mapping[str, VehicleSignals]
+    recording: Stream, bridge: BridgeOnMap, vehicles: Mapping[str, VehicleSignals]
 ) -> None:
     """What the plan of a bridge has beside its elements: bearings, scale, north, and tracks."""
     root, span = plan_root(bridge.identifier), bridge.span_m
@@ -206,7 +207,7 @@ def log_surroundings(
             log_truck_on_plan(recording, f"{root}/truck/{vehicle}", places[near], time_ns)
 
 
-def log_track_on_plan(recording: rr.RecordingStream, entity: str, places_m: FloatArray) -> None:
+def log_track_on_plan(recording: Stream, entity: str, places_m: FloatArray) -> None:
     """All places at which the receiver said that a truck was (f, 2), in the plan's coordinates."""
     recording.log(
         entity,
@@ -221,26 +222,42 @@ def log_track_on_plan(recording: rr.RecordingStream, entity: str, places_m: Floa
 
 
 def log_truck_on_plan(
-    recording: rr.RecordingStream,
+    recording: Stream,
     entity: str,
     places_m: FloatArray,
     time_ns: IntArray,
     chainage_m: FloatArray | None = None,
 ) -> None:
     """Where the receiver said that the truck was (f, 2), in the plan's coordinates, over time."""
-    recording.log(
-        entity,
-        rr.Points2D.from_fields(
-            radii=rr.Radius.ui_points(6.0), colors=[rgb(VEHICLE_COLOURS["rear"])]
-        ),
-        static=True,
+    log_truck_look(recording, entity)
+    send_places(recording, entity, places_m, time_ns, chainage_m)
+
+
+def log_truck_look(recording: Stream, entity: str, name: str | None = None) -> None:
+    """How a truck looks on a plan, with its name where there may be others."""
+    look = rr.Points2D.from_fields(
+        radii=rr.Radius.ui_points(6.0),
+        colors=[rgb(VEHICLE_COLOURS["rear"])],
+        labels=None if name is None else [name],
+        show_labels=None if name is None else True,
     )
+    recording.log(entity, look, static=True)
+
+
+def send_places(
+    recording: Stream,
+    entity: str,
+    places_m: FloatArray,
+    time_ns: IntArray,
+    chainage_m: FloatArray | None = None,
+) -> None:
+    """Places on a plan (f, 2), over time."""
     recording.send_columns(
         entity, columns_of(time_ns, chainage_m), rr.Points2D.columns(positions=places_m)
     )
 
 
-def log_vehicle(recording: rr.RecordingStream, vehicle: str, fixes: Sequence[GnssFix]) -> None:
+def log_vehicle(recording: Stream, vehicle: str, fixes: Sequence[GnssFix]) -> None:
     """The track of a truck on the map, where it is at a time, and how fast."""
     if not fixes:
         return
@@ -266,7 +283,7 @@ def log_vehicle(recording: rr.RecordingStream, vehicle: str, fixes: Sequence[Gns
 
 
 def log_drive_plan(
-    recording: rr.RecordingStream,
+    recording: Stream,
     bridges: Sequence[BridgeOnMap],
     vehicles: Mapping[str, VehicleSignals],
 ) -> None:
@@ -299,7 +316,7 @@ def log_drive_plan(
         )
 
 
-def log_marker(recording: rr.RecordingStream, entity: str) -> None:
+def log_marker(recording: Stream, entity: str) -> None:
     """How a truck looks on the map."""
     look = rr.GeoPoints.from_fields(
         radii=rr.Radius.ui_points(7.0), colors=[rgb(VEHICLE_COLOURS["front"])]
@@ -307,9 +324,7 @@ def log_marker(recording: rr.RecordingStream, entity: str) -> None:
     recording.log(entity, look, static=True)
 
 
-def _log_on_map(
-    recording: rr.RecordingStream, entity: str, bridge: BridgeOnMap, colours: list[Rgb]
-) -> None:
+def _log_on_map(recording: Stream, entity: str, bridge: BridgeOnMap, colours: list[Rgb]) -> None:
     start, end = np.array(bridge.start), np.array(bridge.end)
     share = np.array(bridge.edges_m) / bridge.span_m
     edges = start + share[:, None] * (end - start)

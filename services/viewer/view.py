@@ -207,19 +207,33 @@ def viewer_program() -> Path:
     return Path(str(resources.files("rerun_cli") / "rerun"))
 
 
-def viewer_arguments(shown: Path, *, web: bool) -> list[str]:
-    """Command line of the viewer. Without `--bind` it would listen on every interface."""
-    arguments = [str(viewer_program()), "--bind", "127.0.0.1", "--port", "auto"]
+def viewer_arguments(shown: Path | str, *, web: bool, address: str = "127.0.0.1") -> list[str]:
+    """Command line of the viewer of a file or a server.
+
+    It listens at one address; without `--bind` it would listen on every interface.
+    """
+    arguments = [str(viewer_program()), "--bind", address, "--port", "auto"]
     if web:
         arguments += ["--web-viewer", "--web-viewer-port", "0"]
     return [*arguments, str(shown)]
 
 
-def _run_viewer(shown: Path, *, web: bool) -> int:
+def prepare_viewer() -> None:
+    """Switch its statistics off; FailureError if there is none."""
     program = viewer_program()
     if not program.is_file():
         raise FailureError(f"{program}: the Rerun viewer is not installed for this platform")
     subprocess.run([program, "analytics", "disable"], check=False, capture_output=True)
+
+
+def check_ended_well(code: int) -> None:
+    """FailureError if the viewer did not end because somebody closed it."""
+    if code not in (0, -signal.SIGTERM):
+        raise FailureError(f"the Rerun viewer ended with code {code}; without a screen, try --web")
+
+
+def _run_viewer(shown: Path, *, web: bool) -> int:
+    prepare_viewer()
     # The viewer would go on alone if this program were told to stop and only itself did, be it
     # while the viewer is being started.
     told_to_stop = threading.Event()
@@ -236,6 +250,5 @@ def _run_viewer(shown: Path, *, web: bool) -> int:
                 code = 0
     finally:
         signal.signal(signal.SIGTERM, previous)
-    if code not in (0, -signal.SIGTERM):
-        raise FailureError(f"the Rerun viewer ended with code {code}; without a screen, try --web")
+    check_ended_well(code)
     return 0

@@ -27,7 +27,7 @@ import zenoh
 
 from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Header
+from schemas.results import Header, verdict_line
 from schemas.settings import IdentificationSettings
 from schemas.signals import Identity
 from schemas.site_file import parse_site, read_site_text, site_hash
@@ -40,6 +40,7 @@ from schemas.topics import (
     selector,
 )
 from services.bus.credentials import check_speaks_for
+from services.bus.listening import Elsewhere
 from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
@@ -241,6 +242,7 @@ def _take_all(
     closing: threading.Event,
 ) -> None:
     seen = Seen()
+    elsewhere, is_told = Elsewhere(bus, realm), False
     alive = bus.liveliness().declare_subscriber(
         selector(realm, "vehicle", "alive"), zenoh.handlers.FifoChannel(1000), history=True
     )
@@ -255,6 +257,10 @@ def _take_all(
                     is_alive = token.kind == zenoh.SampleKind.PUT
                     _put(arrivals, Token(key.realm, key.identifier, is_alive, now_s), closing)
                 if received is None:
+                    elsewhere.look()
+                    if not is_told and not seen.streams and (line := elsewhere.line()):
+                        is_told = True
+                        _log.warning("%s", line)
                     continue
                 key, identity = received.key(), received.identity()
             except ValueError as error:
@@ -264,6 +270,7 @@ def _take_all(
                 arrived = Arrived(key, identity.boot_id, received.payload, now_s)
                 _put(arrivals, arrived, closing)
     alive.undeclare()  # type: ignore[no-untyped-call]
+    elsewhere.close()
 
 
 def _put(arrivals: _Queue, item: Arrived | Token, closing: threading.Event) -> None:
@@ -418,7 +425,7 @@ def _publish(
             raise FailureError(f"{stream} of {identifier} cannot be published: {error}") from error
         if output.result is not None:
             result = output.result
-            _log.info("%s: %s %s", result.crossing_id, result.verdict, ", ".join(result.reasons))
+            _log.info("%s: %s", result.crossing_id, verdict_line(result))
 
 
 def _worked_out(outputs: Iterable[Output]) -> Iterator[Output]:

@@ -23,6 +23,7 @@ SAMPLE = "recordings/sample/crossing.mcap"
 LONG = "takes minutes to hours; `make test-all`, `make faults` or a person runs it"
 WINDOW = "opens a window until somebody closes it; tests/unit/viewer opens it without a screen"
 SERVICE = "runs until it is stopped; tests/process_replay starts it as a process"
+FOUR = "is one of four at once; tests/process_replay/test_four_terminals.py runs them as they stand"
 MACHINES = "is for machines that are not here; tests/process_replay and tests/faults do it on one"
 NETWORK = "needs a network"
 FUSES = "is of many drives; tests/unit/identification/test_fusing.py runs the commands"
@@ -67,6 +68,12 @@ NOT_RUN = {
     "driveby view crossing.rrd": WINDOW,
     "driveby view drive.rrd": WINDOW,
     f"driveby view {SAMPLE}": WINDOW,
+    "driveby view live": WINDOW,
+    "driveby logger --realm sim-first": FOUR,
+    "driveby worker --realm sim-first --site docs/site.example.toml": FOUR,
+    "driveby watch --realm sim-first": FOUR,
+    "driveby truck recordings/sample/crossing.mcap --realm sim-first": FOUR,
+    "driveby view live --site site.toml": WINDOW,
     "driveby logger --realm '*'": SERVICE,
     "driveby logger --realm 'replay-*'": SERVICE,
     "driveby worker --site site.toml": SERVICE,

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -230,3 +231,27 @@ def test_a_demo_that_is_told_to_end(running: subprocess.Popen[str], tmp_path: Pa
     _, err = running.communicate(timeout=LONGEST_S)
     assert (running.returncode, err) == (130, "driveby: interrupted\n")
     assert processes_of(tmp_path / "demo") == {}
+
+
+def test_a_demo_that_is_watched_stays_until_it_is_told_to_end(
+    tmp_path: Path, project: Path
+) -> None:
+    folder, log = tmp_path / "demo", tmp_path / "demo.log"
+    # BROWSER: none of the machine's is to open.
+    own = {**os.environ, "HOME": str(tmp_path), "BROWSER": "true", "PYTHONUNBUFFERED": "1"}
+    address = re.compile(r"The live view stays until Ctrl-C, at (http://127\.0\.0\.1:\S+)\n")
+    with log.open("wb") as said:
+        demo = subprocess.Popen([*command(folder), "--web"], cwd=project, env=own, stdout=said)
+    try:
+        until(lambda: address.search(log.read_text()) or demo.poll() is not None)
+        found = address.search(log.read_text())
+        assert found, log.read_text()
+        with urlopen(found[1], timeout=LONGEST_S) as page:  # noqa: S310 - it begins with http
+            assert b"Rerun" in page.read()
+        demo.send_signal(signal.SIGINT)
+        assert demo.wait(timeout=LONGEST_S) == 0
+        until(lambda: processes_of(folder) == {}, "the end of all its processes")
+        assert sorted(path.name for path in folder.iterdir()) == FILES
+    finally:
+        demo.kill()
+        demo.wait()

@@ -1,0 +1,61 @@
+"""`driveby view`: a file, or what travels on the bus now, in the Rerun viewer."""
+
+import argparse
+from typing import Any
+
+from services.cli.parsing import a_console, add_endpoint, add_realm, add_site, command, whole
+from services.common.endpoints import LOOPBACK, default_endpoint
+
+
+def add_view(commands: Any) -> None:
+    """`driveby view`: look at a recording or a result."""
+    p = command(
+        commands,
+        "view",
+        _view,
+        "look at a recording or a result",
+        "driveby view run.mcap --web",
+    )
+    p.add_argument(
+        "target",
+        metavar="REC|RESULT|RRD|live",
+        help="a .mcap, .json or .rrd file; live: what travels on the bus now",
+    )
+    p.add_argument("--web", action="store_true", help="in the browser")
+    live = p.add_argument_group("live")
+    add_endpoint(live)
+    add_realm(live)
+    add_site(live, "where bridges are (without it there are results, and no plan)")
+    live.add_argument(
+        "--serve",
+        action="store_true",
+        help="open nothing; viewers that connect get all that there was",
+    )
+    live.add_argument(
+        "--listen",
+        metavar="ADDRESS",
+        default=LOOPBACK,
+        help=f"where viewers connect (default: {LOOPBACK}, this machine only)",
+    )
+    live.add_argument(
+        "--port", type=whole("a port", 0, 65_535), default=0, help="(default: any that is free)"
+    )
+
+
+def _view(options: argparse.Namespace) -> int:
+    if options.target == "live":
+        from services.viewer.live import live_command
+
+        return live_command(
+            endpoint=options.endpoint or default_endpoint(options.tls),
+            realm=options.realm,
+            site=options.site,
+            tls=options.tls,
+            show=None if options.serve else "web" if options.web else "window",
+            address=options.listen,
+            port=options.port,
+            say=lambda line: print(line, flush=True),
+        )
+    from services.viewer.view import view_command
+
+    return view_command(target=options.target, web=options.web, console=a_console())

@@ -1,0 +1,213 @@
+"""The page of `driveby watch`: what is known of a realm, as tables of a given width and height."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Final, Protocol
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from schemas.topics import is_replayed
+from services.bus.listening import elsewhere_line
+from services.cli.watched import SILENT_S, BridgeRow, Row, Truck, Watched, service_figures, way
+
+_BLOCKS: Final = "▁▂▃▄▅▆▇█"
+_STEP: Final = 0.2
+"""Of EI over nominal for each step of a bar: what is within a tenth of 1 is as high as 1."""
+_WIDE: Final = 110
+"""Columns from which on there is room for intervals and reasons beside each other."""
+_OLD_S: Final = 60.0
+"""Samples that are older when they come are not of now."""
+_LATE_S: Final = 150.0
+"""A service that has said nothing for so long is not well, as for `driveby health`."""
+_VERDICTS: Final = {"good": "green", "suspect": "yellow", "rejected": "red"}
+
+
+class Heard(Protocol):
+    """What of a `Listening` is shown."""
+
+    realm: str
+
+    @property
+    def alive(self) -> set[str]: ...  # noqa: D102
+    @property
+    def elsewhere(self) -> dict[str, set[str]]: ...  # noqa: D102
+
+
+def page(
+    watched: Watched,
+    where: str,
+    listening: Heard,
+    *,
+    now_s: float,
+    now_ns: int,
+    width: int,
+    height: int,
+) -> RenderableType:
+    """The page at a moment; where there is no room the newest crossings and first trucks."""
+    is_wide = width >= _WIDE
+    trucks, rows = _sorted_trucks(watched, now_s), watched.rows()
+    room = max(8, height - 11 - len(watched.services) - 3 * min(len(watched.bridges), 4))
+    most_trucks = max(2, min(len(trucks), room // 3))
+    parts: list[RenderableType] = [_headline(watched, where, now_ns)]
+    hint = elsewhere_line(listening.realm, listening.elsewhere)
+    if not trucks and not rows:
+        parts.append(Text(hint or "Nobody drives yet.", style="yellow" if hint else "dim"))
+    if trucks:
+        parts.append(_trucks(trucks[:most_trucks], listening, now_s))
+        parts += _old(trucks, listening.realm)
+        if len(trucks) > most_trucks:
+            parts.append(Text(f"  and {len(trucks) - most_trucks} more", style="dim"))
+    if rows:
+        shown = rows[: max(3, room - most_trucks)]
+        parts.append(_crossings(shown, is_wide=is_wide))
+        if len(rows) > len(shown):
+            parts.append(Text(f"  and {len(rows) - len(shown)} earlier", style="dim"))
+    if watched.bridges:
+        parts.append(_bridges(watched.bridges, is_wide=is_wide))
+    if watched.services:
+        parts.append(_services(watched, now_ns))
+    spaced = [
+        one for part in parts for one in ([Text()] if isinstance(part, Table) else []) + [part]
+    ]
+    return Group(*spaced)
+
+
+def bars(ratios: Sequence[float], weak: frozenset[int], *, doubtful: bool = False) -> Text:
+    """A bar for each element, as high as its EI is of nominal; the weak ones stand out."""
+    text = Text()
+    for number, ratio in enumerate(ratios, start=1):
+        level = min(max(round(ratio / _STEP), 0), len(_BLOCKS) - 1)
+        colour = "bright_black" if doubtful else "bold yellow" if number in weak else "cyan"
+        text.append(_BLOCKS[level], style=colour)
+    return text
+
+
+def silent_trucks(watched: Watched, now_s: float) -> frozenset[str]:
+    """The trucks that have said nothing for a while."""
+    return frozenset(n for n, truck in watched.trucks.items() if now_s - truck.heard_s > SILENT_S)
+
+
+def _sorted_trucks(watched: Watched, now_s: float) -> list[tuple[str, Truck]]:
+    """Those that drive first."""
+    silent = silent_trucks(watched, now_s)
+    return sorted(watched.trucks.items(), key=lambda item: (item[0] in silent, item[0]))
+
+
+def _headline(watched: Watched, where: str, now_ns: int) -> Text:
+    over = [row for row in watched.crossings.values() if row.is_over]
+    text = Text(no_wrap=True, overflow="ellipsis")
+    text.append("driveby watch", style="bold")
+    text.append(f"  {where}  {_clock(now_ns)} UTC  ")
+    text.append(f"{len(over)} done, {watched.waiting} waiting", style="dim")
+    return text
+
+
+def _trucks(trucks: Sequence[tuple[str, Truck]], listening: Heard, now_s: float) -> Table:
+    table = _table("truck", "", "accelerometers", "batches/s", "fixes/s", "m/s", "lag")
+    for name, truck in trucks:
+        silent_s = now_s - truck.heard_s
+        batches, fixes = truck.rates(now_s)
+        state = Text("drives", style="green")
+        if silent_s > SILENT_S:
+            there = "" if name in listening.alive else ", left"
+            state = Text(f"silent {_length(silent_s)}{there}", style="dim")
+        hertz = "/".join(f"{rate:g}" for rate in sorted(set(truck.channels.values())))
+        speed = "" if truck.speed_m_per_s is None else f"{truck.speed_m_per_s:.1f}"
+        lag = Text("replay", style="dim") if is_replayed(listening.realm) else _lag(truck.lag_s)
+        table.add_row(
+            name,
+            state,
+            f"{len(truck.channels)} × {hertz} Hz" if truck.channels else "none",
+            f"{batches:.0f}",
+            f"{fixes:.0f}",
+            speed,
+            lag,
+        )
+    return table
+
+
+def _lag(seconds: float) -> Text:
+    return Text(_length(seconds), style="yellow" if seconds > _OLD_S else "")
+
+
+def _old(trucks: Sequence[tuple[str, Truck]], realm: str) -> list[Text]:
+    """Why samples may be old when they come, where they are."""
+    old = [name for name, truck in trucks if truck.lag_s > _OLD_S]
+    if not old or is_replayed(realm):
+        return []
+    why = "played faster than real, sent late, or a clock is off"
+    said = f"  {', '.join(old[:3])}: samples are old when they come: {why}"
+    return [Text(said, style="yellow", no_wrap=True, overflow="ellipsis")]
+
+
+def _crossings(rows: Sequence[Row], *, is_wide: bool) -> Table:
+    names = ("entry", "crossing", "", "EI", "lowest, of nominal")
+    table = _table(*names, *(["why"] if is_wide else []))
+    for row in rows:
+        state = Text(row.state, style=_VERDICTS.get(row.state, ""))
+        if row.fraction is not None and not row.is_over:
+            state.append(f" {row.fraction:.0%}")
+        why = Text(row.reason, style="dim")
+        lowest = Text("")
+        if row.lowest is not None:
+            lowest.append(f"{row.lowest.name} {row.lowest.ratio:.2f}")
+            if row.lowest.low is not None:
+                lowest.append(f" ({row.lowest.low:.2f}–{row.lowest.high:.2f})")
+            if row.state != "good":
+                lowest.stylize("bright_black")
+        elif not is_wide:
+            lowest = why
+        heights = bars(row.ratios, row.weak, doubtful=row.state != "good")
+        cells: list[RenderableType] = [_clock(row.entry_ns), way(row), state, heights, lowest]
+        table.add_row(*cells, *([why] if is_wide else []))
+    return table
+
+
+def _bridges(bridges: dict[str, BridgeRow], *, is_wide: bool) -> Table:
+    table = _table("bridge", "crossings", "EI", "by all crossings")
+    for name, row in list(bridges.items())[-4:]:
+        said = row.finding or row.lowest
+        is_good = row.verdict in ("", "good")
+        found = Text(said if is_good else f"{row.verdict}: {said}", overflow="fold")
+        found.no_wrap = False
+        heights = bars(row.ratios, row.weak, doubtful=not is_good)
+        table.add_row(name, f"{row.used}", heights, found)
+    return table
+
+
+def _services(watched: Watched, now_ns: int) -> Table:
+    table = _table("service", "", "")
+    for name, service in sorted(watched.services.items()):
+        age_s = (now_ns - service.time_ns) * 1e-9
+        state = Text("well", style="green")
+        if age_s > _LATE_S:
+            state = Text(f"silent {_length(age_s)}", style="red")
+        elif not service.ok:
+            state = Text("not well", style="red")
+        said = [service_figures(service), watched.work.get(name, "")]
+        table.add_row(name, state, "; ".join(one for one in said if one))
+    return table
+
+
+def _table(*names: str) -> Table:
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", expand=True, pad_edge=False)
+    for number, name in enumerate(names):
+        is_last = number == len(names) - 1
+        table.add_column(
+            name, no_wrap=True, overflow="ellipsis", ratio=1 if is_last else None,
+        )  # fmt: skip
+    return table
+
+
+def _clock(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns * 1e-9, UTC):%H:%M:%S}"
+
+
+def _length(seconds: float) -> str:
+    if abs(seconds) < 10.0:
+        return f"{seconds:.1f} s"
+    if abs(seconds) < 600.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if abs(seconds) < 36_000.0 else f"{seconds / 3600.0:.0f} h"

@@ -1,0 +1,160 @@
+"""`driveby view live`: what travels on a bus now, in the Rerun viewer.
+
+This process is a subscriber as any other and needs nothing of the worker. It serves what it draws
+to viewers: the one that it opens, and others that connect later, which get what happened before as
+far as `_KEPT` goes. Beyond it the oldest is let go of.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import logging
+import socket
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final, Literal
+
+import rerun as rr
+
+from schemas.site_file import load_site
+from services.bus.listening import Listening, check_listenable, connected, elsewhere_line
+from services.bus.playback import leave_at_once, stopped_by_signals
+from services.common.errors import FailureError, InputError
+from services.viewer.live_layout import WAITING, waiting_blueprint
+from services.viewer.live_picture import LivePicture
+from services.viewer.rerun_parts import log_markdown
+from services.viewer.view import check_ended_well, prepare_viewer, viewer_arguments
+
+_log = logging.getLogger(__name__)
+
+APPLICATION: Final = "driveby-live"
+_KEPT: Final = "256MB"
+"""For viewers that come late: some hours of a truck, or hundreds of results."""
+_PAST_S: Final = 60.0
+"""Of what trucks measured before this command began, as far as they keep it."""
+_PERIOD_S: Final = 0.25
+"""How often what has come is drawn."""
+
+Show = Literal["window", "web"]
+
+
+def live_command(
+    *,
+    endpoint: str,
+    realm: str,
+    site: Path | None,
+    tls: Path | None,
+    show: Show | None,
+    address: str,
+    port: int,
+    say: Callable[[str], None],
+) -> int:
+    """Show a realm until the viewer is closed or a signal comes; return 0.
+
+    `show` None: only serve it. Viewers connect to `address`, at a `port` (0: any that is free).
+    Waits for the router for ever.
+
+    InputError: a bad realm, site file or address. FailureError: the port is taken, or there is no
+    viewer or it fails.
+    """
+    check_listenable(realm)
+    known = None if site is None else load_site(site)
+    _check_address(address)
+    chosen = _free_port(address, port)
+    if show is not None:
+        prepare_viewer()
+    with (
+        stopped_by_signals(leave_at_once) as stop,
+        rr.RecordingStream(APPLICATION) as recording,
+    ):
+        sink = rr.GrpcServerSink(address, chosen, server_memory_limit=_KEPT)
+        recording.set_sinks(sink)
+        recording.send_recording_name(realm)
+        recording.send_blueprint(waiting_blueprint())
+        log_markdown(recording, WAITING, f"Waiting for a router at {endpoint}.")
+        say(f"realm {realm}, live at {sink.uri}; more viewers: rerun {sink.uri}")
+        with _viewer(sink.uri, show, address) as viewer:
+            session = connected(endpoint, tls, lambda: stop.is_set() or _has_ended(viewer))
+            if session is not None:
+                with session:
+                    listening = Listening(session, realm, past_s=_PAST_S)
+                    try:
+                        _draw(recording, LivePicture(recording, known), listening, stop, viewer)
+                    finally:
+                        listening.close()
+        recording.disconnect()
+    if viewer is not None and not stop.is_set():
+        check_ended_well(viewer.returncode)
+    return 0
+
+
+def _draw(
+    recording: rr.RecordingStream,
+    picture: LivePicture,
+    listening: Listening,
+    stop: threading.Event,
+    viewer: subprocess.Popen[bytes] | None,
+) -> None:
+    """Draw what comes until the viewer is closed or a signal comes."""
+    shown = ""
+    while not stop.is_set() and not _has_ended(viewer):
+        for heard in listening.heard():
+            picture.take(heard)
+            if stop.is_set():
+                return
+        picture.flush()
+        if picture.is_empty:
+            hint = elsewhere_line(listening.realm, listening.elsewhere)
+            page = f"# Realm {listening.realm}\n\nNobody drives yet.\n\n{hint or ''}"
+            if page != shown:
+                log_markdown(recording, WAITING, page)
+                shown = page
+                if hint is not None:
+                    _log.warning("%s", hint)
+        stop.wait(_PERIOD_S)
+
+
+@contextlib.contextmanager
+def _viewer(uri: str, show: Show | None, address: str) -> Iterator[subprocess.Popen[bytes] | None]:
+    """The viewer of a server; it ends with this."""
+    if show is None:
+        yield None
+        return
+    arguments = viewer_arguments(uri, web=show == "web", address=address)
+    # Of a Ctrl-C this process hears, and ends the viewer.
+    with subprocess.Popen(arguments, start_new_session=True) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def _has_ended(viewer: subprocess.Popen[bytes] | None) -> bool:
+    return viewer is not None and viewer.poll() is not None
+
+
+def _check_address(address: str) -> None:
+    try:
+        ip = ipaddress.ip_address(address)
+    except ValueError:
+        raise InputError(
+            f"--listen {address}: is no address; one of this machine is expected, as 127.0.0.1"
+        ) from None
+    if not ip.is_loopback:
+        _log.warning("whoever reaches %s sees what is shown: nobody is asked who they are", address)
+
+
+def _free_port(address: str, port: int) -> int:
+    """A port at which nobody listens: Rerun takes another one's for its own without a word."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    with socket.socket(family) as probe:
+        try:
+            probe.bind((address, port))
+        except OSError as error:
+            raise FailureError(
+                f"cannot listen at {address}, port {port}: {error.strerror}; give another --port"
+            ) from None
+        return int(probe.getsockname()[1])

@@ -1,0 +1,121 @@
+"""The layout of the live view: where trucks are, how crossings go, what was felt and found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence, Set
+from typing import Final
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from services.viewer.layout import acceleration_plots, bridge_places
+from services.viewer.live_parts import ROADS_MIDDLE, ROADS_REACH
+from services.viewer.rerun_parts import TIME
+from services.viewer.rerun_places import BridgeOnMap
+from services.viewer.strip import STRIP_PAPER, STRIP_WIDTH
+
+WINDOW_S: Final = 45.0
+"""Of accelerations and speed before the moment that is looked at."""
+LANES_S: Final = 120.0
+"""Of crossings."""
+WAITING = "waiting"
+"""Entity of the page that stands alone until something is heard."""
+
+
+def lane_entity(bridge: str, vehicle: str) -> str:
+    """Entity of the states of a truck's crossings of a bridge."""
+    return f"crossings/{_part(bridge)}/{_part(vehicle)}"
+
+
+def result_root(bridge: str) -> str:
+    """Entity path of the newest result of a bridge."""
+    return f"latest/{_part(bridge)}"
+
+
+def trend_root(bridge: str) -> str:
+    """Entity path of what all crossings of a bridge say together, over time."""
+    return f"fused/{_part(bridge)}"
+
+
+def waiting_blueprint() -> rrb.Blueprint:
+    """Before anything is heard."""
+    page = rrb.TextDocumentView(origin=WAITING, name="Live")
+    return _blueprint(page)
+
+
+def live_blueprint(
+    trucks: Mapping[str, Set[str]], bridges: Sequence[str], on_map: Sequence[BridgeOnMap]
+) -> rrb.Blueprint:
+    """The trucks whose channels are drawn, the bridges, and those of them of which it is known
+    where they are."""
+    columns: list[tuple[rrb.Container | rrb.View, int]] = [(_where_and_when(on_map), 4)]
+    if trucks:
+        columns.append((_tabs([_truck(name, known) for name, known in trucks.items()]), 4))
+    if bridges:
+        columns.append((_tabs([_bridge(name) for name in bridges]), 5))
+    shares = [share for _, share in columns]
+    return _blueprint(rrb.Horizontal(*(one for one, _ in columns), column_shares=shares))
+
+
+def _blueprint(root: rrb.Container | rrb.View) -> rrb.Blueprint:
+    return rrb.Blueprint(
+        root,
+        rrb.TimePanel(state="collapsed", timeline=TIME, play_state="following"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def _where_and_when(on_map: Sequence[BridgeOnMap]) -> rrb.Container:
+    plans = [bridge_places(bridge, coloured=False, name=bridge.identifier) for bridge in on_map]
+    places = _tabs(plans) if plans else bridge_places(None, coloured=False)
+    infinite = rrb.TimeRangeBoundary.infinite()
+    shown = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-LANES_S),
+        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
+    )
+    lanes = rrb.StateTimelineView(
+        origin="crossings",
+        name="Crossings",
+        time_ranges=[rrb.VisibleTimeRange(TIME, start=infinite, end=infinite)],
+        time_view=rrb.TimeAxis(view_range=shown),
+    )
+    return rrb.Vertical(places, lanes, row_shares=[2, 1])
+
+
+def _truck(vehicle: str, channels: Set[str]) -> rrb.Container:
+    origin = f"vehicle/{vehicle}/acceleration"
+    plots = acceleration_plots(origin, channels, f"{vehicle}:", window_s=WINDOW_S)
+    return rrb.Vertical(*plots, name=vehicle)
+
+
+def _bridge(bridge: str) -> rrb.Container:
+    said = rrb.TextDocumentView(origin=f"said/{_part(bridge)}", name="Newest result")
+    strip = rrb.Spatial2DView(
+        origin=f"{result_root(bridge)}/strip",
+        name="EI along the span, of nominal, 95 % interval; road",
+        background=STRIP_PAPER,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=(-20.0, STRIP_WIDTH + 150.0),
+            y_range=(-20.0, ROADS_MIDDLE + ROADS_REACH + 80.0),
+        ),
+    )
+    infinite = rrb.TimeRangeBoundary.infinite()
+    trend = rrb.TimeSeriesView(
+        origin=trend_root(bridge),
+        name="EI by all crossings so far, of nominal; orange: the lowest",
+        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=infinite, end=infinite)),
+        axis_y=rrb.ScalarAxis(range=(0.0, 1.6)),
+        time_ranges=[rrb.VisibleTimeRange(TIME, start=infinite, end=infinite)],
+        plot_legend=rrb.PlotLegend(visible=False),
+    )
+    return rrb.Vertical(said, strip, trend, row_shares=[4, 6, 3], name=bridge)
+
+
+def _tabs(parts: Sequence[rrb.Container | rrb.View]) -> rrb.Container | rrb.View:
+    return parts[0] if len(parts) == 1 else rrb.Tabs(*parts, active_tab=0)
+
+
+def _part(name: str) -> str:
+    return rr.escape_entity_path_part(name)

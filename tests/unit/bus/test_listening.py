@@ -1,0 +1,94 @@
+"""What a display hears: each message once, at nobody's cost, and who drives elsewhere."""
+
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from schemas.signals import Identity
+from schemas.topics import key
+from services.bus.listening import Heard, Listening, elsewhere_line
+from services.bus.publisher import Publisher
+from services.common.errors import InputError
+from tests.waiting import until
+
+
+@pytest.fixture
+def publisher(client: zenoh.Session) -> Iterator[Publisher]:
+    publisher = Publisher(client, "live")
+    yield publisher
+    publisher.close()
+
+
+def gathered(listening: Listening, number: int) -> list[Heard]:
+    found: list[Heard] = []
+    until(lambda: found.extend(listening.heard()) or len(found) >= number, f"{number} messages")
+    return found
+
+
+def test_each_message_once_with_what_was_before(
+    router: zenoh.Session, publisher: Publisher
+) -> None:
+    for number in range(100):
+        publisher.put("vehicle", "truck-1", "accel", b"%d" % number)
+    publisher.put("bridge", "b-1", "state", b"before")
+    listening = Listening(router, "live", past_s=1.0)
+    found = gathered(listening, 21)
+    publisher.put("bridge", "b-1", "estimate", b"now", Identity(7, 3))
+    publisher.put("bridge", "b-1", "estimate", b"now", Identity(7, 3))  # as after a new start
+    publisher.put("bridge", "b-1", "estimate", b"last")
+    found += gathered(listening, 2)
+    listening.close()
+    assert [one.payload for one in found if one.key.stream == "accel"] == [
+        b"%d" % number
+        for number in range(80, 100)  # a second of what the truck still has
+    ]
+    assert [one.payload for one in found if one.key.owner == "bridge"] == [
+        b"before", b"now", b"last"
+    ]  # fmt: skip
+
+
+def test_who_does_not_look_holds_nobody_up(router: zenoh.Session, publisher: Publisher) -> None:
+    listening = Listening(router, "live")
+    assert list(listening.heard()) == []
+    for number in range(30_000):  # more than may wait: a subscriber that keeps all would block
+        publisher.put("vehicle", "truck-1", "accel", b"%d" % number)
+    found: list[Heard] = []
+    until(lambda: found.extend(listening.heard()) or (found and found[-1].payload == b"29999"))
+    listening.close()
+    assert len(found) < 30_000
+
+
+def test_a_truck_that_drives_in_another_realm_is_named(
+    router: zenoh.Session, client: zenoh.Session
+) -> None:
+    listening = Listening(router, "live")
+    other = Publisher(client, "replay-monday")
+    other.put("vehicle", "truck-7", "info", b"")
+    token = client.liveliness().declare_token(key("sim-x", "vehicle", "truck-1", "alive"))
+    until(lambda: list(listening.heard()) or len(listening.elsewhere) == 2, "both realms")
+    assert elsewhere_line("live", listening.elsewhere) == (
+        "nothing in realm live, but truck-7 in replay-monday and truck-1 in sim-x: "
+        "--realm replay-monday"
+    )
+    token.undeclare()
+    until(lambda: list(listening.heard()) or "sim-x" not in listening.elsewhere, "its leave")
+    here = client.liveliness().declare_token(key("live", "vehicle", "truck-2", "alive"))
+    until(lambda: list(listening.heard()) or listening.alive == {"truck-2"}, "the one here")
+    here.undeclare()
+    until(lambda: list(listening.heard()) or not listening.alive, "its leave")
+    other.close()
+    listening.close()
+
+
+def test_of_many_trucks_elsewhere_some_are_named() -> None:
+    assert elsewhere_line("live", {}) is None
+    trucks = {f"truck-{n}" for n in range(9)}
+    assert elsewhere_line("live", {"sim-a": trucks}) == (
+        "nothing in realm live, but truck-0, truck-1, truck-2 … in sim-a: --realm sim-a"
+    )
+
+
+def test_a_realm_that_is_none(router: zenoh.Session) -> None:
+    with pytest.raises(InputError, match="realm 'monday' must be live"):
+        Listening(router, "monday")

@@ -1,0 +1,201 @@
+"""`driveby watch`: what it knows of a realm, and the page that it makes of it."""
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.site import Site
+from schemas.site_file import load_site
+from services.cli import main as cli
+from services.cli import watched as watched_module
+from services.cli.watch_page import bars, page, silent_trucks
+from services.cli.watched import Watched
+from tests.unit.cli.watching import (
+    NOW_NS,
+    NOW_S,
+    Listened,
+    a_morning,
+    drives,
+    estimate,
+    health,
+    heard,
+    progress,
+    result,
+    state,
+    tell,
+)
+
+
+@pytest.fixture(scope="module")
+def site(project: Path) -> Site:
+    return load_site(project / "docs/site.example.toml")
+
+
+def drawn(
+    watched: Watched, width: int = 120, height: int = 40, listened: Listened | None = None
+) -> list[str]:
+    """The lines of the page, without colours."""
+    file = io.StringIO()
+    console = Console(file=file, width=width, height=height, color_system=None)
+    listening = listened or Listened(alive={"truck-1", "truck-2"})
+    console.print(
+        page(
+            watched, f"realm {listening.realm}", listening,
+            now_s=NOW_S, now_ns=NOW_NS, width=width, height=height,
+        )
+    )  # fmt: skip
+    return file.getvalue().splitlines()
+
+
+def line(lines: list[str], begins: str) -> str:
+    (found,) = [one for one in lines if one.startswith(begins)]
+    return " ".join(found.split())
+
+
+def test_a_morning_on_a_wide_terminal(site: Site) -> None:
+    lines = drawn(a_morning(site))
+    assert line(lines, "truck-1") == "truck-1 drives 4 × 1000 Hz 20 10 9.8 0.1 s"
+    assert line(lines, "truck-3") == "truck-3 silent 300 s, left 4 × 1000 Hz 0 0 9.8 0.1 s"
+    assert (
+        line(lines, "14:13:20") == "14:13:20 truck-1 → bridge-1 good ▆▆▆▃▆▆▆ EI_4 0.40 (0.38–0.42)"
+    )
+    assert line(lines, "14:17:20").endswith("EI_4 0.40 (0.38–0.42) model_misfit")
+    assert line(lines, "14:18:20").endswith("rejected channel_missing")
+    assert line(lines, "14:22:30").endswith("truck-1 → bridge-1 identifying 45%")
+    assert line(lines, "14:23:16").endswith("truck-2 → bridge-1 on the bridge")
+    assert "60 % less stiff than the other elements" in line(lines, "bridge-1")
+    assert line(lines, "logger") == "logger well 120 messages/s, queue 3, lost 0, dropped 0"
+    assert "5 done, 1 waiting" in lines[0]
+
+
+@pytest.mark.parametrize("width", [40, 80, 120])
+@pytest.mark.parametrize("height", [10, 24, 60])
+def test_no_line_is_longer_than_the_terminal(site: Site, width: int, height: int) -> None:
+    watched = a_morning(site)
+    for number in range(100):
+        drives(watched, f"truck-{number}")
+        watched.crossings[str(number)] = watched.rows()[0]._replace(entry_ns=NOW_NS - number)
+    lines = drawn(watched, width, height)
+    assert max(map(len, lines)) <= width
+    if height >= 24 and width >= 80:  # on fewer columns findings take many lines
+        assert len(lines) <= height + 2
+        assert any(one.strip().startswith("and ") for one in lines)
+
+
+def test_on_80_columns_the_lowest_element_is_whole(site: Site) -> None:
+    lines = drawn(a_morning(site), 80, 40)
+    assert line(lines, "14:13:20").endswith("EI_4 0.40 (0.38–0.42)")
+    assert line(lines, "14:18:20").endswith("rejected channel_missing")
+
+
+def test_bars_say_which_element_is_weak() -> None:
+    text = bars((1.0, 0.96, 1.07, 0.4, 0.0, 9.0), frozenset({4}))
+    assert text.plain == "▆▆▆▃▁█"
+    styles = {str(span.style) for span in text.spans if span.start == 3}
+    assert styles == {"bold yellow"}
+    assert {str(span.style) for span in bars((1.0, 0.4), frozenset(), doubtful=True).spans} == {
+        "bright_black"
+    }
+
+
+def test_lines_for_a_pipe(site: Site) -> None:
+    watched = Watched()
+    said = [one for one in drives(watched, "truck-1") if one is not None]
+    said += [
+        one
+        for message in (
+            state("a", pb.DETECTED, "truck-1", 0.0),
+            state("a", pb.DETECTED, "truck-1", 0.0),
+            state("a", pb.COMPLETE, "truck-1", 0.0),
+            state("a", pb.IDENTIFYING, "truck-1", 0.0),
+            progress("worker", "a", "sampling", 0.5),
+            estimate(result(site, "a")),
+            state("a", pb.DONE, "truck-1", 0.0),
+            state("a", pb.IDENTIFYING, "truck-1", 0.0),  # late
+            health("logger", ok=False, note="disk full", rate_per_s=3.0),
+        )
+        if (one := tell(watched, message)) is not None
+    ]
+    assert said == [
+        "truck-1 drives",
+        "truck-1 → bridge-1: on the bridge",
+        "truck-1 → bridge-1: complete",
+        "truck-1 → bridge-1: identifying",
+        "truck-1 → bridge-1: good, lowest EI_4 0.400 of nominal (0.377 to 0.424)",
+        "logger is NOT WELL: 3 messages/s, disk full",
+    ]
+
+
+def test_a_truck_that_comes_back_is_said_again() -> None:
+    watched = Watched()
+    assert drives(watched, "truck-1", ago_s=60.0).count("truck-1 drives") == 1
+    assert silent_trucks(watched, NOW_S) == {"truck-1"}
+    assert drives(watched, "truck-1").count("truck-1 drives") == 1
+    assert silent_trucks(watched, NOW_S) == set()
+
+
+def test_old_samples_are_explained() -> None:
+    watched = Watched()
+    drives(watched, "truck-1", lag_s=1356.0)
+    lines = drawn(watched)
+    assert line(lines, "truck-1").endswith("23 min")
+    (why,) = [one for one in lines if "samples are old when they come" in one]
+    assert "played faster than real, sent late, or a clock is off" in why
+    replayed = drawn(watched, listened=Listened("replay-monday"))
+    assert line(replayed, "truck-1").endswith("replay")
+    assert not any("samples are old" in one for one in replayed)
+
+
+def test_an_empty_realm_names_the_others() -> None:
+    listened = Listened()
+    assert any("Nobody drives yet." in one for one in drawn(Watched(), listened=listened))
+    listened.elsewhere = {"sim-demo": {"truck-1"}}
+    lines = drawn(Watched(), listened=listened)
+    assert "nothing in realm live, but truck-1 in sim-demo: --realm sim-demo" in lines
+
+
+def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
+    watched = Watched()
+    tell(watched, health("logger", ok=False, note="disk full"))
+    tell(watched, health("worker"))
+    tell(watched, progress("worker", "", "validating truck-1 on bridge-1", 0.3))
+    assert line(drawn(watched), "logger") == "logger not well disk full"
+    assert line(drawn(watched), "worker") == "worker well validating truck-1 on bridge-1, 30%"
+    watched.services["worker"] = watched.services["worker"]._replace(time_ns=NOW_NS - 10**12)
+    assert line(drawn(watched), "worker").startswith("worker silent 17 min")
+
+
+def test_what_it_keeps_is_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_MOST_CROSSINGS", "_MOST_TRUCKS", "_MOST_BRIDGES", "_MOST_SERVICES"):
+        monkeypatch.setattr(watched_module, name, 5)
+    watched = Watched()
+    for number in range(20):
+        drives(watched, f"truck-{number}", ago_s=20.0 - number)
+        tell(watched, estimate(result(site, f"c-{number}", entry=float(number))))
+        tell(watched, health(f"logger-{number}"))
+    assert len(watched.crossings) <= 6
+    assert watched.rows()[0].crossing_id == "c-19"
+    assert set(watched.trucks) == {f"truck-{number}" for number in range(15, 20)}
+    assert len(watched.services) == 5
+
+
+def test_what_cannot_be_read_is_left_out() -> None:
+    watched = Watched()
+    for owner, stream in (
+        ("vehicle", "accel"), ("vehicle", "gnss"), ("bridge", "crossing"), ("bridge", "estimate"),
+        ("bridge", "state"), ("service", "health"), ("service", "progress"),
+    ):  # fmt: skip
+        assert tell(watched, heard(owner, "x", stream, b"\xff\x00nonsense")) is None
+    assert not watched.crossings
+    assert not watched.services
+
+
+def test_bad_options_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["watch", "--realm", "monday"]) == 2
+    assert cli.main(["watch", "--endpoint", "nowhere"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 2
+    assert "realm 'monday' must be live" in err
