@@ -151,6 +151,12 @@ def add_worker(commands: Any) -> None:
         metavar="N",
         help="identify so many crossings at once, beside the process that listens (default: 1)",
     )
+    p.add_argument(
+        "--limit",
+        type=number("seconds", low=1, high=1e6),
+        metavar="S",
+        help="processor time that a crossing may take; then it is tried once more (default: 900)",
+    )
     add_id(p, "worker")
     first = p.add_mutually_exclusive_group()
     first.add_argument(
@@ -169,6 +175,7 @@ def add_worker(commands: Any) -> None:
 
 def _worker(options: argparse.Namespace) -> int:
     from services import worker
+    from services.execution.watch import LIMIT_S
 
     return worker.run(
         endpoint=options.endpoint or default_endpoint(options.tls),
@@ -181,6 +188,7 @@ def _worker(options: argparse.Namespace) -> int:
         ready=lambda: print(f"ready, waiting for crossings in realm {options.realm}", flush=True),
         tls=options.tls,
         processes=options.processes,
+        limit_s=LIMIT_S if options.limit is None else options.limit,
         certificates=options.certificates,
         validate=True if options.validate_first else False if options.no_certificates else None,
     )

@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import zenoh
 
@@ -46,8 +47,9 @@ from services.bus.session import open_session
 from services.bus.subscription import Seen, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
-from services.execution.dispatch import Execution, awaited, collected, dispatched
+from services.execution.dispatch import awaited, collected, dispatched
 from services.execution.processes import Processes
+from services.execution.watch import LIMIT_S, Limits
 from services.history.baselines import baselines_of
 from services.history.certificates import found_in
 from services.history.result_files import Earlier, ResultFiles, read_earlier
@@ -68,10 +70,20 @@ _POLL_S = 0.1
 _LONGEST_QUEUE = 200_000
 """Messages: two hours of one truck, or a minute of a hundred. Then publishers wait."""
 _LONGEST_NOTE = 1000
+_SOONEST_HEALTH_S = 5.0
+"""Who waits and what is identified may change many times a second: so often it is told at most."""
 _MOST_NAMED = 10
 """Crossings in one line of the log."""
 _CONNECT_S = 1.0
 """An attempt is so short that a signal is heard between two."""
+
+
+class _Backlog(NamedTuple):
+    """What is not identified yet: how long it is under way does not change it."""
+
+    under_way: tuple[str, ...]
+    waiting: int
+    waiting_for_certificate: int
 
 
 def run(
@@ -86,6 +98,7 @@ def run(
     ready: Callable[[], None] | None = None,
     tls: Path | None = None,
     processes: int = 1,
+    limit_s: float = LIMIT_S,
     certificates: Path | None = None,
     validate: bool | None = None,
 ) -> int:
@@ -95,7 +108,8 @@ def run(
     What earlier runs left in that folder is taken up, unless this run has a `file` of its own or
     the realm is one of replays. Waits for the router for ever. `ready` is called once, when the
     worker listens. `tls` is a folder of credentials, see `open_session`. Crossings are identified
-    in so many `processes` beside this one.
+    in so many `processes` beside this one; one that takes more than `limit_s` of processor time
+    for a crossing is ended.
 
     A crossing whose vehicle and bridge have no certificate in the folder `certificates` (by default
     one in `folder`) waits for one, which is made meanwhile: if `validate` says so, or says nothing
@@ -144,7 +158,9 @@ def run(
         def report(crossing_id: str, stage: str, fraction: float) -> None:
             _say_progress(publisher, service_id, crossing_id, stage, fraction)
 
-        execution = stack.enter_context(Processes(processes, report=report))
+        execution = stack.enter_context(
+            Processes(processes, report=report, limits=Limits(processor_s=limit_s))
+        )
         bus = _connected(endpoint, tls, stop)
         if bus is None:
             return 0
@@ -307,7 +323,7 @@ def _resume(engine: Engine, earlier: Earlier, publisher: Publisher, files: Resul
 
 def _serve(
     engine: Engine,
-    execution: Execution,
+    execution: Processes,
     certificates: Certificates,
     queued: _Queue,
     publisher: Publisher,
@@ -322,7 +338,8 @@ def _serve(
     """
     arrivals = Arrivals()
     told: set[str] = set()
-    next_health_s = 0.0
+    next_health_s = soonest_health_s = 0.0
+    told_backlog: _Backlog | None = None
     leave_at_s = math.inf
     want = certificates.want
     progress: tuple[Pair, float] | None = None
@@ -333,10 +350,17 @@ def _serve(
     while now_s < leave_at_s and (
         not stop.is_set() or not queued.empty() or _may_lose(engine, arrivals)
     ):
-        if time.monotonic() >= next_health_s or certificates.has_news:
-            next_health_s = time.monotonic() + HEALTH_PERIOD_S
-            certificates.has_news = False
-            _say_health(publisher, service_id, queued.qsize(), certificates.note)
+        if time.monotonic() >= soonest_health_s or certificates.has_news:
+            soonest_health_s = time.monotonic() + _SOONEST_HEALTH_S
+            backlog = _backlog(engine, execution)
+            is_due = time.monotonic() >= next_health_s or certificates.has_news
+            if is_due or backlog != told_backlog:
+                next_health_s = time.monotonic() + HEALTH_PERIOD_S
+                certificates.has_news = False
+                told_backlog = backlog
+                _say_health(
+                    publisher, service_id, queued.qsize(), backlog, execution, certificates.note
+                )
         batch: list[Arrived] = []
         one = _next(queued)
         # After a long identification the queue holds what came meanwhile: whether a truck has gone
@@ -443,13 +467,38 @@ def _say_progress(
     publisher.put("service", service_id, "progress", progress.SerializeToString())
 
 
-def _say_health(publisher: Publisher, service_id: str, waiting: int, note: str) -> None:
+def _backlog(engine: Engine, execution: Processes) -> _Backlog:
+    return _Backlog(
+        tuple(one.crossing_id for one in execution.under_way),
+        execution.waiting,
+        sum(len(names) for names in engine.waiting().values()),
+    )
+
+
+def _say_health(
+    publisher: Publisher,
+    service_id: str,
+    queued: int,
+    backlog: _Backlog,
+    execution: Processes,
+    note: str,
+) -> None:
+    under_way = execution.under_way
+    notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in under_way]
+    notes += [f"{backlog.waiting} wait for a process"] if backlog.waiting else []
+    notes += [note] if note else []
     health = pb.Health(
         schema_version=1,
         time_ns=time.time_ns(),
         service=service_id,
         ok=True,
-        figures={"queue": float(waiting)},
-        note=note[:_LONGEST_NOTE],
+        figures={
+            "queue": float(queued),
+            "identifying": float(len(under_way)),
+            "identifying_longest_s": max((one.seconds for one in under_way), default=0.0),
+            "waiting_for_process": float(backlog.waiting),
+            "waiting_for_certificate": float(backlog.waiting_for_certificate),
+        },
+        note="; ".join(notes)[:_LONGEST_NOTE],
     )
     publisher.put("service", service_id, "health", health.SerializeToString())

@@ -292,7 +292,10 @@ def test_history_and_latched_topics_work_under_access_control(
         assert len(history(router, f"{V1}/**", 201)) == 201
         assert len(history(worker, vehicles, 200)) == 200
         assert [one.payload for one in history(viewer, bridges, 1)] == [b"weak"]
-        states, written = selector("live", "bridge", "state"), selector("live", "service", "durable")
+        states, written = (
+            selector("live", "bridge", "state"),
+            selector("live", "service", "durable"),
+        )
         until(lambda: get_latest(viewer, states) == [b"weak"], "the state")
         until(lambda: get_latest(truck, written) == [b"safe"], "what is on disk")
         assert history(viewer, vehicles, 0) == []
