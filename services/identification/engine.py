@@ -34,7 +34,7 @@ from schemas.signals import (
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
 from schemas.vehicle_info import differences
-from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
+from services.common.geodesy import to_chainage
 from services.identification.bridge_state import (
     NOTHING_STORED,
     Fusing,
@@ -43,6 +43,7 @@ from services.identification.bridge_state import (
     count_in,
     usable,
 )
+from services.identification.bridges import AWAY_S, Bridges
 from services.identification.crossing_data import CrossingData, Window, window
 from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
 from services.identification.outputs import (
@@ -54,7 +55,7 @@ from services.identification.outputs import (
     state_output,
 )
 from services.identification.remembered import BridgeCrossings, TruckBoot, UnderWay, Waiting
-from services.identification.stays import MERGE_S, Passage, Stay, least_depth_m, stays_on
+from services.identification.stays import MERGE_S, Passage, Stay
 from services.identification.streams import PATIENCE_S
 from services.identification.traffic import Traffic
 
@@ -69,8 +70,6 @@ MOST_WAITING = 100
 """Crossings that are kept while they wait for a certificate: half a megabyte each, or more."""
 _ROUNDING_S = 1e-6
 """More than is lost when a time in nanoseconds becomes one in seconds."""
-_REACH_M = 50.0
-"""Further away than this from the ends of a bridge no fix changes what happened on it."""
 _Name = tuple[str, str]
 """Realm and bridge."""
 _DECODERS: dict[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]] = {
@@ -111,14 +110,14 @@ class Engine:
         self._site = site
         self._settings = settings
         self._header = header
-        self._frames: list[tuple[Bridge, BridgeFrame]] = [
-            (bridge, bridge_frame(bridge)) for bridge in site.bridges
-        ]
+        self._bridges = Bridges(site.bridges, site.receiver)
         self._vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
-        self._traffic = Traffic(self._frames, self._vehicles, least_depth_m(site.receiver))
+        self._traffic = Traffic(self._bridges, self._vehicles)
         self._trucks: dict[tuple[str, str, int], TruckBoot] = {}
         self._newest_boot: dict[tuple[str, str], int] = {}
         self._of_bridge: dict[_Name, BridgeCrossings] = {}
+        self._expected: tuple[bytes, GnssFix] | None = None
+        """The fix that was noted last: as a rule it is fed next, and taken apart once."""
         self._works = 0
         """How many there have been."""
         self._known: dict[tuple[str, str, str], list[Known]] = {}
@@ -172,6 +171,7 @@ class Engine:
         if key.owner == "vehicle" and key.stream == "gnss":
             with contextlib.suppress(ValueError):
                 fix = decode_gnss(payload)
+                self._expected = payload, fix
                 self._traffic.note(key.realm, key.identifier, fix, for_ever=for_ever)
 
     def feed(self, key: Key, payload: bytes) -> Iterator[Said]:
@@ -186,6 +186,8 @@ class Engine:
         if vehicle is None:
             self.unknown_vehicles.add(key.identifier)
             return iter(())
+        if self._expected is not None and self._expected[0] is payload:
+            return self._take(key, vehicle, self._expected[1])
         return self._take(key, vehicle, _DECODERS[key.stream](payload))
 
     def _take(
@@ -223,13 +225,12 @@ class Engine:
             if np.isfinite(truck.latest_s):
                 now_s = truck.latest_s
                 wait = (lambda *_: False) if for_good else self._has_hole
-                yield from self._look(realm, truck, self._frames, now_s, wait)
+                yield from self._look(realm, truck, list(truck.near), now_s, wait)
 
     def has_undecided(self, realm: str, vehicle: str) -> bool:
         """Whether a truck is known to have a crossing that is not decided, or may have one."""
         return any(
-            truck.boot.lacks_fixes() or any(truck.is_busy_at(bridge) for bridge, _ in self._frames)
-            for truck in self._boots_of(realm, vehicle)
+            truck.boot.lacks_fixes() or truck.busy_at() for truck in self._boots_of(realm, vehicle)
         )
 
     def _boots_of(self, realm: str, vehicle: str) -> list[TruckBoot]:
@@ -241,13 +242,12 @@ class Engine:
         """Look once at every fix: what is found does not depend on which came together."""
         for fix in truck.boot.settle(all_there_is=all_there_is):
             truck.latest_s = max(truck.latest_s, fix.device_time_ns * 1e-9)
-            bridges = [b for b in self._frames if self._may_change(truck, *b, fix)]
-            yield from self._look(realm, truck, bridges, truck.latest_s)
+            yield from self._look(realm, truck, truck.came_to(self._bridges, fix), truck.latest_s)
             self._forget(truck, truck.latest_s)
 
     def _finish(self, realm: str, truck: TruckBoot) -> Iterator[Said]:
         yield from self._settle(realm, truck, all_there_is=True)
-        yield from self._look(realm, truck, self._frames, np.inf)
+        yield from self._look(realm, truck, list(truck.near), np.inf)
 
     def _forget(self, truck: TruckBoot, now_s: float) -> None:
         truck.began_s = min(truck.began_s, now_s)
@@ -277,22 +277,11 @@ class Engine:
                 yield from self._finish(key.realm, self._trucks.pop(name))
         self._newest_boot[key.realm, key.identifier] = boot_id
 
-    def _may_change(
-        self, truck: TruckBoot, bridge: Bridge, frame: BridgeFrame, fix: GnssFix
-    ) -> bool:
-        """Whether a fix can begin, change or end a stay on a bridge: most are far from it."""
-        here_m, _ = to_chainage(frame, fix.latitude_deg, fix.longitude_deg)
-        reach_m = _REACH_M + 2.0 * least_depth_m(self._site.receiver)
-        side = -1 if here_m < -reach_m else 1 if here_m > bridge.span_m + reach_m else 0
-        before = truck.side.get(bridge.id, side)
-        truck.side[bridge.id] = side
-        return side == 0 or side != before or truck.is_busy_at(bridge)
-
     def _look(
         self,
         realm: str,
         truck: TruckBoot,
-        bridges: list[tuple[Bridge, BridgeFrame]],
+        bridges: list[int],
         now_s: float,
         wait: _Wait | None = None,
     ) -> Iterator[Said]:
@@ -304,10 +293,17 @@ class Engine:
             return
         wait = wait or self._may_still_come
         fixes = truck.boot.fixes()
-        for bridge, frame in bridges:
-            stays = stays_on(bridge, frame, truck.vehicle, self._site.receiver, fixes)
+        for number in sorted(bridges):
+            visit = truck.near.get(number)
+            # A truck may have stood somewhere for minutes: what was before it came is not needed.
+            lately = fixes if visit is None else fixes.since(visit.since_s - AWAY_S)
+            stays = self._bridges.stays(number, truck.vehicle, lately)
+            bridge = self._bridges.bridge(number)
             for stay in stays:
-                yield from self._advance(realm, truck, bridge, stay, now_s, wait)
+                # Which of several beside each other it is on is told when it has left them.
+                is_plain = stay.is_over or not self._bridges.rivals(number)
+                if is_plain or now_s - stay.entry_s >= LONGEST_STAY_S:
+                    yield from self._advance(realm, truck, bridge, stay, now_s, wait)
 
     def _advance(
         self,
@@ -498,7 +494,7 @@ class Engine:
     def _data(
         self, realm: str, truck: TruckBoot, bridge: Bridge, stay: Stay, crossing_id: str
     ) -> CrossingData:
-        frame = {b.id: f for b, f in self._frames}[bridge.id]
+        frame = self._bridges.frame(self._bridges.number[bridge.id])
         fixes = truck.boot.fixes()
         chainage, _ = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
         entry_ns = round(stay.entry_s * 1e9)
@@ -531,7 +527,7 @@ class Engine:
             reasons.append(Reason.VEHICLE_DIFFERS_FROM_SITE)
         wall_ns = truck.boot.wall_time_ns
         others = self._traffic.others(
-            realm, bridge, truck.vehicle.id, wall_ns(stay.entry_s), wall_ns(stay.exit_s)
+            realm, bridge.id, truck.vehicle.id, wall_ns(stay.entry_s), wall_ns(stay.exit_s)
         )
         if others:
             _log.warning("%s: %s was on the bridge as well", crossing_id, ", ".join(others))

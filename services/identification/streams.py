@@ -38,6 +38,12 @@ class Fixes(NamedTuple):
     latitude_deg: Floats
     longitude_deg: Floats
     speed_m_per_s: Floats
+    altitude_m: Floats
+
+    def since(self, time_s: float) -> "Fixes":
+        """Those from a time on."""
+        first = int(np.searchsorted(self.time_s, time_s))
+        return Fixes(*(column[first:] for column in self))
 
 
 class Samples(NamedTuple):
@@ -69,7 +75,7 @@ class Boot:
         """Those that came before one that is missing."""
         self._next_fix = 0
         self._fresh: list[GnssFix] = []
-        self._columns: Floats = np.empty((4, 0))
+        self._columns: Floats = np.empty((len(Fixes._fields), 0))
         """Known fixes as `fixes` gives them, but for the fresh ones: thousands, asked for often."""
         self._forgotten_ns = -1
         self._channels: set[str] = set()
@@ -133,7 +139,8 @@ class Boot:
             batch = self._batches[sequence]
             if batch.device_time_ns <= start_ns:
                 begin = sequence
-            if _end_ns(batch) >= stop_ns:
+            is_late = batch.device_time_ns + 1.01 * MAX_BATCH_S * NS_PER_S >= stop_ns
+            if is_late and _end_ns(batch) >= stop_ns:  # seldom asked: it takes time
                 stop = sequence
                 break
         if stop < 0:
@@ -161,7 +168,13 @@ class Boot:
         """All settled fixes in order of time."""
         if self._fresh:
             rows = [
-                (f.device_time_ns / NS_PER_S, f.latitude_deg, f.longitude_deg, f.speed_m_per_s)
+                (
+                    f.device_time_ns / NS_PER_S,
+                    f.latitude_deg,
+                    f.longitude_deg,
+                    f.speed_m_per_s,
+                    f.altitude_m,
+                )
                 for f in self._fresh
             ]
             self._fresh.clear()
