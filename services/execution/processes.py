@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 from schemas.results import Crossing
 from services.common.errors import FailureError
-from services.execution.dispatch import Finished, failed
+from services.execution.dispatch import Begun, Finished, failed
 from services.execution.here import Here, Report
 from services.execution.warm_up import warm_up
 from services.execution.watch import Limits, Watch
@@ -60,14 +60,6 @@ class Aftermath(NamedTuple):
 
     aside: Aside
     outcome: object | None
-
-
-class UnderWay(NamedTuple):
-    """A crossing that is being identified."""
-
-    crossing_id: str
-    seconds: float
-    """Since its process began with it, this time."""
 
 
 class _Job(NamedTuple):
@@ -127,16 +119,22 @@ class Processes:
         return len(self._waiting) >= _WAITING_PER_PROCESS * len(self._places)
 
     @property
+    def is_idle(self) -> bool:
+        """Whether a work that is started now is begun at once, or as soon as an aside is over."""
+        works = sum(1 for p in self._places if p.job and isinstance(p.job.task, Work))
+        return not self._waiting and works < len(self._places)
+
+    @property
     def waiting(self) -> int:
         """How many works wait for a process."""
         return len(self._waiting)
 
     @property
-    def under_way(self) -> list[UnderWay]:
+    def under_way(self) -> list[Begun]:
         """The crossings that are being identified, the one that was begun first first."""
         now_s = time.monotonic()
         found = [
-            UnderWay(place.job.name, now_s - place.began_s)
+            Begun(place.job.name, now_s - place.began_s)
             for place in self._places
             if place.job and isinstance(place.job.task, Work)
         ]

@@ -44,7 +44,12 @@ from services.identification.bridge_state import (
     usable,
 )
 from services.identification.bridges import AWAY_S, Bridges
-from services.identification.crossing_data import CrossingData, Window, window
+from services.identification.crossing_data import (
+    LONGEST_MARGIN_S,
+    CrossingData,
+    Window,
+    window,
+)
 from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
 from services.identification.outputs import (
     Output,
@@ -54,7 +59,13 @@ from services.identification.outputs import (
     crossing_output,
     state_output,
 )
-from services.identification.remembered import BridgeCrossings, TruckBoot, UnderWay, Waiting
+from services.identification.remembered import (
+    BridgeCrossings,
+    Found,
+    TruckBoot,
+    UnderWay,
+    Waiting,
+)
 from services.identification.stays import MERGE_S, Passage, Stay
 from services.identification.streams import PATIENCE_S
 from services.identification.traffic import Traffic
@@ -86,6 +97,7 @@ class Engine:
 
     It identifies nothing itself: what it yields holds a `Work` for each crossing, whose result is
     to be given to `done`, at any later time and in any order. `services.execution` does that.
+    If it `finds_only`, what it finds is in `found`, and of that nothing is identified.
     `header` says what goes into every estimate, `fusing` how those of a bridge become one. Whoever
     asks for `bridges` at the end only may do without their states on the way (`tells_states`).
 
@@ -104,6 +116,7 @@ class Engine:
         certificates: Mapping[Pair, str] | None = None,
         are_required: bool = False,
         tells_states: bool = True,
+        finds_only: bool = False,
     ) -> None:
         self._states = States(NOTHING_STORED if fusing is None else fusing)
         self._tells_states = tells_states
@@ -127,6 +140,11 @@ class Engine:
         self._wanted: set[Pair] = set()
         self._waiting: deque[Waiting] = deque()
         """In the order in which they were found."""
+        self.found: list[Found] = []
+        self._finds_only = finds_only
+        self.recorded: frozenset[str] = frozenset()
+        """Trucks that a logger records: a crossing that began before the first message of theirs
+        that has come here is in a recording, and is left to who reads that (`take`)."""
         self.unknown_vehicles: set[str] = set()
         """Trucks that the site file does not know; nothing of theirs can be identified."""
 
@@ -317,6 +335,8 @@ class Engine:
         begins = stay.passage is Passage.BEGINS_ON_BRIDGE
         if begins and stay.entry_s < truck.forgotten_s + _FORGET_EVERY_S:
             return  # what was before has been forgotten; this had been decided before that
+        if self._is_recorded(truck, bridge, stay):
+            return
         crossing_id, is_new = self._identity(realm, truck, bridge, stay)
         if crossing_id in truck.done:
             return
@@ -348,18 +368,88 @@ class Engine:
             told(pb.IDENTIFYING, stay.exit_s) if pb.IDENTIFYING not in said else None,
             told(pb.DONE, stay.exit_s),
         )
+        if self._finds_only:
+            begun = []
+            if pb.DETECTED not in said:  # as it is told while the truck is on the bridge
+                found = stay._replace(passage=Passage.ENDS_ON_BRIDGE)
+                begun.append(told(pb.DETECTED, stay.entry_s))
+                found = stay
+            if pb.COMPLETE not in said:
+                begun.append(told(pb.COMPLETE, stay.exit_s))
+            times = (truck.boot.wall_time_ns(t) for t in (stay.entry_s, stay.exit_s))
+            self.found.append(Found(tuple(begun), waiting, *times))
+            return
         pair = Pair(truck.vehicle.id, bridge.id)
-        if self._is_certified(pair) and pair not in self.waiting():
+        if self.is_certified(pair) and pair not in self.waiting():
             yield from self._begun(waiting)
             return
-        if not self._is_certified(pair) and pb.WAITING_NOT_VALIDATED not in said:
+        if not self.is_certified(pair) and pb.WAITING_NOT_VALIDATED not in said:
             yield told(pb.WAITING_NOT_VALIDATED, stay.exit_s)
         self._keep(waiting)
-        if not self._is_certified(pair) and pair not in self._wanted:
+        if not self.is_certified(pair) and pair not in self._wanted:
             self._wanted.add(pair)
             yield Wanted(pair)
 
-    def _is_certified(self, pair: Pair) -> bool:
+    def _is_recorded(self, truck: TruckBoot, bridge: Bridge, stay: Stay) -> bool:
+        """Whether the beginning of a crossing has not come here and is in a recording."""
+        begin_s, _ = self._window(truck, bridge, stay)
+        return truck.vehicle.id in self.recorded and truck.boot.is_cut_off_at(begin_s)
+
+    def has_in_hand(
+        self, realm: str, vehicle: str, boot_id: int, bridge: str, entry_s: float
+    ) -> bool:
+        """Whether a stay whose entry is at `entry_s` on its truck's clock is found here, too.
+
+        It is if the messages around it came from the truck itself: then it has been decided, or
+        will be.
+        """
+        truck = self._trucks.get((realm, vehicle, boot_id))
+        if truck is None or entry_s < max(truck.forgotten_s + _FORGET_EVERY_S, truck.began_s):
+            return False
+        number = self._bridges.number.get(bridge)
+        if number is None:
+            return True  # of another site file
+        before = LONGEST_MARGIN_S if vehicle in self.recorded else 0.0
+        return not truck.boot.is_cut_off_at(entry_s - before)
+
+    def take(self, found: Found, others: Iterable[str] = ()) -> Iterator[Said]:
+        """Take in a crossing that was found in a recording; `others` were on the bridge, too.
+
+        What the trucks themselves send of it from now on is no other crossing.
+        """
+        work = found.waiting.work
+        data = work.data
+        crossings = self._known.setdefault((data.realm, data.vehicle.id, data.bridge.id), [])
+        for known in crossings:
+            if known.crossing_id == work.crossing_id:
+                known.is_taken = True
+                break
+        else:
+            crossings.append(
+                Known(
+                    *(data.realm, data.vehicle.id, data.bridge.id, work.crossing_id),
+                    *(found.entry_ns, found.exit_ns),
+                    is_taken=True,
+                )
+            )
+        seen = self._traffic.others(
+            data.realm, data.bridge.id, data.vehicle.id, found.entry_ns, found.exit_ns
+        )
+        against = data.against
+        if names := sorted({*seen, *others}):
+            _log.warning("%s: %s was on the bridge as well", work.crossing_id, ", ".join(names))
+            against = tuple(dict.fromkeys((*against, Reason.OTHER_TRUCK_ON_BRIDGE)))
+        self._works += 1
+        work = work._replace(number=self._works, data=data._replace(against=against))
+        yield from found.told
+        yield from self._begun(found.waiting._replace(work=work))
+
+    def ids_in_hand(self) -> set[str]:
+        """The crossings that are being identified or wait for it."""
+        under_way = {u.work.crossing_id for b in self._of_bridge.values() for u in b.under_way}
+        return under_way.union(one.work.crossing_id for one in self._waiting)
+
+    def is_certified(self, pair: Pair) -> bool:
         """Whether its crossings may be identified."""
         return not self._are_required or pair in self._certificates
 
@@ -367,8 +457,8 @@ class Engine:
         self._waiting.append(waiting)
         if len(self._waiting) > MOST_WAITING:
             _log.warning(
-                "%s has waited too long for a certificate and is given up here: `driveby identify` "
-                "gives its result from the logger's recording",
+                "%s has waited too long for a certificate and is given up here: it is taken from "
+                "the logger's recording later, or `driveby identify` gives its result from there",
                 self._waiting.popleft().work.crossing_id,
             )
 
@@ -386,7 +476,7 @@ class Engine:
     @property
     def has_released(self) -> bool:
         """Whether a crossing that waited may go on."""
-        return any(self._is_certified(_pair(one.work)) for one in self._waiting)
+        return any(self.is_certified(_pair(one.work)) for one in self._waiting)
 
     def release(self) -> Iterator[Said]:
         """Let the first crossing go on that has waited and need not any more, if there is one.
@@ -394,7 +484,7 @@ class Engine:
         One at a time: who asks goes on listening in between.
         """
         for place, one in enumerate(self._waiting):
-            if self._is_certified(_pair(one.work)):
+            if self.is_certified(_pair(one.work)):
                 del self._waiting[place]
                 yield from self._begun(one)
                 return
@@ -483,7 +573,7 @@ class Engine:
             if is_stay_of(known, stay, wall_ns):
                 truck.detected[bridge.id, stay.entry_s] = known.crossing_id
                 truck.said[known.crossing_id] = known.states
-                if known.is_identified:
+                if known.is_identified or known.is_taken:
                     truck.done.add(known.crossing_id)
                 return known.crossing_id, True
         moment = datetime.fromtimestamp(wall_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]

@@ -105,6 +105,17 @@ class Waiting(NamedTuple):
     done: Output
 
 
+class Found(NamedTuple):
+    """A crossing whose data are all there, found in a recording by an engine of its own."""
+
+    told: tuple[Output, ...]
+    """That it was detected and is complete, as far as earlier runs have not told it."""
+    waiting: Waiting
+    entry_ns: int
+    """Since 1970 UTC."""
+    exit_ns: int
+
+
 @dataclass
 class BridgeCrossings:
     """What has been found on one bridge, in one realm."""

@@ -5,7 +5,7 @@ before it is on the bus, so the results files know all that anybody may have hea
 those of the runs before: what the bus may not have got it publishes again as it was, identity and
 all; what was about to be said it says; and a crossing that has a result is not identified again.
 One that has none is found again in what its truck still keeps (`cache` in the table of topics: the
-last five minutes).
+last five minutes), or in the recordings that a logger made of it (`catching_up`).
 
 Real crossings (realm `live`) are identified only where simulated ones of the same truck on the same
 bridge have shown that the method recovers what was put in: until then they wait (`certificates`).
@@ -47,18 +47,20 @@ from services.bus.session import open_session
 from services.bus.subscription import Seen, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
-from services.execution.dispatch import awaited, collected, dispatched
+from services.execution.dispatch import Execution, awaited, collected, dispatched
 from services.execution.processes import Processes
 from services.execution.watch import LIMIT_S, Limits
 from services.history.baselines import baselines_of
 from services.history.certificates import found_in
-from services.history.result_files import Earlier, ResultFiles, read_earlier
+from services.history.result_files import KNOWN_AGE_S, Earlier, ResultFiles, read_earlier
+from services.history.store import Ledger
 from services.identification.bridge_state import Fusing
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.outputs import Output
 from services.recordings.recording import Message, program_version
 from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
+from services.worker.catching_up import DAYS, MARGIN_S, CatchingUp, Source
 from services.worker.certificates import Certificates
 
 __all__ = ["run"]
@@ -74,6 +76,7 @@ _SOONEST_HEALTH_S = 5.0
 """Who waits and what is identified may change many times a second: so often it is told at most."""
 _MOST_NAMED = 10
 """Crossings in one line of the log."""
+_CATCH_UP_EVERY_S = 0.2
 _CONNECT_S = 1.0
 """An attempt is so short that a signal is heard between two."""
 
@@ -84,6 +87,7 @@ class _Backlog(NamedTuple):
     under_way: tuple[str, ...]
     waiting: int
     waiting_for_certificate: int
+    in_recordings: int
 
 
 def run(
@@ -101,6 +105,8 @@ def run(
     limit_s: float = LIMIT_S,
     certificates: Path | None = None,
     validate: bool | None = None,
+    recordings: Path | None = None,
+    recordings_days: float = DAYS,
 ) -> int:
     """Identify all crossings of a realm until SIGINT or SIGTERM; return 0.
 
@@ -114,6 +120,8 @@ def run(
     A crossing whose vehicle and bridge have no certificate in the folder `certificates` (by default
     one in `folder`) waits for one, which is made meanwhile: if `validate` says so, or says nothing
     and the realm is `live`.
+    What nobody sends any more is taken from the logger's `recordings` (by default in `folder`) of
+    the last so many days, unless this run has a `file` of its own or the realm is one of replays.
     InputError: a bad site file, realm or id, or a method that has no certificates. FailureError: a
     result or a certificate cannot be written.
     """
@@ -137,11 +145,21 @@ def run(
     )
     fusing = Fusing(baselines_of(known, site.parent))
     earlier = Earlier()
+    catches_up, age_s = False, 0.0
     if file is None:
         moment = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         file = folder / realm / f"results-{moment}.mcap"
         if not is_replayed(realm):
-            earlier = read_earlier(folder / realm, realm, time.time(), search_hash(header), fusing)
+            catches_up = recordings_days > 0.0
+            age_s = recordings_days * 86_400.0
+            earlier = read_earlier(
+                folder / realm,
+                realm,
+                time.time(),
+                search_hash(header),
+                fusing,
+                max(KNOWN_AGE_S, age_s + MARGIN_S) if catches_up else KNOWN_AGE_S,
+            )
     check_folder_writable(file.parent)
     if file.exists():
         raise InputError(f"{file}: exists, and results are never overwritten; give another name")
@@ -151,7 +169,8 @@ def run(
         check_folder_writable(certificates)
     elif realm == "live":
         _log.warning("--no-certificates: crossings count that nobody has validated")
-    files = ResultFiles(file, text, header, earlier.previous)
+    ledger = Ledger(earlier.crossings, time.time())
+    files = ResultFiles(file, text, header, earlier.previous, ledger.note)
     # A second signal: what was published is on the disk, and the next run takes it up.
     with stopped_by_signals(leave_at_once) as stop, contextlib.ExitStack() as stack:
 
@@ -175,6 +194,11 @@ def run(
             are_required=are_required,
         )
         certified = Certificates(certificates, known, settings, execution)
+        catching_up = None
+        if catches_up:
+            source = Source(recordings or folder, realm, age_s)
+            catching_up = CatchingUp(source, known, settings, header, ledger)
+            stack.callback(catching_up.close)
         execution.wait_until_warm()
         arrivals: _Queue = queue.Queue(_LONGEST_QUEUE)
         closing, failed = threading.Event(), threading.Event()
@@ -191,7 +215,16 @@ def run(
             del earlier  # of two days
             receiver.start()
             _serve(
-                engine, execution, certified, arrivals, publisher, service_id, files, stop, ready
+                engine,
+                execution,
+                certified,
+                arrivals,
+                publisher,
+                service_id,
+                files,
+                stop,
+                ready,
+                catching_up,
             )
         except BaseException:
             files.abandon()
@@ -314,16 +347,15 @@ def _resume(engine: Engine, earlier: Earlier, publisher: Publisher, files: Resul
     ]
     if waited:
         _log.warning(
-            "%d crossings waited for a certificate when an earlier run ended (%s): those that "
-            "their trucks still have go on, for the others `driveby identify` reads the logger's "
-            "recording",
+            "%d crossings waited for a certificate when an earlier run ended (%s): they go on if "
+            "their trucks still have them or they are in the logger's recordings",
             *(len(waited), ", ".join(waited[-_MOST_NAMED:])),
         )
 
 
 def _serve(
     engine: Engine,
-    execution: Processes,
+    execution: Execution,
     certificates: Certificates,
     queued: _Queue,
     publisher: Publisher,
@@ -331,6 +363,7 @@ def _serve(
     files: ResultFiles,
     stop: threading.Event,
     ready: Callable[[], None] | None,
+    catching_up: CatchingUp | None = None,
 ) -> None:
     """Identify until `stop`, and then what nobody would give to the next run.
 
@@ -338,7 +371,7 @@ def _serve(
     """
     arrivals = Arrivals()
     told: set[str] = set()
-    next_health_s = soonest_health_s = 0.0
+    next_health_s = soonest_health_s = next_catch_up_s = 0.0
     told_backlog: _Backlog | None = None
     leave_at_s = math.inf
     want = certificates.want
@@ -352,7 +385,7 @@ def _serve(
     ):
         if time.monotonic() >= soonest_health_s or certificates.has_news:
             soonest_health_s = time.monotonic() + _SOONEST_HEALTH_S
-            backlog = _backlog(engine, execution)
+            backlog = _backlog(engine, execution, catching_up)
             is_due = time.monotonic() >= next_health_s or certificates.has_news
             if is_due or backlog != told_backlog:
                 next_health_s = time.monotonic() + HEALTH_PERIOD_S
@@ -400,6 +433,15 @@ def _serve(
             if engine.has_released and not execution.is_full:
                 released = dispatched(engine, execution, engine.release(), want)
                 _publish(released, engine, publisher, files)
+            if catching_up is not None and time.monotonic() >= next_catch_up_s:
+                next_catch_up_s = time.monotonic() + _CATCH_UP_EVERY_S
+                said = catching_up.advance(
+                    engine,
+                    time.monotonic(),
+                    has_room=execution.is_idle and not engine.has_released,
+                    want=want,
+                )
+                _publish(dispatched(engine, execution, said, want), engine, publisher, files)
         for vehicle in engine.unknown_vehicles - told:
             told.add(vehicle)
             _log.warning("%s drives, but the site file has no such vehicle", vehicle)
@@ -407,8 +449,8 @@ def _serve(
     waiting = [name for names in engine.waiting().values() for name in names]
     if waiting:
         _log.warning(
-            "%d crossings still wait for a certificate (%s): the next run gets them if their "
-            "trucks still have them, else `driveby identify` reads the logger's recording",
+            "%d crossings still wait for a certificate (%s): the next run gets them from their "
+            "trucks, or from the logger's recordings",
             *(len(waiting), ", ".join(waiting[-_MOST_NAMED:])),
         )
 
@@ -426,7 +468,10 @@ def _may_lose(engine: Engine, arrivals: Arrivals) -> bool:
 
 
 def _publish(
-    outputs: Iterable[Output], engine: Engine, publisher: Publisher, files: ResultFiles
+    outputs: Iterable[Output],
+    engine: Engine,
+    publisher: Publisher,
+    files: ResultFiles,
 ) -> None:
     """Write each message to the disk and only then to the bus: nobody hears what may be lost."""
     for output in _worked_out(outputs):
@@ -467,11 +512,12 @@ def _say_progress(
     publisher.put("service", service_id, "progress", progress.SerializeToString())
 
 
-def _backlog(engine: Engine, execution: Processes) -> _Backlog:
+def _backlog(engine: Engine, execution: Execution, catching_up: CatchingUp | None) -> _Backlog:
     return _Backlog(
         tuple(one.crossing_id for one in execution.under_way),
         execution.waiting,
         sum(len(names) for names in engine.waiting().values()),
+        0 if catching_up is None else catching_up.waiting,
     )
 
 
@@ -480,12 +526,13 @@ def _say_health(
     service_id: str,
     queued: int,
     backlog: _Backlog,
-    execution: Processes,
+    execution: Execution,
     note: str,
 ) -> None:
     under_way = execution.under_way
     notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in under_way]
     notes += [f"{backlog.waiting} wait for a process"] if backlog.waiting else []
+    notes += [f"{backlog.in_recordings} wait in recordings"] if backlog.in_recordings else []
     notes += [note] if note else []
     health = pb.Health(
         schema_version=1,
@@ -498,6 +545,7 @@ def _say_health(
             "identifying_longest_s": max((one.seconds for one in under_way), default=0.0),
             "waiting_for_process": float(backlog.waiting),
             "waiting_for_certificate": float(backlog.waiting_for_certificate),
+            "waiting_in_recordings": float(backlog.in_recordings),
         },
         note="; ".join(notes)[:_LONGEST_NOTE],
     )
