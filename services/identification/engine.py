@@ -10,7 +10,7 @@ certificates change in turn.
 
 import contextlib
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 
@@ -468,6 +468,16 @@ class Engine:
         for one in self._waiting:
             found.setdefault(_pair(one.work), []).append(one.work.crossing_id)
         return found
+
+    def pairs_that_wait(self) -> list[Pair]:
+        """Pairs with crossings that wait: with most first, of as many the one found last first."""
+        count: Counter[Pair] = Counter()
+        latest: dict[Pair, int] = {}
+        for number, one in enumerate(self._waiting):
+            pair = _pair(one.work)
+            count[pair] += 1
+            latest[pair] = number
+        return sorted(count, key=lambda pair: (-count[pair], -latest[pair]))
 
     def certify(self, pair: Pair, certificate: str) -> None:
         """Take the hash of a pair's certificate, which has passed: `release` its crossings."""

@@ -424,7 +424,8 @@ def _serve(
             _publish(dispatched(engine, execution, said, want), engine, publisher, files)
         _publish(collected(engine, execution), engine, publisher, files)
         if not stop.is_set():
-            for pair, digest in certificates.advance(time.monotonic()).items():
+            passed = certificates.advance(time.monotonic(), engine.pairs_that_wait)
+            for pair, digest in passed.items():
                 engine.certify(pair, digest)
             if certificates.progress not in (None, progress):
                 progress = certificates.progress

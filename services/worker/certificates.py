@@ -1,12 +1,13 @@
 """Certificates of the pairs that have crossings waiting: made aside, kept in a folder, looked for.
 
-One pair at a time, in the order in which they were asked for; crossings that need not wait come
+One pair at a time, those that drive most and latest first; crossings that need not wait come
 before (`Processes`). Which crossings wait is the engine's to know.
 """
 
 import logging
 import time
 from collections import deque
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -62,16 +63,19 @@ class Certificates:
         self._wanted.append(pair)
         self._next_look_s = 0.0
 
-    def advance(self, now_s: float) -> dict[Pair, str]:
+    def advance(self, now_s: float, order: Callable[[], Sequence[Pair]] = tuple) -> dict[Pair, str]:
         """Go on, by any steady clock; return the hashes of what has come to pass since.
 
+        `order` says which pairs are to be next, where several wait; others come after them, in the
+        order in which they were asked for.
         InputError, FailureError: a certificate cannot be written.
         """
         passed = self._looked_for() if now_s >= self._next_look_s else {}
         if now_s >= self._next_look_s:
             self._next_look_s = now_s + self._look_again_s
         if self._trial is None and self._wanted:
-            pair = self._wanted.popleft()
+            pair = next((p for p in order() if p in self._wanted), self._wanted[0])
+            self._wanted.remove(pair)
             self._trial = Trial(self._site, pair, self._settings)
             self._numbers.clear()
             self.has_news = True
