@@ -7,6 +7,7 @@ results of that file as JSON beside it. Together the files of a folder hold each
 import logging
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -97,12 +98,24 @@ class ResultFiles:
             self._crossings += 1
             self._json.add(result, bridges)
 
-    def finish(self) -> None:
+    def begin_anew(self, path: Path, site_toml: str, header: Header) -> None:
+        """What is written from now on goes to another file: it belongs to another site file.
+
+        The messages go on where they were. FailureError if this one cannot be closed.
+        """
+        if self._writer is not None:
+            self.finish("another site file")
+            self._previous = self.path.name
+        self.path, self._site_toml = path, site_toml
+        self._json = GrowingJson(path.with_suffix(".json"), header)
+        self._writer, self._crossings = None, 0
+
+    def finish(self, reason: str = "stopped by a signal") -> None:
         """Close the recording of a run that ended well. FailureError if that is not possible."""
         if self._writer is None:
             return
         try:
-            self._writer.finish("stopped by a signal", {"crossings": self._crossings})
+            self._writer.finish(reason, {"crossings": self._crossings})
         except OSError as error:
             self._writer.abandon()
             raise FailureError(f"{self.path}: cannot be ended: {error.strerror}") from error
@@ -113,6 +126,16 @@ class ResultFiles:
         """
         if self._writer is not None:
             self._writer.abandon()
+
+
+def free_results_path(folder: Path) -> Path:
+    """The name of a file for the results of a run, or of a part of it, that begins now."""
+    stem = f"results-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    path, number = folder / f"{stem}.mcap", 2
+    while path.exists():
+        # "_" comes after "." in the order of names, which is that of the runs
+        path, number = folder / f"{stem}_{number}.mcap", number + 1
+    return path
 
 
 class MessageName(NamedTuple):

@@ -33,7 +33,6 @@ from schemas.signals import (
 )
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
-from schemas.vehicle_info import differences
 from services.common.geodesy import to_chainage
 from services.identification.bridge_state import (
     NOTHING_STORED,
@@ -178,6 +177,51 @@ class Engine:
         for known in crossings:
             known.last = known.usable = None  # nobody asks for them again, and they are large
 
+    def retarget(
+        self, site: Site, header: Header, fusing: Fusing, certificates: Mapping[Pair, str]
+    ) -> Iterator[Wanted]:
+        """Go on with another site file; nothing must be under way. Yield the certificates wanted.
+
+        What was decided stays decided. Crossings that wait are identified with what the new file
+        says of their truck and bridge; as after a new start the states of bridges begin anew.
+        """
+        before, bridges = self._bridges, Bridges(site.bridges, site.receiver)
+        vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
+        self._site, self._header, self._bridges, self._vehicles = site, header, bridges, vehicles
+        self._states = States(fusing)
+        self._of_bridge.clear()
+        self._traffic.retarget(bridges, vehicles)
+        for name, truck in list(self._trucks.items()):
+            if name[1] in vehicles:
+                truck.retarget(vehicles[name[1]], before, bridges)
+            else:
+                del self._trucks[name]
+        self._certificates = dict(certificates)
+        self._wanted.clear()
+        self.unknown_vehicles.clear()
+        self._waiting = deque(
+            one._replace(work=one.work._replace(data=self._retargeted(one.work.data)))
+            for one in self._waiting
+            if one.work.data.vehicle.id in vehicles and one.work.data.bridge.id in bridges.number
+        )
+        for pair in self.waiting():
+            if not self.is_certified(pair):
+                self._wanted.add(pair)
+                yield Wanted(pair)
+
+    def _retargeted(self, data: CrossingData) -> CrossingData:
+        number = self._bridges.number[data.bridge.id]
+        chainage, _ = to_chainage(
+            self._bridges.frame(number), data.fixes.latitude_deg, data.fixes.longitude_deg
+        )
+        return data._replace(
+            vehicle=self._vehicles[data.vehicle.id],
+            bridge=self._bridges.bridge(number),
+            sensor=self._site.sensor,
+            receiver=self._site.receiver,
+            chainage_m=chainage,
+        )
+
     def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
         """Note where a truck is, as soon as that comes: another one may be on the bridge then.
 
@@ -215,7 +259,7 @@ class Engine:
             return  # its crossings have been decided
         truck = self._truck(key, message.boot_id, vehicle)
         if isinstance(message, VehicleInfo):
-            truck.differences = truck.differences or differences(message.site_toml, vehicle)
+            truck.says(message.site_toml)
         elif isinstance(message, AccelBatch):
             truck.boot.add_accel(message)
             self._forget(truck, message.device_time_ns * 1e-9)

@@ -10,7 +10,7 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing
 from schemas.signals import GnssFix
 from schemas.site import Vehicle
-from schemas.vehicle_info import Difference
+from schemas.vehicle_info import Difference, differences
 from services.identification.bridge_state import Counted
 from services.identification.bridges import AWAY_S, Bridges
 from services.identification.outputs import Output, Work
@@ -49,8 +49,26 @@ class TruckBoot:
         """Time, latitude and longitude of the latest fix."""
         self.near: dict[int, Visit] = {}
         """By number of the bridge: those that it came to within what is remembered."""
+        self._said_toml: str | None = None
         self.differences: list[Difference] = []
         """Where it says of itself what the site file does not say of it."""
+
+    def says(self, site_toml: str) -> None:
+        """Take in what the truck says of itself; the first time that it differs counts."""
+        if not self.differences:
+            self._said_toml = site_toml
+            self.differences = differences(site_toml, self.vehicle)
+
+    def retarget(self, vehicle: Vehicle, before: Bridges, bridges: Bridges) -> None:
+        """The truck and the bridges are those of another site file now."""
+        self.vehicle = vehicle
+        ids = {before.bridge(number).id: visit for number, visit in self.near.items()}
+        self.near = {bridges.number[i]: v for i, v in ids.items() if i in bridges.number}
+        gone = {name: one for name, one in self.detected.items() if name[0] not in bridges.number}
+        self.detected = {name: one for name, one in self.detected.items() if name not in gone}
+        self.differences = []
+        if self._said_toml is not None:
+            self.says(self._said_toml)
 
     def busy_at(self) -> set[str]:
         """The bridges of which a crossing has begun and is not decided yet."""

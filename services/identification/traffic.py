@@ -44,6 +44,12 @@ class Traffic:
         self._near: OrderedDict[tuple[str, str, str], _Near] = OrderedDict()
         """By realm, bridge and vehicle; who was heard last stands last."""
 
+    def retarget(self, bridges: Bridges, vehicles: dict[str, Vehicle]) -> None:
+        """From now on the bridges and trucks of another site file; where trucks were, stays."""
+        self._bridges, self._vehicles = bridges, vehicles
+        for name in [name for name in self._near if name[1] not in bridges.number]:
+            del self._near[name]
+
     def note(self, realm: str, vehicle: str, fix: GnssFix, *, for_ever: bool = False) -> None:
         """Keep a fix if it is near a bridge; `for_ever`: whatever else comes."""
         here = fix.latitude_deg, fix.longitude_deg

@@ -17,10 +17,10 @@ import contextlib
 import logging
 import math
 import queue
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,16 +52,23 @@ from services.execution.processes import Processes
 from services.execution.watch import LIMIT_S, Limits
 from services.history.baselines import baselines_of
 from services.history.certificates import found_in
-from services.history.result_files import KNOWN_AGE_S, Earlier, ResultFiles, read_earlier
+from services.history.result_files import (
+    KNOWN_AGE_S,
+    Earlier,
+    ResultFiles,
+    free_results_path,
+    read_earlier,
+)
 from services.history.store import Ledger
 from services.identification.bridge_state import Fusing
 from services.identification.engine import Engine
 from services.identification.known import search_hash
-from services.identification.outputs import Output
+from services.identification.outputs import Output, Said
 from services.recordings.recording import Message, program_version
 from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
 from services.worker.catching_up import DAYS, MARGIN_S, CatchingUp, Source
 from services.worker.certificates import Certificates
+from services.worker.site_watch import Edited, SiteWatch
 
 __all__ = ["run"]
 
@@ -79,6 +86,21 @@ _MOST_NAMED = 10
 _CATCH_UP_EVERY_S = 0.2
 _CONNECT_S = 1.0
 """An attempt is so short that a signal is heard between two."""
+
+
+class Editing(NamedTuple):
+    """How an edited site file is noticed, and what is done with it."""
+
+    watch: SiteWatch
+    asked: threading.Event
+    """Somebody asks to read it again."""
+    retarget: Callable[[Edited], Iterator[Said]]
+
+    def edited(self, now_s: float) -> Edited | None:
+        """The site file, if it was edited since the last call."""
+        is_asked = self.asked.is_set()
+        self.asked.clear()
+        return self.watch.edited(now_s, is_asked=is_asked)
 
 
 class _Backlog(NamedTuple):
@@ -146,9 +168,10 @@ def run(
     fusing = Fusing(baselines_of(known, site.parent))
     earlier = Earlier()
     catches_up, age_s = False, 0.0
+    watch: SiteWatch | None = None
     if file is None:
-        moment = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-        file = folder / realm / f"results-{moment}.mcap"
+        file = free_results_path(folder / realm)
+        watch = SiteWatch(site, known)  # a file of its own has room for one site file
         if not is_replayed(realm):
             catches_up = recordings_days > 0.0
             age_s = recordings_days * 86_400.0
@@ -214,18 +237,32 @@ def run(
             _resume(engine, earlier, publisher, files)
             del earlier  # of two days
             receiver.start()
-            _serve(
-                engine,
-                execution,
-                certified,
-                arrivals,
-                publisher,
-                service_id,
-                files,
-                stop,
-                ready,
-                catching_up,
-            )
+
+            def retarget(edited: Edited) -> Iterator[Said]:
+                now = header._replace(created=time.time(), site_hash=edited.hash)
+                found = found_in(certificates, edited.site, settings)
+                path = free_results_path(files.path.parent)
+                files.begin_anew(path, edited.text, now)
+                certified.retarget(edited.site)
+                if catching_up is not None:
+                    catching_up.retarget(edited.site, now)
+                _log.info("%s was edited: %s counts now, results in %s", site, edited.hash, path)
+                yield from engine.retarget(edited.site, now, Fusing(edited.baselines), found)
+
+            with _asked_by_hangup() as asked:
+                _serve(
+                    engine,
+                    execution,
+                    certified,
+                    arrivals,
+                    publisher,
+                    service_id,
+                    files,
+                    stop,
+                    ready,
+                    catching_up,
+                    None if watch is None else Editing(watch, asked, retarget),
+                )
         except BaseException:
             files.abandon()
             raise
@@ -364,6 +401,7 @@ def _serve(
     stop: threading.Event,
     ready: Callable[[], None] | None,
     catching_up: CatchingUp | None = None,
+    editing: Editing | None = None,
 ) -> None:
     """Identify until `stop`, and then what nobody would give to the next run.
 
@@ -443,6 +481,13 @@ def _serve(
                     want=want,
                 )
                 _publish(dispatched(engine, execution, said, want), engine, publisher, files)
+        edited = None if stop.is_set() or editing is None else editing.edited(time.monotonic())
+        if editing is not None and edited is not None:
+            # Every result belongs to one site file: what is under way still to that of before.
+            _publish(awaited(engine, execution), engine, publisher, files)
+            said = editing.retarget(edited)
+            _publish(dispatched(engine, execution, said, want), engine, publisher, files)
+            told.clear()
         for vehicle in engine.unknown_vehicles - told:
             told.add(vehicle)
             _log.warning("%s drives, but the site file has no such vehicle", vehicle)
@@ -454,6 +499,20 @@ def _serve(
             "trucks, or from the logger's recordings",
             *(len(waiting), ", ".join(waiting[-_MOST_NAMED:])),
         )
+
+
+@contextlib.contextmanager
+def _asked_by_hangup() -> Iterator[threading.Event]:
+    """An event that SIGHUP sets, which asks to read the site file again."""
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+    before = signal.signal(signal.SIGHUP, lambda number, frame: asked.set())
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def _next(queued: _Queue) -> Arrived | Token | None:

@@ -87,6 +87,16 @@ class Certificates:
                 self._trial = None
         return passed
 
+    def retarget(self, site: Site) -> None:
+        """From now on make those of another site file; what was wanted is to be asked for again."""
+        self._processes.forget_asides()
+        self._site = site
+        self._trial = None
+        self._numbers.clear()
+        self._wanted.clear()
+        self._failed.clear()
+        self.has_news = True
+
     def end(self) -> None:
         """Begin no more crossings: a trial that is not over begins anew in the next run."""
         self._processes.forget_asides()
@@ -119,7 +129,8 @@ class Certificates:
             one = trial.next_run()
             if one is None:
                 return
-            name = f"simulated crossing {one.number} of {trial.pair}"
+            digest = pair_hash(self._site, trial.pair, self._settings)  # of this site file
+            name = f"simulated crossing {one.number} of {trial.pair} ({digest})"
             self._numbers[name] = one.number
             self._processes.start_aside(Aside(name, one.run))
 

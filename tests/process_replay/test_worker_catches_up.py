@@ -10,7 +10,7 @@ import zenoh
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import load_results
-from schemas.site_file import site_toml
+from schemas.site_file import site_hash, site_toml
 from schemas.topics import selector
 from services.bus.session import open_session
 from services.bus.subscription import Received, Subscription
@@ -142,3 +142,53 @@ def test_trucks_that_came_and_left_while_the_worker_was_away(
     assert len(on_disk) == 2
     in_json = [load_results(p) for p in sorted((folder / REALM).glob("results-*.json"))]
     assert sum(len(one.crossings) for one in in_json) == 2
+
+
+@pytest.mark.slow
+def test_a_site_file_that_is_edited_while_the_worker_runs(
+    bus: zenoh.Session,
+    begin: Callable[[], Process],
+    drive_by: Callable[[], None],
+    site: Path,
+    folder: Path,
+) -> None:
+    """A crossing before and one after, by their site files; a broken one in between; and a worker
+    that starts with the edited one identifies neither again."""
+    before = paper_site()
+    bridge = before.bridges[0].model_copy(update={"owner_id": "B 27"})
+    edited = before.model_copy(update={"bridges": (bridge,)})
+    estimates: dict[str, str] = {}
+    with Subscription(bus, selector(REALM, "bridge", "estimate")) as results:
+
+        def heard(number: int) -> bool:
+            one = results.receive(0.1)
+            if one is not None:
+                estimate = pb.Estimate.FromString(one.payload)
+                told = estimates.setdefault(estimate.crossing_id, estimate.site_hash)
+                assert told == estimate.site_hash
+            return len(estimates) >= number
+
+        process = begin()
+        drive_by()
+        until(lambda: heard(1), "the first result")
+        site.write_text("nonsense")
+        assert process.stderr is not None
+        until(lambda: "the site file of before stays" in process.stderr.readline(), "a warning")
+        site.write_text(site_toml(edited))
+        until(lambda: "was edited" in process.stderr.readline(), "that it is taken up")
+        drive_by()
+        until(lambda: heard(2), "the second result")
+        stop(process)
+        again = begin()
+        until(lambda: "published again" in (again.stderr or [""]).readline(), "its start")  # type: ignore[union-attr]
+        drive_by()
+        until(lambda: heard(3), "the third result")
+        stop(again)
+        heard(4)
+    assert list(estimates.values()) == [site_hash(before), site_hash(edited), site_hash(edited)]
+    found = [load_results(path) for path in sorted((folder / REALM).glob("results-*.json"))]
+    assert [(one.site_hash, len(one.crossings)) for one in found] == [
+        (site_hash(before), 1),
+        (site_hash(edited), 1),
+        (site_hash(edited), 1),
+    ]
