@@ -8,8 +8,8 @@ report and the terminal a browser (Debian: chromium).
 """
 
 import io
-import os
 import math
+import os
 import re
 import subprocess
 import sys

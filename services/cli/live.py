@@ -157,6 +157,12 @@ def add_worker(commands: Any) -> None:
         metavar="N",
         help="identify so many crossings at once, beside the process that listens (default: 1)",
     )
+    p.add_argument(
+        "--limit",
+        type=number("seconds", low=1, high=1e6),
+        metavar="S",
+        help="processor time that a crossing may take; then it is tried once more (default: 900)",
+    )
     add_id(p, "worker")
     first = p.add_mutually_exclusive_group()
     first.add_argument(
@@ -171,10 +177,25 @@ def add_worker(commands: Any) -> None:
         help="identify at once in realm live, too: for those who know what they do",
     )
     add_certificates(p, "where certificates are kept (default: certificates in --folder)")
+    p.add_argument(
+        "--recordings",
+        type=Path,
+        metavar="DIR",
+        help="the logger's --folder, for crossings that trucks do not send any more "
+        "(default: --folder)",
+    )
+    p.add_argument(
+        "--recordings-days",
+        type=number("days", low=0, high=3650),
+        metavar="DAYS",
+        help="so far back (default: 2; 0: nothing is taken from recordings)",
+    )
 
 
 def _worker(options: argparse.Namespace) -> int:
     from services import worker
+    from services.execution.watch import LIMIT_S
+    from services.worker.catching_up import DAYS
 
     return worker.run(
         endpoint=options.endpoint or default_endpoint(options.tls),
@@ -187,7 +208,10 @@ def _worker(options: argparse.Namespace) -> int:
         ready=lambda: print(f"ready, waiting for crossings in realm {options.realm}", flush=True),
         tls=options.tls,
         processes=options.processes,
+        limit_s=LIMIT_S if options.limit is None else options.limit,
         certificates=options.certificates,
+        recordings=options.recordings,
+        recordings_days=DAYS if options.recordings_days is None else options.recordings_days,
         validate=True if options.validate_first else False if options.no_certificates else None,
     )
 

@@ -15,10 +15,10 @@ from schemas.site import Site
 from schemas.site_file import parse_site
 from schemas.topics import Key, topic
 from services.common.errors import InputError
-from services.common.geodesy import bridge_frame
 from services.common.intervals import Intervals
 from services.common.progress import Offset, unwatched
-from services.identification.stays import Passage, stays_on
+from services.identification.bridges import Bridges
+from services.identification.stays import Passage
 from services.identification.streams import Boot, boot_of
 from services.recordings.recording import Message, RecordingInfo, read_info
 
@@ -223,12 +223,12 @@ def _gaps(streams: dict[tuple[Key, int], _Heard]) -> tuple[Gap, ...]:
 
 def _passings(site: Site, boots: dict[tuple[str, str, int], Boot]) -> tuple[Passing, ...]:
     trucks = {vehicle.id: vehicle for vehicle in site.vehicles}
-    frames = [(bridge, bridge_frame(bridge)) for bridge in site.bridges]
+    bridges = Bridges(site.bridges, site.receiver)
     found = [
         Passing(
             realm,
             vehicle,
-            bridge.id,
+            bridges.bridge(number).id,
             stay.direction > 0,
             boot.wall_time_ns(stay.entry_s),
             boot.wall_time_ns(stay.exit_s),
@@ -236,7 +236,6 @@ def _passings(site: Site, boots: dict[tuple[str, str, int], Boot]) -> tuple[Pass
         )
         for (realm, vehicle, _), boot in boots.items()
         if vehicle in trucks and boot.fixes().time_s.size
-        for bridge, frame in frames
-        for stay in stays_on(bridge, frame, trucks[vehicle], site.receiver, boot.fixes())
+        for number, stay in bridges.all_stays(trucks[vehicle], boot.fixes())
     ]
     return tuple(sorted(found, key=lambda passing: (passing.entry_ns, passing.vehicle)))

@@ -26,6 +26,14 @@ class Finished(NamedTuple):
     result: Crossing
 
 
+class Begun(NamedTuple):
+    """A crossing that is being identified."""
+
+    crossing_id: str
+    seconds: float
+    """Since it was begun, this time."""
+
+
 class Execution(Protocol):
     """Where crossings are identified. To be used from one thread."""
 
@@ -36,6 +44,18 @@ class Execution(Protocol):
     @property
     def is_full(self) -> bool:
         """Whether more works should wait until some have been given back."""
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether a work that is started now is begun at once, or as soon as an aside is over."""
+
+    @property
+    def waiting(self) -> int:
+        """How many works have been started and not begun."""
+
+    @property
+    def under_way(self) -> list[Begun]:
+        """The crossings that are being identified, the one that was begun first first."""
 
     def start(self, work: Work) -> None:
         """Take a work; it is done now, later or elsewhere."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 
 from schemas.results import Crossing
-from services.execution.dispatch import Finished
+from services.execution.dispatch import Begun, Finished
 from services.identification.identify import Identify, Keep, identify
 from services.identification.outputs import Work
 
@@ -44,6 +44,21 @@ class Here:
     def is_full(self) -> bool:
         """Never: what is started is done."""
         return False
+
+    @property
+    def is_idle(self) -> bool:
+        """Always."""
+        return True
+
+    @property
+    def waiting(self) -> int:
+        """None ever does."""
+        return 0
+
+    @property
+    def under_way(self) -> list[Begun]:
+        """None, when somebody can ask."""
+        return []
 
     def start(self, work: Work) -> None:
         """Identify the crossing. Raises what `identify` does."""

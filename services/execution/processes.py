@@ -2,7 +2,8 @@
 
 Every process is warm (its kernels are loaded before its first crossing) and works on one crossing
 at a time. If it dies, for want of memory or in a library, its crossing is tried once more in a new
-one and then rejected as `failed`: no crossing can end who asked for it, nor another crossing.
+one and then rejected as `failed`: no crossing can end who asked for it, nor another crossing. One
+that is hung (`watch`) is killed, so it dies as well.
 
 What else is to be computed (`Aside`) is computed in the same processes, when no crossing waits for
 one: so a crossing waits for one aside at most.
@@ -11,10 +12,13 @@ They are spawned: numba's and OpenBLAS's threads would not survive a fork. Signa
 process that started them, and they end with it, however it ends.
 """
 
+import contextlib
 import logging
+import math
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
@@ -24,9 +28,10 @@ from typing import Any, NamedTuple
 
 from schemas.results import Crossing
 from services.common.errors import FailureError
-from services.execution.dispatch import Finished, failed
+from services.execution.dispatch import Begun, Finished, failed
 from services.execution.here import Here, Report
 from services.execution.warm_up import warm_up
+from services.execution.watch import Limits, Watch
 from services.identification.identify import Identify, identify
 from services.identification.outputs import Work
 
@@ -36,7 +41,9 @@ _TRIES = 2
 """A process may be ended for what others do to the machine's memory; twice is no accident."""
 _WAITING_PER_PROCESS = 2
 """What waits here is finished even after a signal, and a service has a minute to end."""
-
+_USUAL = Limits()
+_WATCH_EVERY_S = 0.5
+"""So often it is looked whether a process is hung."""
 _LONGEST_END_S = 5.0
 """A process ends as soon as its interpreter has a turn, which a kernel may hold up for a while."""
 
@@ -67,8 +74,9 @@ class _Job(NamedTuple):
 class Processes:
     """The `Execution` in `number` processes; `report` may be told from another thread.
 
-    Each takes its share of the settings' `threads`, at least one. It keeps no draws. To be closed,
-    or used as a context manager: what is under way then is given up.
+    Each takes its share of the settings' `threads`, at least one. It keeps no draws. One that takes
+    more than the `limits` for a piece of work is killed. To be closed, or used as a context
+    manager: what is under way then is given up.
     """
 
     def __init__(
@@ -78,10 +86,12 @@ class Processes:
         report: Report = lambda crossing_id, stage, fraction: None,
         identify: Identify = identify,
         prepare: Callable[[], None] = warm_up,
+        limits: Limits = _USUAL,
     ) -> None:
         # Read when a process loads numpy: its threads would fight with those of its neighbours.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        self._places = [_Place(report, identify, prepare) for _ in range(number)]
+        self._report = report
+        self._places = [_Place(report, identify, prepare, limits) for _ in range(number)]
         self._waiting: deque[_Job] = deque()
         self._finished: list[Finished] = []
         self._asides: deque[_Job] = deque()
@@ -108,10 +118,34 @@ class Processes:
         """Whether enough works wait for a process."""
         return len(self._waiting) >= _WAITING_PER_PROCESS * len(self._places)
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether a work that is started now is begun at once, or as soon as an aside is over."""
+        works = sum(1 for p in self._places if p.job and isinstance(p.job.task, Work))
+        return not self._waiting and works < len(self._places)
+
+    @property
+    def waiting(self) -> int:
+        """How many works wait for a process."""
+        return len(self._waiting)
+
+    @property
+    def under_way(self) -> list[Begun]:
+        """The crossings that are being identified, the one that was begun first first."""
+        now_s = time.monotonic()
+        found = [
+            Begun(place.job.name, now_s - place.began_s)
+            for place in self._places
+            if place.job and isinstance(place.job.task, Work)
+        ]
+        return sorted(found, key=lambda one: -one.seconds)
+
     def start(self, work: Work) -> None:
         """Give a work to a process, as soon as one is free."""
         self._waiting.append(_Job(work))
         self._fill()
+        if self._waiting:
+            self._report(work.crossing_id, "waiting for a process", 0.0)
 
     def finished(self, timeout_s: float = 0.0) -> list[Finished]:
         """What has been done since the last call; see `Execution`."""
@@ -121,6 +155,8 @@ class Processes:
         for place in self._places:
             if place.future is not None and place.future.done():
                 self._take(place, place.future)
+            elif place.job is not None:
+                place.end_if_hung()
         self._fill()
         finished, self._finished = self._finished, []
         return finished
@@ -193,9 +229,16 @@ class Processes:
 class _Place:
     """One process after the other, and what it works on."""
 
-    def __init__(self, report: Report, identify: Identify, prepare: Callable[[], None]) -> None:
+    def __init__(
+        self, report: Report, identify: Identify, prepare: Callable[[], None], limits: Limits
+    ) -> None:
         self._report = report
         self._begin = identify, prepare
+        self._limits = limits
+        self._watch: Watch | None = None
+        self._next_look_s = 0.0
+        self.began_s = 0.0
+        """When the job was given to the process."""
         self.job: _Job | None = None
         self.future: Future[Any] | None = None
         self._open()
@@ -203,6 +246,9 @@ class _Place:
     def begin(self, job: _Job, places: int) -> None:
         """Work on a crossing, with the share of its threads that one of `places` has; or aside."""
         self.job = job
+        self._watch = None
+        self._next_look_s = 0.0
+        self.began_s = time.monotonic()
         task = job.task
         try:
             if isinstance(task, Aside):
@@ -214,6 +260,22 @@ class _Place:
         except BrokenExecutor as error:  # it died while it had nothing to do
             self.future = Future()
             self.future.set_exception(error)
+
+    def end_if_hung(self) -> None:
+        """Kill the process if it takes too much for its job, which then is as if it had died."""
+        now_s = time.monotonic()
+        if now_s < self._next_look_s or not self.is_warm.done() or self.is_warm.exception():
+            return
+        self._next_look_s = now_s + _WATCH_EVERY_S
+        pid = self.is_warm.result()
+        if self._watch is None:
+            self._watch = Watch(pid, self._limits, now_s)
+        why = self._watch.why_hung(now_s)
+        if why and self.job is not None:
+            self._next_look_s = math.inf
+            _log.warning("the process that works on %s %s and is ended", self.job.name, why)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
 
     def renew(self) -> None:
         """Put a new process in the place of one that has died."""
@@ -234,7 +296,7 @@ class _Place:
         self._executor = ProcessPoolExecutor(
             1, mp_context=_SPAWN, initializer=_prepare, initargs=(its_end, self._send, *self._begin)
         )
-        self.is_warm = self._executor.submit(_nothing)
+        self.is_warm = self._executor.submit(os.getpid)
         its_end.close()
         self._reader = threading.Thread(
             target=self._read, args=(receive,), name="progress", daemon=True
@@ -279,10 +341,6 @@ def _end_with(lifeline: Connection) -> None:
         lifeline.recv_bytes()
     except (EOFError, OSError):
         os._exit(1)
-
-
-def _nothing() -> None:
-    """Be done as soon as the process is prepared."""
 
 
 def _identified(work: Work) -> Crossing:

@@ -16,10 +16,9 @@ from schemas.signals import GnssFix, decode_gnss
 from schemas.site import Site
 from schemas.site_file import parse_site
 from services.common.errors import InputError
-from services.common.geodesy import bridge_frame
 from services.history.store import Store
+from services.identification.bridges import Bridges
 from services.identification.known import Known, is_stay_of
-from services.identification.stays import stays_on
 from services.identification.streams import Boot, boot_of
 from services.recordings.recording import read_identities, read_messages, read_site
 
@@ -68,12 +67,13 @@ def _are_known(site: Site, realm: str, vehicle: str, boot: Boot, known: list[Kno
     fixes = boot.fixes()
     if truck is None or not fixes.time_s.size:
         return False
-    for bridge in site.bridges:
-        about = [k for k in known if (k.realm, k.vehicle, k.bridge) == (realm, vehicle, bridge.id)]
-        for stay in stays_on(bridge, bridge_frame(bridge), truck, site.receiver, fixes):
-            entry_ns = boot.wall_time_ns(stay.entry_s)
-            if not any(is_stay_of(one, stay, entry_ns) for one in about):
-                return False
+    bridges = Bridges(site.bridges, site.receiver)
+    for number, stay in bridges.all_stays(truck, fixes):
+        name = (realm, vehicle, bridges.bridge(number).id)
+        about = [k for k in known if (k.realm, k.vehicle, k.bridge) == name]
+        entry_ns = boot.wall_time_ns(stay.entry_s)
+        if not any(is_stay_of(one, stay, entry_ns) for one in about):
+            return False
     return True
 
 

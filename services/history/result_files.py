@@ -6,7 +6,8 @@ results of that file as JSON beside it. Together the files of a folder hold each
 
 import logging
 from collections import Counter, defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ from services.recordings.recording import Message, is_being_written, read_info, 
 from services.recordings.writer import RecordingWriter
 
 _log = logging.getLogger(__name__)
-_KNOWN_AGE_S = 2 * 86_400.0
+KNOWN_AGE_S = 2 * 86_400.0
 """Older files are not read: no truck still sends what they are about."""
 _UNSURE_NS = 60 * NS_PER_S
 """What a run wrote in its last minute may not have reached every subscriber: it was killed, or the
@@ -41,8 +42,19 @@ router was away, which nobody tells a publisher."""
 class ResultFiles:
     """What a run has found, as a recording and as JSON beside it; made with the first message."""
 
-    def __init__(self, path: Path, site_toml: str, header: Header, previous: str | None) -> None:
-        """`previous` is the name of the file of the run before, if any."""
+    def __init__(
+        self,
+        path: Path,
+        site_toml: str,
+        header: Header,
+        previous: str | None,
+        note: Callable[[Key, bytes], None] = lambda key, payload: None,
+    ) -> None:
+        """`previous` is the name of the file of the run before, if any.
+
+        `note` is told of every message that is on the disk.
+        """
+        self._note = note
         self.path = path
         self._site_toml = site_toml
         self._json = GrowingJson(path.with_suffix(".json"), header)
@@ -81,16 +93,29 @@ class ResultFiles:
         self._writer.write(message)
         self._writer.sync()
         self._sequences[message.key] += 1
+        self._note(message.key, message.payload)
         if result is not None:
             self._crossings += 1
             self._json.add(result, bridges)
 
-    def finish(self) -> None:
+    def begin_anew(self, path: Path, site_toml: str, header: Header) -> None:
+        """What is written from now on goes to another file: it belongs to another site file.
+
+        The messages go on where they were. FailureError if this one cannot be closed.
+        """
+        if self._writer is not None:
+            self.finish("another site file")
+            self._previous = self.path.name
+        self.path, self._site_toml = path, site_toml
+        self._json = GrowingJson(path.with_suffix(".json"), header)
+        self._writer, self._crossings = None, 0
+
+    def finish(self, reason: str = "stopped by a signal") -> None:
         """Close the recording of a run that ended well. FailureError if that is not possible."""
         if self._writer is None:
             return
         try:
-            self._writer.finish("stopped by a signal", {"crossings": self._crossings})
+            self._writer.finish(reason, {"crossings": self._crossings})
         except OSError as error:
             self._writer.abandon()
             raise FailureError(f"{self.path}: cannot be ended: {error.strerror}") from error
@@ -101,6 +126,16 @@ class ResultFiles:
         """
         if self._writer is not None:
             self._writer.abandon()
+
+
+def free_results_path(folder: Path) -> Path:
+    """The name of a file for the results of a run, or of a part of it, that begins now."""
+    stem = f"results-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    path, number = folder / f"{stem}.mcap", 2
+    while path.exists():
+        # "_" comes after "." in the order of names, which is that of the runs
+        path, number = folder / f"{stem}_{number}.mcap", number + 1
+    return path
 
 
 class MessageName(NamedTuple):
@@ -174,9 +209,14 @@ class _Read:
 
 
 def read_earlier(
-    folder: Path, realm: str, now_s: float, search: str, fusing: Fusing = NOTHING_STORED
+    folder: Path,
+    realm: str,
+    now_s: float,
+    search: str,
+    fusing: Fusing = NOTHING_STORED,
+    age_s: float = KNOWN_AGE_S,
 ) -> Earlier:
-    """What earlier runs left of a realm in a folder, in the last two days.
+    """What earlier runs left of a realm in a folder, in files that are no older than `age_s`.
 
     `now_s` is the wall clock, `search` tells which results are ours (`search_hash`). A file that
     cannot be read is a warning; one that was cut off is read as far as it goes, and its JSON file
@@ -185,7 +225,7 @@ def read_earlier(
     read = _Read(search, fusing)
     continued: set[str | None] = set()
     tails: list[tuple[_Run, list[Message]]] = []
-    for run in _runs(folder, now_s):
+    for run in _runs(folder, now_s, age_s):
         tail = _read_run(run, realm, read)
         if tail is None:
             continue
@@ -208,10 +248,10 @@ def read_earlier(
     )
 
 
-def _runs(folder: Path, now_s: float) -> Iterator[_Run]:
+def _runs(folder: Path, now_s: float, age_s: float) -> Iterator[_Run]:
     for path in sorted(folder.glob("results-*.mcap")):
         try:
-            if now_s - path.stat().st_mtime > _KNOWN_AGE_S:
+            if now_s - path.stat().st_mtime > age_s:
                 continue
             goes_on = is_being_written(path)
             info = read_info(path)

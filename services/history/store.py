@@ -6,6 +6,7 @@ recordings (`processed`). Both ask what is made here: `Known`, in `services.iden
 
 import logging
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 from schemas.messages import decode
@@ -19,6 +20,8 @@ from services.identification.known import Known, search_hash
 _log = logging.getLogger(__name__)
 _Name = tuple[str, str]
 """Realm and crossing id."""
+_Whose = tuple[str, str, str]
+"""Realm, vehicle and bridge."""
 
 
 class Told(NamedTuple):
@@ -73,9 +76,18 @@ class Store:
     def crossings(self) -> list[Known]:
         """All crossings in order of their entries."""
         for name, known in self._found.items():
+            known.has_other_result = name in self._of_others
             if not known.has_result and name in self._of_others:
                 known.states.clear()
         return sorted(self._found.values(), key=lambda known: known.entry_ns)
+
+    def take_all(self) -> list[Known]:
+        """All crossings of which something has been added since the last call."""
+        crossings = self.crossings()
+        self._found.clear()
+        self._of_others.clear()
+        self._open.clear()
+        return crossings
 
     def _add_state(self, key: Key, message: pb.Crossing) -> None:
         known = self._found.setdefault(
@@ -108,6 +120,58 @@ class Store:
         known.usable = usable(result)
         if known.usable is not None:
             self._open[key.realm, key.identifier] = known
+
+
+class Ledger:
+    """What has been told of crossings so far, by earlier runs and by this one.
+
+    It keeps their names, times and states, and no results. When something was told is by the clock
+    of whoever keeps it: a truck's may be a year behind.
+    """
+
+    def __init__(self, known: Iterable[Known], now_s: float = 0.0) -> None:
+        self._store = Store(None)
+        self._known: dict[_Whose, dict[str, Known]] = {}
+        self._told_s: dict[_Name, float] = {}
+        for one in known:
+            self._put(replace(one, states=set(one.states)), now_s)
+
+    def note(self, key: Key, payload: bytes) -> None:
+        """Take in what is told."""
+        self._store.add(key, payload)
+
+    def settle(self, now_s: float) -> None:
+        """Bring what was noted, now or shortly before, to what was known."""
+        for one in self._store.take_all():
+            before = self._known.get(_whose(one), {}).get(one.crossing_id)
+            if before is not None:
+                one.states |= before.states
+                one.entry_ns = one.entry_ns or before.entry_ns
+                one.exit_ns = max(one.exit_ns, before.exit_ns)
+                one.has_result |= before.has_result
+                one.has_other_result |= before.has_other_result
+            self._put(one, now_s)
+
+    def about(self, realm: str, vehicle: str, bridge: str) -> list[Known]:
+        """What is known of the crossings of a truck and a bridge."""
+        return list(self._known.get((realm, vehicle, bridge), {}).values())
+
+    def forget_told_before(self, time_s: float) -> None:
+        """Forget crossings of which the last was told before a time."""
+        for whose, crossings in list(self._known.items()):
+            for name in [n for n in crossings if self._told_s[whose[0], n] < time_s]:
+                del crossings[name], self._told_s[whose[0], name]
+            if not crossings:
+                del self._known[whose]
+
+    def _put(self, known: Known, now_s: float) -> None:
+        known.last = known.usable = None  # they are large, and nobody asks for them here
+        self._known.setdefault(_whose(known), {})[known.crossing_id] = known
+        self._told_s[known.realm, known.crossing_id] = now_s
+
+
+def _whose(known: Known) -> _Whose:
+    return known.realm, known.vehicle, known.bridge
 
 
 def known_crossings(

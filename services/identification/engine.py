@@ -10,7 +10,7 @@ certificates change in turn.
 
 import contextlib
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 
@@ -33,8 +33,7 @@ from schemas.signals import (
 )
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
-from schemas.vehicle_info import differences
-from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
+from services.common.geodesy import to_chainage
 from services.identification.bridge_state import (
     NOTHING_STORED,
     Fusing,
@@ -43,7 +42,13 @@ from services.identification.bridge_state import (
     count_in,
     usable,
 )
-from services.identification.crossing_data import CrossingData, Window, window
+from services.identification.bridges import AWAY_S, Bridges
+from services.identification.crossing_data import (
+    LONGEST_MARGIN_S,
+    CrossingData,
+    Window,
+    window,
+)
 from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
 from services.identification.outputs import (
     Output,
@@ -53,8 +58,14 @@ from services.identification.outputs import (
     crossing_output,
     state_output,
 )
-from services.identification.remembered import BridgeCrossings, TruckBoot, UnderWay, Waiting
-from services.identification.stays import MERGE_S, Passage, Stay, least_depth_m, stays_on
+from services.identification.remembered import (
+    BridgeCrossings,
+    Found,
+    TruckBoot,
+    UnderWay,
+    Waiting,
+)
+from services.identification.stays import MERGE_S, Passage, Stay
 from services.identification.streams import PATIENCE_S
 from services.identification.traffic import Traffic
 
@@ -69,8 +80,6 @@ MOST_WAITING = 100
 """Crossings that are kept while they wait for a certificate: half a megabyte each, or more."""
 _ROUNDING_S = 1e-6
 """More than is lost when a time in nanoseconds becomes one in seconds."""
-_REACH_M = 50.0
-"""Further away than this from the ends of a bridge no fix changes what happened on it."""
 _Name = tuple[str, str]
 """Realm and bridge."""
 _DECODERS: dict[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]] = {
@@ -87,6 +96,7 @@ class Engine:
 
     It identifies nothing itself: what it yields holds a `Work` for each crossing, whose result is
     to be given to `done`, at any later time and in any order. `services.execution` does that.
+    If it `finds_only`, what it finds is in `found`, and of that nothing is identified.
     `header` says what goes into every estimate, `fusing` how those of a bridge become one. Whoever
     asks for `bridges` at the end only may do without their states on the way (`tells_states`).
 
@@ -105,20 +115,21 @@ class Engine:
         certificates: Mapping[Pair, str] | None = None,
         are_required: bool = False,
         tells_states: bool = True,
+        finds_only: bool = False,
     ) -> None:
         self._states = States(NOTHING_STORED if fusing is None else fusing)
         self._tells_states = tells_states
         self._site = site
         self._settings = settings
         self._header = header
-        self._frames: list[tuple[Bridge, BridgeFrame]] = [
-            (bridge, bridge_frame(bridge)) for bridge in site.bridges
-        ]
+        self._bridges = Bridges(site.bridges, site.receiver)
         self._vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
-        self._traffic = Traffic(self._frames, self._vehicles, least_depth_m(site.receiver))
+        self._traffic = Traffic(self._bridges, self._vehicles)
         self._trucks: dict[tuple[str, str, int], TruckBoot] = {}
         self._newest_boot: dict[tuple[str, str], int] = {}
         self._of_bridge: dict[_Name, BridgeCrossings] = {}
+        self._expected: tuple[bytes, GnssFix] | None = None
+        """The fix that was noted last: as a rule it is fed next, and taken apart once."""
         self._works = 0
         """How many there have been."""
         self._known: dict[tuple[str, str, str], list[Known]] = {}
@@ -128,6 +139,11 @@ class Engine:
         self._wanted: set[Pair] = set()
         self._waiting: deque[Waiting] = deque()
         """In the order in which they were found."""
+        self.found: list[Found] = []
+        self._finds_only = finds_only
+        self.recorded: frozenset[str] = frozenset()
+        """Trucks that a logger records: a crossing that began before the first message of theirs
+        that has come here is in a recording, and is left to who reads that (`take`)."""
         self.unknown_vehicles: set[str] = set()
         """Trucks that the site file does not know; nothing of theirs can be identified."""
 
@@ -161,6 +177,51 @@ class Engine:
         for known in crossings:
             known.last = known.usable = None  # nobody asks for them again, and they are large
 
+    def retarget(
+        self, site: Site, header: Header, fusing: Fusing, certificates: Mapping[Pair, str]
+    ) -> Iterator[Wanted]:
+        """Go on with another site file; nothing must be under way. Yield the certificates wanted.
+
+        What was decided stays decided. Crossings that wait are identified with what the new file
+        says of their truck and bridge; as after a new start the states of bridges begin anew.
+        """
+        before, bridges = self._bridges, Bridges(site.bridges, site.receiver)
+        vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
+        self._site, self._header, self._bridges, self._vehicles = site, header, bridges, vehicles
+        self._states = States(fusing)
+        self._of_bridge.clear()
+        self._traffic.retarget(bridges, vehicles)
+        for name, truck in list(self._trucks.items()):
+            if name[1] in vehicles:
+                truck.retarget(vehicles[name[1]], before, bridges)
+            else:
+                del self._trucks[name]
+        self._certificates = dict(certificates)
+        self._wanted.clear()
+        self.unknown_vehicles.clear()
+        self._waiting = deque(
+            one._replace(work=one.work._replace(data=self._retargeted(one.work.data)))
+            for one in self._waiting
+            if one.work.data.vehicle.id in vehicles and one.work.data.bridge.id in bridges.number
+        )
+        for pair in self.waiting():
+            if not self.is_certified(pair):
+                self._wanted.add(pair)
+                yield Wanted(pair)
+
+    def _retargeted(self, data: CrossingData) -> CrossingData:
+        number = self._bridges.number[data.bridge.id]
+        chainage, _ = to_chainage(
+            self._bridges.frame(number), data.fixes.latitude_deg, data.fixes.longitude_deg
+        )
+        return data._replace(
+            vehicle=self._vehicles[data.vehicle.id],
+            bridge=self._bridges.bridge(number),
+            sensor=self._site.sensor,
+            receiver=self._site.receiver,
+            chainage_m=chainage,
+        )
+
     def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
         """Note where a truck is, as soon as that comes: another one may be on the bridge then.
 
@@ -172,6 +233,7 @@ class Engine:
         if key.owner == "vehicle" and key.stream == "gnss":
             with contextlib.suppress(ValueError):
                 fix = decode_gnss(payload)
+                self._expected = payload, fix
                 self._traffic.note(key.realm, key.identifier, fix, for_ever=for_ever)
 
     def feed(self, key: Key, payload: bytes) -> Iterator[Said]:
@@ -186,6 +248,8 @@ class Engine:
         if vehicle is None:
             self.unknown_vehicles.add(key.identifier)
             return iter(())
+        if self._expected is not None and self._expected[0] is payload:
+            return self._take(key, vehicle, self._expected[1])
         return self._take(key, vehicle, _DECODERS[key.stream](payload))
 
     def _take(
@@ -195,7 +259,7 @@ class Engine:
             return  # its crossings have been decided
         truck = self._truck(key, message.boot_id, vehicle)
         if isinstance(message, VehicleInfo):
-            truck.differences = truck.differences or differences(message.site_toml, vehicle)
+            truck.says(message.site_toml)
         elif isinstance(message, AccelBatch):
             truck.boot.add_accel(message)
             self._forget(truck, message.device_time_ns * 1e-9)
@@ -223,13 +287,12 @@ class Engine:
             if np.isfinite(truck.latest_s):
                 now_s = truck.latest_s
                 wait = (lambda *_: False) if for_good else self._has_hole
-                yield from self._look(realm, truck, self._frames, now_s, wait)
+                yield from self._look(realm, truck, list(truck.near), now_s, wait)
 
     def has_undecided(self, realm: str, vehicle: str) -> bool:
         """Whether a truck is known to have a crossing that is not decided, or may have one."""
         return any(
-            truck.boot.lacks_fixes() or any(truck.is_busy_at(bridge) for bridge, _ in self._frames)
-            for truck in self._boots_of(realm, vehicle)
+            truck.boot.lacks_fixes() or truck.busy_at() for truck in self._boots_of(realm, vehicle)
         )
 
     def _boots_of(self, realm: str, vehicle: str) -> list[TruckBoot]:
@@ -241,13 +304,12 @@ class Engine:
         """Look once at every fix: what is found does not depend on which came together."""
         for fix in truck.boot.settle(all_there_is=all_there_is):
             truck.latest_s = max(truck.latest_s, fix.device_time_ns * 1e-9)
-            bridges = [b for b in self._frames if self._may_change(truck, *b, fix)]
-            yield from self._look(realm, truck, bridges, truck.latest_s)
+            yield from self._look(realm, truck, truck.came_to(self._bridges, fix), truck.latest_s)
             self._forget(truck, truck.latest_s)
 
     def _finish(self, realm: str, truck: TruckBoot) -> Iterator[Said]:
         yield from self._settle(realm, truck, all_there_is=True)
-        yield from self._look(realm, truck, self._frames, np.inf)
+        yield from self._look(realm, truck, list(truck.near), np.inf)
 
     def _forget(self, truck: TruckBoot, now_s: float) -> None:
         truck.began_s = min(truck.began_s, now_s)
@@ -277,22 +339,11 @@ class Engine:
                 yield from self._finish(key.realm, self._trucks.pop(name))
         self._newest_boot[key.realm, key.identifier] = boot_id
 
-    def _may_change(
-        self, truck: TruckBoot, bridge: Bridge, frame: BridgeFrame, fix: GnssFix
-    ) -> bool:
-        """Whether a fix can begin, change or end a stay on a bridge: most are far from it."""
-        here_m, _ = to_chainage(frame, fix.latitude_deg, fix.longitude_deg)
-        reach_m = _REACH_M + 2.0 * least_depth_m(self._site.receiver)
-        side = -1 if here_m < -reach_m else 1 if here_m > bridge.span_m + reach_m else 0
-        before = truck.side.get(bridge.id, side)
-        truck.side[bridge.id] = side
-        return side == 0 or side != before or truck.is_busy_at(bridge)
-
     def _look(
         self,
         realm: str,
         truck: TruckBoot,
-        bridges: list[tuple[Bridge, BridgeFrame]],
+        bridges: list[int],
         now_s: float,
         wait: _Wait | None = None,
     ) -> Iterator[Said]:
@@ -304,10 +355,17 @@ class Engine:
             return
         wait = wait or self._may_still_come
         fixes = truck.boot.fixes()
-        for bridge, frame in bridges:
-            stays = stays_on(bridge, frame, truck.vehicle, self._site.receiver, fixes)
+        for number in sorted(bridges):
+            visit = truck.near.get(number)
+            # A truck may have stood somewhere for minutes: what was before it came is not needed.
+            lately = fixes if visit is None else fixes.since(visit.since_s - AWAY_S)
+            stays = self._bridges.stays(number, truck.vehicle, lately)
+            bridge = self._bridges.bridge(number)
             for stay in stays:
-                yield from self._advance(realm, truck, bridge, stay, now_s, wait)
+                # Which of several beside each other it is on is told when it has left them.
+                is_plain = stay.is_over or not self._bridges.rivals(number)
+                if is_plain or now_s - stay.entry_s >= LONGEST_STAY_S:
+                    yield from self._advance(realm, truck, bridge, stay, now_s, wait)
 
     def _advance(
         self,
@@ -321,6 +379,8 @@ class Engine:
         begins = stay.passage is Passage.BEGINS_ON_BRIDGE
         if begins and stay.entry_s < truck.forgotten_s + _FORGET_EVERY_S:
             return  # what was before has been forgotten; this had been decided before that
+        if self._is_recorded(truck, bridge, stay):
+            return
         crossing_id, is_new = self._identity(realm, truck, bridge, stay)
         if crossing_id in truck.done:
             return
@@ -352,18 +412,88 @@ class Engine:
             told(pb.IDENTIFYING, stay.exit_s) if pb.IDENTIFYING not in said else None,
             told(pb.DONE, stay.exit_s),
         )
+        if self._finds_only:
+            begun = []
+            if pb.DETECTED not in said:  # as it is told while the truck is on the bridge
+                found = stay._replace(passage=Passage.ENDS_ON_BRIDGE)
+                begun.append(told(pb.DETECTED, stay.entry_s))
+                found = stay
+            if pb.COMPLETE not in said:
+                begun.append(told(pb.COMPLETE, stay.exit_s))
+            times = (truck.boot.wall_time_ns(t) for t in (stay.entry_s, stay.exit_s))
+            self.found.append(Found(tuple(begun), waiting, *times))
+            return
         pair = Pair(truck.vehicle.id, bridge.id)
-        if self._is_certified(pair) and pair not in self.waiting():
+        if self.is_certified(pair) and pair not in self.waiting():
             yield from self._begun(waiting)
             return
-        if not self._is_certified(pair) and pb.WAITING_NOT_VALIDATED not in said:
+        if not self.is_certified(pair) and pb.WAITING_NOT_VALIDATED not in said:
             yield told(pb.WAITING_NOT_VALIDATED, stay.exit_s)
         self._keep(waiting)
-        if not self._is_certified(pair) and pair not in self._wanted:
+        if not self.is_certified(pair) and pair not in self._wanted:
             self._wanted.add(pair)
             yield Wanted(pair)
 
-    def _is_certified(self, pair: Pair) -> bool:
+    def _is_recorded(self, truck: TruckBoot, bridge: Bridge, stay: Stay) -> bool:
+        """Whether the beginning of a crossing has not come here and is in a recording."""
+        begin_s, _ = self._window(truck, bridge, stay)
+        return truck.vehicle.id in self.recorded and truck.boot.is_cut_off_at(begin_s)
+
+    def has_in_hand(
+        self, realm: str, vehicle: str, boot_id: int, bridge: str, entry_s: float
+    ) -> bool:
+        """Whether a stay whose entry is at `entry_s` on its truck's clock is found here, too.
+
+        It is if the messages around it came from the truck itself: then it has been decided, or
+        will be.
+        """
+        truck = self._trucks.get((realm, vehicle, boot_id))
+        if truck is None or entry_s < max(truck.forgotten_s + _FORGET_EVERY_S, truck.began_s):
+            return False
+        number = self._bridges.number.get(bridge)
+        if number is None:
+            return True  # of another site file
+        before = LONGEST_MARGIN_S if vehicle in self.recorded else 0.0
+        return not truck.boot.is_cut_off_at(entry_s - before)
+
+    def take(self, found: Found, others: Iterable[str] = ()) -> Iterator[Said]:
+        """Take in a crossing that was found in a recording; `others` were on the bridge, too.
+
+        What the trucks themselves send of it from now on is no other crossing.
+        """
+        work = found.waiting.work
+        data = work.data
+        crossings = self._known.setdefault((data.realm, data.vehicle.id, data.bridge.id), [])
+        for known in crossings:
+            if known.crossing_id == work.crossing_id:
+                known.is_taken = True
+                break
+        else:
+            crossings.append(
+                Known(
+                    *(data.realm, data.vehicle.id, data.bridge.id, work.crossing_id),
+                    *(found.entry_ns, found.exit_ns),
+                    is_taken=True,
+                )
+            )
+        seen = self._traffic.others(
+            data.realm, data.bridge.id, data.vehicle.id, found.entry_ns, found.exit_ns
+        )
+        against = data.against
+        if names := sorted({*seen, *others}):
+            _log.warning("%s: %s was on the bridge as well", work.crossing_id, ", ".join(names))
+            against = tuple(dict.fromkeys((*against, Reason.OTHER_TRUCK_ON_BRIDGE)))
+        self._works += 1
+        work = work._replace(number=self._works, data=data._replace(against=against))
+        yield from found.told
+        yield from self._begun(found.waiting._replace(work=work))
+
+    def ids_in_hand(self) -> set[str]:
+        """The crossings that are being identified or wait for it."""
+        under_way = {u.work.crossing_id for b in self._of_bridge.values() for u in b.under_way}
+        return under_way.union(one.work.crossing_id for one in self._waiting)
+
+    def is_certified(self, pair: Pair) -> bool:
         """Whether its crossings may be identified."""
         return not self._are_required or pair in self._certificates
 
@@ -371,8 +501,8 @@ class Engine:
         self._waiting.append(waiting)
         if len(self._waiting) > MOST_WAITING:
             _log.warning(
-                "%s has waited too long for a certificate and is given up here: `driveby identify` "
-                "gives its result from the logger's recording",
+                "%s has waited too long for a certificate and is given up here: it is taken from "
+                "the logger's recording later, or `driveby identify` gives its result from there",
                 self._waiting.popleft().work.crossing_id,
             )
 
@@ -383,6 +513,16 @@ class Engine:
             found.setdefault(_pair(one.work), []).append(one.work.crossing_id)
         return found
 
+    def pairs_that_wait(self) -> list[Pair]:
+        """Pairs with crossings that wait: with most first, of as many the one found last first."""
+        count: Counter[Pair] = Counter()
+        latest: dict[Pair, int] = {}
+        for number, one in enumerate(self._waiting):
+            pair = _pair(one.work)
+            count[pair] += 1
+            latest[pair] = number
+        return sorted(count, key=lambda pair: (-count[pair], -latest[pair]))
+
     def certify(self, pair: Pair, certificate: str) -> None:
         """Take the hash of a pair's certificate, which has passed: `release` its crossings."""
         self._certificates[pair] = certificate
@@ -390,7 +530,7 @@ class Engine:
     @property
     def has_released(self) -> bool:
         """Whether a crossing that waited may go on."""
-        return any(self._is_certified(_pair(one.work)) for one in self._waiting)
+        return any(self.is_certified(_pair(one.work)) for one in self._waiting)
 
     def release(self) -> Iterator[Said]:
         """Let the first crossing go on that has waited and need not any more, if there is one.
@@ -398,7 +538,7 @@ class Engine:
         One at a time: who asks goes on listening in between.
         """
         for place, one in enumerate(self._waiting):
-            if self._is_certified(_pair(one.work)):
+            if self.is_certified(_pair(one.work)):
                 del self._waiting[place]
                 yield from self._begun(one)
                 return
@@ -487,7 +627,7 @@ class Engine:
             if is_stay_of(known, stay, wall_ns):
                 truck.detected[bridge.id, stay.entry_s] = known.crossing_id
                 truck.said[known.crossing_id] = known.states
-                if known.is_identified:
+                if known.is_identified or known.is_taken:
                     truck.done.add(known.crossing_id)
                 return known.crossing_id, True
         moment = datetime.fromtimestamp(wall_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]
@@ -498,7 +638,7 @@ class Engine:
     def _data(
         self, realm: str, truck: TruckBoot, bridge: Bridge, stay: Stay, crossing_id: str
     ) -> CrossingData:
-        frame = {b.id: f for b, f in self._frames}[bridge.id]
+        frame = self._bridges.frame(self._bridges.number[bridge.id])
         fixes = truck.boot.fixes()
         chainage, _ = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
         entry_ns = round(stay.entry_s * 1e9)
@@ -531,7 +671,7 @@ class Engine:
             reasons.append(Reason.VEHICLE_DIFFERS_FROM_SITE)
         wall_ns = truck.boot.wall_time_ns
         others = self._traffic.others(
-            realm, bridge, truck.vehicle.id, wall_ns(stay.entry_s), wall_ns(stay.exit_s)
+            realm, bridge.id, truck.vehicle.id, wall_ns(stay.entry_s), wall_ns(stay.exit_s)
         )
         if others:
             _log.warning("%s: %s was on the bridge as well", crossing_id, ", ".join(others))

@@ -36,6 +36,10 @@ class Known:
     """By the search that was asked for."""
     usable: Usable | None = None
     """What of the result counts in the state of the bridge."""
+    has_other_result: bool = False
+    """By another search or site file."""
+    is_taken: bool = False
+    """It is being identified from a recording: who finds it once more has nothing to do."""
     is_in_state: bool = False
     """A state of the bridge that takes account of it was told."""
 

@@ -8,12 +8,21 @@ import numpy as np
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing
-from schemas.site import Bridge, Vehicle
-from schemas.vehicle_info import Difference
+from schemas.signals import GnssFix
+from schemas.site import Vehicle
+from schemas.vehicle_info import Difference, differences
 from services.identification.bridge_state import Counted
+from services.identification.bridges import AWAY_S, Bridges
 from services.identification.outputs import Output, Work
 from services.identification.stays import MERGE_S
 from services.identification.streams import Boot
+
+
+class Visit(NamedTuple):
+    """A while in which a truck is near a bridge, on its own clock."""
+
+    since_s: float
+    last_s: float
 
 
 class TruckBoot:
@@ -36,22 +45,55 @@ class TruckBoot:
         """Bridge, times of the fixes around it, and id of each crossing that is decided."""
         self.said: dict[str, set[pb.CrossingState]] = {}
         """By crossing id: states that an earlier run of the worker has told."""
-        self.side: dict[str, int] = {}
-        """By bridge: far before its start (-1), far behind its end (1), or near (0)."""
+        self.place: tuple[float, float, float] | None = None
+        """Time, latitude and longitude of the latest fix."""
+        self.near: dict[int, Visit] = {}
+        """By number of the bridge: those that it came to within what is remembered."""
+        self._said_toml: str | None = None
         self.differences: list[Difference] = []
         """Where it says of itself what the site file does not say of it."""
 
-    def is_busy_at(self, bridge: Bridge) -> bool:
-        """Whether a crossing of this bridge has begun and is not decided yet."""
-        return any(
-            known_bridge == bridge.id and crossing_id not in self.done
-            for (known_bridge, _), crossing_id in self.detected.items()
-        )
+    def says(self, site_toml: str) -> None:
+        """Take in what the truck says of itself; the first time that it differs counts."""
+        if not self.differences:
+            self._said_toml = site_toml
+            self.differences = differences(site_toml, self.vehicle)
+
+    def retarget(self, vehicle: Vehicle, before: Bridges, bridges: Bridges) -> None:
+        """The truck and the bridges are those of another site file now."""
+        self.vehicle = vehicle
+        ids = {before.bridge(number).id: visit for number, visit in self.near.items()}
+        self.near = {bridges.number[i]: v for i, v in ids.items() if i in bridges.number}
+        gone = {name: one for name, one in self.detected.items() if name[0] not in bridges.number}
+        self.detected = {name: one for name, one in self.detected.items() if name not in gone}
+        self.differences = []
+        if self._said_toml is not None:
+            self.says(self._said_toml)
+
+    def busy_at(self) -> set[str]:
+        """The bridges of which a crossing has begun and is not decided yet."""
+        return {bridge for (bridge, _), name in self.detected.items() if name not in self.done}
+
+    def came_to(self, bridges: Bridges, fix: GnssFix) -> list[int]:
+        """Note a fix; return the numbers of the bridges at which it may change something."""
+        now_s = fix.device_time_ns * 1e-9
+        here = (now_s, fix.latitude_deg, fix.longitude_deg)
+        before, self.place = self.place or here, here
+        busy = {bridges.number[bridge] for bridge in self.busy_at()}
+        found = bridges.between(*before[1:], *here[1:])
+        for number in found:
+            visit = self.near.get(number)
+            if visit is None or (now_s - visit.last_s > AWAY_S and number not in busy):
+                visit = Visit(before[0], now_s)  # it may have jumped over it since then
+            self.near[number] = Visit(min(visit.since_s, now_s), max(visit.last_s, now_s))
+        return sorted(busy.union(found)) if busy else found
 
     def forget_before(self, time_s: float) -> None:
         """Forget samples, fixes and crossings that are decided: no stay is found there again."""
         self.forgotten_s = time_s
         self.boot.forget_before(time_s)
+        busy = self.busy_at()
+        self.near = {n: v for n, v in self.near.items() if v.last_s >= time_s or busy}
         self.decided = [one for one in self.decided if one[2] >= time_s]
         kept = {crossing_id for *_, crossing_id in self.decided}
         self.detected = {
@@ -79,6 +121,17 @@ class Waiting(NamedTuple):
     identifying: Output | None
     """What is told when it goes on; None if an earlier run has told it."""
     done: Output
+
+
+class Found(NamedTuple):
+    """A crossing whose data are all there, found in a recording by an engine of its own."""
+
+    told: tuple[Output, ...]
+    """That it was detected and is complete, as far as earlier runs have not told it."""
+    waiting: Waiting
+    entry_ns: int
+    """Since 1970 UTC."""
+    exit_ns: int
 
 
 @dataclass

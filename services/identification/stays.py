@@ -9,12 +9,12 @@ through, or further onto the bridge than noise reaches, is a stay.
 """
 
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.site import Bridge, Receiver, Vehicle
+from schemas.site import Bridge, Receiver
 from services.common.geodesy import BridgeFrame, to_chainage
 from services.identification.streams import Fixes
 
@@ -27,6 +27,10 @@ MERGE_S = 5.0
 """Two entries less than this apart are one crossing (docs/contract.md)."""
 MARGIN_M = 3.0
 """More than a usable receiver's noise between two fixes."""
+_LARGEST_SLOPE = 0.2
+"""Who moves aside by more than this share of what he drives along a bridge (11 degrees), and by
+more than a lane, is on a road across it, above or below."""
+_LANE_M = 3.5
 STANDING_M_PER_S = 0.5
 """Below it the positions move by their noise, not by driving."""
 
@@ -51,6 +55,15 @@ class Stay(NamedTuple):
     """False: the truck is on the bridge in the last fix."""
 
 
+class Car(Protocol):
+    """What is needed of a truck; `schemas.site.Vehicle` has it."""
+
+    @property
+    def wheelbase_m(self) -> float: ...  # noqa: D102
+    @property
+    def gps_antenna_to_front_axle_m(self) -> float: ...  # noqa: D102
+
+
 class _Places(NamedTuple):
     """Where the truck was at each fix (m,)."""
 
@@ -67,9 +80,12 @@ def least_depth_m(receiver: Receiver) -> float:
 
 
 def stays_on(
-    bridge: Bridge, frame: BridgeFrame, vehicle: Vehicle, receiver: Receiver, fixes: Fixes
+    bridge: Bridge, frame: BridgeFrame, vehicle: Car, receiver: Receiver, fixes: Fixes
 ) -> list[Stay]:
-    """All stays of a truck on a bridge of the site file: the one way from fixes to stays."""
+    """All stays of a truck on one bridge: the one way from fixes to stays.
+
+    Whether it was on another one beside it is told by `bridges`.
+    """
     chainage_m, lateral_m = to_chainage(frame, fixes.latitude_deg, fixes.longitude_deg)
     return find_stays(
         fixes.time_s,
@@ -126,7 +142,8 @@ def find_stays(
                 deep = np.minimum(np.maximum(axle, other), span_m - np.minimum(axle, other))
                 deep_m = float(deep.max())
             was_on_it = deep_m >= min(margin_m, 0.25 * (span_m + wheelbase_m))
-            if was_on_it and _is_near(lateral_m, places, n, stop, stay):
+            is_near = _is_near(lateral_m, places, n, stop, stay)
+            if was_on_it and is_near and _is_along(lateral_m, front, n, stop, span_m):
                 stays.append(stay)
     return _merged(stays)
 
@@ -218,6 +235,20 @@ def _is_near(lateral_m: Floats, places: _Places, start: int, stop: int, stay: St
         return bool(beside.max() <= CORRIDOR_M)
     came_in = np.abs(lateral_m[[before, start]]).min()
     return bool(max(came_in, np.median(beside)) <= CORRIDOR_M)
+
+
+def _is_along(lateral_m: Floats, front_m: Floats, start: int, stop: int, span_m: float) -> bool:
+    """Whether the truck drove along the bridge's line and not across it, as far as it has come."""
+    along, aside = front_m[start:stop], lateral_m[start:stop]
+    if along.size < 2 or np.ptp(along) < 0.3 * span_m:
+        return True
+    beyond = along > 0.5 * (along.min() + along.max())  # by place: a truck may stand for long
+    if min(beyond.sum(), (~beyond).sum()) < 3:
+        return True
+    # Medians: a single wild fix is no way across.
+    came_m = float(np.median(along[beyond]) - np.median(along[~beyond]))
+    moved_m = abs(float(np.median(aside[beyond]) - np.median(aside[~beyond])))
+    return moved_m * span_m <= came_m * (_LARGEST_SLOPE * span_m + _LANE_M)
 
 
 def _merged(stays: list[Stay]) -> list[Stay]:

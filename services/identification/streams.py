@@ -38,6 +38,12 @@ class Fixes(NamedTuple):
     latitude_deg: Floats
     longitude_deg: Floats
     speed_m_per_s: Floats
+    altitude_m: Floats
+
+    def since(self, time_s: float) -> "Fixes":
+        """Those from a time on."""
+        first = int(np.searchsorted(self.time_s, time_s))
+        return Fixes(*(column[first:] for column in self))
 
 
 class Samples(NamedTuple):
@@ -69,19 +75,23 @@ class Boot:
         """Those that came before one that is missing."""
         self._next_fix = 0
         self._fresh: list[GnssFix] = []
-        self._columns: Floats = np.empty((4, 0))
+        self._columns: Floats = np.empty((len(Fixes._fields), 0))
         """Known fixes as `fixes` gives them, but for the fresh ones: thousands, asked for often."""
         self._forgotten_ns = -1
+        self._first_accel = self._first_fix = (1 << 64, 0)
+        """Sequence and time of the earliest message that has come."""
         self._channels: set[str] = set()
 
     def add_accel(self, batch: AccelBatch) -> None:
         """Take a batch in; one that is here already is ignored."""
+        self._first_accel = min(self._first_accel, (batch.sequence, batch.device_time_ns))
         if batch.device_time_ns >= self._forgotten_ns:
             self._batches.setdefault(batch.sequence, batch)
             self._channels.update(batch.channels)
 
     def add_fix(self, fix: GnssFix) -> None:
         """Take a fix in; one that is here already is ignored. `settle` makes it known."""
+        self._first_fix = min(self._first_fix, (fix.sequence, fix.device_time_ns))
         if fix.sequence >= self._next_fix:
             self._waiting.setdefault(fix.sequence, fix)
         elif fix.device_time_ns >= self._forgotten_ns and fix.sequence not in dict(self._fixes):
@@ -105,6 +115,16 @@ class Boot:
             self._fixes.append((sequence, fix))
             self._fresh.append(fix)
             yield fix
+
+    def is_cut_off_at(self, time_s: float) -> bool:
+        """Whether the truck made messages between a time and the first that has come of a stream.
+
+        A history that goes back to the first of a boot is not cut off.
+        """
+        return any(
+            sequence > 0 and first_ns > time_s * NS_PER_S
+            for sequence, first_ns in (self._first_accel, self._first_fix)
+        )
 
     def lacks_fixes(self) -> bool:
         """Whether fixes that have come wait for one before them that has not."""
@@ -133,7 +153,8 @@ class Boot:
             batch = self._batches[sequence]
             if batch.device_time_ns <= start_ns:
                 begin = sequence
-            if _end_ns(batch) >= stop_ns:
+            is_late = batch.device_time_ns + 1.01 * MAX_BATCH_S * NS_PER_S >= stop_ns
+            if is_late and _end_ns(batch) >= stop_ns:  # seldom asked: it takes time
                 stop = sequence
                 break
         if stop < 0:
@@ -161,7 +182,13 @@ class Boot:
         """All settled fixes in order of time."""
         if self._fresh:
             rows = [
-                (f.device_time_ns / NS_PER_S, f.latitude_deg, f.longitude_deg, f.speed_m_per_s)
+                (
+                    f.device_time_ns / NS_PER_S,
+                    f.latitude_deg,
+                    f.longitude_deg,
+                    f.speed_m_per_s,
+                    f.altitude_m,
+                )
                 for f in self._fresh
             ]
             self._fresh.clear()

@@ -74,6 +74,7 @@ _FIX_RATE_HZ = 10.0
 SLOW_ERROR_S = 300.0
 """A receiver's slow error is forgotten within minutes: a crossing sees it as almost constant."""
 _ALTITUDE_M = 25.0
+"""Of a bridge whose altitude the site file does not tell."""
 BETWEEN_RUNS_S = 600.0
 """From the beginning of a run to that of the next."""
 
@@ -416,6 +417,13 @@ def _receiver(site: Site, *, perfect: bool) -> Receiver:
     )
 
 
+def _altitude_m(bridge: Bridge, chainage_m: Floats) -> Floats:
+    """Of the road: level but for the bridge, if the altitudes of its ends are known."""
+    ends = [a for a in (bridge.start_altitude_m, bridge.end_altitude_m) if a is not None]
+    low, high = (ends[0], ends[-1]) if ends else (_ALTITUDE_M, _ALTITUDE_M)
+    return np.interp(chainage_m, [0.0, bridge.span_m], [low, high])
+
+
 def _fixes(
     bridge: Bridge,
     step_s: float,
@@ -435,7 +443,7 @@ def _fixes(
         START_TIME_S + fixes.time_s,
         latitude,
         longitude,
-        np.full(latitude.size, _ALTITUDE_M),
+        _altitude_m(bridge, fixes.chainage_m),
         fixes.speed_m_per_s,
         np.full(latitude.size, heading_deg(frame, start_to_end=forward)),
     )

@@ -29,6 +29,7 @@ from services.viewer.crossing_view import (
     CrossingView,
     Elements,
     FloatArray,
+    comparison_of,
     elements_of_result,
     summary_line,
     view_of_crossing,
@@ -41,7 +42,7 @@ from services.viewer.live_layout import (
     trend_root,
 )
 from services.viewer.live_parts import Dated, extremes, log_roads, log_trend, log_trend_look
-from services.viewer.rerun_crossing import comparison_of, log_rigidity
+from services.viewer.rerun_crossing import log_rigidity
 from services.viewer.rerun_file import acceleration_series
 from services.viewer.rerun_parts import (
     CHANNEL_COLOURS,

@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from services.viewer.crossing_view import CrossingView, FloatArray, ResidualCells
-from services.viewer.rerun_parts import log_labels
+from services.viewer.rerun_parts import Stream, log_labels
 
 RESIDUALS_BOUNDS = ((-2.8, 4.2), (-1.3, 10.7))
 """What the view shows of x and y."""
@@ -25,7 +25,7 @@ _GAP = 0.3
 """Between the kinds."""
 
 
-def log_residuals(recording: rr.RecordingStream, root: str, crossing: CrossingView) -> None:
+def log_residuals(recording: Stream, root: str, crossing: CrossingView) -> None:
     """The mean square of each cell over what the declared noise explains, if it is known."""
     if crossing.residuals is None:
         return

@@ -5,7 +5,7 @@ before it is on the bus, so the results files know all that anybody may have hea
 those of the runs before: what the bus may not have got it publishes again as it was, identity and
 all; what was about to be said it says; and a crossing that has a result is not identified again.
 One that has none is found again in what its truck still keeps (`cache` in the table of topics: the
-last five minutes).
+last five minutes), or in the recordings that a logger made of it (`catching_up`).
 
 Real crossings (realm `live`) are identified only where simulated ones of the same truck on the same
 bridge have shown that the method recovers what was put in: until then they wait (`certificates`).
@@ -17,11 +17,12 @@ import contextlib
 import logging
 import math
 import queue
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import zenoh
 
@@ -49,16 +50,26 @@ from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
 from services.execution.dispatch import Execution, awaited, collected, dispatched
 from services.execution.processes import Processes
+from services.execution.watch import LIMIT_S, Limits
 from services.history.baselines import baselines_of
 from services.history.certificates import found_in
-from services.history.result_files import Earlier, ResultFiles, read_earlier
+from services.history.result_files import (
+    KNOWN_AGE_S,
+    Earlier,
+    ResultFiles,
+    free_results_path,
+    read_earlier,
+)
+from services.history.store import Ledger
 from services.identification.bridge_state import Fusing
 from services.identification.engine import Engine
 from services.identification.known import search_hash
-from services.identification.outputs import Output
+from services.identification.outputs import Output, Said
 from services.recordings.recording import Message, program_version
 from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
+from services.worker.catching_up import DAYS, MARGIN_S, CatchingUp, Source
 from services.worker.certificates import Certificates
+from services.worker.site_watch import Edited, SiteWatch
 
 __all__ = ["run"]
 
@@ -69,10 +80,37 @@ _POLL_S = 0.1
 _LONGEST_QUEUE = 200_000
 """Messages: two hours of one truck, or a minute of a hundred. Then publishers wait."""
 _LONGEST_NOTE = 1000
+_SOONEST_HEALTH_S = 5.0
+"""Who waits and what is identified may change many times a second: so often it is told at most."""
 _MOST_NAMED = 10
 """Crossings in one line of the log."""
+_CATCH_UP_EVERY_S = 0.2
 _CONNECT_S = 1.0
 """An attempt is so short that a signal is heard between two."""
+
+
+class Editing(NamedTuple):
+    """How an edited site file is noticed, and what is done with it."""
+
+    watch: SiteWatch
+    asked: threading.Event
+    """Somebody asks to read it again."""
+    retarget: Callable[[Edited], Iterator[Said]]
+
+    def edited(self, now_s: float) -> Edited | None:
+        """The site file, if it was edited since the last call."""
+        is_asked = self.asked.is_set()
+        self.asked.clear()
+        return self.watch.edited(now_s, is_asked=is_asked)
+
+
+class _Backlog(NamedTuple):
+    """What is not identified yet: how long it is under way does not change it."""
+
+    under_way: tuple[str, ...]
+    waiting: int
+    waiting_for_certificate: int
+    in_recordings: int
 
 
 def run(
@@ -87,8 +125,11 @@ def run(
     ready: Callable[[], None] | None = None,
     tls: Path | None = None,
     processes: int = 1,
+    limit_s: float = LIMIT_S,
     certificates: Path | None = None,
     validate: bool | None = None,
+    recordings: Path | None = None,
+    recordings_days: float = DAYS,
 ) -> int:
     """Identify all crossings of a realm until SIGINT or SIGTERM; return 0.
 
@@ -96,11 +137,14 @@ def run(
     What earlier runs left in that folder is taken up, unless this run has a `file` of its own or
     the realm is one of replays. Waits for the router for ever. `ready` is called once, when the
     worker listens. `tls` is a folder of credentials, see `open_session`. Crossings are identified
-    in so many `processes` beside this one.
+    in so many `processes` beside this one; one that takes more than `limit_s` of processor time
+    for a crossing is ended.
 
     A crossing whose vehicle and bridge have no certificate in the folder `certificates` (by default
     one in `folder`) waits for one, which is made meanwhile: if `validate` says so, or says nothing
     and the realm is `live`.
+    What nobody sends any more is taken from the logger's `recordings` (by default in `folder`) of
+    the last so many days, unless this run has a `file` of its own or the realm is one of replays.
     InputError: a bad site file, realm or id, or a method that has no certificates. FailureError: a
     result or a certificate cannot be written.
     """
@@ -124,11 +168,22 @@ def run(
     )
     fusing = Fusing(baselines_of(known, site.parent))
     earlier = Earlier()
+    catches_up, age_s = False, 0.0
+    watch: SiteWatch | None = None
     if file is None:
-        moment = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-        file = folder / realm / f"results-{moment}.mcap"
+        file = free_results_path(folder / realm)
+        watch = SiteWatch(site, known)  # a file of its own has room for one site file
         if not is_replayed(realm):
-            earlier = read_earlier(folder / realm, realm, time.time(), search_hash(header), fusing)
+            catches_up = recordings_days > 0.0
+            age_s = recordings_days * 86_400.0
+            earlier = read_earlier(
+                folder / realm,
+                realm,
+                time.time(),
+                search_hash(header),
+                fusing,
+                max(KNOWN_AGE_S, age_s + MARGIN_S) if catches_up else KNOWN_AGE_S,
+            )
     check_folder_writable(file.parent)
     if file.exists():
         raise InputError(f"{file}: exists, and results are never overwritten; give another name")
@@ -138,14 +193,17 @@ def run(
         check_folder_writable(certificates)
     elif realm == "live":
         _log.warning("--no-certificates: crossings count that nobody has validated")
-    files = ResultFiles(file, text, header, earlier.previous)
+    ledger = Ledger(earlier.crossings, time.time())
+    files = ResultFiles(file, text, header, earlier.previous, ledger.note)
     # A second signal: what was published is on the disk, and the next run takes it up.
     with stopped_by_signals(leave_at_once) as stop, contextlib.ExitStack() as stack:
 
         def report(crossing_id: str, stage: str, fraction: float) -> None:
             _say_progress(publisher, service_id, crossing_id, stage, fraction)
 
-        execution = stack.enter_context(Processes(processes, report=report))
+        execution = stack.enter_context(
+            Processes(processes, report=report, limits=Limits(processor_s=limit_s))
+        )
         bus = _connected(endpoint, tls, stop)
         if bus is None:
             return 0
@@ -160,6 +218,11 @@ def run(
             are_required=are_required,
         )
         certified = Certificates(certificates, known, settings, execution)
+        catching_up = None
+        if catches_up:
+            source = Source(recordings or folder, realm, age_s)
+            catching_up = CatchingUp(source, known, settings, header, ledger)
+            stack.callback(catching_up.close)
         execution.wait_until_warm()
         arrivals: _Queue = queue.Queue(_LONGEST_QUEUE)
         closing, failed = threading.Event(), threading.Event()
@@ -175,9 +238,32 @@ def run(
             _resume(engine, earlier, publisher, files)
             del earlier  # of two days
             receiver.start()
-            _serve(
-                engine, execution, certified, arrivals, publisher, service_id, files, stop, ready
-            )
+
+            def retarget(edited: Edited) -> Iterator[Said]:
+                now = header._replace(created=time.time(), site_hash=edited.hash)
+                found = found_in(certificates, edited.site, settings)
+                path = free_results_path(files.path.parent)
+                files.begin_anew(path, edited.text, now)
+                certified.retarget(edited.site)
+                if catching_up is not None:
+                    catching_up.retarget(edited.site, now)
+                _log.info("%s was edited: %s counts now, results in %s", site, edited.hash, path)
+                yield from engine.retarget(edited.site, now, Fusing(edited.baselines), found)
+
+            with _asked_by_hangup() as asked:
+                _serve(
+                    engine,
+                    execution,
+                    certified,
+                    arrivals,
+                    publisher,
+                    service_id,
+                    files,
+                    stop,
+                    ready,
+                    catching_up,
+                    None if watch is None else Editing(watch, asked, retarget),
+                )
         except BaseException:
             files.abandon()
             raise
@@ -305,9 +391,8 @@ def _resume(engine: Engine, earlier: Earlier, publisher: Publisher, files: Resul
     ]
     if waited:
         _log.warning(
-            "%d crossings waited for a certificate when an earlier run ended (%s): those that "
-            "their trucks still have go on, for the others `driveby identify` reads the logger's "
-            "recording",
+            "%d crossings waited for a certificate when an earlier run ended (%s): they go on if "
+            "their trucks still have them or they are in the logger's recordings",
             *(len(waited), ", ".join(waited[-_MOST_NAMED:])),
         )
 
@@ -322,6 +407,8 @@ def _serve(
     files: ResultFiles,
     stop: threading.Event,
     ready: Callable[[], None] | None,
+    catching_up: CatchingUp | None = None,
+    editing: Editing | None = None,
 ) -> None:
     """Identify until `stop`, and then what nobody would give to the next run.
 
@@ -329,7 +416,8 @@ def _serve(
     """
     arrivals = Arrivals()
     told: set[str] = set()
-    next_health_s = 0.0
+    next_health_s = soonest_health_s = next_catch_up_s = 0.0
+    told_backlog: _Backlog | None = None
     leave_at_s = math.inf
     want = certificates.want
     progress: tuple[Pair, float] | None = None
@@ -340,10 +428,17 @@ def _serve(
     while now_s < leave_at_s and (
         not stop.is_set() or not queued.empty() or _may_lose(engine, arrivals)
     ):
-        if time.monotonic() >= next_health_s or certificates.has_news:
-            next_health_s = time.monotonic() + HEALTH_PERIOD_S
-            certificates.has_news = False
-            _say_health(publisher, service_id, queued.qsize(), certificates.note)
+        if time.monotonic() >= soonest_health_s or certificates.has_news:
+            soonest_health_s = time.monotonic() + _SOONEST_HEALTH_S
+            backlog = _backlog(engine, execution, catching_up)
+            is_due = time.monotonic() >= next_health_s or certificates.has_news
+            if is_due or backlog != told_backlog:
+                next_health_s = time.monotonic() + HEALTH_PERIOD_S
+                certificates.has_news = False
+                told_backlog = backlog
+                _say_health(
+                    publisher, service_id, queued.qsize(), backlog, execution, certificates.note
+                )
         batch: list[Arrived] = []
         one = _next(queued)
         # After a long identification the queue holds what came meanwhile: whether a truck has gone
@@ -374,7 +469,8 @@ def _serve(
             _publish(dispatched(engine, execution, said, want), engine, publisher, files)
         _publish(collected(engine, execution), engine, publisher, files)
         if not stop.is_set():
-            for pair, digest in certificates.advance(time.monotonic()).items():
+            passed = certificates.advance(time.monotonic(), engine.pairs_that_wait)
+            for pair, digest in passed.items():
                 engine.certify(pair, digest)
             if certificates.progress not in (None, progress):
                 progress = certificates.progress
@@ -383,6 +479,22 @@ def _serve(
             if engine.has_released and not execution.is_full:
                 released = dispatched(engine, execution, engine.release(), want)
                 _publish(released, engine, publisher, files)
+            if catching_up is not None and time.monotonic() >= next_catch_up_s:
+                next_catch_up_s = time.monotonic() + _CATCH_UP_EVERY_S
+                said = catching_up.advance(
+                    engine,
+                    time.monotonic(),
+                    has_room=execution.is_idle and not engine.has_released,
+                    want=want,
+                )
+                _publish(dispatched(engine, execution, said, want), engine, publisher, files)
+        edited = None if stop.is_set() or editing is None else editing.edited(time.monotonic())
+        if editing is not None and edited is not None:
+            # Every result belongs to one site file: what is under way still to that of before.
+            _publish(awaited(engine, execution), engine, publisher, files)
+            said = editing.retarget(edited)
+            _publish(dispatched(engine, execution, said, want), engine, publisher, files)
+            told.clear()
         for vehicle in engine.unknown_vehicles - told:
             told.add(vehicle)
             _log.warning("%s drives, but the site file has no such vehicle", vehicle)
@@ -390,10 +502,24 @@ def _serve(
     waiting = [name for names in engine.waiting().values() for name in names]
     if waiting:
         _log.warning(
-            "%d crossings still wait for a certificate (%s): the next run gets them if their "
-            "trucks still have them, else `driveby identify` reads the logger's recording",
+            "%d crossings still wait for a certificate (%s): the next run gets them from their "
+            "trucks, or from the logger's recordings",
             *(len(waiting), ", ".join(waiting[-_MOST_NAMED:])),
         )
+
+
+@contextlib.contextmanager
+def _asked_by_hangup() -> Iterator[threading.Event]:
+    """An event that SIGHUP sets, which asks to read the site file again."""
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+    before = signal.signal(signal.SIGHUP, lambda number, frame: asked.set())
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def _next(queued: _Queue) -> Arrived | Token | None:
@@ -409,7 +535,10 @@ def _may_lose(engine: Engine, arrivals: Arrivals) -> bool:
 
 
 def _publish(
-    outputs: Iterable[Output], engine: Engine, publisher: Publisher, files: ResultFiles
+    outputs: Iterable[Output],
+    engine: Engine,
+    publisher: Publisher,
+    files: ResultFiles,
 ) -> None:
     """Write each message to the disk and only then to the bus: nobody hears what may be lost."""
     for output in _worked_out(outputs):
@@ -450,13 +579,41 @@ def _say_progress(
     publisher.put("service", service_id, "progress", progress.SerializeToString())
 
 
-def _say_health(publisher: Publisher, service_id: str, waiting: int, note: str) -> None:
+def _backlog(engine: Engine, execution: Execution, catching_up: CatchingUp | None) -> _Backlog:
+    return _Backlog(
+        tuple(one.crossing_id for one in execution.under_way),
+        execution.waiting,
+        sum(len(names) for names in engine.waiting().values()),
+        0 if catching_up is None else catching_up.waiting,
+    )
+
+
+def _say_health(
+    publisher: Publisher,
+    service_id: str,
+    queued: int,
+    backlog: _Backlog,
+    execution: Execution,
+    note: str,
+) -> None:
+    under_way = execution.under_way
+    notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in under_way]
+    notes += [f"{backlog.waiting} wait for a process"] if backlog.waiting else []
+    notes += [f"{backlog.in_recordings} wait in recordings"] if backlog.in_recordings else []
+    notes += [note] if note else []
     health = pb.Health(
         schema_version=1,
         time_ns=time.time_ns(),
         service=service_id,
         ok=True,
-        figures={"queue": float(waiting)},
-        note=note[:_LONGEST_NOTE],
+        figures={
+            "queue": float(queued),
+            "identifying": float(len(under_way)),
+            "identifying_longest_s": max((one.seconds for one in under_way), default=0.0),
+            "waiting_for_process": float(backlog.waiting),
+            "waiting_for_certificate": float(backlog.waiting_for_certificate),
+            "waiting_in_recordings": float(backlog.in_recordings),
+        },
+        note="; ".join(notes)[:_LONGEST_NOTE],
     )
     publisher.put("service", service_id, "health", health.SerializeToString())

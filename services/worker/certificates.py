@@ -1,12 +1,13 @@
 """Certificates of the pairs that have crossings waiting: made aside, kept in a folder, looked for.
 
-One pair at a time, in the order in which they were asked for; crossings that need not wait come
+One pair at a time, those that drive most and latest first; crossings that need not wait come
 before (`Processes`). Which crossings wait is the engine's to know.
 """
 
 import logging
 import time
 from collections import deque
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -62,16 +63,19 @@ class Certificates:
         self._wanted.append(pair)
         self._next_look_s = 0.0
 
-    def advance(self, now_s: float) -> dict[Pair, str]:
+    def advance(self, now_s: float, order: Callable[[], Sequence[Pair]] = tuple) -> dict[Pair, str]:
         """Go on, by any steady clock; return the hashes of what has come to pass since.
 
+        `order` says which pairs are to be next, where several wait; others come after them, in the
+        order in which they were asked for.
         InputError, FailureError: a certificate cannot be written.
         """
         passed = self._looked_for() if now_s >= self._next_look_s else {}
         if now_s >= self._next_look_s:
             self._next_look_s = now_s + self._look_again_s
         if self._trial is None and self._wanted:
-            pair = self._wanted.popleft()
+            pair = next((p for p in order() if p in self._wanted), self._wanted[0])
+            self._wanted.remove(pair)
             self._trial = Trial(self._site, pair, self._settings)
             self._numbers.clear()
             self.has_news = True
@@ -82,6 +86,16 @@ class Certificates:
                 passed |= self._ended(self._trial.certificate(time.time()))
                 self._trial = None
         return passed
+
+    def retarget(self, site: Site) -> None:
+        """From now on make those of another site file; what was wanted is to be asked for again."""
+        self._processes.forget_asides()
+        self._site = site
+        self._trial = None
+        self._numbers.clear()
+        self._wanted.clear()
+        self._failed.clear()
+        self.has_news = True
 
     def end(self) -> None:
         """Begin no more crossings: a trial that is not over begins anew in the next run."""
@@ -115,7 +129,8 @@ class Certificates:
             one = trial.next_run()
             if one is None:
                 return
-            name = f"simulated crossing {one.number} of {trial.pair}"
+            digest = pair_hash(self._site, trial.pair, self._settings)  # of this site file
+            name = f"simulated crossing {one.number} of {trial.pair} ({digest})"
             self._numbers[name] = one.number
             self._processes.start_aside(Aside(name, one.run))
 

@@ -22,7 +22,9 @@ def steady_crossing(fix_times_s: Floats, **vehicle: object) -> CrossingData:
         sensor=_SITE.sensor,
         receiver=_SITE.receiver,
         stay=Stay(Passage.THROUGH, 1, ENTRY_S, EXIT_S),
-        fixes=Fixes(fix_times_s, fix_times_s, fix_times_s, np.full(fix_times_s.size, 10.0)),
+        fixes=Fixes(
+            fix_times_s, fix_times_s, fix_times_s, np.full(fix_times_s.size, 10.0), fix_times_s
+        ),
         chainage_m=place_m,
         samples=None,
         wall_offset_s=0.0,

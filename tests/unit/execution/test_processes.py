@@ -18,6 +18,7 @@ from schemas.settings import IdentificationSettings
 from services.common.errors import FailureError
 from services.execution.dispatch import Finished, feed_all
 from services.execution.processes import Aftermath, Aside, Processes
+from services.execution.watch import Limits
 from services.identification.crossing_data import CrossingData
 from services.identification.engine import Engine
 from services.identification.outputs import Work
@@ -68,6 +69,21 @@ def slow(data: CrossingData, settings: IdentificationSettings, **others: Any) ->
     """For ever."""
     while True:
         time.sleep(1.0)
+
+
+def busy(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+    """For ever, and with all of a processor; the way there only."""
+    while data.stay.direction > 0:
+        pass
+    return quick(data, settings, **others)
+
+
+def busy_once(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+    mark = Path(os.environ["DEADLY_ONCE"]) / data.crossing_id
+    while mark.exists():
+        return quick(data, settings, **others)
+    mark.touch()
+    return busy(data, settings, **others)
 
 
 def works() -> list[Work]:
@@ -144,6 +160,56 @@ def test_a_process_that_dies_once_costs_nothing(
         results = [result for _, result in all_of(processes)]
     assert [result.verdict for result in results] == ["good", "good"]
     assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("search", "limits", "why"),
+    [
+        (slow, Limits(idle_s=1.0), "has done nothing for 1 s"),
+        (busy, Limits(processor_s=1.0), "has taken more than 1 s of processor time"),
+    ],
+)
+def test_a_hung_process_is_ended_and_its_crossing_fails_at_the_second_time(
+    search: Callable[..., Crossing], limits: Limits, why: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    told: list[tuple[str, str, float]] = []
+    (first, second) = works()
+    with Processes(
+        1, identify=search, prepare=nothing, limits=limits, report=lambda *how: told.append(how)
+    ) as processes:
+        processes.start(first)
+        processes.start(second)
+        assert (second.crossing_id, "waiting for a process", 0.0) in told
+        assert [one.crossing_id for one in processes.under_way] == [first.crossing_id]
+        assert processes.waiting == 1
+        results = {work.number: result for work, result in all_of(processes)}
+        assert (processes.under_way, processes.waiting) == ([], 0)
+    assert results[first.number].reasons == ("failed",)
+    said = [record.getMessage() for record in caplog.records]
+    hung = f"the process that works on {first.crossing_id} {why} and is ended"
+    assert said.count(hung) == 2
+    assert sum(f"{first.crossing_id} died; tried once more" in text for text in said) == 1
+    assert (results[second.number].verdict == "good") == (search is busy)
+
+
+def test_a_process_that_is_hung_once_costs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
+    limits = Limits(processor_s=1.0)
+    with Processes(1, identify=busy_once, prepare=nothing, limits=limits) as processes:
+        processes.start(works()[0])
+        (finished,) = all_of(processes)
+    assert finished.result.verdict == "good"
+
+
+def test_an_aside_that_is_hung_makes_room(caplog: pytest.LogCaptureFixture) -> None:
+    (work, _) = works()
+    with Processes(1, identify=quick, prepare=nothing, limits=Limits(idle_s=1.0)) as processes:
+        processes.start_aside(Aside("for ever", partial(time.sleep, 1e6)))
+        processes.start(work)
+        (finished,) = all_of(processes)
+    assert finished.result.verdict == "good"
 
 
 def test_an_error_in_a_process_is_a_verdict(caplog: pytest.LogCaptureFixture) -> None:

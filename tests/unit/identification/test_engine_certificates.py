@@ -169,6 +169,28 @@ def test_another_pair_is_not_held_up() -> None:
     assert asking.engine.waiting() == {PAIR: [ONE, OTHER]}
 
 
+def test_the_pairs_that_drive_most_and_latest_are_told_first() -> None:
+    names = ("truck-1", "truck-2", "truck-3")
+    site = SITE.model_copy(
+        update={"vehicles": tuple(SITE.vehicles[0].model_copy(update={"id": n}) for n in names)}
+    )
+    asking = Asking()
+    asking.engine = Engine(site, SETTINGS, HEADER, are_required=True)
+
+    def drives(name: str, messages: list[Message]) -> None:
+        asking.fed(m._replace(key=m.key._replace(identifier=name)) for m in messages)
+
+    one_way = [m for m in TWO if m.log_time_ns < TWO[-1].log_time_ns - 25_000_000_000]
+    pairs = [Pair(name, "bridge-1") for name in names]
+    drives("truck-1", one_way)
+    drives("truck-2", one_way)
+    assert asking.engine.pairs_that_wait() == [pairs[1], pairs[0]]
+    drives("truck-3", TWO)
+    assert asking.engine.pairs_that_wait() == [pairs[2], pairs[1], pairs[0]]
+    drives("truck-1", TWO)
+    assert asking.engine.pairs_that_wait() == [pairs[0], pairs[2], pairs[1]]
+
+
 @pytest.mark.parametrize("number", range(7))
 def test_a_run_that_was_cut_off_while_they_waited_goes_on(number: int) -> None:
     """Whatever was told of them before: no state is told twice, none is left out."""

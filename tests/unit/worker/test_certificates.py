@@ -2,6 +2,7 @@
 
 import logging
 from collections import deque
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -116,6 +117,30 @@ def test_pairs_are_validated_in_the_order_in_which_they_are_wanted(tmp_path: Pat
     assert one.note == ""
     assert found_in(folder, SITE, SETTINGS) == passed
     assert load_certificate(certificate_path(folder, hash_of(PAIR))).reason.startswith("8 of 8")
+
+
+def test_of_a_hundred_pairs_those_that_drive_come_first(tmp_path: Path) -> None:
+    """Who drives most is next when a place is free, however long others have waited."""
+    places = Places()
+    many = [Pair("truck-1", f"bridge-{n}") for n in range(1, 101)]
+    bridges = tuple(_PAPER.bridges[0].model_copy(update={"id": pair.bridge}) for pair in many)
+    site = _PAPER.model_copy(update={"bridges": bridges})
+    one = Certificates(tmp_path, site, SETTINGS, cast(Processes, places))
+    for pair in many:
+        one.want(pair)
+    driving = [many[70], many[3]]
+    began: list[Pair] = []
+    for _ in range(3000):
+        one.advance(0.0, partial(tuple, driving))
+        if one.progress is not None and one.progress[0] not in began:
+            began.append(one.progress[0])
+            if len(began) == 2:
+                driving = [many[99]]
+        if places.asides:
+            places.compute()
+        if len(began) == 4:
+            break
+    assert began == [many[70], many[3], many[99], many[0]]
 
 
 @pytest.mark.parametrize("verdict", ["rejected", "died"])
