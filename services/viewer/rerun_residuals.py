@@ -38,12 +38,9 @@ def log_residuals(recording: Stream, root: str, crossing: CrossingView) -> None:
         block = np.repeat(np.repeat(shades[kind], _PIXELS, axis=0), _PIXELS, axis=1)
         place = f"{entity}/cells/{kind}"
         top = down[kind * stretches] - 0.5
-        recording.log(
-            place,
-            rr.Transform3D(translation=(0.0, top, 0.0), scale=1.0 / _PIXELS),
-            rr.Image(block),
-            static=True,
-        )
+        at = rr.Transform3D(translation=(0.0, top, 0.0), scale=1.0 / _PIXELS)
+        recording.log(place, at, static=True)
+        recording.log(place, rr.Image(block), static=True)
     x, y = np.tile(across, kinds * stretches), np.repeat(down - 0.35, bands)
     values = cells.mean_square.reshape(-1)
     known = np.isfinite(values)
