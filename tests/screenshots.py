@@ -7,6 +7,7 @@ Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-driv
 report and the terminal a browser (Debian: chromium).
 """
 
+import contextlib
 import io
 import math
 import os
@@ -14,12 +15,14 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from PIL import Image
+from rerun.experimental import ViewerClient
 from rich.console import Console
 
 from schemas.site_file import load_site
@@ -28,9 +31,10 @@ from services.cli.watch_page import page
 from services.recordings.recording import read_site
 from services.report.pdf import find_browser
 from services.viewer.view import convert
+from tests.endpoints import free_endpoint, free_port
 from tests.unit.cli.watching import NOW_NS, NOW_S, Listened, a_morning
-from tests.viewer_screen import complaints, has_driver, open_tab, opened, picture
-from tests.waiting import LONGEST_S
+from tests.viewer_screen import complaints, has_driver, open_tab, opened, picture, pixels
+from tests.waiting import LONGEST_S, until
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "recordings/sample/crossing.mcap"
@@ -78,10 +82,12 @@ def main() -> int:
         if SHARED.is_dir():
             make_many(folder)
             takers[OF_MANY.name] = partial(take, OF_MANY, folder)
-        for wanted in sys.argv[1:] or takers:
-            path = FOLDER / f"{wanted}.png"
-            path.write_bytes(smaller(takers[wanted]()))
-            print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
+        for wanted in sys.argv[1:] or [*takers, "view-live"]:
+            both = take_live(folder) if wanted == "view-live" else {wanted: takers[wanted]()}
+            for shown, taken in both.items():
+                path = FOLDER / f"{shown}.png"
+                path.write_bytes(smaller(taken))
+                print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
     return 0
 
 
@@ -135,6 +141,61 @@ def take_report(folder: Path, size: str = "794,1123") -> bytes:
     command = [find_browser(), *options, f"--screenshot={png}", html.as_uri()]
     subprocess.run(command, check=True, capture_output=True, timeout=LONGEST_S)
     return png.read_bytes()
+
+
+def take_live(folder: Path, size: str = "1400x850") -> dict[str, bytes]:
+    """`driveby view live` while the sample is driven, and when its result is there, as PNG."""
+    endpoint, port = free_endpoint(), free_port()
+    site = ["--site", str(ROOT / "docs/site.example.toml")]
+    bus = ["--endpoint", endpoint, "--realm", "sim-first"]
+    recorded = ["--listen", endpoint, "--realm", "*", "--folder", str(folder / "recordings")]
+    found = [*bus, *site, "--folder", str(folder / "recordings")]
+    with (
+        running(folder, "logger", *recorded),
+        running(folder, "worker", *found) as worker,
+        running(folder, "view", "live", "--serve", "--port", str(port), *bus, *site),
+    ):
+        until(lambda: "ready, " in worker.read_text(), "the worker")
+        with running(folder, "truck", str(SAMPLE), *bus):
+            address = f"rerun+http://127.0.0.1:{port}/proxy"
+            with opened(address, folder, size=size) as viewer:
+                shows(viewer, ON_THE_BRIDGE, 300)
+                driving = viewer.take_screenshot()
+                shows(viewer, GOOD, 1500)
+                answered = viewer.take_screenshot()
+                assert complaints(viewer) == []
+    return {"view-live": driving, "view-live-result": answered}
+
+
+ON_THE_BRIDGE, GOOD = (0, 114, 178), (0, 158, 115)
+"""Red, green and blue of two lanes; what is not looked at is drawn darker."""
+
+
+def shows(viewer: ViewerClient, colour: tuple[int, int, int], fewest: int) -> None:
+    """Wait until the lane of the crossing, at the left below, has a colour."""
+
+    def is_seen() -> bool:
+        seen = pixels(viewer.take_screenshot())
+        lanes = seen[seen.shape[0] // 2 :, : seen.shape[1] // 3]
+        wanted = 0.8 * np.array(colour) / 255.0
+        return bool((np.abs(lanes - wanted).max(axis=2) < 0.06).sum() > fewest)
+
+    until(is_seen, f"the colour {colour}")
+
+
+@contextlib.contextmanager
+def running(folder: Path, *arguments: str) -> Iterator[Path]:
+    """A command as a process; what it says is in the file."""
+    log = folder / f"{arguments[0]}.log"
+    command = [sys.executable, "-m", "driveby", *arguments]
+    own = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with log.open("wb") as said:
+        process = subprocess.Popen(command, stdout=said, stderr=said, env=own)
+    try:
+        yield log
+    finally:
+        process.terminate()
+        process.wait(timeout=LONGEST_S)
 
 
 def take_terminal(folder: Path, columns: int, lines: int = 30) -> bytes:

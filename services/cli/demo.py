@@ -137,7 +137,7 @@ def _view(services: _Services, live: Live) -> Iterator["_Running"]:
 
 def _wait_until_closed(view: "_Running", console: "Console") -> None:
     """Until somebody closes the window, or ends the demo; what was found is printed by then."""
-    address = re.search(r"connect at (http://\S+)", view.log.read_text(errors="replace"))
+    address = re.search(r"in a browser: (http://\S+)", view.log.read_text(errors="replace"))
     said = "The live view stays until its window is closed, or Ctrl-C."
     if address is not None:
         said = f"The live view stays until Ctrl-C, at {address[1]}"

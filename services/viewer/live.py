@@ -13,9 +13,12 @@ import logging
 import socket
 import subprocess
 import threading
+import time
+import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Literal
+from urllib.parse import quote
 
 import rerun as rr
 
@@ -37,6 +40,9 @@ _PAST_S: Final = 60.0
 """Of what trucks measured before this command began, as far as they keep it."""
 _PERIOD_S: Final = 0.25
 """How often what has come is drawn."""
+
+_TRIES: Final = 120
+"""How often it is looked whether the page is there."""
 
 Show = Literal["window", "web"]
 
@@ -76,7 +82,7 @@ def live_command(
         recording.send_blueprint(waiting_blueprint())
         log_markdown(recording, WAITING, f"Waiting for a router at {endpoint}.")
         say(f"realm {realm}, live at {sink.uri}; more viewers: rerun {sink.uri}")
-        with _viewer(sink.uri, show, address) as viewer:
+        with _viewer(sink.uri, show, address, say) as viewer:
             session = connected(endpoint, tls, lambda: stop.is_set() or _has_ended(viewer))
             if session is not None:
                 with session:
@@ -118,12 +124,21 @@ def _draw(
 
 
 @contextlib.contextmanager
-def _viewer(uri: str, show: Show | None, address: str) -> Iterator[subprocess.Popen[bytes] | None]:
+def _viewer(
+    uri: str, show: Show | None, address: str, say: Callable[[str], None]
+) -> Iterator[subprocess.Popen[bytes] | None]:
     """The viewer of a server; it ends with this."""
     if show is None:
         yield None
         return
-    arguments = viewer_arguments(uri, web=show == "web", address=address)
+    arguments = viewer_arguments(uri, web=False, address=address)
+    if show == "web":
+        port = _free_port(address, 0)
+        arguments[1:1] = ["--serve-web", "--web-viewer-port", str(port)]
+        # The words in its pictures are meant for a dark page.
+        page = f"http://{address}:{port}?url={quote(uri, safe='')}&theme=dark"
+        say(f"in a browser: {page}")
+        threading.Thread(target=_open_browser, args=(page, address, port), daemon=True).start()
     # Of a Ctrl-C this process hears, and ends the viewer.
     with subprocess.Popen(arguments, start_new_session=True) as process:
         try:
@@ -132,16 +147,25 @@ def _viewer(uri: str, show: Show | None, address: str) -> Iterator[subprocess.Po
             process.terminate()
 
 
+def _open_browser(page: str, address: str, port: int) -> None:
+    """Open a page as soon as it is served; who has no browser here has been told where it is."""
+    for _ in range(_TRIES):
+        with contextlib.suppress(OSError), socket.create_connection((address, port), 1.0):
+            webbrowser.open(page)
+            return
+        time.sleep(_PERIOD_S)
+
+
 def _has_ended(viewer: subprocess.Popen[bytes] | None) -> bool:
     return viewer is not None and viewer.poll() is not None
 
 
 def _check_address(address: str) -> None:
     try:
-        ip = ipaddress.ip_address(address)
+        ip = ipaddress.IPv4Address(address)
     except ValueError:
         raise InputError(
-            f"--listen {address}: is no address; one of this machine is expected, as 127.0.0.1"
+            f"--listen {address}: is no IPv4 address; one of this machine is expected, as 127.0.0.1"
         ) from None
     if not ip.is_loopback:
         _log.warning("whoever reaches %s sees what is shown: nobody is asked who they are", address)
@@ -149,8 +173,7 @@ def _check_address(address: str) -> None:
 
 def _free_port(address: str, port: int) -> int:
     """A port at which nobody listens: Rerun takes another one's for its own without a word."""
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    with socket.socket(family) as probe:
+    with socket.socket() as probe:
         try:
             probe.bind((address, port))
         except OSError as error:

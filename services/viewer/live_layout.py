@@ -14,10 +14,8 @@ from services.viewer.rerun_parts import TIME
 from services.viewer.rerun_places import BridgeOnMap
 from services.viewer.strip import STRIP_PAPER, STRIP_WIDTH
 
-WINDOW_S: Final = 45.0
-"""Of accelerations and speed before the moment that is looked at."""
-LANES_S: Final = 120.0
-"""Of crossings."""
+WINDOW_S: Final = 60.0
+"""Of accelerations and crossings before the moment that is looked at."""
 WAITING = "waiting"
 """Entity of the page that stands alone until something is heard."""
 
@@ -72,7 +70,7 @@ def _where_and_when(on_map: Sequence[BridgeOnMap]) -> rrb.Container:
     places = _tabs(plans) if plans else bridge_places(None, coloured=False)
     infinite = rrb.TimeRangeBoundary.infinite()
     shown = rrb.TimeRange(
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-LANES_S),
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S),
         end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
     )
     lanes = rrb.StateTimelineView(

@@ -21,6 +21,7 @@ from services.bus.session import open_session
 from tests.endpoints import free_port
 from tests.process_replay.starting import Start, start_logger
 from tests.unit.viewer.found import results_of, some_crossing
+from tests.unit.viewer.test_web import browser
 from tests.viewer_screen import complaints, opened, pixels
 from tests.waiting import LONGEST_S, until
 
@@ -146,7 +147,8 @@ def test_in_a_browser_until_it_is_closed(endpoint: str, tmp_path: Path) -> None:
         with log.open("wb") as said:
             view = subprocess.Popen(command, env=own, stdout=said, stderr=said)
         try:
-            until(lambda: "connect at http://127.0.0.1:" in log.read_text())
+            until(lambda: re.search(r"in a browser: http://127.0.0.1:\d+\?url=", log.read_text()))
+            until(lambda pid=view.pid: children(pid), "the viewer")
             (viewer,) = children(view.pid)
             os.kill(viewer if end == "viewer" else view.pid, signal.SIGTERM)
             assert view.wait(timeout=LONGEST_S) == 0, log.read_text()
@@ -154,6 +156,38 @@ def test_in_a_browser_until_it_is_closed(endpoint: str, tmp_path: Path) -> None:
         finally:
             view.kill()
             view.wait()
+
+
+def test_it_is_seen_in_a_browser(
+    start: Start, endpoint: str, tmp_path: Path, project: Path
+) -> None:
+    start_logger(start, endpoint, tmp_path / "live.mcap")
+    own = {**os.environ, "HOME": str(tmp_path), "BROWSER": "true", "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-m", "driveby", "view", "live", "--web", "--endpoint", endpoint]
+    command += ["--site", str(project / "docs/site.example.toml")]
+    log = tmp_path / "view.log"
+    with browser(tmp_path) as tab, open_session(connect=endpoint, timeout_s=LONGEST_S) as bus:
+        publisher = Publisher(bus, "live")
+        drive(publisher, project)
+        with log.open("wb") as said:
+            view = subprocess.Popen(command, env=own, stdout=said, stderr=said)
+        try:
+            until(lambda: "in a browser: " in log.read_text())
+            page = re.findall(r"in a browser: (\S+)", log.read_text())[0]
+            port = int(re.findall(r":(\d+)\?", page)[0])
+            until(lambda: listening(port) == {"0100007F"}, "the page")
+            tab.open(f"{page}&renderer=webgl")
+
+            def is_weak_element_seen() -> bool:
+                seen = tab.screenshot()
+                return bool((np.abs(seen - WEAK).max(axis=2) < 0.1).sum() > 50)
+
+            until(is_weak_element_seen, "the weak element")
+            assert tab.screenshot().mean() < 0.3  # dark, as its words want it
+        finally:
+            view.terminate()
+            view.wait(timeout=LONGEST_S)
+        publisher.close()
 
 
 def children(pid: int) -> list[int]:
@@ -165,6 +199,6 @@ def children(pid: int) -> list[int]:
             line = (entry / "cmdline").read_bytes()
         except (OSError, IndexError):
             continue
-        if parent == str(pid) and b"--web-viewer" in line:
+        if parent == str(pid) and b"--serve-web" in line:
             found.append(int(entry.name))
     return found

@@ -19,7 +19,12 @@ def test_every_picture_is_there_small_and_named_on_the_page(project: Path) -> No
         path = screenshots.FOLDER / f"{shot.name}.png"
         assert path.stat().st_size < screenshots.MOST_BYTES
         assert f"(images/{path.name})" in page
-    assert page.count("(images/") == len(shots)
+    others = [(page, "view-live"), (page, "view-live-result")]
+    others.append(((project / "docs/watch.md").read_text(), "watch"))
+    for text, name in others:
+        assert (screenshots.FOLDER / f"{name}.png").stat().st_size < screenshots.MOST_BYTES
+        assert f"(images/{name}.png)" in text
+    assert page.count("(images/") == len(shots) + 2
 
 
 @pytest.mark.slow
@@ -71,3 +76,29 @@ def test_the_report_can_be_photographed_and_names_the_weak_element(tmp_path: Pat
     taken = pixels(screenshots.smaller(screenshots.take_report(tmp_path)))
     box = np.array([0xFD, 0xF0, 0xD5]) / 255.0  # of a finding that names an element
     assert (np.abs(taken - box).max(axis=2) < 0.02).mean() > 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.process
+def test_the_live_pictures_can_be_made(tmp_path: Path) -> None:
+    if not has_driver():
+        pytest.skip("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)")
+    taken = screenshots.take_live(tmp_path)
+    assert set(taken) == {"view-live", "view-live-result"}
+    weak = np.array([230, 159, 0]) / 255.0
+    assert all(screenshots.smaller(png) for png in taken.values())
+    # The weak element, at the right, is there after the drive; lines of the body are orange, too.
+    right = [pixels(png)[:, 900:] for png in taken.values()]
+    seen = [(np.abs(side - weak).max(axis=2) < 0.1).sum() for side in right]
+    assert seen[0] == 0 < 50 < seen[1]
+
+
+@pytest.mark.process
+def test_the_terminal_can_be_drawn(tmp_path: Path) -> None:
+    try:
+        find_browser()
+    except FailureError:
+        pytest.skip("no browser (Debian: apt install chromium)")
+    drawn = pixels(screenshots.smaller(screenshots.take_terminal(tmp_path, columns=80)))
+    yellow = np.array([0.8, 0.7, 0.25])
+    assert (np.abs(drawn - yellow).max(axis=2) < 0.15).sum() > 200  # the weak element's bars
