@@ -119,6 +119,11 @@ class Processes:
         return len(self._waiting) >= _WAITING_PER_PROCESS * len(self._places)
 
     @property
+    def has_room(self) -> bool:
+        """Whether one more may wait for a process, and then it is not full."""
+        return len(self._waiting) + 1 < _WAITING_PER_PROCESS * len(self._places)
+
+    @property
     def is_idle(self) -> bool:
         """Whether a work that is started now is begun at once, or as soon as an aside is over."""
         works = sum(1 for p in self._places if p.job and isinstance(p.job.task, Work))
