@@ -155,7 +155,7 @@ class Processes:
     def finished(self, timeout_s: float = 0.0) -> list[Finished]:
         """What has been done since the last call; see `Execution`."""
         under_way = [place.future for place in self._places if place.future is not None]
-        if under_way:
+        if under_way and timeout_s > 0.0:  # asked after every message: no time for nothing
             wait(under_way, timeout_s, FIRST_COMPLETED)
         for place in self._places:
             if place.future is not None and place.future.done():
