@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo up test test-all faults soak mutants validate lint docs bench lock clean
+.PHONY: help install demo up test test-all faults soak day mutants validate lint docs bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -52,6 +52,9 @@ KILLS ?= 50
 MINUTES ?= 60
 soak: $(STAMP) ## 50 kills of each kind and an hour of 100 trucks (KILLS=50 MINUTES=60)
 	DRIVEBY_SOAK_KILLS=$(KILLS) DRIVEBY_SOAK_MINUTES=$(MINUTES) $(BIN)/python -m pytest tests/faults -m soak -s
+
+day: $(STAMP) ## two trucks for an hour, a worker that is killed: one result per crossing (MINUTES=60)
+	$(BIN)/python -m tests.faults.day --minutes $(MINUTES)
 
 MUTANTS ?= 40
 SEED ?= 1

@@ -46,6 +46,10 @@ class Execution(Protocol):
         """Whether more works should wait until some have been given back."""
 
     @property
+    def has_room(self) -> bool:
+        """Whether it would not be full after one more work."""
+
+    @property
     def is_idle(self) -> bool:
         """Whether a work that is started now is begun at once, or as soon as an aside is over."""
 

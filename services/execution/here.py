@@ -46,6 +46,11 @@ class Here:
         return False
 
     @property
+    def has_room(self) -> bool:
+        """Always."""
+        return True
+
+    @property
     def is_idle(self) -> bool:
         """Always."""
         return True

@@ -119,6 +119,11 @@ class Processes:
         return len(self._waiting) >= _WAITING_PER_PROCESS * len(self._places)
 
     @property
+    def has_room(self) -> bool:
+        """Whether one more may wait for a process, and then it is not full."""
+        return len(self._waiting) + 1 < _WAITING_PER_PROCESS * len(self._places)
+
+    @property
     def is_idle(self) -> bool:
         """Whether a work that is started now is begun at once, or as soon as an aside is over."""
         works = sum(1 for p in self._places if p.job and isinstance(p.job.task, Work))
@@ -150,7 +155,7 @@ class Processes:
     def finished(self, timeout_s: float = 0.0) -> list[Finished]:
         """What has been done since the last call; see `Execution`."""
         under_way = [place.future for place in self._places if place.future is not None]
-        if under_way:
+        if under_way and timeout_s > 0.0:  # asked after every message: no time for nothing
             wait(under_way, timeout_s, FIRST_COMPLETED)
         for place in self._places:
             if place.future is not None and place.future.done():

@@ -48,7 +48,7 @@ class ResultFiles:
         site_toml: str,
         header: Header,
         previous: str | None,
-        note: Callable[[Key, bytes], None] = lambda key, payload: None,
+        note: Callable[[Key, bytes], None] | None = None,
     ) -> None:
         """`previous` is the name of the file of the run before, if any.
 
@@ -93,7 +93,8 @@ class ResultFiles:
         self._writer.write(message)
         self._writer.sync()
         self._sequences[message.key] += 1
-        self._note(message.key, message.payload)
+        if self._note is not None:
+            self._note(message.key, message.payload)
         if result is not None:
             self._crossings += 1
             self._json.add(result, bridges)

@@ -77,7 +77,8 @@ _SILENCE_S = 120.0
 _FORGET_EVERY_S = 10.0
 """To forget takes time, which is spent this often."""
 MOST_WAITING = 100
-"""Crossings that are kept while they wait for a certificate: half a megabyte each, or more."""
+"""Crossings that are kept while they wait for a certificate or for room: half a megabyte each, or
+more."""
 _ROUNDING_S = 1e-6
 """More than is lost when a time in nanoseconds becomes one in seconds."""
 _Name = tuple[str, str]
@@ -141,6 +142,9 @@ class Engine:
         """In the order in which they were found."""
         self.found: list[Found] = []
         self._finds_only = finds_only
+        self.has_room: Callable[[], bool] = lambda: True
+        """Whether a crossing would be begun soon. While there is none, those of trucks that are
+        recorded wait as for a certificate, untold: who listens must not be held up."""
         self.recorded: frozenset[str] = frozenset()
         """Trucks that a logger records: a crossing that began before the first message of theirs
         that has come here is in a recording, and is left to who reads that (`take`)."""
@@ -258,6 +262,7 @@ class Engine:
         if message.boot_id < self._newest_boot.get((key.realm, key.identifier), 0):
             return  # its crossings have been decided
         truck = self._truck(key, message.boot_id, vehicle)
+        truck.is_gone = False
         if isinstance(message, VehicleInfo):
             truck.says(message.site_toml)
         elif isinstance(message, AccelBatch):
@@ -265,7 +270,8 @@ class Engine:
             self._forget(truck, message.device_time_ns * 1e-9)
         else:
             yield from self._finish_older_boots(key, message.boot_id)
-            truck.boot.add_fix(message)
+            if truck.boot.add_fix(message):
+                truck.came_late(self._bridges, message)
             yield from self._settle(key.realm, truck)
 
     def finish(self) -> Iterator[Said]:
@@ -281,6 +287,7 @@ class Engine:
         missing; of what was to follow on the last that came nothing is needed.
         """
         for truck in self._boots_of(realm, vehicle):
+            truck.is_gone = for_good
             if truck.boot.lacks_fixes() and not for_good:
                 continue
             yield from self._settle(realm, truck, all_there_is=True)
@@ -304,7 +311,10 @@ class Engine:
         """Look once at every fix: what is found does not depend on which came together."""
         for fix in truck.boot.settle(all_there_is=all_there_is):
             truck.latest_s = max(truck.latest_s, fix.device_time_ns * 1e-9)
-            yield from self._look(realm, truck, truck.came_to(self._bridges, fix), truck.latest_s)
+            near = truck.came_to(self._bridges, fix)
+            if truck.late:
+                near = sorted({*near, *truck.late_enough()})
+            yield from self._look(realm, truck, near, truck.latest_s)
             self._forget(truck, truck.latest_s)
 
     def _finish(self, realm: str, truck: TruckBoot) -> Iterator[Said]:
@@ -424,7 +434,8 @@ class Engine:
             self.found.append(Found(tuple(begun), waiting, *times))
             return
         pair = Pair(truck.vehicle.id, bridge.id)
-        if self.is_certified(pair) and pair not in self.waiting():
+        may_wait = truck.vehicle.id in self.recorded and not self.has_room()
+        if self.is_certified(pair) and not may_wait and pair not in self.waiting():
             yield from self._begun(waiting)
             return
         if not self.is_certified(pair) and pb.WAITING_NOT_VALIDATED not in said:
@@ -444,11 +455,15 @@ class Engine:
     ) -> bool:
         """Whether a stay whose entry is at `entry_s` on its truck's clock is found here, too.
 
-        It is if the messages around it came from the truck itself: then it has been decided, or
-        will be.
+        It is if the messages around it came from the truck itself, and the truck has not left for
+        good: then it has been decided, or will be.
         """
         truck = self._trucks.get((realm, vehicle, boot_id))
-        if truck is None or entry_s < max(truck.forgotten_s + _FORGET_EVERY_S, truck.began_s):
+        if (
+            truck is None
+            or truck.is_gone
+            or entry_s < max(truck.forgotten_s + _FORGET_EVERY_S, truck.began_s)
+        ):
             return False
         number = self._bridges.number.get(bridge)
         if number is None:
@@ -501,8 +516,8 @@ class Engine:
         self._waiting.append(waiting)
         if len(self._waiting) > MOST_WAITING:
             _log.warning(
-                "%s has waited too long for a certificate and is given up here: it is taken from "
-                "the logger's recording later, or `driveby identify` gives its result from there",
+                "%s has waited too long and is given up here: it is taken from the logger's "
+                "recording later, or `driveby identify` gives its result from there",
                 self._waiting.popleft().work.crossing_id,
             )
 

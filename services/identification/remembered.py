@@ -15,7 +15,7 @@ from services.identification.bridge_state import Counted
 from services.identification.bridges import AWAY_S, Bridges
 from services.identification.outputs import Output, Work
 from services.identification.stays import MERGE_S
-from services.identification.streams import Boot
+from services.identification.streams import PATIENCE_S, Boot
 
 
 class Visit(NamedTuple):
@@ -49,6 +49,10 @@ class TruckBoot:
         """Time, latitude and longitude of the latest fix."""
         self.near: dict[int, Visit] = {}
         """By number of the bridge: those that it came to within what is remembered."""
+        self.late: dict[int, float] = {}
+        """By number of the bridge: when the last of the fixes near it came that came late."""
+        self.is_gone = False
+        """It has left for good, as far as is known."""
         self._said_toml: str | None = None
         self.differences: list[Difference] = []
         """Where it says of itself what the site file does not say of it."""
@@ -64,6 +68,7 @@ class TruckBoot:
         self.vehicle = vehicle
         ids = {before.bridge(number).id: visit for number, visit in self.near.items()}
         self.near = {bridges.number[i]: v for i, v in ids.items() if i in bridges.number}
+        self.late.clear()
         gone = {name: one for name, one in self.detected.items() if name[0] not in bridges.number}
         self.detected = {name: one for name, one in self.detected.items() if name not in gone}
         self.differences = []
@@ -87,6 +92,22 @@ class TruckBoot:
                 visit = Visit(before[0], now_s)  # it may have jumped over it since then
             self.near[number] = Visit(min(visit.since_s, now_s), max(visit.last_s, now_s))
         return sorted(busy.union(found)) if busy else found
+
+    def came_late(self, bridges: Bridges, fix: GnssFix) -> None:
+        """Note a fix that had been taken to be lost: what it changes is looked at later."""
+        time_s = fix.device_time_ns * 1e-9
+        here = (fix.latitude_deg, fix.longitude_deg)
+        for number in bridges.between(*here, *here):
+            visit = self.near.get(number, Visit(time_s, time_s))
+            self.near[number] = Visit(min(visit.since_s, time_s), max(visit.last_s, time_s))
+            self.late[number] = self.latest_s
+
+    def late_enough(self) -> list[int]:
+        """The bridges of which late fixes have come, if by now none of them is missing still."""
+        found = [n for n, came_s in self.late.items() if self.latest_s > came_s + PATIENCE_S]
+        for number in found:
+            del self.late[number]
+        return found
 
     def forget_before(self, time_s: float) -> None:
         """Forget samples, fixes and crossings that are decided: no stay is found there again."""

@@ -89,14 +89,19 @@ class Boot:
             self._batches.setdefault(batch.sequence, batch)
             self._channels.update(batch.channels)
 
-    def add_fix(self, fix: GnssFix) -> None:
-        """Take a fix in; one that is here already is ignored. `settle` makes it known."""
+    def add_fix(self, fix: GnssFix) -> bool:
+        """Take a fix in; one that is here already is ignored. `settle` makes it known.
+
+        One that had been taken to be lost is known at once, and that is returned.
+        """
         self._first_fix = min(self._first_fix, (fix.sequence, fix.device_time_ns))
         if fix.sequence >= self._next_fix:
             self._waiting.setdefault(fix.sequence, fix)
         elif fix.device_time_ns >= self._forgotten_ns and fix.sequence not in dict(self._fixes):
             insort(self._fixes, (fix.sequence, fix))
             self._fresh.append(fix)
+            return True
+        return False
 
     def settle(self, *, all_there_is: bool = False) -> Iterator[GnssFix]:
         """Make fixes known to `fixes` one by one, in their order, and yield them.

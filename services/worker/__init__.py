@@ -104,6 +104,14 @@ class Editing(NamedTuple):
         return self.watch.edited(now_s, is_asked=is_asked)
 
 
+class _Behind(NamedTuple):
+    """What has come and has not been looked at."""
+
+    messages: int
+    lag_s: float
+    """The longest that one has waited since this was told last."""
+
+
 class _Backlog(NamedTuple):
     """What is not identified yet: how long it is under way does not change it."""
 
@@ -217,6 +225,7 @@ def run(
             certificates=found_in(certificates, known, settings),
             are_required=are_required,
         )
+        engine.has_room = lambda: execution.has_room
         certified = Certificates(certificates, known, settings, execution)
         catching_up = None
         if catches_up:
@@ -422,6 +431,7 @@ def _serve(
     want = certificates.want
     progress: tuple[Pair, float] | None = None
     now_s = time.monotonic()
+    lag_s = 0.0
     if ready is not None:
         ready()
     # Who goes on talking goes on to the next run, too: what comes so late is not waited for.
@@ -436,14 +446,15 @@ def _serve(
                 next_health_s = time.monotonic() + HEALTH_PERIOD_S
                 certificates.has_news = False
                 told_backlog = backlog
-                _say_health(
-                    publisher, service_id, queued.qsize(), backlog, execution, certificates.note
-                )
+                behind = _Behind(queued.qsize(), lag_s)
+                _say_health(publisher, service_id, behind, backlog, execution, certificates.note)
+                lag_s = 0.0
         batch: list[Arrived] = []
         one = _next(queued)
         # After a long identification the queue holds what came meanwhile: whether a truck has gone
         # is told by when its messages came, not by when they are looked at.
         now_s = time.monotonic() if one is None else one.received_s
+        lag_s = max(lag_s, time.monotonic() - now_s)
         if isinstance(one, Token):
             arrivals.note(one)
         elif one is not None:
@@ -476,7 +487,7 @@ def _serve(
                 progress = certificates.progress
                 pair, share = progress
                 _say_progress(publisher, service_id, "", f"validating {pair}", share)
-            if engine.has_released and not execution.is_full:
+            if engine.has_released and execution.has_room:
                 released = dispatched(engine, execution, engine.release(), want)
                 _publish(released, engine, publisher, files)
             if catching_up is not None and time.monotonic() >= next_catch_up_s:
@@ -502,8 +513,8 @@ def _serve(
     waiting = [name for names in engine.waiting().values() for name in names]
     if waiting:
         _log.warning(
-            "%d crossings still wait for a certificate (%s): the next run gets them from their "
-            "trucks, or from the logger's recordings",
+            "%d crossings still wait for a certificate or a process (%s): the next run gets them "
+            "from their trucks, or from the logger's recordings",
             *(len(waiting), ", ".join(waiting[-_MOST_NAMED:])),
         )
 
@@ -580,10 +591,12 @@ def _say_progress(
 
 
 def _backlog(engine: Engine, execution: Execution, catching_up: CatchingUp | None) -> _Backlog:
+    waiting = {pair: len(names) for pair, names in engine.waiting().items()}
+    ready = sum(number for pair, number in waiting.items() if engine.is_certified(pair))
     return _Backlog(
         tuple(one.crossing_id for one in execution.under_way),
-        execution.waiting,
-        sum(len(names) for names in engine.waiting().values()),
+        execution.waiting + ready,
+        sum(waiting.values()) - ready,
         0 if catching_up is None else catching_up.waiting,
     )
 
@@ -591,7 +604,7 @@ def _backlog(engine: Engine, execution: Execution, catching_up: CatchingUp | Non
 def _say_health(
     publisher: Publisher,
     service_id: str,
-    queued: int,
+    behind: _Behind,
     backlog: _Backlog,
     execution: Execution,
     note: str,
@@ -607,7 +620,8 @@ def _say_health(
         service=service_id,
         ok=True,
         figures={
-            "queue": float(queued),
+            "queue": float(behind.messages),
+            "lag_s": behind.lag_s,
             "identifying": float(len(under_way)),
             "identifying_longest_s": max((one.seconds for one in under_way), default=0.0),
             "waiting_for_process": float(backlog.waiting),

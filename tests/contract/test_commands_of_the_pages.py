@@ -37,6 +37,7 @@ NOT_RUN = {
     "make test-all": ITSELF,
     "make faults": ITSELF,
     "make soak": LONG,
+    "make day": LONG,
     "make validate": LONG,
     "driveby identify monday.mcap tuesday.mcap --json week.json": FUSES,
     "driveby fuse week.json lastweek.json --json both.json": FUSES,

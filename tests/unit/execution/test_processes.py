@@ -237,11 +237,13 @@ def test_a_process_that_cannot_begin_is_a_failure() -> None:
 def test_more_than_a_few_wait_elsewhere() -> None:
     (work, _) = works()
     with Processes(1, identify=slow, prepare=nothing) as processes:
-        full = []
+        full, room = [], []
         for _ in range(3):
+            room.append(processes.has_room)
             processes.start(work)
             full.append(processes.is_full)
         assert full == [False, False, True]
+        assert room == [True, True, False]
         assert processes.is_busy
         assert processes.finished() == []
 

@@ -191,6 +191,24 @@ def test_the_pairs_that_drive_most_and_latest_are_told_first() -> None:
     assert asking.engine.pairs_that_wait() == [pairs[0], pairs[2], pairs[1]]
 
 
+def test_while_there_is_no_room_they_wait_untold_and_nobody_is_held_up() -> None:
+    """Only those of which there is a recording, should too many wait; and they go on in order."""
+    asking = Asking({PAIR: DIGEST})
+    asking.engine.has_room = lambda: False
+    assert len([o for o in asking.fed(TWO) if o.result]) == 2
+    asking = Asking({PAIR: DIGEST})
+    asking.engine.has_room = lambda: False
+    asking.engine.recorded = frozenset({"truck-1"})
+    outputs = asking.fed(TWO)
+    assert names(outputs) == of_one(ONE, "DETECTED", "COMPLETE") + of_one(
+        OTHER, "DETECTED", "COMPLETE"
+    )
+    assert asking.wanted == []
+    assert asking.engine.has_released
+    outputs += asking.released()
+    assert sorted(said_by(outputs)) == sorted(said_by(Asking({PAIR: DIGEST}).fed(TWO)))
+
+
 @pytest.mark.parametrize("number", range(7))
 def test_a_run_that_was_cut_off_while_they_waited_goes_on(number: int) -> None:
     """Whatever was told of them before: no state is told twice, none is left out."""

@@ -318,6 +318,25 @@ def test_fixes_that_come_after_the_decision_make_no_second_crossing() -> None:
     assert whole.entry_time - told[0].entry_time > 5.0  # or it would prove nothing
 
 
+@pytest.mark.parametrize("ends", ["drives on", "gone", "finish"])
+def test_a_history_that_comes_after_what_is_live_is_looked_at(ends: str) -> None:
+    """Half a minute behind, when its fixes had long been taken to be lost: it tells a crossing."""
+    long = messages_of(*THERE, (60.0, 540.0))
+    stop_s = 60.0 if ends == "drives on" else 40.0
+    live = [m for m in long if 12.0 <= m.log_time_ns * 1e-9 - START_S < stop_s]
+    history = [m for m in long if m.log_time_ns * 1e-9 - START_S < 12.0]
+    middle = round(0.6 * len(live))
+    one = engine()
+    outputs = fed(one, [*live[:middle], *history, *live[middle:]])
+    if ends == "gone":
+        outputs += one.gone(REALM, "truck-1", for_good=True)
+    if ends == "finish":
+        outputs += one.finish()
+    (result,) = [o.result for o in outputs if o.result]
+    assert result.verdict == "good"
+    assert result.crossing_id == next(o.result for o in WHOLE if o.result).crossing_id
+
+
 @pytest.mark.parametrize("number", [0, 5])
 def test_one_batch_from_far_ahead_costs_no_crossing(
     number: int, caplog: pytest.LogCaptureFixture
