@@ -166,6 +166,9 @@ def _result(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Ite
     said = " ".join(report.finding.sentences)
     yield tag("figure", inlined_svg(svg, prefix, f"EI along the span. {said}"))
     yield _elements(report)
+    if report.finding.kind == "weak":
+        yield tag("h2", "What to do next")
+        yield tag("ul", *(tag("li", text) for text in _next_steps(report)))
     yield from _caveats(report)
 
 
@@ -182,7 +185,7 @@ def _elements(report: BridgeReport) -> Html:
         if compared:
             element = compared[n]
             change = f"{_signed(element.ratio)} ({_signed(element.low)} to {_signed(element.high)})"
-            remark = "weaker" if element.is_weak else "stiffer" if element.is_stiff else ""
+            remark = "less stiff" if element.is_weak else "stiffer" if element.is_stiff else ""
         if n + 1 in view.unresolved and not remark:
             remark = "not resolved"
         rows.append(
@@ -193,10 +196,10 @@ def _elements(report: BridgeReport) -> Html:
                 f"{low:.2f}–{high:.2f}",
                 f"{mean / view.nominal_nm2[n]:.3f}",
                 change,
-                remark + ("?" if remark in ("weaker", "stiffer") and view.is_doubtful else ""),
+                remark + ("?" if remark in ("less stiff", "stiffer") and view.is_doubtful else ""),
             ]
         )
-        classes.append("" if view.is_doubtful else {"weaker": "weak"}.get(remark, ""))
+        classes.append("" if view.is_doubtful else {"less stiff": "weak"}.get(remark, ""))
     return table(heads, rows, classes)
 
 
@@ -218,11 +221,45 @@ def _caveats(report: BridgeReport) -> Iterator[Html]:
     yield tag("p", _visible(comparison), class_="note")
 
 
+def _next_steps(report: BridgeReport) -> Iterator[str]:
+    """Where to look, and how a second survey would tell more than this one."""
+    view = report.view
+    elements = () if view.comparison is None else view.comparison.elements
+    weak = [one for one in elements if one.is_weak]
+    places = ", ".join(
+        f"element {one.number} ({one.from_m:.1f} to {one.to_m:.1f} m from the start)"
+        for one in weak
+    )
+    at_end = any(one.number in (1, len(elements)) for one in weak)
+    bearing = ", and at the bearing there" if at_end else ""
+    yield f"Have somebody look at {places}{bearing}."
+    if report.baseline_name is None:
+        yield "Was it built unlike the others? Then the difference is no damage."
+    used = [one for one in report.crossings if one.crossing_id in view.used]
+    once = [
+        text
+        for text, values in (
+            ("on another day", {_day(one.entry_time) for one in used}),
+            ("in the other direction", {one.direction for one in used}),
+            ("with another truck", {one.vehicle for one in used}),
+        )
+        if len(values) < 2
+    ]
+    if once:
+        again = once[0] if len(once) == 1 else f"{', '.join(once[:-1])} and {once[-1]}"
+        yield f"Drive again {again}: what is found again is neither weather nor the drive."
+    if report.baseline_name is None:
+        yield (
+            "Keep these results as a baseline: the next survey then tells what has changed since, "
+            "whatever nominal is."
+        )
+
+
 def _visible(comparison: Comparison) -> str:
     losses = sorted(element.visible_loss for element in comparison.elements)
     return (
-        f"A loss of {100.0 * losses[0]:.0f} % in one element would have been called clear where "
-        f"this measurement is sharpest, one of {100.0 * losses[-1]:.0f} % where it is bluntest."
+        f"An element {100.0 * losses[0]:.0f} % less stiff would have been called clear where this "
+        f"measurement is sharpest, one {100.0 * losses[-1]:.0f} % less stiff where it is bluntest."
     )
 
 

@@ -70,6 +70,10 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "The other good crossing agrees with them: at most 0.0 standard deviations apart" in text
     assert "class A of ISO 8608, IRI 2.4 m/km" in text
     assert "never a condition rating" in text
+    assert "Have somebody look at element 4 (12.9 to 17.1 m from the start)." in text
+    assert "Was it built unlike the others? Then the difference is no damage." in text
+    assert "Drive again on another day, in the other direction and with another truck:" in text
+    assert "Keep these results as a baseline" in text
     # Where there is no baseline that is said, and what it means.
     assert "each other (no baseline is stored)" in text
     assert "A loss that all elements share cannot be seen without a baseline." in text
@@ -96,6 +100,10 @@ def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) ->
     assert "7 elements are clearly less stiff." in text
     assert "Element 1, 0.0 to 4.3 m: 30 % less stiff than the baseline, interval" in text
     assert "Compared with the baseline then.json" in text
+    assert "0.0 to 4.3 m from the start" in text
+    assert ", and at the bearing there." in text
+    assert "Keep these results" not in text
+    assert "built unlike" not in text
     assert "No baseline is stored" not in text
     unchanged = reported(site, results_of(site, some_crossing("b"), used="b"), baseline=then).text
     assert "No element has clearly changed: all are unchanged within 1 %." in unchanged
@@ -108,7 +116,7 @@ def test_a_suspect_result_is_doubtful_and_says_why(site: Site) -> None:
     assert "Doubtful: to be looked at, not to be relied upon." in found.text
     assert "The reasons: The receiver gave no position" in found.text
     assert "Look at the satellite receiver and its antenna." in found.text
-    assert "weaker?" in found.text
+    assert "less stiff?" in found.text
     assert ("class", "weak") not in found.attributes
 
 
