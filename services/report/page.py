@@ -97,6 +97,7 @@ def _bridge(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Htm
         *_result(report, prefix, drawn),
         tag("h2", "What this does not mean"),
         tag("ul", *(tag("li", text) for text in _not_meant(report))),
+        *_caveats(report),
         class_="first",
     )
     newest_first = list(reversed(report.crossings))
@@ -169,7 +170,6 @@ def _result(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Ite
     if report.finding.kind == "weak":
         yield tag("h2", "What to do next")
         yield tag("ul", *(tag("li", text) for text in _next_steps(report)))
-    yield from _caveats(report)
 
 
 def _elements(report: BridgeReport) -> Html:
@@ -204,6 +204,8 @@ def _elements(report: BridgeReport) -> Html:
 
 
 def _caveats(report: BridgeReport) -> Iterator[Html]:
+    if report.view.estimate is None:
+        return
     comparison = report.view.comparison
     yield tag("p", _HOW_TO_READ, class_="note")
     if comparison is None:
@@ -232,9 +234,9 @@ def _next_steps(report: BridgeReport) -> Iterator[str]:
     )
     at_end = any(one.number in (1, len(elements)) for one in weak)
     bearing = ", and at the bearing there" if at_end else ""
-    yield f"Have somebody look at {places}{bearing}."
-    if report.baseline_name is None:
-        yield "Was it built unlike the others? Then the difference is no damage."
+    no_baseline = report.baseline_name is None
+    unlike = " Was it built unlike the others? Then the difference is no damage."
+    yield f"Have somebody look at {places}{bearing}.{unlike if no_baseline else ''}"
     used = [one for one in report.crossings if one.crossing_id in view.used]
     once = [
         text
@@ -248,7 +250,7 @@ def _next_steps(report: BridgeReport) -> Iterator[str]:
     if once:
         again = once[0] if len(once) == 1 else f"{', '.join(once[:-1])} and {once[-1]}"
         yield f"Drive again {again}: what is found again is neither weather nor the drive."
-    if report.baseline_name is None:
+    if no_baseline:
         yield (
             "Keep these results as a baseline: the next survey then tells what has changed since, "
             "whatever nominal is."

@@ -37,7 +37,7 @@ svg { width: 100%; height: auto; display: block; }
   .first + .break + .crossing { break-before: avoid; }
   .crossing + .first { break-before: page; }
   figure, tr, .finding { break-inside: avoid; }
-  .first figure svg { max-height: 55mm; }
+  .first figure svg { max-height: 48mm; }
   .crossing figure svg { max-height: 118mm; }
   .crossing { break-inside: avoid; }
   h2 { margin-top: 2mm; }
