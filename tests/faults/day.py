@@ -336,7 +336,9 @@ def live(
     wanted = sum(len(plan.crossings) for plan in plans.values())
     moments = random.Random(seed)
     # The results are looked at while they are written.
-    logging.getLogger(read_messages.__module__).setLevel(logging.ERROR)
+    log = logging.getLogger(read_messages.__module__)
+    said_before = log.level
+    log.setLevel(logging.ERROR)
     fleet = Fleet(folder, method=method, processes=processes)
     began = time.monotonic()
     longest_backlog = 0
@@ -372,6 +374,7 @@ def live(
         results = fleet.results()
     finally:
         fleet.close()
+        log.setLevel(said_before)
     problems = problems_of(plans, results)
     if problems:
         problems.append(fleet.logs())

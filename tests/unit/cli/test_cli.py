@@ -339,8 +339,8 @@ def test_every_command_has_help_with_an_example(
 
 def test_the_commands_offered_are_those_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(command in refused(capsys, "none") for command in COMMANDS)
-    assert "'watch'" in refused(capsys, "watch").split("(choose from")[0]
-    assert "watch" not in refused(capsys, "none")
+    assert "'listen'" in refused(capsys, "listen").split("(choose from")[0]
+    assert "listen" not in refused(capsys, "none")
 
 
 @pytest.mark.parametrize(
