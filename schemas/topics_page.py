@@ -14,6 +14,7 @@ SUBSCRIBER = """\
 import json, sys, zenoh
 from schemas.messages import decode
 from schemas.topics import parse_key, topic
+
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))  # tcp/127.0.0.1:7447

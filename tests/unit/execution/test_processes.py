@@ -32,8 +32,7 @@ from tests.unit.identification.test_engine_resume import (
     Identifications,
     messages_of,
 )
-
-LONGEST_S = 100.0
+from tests.waiting import LONGEST_S, until
 
 
 def nothing() -> None:
