@@ -9,6 +9,7 @@ from schemas.signals import Identity
 from schemas.topics import key
 from services.bus.listening import Heard, Listening, elsewhere_line
 from services.bus.publisher import Publisher
+from services.bus.subscription import Received, Subscription
 from services.common.errors import InputError
 from tests.waiting import until
 
@@ -26,12 +27,26 @@ def gathered(listening: Listening, number: int) -> list[Heard]:
     return found
 
 
+def arrived(router: zenoh.Session, number: int) -> None:
+    """Wait until so many messages are on no way any more: what is would come as if said now."""
+    with Subscription(router, "driveby/v1/live/**") as subscription:
+        found: list[Received] = []
+        until(
+            lambda: (
+                found.extend(one for one in [subscription.receive(0.1)] if one is not None)
+                or len(found) >= number
+            ),
+            f"{number} messages",
+        )
+
+
 def test_each_message_once_with_what_was_before(
     router: zenoh.Session, publisher: Publisher
 ) -> None:
     for number in range(100):
         publisher.put("vehicle", "truck-1", "accel", b"%d" % number)
     publisher.put("bridge", "b-1", "state", b"before")
+    arrived(router, 101)
     listening = Listening(router, "live", past_s=1.0)
     found = gathered(listening, 21)
     publisher.put("bridge", "b-1", "estimate", b"now", Identity(7, 3))
