@@ -25,6 +25,8 @@ DELIVERY_TIMEOUT_S = 30.0
 """A logger may have a slow disk; one that is silent for longer has gone."""
 GAP_S = 2.0
 """A silence of a recording that is longer is passed over where gaps are skipped."""
+_LOOK_S = 0.05
+"""How often is looked whether a signal has come, which ends no sleep."""
 SETTLE_S = 0.3
 """For the queries that every subscriber sends to a new publisher."""
 
@@ -109,6 +111,33 @@ def confirm(delivery: Delivery, sent: int) -> None:
         _log.warning("no logger in realm %s: nobody confirmed the messages", delivery.realm)
 
 
+class _Stop(threading.Event):
+    """An event without a lock, so that a signal may set it while its own thread waits for it.
+
+    The lock of the standard one is taken by `wait`; a signal's handler that comes in that moment
+    runs in the same thread, waits for the lock in `set`, and the process stands still for ever.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._is_set = False
+
+    def is_set(self) -> bool:
+        return self._is_set
+
+    def set(self) -> None:
+        self._is_set = True
+
+    def wait(self, timeout: float | None = None) -> bool:
+        end = None if timeout is None else time.monotonic() + timeout
+        while not self._is_set:
+            left = _LOOK_S if end is None else min(_LOOK_S, end - time.monotonic())
+            if left <= 0.0:
+                break
+            time.sleep(left)
+        return self._is_set
+
+
 @contextmanager
 def stopped_by_signals(
     on_second: Callable[[], None] | None = None,
@@ -117,7 +146,7 @@ def stopped_by_signals(
 
     A second signal calls `on_second`. In another thread than the main one signals are left alone.
     """
-    stop = threading.Event()
+    stop = _Stop()
 
     def handle(number: int, frame: FrameType | None) -> None:
         if stop.is_set() and on_second is not None:

@@ -1,5 +1,7 @@
 """The spacing of what is published again, by a clock of its own."""
 
+import os
+import signal
 import threading
 from collections.abc import Iterator
 
@@ -8,6 +10,7 @@ import pytest
 from schemas.topics import Key
 from services.bus import playback
 from services.recordings.recording import Message
+from tests.waiting import LONGEST_S
 
 WHERE = Key("live", "vehicle", "truck-1", "gnss")
 
@@ -60,3 +63,19 @@ def test_without_a_speed_nothing_is_waited_for(monkeypatch: pytest.MonkeyPatch) 
     put: list[Message] = []
     playback.play(recorded(0.0, 100.0), put.append, Delivered(), speed=0.0, stop=clock)  # type: ignore[arg-type]
     assert (len(put), clock.now_s) == (2, 1000.0)
+
+
+def test_a_signal_that_comes_while_one_waits_for_it_stops_nothing_else() -> None:
+    """In the same thread, in any moment: a lock that both took would be waited for for ever."""
+    for _ in range(50):
+        with playback.stopped_by_signals() as stop:
+            sender = threading.Thread(target=lambda: os.kill(os.getpid(), signal.SIGTERM))
+            sender.start()
+            while not stop.is_set():
+                stop.wait(1e-6)
+            sender.join()
+    with playback.stopped_by_signals() as stop:
+        assert not stop.wait(0.001)
+        stop.set()
+        assert stop.wait(LONGEST_S)
+        assert stop.wait()
