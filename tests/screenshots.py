@@ -130,15 +130,21 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
 
 def take_report(folder: Path, size: str = "794,1123") -> bytes:
     """The first page of the sample's report as a browser shows it, A4 at 96 pixels an inch."""
-    html, png = folder / "report.html", folder / "report.png"
+    html = folder / "report.html"
     site = folder / "site.toml"
     site.write_text(read_site(SAMPLE) or "")
     found = ["report", str(folder / "good.json"), "--site", str(site), "-o", str(html)]
     assert cli.main(found) == 0
+    return browsed(html, folder, size)
+
+
+def browsed(page: Path, folder: Path, size: str) -> bytes:
+    """A file as a browser shows it in a window of that size, as PNG."""
+    png = folder / f"{page.stem}.png"
     options = ["--headless", "--disable-gpu", "--no-first-run", "--hide-scrollbars"]
     options += [f"--user-data-dir={folder / 'profile'}", f"--window-size={size}"]
     options += ["--no-sandbox"] if os.geteuid() == 0 else []
-    command = [find_browser(), *options, f"--screenshot={png}", html.as_uri()]
+    command = [find_browser(), *options, f"--screenshot={png}", page.absolute().as_uri()]
     subprocess.run(command, check=True, capture_output=True, timeout=LONGEST_S)
     return png.read_bytes()
 
@@ -208,16 +214,9 @@ def take_terminal(folder: Path, columns: int, lines: int = 30) -> bytes:
     shown.print(page(watched, where, listened, **moment, width=columns, height=lines))
     svg = shown.export_svg(title="driveby watch")
     width, height = (float(size) for size in re.findall(r'viewBox="0 0 (\S+) (\S+)"', svg)[0])
-    (folder / "terminal.svg").write_text(svg)
-    written = folder / "terminal.png"
-    command = [
-        find_browser(), "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
-        f"--user-data-dir={folder / 'profile'}", f"--screenshot={written}",
-        f"--window-size={math.ceil(width)},{math.ceil(height)}",
-        (folder / "terminal.svg").absolute().as_uri(),
-    ]  # fmt: skip
-    subprocess.run(command, check=True, capture_output=True)
-    return written.read_bytes()
+    drawn = folder / "terminal.svg"
+    drawn.write_text(svg)
+    return browsed(drawn, folder, f"{math.ceil(width)},{math.ceil(height)}")
 
 
 def smaller(png: bytes) -> bytes:

@@ -11,11 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing.optimum import chi2_per_dof
-from pre_core.crossing.posterior import Problem, all_rows, data_rows, layout, points
-from pre_core.crossing.preparation import Inputs, levels_at, prepare, with_noise_at
+from pre_core.crossing.posterior import (
+    Problem,
+    all_rows,
+    data_rows,
+    layout,
+)
+from pre_core.crossing.preparation import (
+    Inputs,
+    in_spreads,
+    levels_at,
+    prepare,
+    rear_at_rows_m,
+    with_noise_at,
+)
 from pre_core.crossing.whitening import DOUBTED_OF_A_MISFIT, RESIDUALS, linear_springs
 from pre_core.physics.bridge import FloatArray
-from pre_core.physics.simulate import rear_position_m
 from pre_core.search.levenberg_marquardt import minimised
 
 BEFORE, ON, AFTER = range(3)
@@ -67,7 +78,7 @@ def left_over(inputs: Inputs, found: Found) -> LeftOver:
     rows = problem.rows
     return LeftOver(
         white,
-        _stretches(problem, y, white.shape[0]),
+        _stretches(problem, y),
         rows.every * rows.step_s,
         chi2_per_dof(problem, y),
     )
@@ -76,13 +87,8 @@ def left_over(inputs: Inputs, found: Found) -> LeftOver:
 def _coordinates(problem: Problem, y: FloatArray, found: Found) -> FloatArray:
     """y (size,) with what was found in it, all else as it was."""
     where, priors = layout(problem), problem.priors
-    kept = np.flatnonzero(priors.estimated)
     y = y.copy()
-    for k, i in enumerate(kept):
-        if priors.half_normal[i]:
-            y[k] = found.theta[i] / priors.spread[i]
-        else:
-            y[k] = np.log(found.theta[i] / priors.theta[i]) / priors.spread[i]
+    y[where.theta] = in_spreads(priors, found.theta)
     y[where.offset] = found.shift_m
     y[where.trajectory] -= found.shift_m
     return y
@@ -94,12 +100,9 @@ def _bottom(problem: Problem, y: FloatArray) -> FloatArray:
     return minimised(lambda at: all_rows(problem, at), y, _STEPS, _ENOUGH, lower).state.y
 
 
-def _stretches(problem: Problem, y: FloatArray, count: int) -> NDArray[np.int64]:
-    """By where the rear axle is at the middle of each row (count,)."""
-    crossing, rows = problem.crossing, problem.rows
-    at = points(problem, y[None, :])
-    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
-    middle = rear[crossing.first_row + rows.taps.size // 2 + rows.every * np.arange(count)]
+def _stretches(problem: Problem, y: FloatArray) -> NDArray[np.int64]:
+    """By where the rear axle is at the middle of each row (m,)."""
+    crossing, middle = problem.crossing, rear_at_rows_m(problem, y)
     travelled = middle if crossing.direction > 0 else crossing.span_m - middle
     stretch = np.where(travelled < 0.0, BEFORE, np.where(travelled > crossing.span_m, AFTER, ON))
     return stretch.astype(np.int64)

@@ -282,6 +282,25 @@ def levels_at(problem: Problem, y: FloatArray) -> FloatArray:
     return level if gain > MISMATCHED else np.zeros_like(level)
 
 
+def in_spreads(priors: Priors, theta: FloatArray) -> FloatArray:
+    """The coordinates (t,) in y of values (p,) of truck and bridge that are estimated."""
+    values = np.zeros(theta.size)
+    logs = np.flatnonzero(priors.estimated & ~priors.half_normal)
+    values[logs] = np.log(theta[logs] / priors.theta[logs]) / priors.spread[logs]
+    zero = np.flatnonzero(priors.estimated & priors.half_normal)
+    values[zero] = theta[zero] / priors.spread[zero]
+    return values[priors.estimated]
+
+
+def rear_at_rows_m(problem: Problem, y: FloatArray) -> FloatArray:
+    """Where the rear axle is at the middle of each filtered row (m,), of one point y (size,)."""
+    crossing, rows = problem.crossing, problem.rows
+    at = points(problem, y[None, :])
+    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
+    count = row_count(rows, crossing.rows)
+    return rear[crossing.first_row + rows.taps.size // 2 + rows.every * np.arange(count)]
+
+
 def off_bridge_m(problem: Problem, y: FloatArray) -> float:
     """How many metres of road the rows off the bridge compare, in stretches that tell something."""
     rows = [one.stop - one.start for one in off_bridge(problem, y)]

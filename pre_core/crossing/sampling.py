@@ -35,6 +35,10 @@ _WORTH = 1.0 / 3.0
 than is asked of chains: what weights are worth is an estimate from the weights themselves."""
 
 
+_Weighted = tuple[importance.Draws, importance.Smoothed]
+"""Draws, and what they are worth."""
+
+
 class Sampled(NamedTuple):
     """Draws (n, chains, f) in the coordinates of the posterior; `pareto_k` of weighted ones.
 
@@ -79,7 +83,7 @@ def sample(
     weighted, mixed, drawn = _weighted(target, mixed, draws, report)
     spent += drawn
     if weighted is not None:
-        return _dealt_out(weighted, _told(problem), draws, seed, spent)
+        return _dealt_out(*weighted, _told(problem), draws, seed, spent)
     return _by_chains(target, mixed, draws, _told(problem), spent, report)
 
 
@@ -98,7 +102,7 @@ def _approximation(found: optimum.Optimum, inflation: float, seed: int) -> appro
 
 def _weighted(
     target: approximation.LogDensity, mixed: approximation.Mixture, draws: int, report: Report
-) -> tuple[importance.Draws | None, approximation.Mixture, int]:
+) -> tuple[_Weighted | None, approximation.Mixture, int]:
     """Weighted draws that are worth enough or none, the approximation, the evaluations.
 
     Where the first are not, the approximation is fitted to what they show, they are thrown away,
@@ -106,12 +110,12 @@ def _weighted(
     """
     first, worth = _worth_enough(target, mixed, draws, 0, report)
     if _is_enough(worth, draws):
-        return first, mixed, first.log_weight.size
+        return (first, worth), mixed, first.log_weight.size
     fitted = approximation.learnt(mixed, first.part, first.v, first.log_weight)
     second, worth_now = _worth_enough(target, fitted, draws, _MOST_BATCHES, report)
     spent = first.log_weight.size + second.log_weight.size
     if _is_enough(worth_now, draws):
-        return second, fitted, spent
+        return (second, worth_now), fitted, spent
     per_draw = worth.ess / first.log_weight.size, worth_now.ess / second.log_weight.size
     return None, fitted if per_draw[1] > per_draw[0] else mixed, spent
 
@@ -126,7 +130,7 @@ def _worth_enough(
     draws: int,
     number: int,
     report: Report,
-) -> tuple[importance.Draws, importance.Smoothed]:
+) -> _Weighted:
     """Weighted draws in batches from `number` on, until they are enough or will not be."""
     batches: list[importance.Draws] = []
     while True:
@@ -145,10 +149,14 @@ def _worth_enough(
 
 
 def _dealt_out(
-    weighted: importance.Draws, told: NDArray[np.int64], draws: int, seed: int, evaluations: int
+    weighted: importance.Draws,
+    worth: importance.Smoothed,
+    told: NDArray[np.int64],
+    draws: int,
+    seed: int,
+    evaluations: int,
 ) -> Sampled:
     """Weighted draws, each as often as its weight says, as if chains had drawn them."""
-    worth = importance.smoothed(weighted.log_weight)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
     count = -(-max(draws, weighted.log_weight.size) // crank_nicolson.CHAINS)
     chosen = importance.evenly(worth.weight, count * crank_nicolson.CHAINS, rng)

@@ -3,10 +3,8 @@
 What comes too quickly is dropped, the oldest first, and nothing that was missed is asked for.
 """
 
-import logging
 import math
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import zenoh
@@ -14,13 +12,9 @@ from zenoh import handlers
 
 from schemas.signals import Identity
 from schemas.topics import Key, check_realm, parse_key, selector, topic
-from services.bus.session import open_session
 from services.bus.subscription import Received, Seen, subscribe_latest
-from services.common.errors import FailureError, InputError
+from services.common.errors import InputError
 
-_log = logging.getLogger(__name__)
-_CONNECT_S: Final = 1.0
-"""An attempt is so short that a signal is heard between two."""
 _SIGNALS: Final = ("accel", "gnss")
 _OTHERS: Final = (
     ("vehicle", "info"),
@@ -177,22 +171,6 @@ def check_listenable(realm: str) -> str:
         return check_realm(realm)
     except ValueError as error:
         raise InputError(str(error)) from None
-
-
-def connected(endpoint: str, tls: Path | None, is_over: Callable[[], bool]) -> zenoh.Session | None:
-    """A session as soon as a router answers; None if it is over before.
-
-    InputError: a malformed endpoint or bad credentials.
-    """
-    is_told = False
-    while not is_over():
-        try:
-            return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
-        except FailureError as error:
-            if not is_told:
-                _log.warning("%s; trying on", error)
-            is_told = True
-    return None
 
 
 def elsewhere_line(realm: str, elsewhere: dict[str, set[str]]) -> str | None:

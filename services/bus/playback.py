@@ -111,7 +111,7 @@ def confirm(delivery: Delivery, sent: int) -> None:
         _log.warning("no logger in realm %s: nobody confirmed the messages", delivery.realm)
 
 
-class _Stop(threading.Event):
+class _SetBySignal(threading.Event):
     """An event without a lock, so that a signal may set it while its own thread waits for it.
 
     The lock of the standard one is taken by `wait`; a signal's handler that comes in that moment
@@ -128,6 +128,9 @@ class _Stop(threading.Event):
     def set(self) -> None:
         self._is_set = True
 
+    def clear(self) -> None:
+        self._is_set = False
+
     def wait(self, timeout: float | None = None) -> bool:
         end = None if timeout is None else time.monotonic() + timeout
         while not self._is_set:
@@ -142,11 +145,21 @@ class _Stop(threading.Event):
 def stopped_by_signals(
     on_second: Callable[[], None] | None = None,
 ) -> Iterator[threading.Event]:
-    """Give an event that SIGINT and SIGTERM set; the handlers before are put back at the end.
+    """Give an event that SIGINT and SIGTERM set; see `set_by_signals`."""
+    with set_by_signals(signal.SIGINT, signal.SIGTERM, on_second=on_second) as stop:
+        yield stop
 
-    A second signal calls `on_second`. In another thread than the main one signals are left alone.
+
+@contextmanager
+def set_by_signals(
+    *numbers: signal.Signals, on_second: Callable[[], None] | None = None
+) -> Iterator[threading.Event]:
+    """Give an event that signals set; the handlers before are put back at the end.
+
+    One that comes while it is set calls `on_second`. In another thread than the main one signals
+    are left alone.
     """
-    stop = _Stop()
+    stop = _SetBySignal()
 
     def handle(number: int, frame: FrameType | None) -> None:
         if stop.is_set() and on_second is not None:
@@ -156,7 +169,7 @@ def stopped_by_signals(
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield stop
     finally:

@@ -25,6 +25,7 @@ import os
 import re
 import socket
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,8 @@ _log = logging.getLogger(__name__)
 _ENDPOINT = re.compile(r"(tcp|tls|quic|ws|unixsock-stream)/\S+")
 _CONNECT_TRY_MS = 500
 """An attempt is so short that a signal is heard between two."""
+_CONNECT_S = 1.0
+"""So long is tried before it is looked whether to go on trying."""
 _PATIENCE_WITH_SUBSCRIBER_US = 1_000_000
 """Zenoh's own is 5 s; who is cut off connects again and gets what it missed."""
 _RUNTIME = "(rx: (handover: acc), acc: (worker_threads: 2))"
@@ -99,6 +102,23 @@ def open_session(
             # Zenoh would wait by itself, but meanwhile Python hears no signal.
             if time.monotonic() >= deadline:
                 raise FailureError(_why_not_connected(endpoint, timeout_s, tls)) from None
+
+
+def connected(endpoint: str, tls: Path | None, is_over: Callable[[], bool]) -> zenoh.Session | None:
+    """A session as soon as a router answers; None if it is over before.
+
+    InputError: a malformed endpoint or bad credentials.
+    """
+    is_told = False
+    while not is_over():
+        # Zenoh itself would wait for ever, and no signal would be heard meanwhile.
+        try:
+            return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
+        except FailureError as error:
+            if not is_told:
+                _log.warning("%s; trying on", error)
+            is_told = True
+    return None
 
 
 def _why_not_connected(endpoint: str, timeout_s: float | None, tls: Path | None) -> str:

@@ -49,8 +49,9 @@ def watch_command(*, endpoint: str, realm: str, tls: Path | None, console: "Cons
 
     InputError: a bad realm, endpoint or credentials.
     """
-    from services.bus.listening import Listening, check_listenable, connected
+    from services.bus.listening import Listening, check_listenable
     from services.bus.playback import leave_at_once, stopped_by_signals
+    from services.bus.session import connected
 
     check_listenable(realm)
     with stopped_by_signals(leave_at_once) as stop:

@@ -23,15 +23,15 @@ from services.common.errors import InputError
 from services.identification.bridges import Bridges
 from services.identification.crossing_data import window
 from services.identification.engine import Engine
-from services.identification.known import Known, overlap
+from services.identification.known import Known, are_one
 from services.identification.outputs import Work
 from services.identification.remembered import Found
-from services.identification.stays import MERGE_S, Car, Passage
+from services.identification.stays import Car, Passage
 from services.identification.streams import Fixes, device_time_ns
 from services.identification.traffic import Stranger
 from services.recordings.recording import Message, is_being_written, read_messages
 
-_AROUND_NS: Final = 60 * NS_PER_S
+AROUND_NS: Final = 60 * NS_PER_S
 """So much is read before and behind a crossing: for the sense of travel, and for late messages."""
 
 
@@ -212,7 +212,7 @@ def _is_wanted(message: Message, stays: Sequence[Stayed]) -> bool:
     if message.key.stream == "info":
         return True
     return message.key.stream in ("accel", "gnss") and any(
-        stay.entry_ns - _AROUND_NS <= message.log_time_ns <= stay.exit_ns + _AROUND_NS
+        stay.entry_ns - AROUND_NS <= message.log_time_ns <= stay.exit_ns + AROUND_NS
         for stay in stays
     )
 
@@ -235,13 +235,10 @@ def _decided(
                 pass
     for _ in engine.finish():
         pass
-    begin, end = wanted.entry_ns, wanted.exit_ns
-    merge_ns = round(MERGE_S * NS_PER_S)
+    times = wanted.entry_ns, wanted.exit_ns
     for one in engine.found:
-        is_it = one.waiting.work.data.bridge.id == wanted.bridge and (
-            abs(one.entry_ns - begin) < merge_ns or overlap(one.entry_ns, one.exit_ns, begin, end)
-        )
-        if is_it:
+        is_there = one.waiting.work.data.bridge.id == wanted.bridge
+        if is_there and are_one(one.entry_ns, one.exit_ns, *times):
             return one
     return None
 

@@ -11,6 +11,7 @@ from hashlib import sha256
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Header
 from schemas.settings import NOT_OF_THE_RESULT
+from schemas.signals import NS_PER_S
 from services.identification.bridge_state import Usable
 from services.identification.stays import MERGE_S, Passage, Stay
 
@@ -70,6 +71,13 @@ def is_stay_of(known: Known, stay: Stay, entry_ns: int) -> bool:
         return begins and 0 < entry_ns - known.entry_ns < longest_ns
     exit_ns = entry_ns + round((stay.exit_s - stay.entry_s) * 1e9)
     return overlap(known.entry_ns, known.exit_ns, entry_ns, exit_ns)
+
+
+def are_one(entry_ns: float, exit_ns: float, other_entry_ns: float, other_exit_ns: float) -> bool:
+    """Whether two stays of one truck on one bridge are the same: begun together, or overlapping."""
+    if abs(entry_ns - other_entry_ns) < MERGE_S * NS_PER_S:
+        return True
+    return overlap(entry_ns, exit_ns, other_entry_ns, other_exit_ns)
 
 
 def overlap(begin: float, end: float, other_begin: float, other_end: float) -> bool:

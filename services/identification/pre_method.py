@@ -16,12 +16,12 @@ from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import optimum, posterior
 from pre_core.crossing.compliances import LEANING_SPREAD, led_by_mismatch
 from pre_core.crossing.mismatch import as_two_numbers
-from pre_core.crossing.preparation import Inputs, off_bridge_m
+from pre_core.crossing.preparation import Inputs, off_bridge_m, rear_at_rows_m
 from pre_core.crossing.sampling import Sampled, sample
 from pre_core.crossing.whitening import RESIDUALS
 from pre_core.physics.beam_basis import first_frequencies_hz
 from pre_core.physics.models import body_masses
-from pre_core.physics.simulate import Motion, rear_position_m
+from pre_core.physics.simulate import Motion
 from pre_core.search.loop import Ending, Report
 from schemas import results
 from schemas.reasons import Reason
@@ -238,11 +238,8 @@ def identify_pre(
 def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
     """What the checks after the fit look at."""
     problem, y = found.problem, found.state.y
-    where, rows, crossing = posterior.layout(problem), problem.rows, problem.crossing
+    where, rows = posterior.layout(problem), problem.rows
     white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
-    at = posterior.points(problem, y[None, :])
-    middle = crossing.first_row + rows.taps.size // 2 + rows.every * np.arange(white.shape[0])
-    rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), data.stay.direction)
     rows_of = unknowns.table(data.bridge.elements)
     estimated = [rows_of[i] for i in np.flatnonzero(problem.priors.estimated)]
     # Where the axles' roads differ that leads the truck as far as it is known.
@@ -256,7 +253,7 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
     return Fit(
         white,
         rows.every * rows.step_s,
-        rear[middle],
+        rear_at_rows_m(problem, y),
         found.chi2_per_dof,
         prior_z | {"wheelbase": float(y[where.wheelbase])},
         float(problem.receiver_rows[-1, -1] * y[where.offset]),

@@ -23,7 +23,7 @@ from pre_core.crossing import posterior
 from pre_core.crossing.bound import DIFFERENCE, central_jacobian, settle
 from pre_core.crossing.compliances import in_compliances
 from pre_core.crossing.mismatch import levels_on, shapes_of
-from pre_core.crossing.preparation import prepare, with_noise_at
+from pre_core.crossing.preparation import in_spreads, prepare, with_noise_at
 from pre_core.diagnostics.calibration import without_negative
 from pre_core.physics.vehicle import total_mass_kg
 from pre_core.survey.plan import Spreads, known_before, spreads, together, track_of
@@ -221,10 +221,7 @@ def _times(problem: posterior.Problem, fixes: posterior.Fixes) -> Floats:
 def _set_theta(problem: posterior.Problem, y: Floats, theta: Floats, wheelbase_m: float) -> None:
     """Put physical values (p,) into the coordinates y; modified in place."""
     priors, where = problem.priors, posterior.layout(problem)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.log(theta / priors.theta) / priors.spread
-        values[priors.half_normal] = (theta / priors.spread)[priors.half_normal]
-    y[where.theta] = values[priors.estimated]
+    y[where.theta] = in_spreads(priors, theta)
     y[where.wheelbase] = np.log(wheelbase_m / priors.wheelbase_m) / priors.wheelbase_spread
 
 

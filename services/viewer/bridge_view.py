@@ -22,6 +22,7 @@ from services.viewer.baseline import named_baseline
 from services.viewer.crossing_view import (
     CrossingView,
     FloatArray,
+    of_clear_elements,
     unresolved_elements,
     view_of_crossing,
 )
@@ -93,8 +94,7 @@ def told(view: BridgeView) -> list[str]:
     if view.comparison is None or not open_ones:
         return sentences(view.comparison)
     elements = view.comparison.elements
-    clear = tuple(one for one in elements if one.is_weak or one.is_stiff)
-    said = sentences(view.comparison._replace(elements=clear)) if clear else []
+    said = of_clear_elements(view.comparison)
     if view.elsewhere:
         either = " or ".join(map(str, view.elsewhere))
         said.append(f"The loss may as well be in element {either}, beside it and not resolved.")

@@ -183,15 +183,19 @@ def comparison_of(crossing: CrossingView, baseline: Estimate | None = None) -> C
     return compare(found, crossing.nominal_nm2, crossing.element_edges_m, baseline)
 
 
+def of_clear_elements(found: Comparison) -> list[str]:
+    """What is said of elements that differ clearly, and nothing of the others."""
+    clear = tuple(one for one in found.elements if one.is_weak or one.is_stiff)
+    return sentences(found._replace(elements=clear)) if clear else []
+
+
 def told_of_crossing(crossing: CrossingView, found: Comparison | None) -> list[str]:
     """What one crossing found, in words: only of what is resolved is said that it agrees."""
     if found is None:
         return []
     if crossing.resolution is None:
         return sentences(found)
-    clear = tuple(one for one in found.elements if one.is_weak or one.is_stiff)
-    said = sentences(found._replace(elements=clear)) if clear else []
-    return [*said, f"Not all is resolved: {crossing.resolution}."]
+    return [*of_clear_elements(found), f"Not all is resolved: {crossing.resolution}."]
 
 
 def view_of_crossing(crossing: Crossing, bridge: Elements) -> CrossingView:

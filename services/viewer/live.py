@@ -23,8 +23,9 @@ from urllib.parse import quote
 import rerun as rr
 
 from schemas.site_file import load_site
-from services.bus.listening import Listening, check_listenable, connected, elsewhere_line
+from services.bus.listening import Listening, check_listenable, elsewhere_line
 from services.bus.playback import leave_at_once, stopped_by_signals
+from services.bus.session import connected
 from services.common.errors import FailureError, InputError
 from services.viewer.live_layout import WAITING, waiting_blueprint
 from services.viewer.live_picture import LivePicture

@@ -42,9 +42,9 @@ from schemas.topics import (
 )
 from services.bus.credentials import check_speaks_for
 from services.bus.listening import Elsewhere
-from services.bus.playback import leave_at_once, stopped_by_signals
+from services.bus.playback import leave_at_once, set_by_signals, stopped_by_signals
 from services.bus.publisher import Publisher
-from services.bus.session import open_session
+from services.bus.session import connected
 from services.bus.subscription import Seen, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
@@ -85,8 +85,6 @@ _SOONEST_HEALTH_S = 5.0
 _MOST_NAMED = 10
 """Crossings in one line of the log."""
 _CATCH_UP_EVERY_S = 0.2
-_CONNECT_S = 1.0
-"""An attempt is so short that a signal is heard between two."""
 
 
 class Editing(NamedTuple):
@@ -100,7 +98,8 @@ class Editing(NamedTuple):
     def edited(self, now_s: float) -> Edited | None:
         """The site file, if it was edited since the last call."""
         is_asked = self.asked.is_set()
-        self.asked.clear()
+        if is_asked:  # who asks after the look is not forgotten
+            self.asked.clear()
         return self.watch.edited(now_s, is_asked=is_asked)
 
 
@@ -212,7 +211,7 @@ def run(
         execution = stack.enter_context(
             Processes(processes, report=report, limits=Limits(processor_s=limit_s))
         )
-        bus = _connected(endpoint, tls, stop)
+        bus = connected(endpoint, tls, stop.is_set)
         if bus is None:
             return 0
         stack.enter_context(bus)
@@ -259,7 +258,7 @@ def run(
                 _log.info("%s was edited: %s counts now, results in %s", site, edited.hash, path)
                 yield from engine.retarget(edited.site, now, Fusing(edited.baselines), found)
 
-            with _asked_by_hangup() as asked:
+            with set_by_signals(signal.SIGHUP) as asked:
                 _serve(
                     engine,
                     execution,
@@ -294,20 +293,6 @@ def _check_names(realm: str, service_id: str) -> None:
         check_identifier(service_id)
     except ValueError as error:
         raise InputError(str(error)) from None
-
-
-def _connected(endpoint: str, tls: Path | None, stop: threading.Event) -> zenoh.Session | None:
-    """A session as soon as a router answers; None if a signal came first."""
-    is_told = False
-    while not stop.is_set():
-        # Zenoh itself would wait for ever, and no signal would be heard meanwhile.
-        try:
-            return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
-        except FailureError as error:
-            if not is_told:
-                _log.warning("%s; trying on", error)
-            is_told = True
-    return None
 
 
 def _receive(
@@ -517,20 +502,6 @@ def _serve(
             "from their trucks, or from the logger's recordings",
             *(len(waiting), ", ".join(waiting[-_MOST_NAMED:])),
         )
-
-
-@contextlib.contextmanager
-def _asked_by_hangup() -> Iterator[threading.Event]:
-    """An event that SIGHUP sets, which asks to read the site file again."""
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked
-        return
-    before = signal.signal(signal.SIGHUP, lambda number, frame: asked.set())
-    try:
-        yield asked
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 def _next(queued: _Queue) -> Arrived | Token | None:

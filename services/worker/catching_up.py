@@ -25,13 +25,13 @@ from schemas.site import Site
 from schemas.topics import IDENTIFIER
 from services.common.errors import InputError
 from services.execution.processes import Aftermath, Aside, Processes
-from services.history.recorded import Looked, Stayed, Taken, look, take
+from services.history.recorded import AROUND_NS, Looked, Stayed, Taken, look, take
 from services.history.store import Ledger
 from services.identification.engine import Engine
-from services.identification.known import Known, overlap
+from services.identification.known import Known, are_one, overlap
 from services.identification.outputs import Said
 from services.identification.remembered import Found
-from services.identification.stays import MERGE_S, Passage
+from services.identification.stays import Passage
 from services.recordings.recording import is_being_written
 
 _log = logging.getLogger(__name__)
@@ -50,7 +50,6 @@ _SETTLED_S: Final = 5.0
 """What the logger had later than this ago its truck is about to send here, too."""
 _FILES_AT_ONCE: Final = 4
 """An hour of a truck, with the file before them, which a crossing may have begun in."""
-_AROUND_NS: Final = 60 * NS_PER_S
 _AT_ONCE: Final = 3
 """Crossings that are held here, half a megabyte each or more."""
 _NICE: Final = 10
@@ -278,7 +277,7 @@ class CatchingUp:
             files = tuple(
                 path
                 for path, (first_ns, last_ns) in looked.ranges.items()
-                if first_ns <= stay.exit_ns + _AROUND_NS and stay.entry_ns - _AROUND_NS <= last_ns
+                if first_ns <= stay.exit_ns + AROUND_NS and stay.entry_ns - AROUND_NS <= last_ns
             )
             found = stay
             for one in [one for one in known if _is_same(one.stay, stay)]:
@@ -417,9 +416,7 @@ def _is_about(known: Known, stay: Stayed) -> bool:
 
 
 def _near(entry_ns: int, exit_ns: int, stay: Stayed) -> bool:
-    if abs(entry_ns - stay.entry_ns) < MERGE_S * NS_PER_S:
-        return True
-    return overlap(entry_ns, max(exit_ns, entry_ns + 1), stay.entry_ns, stay.exit_ns)
+    return are_one(entry_ns, max(exit_ns, entry_ns + 1), stay.entry_ns, stay.exit_ns)
 
 
 def _gently() -> None:

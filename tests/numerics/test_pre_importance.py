@@ -149,12 +149,12 @@ def silent(stage: str, fraction: float) -> None:
 
 
 def test_weighted_draws_of_a_posterior_that_leans() -> None:
-    drawn, _, spent = sampling._weighted(
+    weighted, _, spent = sampling._weighted(
         log_gamma_times_normal, skewed_approximation(bend=-0.2), 1200, silent
     )
-    assert drawn is not None
+    assert weighted is not None
+    drawn, worth = weighted
     assert drawn.log_weight.size == spent == 1200
-    worth = importance.smoothed(drawn.log_weight)
     mean = float(worth.weight @ np.exp(drawn.y[:, 0]))  # of a gamma variate: its shape
     assert abs(mean - 2.5) < DEVIATIONS * np.sqrt(2.5 / worth.ess)
 

@@ -23,9 +23,11 @@ from schemas.signals import (
     encode_info,
     encode_location,
 )
+from schemas.site_file import site_toml
 from schemas.topics import Key
 from services.recordings.recording import Message
 from services.recordings.writer import write_recording
+from services.simulation.drive import paper_site
 from tests.process_replay.starting import End, Process, Start
 from tests.waiting import LONGEST_S
 
@@ -125,6 +127,14 @@ def drive(batches: int = 200, vehicle: str = "truck-1", boot_id: int = 77) -> It
             )
             yield message("gnss", encode_gnss(fix), number // 2, time_ns)
             yield message("location", encode_location(fix), number // 2, time_ns)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """Of the paper's truck and bridge."""
+    path = tmp_path / "site.toml"
+    path.write_text(site_toml(paper_site()))
+    return path
 
 
 @pytest.fixture

@@ -30,13 +30,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> Path:
-    path = tmp_path / "site.toml"
-    path.write_text(site_toml(paper_site()))
-    return path
-
-
-@pytest.fixture
 def logger(start: Start, endpoint: str, folder: Path) -> Process:
     return start_logger(start, endpoint, None, folder=folder)
 

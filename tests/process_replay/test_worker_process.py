@@ -17,7 +17,6 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import load_results
 from schemas.signals import Identity, decode_info, encode_info
-from schemas.site_file import site_toml
 from schemas.topics import selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
@@ -26,7 +25,8 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, run_to_messages
 from services.recordings.recording import Message, read_info, read_messages, read_site
 from services.simulation.drive import Drive, paper_site
-from tests.waiting import LONGEST_S, until
+from tests.receiving import several
+from tests.waiting import LONGEST_S
 
 pytestmark = pytest.mark.process
 
@@ -66,13 +66,6 @@ def drive_on(scenario_6: Drive) -> list[Message]:
         accel_time_s=np.append(run.accel_time_s, extra), channels=channels, gnss=gnss
     )
     return list(run_to_messages([longer], site, REALM, "truck-1"))
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Path:
-    path = tmp_path / "site.toml"
-    path.write_text(site_toml(paper_site()))
-    return path
 
 
 @pytest.fixture
@@ -127,19 +120,6 @@ def up_to(subscription: Subscription, stream: str) -> list[Received]:
             if one.key().stream == stream:
                 return received
     pytest.fail(f"no {stream} within {LONGEST_S} s, only {[r.key_text for r in received]}")
-
-
-def several(subscription: Subscription, number: int) -> list[Received]:
-    """The next messages, as many as there must be."""
-    received: list[Received] = []
-    until(
-        lambda: (
-            received.extend(one for one in [subscription.receive(0.2)] if one is not None)
-            or len(received) >= number
-        ),
-        f"{number} messages",
-    )
-    return received
 
 
 def after(subscription: Subscription, seconds: float) -> list[Received]:

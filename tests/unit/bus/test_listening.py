@@ -9,8 +9,9 @@ from schemas.signals import Identity
 from schemas.topics import key
 from services.bus.listening import Heard, Listening, elsewhere_line
 from services.bus.publisher import Publisher
-from services.bus.subscription import Received, Subscription
+from services.bus.subscription import Subscription
 from services.common.errors import InputError
+from tests.receiving import several
 from tests.waiting import until
 
 
@@ -30,14 +31,7 @@ def gathered(listening: Listening, number: int) -> list[Heard]:
 def arrived(router: zenoh.Session, number: int) -> None:
     """Wait until so many messages are on no way any more: what is would come as if said now."""
     with Subscription(router, "driveby/v1/live/**") as subscription:
-        found: list[Received] = []
-        until(
-            lambda: (
-                found.extend(one for one in [subscription.receive(0.1)] if one is not None)
-                or len(found) >= number
-            ),
-            f"{number} messages",
-        )
+        several(subscription, number)
 
 
 def test_each_message_once_with_what_was_before(

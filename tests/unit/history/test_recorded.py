@@ -160,7 +160,7 @@ def test_others_and_other_realms_are_not_this_truck(tmp_path: Path) -> None:
 def test_accelerations_far_from_bridges_are_not_held(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorded, "_AROUND_NS", NS_PER_S)
+    monkeypatch.setattr(recorded, "AROUND_NS", NS_PER_S)
     held: list[int] = []
     decided = recorded._decided
 
