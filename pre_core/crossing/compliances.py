@@ -48,7 +48,8 @@ class Compliances(NamedTuple):
     precision: FloatArray  # (k, k) of the told, the others integrated out
     linear: FloatArray  # (k,)
     log_odds: FloatArray  # (k,) of being exactly zero, against the density per unit
-    others_root: FloatArray  # lower triangle L, L L' the precision of the others given the told
+    others_root: FloatArray
+    """(others, others) lower triangle M: M' M is the covariance of the others given the told."""
     others_linear: FloatArray
     others_told: FloatArray  # (others, k) block of the precision
     leaning: FloatArray
@@ -133,7 +134,7 @@ def of_normal(
         inflation,
         *marginal(precision, linear, told),
         log_odds[told],
-        np.asarray(cholesky(precision[np.ix_(others, others)], lower=True)),
+        np.linalg.inv(cholesky(precision[np.ix_(others, others)], lower=True)),
         linear[others],
         precision[np.ix_(others, told)],
         leaning,
@@ -188,11 +189,10 @@ def draws(
     x[:, :e] = np.exp(-of.sigma * told[:, :e])
     mean = of.others_linear - x @ of.others_told.T
     normal = rng.standard_normal((count, of.others.size))
-    # With the precision L L' the mean is (L L')^-1 of the above, and the noise L'^-1 of a normal.
-    half = np.linalg.solve(of.others_root, mean.T)
+    # With the covariance M' M the mean is M' M of the above, and the noise M' of a normal.
     y = np.empty((count, of.told.size + of.others.size))
     y[:, of.told] = told
-    y[:, of.others] = np.linalg.solve(of.others_root.T, half + normal.T).T
+    y[:, of.others] = (mean @ of.others_root.T + normal) @ of.others_root
     return y + LEANING_SPREAD * rng.standard_normal((count, 1)) * of.leaning
 
 

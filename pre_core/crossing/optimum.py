@@ -189,7 +189,7 @@ def _descend(
     rows = _tempered(problem, y, directions, temperature)
     start = np.zeros(directions.shape[1])
     lower = _lower(problem, y, directions, is_free=is_free)
-    found = minimised(rows, start, steps, enough, lower)
+    found = minimised(rows, start, steps, enough, lower, is_followed=is_free)
     return y + directions @ found.state.y, found.state, found.ending, _evaluations(found)
 
 
@@ -276,7 +276,7 @@ def _looking(problem: Problem, y: FloatArray, way: Way) -> Look:
             return np.asarray(values - (values @ others) @ others.T)
 
         lower = _lower(problem, moved, free[:, places], is_free=True)
-        found = minimised(projected, start, _WALK_STEPS, _WALK_ENOUGH, lower)
+        found = minimised(projected, start, _WALK_STEPS, _WALK_ENOUGH, lower, is_followed=True)
         place = _Place(found.state.objective, shift, found.state.y, places)
         return place, _evaluations(found)
 

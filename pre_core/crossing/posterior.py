@@ -7,7 +7,7 @@ its place. The sum of squares of all rows is then -2 log posterior up to a const
 Gauss-Newton curvature the precision of the normal that the Markov chains are steered by.
 """
 
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -130,18 +130,31 @@ class Layout(NamedTuple):
 def layout(problem: Problem) -> Layout:
     """Theta (what is estimated), wheelbase, gains, delays, initial states, swing, trajectory."""
     priors = problem.priors
-    kept = np.flatnonzero(priors.estimated)
+    return _layout(
+        priors.estimated.tobytes(), priors.half_normal.tobytes(), problem.basis_position.shape[1]
+    )
+
+
+@lru_cache(maxsize=8)
+def _layout(estimated: bytes, half_normal: bytes, coefficients: int) -> Layout:
+    """Of flags (p,) and so many coefficients of the trajectory: asked for at every evaluation."""
+    kept = np.flatnonzero(np.frombuffer(estimated, dtype=np.bool_))
     t = kept.size
     gains = slice(t + 1, t + 4)
     delays = slice(gains.stop + 1, gains.stop + 1 + CHANNELS)
     initial = slice(delays.stop, delays.stop + 3 * CHANNELS)
     swing = slice(initial.stop, initial.stop + 2 * SWING_MODES)
-    trajectory = slice(swing.stop, swing.stop + problem.basis_position.shape[1])
-    return Layout(
-        slice(0, t),
+    trajectory = slice(swing.stop, swing.stop + coefficients)
+    places = (
         np.flatnonzero(kept >= FIRST_OF_BRIDGE),
         np.flatnonzero(kept >= EI_1),
-        np.flatnonzero(priors.half_normal[kept]),
+        np.flatnonzero(np.frombuffer(half_normal, dtype=np.bool_)[kept]),
+    )
+    for one in places:
+        one.flags.writeable = False
+    return Layout(
+        slice(0, t),
+        *places,
         t,
         gains,
         gains.stop,

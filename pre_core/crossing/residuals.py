@@ -122,6 +122,8 @@ class Work(NamedTuple):
     sharp: FloatArray  # (2, n)
     road: FloatArray  # (2, n)
     body: FloatArray  # (2, n)
+    begin: NDArray[np.int64]  # (rows,)
+    between: FloatArray  # (rows,)
     residual: FloatArray  # (3, rows)
     row: FloatArray  # (filtered rows,)
     modes_of: FloatArray  # (p,) the bridge whose modes are in `cubics`
@@ -151,6 +153,8 @@ def workspace(crossing: Crossing, parameters: int, rows: RowFilter) -> Work:
         np.zeros((2, n)),
         np.zeros((2, n)),
         np.zeros((2, n)),
+        np.zeros(crossing.rows, dtype=np.int64),
+        np.zeros(crossing.rows),
         np.zeros((RESIDUALS, crossing.rows)),
         np.zeros(row_count(rows, crossing.rows)),
         np.full(parameters, np.nan),
@@ -517,40 +521,24 @@ def _deflect(crossing: Crossing, work: Work, points: Points, k: int) -> None:
         begin = stop
 
 
-@summing
-def _weighted(
-    low: FloatArray, high: FloatArray, share: float, x: FloatArray, y: FloatArray
-) -> tuple[float, float]:
-    """Sums of x and of y with weights between those of two rows of the table (2, taps)."""
-    rest = 1.0 - share
-    value_high = share * share * (3.0 - 2.0 * share)
-    value_low = 1.0 - value_high
-    slope_low = share * rest * rest
-    slope_high = -share * share * rest
-    sum_x = sum_y = 0.0
-    for k in range(_SINC_TAPS):
-        weight = (value_low * low[0, k] + value_high * high[0, k]) + (
-            slope_low * low[1, k] + slope_high * high[1, k]
-        )
-        sum_x += weight * x[k]
-        sum_y += weight * y[k]
-    return sum_x, sum_y
-
-
 @kernel
-def _compare(
-    crossing: Crossing, work: Work, front: FloatArray, wheelbase: float, out: FloatArray
+def _find(
+    crossing: Crossing,
+    front: FloatArray,
+    wheelbase: float,
+    begin: NDArray[np.int64],
+    between: FloatArray,
 ) -> bool:
-    """The residuals of every row into `out` (3, rows); False if the front is not known there."""
+    """When the front wheel was where the rear wheel is; False if it is not known to have been.
+
+    For every row the first sample that is weighted (`begin`), and how far (0 to 1) the moment is
+    from the last one before it to the next.
+    """
     sign = 1.0 if crossing.direction > 0 else -1.0
     n = front.size
-    sinc = crossing.sinc
-    taps = sinc.shape[2]
-    ahead = taps // 2
+    ahead = _SINC_TAPS // 2
     j = ahead - 1
-    r, b = work.road[0], work.body[0]
-    road, body_front = out[0], out[1]
-    for row in range(crossing.rows):
+    for row in range(begin.size):
         i = crossing.first_row + row
         wanted = sign * front[i] - wheelbase
         while j < n - ahead - 1 and sign * front[j + 1] < wanted:
@@ -564,18 +552,52 @@ def _compare(
         f = (wanted - x1) * slope
         curvature = 0.5 * (sign * (front[j + 2] + front[j - 1]) - x1 - x2) * slope
         f -= 0.5 * f * (f - 1.0) * curvature
-        place = min(max(f, 0.0), 1.0) * _PHASES
-        phase = min(int(place), _PHASES - 1)
-        share = place - phase
-        low, high = sinc[phase], sinc[phase + 1]
-        begin = j - ahead + 1
-        front_road, front_body = _weighted(
-            low, high, share, r[begin : begin + taps], b[begin : begin + taps]
-        )
-        road[row] = work.road[1, i] - front_road  # both hold y - u, minus the road
-        body_front[row] = front_body
-    out[2] = work.body[1, crossing.first_row : crossing.first_row + crossing.rows]
+        begin[row] = j - ahead + 1
+        between[row] = min(max(f, 0.0), 1.0)
     return True
+
+
+@summing
+def _read(
+    sinc: FloatArray, place: float, begin: int, wheel: int, road: FloatArray, body: FloatArray
+) -> tuple[float, float]:
+    """`road` and `body` (2, n) of a wheel at `place` (0 to 1) between the middle two of the taps.
+
+    These are the samples from `begin` on. The indices have no sign: of one that has, every access
+    asks whether it counts from the end, and the compiler leaves the vector registers alone, which
+    takes four times as long.
+    """
+    phase = min(int(place * _PHASES), _PHASES - 1)
+    share = place * _PHASES - phase
+    low, first, w = np.uintp(phase), np.uintp(begin), np.uintp(wheel)
+    high = low + np.uintp(1)
+    rest = 1.0 - share
+    value_high = share * share * (3.0 - 2.0 * share)
+    value_low = 1.0 - value_high
+    slope_low = share * rest * rest
+    slope_high = -share * share * rest
+    sum_road = sum_body = 0.0
+    for k in range(np.uintp(_SINC_TAPS)):
+        weight = (value_low * sinc[low, 0, k] + value_high * sinc[high, 0, k]) + (
+            slope_low * sinc[low, 1, k] + slope_high * sinc[high, 1, k]
+        )
+        sum_road += weight * road[w, first + k]
+        sum_body += weight * body[w, first + k]
+    return sum_road, sum_body
+
+
+@kernel
+def _compare(crossing: Crossing, work: Work, out: FloatArray) -> None:
+    """The residuals of every row into `out` (3, rows), read where `_find` found them."""
+    road, body = work.road, work.body
+    first = np.uintp(crossing.first_row)
+    for row in range(np.uintp(crossing.rows)):
+        front_road, front_body = _read(
+            crossing.sinc, work.between[row], work.begin[row], 0, road, body
+        )
+        out[0, row] = road[1, first + row] - front_road  # both hold y - u, minus the road
+        out[1, row] = front_body
+        out[2, row] = body[1, first + row]
 
 
 @kernel
@@ -589,8 +611,11 @@ def _residuals(crossing: Crossing, work: Work, points: Points, k: int, out: Floa
             return False
     if not _roads(crossing, work, points, k):
         return False
+    if not _find(crossing, points.position_m[k], points.wheelbase_m[k], work.begin, work.between):
+        return False
     _deflect(crossing, work, points, k)
-    return _compare(crossing, work, points.position_m[k], points.wheelbase_m[k], out)
+    _compare(crossing, work, out)
+    return True
 
 
 @kernel

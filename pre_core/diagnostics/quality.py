@@ -7,8 +7,8 @@ kind of residual, part of the drive and band of frequencies, and how unlikely is
 Thresholds stand where verdicts are made.
 """
 
-from itertools import permutations
-from typing import Any, NamedTuple
+from itertools import permutations, product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,7 +201,7 @@ def stiffness_per_mass(
                 omega,
                 float(known_stiffness[w]),
                 float(known_damping[w]),
-            ).x[0]
+            )[0][0]
         )
         for w in (0, 1)
     ]
@@ -232,8 +232,7 @@ def _unexplained(
     power = float(np.vdot(body, body).real)
     if not power > 0.0:
         return 1.0
-    found = _constants(body, axle, other, omega, stiffness_per_mass, damping_per_mass)
-    return 2.0 * float(found.cost) / power
+    return _constants(body, axle, other, omega, stiffness_per_mass, damping_per_mass)[1] / power
 
 
 def _constants(
@@ -243,10 +242,8 @@ def _constants(
     omega: FloatArray,
     stiffness_per_mass: float,
     damping_per_mass: float,
-) -> Any:
-    """The fit of the body equation: factors of k/m and c/m, and the coupling."""
-    from scipy.optimize import lsq_linear  # slow to import, seldom needed
-
+) -> tuple[FloatArray, float]:
+    """The fit of the body equation: factors of k/m and c/m, and the coupling; |residual|^2."""
     stroke = body - axle
     columns = np.stack(
         [
@@ -260,7 +257,37 @@ def _constants(
     right = -np.concatenate([body.real, body.imag])
     low = [1.0 / _BODY_FACTOR, 0.0, -_LARGEST_COUPLING]
     high = [_BODY_FACTOR, _BODY_FACTOR, _LARGEST_COUPLING]
-    return lsq_linear(matrix, right, (low, high), method="bvls")
+    return least_squares_in_a_box(matrix, right, np.array(low), np.array(high))
+
+
+def least_squares_in_a_box(
+    matrix: FloatArray, right: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, float]:
+    """Minimiser x (k,) of |matrix x - right|^2 within low <= x <= high, and the minimum.
+
+    `matrix` (m, k) is of full rank with few columns: every face of the box is tried (3^k), and as
+    the problem is convex, the best of the minima that lie within it is the one. (scipy.optimize has
+    it for any number, and takes longer to import than a tenth of a crossing takes.)
+    """
+    k = low.size
+    root = np.linalg.qr(np.column_stack([matrix, right])).R
+    triangle, image = root[:k, :k], root[:k, k]
+    best, least = low, np.inf
+    for face in product((0, -1, 1), repeat=k):
+        free = np.array(face) == 0
+        x = np.where(np.array(face) < 0, low, high)
+        if free.any():
+            x[free] = np.linalg.lstsq(
+                triangle[:, free], image - triangle[:, ~free] @ x[~free], rcond=None
+            )[0]
+        if np.any(x < low) or np.any(x > high):
+            continue
+        cost = float(np.sum((triangle @ x - image) ** 2))
+        if cost < least:
+            best, least = x, cost
+        if free.all():
+            break
+    return best, least + float(np.sum(root[k:, k] ** 2))
 
 
 def lead(

@@ -27,7 +27,17 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from pre_core.kernels.jacobi import diagonalise, diagonalise_one
-from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store, sub
+from pre_core.kernels.lanes import (
+    LANES,
+    add,
+    fma,
+    fma_scalar,
+    kernel,
+    load,
+    mul,
+    store,
+    sub,
+)
 from pre_core.physics.bridge import (
     element_cubics,
     held_nodes,
@@ -218,23 +228,28 @@ def diagonalise_bridge(
 
 @kernel
 def shape_cubics(
-    basis_cubics: FloatArray, vector: FloatArray, size: float, lane: int, out: FloatArray
+    basis_cubics: FloatArray, vectors: FloatArray, size: FloatArray, out: FloatArray
 ) -> None:
-    """Cubics of one mode in every part, times `size`, into out (parts, 4, lanes) at `lane`."""
-    m = vector.size
+    """Cubics of all modes in every part into out (parts, g, 4, 4) [part, group, power, mode].
+
+    `vectors` (m, m) has the modes in its rows, each of which is multiplied by its `size` (m,).
+    """
+    m = np.uintp(size.size)
+    turned = np.empty((size.size, size.size))
+    for k in range(m):
+        for i in range(m):
+            turned[i, k] = size[k] * vectors[k, i]
+    row = np.empty(size.size)
     for e in range(basis_cubics.shape[0]):
         for power in range(4):
-            row = basis_cubics[e, power]
-            # Four sums, so that each need not wait for the one before.
-            s0 = s1 = s2 = s3 = 0.0
-            for i in range(0, m - 3, 4):
-                s0 += vector[i] * row[i]
-                s1 += vector[i + 1] * row[i + 1]
-                s2 += vector[i + 2] * row[i + 2]
-                s3 += vector[i + 3] * row[i + 3]
-            for i in range(m - m % 4, m):
-                s0 += vector[i] * row[i]
-            out[e, power, lane] = size * ((s0 + s1) + (s2 + s3))
+            # Mode beside mode, so that they share the vector registers.
+            row[:] = 0.0
+            for i in range(m):
+                one = basis_cubics[e, power, i]
+                for k in range(m):
+                    row[k] += one * turned[i, k]
+            for k in range(size.size):
+                out[e, k // LANES, power, k % LANES] = row[k]
 
 
 @kernel
@@ -258,15 +273,16 @@ def modal_filters_one(
     a = 2.0 / step_s
     cubics[:] = 0.0
     feedback[:] = 0.0
-    for k in range(basis_stiffness.shape[1]):
+    size = np.empty(basis_stiffness.shape[1])
+    for k in range(size.size):
         group, lane = k // LANES, k % LANES
         eigenvalue = matrix[k, k] / theta[RHO_A]
         damping = modal_damping(theta, eigenvalue)
         b_0 = a * a + a * damping + eigenvalue
         feedback[group, 0, lane] = -4.0 * eigenvalue / b_0
         feedback[group, 1, lane] = (a * a - a * damping - 3.0 * eigenvalue) / b_0
-        size = 1.0 / np.sqrt(theta[RHO_A] * b_0)
-        shape_cubics(basis_cubics, vectors[k], size, lane, cubics[:, group])
+        size[k] = 1.0 / np.sqrt(theta[RHO_A] * b_0)
+    shape_cubics(basis_cubics, vectors, size, cubics)
     return True
 
 

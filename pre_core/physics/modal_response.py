@@ -98,7 +98,8 @@ def modal_filters(
     cubics[:] = 0.0
     feedback[:] = 0.0
     one = np.empty(COEFFICIENTS)
-    for k in range(basis_stiffness.shape[1]):
+    size = np.empty(basis_stiffness.shape[1])
+    for k in range(size.size):
         group, lane = k // LANES, k % LANES
         eigenvalue = matrix[k, k] / theta[RHO_A]
         damping = modal_damping(theta, eigenvalue)
@@ -106,11 +107,11 @@ def modal_filters(
         if not total > 0.0:
             return False
         feedback[group, :, lane] = one
-        size = np.sqrt(total / theta[RHO_A])
+        size[k] = np.sqrt(total / theta[RHO_A])
         modes[k, 0], modes[k, 1] = eigenvalue, damping
         # In coordinates in which a bridge near by is diagonal a mode is nearly a unit vector.
         modes[k, 2] = np.sqrt(total) if vectors[k, k] >= 0.0 else -np.sqrt(total)
-        shape_cubics(basis_cubics, vectors[k], size, lane, cubics[:, group])
+    shape_cubics(basis_cubics, vectors, size, cubics)
     return True
 
 

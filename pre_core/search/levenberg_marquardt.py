@@ -22,6 +22,8 @@ _SMALLEST_DAMPING = 1e-14
 _GIVE_UP_DAMPING = 1e8
 """Steps that are so short and do not help: the search is stuck."""
 _CONVERGED_STEP = 1e-9  # in logarithms
+_KEPT = 0.5
+"""A step that gains less than this part of what slopes led on promise has them taken anew."""
 _LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
 
 
@@ -61,6 +63,8 @@ class State(NamedTuple):
     objective: float
     damping: float
     differences: Differences
+    is_fresh: bool = True
+    """Whether the Jacobian was taken here, and not led on from where it was (`_follow`)."""
 
 
 class Info(NamedTuple):
@@ -156,6 +160,47 @@ def descend(rows: Rows, state: State, lower: FloatArray | None = None) -> tuple[
     )
 
 
+def _follow(rows: Rows, state: State, lower: FloatArray | None) -> tuple[State, Info]:
+    """`descend` with slopes that are led on from step to step, as long as steps lead there.
+
+    Broyden's update (Dennis and Schnabel, section 8.1): of all slopes that explain the change of
+    the rows along the step those that are nearest to the last ones. Where a step kept too little of
+    its promise slopes are taken anew; and where one with slopes led on leads no further.
+    """
+    there = move(rows, state, lower)
+    if not isinstance(there, Move):
+        stays, info = there
+        return (stays, info) if state.is_fresh else _refreshed(rows, stays, info)
+    change = there.y - state.y
+    told = state.jacobian @ change
+    promised = state.objective - _square(state.residual + told)
+    missed = there.residual - state.residual - told
+    ending = Ending.CONVERGED if there.size < _CONVERGED_STEP else None
+    following = state._replace(
+        y=there.y,
+        residual=there.residual,
+        jacobian=state.jacobian + np.outer(missed, change / max(_square(change), 1e-300)),
+        objective=there.objective,
+        damping=there.damping,
+        is_fresh=False,
+    )
+    info = Info(there.objective, there.size, there.damping, True, there.evaluations, ending)
+    if ending is None and state.objective - there.objective < _KEPT * promised:
+        return _refreshed(rows, following, info)
+    return following, info
+
+
+def _refreshed(rows: Rows, state: State, info: Info) -> tuple[State, Info]:
+    """The same place with slopes taken there, from which a search goes on."""
+    jacobian = _jacobian(rows, state.y, state.residual, state.differences)
+    evaluations = info.evaluations + _evaluations(state.differences, state.y.size)
+    damping = min(state.damping, _FIRST_DAMPING)
+    return (
+        state._replace(jacobian=jacobian, damping=damping, is_fresh=True),
+        info._replace(evaluations=evaluations, ending=None),
+    )
+
+
 def _square(residual: FloatArray) -> float:
     return float(residual @ residual)
 
@@ -203,18 +248,26 @@ def minimised(
     steps: int,
     enough: float,
     lower: FloatArray | None = None,
+    *,
+    is_followed: bool = False,
 ) -> Solution[State, Info]:
     """The bottom below `start` (f,), reached when a step gains less than `enough`.
 
     Where no step helps any more, forward differences have reached their rounding: the bottom too.
+    With `is_followed` slopes are taken where the search begins, and then only where those that are
+    led on (`_follow`) no longer tell the way. A step that gains too little ends the search only if
+    its slopes were taken where it began. The slopes at the end need not be (`State.is_fresh`).
     """
 
     def step(state: State) -> tuple[State, Info]:
-        following, info = descend(rows, state, lower)
-        if info.ending is Ending.STUCK or (
-            info.ending is None and state.objective - following.objective < enough
-        ):
-            info = info._replace(ending=Ending.CONVERGED)
+        following, info = (_follow if is_followed else descend)(rows, state, lower)
+        if info.ending is Ending.STUCK:
+            return following, info._replace(ending=Ending.CONVERGED)
+        if info.ending is None and state.objective - following.objective < enough:
+            if state.is_fresh:
+                return following, info._replace(ending=Ending.CONVERGED)
+            if not following.is_fresh:
+                return _refreshed(rows, following, info)
         return following, info
 
     return run(lambda: begin(rows, start), step, steps)

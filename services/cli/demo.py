@@ -251,20 +251,43 @@ class _Running(NamedTuple):
 def _process(folder: Path, name: str, *arguments: str) -> Iterator[_Running]:
     """Start a sub-command as a process of its own; its log stays in the folder if it fails."""
     log = folder / f"{name}.log"
-    with log.open("wb") as file:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "services", name, *arguments],
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-        )
+    process: subprocess.Popen[bytes] | None = None
     try:
+        with log.open("wb") as file, _held_back():
+            process = subprocess.Popen(
+                [sys.executable, "-m", "services", name, *arguments],
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+            )
         yield _Running(name, process, log)
     finally:
-        if process.poll() is None:
-            process.kill()
-        process.wait()
+        if process is not None:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
     log.unlink()
+
+
+@contextlib.contextmanager
+def _held_back() -> Iterator[None]:
+    """Signals that end the demo count from the end of this on.
+
+    An interrupt inside of `Popen` would leave a process behind that nobody knows.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+    both = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(one, lambda number, frame: caught.append(number)) for one in both]
+    try:
+        yield
+    finally:
+        for one, handler in zip(both, before, strict=True):
+            signal.signal(one, handler)
+    if caught:
+        raise KeyboardInterrupt
 
 
 def _wait(

@@ -213,7 +213,7 @@ def test_draws_of_compliances_against_quadrature() -> None:
     of = Compliances(
         elements=np.array([0]), sigma=np.array([sigma]), told=np.array([0, 1]),
         others=np.array([2]), centre=np.array([1.0]), inflation=1.0, precision=precision,
-        linear=linear, log_odds=np.array([-np.inf, odds]), others_root=np.array([[2.0]]),
+        linear=linear, log_odds=np.array([-np.inf, odds]), others_root=np.array([[0.5]]),
         others_linear=np.array([1.0]), others_told=np.array([[0.5, -0.4]]), leaning=np.zeros(3),
     )  # fmt: skip
     drawn = np.concatenate([draws(of, 1500, 3, stream) for stream in range(4)])

@@ -6,7 +6,7 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from pre_core.crossing.channels import PASS, STOP
-from pre_core.crossing.residuals import _weighted, sinc_table
+from pre_core.crossing.residuals import _read, sinc_table
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 
 FloatArray = NDArray[np.float64]
@@ -19,10 +19,8 @@ AT = np.arange(TAPS) - (TAPS // 2 - 1.0)
 
 def read(samples: FloatArray, place: float) -> float:
     """As `_compare` does it: samples (taps,) at `place`, 0 to 1, beyond the middle one."""
-    phase = min(int(place * PHASES), PHASES - 1)
-    value, again = _weighted(
-        TABLE[phase], TABLE[phase + 1], place * PHASES - phase, samples, samples
-    )
+    wheels = np.stack([samples, samples])
+    value, again = _read(TABLE, place, 0, 0, wheels, wheels)
     assert value == again
     return float(value)
 

@@ -9,6 +9,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from pre_core.diagnostics import quality
 from pre_core.physics.simulate import Motion
@@ -187,3 +188,15 @@ def test_body_equation_is_exact_for_a_linear_truck() -> None:
     assert found.recorded < 0.01
     assert min(found.reversed_) > 0.3
     assert found.best > 0.3
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_least_squares_in_a_box_are_scipys(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    matrix = rng.standard_normal((40, 3)) @ rng.standard_normal((3, 3))
+    right = matrix @ rng.uniform(-2.0, 2.0, 3) + 0.3 * rng.standard_normal(40)
+    low, high = np.array([0.25, 0.0, -0.6]), np.array([1.0, 1.0, 0.6])
+    x, least = quality.least_squares_in_a_box(matrix, right, low, high)
+    theirs = lsq_linear(matrix, right, (low, high), method="bvls")
+    np.testing.assert_allclose(x, theirs.x, atol=1e-9)
+    assert least == pytest.approx(2.0 * theirs.cost, rel=1e-9)

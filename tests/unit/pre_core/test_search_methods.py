@@ -358,6 +358,33 @@ def test_bounds_against_scipy(seed: int):
     assert at_bound.any() == bool(ours > free * (1.0 + 1e-6))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_slopes_that_are_led_on_end_at_the_same_bottom_for_less(seed: int) -> None:
+    """Rows that bend, twelve unknowns, two of them at a bound; the count is of evaluations."""
+    rng = np.random.default_rng(seed)
+    matrix, bent = rng.standard_normal((60, 12)), 0.1 * rng.standard_normal((60, 12))
+    aim = matrix @ rng.standard_normal(12)
+    lower = np.where(np.arange(12) < 2, 0.5, -np.inf)
+    asked = 0
+
+    def rows(y: np.ndarray) -> np.ndarray:
+        nonlocal asked
+        asked += y.shape[0]
+        return y @ matrix.T + (y**2) @ bent.T - aim
+
+    start = np.where(np.arange(12) < 2, 0.5, 2.0)
+    exact = levenberg_marquardt.minimised(rows, start, 100, 1e-9, lower)
+    counted, asked = asked, 0
+    found = levenberg_marquardt.minimised(rows, start, 100, 1e-9, lower, is_followed=True)
+    assert found.ending is Ending.CONVERGED
+    assert asked == 13 + sum(info.evaluations for info in found.infos)
+    assert asked < 0.85 * counted
+    # Forward differences leave this much.
+    assert found.state.objective == pytest.approx(exact.state.objective, rel=1e-6)
+    np.testing.assert_allclose(found.state.y, exact.state.y, atol=1e-3)
+    assert np.all(found.state.y >= lower)
+
+
 def test_at_its_bounds_a_search_ends_at_once():
     """Held coordinates promise nothing: at the bottom beside them no step is tried."""
     matrix = np.array([[1.0, 0.5], [0.0, 1.0], [1.0, 0.0]])
