@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing
+from schemas.results import BridgeResult, Crossing
 from schemas.signals import GnssFix
 from schemas.site import Vehicle
 from schemas.vehicle_info import Difference, differences
@@ -162,5 +162,7 @@ class BridgeCrossings:
     counted: Counted = field(default_factory=Counted)
     under_way: deque[UnderWay] = field(default_factory=deque)
     """In the order in which they were found: so their results are told."""
+    state: BridgeResult | None = None
+    """The latest that was made of those that are counted."""
     results: dict[int, Crossing] = field(default_factory=dict)
     """Those that have come before one that was found earlier, by number of the work."""
