@@ -4,6 +4,10 @@ Driving along the bridge's line, a truck is before the bridge, on it (with at le
 behind it. A crossing is a passage from one side to the other; one that ends on the side where it
 began, or that the positions only begin or end in, is a crossing that cannot be identified.
 
+Where the receiver was out while a truck passed, the fixes before and behind tell it all the same,
+unless the truck drove away from the bridge before and towards it afterwards: it came back unseen,
+or was switched off and began another run, and nobody knows by which way.
+
 A receiver's noise moves a truck that is at an end of the bridge on and off it: only what goes
 through, or further onto the bridge than noise reaches, is a stay.
 """
@@ -131,7 +135,9 @@ def find_stays(
     gone = np.append(np.flatnonzero(depth <= 0.0), time_s.size)
     stop = 0
     for n in begins.tolist():
-        if n >= stop:
+        if n >= stop and not (
+            depth[n] <= 0.0 and _came_unseen(antenna_m, speed_m_per_s, n, margin_m)
+        ):
             stop = int(gone[np.searchsorted(gone, n)]) if depth[n] > 0.0 else n
             stay = _stay(time_s, places, n, stop, span_m, margin_m)
             deep_m = np.inf
@@ -146,6 +152,21 @@ def find_stays(
             if was_on_it and is_near and _is_along(lateral_m, front, n, stop, span_m):
                 stays.append(stay)
     return _merged(stays)
+
+
+def _came_unseen(antenna_m: Floats, speed_m_per_s: Floats, n: int, margin_m: float) -> bool:
+    """Whether a truck that is on the other side at fix n need not have come over the bridge.
+
+    So it is if before it drove the other way, and goes on that way; while it has not moved further
+    than noise does, it is taken to.
+    """
+    direction = np.sign(antenna_m[n] - antenna_m[n - 1])
+    before, after = antenna_m[:n], direction * (antenna_m[n:] - antenna_m[n])
+    # By the fixes before alone: seen from behind it, a truck that stood has turned there.
+    if np.ptp(before) <= margin_m or _senses(before, speed_m_per_s[:n], margin_m)[-1] == direction:
+        return False
+    far = np.flatnonzero(np.abs(after) > margin_m)
+    return far.size == 0 or bool(after[far[0]] < 0.0)
 
 
 def _senses(antenna_m: Floats, speed_m_per_s: Floats, margin_m: float) -> Floats:
