@@ -1,11 +1,21 @@
 """A simulated day in short: two trucks, twelve bridges, and a worker that is killed."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from schemas.proto import driveby_pb2 as pb
-from tests.faults.day import Crossed, Plan, live, problems_of, site, way
+from tests.faults.day import (
+    Crossed,
+    Plan,
+    lanes_driven,
+    live,
+    problems_of,
+    problems_of_view,
+    site,
+    way,
+)
 
 pytestmark = pytest.mark.process
 
@@ -15,7 +25,7 @@ def test_every_crossing_has_one_result_although_the_worker_is_killed(tmp_path: P
     what the worker cannot keep up with waits."""
     told = live(tmp_path, rounds=1, bridges=4, speed=12.0, kills=1, away_s=0.0, seed=1)
     assert told.problems == []
-    assert told.crossings == told.results == 16
+    assert told.crossings == told.results == told.shown == told.to_show == 16
 
 
 @pytest.mark.faults
@@ -24,6 +34,7 @@ def test_killed_five_times_and_away_for_longer_than_a_history(tmp_path: Path) ->
     told = live(tmp_path, rounds=3, bridges=9, speed=8.0, kills=5, away_s=600.0, seed=2)
     assert told.problems == []
     assert told.crossings == told.results == 108
+    assert told.shown == told.to_show == 66
 
 
 def test_the_day_sees_what_is_missing_twice_or_invented() -> None:
@@ -51,6 +62,17 @@ def test_the_day_sees_what_is_missing_twice_or_invented() -> None:
     ):
         assert problems_of(plans, wrong), wrong
     assert problems_of(plans, [one, two, result(1, pb.START_TO_END, "truck-2")])
+
+
+def test_the_day_sees_what_the_view_does_not_show_or_shows_twice() -> None:
+    there, back = Crossed("road-0", "start_to_end"), Crossed("road-0", "end_to_start")
+    far = Crossed("road-8", "start_to_end")  # behind the bridges that are drawn
+    driven = lanes_driven({"truck-1": Plan(Path(), [there, far, back], 10.0)})
+    lane = ("road-0", "truck-1")
+    assert driven == Counter({lane: 2})
+    assert problems_of_view(driven, Counter({lane: 2})) == []
+    wrong = (Counter({lane: 1}), Counter({lane: 3}), Counter({lane: 2, ("road-1", "truck-1"): 1}))
+    assert all(len(problems_of_view(driven, shown)) == 1 for shown in wrong)
 
 
 def test_the_way_is_what_was_described() -> None:
