@@ -11,11 +11,12 @@ that was driven must have one result, in its order, and nothing else may have on
 
 The live view is killed, too, at a random moment before the worker is for the first time: a worker
 that is there tells a new view all that it has told so far. So the view that follows must show each
-crossing of the bridges that it draws once, with a verdict. What it shows is read as a viewer reads
+crossing of the eight bridges that it draws, those that it met first, once and with a verdict. What it shows is read as a viewer reads
 it, by one that writes what it gets into a file.
 """
 
 import argparse
+import contextlib
 import logging
 import os
 import random
@@ -70,8 +71,6 @@ _TWIN = 3
 _BELOW = 5
 """Number of the one that has another one above it."""
 TRUCKS = ("truck-1", "truck-2")
-Lanes = Counter[tuple[str, str]]
-"""Crossings with a verdict, by bridge and truck."""
 
 
 class Crossed(NamedTuple):
@@ -263,7 +262,9 @@ class Fleet:
         self._views += 1
         shown = self.folder / f"view-{self._views}.rrd"
         own = os.environ | {"HOME": str(self.folder), "XDG_CONFIG_HOME": str(self.folder)}
-        subprocess.run([viewer_program(), "analytics", "disable"], env=own, check=True)
+        subprocess.run(
+            [viewer_program(), "analytics", "disable"], env=own, check=True, capture_output=True
+        )
         arguments = viewer_arguments(address, web=False)
         arguments[arguments.index("--port") + 1] = str(free_port())
         viewer = subprocess.Popen(
@@ -328,41 +329,63 @@ class View(NamedTuple):
             process.kill()
             process.wait()
 
-    def lanes(self) -> Lanes:
-        """The verdicts in the picture so far."""
-        with warnings.catch_warnings():
-            # A file that is still being written has no footer.
+    def picture(self) -> "Picture":
+        """What it shows so far."""
+        known = site()
+        lanes = {
+            f"/{lane_entity(bridge.id, vehicle.id)}": (bridge.id, vehicle.id)
+            for bridge in known.bridges
+            for vehicle in known.vehicles
+        }
+        pages = {f"/said/{bridge.id}": bridge.id for bridge in known.bridges}
+        found = Picture(set(), Counter())
+        with warnings.catch_warnings(), contextlib.suppress(RuntimeError):
+            # The file is still being written: it has no footer, and ends in the middle of a chunk.
             warnings.simplefilter("ignore")
-            chunks = list(RrdReader(self.shown).stream()) if self.shown.exists() else []
-        of_lane = {f"/{lane_entity(*lane)}": lane for lane in lanes_of(site())}
-        found: Lanes = Counter()
-        for chunk in chunks:
-            lane = of_lane.get(chunk.entity_path)
-            if lane is None or chunk.is_static:
-                continue
-            rows = chunk.to_record_batch()
-            (column,) = (name for name in rows.schema.names if name.endswith("StateChange:state"))
-            found[lane] += sum(
-                bool(one) and one[0] in VERDICT_COLOURS for one in rows[column].to_pylist()
-            )
+            for chunk in RrdReader(self.shown).stream():
+                if chunk.entity_path in pages:
+                    found.bridges.add(pages[chunk.entity_path])
+                if chunk.entity_path not in lanes or chunk.is_static:
+                    continue
+                rows = chunk.to_record_batch()
+                (name,) = (n for n in rows.schema.names if n.endswith("StateChange:state"))
+                states = [one[0] for one in rows[name].to_pylist() if one]
+                verdicts = sum(state in VERDICT_COLOURS for state in states)
+                found.verdicts[lanes[chunk.entity_path]] += verdicts
         return found
 
 
-def lanes_of(known: Site) -> list[tuple[str, str]]:
-    """The bridges that a view draws of a site whose bridges are all near, with each truck."""
-    bridges = known.bridges[:MOST_BRIDGES]
-    return [(bridge.id, vehicle.id) for bridge in bridges for vehicle in known.vehicles]
+class Picture(NamedTuple):
+    """What a live view shows of crossings."""
+
+    bridges: set[str]
+    """Those that it draws: not more than some, which it met first."""
+    verdicts: Counter[tuple[str, str]]
+    """How many crossings have one, by bridge and truck."""
 
 
-def lanes_driven(plans: dict[str, Plan]) -> Lanes:
-    """What a view must show."""
-    drawn = set(lanes_of(site()))
+def driven_in(picture: Picture, plans: dict[str, Plan]) -> Counter[tuple[str, str]]:
+    """What a picture must show of what was driven."""
     return Counter(
         (crossed.bridge, vehicle)
         for vehicle, plan in plans.items()
         for crossed in plan.crossings
-        if (crossed.bridge, vehicle) in drawn
+        if crossed.bridge in picture.bridges
     )
+
+
+def problems_of_view(picture: Picture, plans: dict[str, Plan]) -> list[str]:
+    """Where a picture has too few or too many crossings with a verdict."""
+    driven = driven_in(picture, plans)
+    found = [
+        f"live view: {picture.verdicts[lane]} crossings of {lane[1]} over {lane[0]} instead of "
+        f"{driven[lane]}"
+        for lane in sorted(driven | picture.verdicts)
+        if picture.verdicts[lane] != driven[lane]
+    ]
+    if len(picture.bridges) != MOST_BRIDGES:
+        found.append(f"live view: {len(picture.bridges)} bridges instead of {MOST_BRIDGES}")
+    return found
 
 
 class Told(NamedTuple):
@@ -406,15 +429,6 @@ def problems_of(plans: dict[str, Plan], results: Sequence[pb.Estimate]) -> list[
             )
     others = {r.vehicle for r in results} - set(plans)
     return found + [f"results of {name}" for name in sorted(others)]
-
-
-def problems_of_view(driven: Lanes, shown: Lanes) -> list[str]:
-    """Where the picture has too few or too many crossings with a verdict."""
-    return [
-        f"live view: {shown[lane]} crossings of {lane[1]} over {lane[0]} instead of {driven[lane]}"
-        for lane in sorted(driven | shown)
-        if shown[lane] != driven[lane]
-    ]
 
 
 def live(
@@ -474,13 +488,13 @@ def live(
             assert worker.poll() is None, fleet.logs()
             time.sleep(0.5)
         seconds = time.monotonic() - began
-        to_show = lanes_driven(plans)
         deadline = time.monotonic() + LONGEST_S
-        while (shown := view.lanes()) != to_show and time.monotonic() < deadline:
+        while problems_of_view(view.picture(), plans) and time.monotonic() < deadline:
             assert view.process.poll() is None, fleet.logs()
             time.sleep(0.5)
         view.process.send_signal(signal.SIGTERM)
         assert view.process.wait(LONGEST_S) == 0, fleet.logs()
+        picture = view.picture()
         worker.send_signal(signal.SIGTERM)
         assert worker.wait(LONGEST_S) == 0, fleet.logs()
         logger.send_signal(signal.SIGTERM)
@@ -489,10 +503,11 @@ def live(
     finally:
         fleet.close()
         log.setLevel(said_before)
-    problems = problems_of(plans, results) + problems_of_view(to_show, shown)
+    problems = problems_of(plans, results) + problems_of_view(picture, plans)
     if problems:
         problems.append(fleet.logs())
-    counts = (wanted, len(results), shown.total(), to_show.total(), kills)
+    shown, to_show = picture.verdicts.total(), driven_in(picture, plans).total()
+    counts = (wanted, len(results), shown, to_show, kills)
     return Told(*counts, seconds, longest_backlog, problems)
 
 
