@@ -318,7 +318,7 @@ class Engine:
             near = truck.came_to(self._bridges, fix)
             if truck.late:
                 near = sorted({*near, *truck.late_enough()})
-            yield from self._look(realm, truck, near, truck.latest_s)
+            yield from self._look(realm, truck, near, truck.latest_s, here=fix)
             self._forget(truck, truck.latest_s)
 
     def _finish(self, realm: str, truck: TruckBoot) -> Iterator[Said]:
@@ -360,26 +360,37 @@ class Engine:
         bridges: list[int],
         now_s: float,
         wait: _Wait | None = None,
+        here: GnssFix | None = None,
     ) -> Iterator[Said]:
         """Find crossings in the fixes that are known, and identify those that are complete.
 
-        A crossing that is over waits while `wait` says so.
+        A crossing that is over waits while `wait` says so. `here` is the fix that is new.
         """
-        if not bridges:
-            return
         wait = wait or self._may_still_come
-        fixes = truck.boot.fixes()
         for number in sorted(bridges):
-            visit = truck.near.get(number)
-            # A truck may have stood somewhere for minutes: what was before it came is not needed.
-            lately = fixes if visit is None else fixes.since(visit.since_s - AWAY_S)
-            stays = self._bridges.stays(number, truck.vehicle, lately)
             bridge = self._bridges.bridge(number)
-            for stay in stays:
+            for stay in self._stays(truck, number, here):
                 # Which of several beside each other it is on is told when it has left them.
                 is_plain = stay.is_over or not self._bridges.rivals(number)
                 if is_plain or now_s - stay.entry_s >= LONGEST_STAY_S:
                     yield from self._advance(realm, truck, bridge, stay, now_s, wait)
+
+    def _stays(self, truck: TruckBoot, number: int, here: GnssFix | None) -> list[Stay]:
+        """All stays on a bridge in the fixes that are known; `here` is the one that is new.
+
+        To look takes time: who is still on the side where nothing changes is not looked at again.
+        """
+        look = truck.looks.get(number)
+        is_newest = here is not None and here.device_time_ns * 1e-9 >= truck.latest_s
+        if here is not None and is_newest and look is not None:
+            place = here.latitude_deg, here.longitude_deg
+            if self._bridges.is_as_it_was(look, number, truck.vehicle, *place):
+                return look.stays
+        fixes, visit = truck.boot.fixes(), truck.near.get(number)
+        # A truck may have stood somewhere for minutes: what was before it came is not needed.
+        lately = fixes if visit is None else fixes.since(visit.since_s - AWAY_S)
+        look = truck.looks[number] = self._bridges.look(number, truck.vehicle, lately, look)
+        return look.stays
 
     def _advance(
         self,

@@ -171,26 +171,28 @@ def _came_unseen(antenna_m: Floats, speed_m_per_s: Floats, n: int, margin_m: flo
 
 def _senses(antenna_m: Floats, speed_m_per_s: Floats, margin_m: float) -> Floats:
     """Sense of travel at each fix, 1 or -1: it turns where the truck turns, not with the noise."""
-    sense = np.zeros(antenna_m.size)
-    current = 0.0
-    lowest = highest = farthest = 0
-    for n in np.flatnonzero(np.abs(speed_m_per_s) >= STANDING_M_PER_S).tolist():
-        here = antenna_m[n]
-        if current == 0.0:
-            lowest = n if here < antenna_m[lowest] else lowest
-            highest = n if here > antenna_m[highest] else highest
-            if max(here - antenna_m[lowest], antenna_m[highest] - here) > margin_m:
-                current = 1.0 if here - antenna_m[lowest] > margin_m else -1.0
-                sense[0] = current
-                farthest = n
-        elif (here - antenna_m[farthest]) * current > 0.0:
-            farthest = n
-        elif (antenna_m[farthest] - here) * current > margin_m:
-            sense[farthest + 1] = -2.0 * current
-            current = -current
-            farthest = n
+    moving = np.flatnonzero(np.abs(speed_m_per_s) >= STANDING_M_PER_S)
+    place = antenna_m[moving]
+    lowest = np.minimum(np.minimum.accumulate(place), antenna_m[0])
+    highest = np.maximum(np.maximum.accumulate(place), antenna_m[0])
+    moved = np.flatnonzero(np.maximum(place - lowest, highest - place) > margin_m)
+    if not moved.size:
+        return np.ones(antenna_m.size)
+    begin = int(moved[0])
+    current = 1.0 if place[begin] - lowest[begin] > margin_m else -1.0
     # Only the turns are noted: first the sense, then its changes.
-    return np.cumsum(sense) if current != 0.0 else np.ones(antenna_m.size)
+    sense = np.zeros(antenna_m.size)
+    sense[0] = current
+    while True:
+        ahead = current * place[begin:]
+        back = np.flatnonzero(np.maximum.accumulate(ahead) - ahead > margin_m)
+        if not back.size:
+            return np.cumsum(sense)
+        # It has turned behind the fix that was farthest.
+        farthest = begin + int(np.argmax(ahead[: back[0]]))
+        sense[moving[farthest] + 1] = -2.0 * current
+        current = -current
+        begin += int(back[0])
 
 
 def _stay(

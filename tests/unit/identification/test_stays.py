@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.identification.stays import CORRIDOR_M, Passage, Stay, find_stays
+from services.identification.stays import (
+    CORRIDOR_M,
+    STANDING_M_PER_S,
+    Passage,
+    Stay,
+    _senses,
+    find_stays,
+)
 
 Floats = NDArray[np.float64]
 
@@ -266,6 +273,41 @@ def test_wandering_positions_of_a_truck_that_stands_do_not_turn_it() -> None:
     stay = only(stays_of(driven, wander_m=wander))
     assert stay.passage is Passage.THROUGH
     assert stay.exit_s == pytest.approx(99.1 + 0.34, abs=0.3)
+
+
+def senses_fix_by_fix(antenna_m: Floats, speed_m_per_s: Floats, margin_m: float) -> Floats:
+    """What `_senses` must give, as one would tell it while driving."""
+    sense = np.zeros(antenna_m.size)
+    current = 0.0
+    lowest = highest = farthest = 0
+    for n in np.flatnonzero(np.abs(speed_m_per_s) >= STANDING_M_PER_S):
+        here = antenna_m[n]
+        if current == 0.0:
+            lowest = n if here < antenna_m[lowest] else lowest
+            highest = n if here > antenna_m[highest] else highest
+            if max(here - antenna_m[lowest], antenna_m[highest] - here) > margin_m:
+                current = 1.0 if here - antenna_m[lowest] > margin_m else -1.0
+                sense[0], farthest = current, n
+        elif (here - antenna_m[farthest]) * current > 0.0:
+            farthest = n
+        elif (antenna_m[farthest] - here) * current > margin_m:
+            sense[farthest + 1] = -2.0 * current
+            current, farthest = -current, n
+    return np.asarray(np.cumsum(sense)) if current else np.ones(antenna_m.size)
+
+
+def test_the_sense_of_travel_is_the_same_fix_by_fix() -> None:
+    rng = np.random.default_rng(0)
+    turns = 0
+    for _ in range(500):
+        size = rng.integers(2, 100)
+        steps = rng.choice([0.5, 1.0, 3.0]) * rng.standard_normal(size)
+        place = np.round(np.cumsum(steps)) if rng.random() < 0.3 else np.cumsum(steps)
+        speed = rng.choice([0.2, 5.0], size) if rng.random() < 0.5 else np.full(size, 5.0)
+        found = _senses(place, speed, 3.0)
+        assert np.array_equal(found, senses_fix_by_fix(place, speed, 3.0))
+        turns += np.count_nonzero(np.diff(found))
+    assert turns > 500
 
 
 @pytest.mark.parametrize("antenna_m", [-1.5, 0.0, 3.0])
