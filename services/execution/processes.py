@@ -3,7 +3,7 @@
 Every process is warm (its kernels are loaded before its first crossing) and works on one crossing
 at a time. If it dies, for want of memory or in a library, its crossing is tried once more in a new
 one and then rejected as `failed`: no crossing can end who asked for it, nor another crossing. One
-that is hung (`watch`) is killed, so it dies as well.
+that is hung (`watch`), at its work or while it is started, is killed, so it dies as well.
 
 Crossings that are to be fused come before those that are to be identified: the state of a bridge
 is due when its result is told, and takes a second. Of one bridge only the newest set waits, and
@@ -27,7 +27,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
@@ -130,9 +130,11 @@ class Processes:
         self._aftermaths: list[Aftermath] = []
 
     def wait_until_warm(self) -> None:
-        """Wait until all processes can begin. FailureError if one of them cannot."""
+        """Wait until all processes can begin. FailureError if one of them cannot, or is hung."""
         try:
             for place in self._places:
+                while not wait([place.is_warm], _WATCH_EVERY_S).done:
+                    place.end_if_hung()
                 place.is_warm.result()
         except BrokenExecutor as error:
             raise FailureError(
@@ -317,7 +319,6 @@ class _Place:
         self._begin = begin
         self._limits = limits
         self._watch: Watch | None = None
-        self._next_look_s = 0.0
         self.began_s = 0.0
         """When the job was given to the process."""
         self.job: _Job | None = None
@@ -346,20 +347,24 @@ class _Place:
             self.future.set_exception(error)
 
     def end_if_hung(self) -> None:
-        """Kill the process if it takes too much for its job, which then is as if it had died."""
+        """Kill the process if it takes too much for its job, or to be started.
+
+        Its job then is as if it had died.
+        """
         now_s = time.monotonic()
-        if now_s < self._next_look_s or not self.is_warm.done() or self.is_warm.exception():
+        if now_s < self._next_look_s:
             return
         self._next_look_s = now_s + _WATCH_EVERY_S
-        pid = self.is_warm.result()
         if self._watch is None:
-            self._watch = Watch(pid, self._limits, now_s)
+            self._watch = Watch(self._pid, self._limits, now_s)
         why = self._watch.why_hung(now_s)
-        if why and self.job is not None:
+        if why:
             self._next_look_s = math.inf
-            _log.warning("the process that works on %s %s and is ended", self.job.name, why)
+            starts = self.job is None or not self.is_warm.done()
+            what = "is being started" if starts else f"works on {self.job and self.job.name}"
+            _log.warning("the process that %s %s and is ended", what, why)
             with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+                os.kill(self._pid, signal.SIGKILL)
 
     def renew(self) -> None:
         """Put a new process in the place of one that has died."""
@@ -380,7 +385,12 @@ class _Place:
         self._executor = ProcessPoolExecutor(
             1, mp_context=_SPAWN, initializer=_prepare, initargs=(its_end, self._send, self._begin)
         )
-        self.is_warm = self._executor.submit(os.getpid)
+        others = set(active_children())
+        self.is_warm = self._executor.submit(os.getpid)  # which starts the process
+        (process,) = set(active_children()) - others
+        assert process.pid is not None  # noqa: S101 - it has been started
+        self._pid = process.pid
+        self._watch, self._next_look_s = None, 0.0
         its_end.close()
         self._reader = threading.Thread(
             target=self._read, args=(receive,), name="progress", daemon=True

@@ -11,8 +11,8 @@ that was driven must have one result, in its order, and nothing else may have on
 
 The live view is killed, too, at a random moment before the worker is for the first time: a worker
 that is there tells a new view all that it has told so far. So the view that follows must show each
-crossing of the eight bridges that it draws, those that it met first, once and with a verdict. What it shows is read as a viewer reads
-it, by one that writes what it gets into a file.
+crossing of the eight bridges that it draws, those that it met first, once and with a verdict. What
+it shows is read as a viewer reads it, by one that writes what it gets into a file.
 """
 
 import argparse

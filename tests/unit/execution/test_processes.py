@@ -238,6 +238,49 @@ def test_a_process_that_cannot_begin_is_a_failure() -> None:
         processes.wait_until_warm()
 
 
+def sleep_for_ever() -> None:
+    time.sleep(1e6)
+
+
+def sleep_at_the_second_start() -> None:
+    starts = Path(os.environ["DEADLY_ONCE"])
+    (starts / f"start {len(list(starts.iterdir()))}").touch()
+    if len(list(starts.iterdir())) == 3:  # a mark of the crossing that killed the first is there
+        sleep_for_ever()
+
+
+def test_a_process_that_hangs_while_it_is_started_is_ended(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    limits = Limits(idle_s=1.0)
+    with (
+        Processes(1, identify=quick, prepare=sleep_for_ever, limits=limits) as processes,
+        pytest.raises(FailureError, match="died while it was started"),
+    ):
+        processes.wait_until_warm()
+    assert "the process that is being started has done nothing for 1 s and is ended" in caplog.text
+
+
+def test_one_that_hangs_at_a_later_start_costs_one_crossing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The first dies at its work, the second never begins."""
+    monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
+    first, second = works()
+    with Processes(
+        1, identify=deadly_once, prepare=sleep_at_the_second_start, limits=Limits(idle_s=1.0)
+    ) as processes:
+        processes.wait_until_warm()
+        processes.start(first)
+        (one,) = all_of(processes)
+        (tmp_path / second.crossing_id).touch()  # it kills nobody
+        processes.start(second)
+        (other,) = all_of(processes)
+    assert one.result.reasons == ("failed",)
+    assert other.result.verdict == "good"
+    assert caplog.text.count("the process that is being started has done nothing") == 1
+
+
 def test_more_than_a_few_wait_elsewhere() -> None:
     (work, _) = works()
     with Processes(1, identify=slow, prepare=nothing) as processes:
