@@ -32,7 +32,8 @@ class WorkingEngine:
         self._header = header
 
     def resume(self, said: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
-        return self.inner.resume(known_crossings(said, search_hash(self._header)))
+        known = known_crossings(said, search_hash(self._header))
+        return dispatched(self.inner, self._execution, self.inner.resume(known))
 
     def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
         self.inner.expect(key, payload, for_ever=for_ever)

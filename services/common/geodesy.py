@@ -5,7 +5,7 @@ of the ellipsoid, so that an altitude error cannot move them. Within a kilometre
 shorter than the ground by less than 0.01 mm.
 """
 
-from math import hypot
+from math import cos, hypot, radians, sin, sqrt
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -70,6 +70,22 @@ def to_chainage(
     offset = _earth_centred(latitude_deg, longitude_deg) - frame.origin
     chainage = offset @ frame.forward * (frame.span_m / frame.ground_length_m)
     return np.asarray(chainage), np.asarray(offset @ frame.left)
+
+
+def chainage_of(frame: BridgeFrame, latitude_deg: float, longitude_deg: float) -> float:
+    """Return the chainage of one place, to a micrometre what `to_chainage` says, in a tenth of the
+    time that arrays take."""
+    latitude, longitude = radians(latitude_deg), radians(longitude_deg)
+    sine, cosine = sin(latitude), cos(latitude)
+    normal = SEMI_MAJOR_AXIS_M / sqrt(1 - ECCENTRICITY_SQUARED * sine * sine)
+    x, y, z = frame.origin.tolist()
+    along, aside, up = frame.forward.tolist()
+    offset = (
+        (normal * cosine * cos(longitude) - x) * along
+        + (normal * cosine * sin(longitude) - y) * aside
+        + (normal * (1 - ECCENTRICITY_SQUARED) * sine - z) * up
+    )
+    return float(offset) * (frame.span_m / frame.ground_length_m)
 
 
 def to_lat_lon(

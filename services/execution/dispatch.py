@@ -1,7 +1,7 @@
-"""Between the engine, which says what is to be identified, and where that is done.
+"""Between the engine, which says what is to be identified and fused, and where that is done.
 
 The engine's messages come through in their order; a crossing is handed to an `Execution`, and what
-the engine says of its result follows when it has come.
+the engine says of its result follows when it has come. So are crossings that are to be fused.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -9,11 +9,11 @@ from typing import NamedTuple, Protocol
 
 from schemas.certificates import Pair
 from schemas.reasons import Reason
-from schemas.results import Crossing
+from schemas.results import BridgeResult, Crossing
 from schemas.topics import Key
 from services.identification.crossing_data import Passing, rejected
 from services.identification.engine import Engine
-from services.identification.outputs import Output, Said, Wanted, Work
+from services.identification.outputs import Fuse, Output, Said, Wanted, Work
 
 _LOOK_AGAIN_S = 0.1
 """A wait is cut into pieces, so that Python hears signals between them."""
@@ -26,6 +26,13 @@ class Finished(NamedTuple):
     result: Crossing
 
 
+class Fused(NamedTuple):
+    """Crossings of a bridge with its state; None: they could not be fused."""
+
+    fuse: Fuse
+    state: BridgeResult | None
+
+
 class Begun(NamedTuple):
     """A crossing that is being identified."""
 
@@ -35,11 +42,11 @@ class Begun(NamedTuple):
 
 
 class Execution(Protocol):
-    """Where crossings are identified. To be used from one thread."""
+    """Where crossings are identified and fused. To be used from one thread."""
 
     @property
     def is_busy(self) -> bool:
-        """Whether there are works that `finished` has not given back yet."""
+        """Whether there is something that `finished` or `fused` has not given back yet."""
 
     @property
     def is_full(self) -> bool:
@@ -71,6 +78,15 @@ class Execution(Protocol):
         over.
         """
 
+    def fuse(self, fuse: Fuse) -> None:
+        """Take crossings to be fused, in place of older ones of their bridge that still wait."""
+
+    def fused(self) -> list[Fused]:
+        """The states that have been made since the last call, those of a bridge in their order.
+
+        `finished` looks after them: it returns, too, as soon as there is one.
+        """
+
 
 def dispatched(
     engine: Engine,
@@ -89,6 +105,10 @@ def dispatched(
         if isinstance(one, Wanted):
             want(one.pair)
             continue
+        if isinstance(one, Fuse):
+            execution.fuse(one)
+            yield from collected(engine, execution)
+            continue
         execution.start(one)
         yield from collected(engine, execution)
         while execution.is_full:
@@ -96,13 +116,15 @@ def dispatched(
 
 
 def collected(engine: Engine, execution: Execution, timeout_s: float = 0.0) -> Iterator[Output]:
-    """What the engine says of the results that have come."""
+    """What the engine says of the results and states that have come."""
     for work, result in execution.finished(timeout_s):
-        yield from engine.done(work, result)
+        yield from dispatched(engine, execution, engine.done(work, result))
+    for fuse, state in execution.fused():
+        yield from engine.fused(fuse, state)
 
 
 def awaited(engine: Engine, execution: Execution) -> Iterator[Output]:
-    """What the engine says of everything that is still being identified."""
+    """What the engine says of everything that is still being identified or fused."""
     while execution.is_busy:
         yield from collected(engine, execution, _LOOK_AGAIN_S)
 

@@ -5,9 +5,10 @@ from collections.abc import Callable
 from functools import partial
 
 from schemas.results import Crossing
-from services.execution.dispatch import Begun, Finished
+from services.execution.dispatch import Begun, Finished, Fused
+from services.identification.bridge_state import state_of
 from services.identification.identify import Identify, Keep, identify
-from services.identification.outputs import Work
+from services.identification.outputs import Fuse, Work
 
 Report = Callable[[str, str, float], None]
 """Takes a crossing's id, the stage of its identification and the fraction that is done."""
@@ -34,11 +35,12 @@ class Here:
         self._stopwatch = stopwatch
         self._identify = identify
         self._finished: list[Finished] = []
+        self._fused: list[Fused] = []
 
     @property
     def is_busy(self) -> bool:
         """Whether something was done that has not been given back."""
-        return bool(self._finished)
+        return bool(self._finished or self._fused)
 
     @property
     def is_full(self) -> bool:
@@ -73,6 +75,15 @@ class Here:
         """What was started since the last call."""
         finished, self._finished = self._finished, []
         return finished
+
+    def fuse(self, fuse: Fuse) -> None:
+        """Fuse the crossings. Raises what `state_of` does."""
+        self._fused.append(Fused(fuse, state_of(fuse.counted, fuse.bridge, fuse.fusing)))
+
+    def fused(self) -> list[Fused]:
+        """What was fused since the last call."""
+        fused, self._fused = self._fused, []
+        return fused
 
     def _result(self, work: Work) -> Crossing:
         return self._identify(

@@ -97,6 +97,7 @@ def identify_messages(
             ),
             dispatched(engine, execution, engine.finish()),
             awaited(engine, execution),
+            dispatched(engine, execution, engine.fuse_all()),
         )
         found = [output.result for output in outputs if output.result is not None]
     found.sort(key=lambda crossing: crossing.entry_time)

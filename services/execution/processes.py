@@ -1,9 +1,14 @@
-"""Identifies crossings in processes of their own, so that who finds them can go on listening.
+"""Identifies and fuses crossings in processes of their own, so that who finds them can listen.
 
 Every process is warm (its kernels are loaded before its first crossing) and works on one crossing
 at a time. If it dies, for want of memory or in a library, its crossing is tried once more in a new
 one and then rejected as `failed`: no crossing can end who asked for it, nor another crossing. One
-that is hung (`watch`) is killed, so it dies as well.
+that is hung (`watch`), at its work or while it is started, is killed, so it dies as well.
+
+Crossings that are to be fused come before those that are to be identified: the state of a bridge
+is due when its result is told, and takes a second. Of one bridge only the newest set waits, and
+while one is being fused the next waits for it: so states come in their order, and however many
+results a bridge has, it takes no more than its place. Who dies twice over it has no state.
 
 What else is to be computed (`Aside`) is computed in the same processes, when no crossing waits for
 one: so a crossing waits for one aside at most.
@@ -22,18 +27,19 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
-from schemas.results import Crossing
+from schemas.results import BridgeResult, Crossing
 from services.common.errors import FailureError
-from services.execution.dispatch import Begun, Finished, failed
+from services.execution.dispatch import Begun, Finished, Fused, failed
 from services.execution.here import Here, Report
 from services.execution.warm_up import warm_up
 from services.execution.watch import Limits, Watch
+from services.identification.bridge_state import Counted, Fusing, state_of
 from services.identification.identify import Identify, identify
-from services.identification.outputs import Work
+from services.identification.outputs import Fuse, Work
 
 _log = logging.getLogger(__name__)
 _SPAWN = get_context("spawn")
@@ -62,13 +68,34 @@ class Aftermath(NamedTuple):
     outcome: object | None
 
 
+StateOf = Callable[[Counted, str, Fusing], BridgeResult | None]
+"""Makes the state of a bridge; as `state_of`."""
+_Task = Work | Fuse | Aside
+_BridgeName = tuple[str, str]
+"""Realm and bridge."""
+
+
+class _Begin(NamedTuple):
+    """What a process does, and what it does before."""
+
+    identify: Identify
+    state_of: StateOf
+    prepare: Callable[[], None]
+
+
 class _Job(NamedTuple):
-    task: Work | Aside
+    task: _Task
     tries: int = 0
 
     @property
     def name(self) -> str:
-        return self.task.crossing_id if isinstance(self.task, Work) else self.task.name
+        match self.task:
+            case Work():
+                return self.task.crossing_id
+            case Fuse():
+                return f"the state of {self.task.bridge}"
+            case Aside():
+                return self.task.name
 
 
 class Processes:
@@ -85,22 +112,29 @@ class Processes:
         *,
         report: Report = lambda crossing_id, stage, fraction: None,
         identify: Identify = identify,
+        state_of: StateOf = state_of,
         prepare: Callable[[], None] = warm_up,
         limits: Limits = _USUAL,
     ) -> None:
         # Read when a process loads numpy: its threads would fight with those of its neighbours.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._report = report
-        self._places = [_Place(report, identify, prepare, limits) for _ in range(number)]
+        begin = _Begin(identify, state_of, prepare)
+        self._places = [_Place(report, begin, limits) for _ in range(number)]
         self._waiting: deque[_Job] = deque()
         self._finished: list[Finished] = []
+        self._to_fuse: dict[_BridgeName, _Job] = {}
+        """The newest of each bridge, in the order in which the bridges came."""
+        self._fused: list[Fused] = []
         self._asides: deque[_Job] = deque()
         self._aftermaths: list[Aftermath] = []
 
     def wait_until_warm(self) -> None:
-        """Wait until all processes can begin. FailureError if one of them cannot."""
+        """Wait until all processes can begin. FailureError if one of them cannot, or is hung."""
         try:
             for place in self._places:
+                while not wait([place.is_warm], _WATCH_EVERY_S).done:
+                    place.end_if_hung()
                 place.is_warm.result()
         except BrokenExecutor as error:
             raise FailureError(
@@ -109,9 +143,9 @@ class Processes:
 
     @property
     def is_busy(self) -> bool:
-        """Whether there are works that `finished` has not given back yet."""
-        under_way = any(p.job and isinstance(p.job.task, Work) for p in self._places)
-        return bool(self._waiting or self._finished or under_way)
+        """Whether there is something that `finished` or `fused` has not given back yet."""
+        waiting = self._waiting or self._to_fuse
+        return bool(waiting or self._finished or self._fused or self._wanted_at)
 
     @property
     def is_full(self) -> bool:
@@ -126,8 +160,7 @@ class Processes:
     @property
     def is_idle(self) -> bool:
         """Whether a work that is started now is begun at once, or as soon as an aside is over."""
-        works = sum(1 for p in self._places if p.job and isinstance(p.job.task, Work))
-        return not self._waiting and works < len(self._places)
+        return not self._waiting and len(self._wanted_at) < len(self._places)
 
     @property
     def waiting(self) -> int:
@@ -154,6 +187,7 @@ class Processes:
 
     def finished(self, timeout_s: float = 0.0) -> list[Finished]:
         """What has been done since the last call; see `Execution`."""
+        self._fill()
         under_way = [place.future for place in self._places if place.future is not None]
         if under_way and timeout_s > 0.0:  # asked after every message: no time for nothing
             wait(under_way, timeout_s, FIRST_COMPLETED)
@@ -162,9 +196,21 @@ class Processes:
                 self._take(place, place.future)
             elif place.job is not None:
                 place.end_if_hung()
-        self._fill()
         finished, self._finished = self._finished, []
+        if not finished:  # else the states that the results lead to come first
+            self._fill()
         return finished
+
+    def fuse(self, fuse: Fuse) -> None:
+        """Give crossings to the next process that is free; see `Execution`."""
+        self._to_fuse[_bridge_of(fuse)] = _Job(fuse)
+        self._fill()
+
+    def fused(self) -> list[Fused]:
+        """The states that have been made since the last call; see `Execution`."""
+        self._fill()
+        fused, self._fused = self._fused, []
+        return fused
 
     def start_aside(self, aside: Aside) -> None:
         """Compute something in a process that no crossing waits for."""
@@ -179,6 +225,7 @@ class Processes:
 
     def aftermaths(self) -> list[Aftermath]:
         """The asides that have been over since the last call; `finished` looks after them."""
+        self._fill()
         aftermaths, self._aftermaths = self._aftermaths, []
         return aftermaths
 
@@ -197,11 +244,28 @@ class Processes:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def _wanted_at(self) -> list["_Place"]:
+        """Where something is done that somebody waits for."""
+        return [p for p in self._places if p.job and not isinstance(p.job.task, Aside)]
+
     def _fill(self) -> None:
         for place in self._places:
-            first = self._waiting or self._asides
-            if first and place.job is None:
-                place.begin(first.popleft(), len(self._places))
+            job = self._next() if place.job is None else None
+            if job is not None:
+                place.begin(job, len(self._places))
+
+    def _next(self) -> _Job | None:
+        under_way = {
+            _bridge_of(place.job.task)
+            for place in self._places
+            if place.job and isinstance(place.job.task, Fuse)
+        }
+        for name in self._to_fuse:
+            if name not in under_way:
+                return self._to_fuse.pop(name)
+        first = self._waiting or self._asides
+        return first.popleft() if first else None
 
     def _take(self, place: "_Place", future: Future[Any]) -> None:
         job = place.job
@@ -213,8 +277,7 @@ class Processes:
             place.renew()
             if job.tries + 1 < _TRIES:
                 _log.warning("the process that worked on %s died; tried once more", job.name)
-                queue = self._waiting if isinstance(job.task, Work) else self._asides
-                queue.appendleft(_Job(job.task, job.tries + 1))
+                self._put_back(_Job(job.task, job.tries + 1))
             else:
                 _log.error("the process that worked on %s died again; it has failed", job.name)
                 self._is_over(job.task, None)
@@ -222,26 +285,40 @@ class Processes:
             _log.exception("work on %s failed", job.name)
             self._is_over(job.task, None)
 
-    def _is_over(self, task: Work | Aside, outcome: Any) -> None:
+    def _put_back(self, job: _Job) -> None:
+        """Let it be the next of its kind; crossings to fuse only if no newer ones have come."""
+        match job.task:
+            case Work():
+                self._waiting.appendleft(job)
+            case Fuse():
+                self._to_fuse = {_bridge_of(job.task): job} | self._to_fuse
+            case Aside():
+                self._asides.appendleft(job)
+
+    def _is_over(self, task: _Task, outcome: Any) -> None:
         """Keep what a task gave; None: nothing."""
-        if isinstance(task, Work):
-            result = failed(task) if outcome is None else outcome
-            self._finished.append(Finished(task, result))
-        else:
-            self._aftermaths.append(Aftermath(task, outcome))
+        match task:
+            case Work():
+                result = failed(task) if outcome is None else outcome
+                self._finished.append(Finished(task, result))
+            case Fuse():
+                self._fused.append(Fused(task, outcome))
+            case Aside():
+                self._aftermaths.append(Aftermath(task, outcome))
+
+
+def _bridge_of(fuse: Fuse) -> _BridgeName:
+    return fuse.realm, fuse.bridge
 
 
 class _Place:
     """One process after the other, and what it works on."""
 
-    def __init__(
-        self, report: Report, identify: Identify, prepare: Callable[[], None], limits: Limits
-    ) -> None:
+    def __init__(self, report: Report, begin: _Begin, limits: Limits) -> None:
         self._report = report
-        self._begin = identify, prepare
+        self._begin = begin
         self._limits = limits
         self._watch: Watch | None = None
-        self._next_look_s = 0.0
         self.began_s = 0.0
         """When the job was given to the process."""
         self.job: _Job | None = None
@@ -258,6 +335,9 @@ class _Place:
         try:
             if isinstance(task, Aside):
                 self.future = self._executor.submit(task.run)
+            elif isinstance(task, Fuse):
+                made_of = (task.counted, task.bridge, task.fusing)
+                self.future = self._executor.submit(self._begin.state_of, *made_of)
             else:
                 threads = max(1, task.settings.threads // places)
                 settings = task.settings.model_copy(update={"threads": threads})
@@ -267,20 +347,24 @@ class _Place:
             self.future.set_exception(error)
 
     def end_if_hung(self) -> None:
-        """Kill the process if it takes too much for its job, which then is as if it had died."""
+        """Kill the process if it takes too much for its job, or to be started.
+
+        Its job then is as if it had died.
+        """
         now_s = time.monotonic()
-        if now_s < self._next_look_s or not self.is_warm.done() or self.is_warm.exception():
+        if now_s < self._next_look_s:
             return
         self._next_look_s = now_s + _WATCH_EVERY_S
-        pid = self.is_warm.result()
         if self._watch is None:
-            self._watch = Watch(pid, self._limits, now_s)
+            self._watch = Watch(self._pid, self._limits, now_s)
         why = self._watch.why_hung(now_s)
-        if why and self.job is not None:
+        if why:
             self._next_look_s = math.inf
-            _log.warning("the process that works on %s %s and is ended", self.job.name, why)
+            starts = self.job is None or not self.is_warm.done()
+            what = "is being started" if starts else f"works on {self.job and self.job.name}"
+            _log.warning("the process that %s %s and is ended", what, why)
             with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+                os.kill(self._pid, signal.SIGKILL)
 
     def renew(self) -> None:
         """Put a new process in the place of one that has died."""
@@ -299,9 +383,14 @@ class _Place:
         receive, self._send = _SPAWN.Pipe(duplex=False)
         its_end, self._lifeline = _SPAWN.Pipe(duplex=False)
         self._executor = ProcessPoolExecutor(
-            1, mp_context=_SPAWN, initializer=_prepare, initargs=(its_end, self._send, *self._begin)
+            1, mp_context=_SPAWN, initializer=_prepare, initargs=(its_end, self._send, self._begin)
         )
-        self.is_warm = self._executor.submit(os.getpid)
+        others = set(active_children())
+        self.is_warm = self._executor.submit(os.getpid)  # which starts the process
+        (process,) = set(active_children()) - others
+        assert process.pid is not None  # noqa: S101 - it has been started
+        self._pid = process.pid
+        self._watch, self._next_look_s = None, 0.0
         its_end.close()
         self._reader = threading.Thread(
             target=self._read, args=(receive,), name="progress", daemon=True
@@ -329,15 +418,13 @@ _HERE: list[Here] = []
 """The process's own execution, once it is prepared."""
 
 
-def _prepare(
-    lifeline: Connection, send: Connection, identify: Identify, prepare: Callable[[], None]
-) -> None:
+def _prepare(lifeline: Connection, send: Connection, begin: _Begin) -> None:
     # A signal to the whole group is for who started this; it says what is to be done.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(lifeline,), name="lifeline", daemon=True).start()
-    _HERE.append(Here(report=lambda *progress: send.send(progress), identify=identify))
-    prepare()
+    _HERE.append(Here(report=lambda *progress: send.send(progress), identify=begin.identify))
+    begin.prepare()
 
 
 def _end_with(lifeline: Connection) -> None:

@@ -11,8 +11,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
+from google.protobuf.message import DecodeError
+
 from schemas.errors import InputError
+from schemas.proto import driveby_pb2 as pb
 from schemas.results import BridgeResult, Crossing, Header, load_results
+from schemas.results_on_the_wire import state_to_bridge
 from schemas.signals import NS_PER_S, Identity
 from schemas.topics import Key
 from services.common.errors import FailureError
@@ -70,7 +74,7 @@ class ResultFiles:
     def write(
         self, message: Message, result: Crossing | None, bridges: dict[str, BridgeResult]
     ) -> None:
-        """Bring a message to the disk, and a result to the JSON file too.
+        """Bring a message to the disk, and a result or a state to the JSON file too.
 
         FailureError if that is not possible.
         """
@@ -98,6 +102,8 @@ class ResultFiles:
         if result is not None:
             self._crossings += 1
             self._json.add(result, bridges)
+        elif message.key.stream == "state":
+            self._json.retell(bridges)
 
     def begin_anew(self, path: Path, site_toml: str, header: Header) -> None:
         """What is written from now on goes to another file: it belongs to another site file.
@@ -160,6 +166,18 @@ class Earlier(NamedTuple):
     """The latest state of each bridge."""
     previous: str | None = None
     """The name of the last run's file."""
+
+    def states(self) -> dict[tuple[str, str], BridgeResult]:
+        """The latest states by realm and bridge, as far as they can be read."""
+        found = {}
+        for message in self.latched:
+            try:
+                name, _, state = state_to_bridge(pb.BridgeState.FromString(message.payload))
+            except (ValueError, DecodeError) as error:
+                _log.warning("a state of %s is left out: %s", message.key.identifier, error)
+                continue
+            found[message.key.realm, name] = state
+        return found
 
 
 class _Run(NamedTuple):

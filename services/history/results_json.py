@@ -22,7 +22,10 @@ _INDENT = "  "
 
 
 class GrowingJson:
-    """Results in a JSON file; it is made with the first one, and replaces what was there."""
+    """Results in a JSON file; it is made with the first one, and replaces what was there.
+
+    States of bridges are due a while after their results, when the file's end is told anew.
+    """
 
     def __init__(self, path: Path, header: Header) -> None:
         self.path = path
@@ -42,7 +45,19 @@ class GrowingJson:
             write_atomically(self.path, first + tail)
             self._end, self._size = len(first), len(first) + len(tail)
             return
-        added = f",\n{entry}".encode()
+        self._write(f",\n{entry}".encode(), tail)
+
+    def retell(self, bridges: dict[str, BridgeResult]) -> None:
+        """Let `bridges` be those of the file, of which the crossings stay. OSError if that fails.
+
+        Without a crossing there is no file yet, and somebody else's is left alone.
+        """
+        if self._size and self._is_ours():
+            _, end = results_json(results(self._header, [], bridges)).rsplit(_NONE, 1)
+            self._write(b"", f"\n ]{end}".encode())
+
+    def _write(self, added: bytes, tail: bytes) -> None:
+        """Write behind the last crossing."""
         descriptor = os.open(self.path, os.O_WRONLY)
         try:
             _write_at(descriptor, self._end, added + tail)

@@ -5,7 +5,7 @@ recordings (`processed`). Both ask what is made here: `Known`, in `services.iden
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -43,8 +43,8 @@ class Store:
         self._search = search
         self._found: dict[_Name, Known] = {}
         self._of_others: set[_Name] = set()
-        self._open: dict[tuple[str, str], Known] = {}
-        """By realm and bridge: the latest usable result of which no state has taken account."""
+        self._open: dict[tuple[str, str], dict[str, Known]] = {}
+        """By realm and bridge: the usable results of which no state has taken account, by id."""
 
     def add(self, key: Key, payload: bytes) -> Told | None:
         """Take a message in, and return the result that it tells, if any.
@@ -65,10 +65,12 @@ class Store:
                 self._add_result(key, told)
                 return told
             elif isinstance(message, pb.BridgeState):
-                # Told right behind the result that it takes account of (`Engine.done`).
-                known = self._open.pop((key.realm, key.identifier), None)
-                if known is not None:
-                    known.is_in_state = True
+                # It was made of what it names: results may have been told while it was made.
+                of_bridge = self._open.get((key.realm, key.identifier), {})
+                for name in crossings_named(message):
+                    known = of_bridge.pop(name, None)
+                    if known is not None:
+                        known.is_in_state = True
         except ValueError as error:
             _log.warning("%s of an earlier run left out: %s", key.stream, error)
         return None
@@ -119,7 +121,7 @@ class Store:
         known.has_result = True
         known.usable = usable(result)
         if known.usable is not None:
-            self._open[key.realm, key.identifier] = known
+            self._open.setdefault((key.realm, key.identifier), {})[known.crossing_id] = known
 
 
 class Ledger:
@@ -172,6 +174,13 @@ class Ledger:
 
 def _whose(known: Known) -> _Whose:
     return known.realm, known.vehicle, known.bridge
+
+
+def crossings_named(state: pb.BridgeState) -> Iterator[str]:
+    """The ids of the crossings that a state of a bridge counts, the newest hundred or so."""
+    yield from state.crossings_used
+    for left_out in state.crossings_left_out:
+        yield left_out.crossing_id
 
 
 def known_crossings(

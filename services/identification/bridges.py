@@ -14,8 +14,16 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from schemas.site import Bridge, Receiver
-from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
-from services.identification.stays import CORRIDOR_M, Car, Passage, Stay, least_depth_m, stays_on
+from services.common.geodesy import BridgeFrame, bridge_frame, chainage_of, to_chainage
+from services.identification.stays import (
+    CORRIDOR_M,
+    STANDING_M_PER_S,
+    Car,
+    Passage,
+    Stay,
+    least_depth_m,
+    stays_on,
+)
 from services.identification.streams import Fixes
 
 _log = logging.getLogger(__name__)
@@ -44,6 +52,18 @@ class Box(NamedTuple):
     north_deg: float
     east_deg: float
     """Up to 540: a box may lie across the meridian of 180 degrees."""
+
+
+class Look(NamedTuple):
+    """What was found when it was looked where a truck was on a bridge."""
+
+    stays: list[Stay]
+    side: int
+    """-1: the truck is well before the bridge's start, 1: well behind its end; 0 else."""
+    first_m: float
+    """Chainage of the first fix on this side."""
+    is_settled: bool
+    """Fixes of a truck that stays on this side change nothing."""
 
 
 class Bridges:
@@ -111,6 +131,49 @@ class Bridges:
                 if any(_overlap(stay, other) for other in theirs)
             )
         ]
+
+    def look(self, number: int, car: Car, fixes: Fixes, before: Look | None) -> Look:
+        """All stays of a truck on one bridge, with what the next look may go on from.
+
+        `before` is the latest look, while it is near the bridge; None if this is the first one.
+        """
+        stays = self.stays(number, car, fixes)
+        if not fixes.time_s.size:
+            return Look(stays, 0, 0.0, is_settled=False)
+        along_m = self._along_m(
+            number, float(fixes.latitude_deg[-1]), float(fixes.longitude_deg[-1])
+        )
+        side = self._side(number, car, along_m)
+        stayed = before is not None and before.side == side
+        first_m = before.first_m if before is not None and stayed else along_m
+        # It has moved there further than noise does: by then it is known which way it drives, and
+        # which way it came.
+        has_moved = abs(along_m - first_m) > least_depth_m(self._receiver)
+        drives = bool(abs(fixes.speed_m_per_s[-1]) >= STANDING_M_PER_S)
+        is_settled = side != 0 and has_moved and drives and not self.rivals(number)
+        return Look(stays, side, first_m, is_settled)
+
+    def is_as_it_was(
+        self, look: Look, number: int, car: Car, latitude_deg: float, longitude_deg: float
+    ) -> bool:
+        """Whether a look would find the same stays after a new fix."""
+        if not look.is_settled:
+            return False
+        return (
+            self._side(number, car, self._along_m(number, latitude_deg, longitude_deg)) == look.side
+        )
+
+    def _along_m(self, number: int, latitude_deg: float, longitude_deg: float) -> float:
+        return chainage_of(self.frame(number), latitude_deg, longitude_deg)
+
+    def _side(self, number: int, car: Car, along_m: float) -> int:
+        """On which side of a bridge a truck is, -1 or 1; 0 if it is on it or near it.
+
+        So near that it may have turned on it and not be known to have turned yet.
+        """
+        reach_m = abs(car.gps_antenna_to_front_axle_m) + car.wheelbase_m
+        reach_m += 2.0 * least_depth_m(self._receiver)
+        return (along_m > self._bridges[number].span_m + reach_m) - (along_m < -reach_m)
 
     def all_stays(self, car: Car, fixes: Fixes) -> list[tuple[int, Stay]]:
         """All stays in a whole drive in order of their entries, with the numbers of the bridges."""

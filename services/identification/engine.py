@@ -1,8 +1,8 @@
 """The part of the worker that decides: messages in, messages out.
 
 It finds crossings in the positions, waits for the samples that belong to them, has them identified
-and says so. It opens nothing, reads no clock and asks nobody, so that a recording that is replayed
-through it gives the same bytes every time.
+and fused, and says so. It opens nothing, reads no clock and asks nobody, so that a recording that
+is replayed through it gives the same bytes every time.
 
 Longer than other modules, because its class holds the one state that messages, results and
 certificates change in turn.
@@ -35,9 +35,9 @@ from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
 from services.common.geodesy import to_chainage
 from services.identification.bridge_state import (
+    LISTED_AT_MOST,
     NOTHING_STORED,
     Fusing,
-    States,
     against,
     count_in,
     usable,
@@ -51,6 +51,7 @@ from services.identification.crossing_data import (
 )
 from services.identification.known import LONGEST_STAY_S, Known, is_stay_of, overlap
 from services.identification.outputs import (
+    Fuse,
     Output,
     Said,
     Wanted,
@@ -96,10 +97,12 @@ class Engine:
     """Takes the messages of a realm's trucks and returns what is to be published.
 
     It identifies nothing itself: what it yields holds a `Work` for each crossing, whose result is
-    to be given to `done`, at any later time and in any order. `services.execution` does that.
+    to be given to `done`, at any later time and in any order. Nor does it fuse: behind a result it
+    yields a `Fuse`, whose state is to be given to `fused`; those of a bridge in their order, and
+    one may be left out for a later one. `services.execution` does that.
     If it `finds_only`, what it finds is in `found`, and of that nothing is identified.
     `header` says what goes into every estimate, `fusing` how those of a bridge become one. Whoever
-    asks for `bridges` at the end only may do without their states on the way (`tells_states`).
+    wants states at the end only may do without those on the way (`tells_states`, `fuse_all`).
 
     `certificates` are the hashes of those that are known; results name them. If they `are_required`
     a crossing of a pair without one waits: a `Wanted` is yielded, once for a pair, the certificate
@@ -118,7 +121,7 @@ class Engine:
         tells_states: bool = True,
         finds_only: bool = False,
     ) -> None:
-        self._states = States(NOTHING_STORED if fusing is None else fusing)
+        self._fusing = NOTHING_STORED if fusing is None else fusing
         self._tells_states = tells_states
         self._site = site
         self._settings = settings
@@ -151,12 +154,15 @@ class Engine:
         self.unknown_vehicles: set[str] = set()
         """Trucks that the site file does not know; nothing of theirs can be identified."""
 
-    def resume(self, crossings: Iterable[Known]) -> Iterator[Output]:
+    def resume(
+        self, crossings: Iterable[Known], states: Mapping[_Name, BridgeResult] | None = None
+    ) -> Iterator[Output | Fuse]:
         """Go on from what is known of crossings; yield what earlier runs did not come to say.
 
         To be called before the first message. A crossing that has a result by these settings and
         this site file gets no other one, and counts in the states of its bridge; of one that has
-        none only those states are told that have not been told.
+        none only those states are told that have not been told. `states` are those that were told
+        last, by realm and bridge.
         """
         crossings = sorted(crossings, key=lambda known: known.entry_ns)
         for known in crossings:
@@ -173,11 +179,9 @@ class Engine:
                     Key(known.realm, "bridge", known.bridge, "crossing"),
                     known.last.SerializeToString(deterministic=True),
                 )
-            if known.usable is not None and not known.is_in_state:
-                latest = self._state(known.realm, known.bridge)
-                if latest is not None:
-                    exit_time = known.usable.exit_time
-                    yield state_output(known.realm, known.bridge, exit_time, latest)
+        for name, bridge in self._of_bridge.items():
+            bridge.state = (states or {}).get(name)
+        yield from self._states_owed(crossings)
         for known in crossings:
             known.last = known.usable = None  # nobody asks for them again, and they are large
 
@@ -192,7 +196,7 @@ class Engine:
         before, bridges = self._bridges, Bridges(site.bridges, site.receiver)
         vehicles = {vehicle.id: vehicle for vehicle in site.vehicles}
         self._site, self._header, self._bridges, self._vehicles = site, header, bridges, vehicles
-        self._states = States(fusing)
+        self._fusing = fusing
         self._of_bridge.clear()
         self._traffic.retarget(bridges, vehicles)
         for name, truck in list(self._trucks.items()):
@@ -314,7 +318,7 @@ class Engine:
             near = truck.came_to(self._bridges, fix)
             if truck.late:
                 near = sorted({*near, *truck.late_enough()})
-            yield from self._look(realm, truck, near, truck.latest_s)
+            yield from self._look(realm, truck, near, truck.latest_s, here=fix)
             self._forget(truck, truck.latest_s)
 
     def _finish(self, realm: str, truck: TruckBoot) -> Iterator[Said]:
@@ -356,26 +360,37 @@ class Engine:
         bridges: list[int],
         now_s: float,
         wait: _Wait | None = None,
+        here: GnssFix | None = None,
     ) -> Iterator[Said]:
         """Find crossings in the fixes that are known, and identify those that are complete.
 
-        A crossing that is over waits while `wait` says so.
+        A crossing that is over waits while `wait` says so. `here` is the fix that is new.
         """
-        if not bridges:
-            return
         wait = wait or self._may_still_come
-        fixes = truck.boot.fixes()
         for number in sorted(bridges):
-            visit = truck.near.get(number)
-            # A truck may have stood somewhere for minutes: what was before it came is not needed.
-            lately = fixes if visit is None else fixes.since(visit.since_s - AWAY_S)
-            stays = self._bridges.stays(number, truck.vehicle, lately)
             bridge = self._bridges.bridge(number)
-            for stay in stays:
+            for stay in self._stays(truck, number, here):
                 # Which of several beside each other it is on is told when it has left them.
                 is_plain = stay.is_over or not self._bridges.rivals(number)
                 if is_plain or now_s - stay.entry_s >= LONGEST_STAY_S:
                     yield from self._advance(realm, truck, bridge, stay, now_s, wait)
+
+    def _stays(self, truck: TruckBoot, number: int, here: GnssFix | None) -> list[Stay]:
+        """All stays on a bridge in the fixes that are known; `here` is the one that is new.
+
+        To look takes time: who is still on the side where nothing changes is not looked at again.
+        """
+        look = truck.looks.get(number)
+        is_newest = here is not None and here.device_time_ns * 1e-9 >= truck.latest_s
+        if here is not None and is_newest and look is not None:
+            place = here.latitude_deg, here.longitude_deg
+            if self._bridges.is_as_it_was(look, number, truck.vehicle, *place):
+                return look.stays
+        fixes, visit = truck.boot.fixes(), truck.near.get(number)
+        # A truck may have stood somewhere for minutes: what was before it came is not needed.
+        lately = fixes if visit is None else fixes.since(visit.since_s - AWAY_S)
+        look = truck.looks[number] = self._bridges.look(number, truck.vehicle, lately, look)
+        return look.stays
 
     def _advance(
         self,
@@ -566,7 +581,7 @@ class Engine:
         bridge.under_way.append(UnderWay(work, waiting.done))
         yield work
 
-    def done(self, work: Work, result: Crossing) -> Iterator[Output]:
+    def done(self, work: Work, result: Crossing) -> Iterator[Output | Fuse]:
         """Take the result of a crossing, and yield what there is to say of it.
 
         Results of one bridge are told in the order in which their crossings were found, whichever
@@ -583,13 +598,13 @@ class Engine:
 
     def _result_told(
         self, bridge: BridgeCrossings, found: UnderWay, result: Crossing
-    ) -> Iterator[Output]:
+    ) -> Iterator[Output | Fuse]:
         realm, name = found.work.data.realm, found.work.data.bridge.id
-        result = against(result, self._states.fusing.baselines.get(name))
+        result = against(result, self._fusing.baselines.get(name))
         if found.work.certificate is not None:
             result = result.model_copy(update={"certificate": found.work.certificate})
         counts = usable(result)
-        if counts is not None:  # who asks for the state together with the result has it
+        if counts is not None:
             bridge.counted = count_in(bridge.counted, [counts])
         # A result is dated by the data that made it: the engine has no clock.
         header = self._header._replace(created=result.exit_time)
@@ -598,9 +613,48 @@ class Engine:
         yield Output(Key(realm, "bridge", name, "estimate"), payload, result)
         yield found.done
         if counts is not None and self._tells_states:
-            latest = self._state(realm, name)
-            if latest is not None:
-                yield state_output(realm, name, result.exit_time, latest)
+            yield self._fuse((realm, name), result.exit_time)
+
+    def fused(self, fuse: Fuse, state: BridgeResult | None) -> Iterator[Output]:
+        """Take the state of a bridge, None if its crossings could not be fused; yield its message.
+
+        None is a warning, and the state is owed: the next one of the bridge holds the same
+        crossings, and so does the first one of the next run.
+        """
+        if state is None:
+            _log.warning(
+                "%s: its crossings could not be fused; its state is told after the next one, or by "
+                "the next run",
+                fuse.bridge,
+            )
+            return
+        self._bridge(fuse.realm, fuse.bridge).state = state
+        yield state_output(fuse.realm, fuse.bridge, fuse.exit_time, state)
+
+    def fuse_all(self) -> Iterator[Fuse]:
+        """What is to be fused of all bridges, for who has had no states on the way."""
+        for name, bridge in self._of_bridge.items():
+            if bridge.counted.newest:
+                yield self._fuse(name, bridge.counted.newest[-1].exit_time)
+
+    def _states_owed(self, crossings: Iterable[Known]) -> Iterator[Fuse]:
+        """What is to be fused of bridges whose latest state does not count one of the crossings."""
+        owed: dict[_Name, float] = {}
+        for known in crossings:
+            if known.usable is not None and not known.is_in_state:
+                name = (known.realm, known.bridge)
+                # No state names those that are older.
+                listed = self._bridge(*name).counted.newest[-LISTED_AT_MOST:]
+                if any(one.crossing_id == known.crossing_id for one in listed):
+                    owed[name] = known.usable.exit_time
+        for name, exit_time in owed.items():
+            yield self._fuse(name, exit_time)
+
+    def _fuse(self, name: _Name, exit_time: float) -> Fuse:
+        realm, bridge = name
+        baseline = self._fusing.baselines.get(bridge)
+        fusing = self._fusing._replace(baselines={} if baseline is None else {bridge: baseline})
+        return Fuse(realm, bridge, self._bridge(realm, bridge).counted, fusing, exit_time)
 
     def _window(self, truck: TruckBoot, bridge: Bridge, stay: Stay) -> Window:
         return window(stay, bridge, truck.vehicle, self._settings.method)
@@ -696,12 +750,9 @@ class Engine:
     def _bridge(self, realm: str, bridge: str) -> BridgeCrossings:
         return self._of_bridge.setdefault((realm, bridge), BridgeCrossings())
 
-    def _state(self, realm: str, bridge: str) -> BridgeResult | None:
-        return self._states.of(self._bridge(realm, bridge).counted, bridge, (realm, bridge))
-
     def bridges(self) -> dict[str, BridgeResult]:
         """The latest state of every bridge that has one, for the results file."""
-        states = {name: self._state(realm, name) for realm, name in self._of_bridge}
+        states = {name: bridge.state for (_, name), bridge in self._of_bridge.items()}
         return {name: state for name, state in states.items() if state is not None}
 
 

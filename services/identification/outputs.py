@@ -1,4 +1,4 @@
-"""What the engine yields: messages to publish, crossings to be identified, certificates wanted."""
+"""What the engine yields: messages to publish, work to be done elsewhere, certificates wanted."""
 
 from typing import NamedTuple
 
@@ -8,6 +8,7 @@ from schemas.results import BridgeResult, Crossing
 from schemas.results_on_the_wire import bridge_to_protobuf, direction_to_protobuf
 from schemas.settings import IdentificationSettings
 from schemas.topics import Key
+from services.identification.bridge_state import Counted, Fusing
 from services.identification.crossing_data import CrossingData
 from services.identification.stays import Passage, Stay
 from services.identification.streams import Boot
@@ -37,13 +38,27 @@ class Work(NamedTuple):
         return self.data.crossing_id
 
 
+class Fuse(NamedTuple):
+    """Crossings of a bridge that are to be fused: all that is needed for it, wherever that is done.
+
+    A newer one of the same realm and bridge holds all that an older one holds.
+    """
+
+    realm: str
+    bridge: str
+    counted: Counted
+    fusing: Fusing
+    exit_time: float
+    """Of the crossing that the state is told after (s since 1970 UTC)."""
+
+
 class Wanted(NamedTuple):
     """A crossing waits for the certificate of its vehicle and bridge."""
 
     pair: Pair
 
 
-Said = Output | Work | Wanted
+Said = Output | Work | Fuse | Wanted
 
 
 def crossing_output(

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing
+from schemas.results import BridgeResult, Crossing
 from schemas.signals import GnssFix
 from schemas.site import Vehicle
 from schemas.vehicle_info import Difference, differences
 from services.identification.bridge_state import Counted
-from services.identification.bridges import AWAY_S, Bridges
+from services.identification.bridges import AWAY_S, Bridges, Look
 from services.identification.outputs import Output, Work
 from services.identification.stays import MERGE_S
 from services.identification.streams import PATIENCE_S, Boot
@@ -49,6 +49,8 @@ class TruckBoot:
         """Time, latitude and longitude of the latest fix."""
         self.near: dict[int, Visit] = {}
         """By number of the bridge: those that it came to within what is remembered."""
+        self.looks: dict[int, Look] = {}
+        """By number of the bridge, in the visit that it is near it in: the latest look."""
         self.late: dict[int, float] = {}
         """By number of the bridge: when the last of the fixes near it came that came late."""
         self.is_gone = False
@@ -69,6 +71,7 @@ class TruckBoot:
         ids = {before.bridge(number).id: visit for number, visit in self.near.items()}
         self.near = {bridges.number[i]: v for i, v in ids.items() if i in bridges.number}
         self.late.clear()
+        self.looks.clear()
         gone = {name: one for name, one in self.detected.items() if name[0] not in bridges.number}
         self.detected = {name: one for name, one in self.detected.items() if name not in gone}
         self.differences = []
@@ -90,6 +93,7 @@ class TruckBoot:
             visit = self.near.get(number)
             if visit is None or (now_s - visit.last_s > AWAY_S and number not in busy):
                 visit = Visit(before[0], now_s)  # it may have jumped over it since then
+                self.looks.pop(number, None)
             self.near[number] = Visit(min(visit.since_s, now_s), max(visit.last_s, now_s))
         return sorted(busy.union(found)) if busy else found
 
@@ -101,6 +105,7 @@ class TruckBoot:
             visit = self.near.get(number, Visit(time_s, time_s))
             self.near[number] = Visit(min(visit.since_s, time_s), max(visit.last_s, time_s))
             self.late[number] = self.latest_s
+        self.looks.clear()
 
     def late_enough(self) -> list[int]:
         """The bridges of which late fixes have come, if by now none of them is missing still."""
@@ -113,6 +118,7 @@ class TruckBoot:
         """Forget samples, fixes and crossings that are decided: no stay is found there again."""
         self.forgotten_s = time_s
         self.boot.forget_before(time_s)
+        self.looks.clear()
         busy = self.busy_at()
         self.near = {n: v for n, v in self.near.items() if v.last_s >= time_s or busy}
         self.decided = [one for one in self.decided if one[2] >= time_s]
@@ -162,5 +168,7 @@ class BridgeCrossings:
     counted: Counted = field(default_factory=Counted)
     under_way: deque[UnderWay] = field(default_factory=deque)
     """In the order in which they were found: so their results are told."""
+    state: BridgeResult | None = None
+    """The latest that was made of those that are counted."""
     results: dict[int, Crossing] = field(default_factory=dict)
     """Those that have come before one that was found earlier, by number of the work."""

@@ -4,6 +4,10 @@ Driving along the bridge's line, a truck is before the bridge, on it (with at le
 behind it. A crossing is a passage from one side to the other; one that ends on the side where it
 began, or that the positions only begin or end in, is a crossing that cannot be identified.
 
+Where the receiver was out while a truck passed, the fixes before and behind tell it all the same,
+unless the truck drove away from the bridge before and towards it afterwards: it came back unseen,
+or was switched off and began another run, and nobody knows by which way.
+
 A receiver's noise moves a truck that is at an end of the bridge on and off it: only what goes
 through, or further onto the bridge than noise reaches, is a stay.
 """
@@ -131,7 +135,9 @@ def find_stays(
     gone = np.append(np.flatnonzero(depth <= 0.0), time_s.size)
     stop = 0
     for n in begins.tolist():
-        if n >= stop:
+        if n >= stop and not (
+            depth[n] <= 0.0 and _came_unseen(antenna_m, speed_m_per_s, n, margin_m)
+        ):
             stop = int(gone[np.searchsorted(gone, n)]) if depth[n] > 0.0 else n
             stay = _stay(time_s, places, n, stop, span_m, margin_m)
             deep_m = np.inf
@@ -148,28 +154,45 @@ def find_stays(
     return _merged(stays)
 
 
+def _came_unseen(antenna_m: Floats, speed_m_per_s: Floats, n: int, margin_m: float) -> bool:
+    """Whether a truck that is on the other side at fix n need not have come over the bridge.
+
+    So it is if before it drove the other way, and goes on that way; while it has not moved further
+    than noise does, it is taken to.
+    """
+    direction = np.sign(antenna_m[n] - antenna_m[n - 1])
+    before, after = antenna_m[:n], direction * (antenna_m[n:] - antenna_m[n])
+    # By the fixes before alone: seen from behind it, a truck that stood has turned there.
+    if np.ptp(before) <= margin_m or _senses(before, speed_m_per_s[:n], margin_m)[-1] == direction:
+        return False
+    far = np.flatnonzero(np.abs(after) > margin_m)
+    return far.size == 0 or bool(after[far[0]] < 0.0)
+
+
 def _senses(antenna_m: Floats, speed_m_per_s: Floats, margin_m: float) -> Floats:
     """Sense of travel at each fix, 1 or -1: it turns where the truck turns, not with the noise."""
-    sense = np.zeros(antenna_m.size)
-    current = 0.0
-    lowest = highest = farthest = 0
-    for n in np.flatnonzero(np.abs(speed_m_per_s) >= STANDING_M_PER_S).tolist():
-        here = antenna_m[n]
-        if current == 0.0:
-            lowest = n if here < antenna_m[lowest] else lowest
-            highest = n if here > antenna_m[highest] else highest
-            if max(here - antenna_m[lowest], antenna_m[highest] - here) > margin_m:
-                current = 1.0 if here - antenna_m[lowest] > margin_m else -1.0
-                sense[0] = current
-                farthest = n
-        elif (here - antenna_m[farthest]) * current > 0.0:
-            farthest = n
-        elif (antenna_m[farthest] - here) * current > margin_m:
-            sense[farthest + 1] = -2.0 * current
-            current = -current
-            farthest = n
+    moving = np.flatnonzero(np.abs(speed_m_per_s) >= STANDING_M_PER_S)
+    place = antenna_m[moving]
+    lowest = np.minimum(np.minimum.accumulate(place), antenna_m[0])
+    highest = np.maximum(np.maximum.accumulate(place), antenna_m[0])
+    moved = np.flatnonzero(np.maximum(place - lowest, highest - place) > margin_m)
+    if not moved.size:
+        return np.ones(antenna_m.size)
+    begin = int(moved[0])
+    current = 1.0 if place[begin] - lowest[begin] > margin_m else -1.0
     # Only the turns are noted: first the sense, then its changes.
-    return np.cumsum(sense) if current != 0.0 else np.ones(antenna_m.size)
+    sense = np.zeros(antenna_m.size)
+    sense[0] = current
+    while True:
+        ahead = current * place[begin:]
+        back = np.flatnonzero(np.maximum.accumulate(ahead) - ahead > margin_m)
+        if not back.size:
+            return np.cumsum(sense)
+        # It has turned behind the fix that was farthest.
+        farthest = begin + int(np.argmax(ahead[: back[0]]))
+        sense[moving[farthest] + 1] = -2.0 * current
+        current = -current
+        begin += int(back[0])
 
 
 def _stay(

@@ -77,6 +77,9 @@ class Boot:
         self._fresh: list[GnssFix] = []
         self._columns: Floats = np.empty((len(Fixes._fields), 0))
         """Known fixes as `fixes` gives them, but for the fresh ones: thousands, asked for often."""
+        self._ahead_ns: dict[int, int] = {}
+        """How far the wall clock was ahead of this one, by the known fixes: all messages about a
+        crossing ask for the same few moments."""
         self._forgotten_ns = -1
         self._first_accel = self._first_fix = (1 << 64, 0)
         """Sequence and time of the earliest message that has come."""
@@ -100,6 +103,7 @@ class Boot:
         elif fix.device_time_ns >= self._forgotten_ns and fix.sequence not in dict(self._fixes):
             insort(self._fixes, (fix.sequence, fix))
             self._fresh.append(fix)
+            self._ahead_ns.clear()
             return True
         return False
 
@@ -119,6 +123,7 @@ class Boot:
             self._next_fix = sequence + 1
             self._fixes.append((sequence, fix))
             self._fresh.append(fix)
+            self._ahead_ns.clear()
             yield fix
 
     def is_cut_off_at(self, time_s: float) -> bool:
@@ -142,6 +147,7 @@ class Boot:
         for sequence in [s for s, b in self._batches.items() if b.device_time_ns < limit_ns]:
             del self._batches[sequence]
         self._fixes = [(s, f) for s, f in self._fixes if f.device_time_ns >= limit_ns]
+        self._ahead_ns.clear()
         known_s = self.fixes().time_s
         self._columns = np.ascontiguousarray(self._columns[:, known_s >= limit_ns / NS_PER_S])
 
@@ -173,15 +179,21 @@ class Boot:
         Their median: single stamps jitter. There must be a fix.
         """
         time_ns = round(time_s * NS_PER_S)
+        if time_ns not in self._ahead_ns:
+            self._ahead_ns[time_ns] = self._wall_clock_ahead_ns(time_ns)
+        return time_ns + self._ahead_ns[time_ns]
+
+    def _wall_clock_ahead_ns(self, time_ns: int) -> int:
+        first_ns = time_ns - _WALL_CLOCK_S * NS_PER_S
         before = [
             fix.wall_time_ns - fix.device_time_ns
             for _, fix in self._fixes
-            if time_ns - _WALL_CLOCK_S * NS_PER_S < fix.device_time_ns <= time_ns
+            if first_ns < fix.device_time_ns <= time_ns
         ]
         if not before:
             nearest = min(self._fixes, key=lambda item: abs(item[1].device_time_ns - time_ns))[1]
             before = [nearest.wall_time_ns - nearest.device_time_ns]
-        return time_ns + sorted(before)[len(before) // 2]
+        return sorted(before)[len(before) // 2]
 
     def fixes(self) -> Fixes:
         """All settled fixes in order of time."""
@@ -210,11 +222,12 @@ class Boot:
         A slower channel is interpolated band-limited. A channel that this truck has but that
         has no sample in this stretch is NaN throughout. None: the truck has no channel at all.
         """
-        chosen = [
-            batch
-            for _, batch in sorted(self._batches.items())
+        sequences = [
+            sequence
+            for sequence, batch in self._batches.items()
             if start_s - MAX_BATCH_S < _seconds(batch.device_time_ns) <= stop_s
         ]
+        chosen = [self._batches[sequence] for sequence in sorted(sequences)]
         grids = {
             name: grid
             for name in CHANNELS

@@ -243,7 +243,7 @@ def run(
 
         receiver = threading.Thread(target=receive, name="receive", daemon=True)
         try:
-            _resume(engine, earlier, publisher, files)
+            _resume(engine, execution, earlier, publisher, files)
             del earlier  # of two days
             receiver.start()
 
@@ -361,8 +361,17 @@ def _put(arrivals: _Queue, item: Arrived | Token, closing: threading.Event) -> N
             return
 
 
-def _resume(engine: Engine, earlier: Earlier, publisher: Publisher, files: ResultFiles) -> None:
-    """Take up what earlier runs left: say again what may not have been heard, finish the rest."""
+def _resume(
+    engine: Engine,
+    execution: Execution,
+    earlier: Earlier,
+    publisher: Publisher,
+    files: ResultFiles,
+) -> None:
+    """Take up what earlier runs left: say again what may not have been heard, finish the rest.
+
+    States of bridges that they owe are told when they have been made, while others are listened to.
+    """
     again = [*earlier.unsure, *(m for m in earlier.latched if m not in earlier.unsure)]
     for message in again:
         _, owner, identifier, stream = message.key
@@ -371,8 +380,8 @@ def _resume(engine: Engine, earlier: Earlier, publisher: Publisher, files: Resul
             publisher.put(owner, identifier, stream, message.payload, identity)
         except ValueError as error:
             _log.warning("not published again: %s", error)
-    finished = list(engine.resume(earlier.crossings))
-    _publish(finished, engine, publisher, files)
+    finished = list(engine.resume(earlier.crossings, earlier.states()))
+    _publish(dispatched(engine, execution, finished), engine, publisher, files)
     if earlier.previous is not None:
         _log.info(
             "%d messages of earlier runs, the last in %s; published again %d, finished %d",
@@ -528,8 +537,7 @@ def _publish(
         identity = files.next_identity(output.key, publisher.boot_id)
         now_ns = time.time_ns()
         message = Message(output.key, output.payload, *identity, now_ns, now_ns)
-        bridges = {} if output.result is None else engine.bridges()
-        files.write(message, output.result, bridges)
+        files.write(message, output.result, engine.bridges())
         try:
             publisher.put(owner, identifier, stream, output.payload, identity)
         except ValueError as error:

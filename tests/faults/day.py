@@ -2,30 +2,40 @@
 
     python -m tests.faults.day [--minutes 60] [--speed 4] [--kills 5] [--away 600] [--seed 1]
 
-Logger, worker and two trucks, each a process of the command `driveby`. The site has twelve bridges:
-nine on one road, the tenth beside one of them on the other carriageway, the eleventh above another
-one and the twelfth across the road; trucks drive to and fro, the way back over the other
-carriageway, and never over the last two. The worker is killed at random moments, and once it is
-away for longer than a truck's history (seconds of the drive). Then each crossing that was driven
-must have one result, in its order, and nothing else may have one.
+Logger, worker, live view and two trucks, each a process of the command `driveby`. The site has
+twelve bridges: nine on one road, the tenth beside one of them on the other carriageway, the
+eleventh above another one and the twelfth across the road; trucks drive to and fro, the way back
+over the other carriageway, and never over the last two. The worker is killed at random moments,
+and once it is away for longer than a truck's history (seconds of the drive). Then each crossing
+that was driven must have one result, in its order, and nothing else may have one.
+
+The live view is killed, too, at a random moment before the worker is for the first time: a worker
+that is there tells a new view all that it has told so far. So the view that follows must show each
+crossing of the eight bridges that it draws, those that it met first, once and with a verdict. What
+it shows is read as a viewer reads it, by one that writes what it gets into a file.
 """
 
 import argparse
+import contextlib
 import logging
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+import warnings
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rerun.chunk import RrdReader
 
 from pre_core.paper.experiment import scenario_ratios
 from schemas.proto import driveby_pb2 as pb
@@ -37,7 +47,11 @@ from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.recordings.recording import read_info, read_messages
 from services.recordings.writer import write_recording
 from services.simulation.drive import Drive, paper_site, simulate_drive
-from tests.endpoints import free_endpoint
+from services.viewer.crossing_view import VERDICT_COLOURS
+from services.viewer.live_layout import lane_entity
+from services.viewer.live_picture import MOST_BRIDGES
+from services.viewer.view import viewer_arguments, viewer_program
+from tests.endpoints import free_endpoint, free_port
 from tests.parent import parent_environment
 from tests.waiting import LONGEST_S
 
@@ -207,6 +221,7 @@ class Fleet:
         self.endpoint = free_endpoint()
         self._worker_options = ("--method", method, "--processes", str(processes))
         self._started: list[subprocess.Popen[bytes]] = []
+        self._views = 0
 
     def start(self, *arguments: str) -> subprocess.Popen[bytes]:
         log = (self.folder / f"{arguments[0]}-{len(self._started)}.log").open("wb")
@@ -236,14 +251,39 @@ class Fleet:
             *("--site", str(self.site), "--folder", str(self.recordings), *self._worker_options),
         )
 
+    def start_view(self) -> "View":
+        """The live view, and a viewer without a screen that writes what it gets into a file."""
+        process = self.start(
+            *("view", "live", "--serve", "--endpoint", self.endpoint, "--realm", REALM),
+            *("--site", str(self.site)),
+        )
+        self._wait_for("live at ", process)
+        address = re.findall(r"live at (\S+);", self._log_of(process).read_text())[0]
+        self._views += 1
+        shown = self.folder / f"view-{self._views}.rrd"
+        own = os.environ | {"HOME": str(self.folder), "XDG_CONFIG_HOME": str(self.folder)}
+        subprocess.run(
+            [viewer_program(), "analytics", "disable"], env=own, check=True, capture_output=True
+        )
+        arguments = viewer_arguments(address, web=False)
+        arguments[arguments.index("--port") + 1] = str(free_port())
+        viewer = subprocess.Popen(
+            [*arguments, "--save", str(shown)], env=own, stderr=subprocess.DEVNULL
+        )
+        self._started.append(viewer)
+        return View(process, viewer, shown)
+
     def start_truck(self, plan: Plan, speed: float) -> subprocess.Popen[bytes]:
         return self.start(
             *("truck", str(plan.recording), "--endpoint", self.endpoint, "--realm", REALM),
             *("--speed", f"{speed:g}"),
         )
 
+    def _log_of(self, process: subprocess.Popen[bytes]) -> Path:
+        return next(self.folder.glob(f"*-{self._started.index(process)}.log"))
+
     def _wait_for(self, text: str, process: subprocess.Popen[bytes]) -> None:
-        log = self.folder / f"logger-{self._started.index(process)}.log"
+        log = self._log_of(process)
         deadline = time.monotonic() + LONGEST_S
         while text not in log.read_text():
             assert time.monotonic() < deadline, log.read_text()
@@ -276,11 +316,86 @@ class Fleet:
             process.wait()
 
 
+class View(NamedTuple):
+    """A live view, and what it shows."""
+
+    process: subprocess.Popen[bytes]
+    viewer: subprocess.Popen[bytes]
+    shown: Path
+
+    def kill(self) -> None:
+        """Both, and what was shown is of no use any more."""
+        for process in (self.process, self.viewer):
+            process.kill()
+            process.wait()
+
+    def picture(self) -> "Picture":
+        """What it shows so far."""
+        known = site()
+        lanes = {
+            f"/{lane_entity(bridge.id, vehicle.id)}": (bridge.id, vehicle.id)
+            for bridge in known.bridges
+            for vehicle in known.vehicles
+        }
+        pages = {f"/said/{bridge.id}": bridge.id for bridge in known.bridges}
+        found = Picture(set(), Counter())
+        with warnings.catch_warnings(), contextlib.suppress(RuntimeError):
+            # The file is still being written: it has no footer, and ends in the middle of a chunk.
+            warnings.simplefilter("ignore")
+            for chunk in RrdReader(self.shown).stream():
+                if chunk.entity_path in pages:
+                    found.bridges.add(pages[chunk.entity_path])
+                if chunk.entity_path not in lanes or chunk.is_static:
+                    continue
+                rows = chunk.to_record_batch()
+                (name,) = (n for n in rows.schema.names if n.endswith("StateChange:state"))
+                states = [one[0] for one in rows[name].to_pylist() if one]
+                verdicts = sum(state in VERDICT_COLOURS for state in states)
+                found.verdicts[lanes[chunk.entity_path]] += verdicts
+        return found
+
+
+class Picture(NamedTuple):
+    """What a live view shows of crossings."""
+
+    bridges: set[str]
+    """Those that it draws: not more than some, which it met first."""
+    verdicts: Counter[tuple[str, str]]
+    """How many crossings have one, by bridge and truck."""
+
+
+def driven_in(picture: Picture, plans: dict[str, Plan]) -> Counter[tuple[str, str]]:
+    """What a picture must show of what was driven."""
+    return Counter(
+        (crossed.bridge, vehicle)
+        for vehicle, plan in plans.items()
+        for crossed in plan.crossings
+        if crossed.bridge in picture.bridges
+    )
+
+
+def problems_of_view(picture: Picture, plans: dict[str, Plan]) -> list[str]:
+    """Where a picture has too few or too many crossings with a verdict."""
+    driven = driven_in(picture, plans)
+    found = [
+        f"live view: {picture.verdicts[lane]} crossings of {lane[1]} over {lane[0]} instead of "
+        f"{driven[lane]}"
+        for lane in sorted(driven | picture.verdicts)
+        if picture.verdicts[lane] != driven[lane]
+    ]
+    if len(picture.bridges) != MOST_BRIDGES:
+        found.append(f"live view: {len(picture.bridges)} bridges instead of {MOST_BRIDGES}")
+    return found
+
+
 class Told(NamedTuple):
     """What a day came to."""
 
     crossings: int
     results: int
+    shown: int
+    """Crossings with a verdict in the picture of the live view, on the bridges that it draws."""
+    to_show: int
     kills: int
     seconds: float
     longest_backlog: int
@@ -345,13 +460,19 @@ def live(
     try:
         logger = fleet.start_logger()
         worker = fleet.start_worker()
+        view = fleet.start_view()
         trucks = [fleet.start_truck(plan, speed) for plan in plans.values()]
         drive_s = max(plan.seconds for plan in plans.values()) / speed
         events = sorted(moments.uniform(0.05, 0.95) * drive_s for _ in range(kills))
         aways = {events[len(events) // 2]: away_s / speed} if away_s and events else {}
+        view_at_s = moments.uniform(0.0, events[0] if events else 0.95 * drive_s)
         drove = time.monotonic()
-        for at_s in events:
+        for at_s in sorted([view_at_s, *events]):
             time.sleep(max(0.0, drove + at_s - time.monotonic()))
+            if at_s == view_at_s:
+                view.kill()
+                view = fleet.start_view()
+                continue
             worker.kill()
             worker.wait()
             time.sleep(aways.get(at_s, 0.0))
@@ -367,6 +488,13 @@ def live(
             assert worker.poll() is None, fleet.logs()
             time.sleep(0.5)
         seconds = time.monotonic() - began
+        deadline = time.monotonic() + LONGEST_S
+        while problems_of_view(view.picture(), plans) and time.monotonic() < deadline:
+            assert view.process.poll() is None, fleet.logs()
+            time.sleep(0.5)
+        view.process.send_signal(signal.SIGTERM)
+        assert view.process.wait(LONGEST_S) == 0, fleet.logs()
+        picture = view.picture()
         worker.send_signal(signal.SIGTERM)
         assert worker.wait(LONGEST_S) == 0, fleet.logs()
         logger.send_signal(signal.SIGTERM)
@@ -375,10 +503,12 @@ def live(
     finally:
         fleet.close()
         log.setLevel(said_before)
-    problems = problems_of(plans, results)
+    problems = problems_of(plans, results) + problems_of_view(picture, plans)
     if problems:
         problems.append(fleet.logs())
-    return Told(wanted, len(results), kills, seconds, longest_backlog, problems)
+    shown, to_show = picture.verdicts.total(), driven_in(picture, plans).total()
+    counts = (wanted, len(results), shown, to_show, kills)
+    return Told(*counts, seconds, longest_backlog, problems)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -411,7 +541,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.folder is None:
             shutil.rmtree(folder)
     print(
-        f"{told.crossings} crossings, {told.results} results; {told.kills} kills, "
+        f"{told.crossings} crossings, {told.results} results; of {told.to_show} on the bridges "
+        f"that it draws the live view shows {told.shown}; {told.kills} kills of the worker, one of "
+        f"the view, "
         f"{told.seconds:.0f} s; {told.longest_backlog} were left when the trucks had arrived"
     )
     for problem in told.problems:

@@ -1,11 +1,21 @@
 """A simulated day in short: two trucks, twelve bridges, and a worker that is killed."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from schemas.proto import driveby_pb2 as pb
-from tests.faults.day import Crossed, Plan, live, problems_of, site, way
+from tests.faults.day import (
+    Crossed,
+    Picture,
+    Plan,
+    live,
+    problems_of,
+    problems_of_view,
+    site,
+    way,
+)
 
 pytestmark = pytest.mark.process
 
@@ -16,6 +26,7 @@ def test_every_crossing_has_one_result_although_the_worker_is_killed(tmp_path: P
     told = live(tmp_path, rounds=1, bridges=4, speed=12.0, kills=1, away_s=0.0, seed=1)
     assert told.problems == []
     assert told.crossings == told.results == 16
+    assert told.shown == told.to_show > 0
 
 
 @pytest.mark.faults
@@ -24,6 +35,7 @@ def test_killed_five_times_and_away_for_longer_than_a_history(tmp_path: Path) ->
     told = live(tmp_path, rounds=3, bridges=9, speed=8.0, kills=5, away_s=600.0, seed=2)
     assert told.problems == []
     assert told.crossings == told.results == 108
+    assert told.shown == told.to_show >= 84  # by which eight of the ten bridges it draws
 
 
 def test_the_day_sees_what_is_missing_twice_or_invented() -> None:
@@ -51,6 +63,22 @@ def test_the_day_sees_what_is_missing_twice_or_invented() -> None:
     ):
         assert problems_of(plans, wrong), wrong
     assert problems_of(plans, [one, two, result(1, pb.START_TO_END, "truck-2")])
+
+
+def test_the_day_sees_what_the_view_does_not_show_or_shows_twice() -> None:
+    there, back = Crossed("road-0", "start_to_end"), Crossed("road-0", "end_to_start")
+    far = Crossed("road-8", "start_to_end")  # behind the bridges that are drawn
+    plans = {"truck-1": Plan(Path(), [there, far, back], 10.0)}
+    drawn = {f"road-{n}" for n in range(8)}
+    lane = ("road-0", "truck-1")
+    assert problems_of_view(Picture(drawn, Counter({lane: 2})), plans) == []
+    for wrong in (
+        Picture(drawn, Counter({lane: 1})),
+        Picture(drawn, Counter({lane: 3})),
+        Picture(drawn, Counter({lane: 2, ("road-1", "truck-1"): 1})),
+        Picture(drawn - {"road-1"}, Counter({lane: 2})),
+    ):
+        assert len(problems_of_view(wrong, plans)) == 1
 
 
 def test_the_way_is_what_was_described() -> None:

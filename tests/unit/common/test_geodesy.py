@@ -9,7 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.site_file import load_site, parse_site
-from services.common.geodesy import bridge_frame, heading_deg, to_chainage, to_lat_lon
+from services.common.geodesy import (
+    bridge_frame,
+    chainage_of,
+    heading_deg,
+    to_chainage,
+    to_lat_lon,
+)
 
 
 class Ends(NamedTuple):
@@ -136,6 +142,16 @@ def test_left_is_left_and_shapes_are_kept() -> None:
     assert chainage.shape == lateral.shape == (2, 3)
     assert np.all(lateral > 10)
     assert to_lat_lon(eastward, 5.0)[0].shape == ()
+
+
+def test_the_chainage_of_one_place_is_that_of_many() -> None:
+    frame = bridge_frame(Ends(-37.95, 144.42, -37.9498, 144.4204, 40.0))
+    rng = np.random.default_rng(1)
+    latitude = -37.95 + 0.01 * rng.standard_normal(100)
+    longitude = 144.42 + 0.01 * rng.standard_normal(100)
+    along, _ = to_chainage(frame, latitude, longitude)
+    one_by_one = [chainage_of(frame, *place) for place in zip(latitude, longitude, strict=True)]
+    assert one_by_one == pytest.approx(along, abs=1e-6)
 
 
 def test_equal_ends_have_no_frame() -> None:

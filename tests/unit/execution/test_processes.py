@@ -13,15 +13,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.results import Crossing
+from schemas.results import BridgeResult, Crossing
 from schemas.settings import IdentificationSettings
 from services.common.errors import FailureError
 from services.execution.dispatch import Finished, feed_all
 from services.execution.processes import Aftermath, Aside, Processes
 from services.execution.watch import Limits
+from services.identification.bridge_state import (
+    NOTHING_STORED,
+    Counted,
+    Fusing,
+    count_in,
+    state_of,
+    usable,
+)
 from services.identification.crossing_data import CrossingData
 from services.identification.engine import Engine
-from services.identification.outputs import Work
+from services.identification.outputs import Fuse, Work
 from tests.unit.identification.test_engine_resume import (
     HEADER,
     SETTINGS,
@@ -32,6 +40,7 @@ from tests.unit.identification.test_engine_resume import (
     Identifications,
     messages_of,
 )
+from tests.unit.identification.test_fusing import crossing
 from tests.waiting import LONGEST_S, until
 
 
@@ -115,12 +124,10 @@ def test_the_bytes_are_those_of_one_process(number: int) -> None:
     assert [(o.key, o.payload) for o in by_stream(outputs)] == [
         (o.key, o.payload) for o in by_stream(WHOLE)
     ]
-    assert [o.key.stream for o in outputs if o.key.stream != "crossing"] == [
-        "estimate",
-        "state",
-        "estimate",
-        "state",
-    ]
+    streams = [o.key.stream for o in outputs if o.key.stream != "crossing"]
+    # Two processes may have found the second one before the first is fused.
+    found_first = ["estimate", "estimate", "state", "state"]
+    assert streams == ["estimate", "state"] * 2 or (number == 2 and streams == found_first)
     names = {o.result.crossing_id for o in WHOLE if o.result}
     until(lambda: {(name, "half", 0.5) for name in names} <= set(told), "progress of both")
     # The second waits for the only process, where there is one.
@@ -231,6 +238,49 @@ def test_a_process_that_cannot_begin_is_a_failure() -> None:
         processes.wait_until_warm()
 
 
+def sleep_for_ever() -> None:
+    time.sleep(1e6)
+
+
+def sleep_at_the_second_start() -> None:
+    starts = Path(os.environ["DEADLY_ONCE"])
+    (starts / f"start {len(list(starts.iterdir()))}").touch()
+    if len(list(starts.iterdir())) == 3:  # a mark of the crossing that killed the first is there
+        sleep_for_ever()
+
+
+def test_a_process_that_hangs_while_it_is_started_is_ended(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    limits = Limits(idle_s=1.0)
+    with (
+        Processes(1, identify=quick, prepare=sleep_for_ever, limits=limits) as processes,
+        pytest.raises(FailureError, match="died while it was started"),
+    ):
+        processes.wait_until_warm()
+    assert "the process that is being started has done nothing for 1 s and is ended" in caplog.text
+
+
+def test_one_that_hangs_at_a_later_start_costs_one_crossing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The first dies at its work, the second never begins."""
+    monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
+    first, second = works()
+    with Processes(
+        1, identify=deadly_once, prepare=sleep_at_the_second_start, limits=Limits(idle_s=1.0)
+    ) as processes:
+        processes.wait_until_warm()
+        processes.start(first)
+        (one,) = all_of(processes)
+        (tmp_path / second.crossing_id).touch()  # it kills nobody
+        processes.start(second)
+        (other,) = all_of(processes)
+    assert one.result.reasons == ("failed",)
+    assert other.result.verdict == "good"
+    assert caplog.text.count("the process that is being started has done nothing") == 1
+
+
 def test_more_than_a_few_wait_elsewhere() -> None:
     (work, _) = works()
     with Processes(1, identify=slow, prepare=nothing) as processes:
@@ -299,6 +349,155 @@ def test_results_may_come_back_in_any_order() -> None:
             list(engine.done(found[0], result))
     first, *others = orders.values()
     assert all(other == first for other in others)
+
+
+# Crossings that are fused
+
+
+STATE = BridgeResult(verdict="rejected")  # type: ignore[call-arg]
+
+
+def fuse_of(number: int, bridge: str = "bridge-1") -> Fuse:
+    return Fuse("live", bridge, Counted((), number), NOTHING_STORED, 1.0 * number)
+
+
+def named_by_number(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+    """Tells which process made it of what, and when."""
+    (Path(os.environ["DEADLY_ONCE"]) / f"{time.monotonic_ns()} {bridge} {counted.number}").touch()
+    return STATE.model_copy(update={"crossings_left_out_count": counted.number})
+
+
+def after_a_signal(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+    state = named_by_number(counted, bridge, fusing)
+    wait_for(str(Path(os.environ["DEADLY_ONCE"]) / "go on"))
+    return state
+
+
+def dies(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+    os.kill(os.getpid(), signal.SIGKILL)
+    raise AssertionError
+
+
+def dies_once(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+    mark = Path(os.environ["DEADLY_ONCE"]) / "died"
+    if not mark.exists():
+        mark.touch()
+        dies(counted, bridge, fusing)
+    return named_by_number(counted, bridge, fusing)
+
+
+def for_ever(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+    time.sleep(1e6)
+    raise AssertionError
+
+
+def bad(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+    raise np.linalg.LinAlgError("singular")
+
+
+@pytest.fixture
+def marks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
+    return tmp_path
+
+
+def begun(marks: Path) -> list[str]:
+    """What was begun to be fused, in order of time."""
+    names = sorted(path.name for path in marks.iterdir() if path.name[0].isdigit())
+    return [name.partition(" ")[2] for name in names]
+
+
+def all_fused(processes: Processes) -> list[tuple[str, int | None]]:
+    found = []
+    deadline = time.monotonic() + LONGEST_S
+    while processes.is_busy and time.monotonic() < deadline:
+        assert processes.finished(0.1) == []
+        for fuse, state in processes.fused():
+            found.append((fuse.bridge, state and state.crossings_left_out_count))
+    assert not processes.is_busy
+    return found
+
+
+def test_of_one_bridge_only_the_newest_waits_while_one_is_fused(marks: Path) -> None:
+    """The first is under way; of the three behind it only the last is fused."""
+    with Processes(2, identify=quick, state_of=after_a_signal, prepare=nothing) as processes:
+        processes.fuse(fuse_of(1))
+        until(lambda: begun(marks) == ["bridge-1 1"], "the first")
+        for number in (2, 3, 4):
+            processes.fuse(fuse_of(number))
+        processes.fuse(fuse_of(5, "other"))
+        until(lambda: len(begun(marks)) == 2, "the other bridge's, in the other process")
+        assert begun(marks) == ["bridge-1 1", "other 5"]
+        assert not processes.is_idle
+        assert not processes.is_full
+        (marks / "go on").touch()
+        found = all_fused(processes)
+    assert sorted(found) == [("bridge-1", 1), ("bridge-1", 4), ("other", 5)]
+    assert found.index(("bridge-1", 1)) < found.index(("bridge-1", 4))
+
+
+def test_a_state_comes_before_the_crossings_that_wait(marks: Path) -> None:
+    first, second = works()
+    with Processes(1, identify=quick, state_of=named_by_number, prepare=nothing) as processes:
+        processes.start(first)
+        processes.start(second)
+        finished: list[Finished] = []
+        deadline = time.monotonic() + LONGEST_S
+        while not finished and time.monotonic() < deadline:
+            finished = processes.finished(0.1)
+        processes.fuse(fuse_of(1))
+        assert (processes.waiting, processes.under_way) == (1, [])
+        rest: list[Finished] = []
+        while processes.is_busy and time.monotonic() < deadline:
+            if now := processes.fused():
+                assert (len(now), rest) == (1, [])
+            rest += processes.finished(0.1)
+    assert [work.number for work, _ in finished + rest] == [first.number, second.number]
+    assert begun(marks) == ["bridge-1 1"]
+
+
+@pytest.mark.parametrize(
+    ("make", "limits"), [(dies, Limits()), (for_ever, Limits(idle_s=1.0)), (bad, Limits())]
+)
+def test_what_cannot_be_fused_costs_its_own_state_only(
+    make: Callable[..., BridgeResult],
+    limits: Limits,
+    marks: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with Processes(1, identify=quick, state_of=make, prepare=nothing, limits=limits) as processes:
+        processes.fuse(fuse_of(1))
+        assert all_fused(processes) == [("bridge-1", None)]
+        processes.start(works()[0])
+        (finished,) = all_of(processes)
+    assert finished.result.verdict == "good"
+    said = [record.getMessage() for record in caplog.records]
+    again = "the process that worked on the state of bridge-1 died; tried once more"
+    assert said.count(again) == (make is not bad)
+    assert any("the state of bridge-1 died again" in text for text in said) == (make is not bad)
+
+
+def test_a_process_that_dies_once_while_it_fuses_costs_nothing(marks: Path) -> None:
+    """Meanwhile a newer set has come: that is the one that is tried."""
+    with Processes(1, identify=quick, state_of=dies_once, prepare=nothing) as processes:
+        processes.fuse(fuse_of(1))
+        processes.fuse(fuse_of(2))
+        assert all_fused(processes) == [("bridge-1", 2)]
+
+
+def test_numbers_of_a_state_are_those_of_this_process() -> None:
+    """To the last bit, of a fusion that has something to fuse."""
+    three = [usable(crossing(number)) for number in range(3)]
+    counted = count_in(Counted(), [one for one in three if one is not None])
+    fuse = Fuse("live", "bridge-1", counted, NOTHING_STORED, 1.0)
+    with Processes(1, identify=quick, prepare=nothing) as processes:
+        processes.fuse(fuse)
+        deadline = time.monotonic() + LONGEST_S
+        while not (found := processes.fused()) and time.monotonic() < deadline:
+            processes.finished(0.1)
+    assert found == [(fuse, state_of(counted, "bridge-1", NOTHING_STORED))]
+    assert found[0].state is not None
+    assert found[0].state.between_crossing_std
 
 
 # What is computed aside

@@ -130,6 +130,32 @@ def test_the_file_is_as_if_it_had_been_written_at_once(tmp_path: Path, number: i
     assert load_results(path).crossings == tuple(crossings)
 
 
+def test_states_that_are_told_later_take_the_place_of_the_end(tmp_path: Path) -> None:
+    """Longer or shorter, and crossings go on behind the one before."""
+    path = tmp_path / "results.json"
+    file = GrowingJson(path, HEADER)
+    state = state_of(next(counted_bridges()), "bridge-1")
+    assert state is not None
+    file.retell({"bridge-1": state})
+    assert not path.exists()  # without a crossing there is nothing to tell
+    crossings = [result(n) for n in range(2)]
+    file.add(crossings[0], {})
+    for bridges in ({"bridge-1": state, "bridge-2": state}, {}, {"bridge-1": state}):
+        file.retell(bridges)
+        assert path.read_text() == results_json(results(HEADER, crossings[:1], bridges))
+    file.add(crossings[1], bridges)
+    assert path.read_text() == results_json(results(HEADER, crossings, bridges))
+
+
+def test_a_file_that_somebody_changed_is_not_told_states(tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    file = GrowingJson(path, HEADER)
+    file.add(result(0), {})
+    path.write_text("{}")
+    file.retell({})
+    assert path.read_text() == "{}"
+
+
 def test_an_end_that_is_much_shorter_leaves_nothing_behind(tmp_path: Path) -> None:
     """More goes with the bridges than comes with the crossing."""
     path = tmp_path / "results.json"

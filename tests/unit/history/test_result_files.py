@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from schemas.results import Crossing, Header, load_results
-from schemas.results_on_the_wire import crossing_to_protobuf
+from schemas.results import BridgeResult, Crossing, Header, load_results
+from schemas.results_on_the_wire import bridge_to_protobuf, crossing_to_protobuf
 from schemas.topics import Key
 from services.common.errors import FailureError
 from services.history.result_files import Earlier, MessageName, ResultFiles, read_earlier
@@ -227,6 +227,21 @@ def test_the_latest_state_of_each_bridge_is_latched(tmp_path: Path) -> None:
     written(tmp_path / "results-2.mcap", state("b", 3), estimate(4), end=True)
     found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     assert [(m.key.identifier, m.sequence) for m in found.latched] == [("a", 0), ("b", 3)]
+
+
+def test_states_of_earlier_runs_are_read_from_their_messages(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    told = BridgeResult(verdict="rejected", crossings_left_out_count=3)  # type: ignore[call-arg]
+
+    def state(bridge: str, payload: bytes) -> Message:
+        return estimate(0)._replace(key=Key(REALM, "bridge", bridge, "state"), payload=payload)
+
+    payload = bridge_to_protobuf("a", 1, told).SerializeToString()
+    written(tmp_path / "results-1.mcap", state("a", payload), state("b", b"x"), end=True)
+    found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
+    assert found.states() == {(REALM, "a"): told}
+    assert "a state of b is left out" in caplog.text
 
 
 def test_a_run_whose_results_could_not_be_written_has_no_end(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from schemas.site import Bridge, Receiver
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.identification.bridges import Bridges
+from services.identification.bridges import Bridges, Look
 from services.identification.stays import Passage, Stay
 from services.identification.streams import Fixes
 from services.simulation.drive import _altitude_m, paper_site
@@ -93,6 +93,46 @@ def test_of_two_carriageways_the_one_that_was_driven(back: bool) -> None:
         ((where, stay),) = found(both, drive)
         assert (where, stay.direction) == (name, -1 if back else 1)
         assert names(both[::-1], drive) == [name]
+
+
+def drawn_way(seed: int) -> Callable[[Floats], tuple[Floats, Floats]]:
+    """To and fro about the bridge, with stops, and now and then on another road."""
+    rng = np.random.default_rng(seed)
+    ends = rng.choice([-120.0, -60.0, -20.0, 10.0, 40.0, 90.0, 150.0], 8)
+    speed = rng.uniform(5.0, 25.0, 8)
+    times, along = [0.0], [float(ends[0])]
+    for end, fast, stop_s in zip(ends[1:], speed, rng.choice([0.0, 2.0], 8), strict=False):
+        times += [times[-1] + max(abs(end - along[-1]) / fast, 0.1)]
+        times += [times[-1] + stop_s + 0.01]
+        along += [float(end)] * 2
+    aside = rng.choice([0.0, 0.0, 0.0, 14.0, 80.0], len(times))
+
+    def place(t: Floats) -> tuple[Floats, Floats]:
+        return np.interp(t, times, along), np.interp(t, times, aside)
+
+    return place
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_who_is_not_looked_at_again_would_be_found_the_same(seed: int) -> None:
+    """After every fix of a drive in which the receiver is out now and then."""
+    drive = fixes(drawn_way(seed), 40.0)
+    rng = np.random.default_rng(seed)
+    out = rng.integers(0, 400, 3)
+    kept = np.array([n for n in range(400) if not any(a <= n < a + 40 for a in out)])
+    drive = Fixes(*(column[kept] for column in drive))
+    bridges = Bridges([ONE, LEFT] if seed % 3 == 0 else [ONE], RECEIVER)
+    look: Look | None = None
+    spared = 0
+    for n in range(1, kept.size + 1):
+        so_far = Fixes(*(column[:n] for column in drive))
+        here = float(so_far.latitude_deg[-1]), float(so_far.longitude_deg[-1])
+        if look is not None and bridges.is_as_it_was(look, 0, TRUCK, *here):
+            spared += 1
+        else:
+            look = bridges.look(0, TRUCK, so_far, look)
+        assert look.stays == bridges.stays(0, TRUCK, so_far)
+    assert (spared == 0) == (seed % 3 == 0)  # of two beside each other none is spared
 
 
 def test_the_way_back_is_on_the_other_carriageway() -> None:

@@ -50,6 +50,9 @@ class Asking:
     def told(self, said: Iterable[Output | Work | Wanted]) -> list[Output]:
         return list(dispatched(self.engine, self.here, said, self.wanted.append))
 
+    def resumed(self, said: Said) -> list[Output]:
+        return self.told(self.engine.resume(known(said)))
+
     def released(self) -> list[Output]:
         found = []
         while self.engine.has_released:
@@ -214,7 +217,7 @@ def test_a_run_that_was_cut_off_while_they_waited_goes_on(number: int) -> None:
     """Whatever was told of them before: no state is told twice, none is left out."""
     before = Asking().fed(TWO)[:number]
     asking = Asking()
-    list(asking.engine.resume(known(said_by(before))))
+    asking.resumed(said_by(before))
     again = asking.fed(TWO)
     assert said_by(before) + said_by(again) == said_by(Asking().fed(TWO))
     assert asking.wanted == [PAIR]
@@ -234,7 +237,7 @@ def test_a_run_that_was_cut_off_while_they_went_on_goes_on(number: int) -> None:
 
     before = whole()[: 6 + number]
     asking = Asking({PAIR: DIGEST})
-    after = [*asking.engine.resume(known(said_by(before))), *asking.fed(TWO)]
+    after = [*asking.resumed(said_by(before)), *asking.fed(TWO)]
     assert sorted(said_by(before) + said_by(after)) == sorted(said_by(whole()))
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing, Header
-from schemas.results_on_the_wire import crossing_to_protobuf
+from schemas.results import BridgeResult, Crossing, Header
+from schemas.results_on_the_wire import crossing_to_protobuf, state_to_bridge
 from schemas.settings import IdentificationSettings
 from schemas.signals import decode_accel, encode_accel
 from schemas.site_file import site_hash
@@ -16,9 +16,13 @@ from schemas.topics import Key
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.execution.here import Here
+from services.history.store import known_crossings
+from services.identification.bridge_state import state_of
 from services.identification.crossing_data import CrossingData, Passing, rejected
+from services.identification.engine import Engine
 from services.identification.identify import Stopwatch
-from services.identification.outputs import Output
+from services.identification.known import search_hash
+from services.identification.outputs import Fuse, Output, Wanted, Work
 from services.recordings.recording import Message
 from services.simulation.drive import paper_site
 from tests.working_engine import WorkingEngine
@@ -160,15 +164,75 @@ def test_earlier_crossings_count_in_the_next_state() -> None:
     assert [out.crossing_id for out in state.crossings_left_out] == [first.crossing_id]
 
 
-def test_the_results_file_counts_the_crossing_that_it_is_written_for() -> None:
+def test_the_results_file_has_the_state_that_is_told() -> None:
+    """Not before: it may be told long after the result that it is about."""
     one = engine()
-    counted = [
-        (output.result.crossing_id, one.bridges()["bridge-1"].crossings_used)
-        for m in TWO
-        for output in one.feed(m.key, m.payload)
-        if output.result is not None
-    ]
-    assert [used for _, used in counted] == [(crossing_id,) for crossing_id, _ in counted]
+    results, used = [], []
+    for m in TWO:
+        for output in one.feed(m.key, m.payload):
+            if output.result is not None:
+                results.append((output.result.crossing_id,))
+            told = bridge_states([output])
+            used += [tuple(state.crossings_used) for state in told]
+            now = [state.crossings_used for state in one.bridges().values()]
+            assert now == used[-1:]
+    assert used == results
+
+
+def fuses_of(run: Engine, said: Iterable[Output | Work | Fuse | Wanted]) -> list[Fuse]:
+    """What is to be fused when the works of a run are done; their states are told later."""
+    found = []
+    for one in said:
+        if isinstance(one, Work):
+            result = Identifications()(one.data, SETTINGS, stopwatch=lambda: 0.0)
+            found += fuses_of(run, run.done(one, result))
+        elif isinstance(one, Fuse):
+            found.append(one)
+    return found
+
+
+def state_made_of(fuse: Fuse) -> BridgeResult:
+    state = state_of(fuse.counted, fuse.bridge, fuse.fusing)
+    assert state is not None
+    return state
+
+
+def test_a_state_that_was_made_before_a_result_does_not_count_it() -> None:
+    """The first is told behind both results: the second one's is owed to the next run."""
+    one = Engine(SITE, SETTINGS, HEADER)
+    first, second = (f for m in TWO for f in fuses_of(one, one.feed(m.key, m.payload)))
+    outputs = [o for o in WHOLE if o.key.stream != "state"]
+    outputs += one.fused(first, state_made_of(first))
+    assert one.bridges() == {"bridge-1": state_made_of(first)}
+    (again,) = resumed(said_by(outputs), [])
+    assert again.payload == WHOLE[11].payload
+    outputs += one.fused(second, state_made_of(second))
+    assert resumed(said_by(outputs), []) == []
+
+
+def test_of_several_results_without_a_state_the_next_run_tells_one() -> None:
+    outputs = [o for o in WHOLE if o.key.stream != "state"]
+    assert [o.payload for o in resumed(said_by(outputs), [])] == [WHOLE[11].payload]
+
+
+def test_crossings_that_could_not_be_fused_are_a_warning_and_owed(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    one = Engine(SITE, SETTINGS, HEADER)
+    first, second = (f for m in TWO for f in fuses_of(one, one.feed(m.key, m.payload)))
+    assert list(one.fused(first, None)) == []
+    assert one.bridges() == {}
+    assert "bridge-1: its crossings could not be fused" in caplog.text
+    assert [o.payload for o in one.fused(second, state_made_of(second))] == [WHOLE[11].payload]
+
+
+def test_a_new_run_has_the_states_that_were_told() -> None:
+    """Nothing is fused for them once more."""
+    told = state_to_bridge(bridge_states(WHOLE)[-1])[2]
+    known = known_crossings(said_by(WHOLE), search_hash(HEADER))
+    one = Engine(SITE, SETTINGS, HEADER)
+    assert list(one.resume(known, {(REALM, "bridge-1"): told, (REALM, "other"): told})) == []
+    assert one.bridges() == {"bridge-1": told}
 
 
 SLOW = ((0.0, -30.0), (40.0, 90.0))

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.identification.stays import CORRIDOR_M, Passage, Stay, find_stays
+from services.identification.stays import (
+    CORRIDOR_M,
+    STANDING_M_PER_S,
+    Passage,
+    Stay,
+    _senses,
+    find_stays,
+)
 
 Floats = NDArray[np.float64]
 
@@ -130,6 +137,45 @@ def test_a_receiver_that_was_out_over_the_whole_bridge() -> None:
     assert stay.exit_s == pytest.approx(8.44, abs=0.01)
 
 
+def out(driven: Drive, begin_s: float, stop_s: float) -> NDArray[np.bool_]:
+    """The fixes that are left when the receiver, or the truck, was off for a while."""
+    return np.asarray((driven.time_s < begin_s) | (driven.time_s >= stop_s))
+
+
+@pytest.mark.parametrize("off_s", [2.0, 20.0, 120.0, 3600.0])
+@pytest.mark.parametrize("stands_s", [0.0, 30.0])
+@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize("noise_m", [0.0, 0.4])
+def test_who_begins_another_run_on_the_first_side_did_not_come_back_over_the_bridge(
+    off_s: float, stands_s: float, noise_m: float, *, forward: bool
+) -> None:
+    """It was off meanwhile, and may stand for a while before and after that."""
+    ends_s, begins_s = 20.0 + stands_s, 20.0 + stands_s + off_s
+    goes_s = begins_s + stands_s
+    way = [(0.0, -60.0), (20.0, 140.0), (ends_s, 140.0), (begins_s, -60.0), (goes_s, -60.0)]
+    way = [*dict(way).items(), (goes_s + 20.0, 140.0)]
+    driven = legs(*((t, x if forward else SPAN_M - x) for t, x in way))
+    found = stays_of(driven, kept=out(driven, ends_s + 0.05, begins_s - 0.05), noise_m=noise_m)
+    assert [stay.passage for stay in found] == [Passage.THROUGH] * 2
+    assert [stay.direction for stay in found] == [1 if forward else -1] * 2
+
+
+def test_nothing_is_told_of_it_before_it_is_known() -> None:
+    """A message that it was detected could not be taken back."""
+    driven = legs((0.0, -60.0), (20.0, 140.0), (620.0, -60.0), (640.0, 140.0))
+    kept = out(driven, 20.05, 619.95)
+    for stop_s in np.arange(620.0, 626.0, 0.1):
+        assert len(stays_of(driven, kept=kept & (driven.time_s < stop_s))) == 1
+
+
+def test_who_came_back_unseen_and_drives_on_came_over_the_bridge() -> None:
+    """Its receiver was out from behind the bridge to before it."""
+    driven = legs((0.0, -60.0), (15.0, 90.0), (16.0, 90.0), (31.0, -60.0), (41.0, -160.0))
+    first, second = stays_of(driven, kept=out(driven, 14.5, 28.5))
+    assert (first.passage, first.direction) == (Passage.THROUGH, 1)
+    assert (second.passage, second.direction) == (Passage.THROUGH, -1)
+
+
 def test_a_short_bridge_between_two_fixes() -> None:
     """6 m at 25 m/s with one fix a second: never seen on the bridge."""
     for begin in np.linspace(0.0, 1.0, 41):
@@ -227,6 +273,41 @@ def test_wandering_positions_of_a_truck_that_stands_do_not_turn_it() -> None:
     stay = only(stays_of(driven, wander_m=wander))
     assert stay.passage is Passage.THROUGH
     assert stay.exit_s == pytest.approx(99.1 + 0.34, abs=0.3)
+
+
+def senses_fix_by_fix(antenna_m: Floats, speed_m_per_s: Floats, margin_m: float) -> Floats:
+    """What `_senses` must give, as one would tell it while driving."""
+    sense = np.zeros(antenna_m.size)
+    current = 0.0
+    lowest = highest = farthest = 0
+    for n in np.flatnonzero(np.abs(speed_m_per_s) >= STANDING_M_PER_S):
+        here = antenna_m[n]
+        if current == 0.0:
+            lowest = n if here < antenna_m[lowest] else lowest
+            highest = n if here > antenna_m[highest] else highest
+            if max(here - antenna_m[lowest], antenna_m[highest] - here) > margin_m:
+                current = 1.0 if here - antenna_m[lowest] > margin_m else -1.0
+                sense[0], farthest = current, n
+        elif (here - antenna_m[farthest]) * current > 0.0:
+            farthest = n
+        elif (antenna_m[farthest] - here) * current > margin_m:
+            sense[farthest + 1] = -2.0 * current
+            current, farthest = -current, n
+    return np.asarray(np.cumsum(sense)) if current else np.ones(antenna_m.size)
+
+
+def test_the_sense_of_travel_is_the_same_fix_by_fix() -> None:
+    rng = np.random.default_rng(0)
+    turns = 0
+    for _ in range(500):
+        size = rng.integers(2, 100)
+        steps = rng.choice([0.5, 1.0, 3.0]) * rng.standard_normal(size)
+        place = np.round(np.cumsum(steps)) if rng.random() < 0.3 else np.cumsum(steps)
+        speed = rng.choice([0.2, 5.0], size) if rng.random() < 0.5 else np.full(size, 5.0)
+        found = _senses(place, speed, 3.0)
+        assert np.array_equal(found, senses_fix_by_fix(place, speed, 3.0))
+        turns += np.count_nonzero(np.diff(found))
+    assert turns > 500
 
 
 @pytest.mark.parametrize("antenna_m", [-1.5, 0.0, 3.0])

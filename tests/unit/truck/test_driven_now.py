@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from schemas.signals import NS_PER_S
 from schemas.topics import Key
 from services.bus import playback
 from services.cli import main as cli
 from services.logger import _health_line
 from services.recordings.recording import Message
-from services.truck import _tell, _times
+from services.truck import _driven_now, _tell, _times
 from tests.unit.bus.test_playback import Clock, Delivered
+from tests.unit.identification.test_engine_resume import THERE, engine, fed, messages_of
 
 WHERE = Key("live", "vehicle", "truck-1", "gnss")
 
@@ -66,6 +68,24 @@ def test_no_stamp_lies_in_the_future(
     assert (times.takes_s, times.waits_s) == pytest.approx((takes_s, waits_s))
     assert times.ahead_ns == round(ahead_s * 1e9)
     assert times.longest_ns == (2_000_000_000, 602_000_000_000)
+
+
+def test_runs_that_are_one_drive_now_are_as_many_crossings() -> None:
+    """Twice there: nobody sees the truck come back, and it is one boot now."""
+    there = messages_of(*THERE)
+    later = [
+        m._replace(boot_id=m.boot_id + 1, log_time_ns=m.log_time_ns + 600 * NS_PER_S) for m in there
+    ]
+    streams: dict[str, list[Message]] = {}
+    for message in [*there, *later]:
+        streams.setdefault(message.key.stream, []).append(message)
+    times = _times(streams, 1.0, skip_gaps=True)
+    drive = list(_driven_now(Path("two.mcap"), streams, "sim-now", 7, times))
+    assert {message.boot_id for message in drive} == {7}
+    one = engine()
+    outputs = [*fed(one, drive), *one.finish()]
+    results = [output.result for output in outputs if output.result is not None]
+    assert [(r.direction, r.verdict) for r in results] == [("start_to_end", "good")] * 2
 
 
 def said(caplog: pytest.LogCaptureFixture, speed: float, *, skip_gaps: bool) -> str:
