@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from pre_core.constants import NORMAL_975
+from pre_core.search.loop import Report
 from schemas.reasons import BridgeReason, LeftOutReason
 from schemas.results import (
     LOSSES_PERCENT,
@@ -126,7 +127,12 @@ def count_in(counted: Counted, crossings: Iterable[Usable]) -> Counted:
     return Counted(tuple(newest), number)
 
 
-def state_of(counted: Counted, bridge: str, fusing: Fusing = NOTHING_STORED) -> BridgeResult | None:
+def state_of(
+    counted: Counted,
+    bridge: str,
+    fusing: Fusing = NOTHING_STORED,
+    report: Report = lambda stage, fraction: None,
+) -> BridgeResult | None:
     """The bridge by all its good crossings together; None without a crossing that gave numbers.
 
     Of a method that leaves nothing to fuse it is the latest crossing alone, and `suspect`. Suspect
@@ -153,7 +159,7 @@ def state_of(counted: Counted, bridge: str, fusing: Fusing = NOTHING_STORED) -> 
             crossings_left_out=_named(left_out),
             crossings_left_out_count=counted.number,
         )
-    found = fused([one.source for one in wanted if one.source is not None])
+    found = fused([one.source for one in wanted if one.source is not None], report)
     left_out |= dict.fromkeys(found.left_out, LeftOutReason.DISAGREES)
     left_out |= dict.fromkeys(found.other_model, LeftOutReason.OTHER_MODEL)
     reasons = []
