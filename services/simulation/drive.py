@@ -148,9 +148,8 @@ def simulate_command(
     check_writable(output, force=force)
     known = paper_site() if site is None else load_site(site)
     ratios = ratios_of(known.bridges[0], scenario, ei)
-    paths = None if surface is None else wheel_paths_of(known.vehicles[0], surface)
+    drives, paths = [], None if surface is None else wheel_paths_of(known.vehicles[0], surface)
     of_noise = seed if drive_seed is None else drive_seed
-    drives = []
     with steps_bar("simulating", console) as progress:
         for number in range(runs):
             progress(number, runs)
@@ -169,7 +168,6 @@ def simulate_command(
                 drive_seed=(of_noise, number) if number else of_noise,
             )
             drives.append(drive)
-        progress(runs, runs)
         site_of_sensors = declared(known, noise, drives[0].run.rate_hz)
         messages = write_drives(output, drives, site_of_sensors, force=force)
     times = drives[0].run.accel_time_s
