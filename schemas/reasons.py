@@ -1,6 +1,6 @@
 """Why a crossing is not `good`: an enumeration with a sentence each."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import Final
 
@@ -135,6 +135,12 @@ LEFT_OUT_TEXTS: Final[dict[str, str]] = {
 }
 
 
-def texts(reasons: Iterable[Reason]) -> list[str]:
-    """Return the sentence of each reason, in the same order."""
-    return [REASON_TEXTS[reason] for reason in reasons]
+def texts(reasons: Iterable[Reason], about: Mapping[Reason, str] | None = None) -> list[str]:
+    """Return the sentence of each reason, in the same order, with the names that it is `about`."""
+    names = about or {}
+    return [
+        f"{REASON_TEXTS[reason].removesuffix('.')}: {names[reason]}."
+        if names.get(reason)
+        else REASON_TEXTS[reason]
+        for reason in reasons
+    ]

@@ -23,6 +23,7 @@ from pre_core.fusion.sums import BridgePriors, Joint, Layout, Ready
 from pre_core.fusion.tracks import Key, Part, Shared, Track, key_of, tracks_of
 from pre_core.search.crank_nicolson import CHAINS
 from pre_core.search.levenberg_marquardt import minimised
+from pre_core.search.loop import Report
 
 FloatArray = NDArray[np.float64]
 
@@ -56,10 +57,17 @@ def fuse(parts: Sequence[Part], priors: BridgePriors, count: int, seed: int) -> 
     return fuse_joined(join(parts, priors), priors, count, seed)
 
 
-def fuse_joined(joint: Joint, priors: BridgePriors, count: int, seed: int) -> Fused:
+def fuse_joined(
+    joint: Joint,
+    priors: BridgePriors,
+    count: int,
+    seed: int,
+    report: Report = lambda stage, fraction: None,
+) -> Fused:
     """As `fuse`, of crossings that are ready."""
     between = between_of(joint, priors)
-    return Fused(*_drawn(joint, priors, between, count, seed), may_be_zero(between), joint.shared)
+    drawn = _drawn(joint, priors, between, count, seed, report)
+    return Fused(*drawn, may_be_zero(between), joint.shared)
 
 
 def join(
@@ -213,7 +221,7 @@ def _with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
 
 
 def _drawn(
-    joint: Joint, priors: BridgePriors, between: Between, count: int, seed: int
+    joint: Joint, priors: BridgePriors, between: Between, count: int, seed: int, report: Report
 ) -> tuple[FloatArray, FloatArray]:
     """Draws (count, chains, b) of the bridge's coordinates, and of tau (count, chains)."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
@@ -224,6 +232,7 @@ def _drawn(
     out, taus = [], []
     last: list[FloatArray | None] = [None] * CHAINS  # from one change to the next little moves
     for k in np.unique(chosen):
+        report("drawing the bridge", float((chosen < k).mean()))
         some = int((chosen == k).sum())
         tau, rho = float(between.tau[k]), float(between.rho[k])
         density = _posterior(joint, priors, *changed(joint, of, tau, rho)[:2])

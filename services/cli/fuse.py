@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,7 +18,7 @@ from schemas.results import (
 from services.cli.bridge_table import print_bridge
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
-from services.common.progress import Steps, steps_bar
+from services.common.progress import Parts, Steps, parts_bar, steps_bar
 from services.identification.bridge_state import (
     NOTHING_STORED,
     Counted,
@@ -70,17 +71,21 @@ def fuse_command(
     fusing = NOTHING_STORED._replace(with_suspect=fuse_suspect)
     if baseline is not None:
         fusing = Fusing(load_results(baseline).bridges, fuse_suspect)
-    found: dict[str, BridgeResult] = {}
-    for name in sorted({crossing.bridge for crossing in crossings.values()}):
-        of = sorted((c for c in crossings.values() if c.bridge == name), key=lambda c: c.entry_time)
-        counts = [one for one in map(usable, of) if one is not None]
-        elements = _elements(name, of)
+    ordered = sorted(crossings.values(), key=lambda crossing: crossing.entry_time)
+    names = sorted({crossing.bridge for crossing in ordered})
+    of_bridges = {name: [one for one in ordered if one.bridge == name] for name in names}
+    elements_of = {name: _elements(name, of) for name, of in of_bridges.items()}
+    for name, elements in elements_of.items():
         if baseline is not None and elements is not None and name in fusing.baselines:
             _check_baseline(baseline, fusing.baselines[name], elements)
-        with console.status(f"fusing {len(counts)} crossings of {name}"):
-            state = state_of(count_in(Counted(), counts), name, fusing)
+    with parts_bar("fusing bridge", len(names), console) as report:
+        states = {name: _state(name, of, fusing, report) for name, of in of_bridges.items()}
+    found: dict[str, BridgeResult] = {}
+    for name, state in states.items():
+        elements = elements_of[name]
         if state is None or elements is None:
-            console.print(f"{name}: none of {len(of)} crossings can be fused", highlight=False)
+            number = len(of_bridges[name])
+            console.print(f"{name}: none of {number} crossings can be fused", highlight=False)
             continue
         if found:
             console.print()
@@ -91,10 +96,18 @@ def fuse_command(
     if json_path is not None:
         last = files[-1]
         header = Header(program_version(), time.time(), last.site_hash, last.settings, last.seed)
-        ordered = sorted(crossings.values(), key=lambda crossing: crossing.entry_time)
         every = results(header, with_common_shares(ordered, found), found)
         write_atomically(json_path, results_json(every))
     return 0
+
+
+def _state(
+    name: str, crossings: list[Crossing], fusing: Fusing, report: Parts
+) -> BridgeResult | None:
+    counts = [one for one in map(usable, crossings) if one is not None]
+    state = state_of(count_in(Counted(), counts), name, fusing, partial(report, name))
+    report(name, "done", 1.0)
+    return state
 
 
 def _loaded(paths: list[Path], progress: Steps) -> Iterator[Results]:

@@ -1,8 +1,7 @@
 """`driveby identify`: identifies the crossings of recordings, prints and writes what was found."""
 
-import contextlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,9 +25,9 @@ from services.common.files import (
     replaced_atomically,
     write_atomically,
 )
-from services.common.progress import progress_bar, reading_bar, steps_bar
+from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.drives.survey import survey
-from services.execution.offline import identify_recordings, site_of
+from services.execution.offline import identify_messages, messages_of_trucks, site_of
 from services.history.baselines import baselines_of
 from services.history.certificates import found_in
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
@@ -81,12 +80,16 @@ def identify_command(
             "simulations without noise are for --method least-squares"
         )
     draws: dict[str, Draws] = {}
-    with _crossings_bar(console, recordings, known) as say:
-        found = identify_recordings(
-            recordings,
+    seen = _crossings_seen(recordings, known, console)
+    with reading_bar("reading", recordings, console) as next_file:
+        messages = messages_of_trucks(recordings, next_file)
+    with parts_bar("crossing", seen, console) as report:
+        found = identify_messages(
+            messages,
+            ", ".join(map(str, recordings)),
             known,
             settings,
-            say,
+            report,
             keep=draws.__setitem__,
             fusing=fusing,
             certificates=found_in(certificates or CERTIFICATES, known, settings),
@@ -150,24 +153,12 @@ def _write_rerun(
         raise FailureError(f"{path}: could not be written: {error}") from error
 
 
-@contextlib.contextmanager
-def _crossings_bar(
-    console: "Console", recordings: list[Path], site: Site
-) -> Iterator[Callable[[str], None]]:
-    """A bar over all crossings that are seen in the recordings, with what is done at the moment."""
-    # Without a terminal nobody sees it, and the recordings need not be looked through for it.
-    seen = []
-    if console.is_terminal:
-        seen = [survey(path, site).passings for path in recordings]
-    with progress_bar(console) as bar:
-        task = bar.add_task("reading", total=sum(map(len, seen)) or None)
-        begun: set[str] = set()
-
-        def say(text: str) -> None:
-            begun.add(text.partition(": ")[0])
-            bar.update(task, description=text, completed=len(begun) - 1)
-
-        yield say
+def _crossings_seen(recordings: list[Path], site: Site, console: "Console") -> int:
+    """How many a bar is of; 0 without a terminal, where nobody sees it."""
+    if not console.is_terminal:
+        return 0
+    with reading_bar("looking for crossings", recordings, console) as next_file:
+        return sum(len(survey(path, site, progress=next_file()).passings) for path in recordings)
 
 
 def _print(console: "Console", found: Results, site: Site) -> None:

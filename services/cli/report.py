@@ -35,8 +35,6 @@ def add_report(commands: Any) -> None:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from schemas.results import load_results
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
@@ -69,7 +67,7 @@ def _report(options: argparse.Namespace) -> int:
         print("no crossing of a known bridge")
     print(output)
     if options.pdf:
-        with Console(stderr=True).status(f"printing {pdf}, a few seconds"):
-            write_pdf(output, pdf, browser)
+        with steps_bar(f"printing {pdf}") as progress:
+            write_pdf(output, pdf, browser, progress)
         print(pdf)
     return 0

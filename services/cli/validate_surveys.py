@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from schemas.site_file import load_site
 from services.cli.survey_forecasts import forecasts_of
 from services.common.files import make_folder
-from services.common.progress import progress_bar
+from services.common.progress import progress_bar, steps_bar
 from services.simulation.drawn import default_site
 from services.validation import detection
 from services.validation.surveys import HEADINGS, fused_surveys, rows, run_surveys, survey_checks
@@ -45,12 +45,14 @@ def validate_surveys_command(
             processes,
             lambda done, jobs: bar.update(task, completed=done, total=jobs),
         )
-    with console.status("fusing", spinner="dots"):
-        fused = fused_surveys(found)
+    with steps_bar("fusing", console) as progress:
+        fused = fused_surveys(found, progress=progress)
+    with console.status("forecasts", spinner="dots"):
         forecasts = forecasts_of(known, fused)
     console.print(_table(HEADINGS, rows(fused, forecasts)))
-    with console.status("fusing groups of crossings", spinner="dots"):
-        detected = detection.detection(detection.groups_of(found, known.bridges[0]))
+    with steps_bar("fusing groups of crossings", console) as progress:
+        groups = detection.groups_of(found, known.bridges[0], progress=progress)
+    detected = detection.detection(groups)
     if detected:
         console.print()
         console.print(_table(detection.HEADINGS, map(detection.cells, detected)))

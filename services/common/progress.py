@@ -17,6 +17,10 @@ Steps = Callable[[int, int], object]
 """Is told how many of how many steps have been done."""
 
 
+Parts = Callable[[str, str, float], None]
+"""Is told which part of the work, its stage in words, and how much of it is done, 0 to 1."""
+
+
 def unwatched(offset: int) -> None:
     """For who does not want to know."""
 
@@ -49,6 +53,27 @@ def steps_bar(description: str, console: "Console | None" = None) -> Iterator[St
 
         def show(done: int, steps: int) -> None:
             bar.update(task, completed=done, total=max(1, steps))
+
+        yield show
+
+
+@contextlib.contextmanager
+def parts_bar(description: str, parts: int, console: "Console | None" = None) -> Iterator[Parts]:
+    """A bar over parts of work that each take about as long: "crossing 2 of 4: stage".
+
+    It moves within a part too, and never back, for some work is begun again in another way. Where
+    it is not known how many `parts` there are (0) it shows that something is done, and no time.
+    """
+    from rich.console import Console
+
+    with progress_bar(console or Console(stderr=True)) as bar:
+        task = bar.add_task(description, total=parts or None)
+        done: dict[str, float] = {}
+
+        def show(part: str, stage: str, fraction: float) -> None:
+            done[part] = max(done.get(part, 0.0), fraction)
+            number = f"{description} {len(done)}" + (f" of {parts}" if parts else "")
+            bar.update(task, description=f"{number}: {stage}", completed=sum(done.values()))
 
         yield show
 

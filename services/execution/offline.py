@@ -12,9 +12,10 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site, site_hash
 from services.common.errors import InputError
+from services.common.progress import Offset, unwatched
 from services.execution.blas import one_blas_thread
 from services.execution.dispatch import awaited, dispatched
-from services.execution.here import Here
+from services.execution.here import Here, Report
 from services.identification.bridge_state import NOTHING_STORED, Fusing, with_common_shares
 from services.identification.engine import Engine
 from services.identification.identify import Keep
@@ -23,6 +24,11 @@ from services.identification.streams import device_time_ns
 from services.recordings.recording import Message, program_version, read_messages, read_site
 
 _log = logging.getLogger(__name__)
+_STREAMS = ("accel", "gnss", "info")
+
+
+def _unwatched(crossing_id: str, stage: str, fraction: float) -> None:
+    """For who does not want to know how far a crossing is."""
 
 
 def site_of(recordings: list[Path], site: Path | None) -> Site:
@@ -40,7 +46,7 @@ def identify_recordings(
     recordings: list[Path],
     site: Site,
     settings: IdentificationSettings,
-    say: Callable[[str], None] = lambda text: None,
+    report: Report = _unwatched,
     keep: Keep = lambda crossing_id, draws: None,
     fusing: Fusing = NOTHING_STORED,
     certificates: Mapping[Pair, str] | None = None,
@@ -49,9 +55,21 @@ def identify_recordings(
 
     They name the `certificates` of their vehicles and bridges, where there are such.
     """
-    messages = (message for path in recordings for message in read_messages(path))
     name = ", ".join(str(path) for path in recordings)
-    return identify_messages(messages, name, site, settings, say, keep, fusing, certificates)
+    messages = messages_of_trucks(recordings)
+    return identify_messages(messages, name, site, settings, report, keep, fusing, certificates)
+
+
+def messages_of_trucks(
+    recordings: Iterable[Path], next_file: Callable[[], Offset] = lambda: unwatched
+) -> list[Message]:
+    """All that an identification reads; `next_file` is called at the beginning of each file."""
+    return [
+        message
+        for path in recordings
+        for message in read_messages(path, next_file())
+        if message.key.owner == "vehicle" and message.key.stream in _STREAMS
+    ]
 
 
 def identify_messages(
@@ -59,13 +77,14 @@ def identify_messages(
     name: str,
     site: Site,
     settings: IdentificationSettings,
-    say: Callable[[str], None] = lambda text: None,
+    report: Report = _unwatched,
     keep: Keep = lambda crossing_id, draws: None,
     fusing: Fusing = NOTHING_STORED,
     certificates: Mapping[Pair, str] | None = None,
 ) -> Results:
     """Results of all crossings in the messages, which errors call `name`; they may be unordered.
 
+    `report` is told of every crossing how far it is, and in the end that all of it is done.
     InputError without accelerations or positions, or if the site knows none of the trucks.
     """
     header = Header(
@@ -76,10 +95,8 @@ def identify_messages(
         seed=settings.seed,
     )
     engine = Engine(site, settings, header, fusing, certificates=certificates, tells_states=False)
-    execution = Here(
-        report=lambda crossing, stage, fraction: say(f"{crossing}: {stage}"), keep=keep
-    )
-    streams: dict[str, list[Message]] = {"accel": [], "gnss": [], "info": []}
+    execution = Here(report=report, keep=keep)
+    streams: dict[str, list[Message]] = {stream: [] for stream in _STREAMS}
     for message in messages:
         if message.key.owner == "vehicle" and message.key.stream in streams:
             streams[message.key.stream].append(message)
@@ -99,7 +116,11 @@ def identify_messages(
             awaited(engine, execution),
             dispatched(engine, execution, engine.fuse_all()),
         )
-        found = [output.result for output in outputs if output.result is not None]
+        found = []
+        for output in outputs:
+            if output.result is not None:
+                report(output.result.crossing_id, "done", 1.0)
+                found.append(output.result)
     found.sort(key=lambda crossing: crossing.entry_time)
     bridges = engine.bridges()
     return results(header, with_common_shares(found, bridges), bridges)

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.special import ndtr
 
 from pre_core.constants import NORMAL_975
+from pre_core.search.loop import Report
 from schemas.reasons import BridgeReason, LeftOutReason
 from schemas.results import (
     LOSSES_PERCENT,
-    RESOLVED,
     BridgeResult,
     Crossing,
     ElementState,
@@ -28,7 +28,8 @@ from services.identification.comparison import (
     Comparison,
     compare,
     estimate_of_state,
-    sentences,
+    told,
+    unresolved_elements,
 )
 from services.identification.crossing_data import part_of_elements
 from services.identification.fusing import Floats, FusedBridge, Source, fused, source_of
@@ -126,7 +127,12 @@ def count_in(counted: Counted, crossings: Iterable[Usable]) -> Counted:
     return Counted(tuple(newest), number)
 
 
-def state_of(counted: Counted, bridge: str, fusing: Fusing = NOTHING_STORED) -> BridgeResult | None:
+def state_of(
+    counted: Counted,
+    bridge: str,
+    fusing: Fusing = NOTHING_STORED,
+    report: Report = lambda stage, fraction: None,
+) -> BridgeResult | None:
     """The bridge by all its good crossings together; None without a crossing that gave numbers.
 
     Of a method that leaves nothing to fuse it is the latest crossing alone, and `suspect`. Suspect
@@ -153,7 +159,7 @@ def state_of(counted: Counted, bridge: str, fusing: Fusing = NOTHING_STORED) -> 
             crossings_left_out=_named(left_out),
             crossings_left_out_count=counted.number,
         )
-    found = fused([one.source for one in wanted if one.source is not None])
+    found = fused([one.source for one in wanted if one.source is not None], report)
     left_out |= dict.fromkeys(found.left_out, LeftOutReason.DISAGREES)
     left_out |= dict.fromkeys(found.other_model, LeftOutReason.OTHER_MODEL)
     reasons = []
@@ -234,9 +240,9 @@ def compared(
 ) -> Comparison | None:
     """What a fused state says of each element, as its `finding` does; see `compare`."""
     edges = np.concatenate([[0.0], np.cumsum(element_lengths_m)])
-    common = 0.0 if state.level is None else state.level.std / state.level.mean
     stored = None if baseline is None else estimate_of_state(baseline)
-    return compare(estimate_of_state(state, common), nominal_nm2, edges, stored)
+    now = estimate_of_state(state, element_lengths_m.tolist())
+    return compare(now, nominal_nm2, edges, stored)
 
 
 def _latest(counted: Counted) -> BridgeResult:
@@ -291,13 +297,5 @@ def _summary(draws: Floats) -> ElementState:
 
 def _finding(found: FusedBridge, state: BridgeResult, baseline: BridgeResult | None) -> str:
     """The bridge in words: what is told of its elements, and what is not."""
-    said = sentences(compared(state, found.nominal_nm2, found.element_lengths_m, baseline))
-    open_ones = sum(one.std > RESOLVED * one.mean for one in state.elements.values())
-    if open_ones and state.level is not None:
-        spread = 100.0 * state.level.std / state.level.mean
-        which = f"{open_ones} of {len(state.elements)} elements are"
-        said.append(
-            f"{which} not resolved; the mean level is {state.level.mean:.2f} of nominal "
-            f"± {spread:.0f} %."
-        )
-    return " ".join(said)
+    comparison = compared(state, found.nominal_nm2, found.element_lengths_m, baseline)
+    return " ".join(told(comparison, unresolved_elements(state.elements.values()), state.level))

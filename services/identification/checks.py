@@ -6,6 +6,8 @@
 sound crossings and on broken ones (docs/verdicts.md).
 """
 
+from collections.abc import Callable
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +17,7 @@ from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.diagnostics import quality
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
+from schemas.signals import CHANNELS
 from schemas.site import Vehicle
 from services.identification.crossing_data import CrossingData, Floats
 
@@ -181,29 +184,80 @@ def loads_are_alike(vehicle: Vehicle) -> bool:
 
 def reasons_before_fit(
     vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion, direction: int
-) -> list[Reason]:
-    """What the accelerations (4, n) alone say against the crossing: all of it forbids a fit.
+) -> dict[Reason, str]:
+    """What the accelerations (4, n) alone say against the crossing, and of which channels.
 
-    `motion` is where the front axle was at every sample.
+    All of it forbids a fit. `motion` is where the front axle was at every sample.
     """
-    return _broken(acceleration, step_s) or order_and_signs(
-        vehicle, acceleration, step_s, motion, direction
+    broken = _broken(acceleration, step_s)
+    if broken:
+        return broken
+    reasons = order_and_signs(vehicle, acceleration, step_s, motion, direction)
+    if not reasons:
+        return {}
+    found = quality.pairing(acceleration, step_s, *body_constants(vehicle))
+    named = {Reason.CHANNEL_INVERTED: _inverted, Reason.CHANNEL_SWAPPED: _exchanged}
+    return {reason: named[reason](found) for reason in reasons}
+
+
+def _broken(acceleration: Floats, step_s: float) -> dict[Reason, str]:
+    """The most plain of what is wrong with single channels: it makes the others show as well."""
+
+    def those(is_wrong: Callable[[Floats], bool]) -> str:
+        each = zip(CHANNELS, acceleration, strict=True)
+        return ", ".join(name for name, values in each if is_wrong(values))
+
+    of_each: list[tuple[Reason, Callable[[Floats], bool]]] = [
+        (Reason.CHANNEL_BIASED, lambda values: abs(values.mean()) > LARGEST_MEAN_M_PER_S2),
+        (Reason.SENSOR_SATURATED, is_saturated),
+        (Reason.SIGNAL_SPIKES, lambda values: quality.spikes(values, SPIKE_HEIGHT) > 0),
+    ]
+    stuck = those(lambda values: quality.longest_hold(values) * step_s > LONGEST_HOLD_S)
+    if stuck:
+        return {Reason.CHANNEL_STUCK: stuck}
+    if quality.smallest_difference(acceleration) < ALIKE:
+        return {Reason.CHANNELS_ALIKE: _alike(acceleration)}
+    for reason, is_wrong in of_each:
+        names = those(is_wrong)
+        if names:
+            return {reason: names}
+    return {}
+
+
+def _alike(acceleration: Floats) -> str:
+    """Names of channels (4, n) that show the same."""
+    pairs = combinations(range(len(CHANNELS)), 2)
+    return ", ".join(
+        f"{CHANNELS[i]} and {CHANNELS[k]}"
+        for i, k in pairs
+        if quality.smallest_difference(acceleration[[i, k]]) < ALIKE
     )
 
 
-def _broken(acceleration: Floats, step_s: float) -> list[Reason]:
-    """The most plain of what is wrong with single channels: it makes the others show as well."""
-    if any(quality.longest_hold(values) * step_s > LONGEST_HOLD_S for values in acceleration):
-        return [Reason.CHANNEL_STUCK]
-    if quality.smallest_difference(acceleration) < ALIKE:
-        return [Reason.CHANNELS_ALIKE]
-    if np.abs(acceleration.mean(axis=1)).max() > LARGEST_MEAN_M_PER_S2:
-        return [Reason.CHANNEL_BIASED]
-    if any(is_saturated(values) for values in acceleration):
-        return [Reason.SENSOR_SATURATED]
-    if any(quality.spikes(values, SPIKE_HEIGHT) > 0 for values in acceleration):
-        return [Reason.SIGNAL_SPIKES]
-    return []
+def _inverted(found: quality.Pairing) -> str:
+    """Names of channels of which one is inverted."""
+    pairs = zip(("front", "rear"), found.upright, strict=True)
+    ends = [end for end, upright in pairs if upright > UNEXPLAINED]
+    if not ends:
+        return "both of one axle"
+    return " and ".join(f"sprung_{end} or unsprung_{end}" for end in ends)
+
+
+def _exchanged(found: quality.Pairing) -> str:
+    """Names of channels that are exchanged; with "or" where the body's equations know no better.
+
+    To them front and rear are alike: if both pairs change places as well, they hold as before. So
+    of both ways the one that moves fewer channels is told.
+    """
+    if found.recorded <= UNEXPLAINED:
+        return "front and rear, of body and axle alike"
+    order = found.best_order
+    ways = [order, (order[1], order[0], order[3], order[2])]
+    moved = [[k for k in range(4) if way[k] != k] for way in ways]
+    fewest = min(map(len, moved))
+    return ", or ".join(
+        " and ".join(CHANNELS[k] for k in one) for one in sorted(moved) if len(one) == fewest
+    )
 
 
 def is_saturated(values: Floats) -> bool:

@@ -7,13 +7,14 @@ bridge is used, to make elements comparable that are not built alike.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence, Set
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.constants import NORMAL_975
-from schemas.results import BridgeResult
+from schemas.results import RESOLVED, BridgeResult, ElementState, Parameter
 
 Floats = NDArray[np.float64]
 
@@ -125,10 +126,90 @@ def compare(
     return Comparison(reference, float(np.median(relative)), elements)
 
 
-def estimate_of_state(state: BridgeResult, scale_error: float = 0.0) -> Estimate:
-    """The stiffness of a bridge's elements by its latest state."""
+def estimate_of_state(state: BridgeResult, lengths_m: Sequence[float] | None = None) -> Estimate:
+    """The stiffness of a bridge's elements by its latest state, with what they have in common.
+
+    `lengths_m` are the elements' (default: all alike).
+    """
     table = np.array([(e.mean, e.q025, e.q975) for e in state.elements.values()]).reshape(-1, 3)
-    return Estimate(table[:, 0], table[:, 1], table[:, 2], scale_error)
+    mean, low, high = table.T
+    return Estimate(mean, low, high, _common_error(state, lengths_m))
+
+
+def _common_error(state: BridgeResult, lengths_m: Sequence[float] | None) -> float:
+    """Relative standard deviation that all elements have in common, by how sure their level is.
+
+    The level is the mean of ln EI, weighted by lengths w that sum to one. With errors of standard
+    deviation s_i, of which c is common, its variance is c² (1 - Σ w_i²) + Σ w_i² s_i². So only what
+    is above the second part is common; the whole of it is not, for elements that err each on their
+    own move their mean too.
+    """
+    of = [e for e in state.elements.values() if e.mean > 0.0]
+    if state.level is None or not state.level.mean > 0.0 or len(of) < _FEWEST_ELEMENTS:
+        return 0.0
+    share = np.ones(len(of)) if lengths_m is None else np.asarray(lengths_m, dtype=np.float64)
+    if share.size != len(of):
+        return 0.0
+    squares = (share / share.sum()) ** 2
+    own = float(squares @ np.array([(e.std / e.mean) ** 2 for e in of]))
+    level = (state.level.std / state.level.mean) ** 2
+    return float(np.sqrt(max(0.0, level - own) / (1.0 - squares.sum())))
+
+
+def unresolved_elements(elements: Iterable[Parameter | ElementState]) -> frozenset[int]:
+    """Numbers of those whose standard deviation is too large to tell a loss of half of them."""
+    counted = enumerate(elements, start=1)
+    return frozenset(n for n, one in counted if one.std > RESOLVED * abs(one.mean))
+
+
+def elsewhere(found: Comparison | None, unresolved: Set[int]) -> tuple[int, ...]:
+    """Numbers of the unresolved neighbours of weak elements: the loss may be theirs.
+
+    What bends under an axle is the sum of what elements that lie side by side do, and between them
+    rigidity is traded.
+    """
+    weak = set() if found is None else {one.number for one in found.weak}
+    beside = {n + side for n in weak for side in (-1, 1)} - weak
+    return tuple(sorted(beside & unresolved))
+
+
+def told(
+    found: Comparison | None, unresolved: Set[int] = frozenset(), level: ElementState | None = None
+) -> list[str]:
+    """What was found, in words: only of elements that are resolved is said that they agree.
+
+    `unresolved` are the numbers of the others; with them the `level` of the bridge is told.
+    """
+    if found is None or not unresolved:
+        return sentences(found)
+    said = of_clear_elements(found)
+    others = elsewhere(found, unresolved)
+    if others:
+        either = " or ".join(map(str, others))
+        said.append(f"The loss may as well be in element {either}, beside it and not resolved.")
+    which = _not_resolved(len(found.elements), unresolved)
+    said.append(f"{which} (standard deviation above {100.0 * RESOLVED:.0f} %).")
+    if level is not None:
+        said.append(
+            f"As a whole the bridge is at {level.mean:.2f} of nominal "
+            f"± {100.0 * level.std / level.mean:.0f} %."
+        )
+    return said
+
+
+def of_clear_elements(found: Comparison) -> list[str]:
+    """What is said of elements that differ clearly, and nothing of the others."""
+    clear = tuple(one for one in found.elements if one.is_weak or one.is_stiff)
+    return sentences(found._replace(elements=clear)) if clear else []
+
+
+def _not_resolved(count: int, unresolved: Set[int]) -> str:
+    if len(unresolved) == count:
+        return "No single element is resolved"
+    *others, last = sorted(unresolved)
+    if not others:
+        return f"Element {last} is not resolved"
+    return f"Elements {', '.join(map(str, others))} and {last} are not resolved"
 
 
 def sentences(found: Comparison | None) -> list[str]:

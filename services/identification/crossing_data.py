@@ -1,5 +1,6 @@
 """What is known of one crossing before it is identified, and what of a result it gives."""
 
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from pre_core.physics.models import beam_from
 from pre_core.physics.road import Profile, iri_m_per_km, iso_8608_class, roughness_coefficient_m3
 from pre_core.physics.simulate import Motion
 from schemas import results
-from schemas.reasons import Reason
+from schemas.reasons import Reason, texts
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Receiver, Sensor, Vehicle
 from services.identification.stays import Stay
@@ -108,14 +109,20 @@ def rejected(
     data: CrossingData,
     settings: IdentificationSettings,
     passing: Passing,
-    reasons: list[Reason],
+    reasons: Iterable[Reason],
+    about: Mapping[Reason, str] | None = None,
     **fields: Any,
 ) -> results.Crossing:
-    """A crossing that cannot be used: reasons, and no number offered as an estimate."""
+    """A crossing that cannot be used: reasons, and no number offered as an estimate.
+
+    `about` names the channels that a reason is about.
+    """
+    once = tuple(dict.fromkeys(reasons))
     return results.Crossing(
         **header(data, settings, passing),
         verdict="rejected",
-        reasons=tuple(dict.fromkeys(reasons)),
+        reasons=once,
+        reason_texts=tuple(texts(once, about)),
         parameters=None,
         **fields,
     )

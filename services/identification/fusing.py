@@ -17,6 +17,7 @@ from pre_core.fusion.sums import BridgePriors
 from pre_core.fusion.tracks import Part
 from pre_core.fusion.trucks import compare_trucks
 from pre_core.physics.surface import Footprint
+from pre_core.search.loop import Report
 from schemas import fusion
 from schemas.results import Crossing, Track
 from services.identification.crossing_data import CrossingData
@@ -28,6 +29,8 @@ _DIGITS = 9
 _DIGITS_OF_BENDS = 4
 _DRAWS_PER_CHAIN = 250
 _SEED = 1
+_COMPARED, _JOINED = 0.1, 0.4
+"""How much is done of a bridge of many crossings when trucks are compared, crossings together."""
 
 
 class Source(NamedTuple):
@@ -130,7 +133,7 @@ def _stretches(off: of_crossing.OffBridge | None) -> tuple[fusion.Stretch, ...]:
     )
 
 
-def fused(sources: Sequence[Source]) -> FusedBridge:
+def fused(sources: Sequence[Source], report: Report = lambda stage, fraction: None) -> FusedBridge:
     """A bridge by crossings, of which the last says what the bridge's unknowns are.
 
     ValueError without crossings.
@@ -143,14 +146,20 @@ def fused(sources: Sequence[Source]) -> FusedBridge:
     priors = _priors(last)
     parts = [_part(one, priors.coordinates) for one in alike]
     vehicles = {part.truck: one.vehicle for part, one in zip(parts, alike, strict=True)}
+    report("comparing trucks", 0.0)
     compared = compare_trucks(parts, priors)
     parts = [part for part in parts if part.name not in compared.strangers]
+    report("putting crossings together", _COMPARED)
     joint = join(parts, priors)
     judged = judge(parts, joint, priors)
     if judged.left_out:
         parts = [part for part in parts if part.name in judged.agree]
         joint = join(parts, priors)
-    found = fuse_joined(joint, priors, _DRAWS_PER_CHAIN, _SEED)
+
+    def drawing(stage: str, fraction: float) -> None:
+        report(stage, _JOINED + (1.0 - _JOINED) * fraction)
+
+    found = fuse_joined(joint, priors, _DRAWS_PER_CHAIN, _SEED, drawing)
     nominal = priors.coordinates.location[-priors.elements :]
     spread = priors.coordinates.scale[-priors.elements :]
     y = found.draws.reshape(-1, found.draws.shape[2])[:, -priors.elements :]

@@ -81,7 +81,7 @@ def identify(
     reject = partial(rejected, data, settings, passing)
     reasons = _unusable(data, settings.method, trajectory, entry_s, exit_s)
     if reasons or trajectory is None or data.samples is None:
-        return reject(reasons or [Reason.FAILED])
+        return reject(reasons or [Reason.FAILED], {Reason.CHANNEL_MISSING: _missing(data)})
     try:
         cut = _cut(data, trajectory, data.samples, passing)
         if cut is None:
@@ -95,7 +95,7 @@ def identify(
             data.stay.direction,
         )
         if broken:
-            return reject(broken)
+            return reject(broken, broken)
         if settings.method == "pre":
             return identify_pre(
                 data, settings, passing, *cut, report, lambda: stopwatch() - began, keep
@@ -218,8 +218,7 @@ def _unusable(
             reasons.append(Reason.INCOMPLETE_CROSSING)
         case Passage.THROUGH:
             pass
-    channels = data.samples.channels if data.samples is not None else {}
-    if any(name not in channels for name in CHANNELS):
+    if _missing(data):
         reasons.append(Reason.CHANNEL_MISSING)
     if data.stay.passage is not Passage.THROUGH:
         return reasons
@@ -234,6 +233,12 @@ def _unusable(
     elif np.median(speed) < SLOWEST_M_PER_S:
         reasons.append(Reason.SPEED_TOO_LOW)
     return reasons
+
+
+def _missing(data: CrossingData) -> str:
+    """Names of the channels that the truck lacks."""
+    there = data.samples.channels if data.samples is not None else {}
+    return ", ".join(name for name in CHANNELS if name not in there)
 
 
 def _size(samples: Samples) -> int:

@@ -49,7 +49,11 @@ def identify(
         if draws:
             kept[crossing_id] = chains
 
-    found = identify_messages(messages, name, known, settings, say, keep)
+    def report(crossing_id: str, stage: str, fraction: float) -> None:
+        if fraction < 1.0:
+            say(f"{crossing_id}: {stage}")
+
+    found = identify_messages(messages, name, known, settings, report, keep)
     solutions = (
         Solution(c, known.bridge(c.bridge), kept.get(c.crossing_id, {})) for c in found.crossings
     )

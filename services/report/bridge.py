@@ -26,8 +26,14 @@ _MOST_REASONS = 3
 _ADVICE = {
     Reason.CHANNEL_MISSING: "Look at plugs and sensors: four accelerometers are needed.",
     Reason.SENSOR_SATURATED: "Use accelerometers of a larger range, or drive more slowly.",
-    Reason.CHANNEL_SWAPPED: "Look at the wiring, and at the order of channels in the recording.",
-    Reason.CHANNEL_INVERTED: "Look at which way the sensors are mounted, and declare it.",
+    Reason.CHANNEL_SWAPPED: (
+        "Look at the wiring of these sensors. If only their names are exchanged in the files, put "
+        "them right and identify again; the drive need not be repeated."
+    ),
+    Reason.CHANNEL_INVERTED: (
+        "Look at which way these sensors are mounted, declare it (up in [sensor] of the site "
+        "file), import the files and identify again; the drive need not be repeated."
+    ),
     Reason.CHANNEL_STUCK: "Look at plugs and sensors: one of them does not measure.",
     Reason.CHANNELS_ALIKE: "Look at the wiring: one sensor seems to be recorded twice.",
     Reason.CHANNEL_BIASED: "Declare whether gravity is in the signals, or change the sensor.",
@@ -196,7 +202,7 @@ def _one_by_one(view: BridgeView, baseline: Estimate | None) -> Iterator[str]:
             low, high = 100.0 * min(losses), 100.0 * max(losses)
             yield (
                 f"By each of the {len(losses)} good crossings alone, element {weak.number} is "
-                f"{low:.0f} to {high:.0f} % less stiff."
+                f"{low:.0f} to {high:.0f} % less stiff; one alone knows less than all together."
             )
 
 

@@ -12,7 +12,9 @@ from services.common.progress import Steps, unwatched_steps
 from services.identification.comparison import Comparison
 from services.report.bridge import BridgeReport, advice
 from services.report.html import Html, inlined_svg, joined, table, tag
+from services.report.place import ends_of, place_of, start_of
 from services.report.style import CSS
+from services.report.words import words_of
 from services.viewer.bridge_figure import draw_bridge
 from services.viewer.crossing_view import view_of_crossing
 from services.viewer.drawing import STYLE, figure_bytes
@@ -25,6 +27,13 @@ _HOW_TO_READ = (
     "EI is the flexural rigidity: how hard the bridge is to bend at a place. A 95 % interval holds "
     "the truth in 95 of 100 cases, if what is declared of truck and sensors is true. Nominal is "
     "what the owner wrote down of the sound bridge."
+)
+_AGAIN = (
+    (
+        "Before the next survey drive a minute on any road and run driveby check on the recording: "
+        "it finds faults of sensors, wiring and site file on the spot."
+    ),
+    "Then drive over the bridge twice or more, if it can be in both directions.",
 )
 _NOT_MEANT = (
     (
@@ -111,7 +120,11 @@ def _bridge(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Htm
         evidence.append(_crossing(report, crossing, f"{prefix}c{n}-" if has_picture else None))
         if has_picture:
             drawn()
-    return joined(first, tag("section", heading, class_="break"), *evidence)
+    # What has no numbers fits on the first sheet.
+    beginning = "break" if report.view.estimate is not None else "evidence"
+    body = joined(first, tag("section", heading, class_=beginning), *evidence)
+    meanings = (tag("p", tag("strong", f"{word}:"), f" {text}") for word, text in words_of(body))
+    return joined(body, tag("section", tag("h2", "Words"), *meanings, class_="words"))
 
 
 def _not_meant(report: BridgeReport) -> Sequence[str]:
@@ -133,8 +146,9 @@ def _facts(report: BridgeReport) -> Html:
     compared = "each other (no baseline is stored)"
     if report.baseline_name is not None:
         compared = f"the baseline {report.baseline_name}"
+    elements = f"{bridge.elements} elements from its start, {start_of(bridge)}"
     rows = [
-        ("Bridge", f"{_name(report)}, {length}, {bridge.elements} elements from its start"),
+        ("Bridge", f"{length}, {elements}"),
         ("Driven", (first if first == last else f"{first} to {last}") + f", by {trucks}"),
         ("Quality", report.quality),
         *([] if report.view.estimate is None else [("Compared with", compared)]),
@@ -228,10 +242,7 @@ def _next_steps(report: BridgeReport) -> Iterator[str]:
     view = report.view
     elements = () if view.comparison is None else view.comparison.elements
     weak = [one for one in elements if one.is_weak]
-    places = ", ".join(
-        f"element {one.number} ({one.from_m:.1f} to {one.to_m:.1f} m from the start)"
-        for one in weak
-    )
+    places = ", ".join(f"element {one.number} ({place_of(one, report.bridge)})" for one in weak)
     at_end = any(one.number in (1, len(elements)) for one in weak)
     bearing = ", and at the bearing there" if at_end else ""
     no_baseline = report.baseline_name is None
@@ -266,20 +277,19 @@ def _visible(comparison: Comparison) -> str:
 
 
 def _what_to_do(crossings: Sequence[Crossing]) -> Iterator[Html]:
-    what = advice(crossings)
-    if what:
-        yield tag("h2", "What would help")
-        yield tag("ul", *(tag("li", text) for text in what))
+    yield tag("h2", "What to do next")
+    yield tag("ul", *(tag("li", text) for text in (*advice(crossings), *_AGAIN)))
 
 
 def _crossing(report: BridgeReport, crossing: Crossing, prefix: str | None) -> Html:
-    way = crossing.direction.replace("_", " ")
+    ends = ends_of(report.bridge)
+    way = " to ".join(ends if crossing.direction == "start_to_end" else reversed(ends))
     used = ", used for the numbers above" if crossing.crossing_id in report.view.used else ""
     parts: list[Html] = [
         tag("h3", f"{_moment(crossing.entry_time)}: {crossing.verdict}{used}"),
         tag(
             "p",
-            f"{crossing.vehicle}, {way}, {crossing.speed_m_per_s:.1f} m/s, method "
+            f"{crossing.vehicle}, from {way}, {crossing.speed_m_per_s:.1f} m/s, method "
             f"{crossing.method.replace('_', ' ')} ({crossing.crossing_id})",
         ),
     ]
@@ -303,9 +313,9 @@ def _crossing(report: BridgeReport, crossing: Crossing, prefix: str | None) -> H
 def _numbers(crossing: Crossing) -> Iterator[tuple[str, str, str]]:
     if crossing.chi2_per_dof is not None:
         yield (
-            "χ² per degree of freedom",
+            "misfit (χ² per degree of freedom)",
             _number(crossing.chi2_per_dof),
-            "misfit against the declared noise; 1 is expected, above 1.25 is doubtful",
+            "of model and signals, over the declared noise; 1 is expected, above 1.25 is doubtful",
         )
     if crossing.scale_error is not None:
         yield (
@@ -328,24 +338,28 @@ def _numbers(crossing: Crossing) -> Iterator[tuple[str, str, str]]:
         )
         if derived.springs_believed is not None:
             share = f"{100.0 * derived.springs_believed:.0f} %"
-            yield "springs believed", share, "100 %: linear as far as can be told; low: they rub"
+            said = "100 %: the truck's springs act in proportion, as assumed; low: they rub"
+            yield "springs believed", share, said
         for ends, what in (
-            (derived.probability_sprung, "bearings held by a spring"),
-            (derived.probability_giving, "bearings that give"),
+            (derived.probability_sprung, "bearings held against turning"),
+            (derived.probability_giving, "bearings that sink under load"),
         ):
             if ends is not None:
                 percent = (
                     f"{100.0 * ends.start:.0f} % at the start, {100.0 * ends.end:.0f} % at the end"
                 )
-                yield what, percent, "probability"
+                yield what, percent, "how likely that is, in place of bearings that do neither"
     road = crossing.road
     if road is not None and (road.iri_m_per_km is not None or road.iso_class is not None):
         yield "road", _one_road(crossing) or "", "International Roughness Index, ISO 8608 class"
     meanings = {
-        "r_hat": ("R-hat", "agreement of the draws; below 1.05"),
-        "ess": ("effective draws", "at least 100; 400 of weighted ones"),
-        "position_shift_m": ("shift of positions (m)", "slow error of the receiver that fits"),
-        "iterations": ("evaluations", "of the model"),
+        "r_hat": ("agreement (R-hat)", "of one part of the draws with the others; below 1.05"),
+        "ess": ("effective draws", "how many independent ones they are worth; at least 100"),
+        "position_shift_m": (
+            "shift of positions (m)",
+            "along the road, by which the satellite receiver seems to have erred",
+        ),
+        "iterations": ("evaluations", "how often the model was computed"),
     }
     for key, (name, meaning) in meanings.items():
         if key in crossing.diagnostics:
@@ -380,7 +394,8 @@ def _name(report: BridgeReport) -> str:
 
 
 def _signed(ratio: float) -> str:
-    return f"{100.0 * (ratio - 1.0):+.0f} %".replace("-", "−")
+    change = round(100.0 * (ratio - 1.0))
+    return f"{change:+d} %".replace("-", "−") if change else "0 %"
 
 
 def _day(seconds: float) -> str:

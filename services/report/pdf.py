@@ -1,19 +1,25 @@
 """An HTML file as PDF, by a browser that is installed and draws without a screen."""
 
+import contextlib
 import os
 import shutil
 import subprocess
 import tempfile
+import time
 from pathlib import Path
 
 from services.common.errors import FailureError
 from services.common.files import write_atomically
+from services.common.progress import Steps, unwatched_steps
 
 _BROWSERS = (
     "chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome",
     "microsoft-edge", "brave-browser",
 )  # fmt: skip
 _TIMEOUT_S = 120.0
+_USUAL_S, _USUAL_S_PER_BYTE = 1.5, 0.7e-6
+"""What printing takes; the browser does not say how far it is."""
+_LOOK_AGAIN_S = 0.1
 
 
 def find_browser() -> str:
@@ -28,8 +34,11 @@ def find_browser() -> str:
     )
 
 
-def write_pdf(html: Path, pdf: Path, browser: str) -> None:
-    """Print an HTML file; FailureError if the browser does not."""
+def write_pdf(html: Path, pdf: Path, browser: str, progress: Steps = unwatched_steps) -> None:
+    """Print an HTML file; FailureError if the browser does not.
+
+    `progress` is told the milliseconds that have passed, of those that it usually takes.
+    """
     with tempfile.TemporaryDirectory(prefix="driveby-pdf-") as folder:
         printed = Path(folder) / "report.pdf"
         command = [
@@ -45,12 +54,26 @@ def write_pdf(html: Path, pdf: Path, browser: str) -> None:
             html.absolute().as_uri(),
         ]
         try:
-            done = subprocess.run(command, capture_output=True, timeout=_TIMEOUT_S, check=False)
+            code = _run(command, _USUAL_S + _USUAL_S_PER_BYTE * html.stat().st_size, progress)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise FailureError(f"{pdf}: {browser} did not print it: {error}") from error
         if not printed.is_file() or not printed.read_bytes().startswith(b"%PDF"):
             raise FailureError(
-                f"{pdf}: {browser} ended with {done.returncode} and printed nothing; the report is "
-                f"in {html}"
+                f"{pdf}: {browser} ended with {code} and printed nothing; the report is in {html}"
             )
         write_atomically(pdf, printed.read_bytes())
+
+
+def _run(command: list[str], usual_s: float, progress: Steps) -> int:
+    """The exit code; subprocess.TimeoutExpired for a command that does not end."""
+    began, usual_ms = time.monotonic(), round(1e3 * usual_s)
+    nowhere = subprocess.DEVNULL
+    with subprocess.Popen(command, stdout=nowhere, stderr=nowhere) as process:
+        try:
+            while (passed_s := time.monotonic() - began) < _TIMEOUT_S:
+                progress(min(round(1e3 * passed_s), usual_ms), usual_ms)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    return process.wait(timeout=_LOOK_AGAIN_S)
+        finally:
+            process.kill()  # does nothing to one that has ended
+    raise subprocess.TimeoutExpired(command, _TIMEOUT_S)

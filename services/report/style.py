@@ -27,6 +27,7 @@ figure { margin: 1.5mm 0; }
 svg { width: 100%; height: auto; display: block; }
 .note { font-size: 9pt; color: #3d4650; }
 .first ul { font-size: 9pt; }
+.words { border-top: 0.8pt solid #5b6570; font-size: 9pt; margin-top: 3mm; }
 .crossing { border-top: 0.8pt solid #5b6570; padding-bottom: 2mm; }
 .crossing.suspect h3::before { content: "○ "; }
 .crossing.rejected h3::before { content: "× "; }
@@ -34,13 +35,18 @@ svg { width: 100%; height: auto; display: block; }
 @media print {
   body { padding: 0; font-size: 9.5pt; }
   .break { break-before: page; }
+  .evidence { break-after: avoid; }
+  .crossing table { font-size: 8.4pt; }
   .first + .break + .crossing { break-before: avoid; }
   .crossing + .first { break-before: page; }
   figure, tr, .finding { break-inside: avoid; }
-  .first figure svg { max-height: 48mm; }
-  .crossing figure svg { max-height: 118mm; }
+  .first figure svg { max-height: 46mm; }
+  .crossing figure svg { max-height: 85mm; }
   .crossing { break-inside: avoid; }
   h2 { margin-top: 2mm; }
+  .words { columns: 2; column-gap: 6mm; font-size: 7.5pt; line-height: 1.22; margin-top: 1mm; }
+  .words h2 { font-size: 10pt; margin: 1mm 0 0; }
+  .words p { break-inside: avoid; margin: 0.5mm 0; }
   .finding p { margin: 0.3mm 0; }
   .note, .first ul { font-size: 8pt; line-height: 1.25; }
   .first table { font-size: 8.6pt; margin: 1mm 0; }

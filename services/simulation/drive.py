@@ -43,6 +43,7 @@ from schemas.site_file import load_site, parse_site, site_toml
 from services.common.errors import FailureError, InputError
 from services.common.files import check_writable
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
+from services.common.progress import steps_bar
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.recordings.writer import write_recording
 from services.simulation.wheel_paths import (
@@ -147,11 +148,12 @@ def simulate_command(
     check_writable(output, force=force)
     known = paper_site() if site is None else load_site(site)
     ratios = ratios_of(known.bridges[0], scenario, ei)
-    paths = None if surface is None else wheel_paths_of(known.vehicles[0], surface)
+    drives, paths = [], None if surface is None else wheel_paths_of(known.vehicles[0], surface)
     of_noise = seed if drive_seed is None else drive_seed
-    with console.status("simulating", spinner="dots"):
-        drives = [
-            simulate_drive(
+    with steps_bar("simulating", console) as progress:
+        for number in range(runs):
+            progress(number, runs)
+            drive = simulate_drive(
                 known,
                 ratios,
                 road_class=road,
@@ -165,8 +167,7 @@ def simulate_command(
                 paths=paths,
                 drive_seed=(of_noise, number) if number else of_noise,
             )
-            for number in range(runs)
-        ]
+            drives.append(drive)
         site_of_sensors = declared(known, noise, drives[0].run.rate_hz)
         messages = write_drives(output, drives, site_of_sensors, force=force)
     times = drives[0].run.accel_time_s

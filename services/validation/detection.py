@@ -12,6 +12,7 @@ import numpy as np
 
 from schemas.results import Crossing
 from schemas.site import Bridge
+from services.common.progress import Steps, unwatched_steps
 from services.identification.bridge_state import Counted, compared, count_in, state_of, usable
 from services.identification.comparison import Comparison
 from services.simulation.drive import ratios_of
@@ -55,13 +56,18 @@ class Detected(NamedTuple):
 
 
 def groups_of(
-    records: Iterable[Record], bridge: Bridge, sizes: Sequence[int] = SIZES
+    records: Iterable[Record],
+    bridge: Bridge,
+    sizes: Sequence[int] = SIZES,
+    progress: Steps = unwatched_steps,
 ) -> list[Group]:
     """Of all surveys of these records whose EI is that of a scenario, of this bridge."""
     nominal = np.array(bridge.nominal_flexural_rigidity_nm2)
     lengths = np.array(bridge.lengths_m)
     found = []
-    for (kind, _), lines in by_survey(records).items():
+    surveys = by_survey(records)
+    for number, ((kind, _), lines) in enumerate(surveys.items()):
+        progress(number, len(surveys))
         scenario = KINDS[kind].scenario
         if scenario is None:
             continue

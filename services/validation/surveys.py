@@ -21,6 +21,7 @@ from pre_core.physics.bridge import Beam
 from schemas.results import BridgeResult, Crossing
 from schemas.settings import IdentificationSettings
 from schemas.site import Site, Vehicle
+from services.common.progress import Steps, unwatched_steps
 from services.identification.bridge_state import Counted, count_in, state_of, usable
 from services.simulation.drawn import Truth, draw_truth, drive, see
 from services.simulation.drive import declared, ratios_of
@@ -289,10 +290,14 @@ class Fused(NamedTuple):
     verdict: str
 
 
-def fused_surveys(records: Iterable[Record], crossings: int | None = None) -> list[Fused]:
+def fused_surveys(
+    records: Iterable[Record], crossings: int | None = None, progress: Steps = unwatched_steps
+) -> list[Fused]:
     """Each survey of which all crossings are there, fused; the first `crossings` of them alone."""
     found = []
-    for (kind, survey), lines in by_survey(records).items():
+    surveys = by_survey(records)
+    for number, ((kind, survey), lines) in enumerate(surveys.items()):
+        progress(number, len(surveys))
         results = [
             Crossing.model_validate(line["result"])
             for line in lines[:crossings]

@@ -55,7 +55,8 @@ def draw_bridge(bridge: BridgeView, *, with_heading: bool = True) -> Figure:
     listed = min(len(bridge.crossings), _MOST_LISTED + 1) if with_heading else 0
     lines = _heading(bridge) if with_heading else []
     heading_in = 1.15 + 0.17 * max(0, len(lines) - 2) if with_heading else 0.35
-    panel_in, list_in = 3.6, 0.2 * listed
+    # Alone it stands on a page where the width is what limits how large its words are.
+    panel_in, list_in = 3.6 if with_heading else 2.2, 0.2 * listed
     list_in += 0.35 if listed else 0.0
     height = heading_in + panel_in + 0.5 + list_in
     figure = Figure(figsize=(WIDTH_IN, height), facecolor="white")

@@ -8,22 +8,20 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.reasons import Reason
-from schemas.results import RESOLVED, BridgeResult, Crossing, Results
+from schemas.results import BridgeResult, Crossing, Results
 from schemas.site import Bridge, Site
+from services.identification import comparison
 from services.identification.comparison import (
     Comparison,
-    Element,
     Estimate,
     compare,
     estimate_of_state,
-    sentences,
+    unresolved_elements,
 )
 from services.viewer.baseline import named_baseline
 from services.viewer.crossing_view import (
     CrossingView,
     FloatArray,
-    of_clear_elements,
-    unresolved_elements,
     view_of_crossing,
 )
 
@@ -64,14 +62,8 @@ class BridgeView(NamedTuple):
 
     @property
     def elsewhere(self) -> tuple[int, ...]:
-        """Numbers of the unresolved neighbours of weak elements: the loss may be theirs.
-
-        What bends under an axle is the sum of what elements that lie side by side do, and between
-        them rigidity is traded.
-        """
-        weak = set() if self.comparison is None else {one.number for one in self.comparison.weak}
-        beside = {n + side for n in weak for side in (-1, 1)} - weak
-        return tuple(sorted(beside & self.unresolved))
+        """Numbers of the unresolved neighbours of weak elements: the loss may be theirs."""
+        return comparison.elsewhere(self.comparison, self.unresolved)
 
 
 def views_of_bridges(results: Results, site: Site, folder: Path | None = None) -> list[BridgeView]:
@@ -89,33 +81,9 @@ def views_of_bridges(results: Results, site: Site, folder: Path | None = None) -
 
 
 def told(view: BridgeView) -> list[str]:
-    """What was found, in words: only of elements that are resolved is said that they agree."""
-    open_ones = view.unresolved
-    if view.comparison is None or not open_ones:
-        return sentences(view.comparison)
-    elements = view.comparison.elements
-    said = of_clear_elements(view.comparison)
-    if view.elsewhere:
-        either = " or ".join(map(str, view.elsewhere))
-        said.append(f"The loss may as well be in element {either}, beside it and not resolved.")
-    which = _not_resolved(elements, open_ones)
-    said.append(f"{which} (standard deviation above {100.0 * RESOLVED:.0f} %).")
+    """What was found, in words, as the state's own finding says it."""
     level = None if view.state is None else view.state.level
-    if level is not None:
-        said.append(
-            f"As a whole the bridge is at {level.mean:.2f} of nominal "
-            f"± {100.0 * level.std / level.mean:.0f} %."
-        )
-    return said
-
-
-def _not_resolved(elements: tuple[Element, ...], open_ones: frozenset[int]) -> str:
-    if len(open_ones) == len(elements):
-        return "No single element is resolved"
-    *others, last = sorted(open_ones)
-    if not others:
-        return f"Element {last} is not resolved"
-    return f"Elements {', '.join(map(str, others))} and {last} are not resolved"
+    return comparison.told(view.comparison, view.unresolved, level)
 
 
 def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) -> BridgeView:
@@ -130,7 +98,7 @@ def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) 
     estimate, used = None, frozenset[str]()
     if state is not None and len(state.elements) == nominal.size:
         used = frozenset(state.crossings_used)
-        estimate = estimate_of_state(state, _common_error(crossings, used))
+        estimate = estimate_of_state(state, bridge.lengths_m)
     of_state = [crossing for crossing in crossings if crossing.crossing_id in used]
     is_doubtful = (
         estimate is not None
@@ -155,9 +123,3 @@ def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) 
 
 def _is_doubtful(crossing: Crossing) -> bool:
     return crossing.verdict != "good" or Reason.NO_NOISE_MODEL in crossing.reasons
-
-
-def _common_error(crossings: list[Crossing], used: frozenset[str]) -> float:
-    """The least of those used: what several crossings have in common is not smaller than that."""
-    errors = [c.scale_error for c in crossings if c.crossing_id in used and c.scale_error]
-    return min(errors, default=0.0)

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.results import RESOLVED, Crossing, ElementState, Parameter, Prior, resolution
-from services.identification.comparison import Comparison, Estimate, compare, sentences
+from schemas.results import Crossing, Prior, resolution
+from services.identification.comparison import (
+    Comparison,
+    Estimate,
+    compare,
+    of_clear_elements,
+    sentences,
+    unresolved_elements,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -183,12 +189,6 @@ def comparison_of(crossing: CrossingView, baseline: Estimate | None = None) -> C
     return compare(found, crossing.nominal_nm2, crossing.element_edges_m, baseline)
 
 
-def of_clear_elements(found: Comparison) -> list[str]:
-    """What is said of elements that differ clearly, and nothing of the others."""
-    clear = tuple(one for one in found.elements if one.is_weak or one.is_stiff)
-    return sentences(found._replace(elements=clear)) if clear else []
-
-
 def told_of_crossing(crossing: CrossingView, found: Comparison | None) -> list[str]:
     """What one crossing found, in words: only of what is resolved is said that it agrees."""
     if found is None:
@@ -239,12 +239,6 @@ def view_of_crossing(crossing: Crossing, bridge: Elements) -> CrossingView:
         resolution=resolution(crossing),
         unresolved=unresolved,
     )
-
-
-def unresolved_elements(elements: Iterable[Parameter | ElementState]) -> frozenset[int]:
-    """Numbers of those whose standard deviation is too large to tell a loss of half of them."""
-    counted = enumerate(elements, start=1)
-    return frozenset(n for n, one in counted if one.std > RESOLVED * abs(one.mean))
 
 
 def elements_of_result(crossing: Crossing) -> ToldElements | None:

@@ -85,12 +85,12 @@ settings = IdentificationSettings.model_validate({"seed": 0})
 def work():
     marks = [("reading", time.perf_counter())]
 
-    def say(text):
-        stage = text.split(": ", 1)[1].split(",")[0]
+    def report(crossing, stage, fraction):
+        stage = stage.split(",")[0]
         if stage != marks[-1][0]:
             marks.append((stage, time.perf_counter()))
 
-    found = identify_recordings(recordings, site_of(recordings, None), settings, say)
+    found = identify_recordings(recordings, site_of(recordings, None), settings, report)
     marks.append(("", time.perf_counter()))
     stages = {}
     for (stage, begin), (_, end) in zip(marks, marks[1:]):

@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear
 
 from pre_core.diagnostics import quality
 from pre_core.physics.simulate import Motion
-from schemas.reasons import Reason
+from schemas.reasons import Reason, texts
 from schemas.signals import CHANNELS
 from services.identification.checks import reasons_before_fit
 from tests.verdicts import faults
@@ -32,6 +32,11 @@ def sound(seed: int | None) -> tuple[Truth, Case]:
 
 
 def reasons(seed: int | None, fault: Fault = faults.NOTHING) -> list[Reason]:
+    """Why the channels cannot be used."""
+    return list(accused(seed, fault))
+
+
+def accused(seed: int | None, fault: Fault = faults.NOTHING) -> dict[Reason, str]:
     """As `identification.identify` asks for them, with the true motion."""
     truth, case = sound(seed)
     time_s = case.run.accel_time_s
@@ -81,6 +86,28 @@ BROKEN: dict[str, tuple[Fault, Reason]] = {
 def test_a_broken_channel_is_named(name: str) -> None:
     fault, reason = BROKEN[name]
     assert reasons(None, fault) == [reason]
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_the_reason_names_the_channels(name: str) -> None:
+    fault, reason = BROKEN[name]
+    (words,) = accused(None, fault).values()
+    (sentence,) = texts([reason], {reason: words})
+    assert sentence.endswith(f": {words}.")
+    concerned = set(CHANNELS) & set(name.split())
+    match reason:
+        case Reason.CHANNEL_SWAPPED if concerned:
+            a, b = sorted(concerned, key=CHANNELS.index)
+            assert f"{a} and {b}" in words.split(", or ")
+        case Reason.CHANNEL_SWAPPED:
+            assert words == "front and rear, of body and axle alike"
+        case Reason.CHANNEL_INVERTED:
+            assert words == "both of one axle" if not concerned else concerned < set(words.split())
+        case Reason.CHANNELS_ALIKE:
+            assert f"{S1} and {S2}" in words
+        case _:
+            assert words in CHANNELS
+            assert concerned in (set(), {words})
 
 
 OTHER = [1, 3, 6]  # 15 t at 500 Hz, 10 t at 1 kHz and 21 m/s, 9 t with a soft front at 2 kHz

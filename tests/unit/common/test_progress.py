@@ -6,15 +6,19 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
-from services.common.progress import reading_bar, steps_bar
+from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.drives.importing import import_command
 from services.drives.signals import signals_of_recording
 from services.drives.survey import survey
+from services.execution.offline import identify_recordings, site_of
+from services.identification.bridge_state import Counted, count_in, state_of, usable
 from services.recordings.recovery import recover_recording
 from services.recordings.writer import write_recording
 from services.report.bridge import bridge_reports
 from services.report.page import page
+from services.report.pdf import write_pdf
 from services.viewer.pictures import write_pictures
 from services.viewer.view import convert
 from tests.unit.drives.recorded import drive
@@ -114,3 +118,85 @@ def test_what_is_made_is_told_step_by_step_up_to_the_last(
     assert list(done) == sorted(set(done))
     assert len(done) > 1
     assert done[-1] == steps[0]
+
+
+def last_drawn(shown: io.StringIO, word: str) -> str:
+    return [line for line in shown.getvalue().split("\r") if word in line][-1]
+
+
+def test_parts_are_a_bar_that_moves_within_each_and_never_back() -> None:
+    shown = io.StringIO()
+    terminal = Console(file=shown, force_terminal=True, width=120, color_system=None)
+    with parts_bar("crossing", 4, terminal) as report:
+        report("a", "finding the truck", 0.0)
+        report("a", "done", 1.0)
+        report("b", "freeing the elements", 0.5)
+        report("b", "finding the truck", 0.1)  # in another way
+    last = last_drawn(shown, "crossing")
+    assert "crossing 2 of 4: finding the truck" in last
+    assert last.count("━") == 15  # one part and a half of four, of 40 characters
+    assert ":" in last.partition("truck")[2]  # the time that is left
+
+
+def test_of_an_unknown_number_of_parts_no_time_is_said() -> None:
+    shown = io.StringIO()
+    terminal = Console(file=shown, force_terminal=True, width=120, color_system=None)
+    with parts_bar("crossing", 0, terminal) as report:
+        report("a", "done", 1.0)
+        report("b", "half", 0.5)
+    last = last_drawn(shown, "crossing")
+    assert "crossing 2: half" in last
+    assert ":" not in last.partition("half")[2]
+
+
+def test_a_crossing_tells_how_far_it_is_up_to_the_end(project: Path) -> None:
+    told: dict[str, list[float]] = {}
+    stages: list[str] = []
+
+    def report(crossing_id: str, stage: str, fraction: float) -> None:
+        told.setdefault(crossing_id, []).append(fraction)
+        stages.append(stage)
+
+    sample = project / "recordings/sample/crossing.mcap"
+    settings = IdentificationSettings(method="pre", seed=1)
+    found = identify_recordings([sample], site_of([sample], None), settings, report)
+    ((crossing_id, fractions),) = told.items()
+    assert crossing_id == found.crossings[0].crossing_id
+    assert fractions[-1] == 1.0
+    assert len(set(fractions)) > 4
+    assert all(0.0 <= fraction <= 1.0 for fraction in fractions)
+    assert stages[-1] == "done"
+    of_bridge: list[float] = []
+    counted = count_in(Counted(), [one for one in map(usable, found.crossings) if one is not None])
+    state_of(counted, "bridge", report=lambda stage, fraction: of_bridge.append(fraction))
+    assert of_bridge == sorted(of_bridge)
+    assert len(set(of_bridge)) > 4
+    assert 0.0 <= of_bridge[0] < of_bridge[-1] < 1.0
+
+
+def test_printing_tells_how_much_of_the_usual_time_has_passed(tmp_path: Path) -> None:
+    """A browser that waits until it is told to go on, and then prints."""
+    told: list[tuple[int, int]] = []
+    go = tmp_path / "go"
+    browser = tmp_path / "browser"
+    browser.write_text(
+        "#!/bin/sh\n"
+        f"while [ ! -e {go} ]; do sleep 0.05; done\n"
+        'for one in "$@"; do case "$one" in --print-to-pdf=*) '
+        'printf %%PDF > "${one#--print-to-pdf=}";; esac; done\n'
+    )
+    browser.chmod(0o755)
+    html = tmp_path / "r.html"
+    html.write_text("<p>")
+
+    def progress(done: int, steps: int) -> None:
+        told.append((done, steps))
+        if len(told) == 4:
+            go.touch()
+
+    write_pdf(html, tmp_path / "r.pdf", str(browser), progress)
+    done, steps = zip(*told, strict=True)
+    assert list(done) == sorted(done)
+    assert done[0] < done[-1] <= steps[0]
+    assert set(steps) == {1500}
+    assert (tmp_path / "r.pdf").read_bytes() == b"%PDF"

@@ -18,6 +18,7 @@ from services.report import pdf
 from services.report.bridge import _ADVICE, bridge_reports
 from services.report.html import Html, inlined_svg, joined, tag
 from services.report.page import page
+from services.report.place import ends_of, start_of
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
 
@@ -64,13 +65,16 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
         in text
     )
     assert "All others agree within 3 %." in text
-    assert "30 m, 7 elements from its start" in text
+    assert (
+        "Bridge 30 m, 7 elements from its start, the south-west end (36.11060° N, 140.10100° E)"
+        in text
+    )
     assert "2026-09-21 to 2026-09-22, by truck-1" in text
     assert "2 crossings: 2 good. The numbers below are of the newest usable one." in text
     assert "The other good crossing agrees with them: at most 0.0 standard deviations apart" in text
     assert "class A of ISO 8608, IRI 2.4 m/km" in text
     assert "never a condition rating" in text
-    assert "Have somebody look at element 4 (12.9 to 17.1 m from the start)." in text
+    assert "Have somebody look at element 4 (12.9 to 17.1 m from the south-west end)." in text
     assert "Was it built unlike the others? Then the difference is no damage." in text
     assert "Drive again on another day, in the other direction and with another truck:" in text
     assert "Keep these results as a baseline" in text
@@ -78,10 +82,11 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "each other (no baseline is stored)" in text
     assert "A loss that all elements share cannot be seen without a baseline." in text
     # The evidence.
-    assert "χ² per degree of freedom 1.02" in text
+    assert "misfit (χ² per degree of freedom) 1.02" in text
     assert "springs believed 100 %" in text
-    assert "bearings held by a spring 3 % at the start, 4 % at the end" in text
-    assert "R-hat 1 " in text
+    assert "bearings held against turning 3 % at the start, 4 % at the end" in text
+    assert "agreement (R-hat) 1 " in text
+    assert "truck-1, from south-west to north-east, 10.0 m/s" in text
 
 
 def test_a_nominal_value_that_is_too_high_is_no_damage_everywhere(site: Site) -> None:
@@ -100,7 +105,11 @@ def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) ->
     assert "7 elements are clearly less stiff." in text
     assert "Element 1, 0.0 to 4.3 m: 30 % less stiff than the baseline, interval" in text
     assert "Compared with the baseline then.json" in text
-    assert "0.0 to 4.3 m from the start" in text
+    assert "element 1 (0.0 to 4.3 m from the south-west end)" in text
+    last = (
+        "element 7 (25.7 to 30.0 m from the south-west end, 0.0 to 4.3 m from the north-east end)"
+    )
+    assert last in text
     assert ", and at the bearing there." in text
     assert "Keep these results" not in text
     assert "built unlike" not in text
@@ -155,7 +164,7 @@ def test_what_single_crossings_say_of_a_weak_element_shows_how_far_they_scatter(
     third = results_of(site, some_crossing("c", verdict="suspect", reasons=("position_outage",)))
     everything = one.crossings + other.crossings + third.crossings
     merged = other.model_copy(update={"crossings": everything})
-    said = "By each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff."
+    said = "By each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff; one alone"
     assert said in reported(site, merged).text
     assert "crossings alone" not in reported(site, one).text
 
@@ -454,3 +463,63 @@ def test_a_single_crossing_in_a_state_is_said_to_have_wider_intervals(site: Site
     )
     alone = results_of(site, some_crossing("a"), used="a")
     assert "allow for how a bridge" not in reported(site, alone).text
+
+
+@pytest.mark.parametrize(
+    ("end", "start_side", "end_side"),
+    [
+        ((36.2, 140.1), "south", "north"),
+        ((36.1, 140.2), "west", "east"),
+        ((36.0, 140.1), "north", "south"),
+        ((36.05, 140.04), "north-east", "south-west"),
+    ],
+)
+def test_ends_are_called_by_the_points_of_the_compass(
+    site: Site, end: tuple[float, float], start_side: str, end_side: str
+) -> None:
+    changes = {
+        "start_latitude_deg": 36.1, "start_longitude_deg": 140.1,
+        "end_latitude_deg": end[0], "end_longitude_deg": end[1],
+    }  # fmt: skip
+    assert ends_of(site.bridges[0].model_copy(update=changes)) == (start_side, end_side)
+
+
+def test_coordinates_of_the_other_hemispheres_are_written_as_people_do(site: Site) -> None:
+    south = {"start_latitude_deg": -36.1, "end_latitude_deg": -36.1002}
+    west = {"start_longitude_deg": -3.5, "end_longitude_deg": -3.5003}
+    moved = site.bridges[0].model_copy(update=south | west)
+    assert start_of(moved) == "the north-east end (36.10000° S, 3.50000° W)"
+
+
+def test_no_change_has_no_sign(site: Site) -> None:
+    ratios = np.array([1.0, 0.998, 1.002, 1.0, 1.0, 0.4, 1.0])
+    text = reported(site, results_of(site, some_crossing("a"), used="a", ratios=ratios)).text
+    assert " 0 % (" in text
+    assert "−0 %" not in text
+    assert "+0 %" not in text
+
+
+def test_the_words_that_are_used_are_explained_and_no_others(site: Site) -> None:
+    good = reported(site, results_of(site, some_crossing("a"), some_crossing("b"), used="b")).text
+    words = good.partition(" Words ")[2]
+    for word in ("Verdict:", "EI:", "95 % interval:", "Misfit, χ²:", "Draws:", "IRI, class"):
+        assert word in words
+    assert "Channel:" not in words
+    assert "Scatter: One crossing alone knows less than all together" in words
+    rejected = some_crossing("a", verdict="rejected", reasons=("channel_swapped",))
+    words = reported(site, results_of(site, rejected)).text.partition(" Words ")[2]
+    assert "sprung_front and sprung_rear are on the body above an axle" in words
+    assert "IRI" not in words
+    assert "Draws" not in words
+
+
+def test_of_a_rejected_crossing_stands_what_to_do_next(site: Site) -> None:
+    rejected = some_crossing("a", verdict="rejected", reasons=("channel_swapped",))
+    content = results_of(site, rejected).model_dump(mode="json")
+    said = "Two channels seem to be exchanged: sprung_front and sprung_rear."
+    content["crossings"][0]["reason_texts"] = [said]
+    text = reported(site, Results.model_validate(content)).text
+    assert f"no number of it means anything. {said}" in text
+    what = text.partition("What to do next")[2].partition("What this does not mean")[0]
+    assert "Look at the wiring of these sensors." in what
+    assert "run driveby check on the recording" in what

@@ -11,8 +11,8 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import parse_site, site_toml
 from services.cli import main as cli
-from services.cli.identify import identify_recordings, site_of
 from services.common.errors import InputError
+from services.execution.offline import identify_recordings, site_of
 from services.simulation.drive import (
     Beyond,
     Drive,
