@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import Final, NoReturn
 
 from services.cli.access import add_certs
+from services.cli.catalog import add_catalog
 from services.cli.check import add_check
 from services.cli.completion import SHELLS, completion
 from services.cli.export import add_export
@@ -51,6 +52,7 @@ _COMMANDS: Final = (
     add_identify,
     add_fuse,
     add_info,
+    add_catalog,
     add_export,
     add_report,
     add_validate,

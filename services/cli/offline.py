@@ -260,6 +260,7 @@ def _import(options: argparse.Namespace) -> int:
 
     from services.common.progress import progress_bar
     from services.drives.importing import import_command
+    from services.history.catalog import catalog_above, catalog_closed
 
     with progress_bar(Console(stderr=True)) as bar:
         reading = bar.add_task("reading", total=None)
@@ -277,6 +278,9 @@ def _import(options: argparse.Namespace) -> int:
             ),
         )
     print(said)
+    folder = catalog_above(options.output)
+    if folder is not None:
+        catalog_closed(folder, options.output)
     return 0
 
 

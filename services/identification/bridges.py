@@ -7,7 +7,7 @@ lie beside or above each other, is told by its distance from their lines and dec
 
 import logging
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from math import cos, floor, hypot, radians
 from typing import Final, NamedTuple
 
@@ -110,6 +110,11 @@ class Bridges:
             before = _box_round(latitude_deg, longitude_deg, latitude_deg, longitude_deg)
             return sorted({*self._near.meeting(here), *self._near.meeting(before)})
         return self._near.meeting(box)
+
+    def meeting(self, box: Box, among: Iterable[int] | None = None) -> list[int]:
+        """The bridges, or `among` some, whose surroundings meet a place, however large that is."""
+        numbers = range(len(self._near.boxes)) if among is None else among
+        return [n for n in numbers if _meet(self._near.boxes[n], box)]
 
     def around(self, latitude_deg: float, longitude_deg: float) -> list[int]:
         """The bridges that are less than `AROUND_M` away, and some that are a little further."""

@@ -25,6 +25,7 @@ from schemas.topics import Key, topic
 from services.common.disk import DISK, Disk
 from services.common.errors import InputError
 from services.common.intervals import Intervals
+from services.history.catalog import catalog_closed
 from services.logger.backlog import Backlog
 from services.logger.drops import FAILED, QUEUE_IS_FULL, Drop, Drops
 from services.logger.durable import DurableStreams
@@ -121,6 +122,7 @@ class FileWriter:
         self._durable = DurableStreams()
         self._end: tuple[str, Mapping[str, int]] = ("", {})
         self._syncing = ThreadPoolExecutor(_SYNCS_AT_ONCE, "sync")
+        self._cataloguing = ThreadPoolExecutor(1, "catalogue")
         if place.file is not None:
             self._open(("", ""), place.file, "logger started")
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
@@ -208,6 +210,7 @@ class FileWriter:
             self._stop(None, f"recording stopped: {error}", EventKind.WRITE_ERROR)
         finally:
             self._syncing.shutdown()
+            self._cataloguing.shutdown()
 
     def _write_all(self) -> None:
         synced_s = time.monotonic()
@@ -324,6 +327,8 @@ class FileWriter:
         del self._files[name]
         self._closed_names[name] = opened.file.path.name
         _log.info("closed %s: %s", opened.file.path, reason)
+        # Beside the writing: a file is read once more for its row, which nobody waits for.
+        self._cataloguing.submit(catalog_closed, self._folder(), opened.file.path)
 
     def _replace(self, name: FileName, what: Misplaced) -> None:
         """Begin a new file for one that somebody has deleted, cut or moved, and say so."""
@@ -389,8 +394,11 @@ class FileWriter:
             _, oldest = self._latched.popitem(last=False)
             self._latched_bytes -= len(oldest.payload)
 
+    def _folder(self) -> Path:
+        return self._place.file.parent if self._place.file is not None else self._place.folder
+
     def _look_at_disk(self) -> None:
-        folder = self._place.file.parent if self._place.file is not None else self._place.folder
+        folder = self._folder()
         try:
             self.free_bytes = self._disk.free_bytes(folder)
         except OSError as error:

@@ -170,6 +170,12 @@ def scan(file: BinaryIO, start: int = 0) -> Iterator[Item]:
         yield Damage(at, 0, text, is_chunk=False, is_cut_off=True)
 
 
+def chunk_items(data: bytes) -> Iterator[Item] | None:
+    """What a chunk holds, given the bytes of its record; None if they do not hold together."""
+    chunk = _chunk_at(io.BytesIO(data), 0, len(data), len(data))
+    return None if chunk is None else chunk.items()
+
+
 def last_metadata(file: BinaryIO, name: str) -> tuple[Metadata, int] | None:
     """Return the last metadata record of a name and where it ends, read from the file's end."""
     encoded = name.encode()

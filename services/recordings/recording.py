@@ -268,7 +268,7 @@ def _scan(
                     # files only the summary does.
                     everywhere = find_channels(path).items()
                     channels |= {
-                        n: _our_channel(path, c) for n, c in everywhere if n not in channels
+                        n: our_channel(path, c) for n, c in everywhere if n not in channels
                     }
                 known = channels.setdefault(item.channel_id, None)
                 if known is not None:
@@ -277,7 +277,7 @@ def _scan(
                     yield Message(where, data, boot_id, sequence, log_time_ns, publish_time_ns)
             elif isinstance(item, Channel):
                 if item.id not in channels:
-                    channels[item.id] = _our_channel(path, item)
+                    channels[item.id] = our_channel(path, item)
             elif isinstance(item, (Metadata, Attachment, Damage)):
                 yield item
 
@@ -302,7 +302,8 @@ def find_channels(path: Path) -> dict[int, Channel]:
     return channels
 
 
-def _our_channel(path: Path, channel: Channel) -> tuple[Key, int] | None:
+def our_channel(path: Path | str, channel: Channel) -> tuple[Key, int] | None:
+    """Key and boot of a channel's messages; None and a warning if they are not ours."""
     boot_id = channel.metadata.get("boot_id", "0")
     try:
         where = parse_key(channel.topic)

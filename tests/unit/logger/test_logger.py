@@ -13,6 +13,8 @@ from services import logger
 from services.bus.subscription import Received
 from services.common.disk import DISK
 from services.common.errors import InputError
+from services.common.stores import folder_at
+from services.history.catalog import mend, stored
 from services.logger.backlog import Backlog
 from services.logger.intake import GAP_PATIENCE_S, Intake
 from services.logger.places import Place
@@ -275,3 +277,16 @@ def test_what_has_come_is_written_or_counted_before_the_file_is_closed(
     assert (read_info(file).end or {})["dropped"] == str(50 - written)
     told = [decode_event(m.payload) for m in found if m.key.stream == "event"]
     assert sum(e.messages for e in told if e.kind == EventKind.QUEUE_FULL) == 50 - written
+
+
+def test_a_file_that_is_closed_has_its_row_in_the_catalogue(tmp_path: Path) -> None:
+    writer = FileWriter(place(tmp_path))
+    for message in messages(3) + messages(2, "truck-2"):
+        assert writer.put(message)
+    writer.finish("done", {})
+    rows = stored(folder_at(str(tmp_path))).rows
+    assert sorted((row.vehicles, row.messages) for row in rows.values()) == [
+        (("truck-1",), 3),
+        (("truck-2",), 2),
+    ]
+    assert mend(folder_at(str(tmp_path))) == (rows, 0, ())

@@ -1,0 +1,134 @@
+"""`driveby catalog`: what recordings a fleet has, and where its trucks were on bridges."""
+
+import argparse
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from services.cli.parsing import add_file, add_site, command
+
+if TYPE_CHECKING:
+    from services.history.catalog_row import Row
+    from services.history.positions import CrossingAt, Looked
+
+_MOST_LINES = 40
+_NS_PER_S = 1_000_000_000
+
+
+def add_catalog(commands: Any) -> None:
+    """`driveby catalog`: build or mend the catalogue of a folder of recordings."""
+    p = command(
+        commands,
+        "catalog",
+        _catalog,
+        "build or mend the catalogue of a folder of recordings, and find crossings in it",
+        "driveby catalog recordings --site site.toml",
+    )
+    p.add_argument("folder", metavar="DIR|s3://…", help="folder with recordings below")
+    p.add_argument(
+        "--verify",
+        action="store_true",
+        help="read every recording and compare it with its row, also where size and time agree",
+    )
+    add_site(p, "list crossings of its bridges, from positions alone")
+    add_file(p, "--csv", "OUT.csv", "write all crossings (with --site) or recordings here")
+
+
+def _catalog(options: argparse.Namespace) -> int:
+    from schemas.site_file import load_site
+    from services.common.files import check_writable, write_atomically
+    from services.common.stores import check_folder, folder_at
+    from services.history.catalog import mend
+    from services.history.positions import crossings_of
+
+    if options.csv is not None:
+        check_writable(options.csv)
+    site = None if options.site is None else load_site(options.site)
+    folder = folder_at(options.folder)
+    check_folder(folder)
+    mended = mend(folder, verify=options.verify)
+    for problem in mended.problems:
+        print(problem)
+    rows = sorted(mended.rows.values(), key=lambda row: (row.first_ns, row.path))
+    print(_summary(rows, mended.added))
+    table = list(_table_of_rows(rows))
+    if site is not None:
+        found = crossings_of(folder, rows, site)
+        for problem in found.problems:
+            print(problem)
+        table = list(_table_of_crossings(found.crossings))
+        _print_crossings(found)
+    if options.csv is not None:
+        write_atomically(options.csv, "".join(_csv(line) for line in table))
+        print(options.csv)
+    return 0
+
+
+def _summary(rows: "list[Row]", added: int) -> str:
+    vehicles = {vehicle for row in rows for vehicle in row.vehicles}
+    size = sum(row.size_bytes for row in rows)
+    gaps = sum(row.gaps for row in rows)
+    said = (
+        f"{len(rows)} recording{'s' if len(rows) != 1 else ''} ({added} new to the catalogue), "
+        f"{len(vehicles)} truck{'s' if len(vehicles) != 1 else ''}, {size / 1e6:.1f} MB, "
+        f"{gaps} gap{'s' if gaps != 1 else ''}"
+    )
+    if rows:
+        said += f", {_time(rows[0].first_ns)} to {_time(max(row.last_ns for row in rows))}"
+    return said
+
+
+def _table_of_rows(rows: "list[Row]") -> Iterator[tuple[object, ...]]:
+    yield (
+        *("recording", "vehicles", "first_time", "last_time", "bytes", "messages", "gaps"),
+        *("gap_s", "south_deg", "west_deg", "north_deg", "east_deg", "sha256"),
+    )
+    for row in rows:
+        box = ("", "", "", "") if row.box is None else row.box
+        times = (row.first_ns / _NS_PER_S, row.last_ns / _NS_PER_S)
+        counts = (row.size_bytes, row.messages, row.gaps, row.gap_s)
+        yield (row.path, " ".join(row.vehicles), *times, *counts, *box, row.content.hex())
+
+
+def _table_of_crossings(found: "tuple[CrossingAt, ...]") -> Iterator[tuple[object, ...]]:
+    yield (
+        *("realm", "vehicle", "bridge", "direction", "entry_time", "exit_time", "passage"),
+        "recordings",
+    )
+    for one in found:
+        direction = "start_to_end" if one.forward else "end_to_start"
+        times = (one.entry_ns / _NS_PER_S, one.exit_ns / _NS_PER_S)
+        where = (one.realm, one.vehicle, one.bridge, direction)
+        yield (*where, *times, one.passage.value, " ".join(one.recordings))
+
+
+def _csv(line: tuple[object, ...]) -> str:
+    import csv
+    import io
+
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerow(line)
+    return out.getvalue()
+
+
+def _print_crossings(found: "Looked") -> None:
+    for one in found.crossings[:_MOST_LINES]:
+        seconds = (one.exit_ns - one.entry_ns) / _NS_PER_S
+        how = f"{seconds:.1f} s on it" if one.passage.value == "through" else one.passage.value
+        direction = "start to end" if one.forward else "end to start"
+        print(
+            f"{_time(one.entry_ns)}  {one.vehicle} over {one.bridge}, {direction}, {how}  "
+            f"{' '.join(one.recordings)}"
+        )
+    if len(found.crossings) > _MOST_LINES:
+        print(f"… and {len(found.crossings) - _MOST_LINES} more (--csv has all)")
+    number = len(found.crossings)
+    print(
+        f"{number} crossing{'s' if number != 1 else ''}; read {found.chunks_read} of "
+        f"{found.chunks} chunks of {found.files_read} recording"
+        f"{'s' if found.files_read != 1 else ''}"
+    )
+
+
+def _time(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns / _NS_PER_S, UTC):%Y-%m-%d %H:%M:%S}"

@@ -1,0 +1,252 @@
+"""The catalogue of a folder of recordings: a row for each that is closed, in small Parquet files.
+
+They lie in `_catalog/DAY/HASH.parquet` below the folder, never change, and are called by what is in
+them: two that write the same row write the same file. Whoever closes a recording writes a file of
+one row; `packed` puts the rows of a day into one file and then removes those that it has read. Who
+is killed between the two leaves rows twice, which readers take once.
+"""
+
+import hashlib
+import io
+import json
+import logging
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from services.common.errors import FailureError, InputError
+from services.common.stores import (
+    Entry,
+    Folder,
+    files_below,
+    folder_at,
+    opened,
+    put,
+    read,
+    remove,
+)
+from services.history.catalog_row import Row, content_of, details_text, row_of
+from services.identification.bridges import Box
+
+_log = logging.getLogger(__name__)
+CATALOG: Final = "_catalog"
+"""No realm is called that."""
+EDITION: Final = "1"
+_EDITION_KEY = "driveby.catalog"
+
+
+class Stored(NamedTuple):
+    """The catalogue as it is stored."""
+
+    rows: dict[str, Row]
+    """By path."""
+    files: dict[str, tuple[Row, ...]]
+    """By file of the catalogue."""
+    problems: tuple[str, ...]
+    """Files of it that cannot be read, a line each."""
+
+
+class Mended(NamedTuple):
+    """What was done to a catalogue."""
+
+    rows: dict[str, Row]
+    added: int
+    problems: tuple[str, ...]
+    """A line each: recordings that are gone, changed or unreadable, files that are no rows."""
+
+
+def stored(folder: Folder) -> Stored:
+    """Read the catalogue of a folder; empty where there is none yet.
+
+    Of two rows of one recording the one counts that was made of the newer file.
+    """
+    files: dict[str, tuple[Row, ...]] = {}
+    problems: list[str] = []
+    for entry in files_below(folder, ".parquet", CATALOG):
+        try:
+            files[entry.name] = tuple(_rows_of(read(folder, entry.name)))
+        except InputError as error:
+            problems.append(str(error))
+        except ValueError as error:
+            problems.append(f"{folder.name}/{entry.name}: left out: {error}")
+    rows: dict[str, Row] = {}
+    for row in (row for some in files.values() for row in some):
+        before = rows.get(row.path)
+        if before is None or (before.modified_ns, before.content) < (row.modified_ns, row.content):
+            rows[row.path] = row
+    return Stored(rows, files, tuple(problems))
+
+
+def add(folder: Folder, row: Row) -> bool:
+    """Write a row as a file of its own; False if it is there already."""
+    return _put(folder, [row])
+
+
+def catalog_closed(folder: Path, recording: Path) -> None:
+    """Add the row of a recording that was closed a moment ago; what fails is a warning.
+
+    The recording is what counts: `driveby catalog` makes the row that is missing.
+    """
+    try:
+        name = recording.resolve().relative_to(folder.resolve()).as_posix()
+        status = recording.stat()
+        here = folder_at(str(folder))
+        add(here, row_of(here, Entry(name, status.st_size, status.st_mtime_ns)))
+    except (InputError, FailureError, OSError, ValueError) as error:
+        _log.warning("%s is not in the catalogue yet: %s", recording.name, error)
+
+
+def catalog_above(recording: Path) -> Path | None:
+    """The nearest folder above a recording that has a catalogue; None if none has."""
+    above = recording.absolute().parents
+    return next((folder for folder in above if (folder / CATALOG).is_dir()), None)
+
+
+def mend(folder: Folder, *, verify: bool = False) -> Mended:
+    """Bring the catalogue to what is in the folder, and pack it.
+
+    Rows that are missing are made; rows of recordings that are gone, or whose content is another,
+    are named and dropped, and made anew where there is a file. A file with the size and time of its
+    row is taken to be that file, unless `verify`: then its content is read and compared.
+    """
+    before = stored(folder)
+    problems = list(before.problems)
+    recordings = {e.name: e for e in files_below(folder, ".mcap")}
+    rows: dict[str, Row] = {}
+    added = 0
+    gone = before.rows.keys() - recordings.keys()
+    problems += [f"{folder.name}/{path}: is gone; its row is dropped" for path in sorted(gone)]
+    for path, entry in recordings.items():
+        old = before.rows.get(path)
+        try:
+            if old is not None and (wrong := _wrong(folder, entry, old, verify=verify)):
+                problems.append(f"{folder.name}/{path}: {wrong}; its row is made anew")
+                old = None
+            elif old is not None and old.modified_ns != entry.modified_ns:
+                old = old._replace(modified_ns=entry.modified_ns)
+            if old is None:
+                rows[path] = row_of(folder, entry)
+                added += 1
+            else:
+                rows[path] = old
+        except InputError as error:
+            problems.append(str(error))
+    _pack(folder, rows, before)
+    return Mended(rows, added, tuple(problems))
+
+
+def _wrong(folder: Folder, entry: Entry, row: Row, *, verify: bool) -> str | None:
+    """In what a row does not say the truth of a file; None if it does."""
+    if entry.size_bytes != row.size_bytes:
+        return f"has {entry.size_bytes} bytes and not {row.size_bytes} as its row says"
+    if entry.modified_ns == row.modified_ns and not verify:
+        return None
+    with opened(folder, entry.name) as file:
+        if content_of(file) != row.content:
+            return "is another file than its row says, of the same size"
+    if verify:
+        now = row_of(folder, entry)
+        for what in Row._fields:
+            if what != "modified_ns" and getattr(now, what) != getattr(row, what):
+                return f"does not agree with its row: {what} is another"
+    return None
+
+
+def _pack(folder: Folder, rows: dict[str, Row], before: Stored) -> None:
+    """Write the rows of each day into one file, then remove what was read and is in none of them.
+
+    What others have written meanwhile was not read, and stays.
+    """
+    days: defaultdict[str, list[Row]] = defaultdict(list)
+    for row in rows.values():
+        days[row.day].append(row)
+    kept = set()
+    for day in sorted(days):
+        kept.add(_name(days[day]))
+        _put(folder, days[day])
+    for name in before.files:
+        if name not in kept:
+            remove(folder, name)
+
+
+def _put(folder: Folder, rows: Iterable[Row]) -> bool:
+    ordered = sorted(rows, key=lambda row: row.path)
+    return put(folder, _name(ordered), _file_of(ordered))
+
+
+def _name(rows: list[Row]) -> str:
+    ordered = sorted(rows, key=lambda row: row.path)
+    digest = hashlib.sha256(repr([tuple(row) for row in ordered]).encode()).hexdigest()[:20]
+    return f"{CATALOG}/{ordered[0].day}/{digest}.parquet"
+
+
+def _file_of(rows: list[Row]) -> bytes:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    boxes = [row.box for row in rows]
+    table = pa.table(
+        {
+            "path": [row.path for row in rows],
+            "size_bytes": pa.array([row.size_bytes for row in rows], pa.int64()),
+            "modified_ns": pa.array([row.modified_ns for row in rows], pa.int64()),
+            "content": pa.array([row.content for row in rows], pa.binary()),
+            "first_ns": pa.array([row.first_ns for row in rows], pa.int64()),
+            "last_ns": pa.array([row.last_ns for row in rows], pa.int64()),
+            **{
+                name: pa.array([None if b is None else b[n] for b in boxes], pa.float64())
+                for n, name in enumerate(Box._fields)
+            },
+            "details": [details_text(row) for row in rows],
+        }
+    )
+    out = io.BytesIO()
+    # A file of one row would be mostly statistics and dictionaries of one value.
+    one = {"use_dictionary": False, "write_statistics": False, "store_schema": False}
+    compression = "zstd" if len(rows) > 1 else "none"
+    with pq.ParquetWriter(out, table.schema, compression=compression, **one) as writer:
+        writer.add_key_value_metadata({_EDITION_KEY: EDITION})
+        writer.write_table(table)
+    return out.getvalue()
+
+
+def _rows_of(content: bytes) -> list[Row]:
+    """The rows of a file; ValueError if it is none of this edition."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        file = pq.ParquetFile(io.BytesIO(content))
+        told = file.metadata.metadata or {}
+        edition = told.get(_EDITION_KEY.encode(), b"").decode(errors="replace")
+        if edition != EDITION:
+            raise ValueError(
+                f"is of edition {edition[:20] or 'none'} of the catalogue, this program knows "
+                f"{EDITION}"
+            )
+        return [_row(one) for one in file.read().to_pylist()]
+    except (pa.ArrowException, OSError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"is no file of a catalogue ({' '.join(str(error).split())[:80]})"
+        ) from None
+
+
+def _row(told: dict[str, Any]) -> Row:
+    details = json.loads(told["details"])
+    sides = [told[name] for name in Box._fields]
+    return Row(
+        told["path"],
+        told["size_bytes"],
+        told["modified_ns"],
+        told["content"],
+        tuple(details["realms"]),
+        tuple(details["vehicles"]),
+        told["first_ns"],
+        told["last_ns"],
+        details["messages"],
+        details["rates_hz"],
+        details["gaps"],
+        details["gap_s"],
+        None if sides[0] is None else Box(*sides),
+    )
