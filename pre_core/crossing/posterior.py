@@ -7,7 +7,7 @@ its place. The sum of squares of all rows is then -2 log posterior up to a const
 Gauss-Newton curvature the precision of the normal that the Markov chains are steered by.
 """
 
-from functools import lru_cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
 from pre_core.crossing import splines, whitening
+from pre_core.crossing.layout import CHANNELS, Layout, laid_out
 from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.residuals import (
     SWING_MODES,
@@ -34,11 +35,10 @@ from pre_core.crossing.whitening import (
     row_count,
     truck_of,
 )
-from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE, K_U1, M_U1
+from pre_core.unknowns import EI_1, K_U1, M_U1
 
 FloatArray = NDArray[np.float64]
 
-CHANNELS = 4
 # Three directions in which four gains differ; what is common to all comes beside them.
 _CONTRASTS = np.array(
     [[0.5, 0.5, -0.5, -0.5], [0.5, -0.5, 0.5, -0.5], [0.5, -0.5, -0.5, 0.5]], dtype=np.float64
@@ -105,65 +105,11 @@ class Problem(NamedTuple):
     works: tuple[Work, ...]
 
 
-class Layout(NamedTuple):
-    """Places of the groups of unknowns in y."""
-
-    theta: slice
-    bridge: NDArray[np.int64]
-    """Where in theta the bridge's unknowns are; `elements` are its last."""
-    elements: NDArray[np.int64]
-    half_normal: NDArray[np.int64]
-    """Coordinates that must not be negative."""
-    wheelbase: int
-    gains: slice
-    """Contrasts between the channels."""
-    common_gain: int
-    delays: slice
-    initial: slice
-    swing: slice
-    """The bridge's own motion when the truck comes."""
-    trajectory: slice
-    offset: int
-    size: int
-
-
 def layout(problem: Problem) -> Layout:
     """Theta (what is estimated), wheelbase, gains, delays, initial states, swing, trajectory."""
     priors = problem.priors
-    return _layout(
+    return laid_out(
         priors.estimated.tobytes(), priors.half_normal.tobytes(), problem.basis_position.shape[1]
-    )
-
-
-@lru_cache(maxsize=8)
-def _layout(estimated: bytes, half_normal: bytes, coefficients: int) -> Layout:
-    """Of flags (p,) and so many coefficients of the trajectory: asked for at every evaluation."""
-    kept = np.flatnonzero(np.frombuffer(estimated, dtype=np.bool_))
-    t = kept.size
-    gains = slice(t + 1, t + 4)
-    delays = slice(gains.stop + 1, gains.stop + 1 + CHANNELS)
-    initial = slice(delays.stop, delays.stop + 3 * CHANNELS)
-    swing = slice(initial.stop, initial.stop + 2 * SWING_MODES)
-    trajectory = slice(swing.stop, swing.stop + coefficients)
-    places = (
-        np.flatnonzero(kept >= FIRST_OF_BRIDGE),
-        np.flatnonzero(kept >= EI_1),
-        np.flatnonzero(np.frombuffer(half_normal, dtype=np.bool_)[kept]),
-    )
-    for one in places:
-        one.flags.writeable = False
-    return Layout(
-        slice(0, t),
-        *places,
-        t,
-        gains,
-        gains.stop,
-        delays,
-        initial,
-        swing,
-        trajectory,
-        trajectory.stop,
-        trajectory.stop + 1,
     )
 
 

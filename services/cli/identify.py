@@ -27,7 +27,8 @@ from services.common.files import (
 )
 from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.drives.survey import survey
-from services.execution.offline import identify_messages, messages_of_trucks, site_of
+from services.execution.offline import identify_drives, site_of
+from services.execution.overview import look_over, messages_of_trucks
 from services.history.baselines import baselines_of
 from services.history.certificates import found_in
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
@@ -82,11 +83,12 @@ def identify_command(
     draws: dict[str, Draws] = {}
     seen = _crossings_seen(recordings, known, console)
     with reading_bar("reading", recordings, console) as next_file:
-        messages = messages_of_trucks(recordings, next_file)
+        drives = look_over(
+            ", ".join(map(str, recordings)), messages_of_trucks(recordings, next_file), known
+        )
     with parts_bar("crossing", seen, console) as report:
-        found = identify_messages(
-            messages,
-            ", ".join(map(str, recordings)),
+        found = identify_drives(
+            drives,
             known,
             settings,
             report,

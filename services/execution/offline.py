@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 
@@ -12,19 +12,23 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site, site_hash
 from services.common.errors import InputError
-from services.common.progress import Offset, unwatched
 from services.execution.blas import one_blas_thread
 from services.execution.dispatch import awaited, dispatched
 from services.execution.here import Here, Report
+from services.execution.overview import (
+    Overview,
+    as_they_were_made,
+    look_over,
+    malformed,
+    messages_of_trucks,
+)
 from services.identification.bridge_state import NOTHING_STORED, Fusing, with_common_shares
 from services.identification.engine import Engine
 from services.identification.identify import Keep
 from services.identification.outputs import Said
-from services.identification.streams import device_time_ns
-from services.recordings.recording import Message, program_version, read_messages, read_site
+from services.recordings.recording import Message, program_version, read_site
 
 _log = logging.getLogger(__name__)
-_STREAMS = ("accel", "gnss", "info")
 
 
 def _unwatched(crossing_id: str, stage: str, fraction: float) -> None:
@@ -56,25 +60,12 @@ def identify_recordings(
     They name the `certificates` of their vehicles and bridges, where there are such.
     """
     name = ", ".join(str(path) for path in recordings)
-    messages = messages_of_trucks(recordings)
-    return identify_messages(messages, name, site, settings, report, keep, fusing, certificates)
+    overview = look_over(name, messages_of_trucks(recordings), site)
+    return identify_drives(overview, site, settings, report, keep, fusing, certificates)
 
 
-def messages_of_trucks(
-    recordings: Iterable[Path], next_file: Callable[[], Offset] = lambda: unwatched
-) -> list[Message]:
-    """All that an identification reads; `next_file` is called at the beginning of each file."""
-    return [
-        message
-        for path in recordings
-        for message in read_messages(path, next_file())
-        if message.key.owner == "vehicle" and message.key.stream in _STREAMS
-    ]
-
-
-def identify_messages(
-    messages: Iterable[Message],
-    name: str,
+def identify_drives(
+    drives: Overview,
     site: Site,
     settings: IdentificationSettings,
     report: Report = _unwatched,
@@ -82,10 +73,10 @@ def identify_messages(
     fusing: Fusing = NOTHING_STORED,
     certificates: Mapping[Pair, str] | None = None,
 ) -> Results:
-    """Results of all crossings in the messages, which errors call `name`; they may be unordered.
+    """Results of all crossings in the drives, which are read again, message by message.
 
     `report` is told of every crossing how far it is, and in the end that all of it is done.
-    InputError without accelerations or positions, or if the site knows none of the trucks.
+    InputError if the site knows none of the trucks.
     """
     header = Header(
         version=program_version(),
@@ -96,21 +87,14 @@ def identify_messages(
     )
     engine = Engine(site, settings, header, fusing, certificates=certificates, tells_states=False)
     execution = Here(report=report, keep=keep)
-    streams: dict[str, list[Message]] = {stream: [] for stream in _STREAMS}
-    for message in messages:
-        if message.key.owner == "vehicle" and message.key.stream in streams:
-            streams[message.key.stream].append(message)
-    for stream, what in (("accel", "accelerations (accel)"), ("gnss", "positions (gnss)")):
-        if not streams[stream]:
-            raise InputError(f"{name}: no {what}, a recording of a truck is expected")
-    _check_vehicles(name, site, [*streams["accel"], *streams["gnss"]])
-    for message in streams["gnss"]:
+    _check_vehicles(drives.name, site, drives.drove)
+    for message in drives.near:
         engine.expect(message.key, message.payload, for_ever=True)
     with one_blas_thread():
         outputs = chain(
             chain.from_iterable(
-                dispatched(engine, execution, _said(name, engine, message))
-                for message in _as_it_happened(name, [m for one in streams.values() for m in one])
+                dispatched(engine, execution, _said(drives.name, engine, message))
+                for message in as_they_were_made(drives)
             ),
             dispatched(engine, execution, engine.finish()),
             awaited(engine, execution),
@@ -126,10 +110,9 @@ def identify_messages(
     return results(header, with_common_shares(found, bridges), bridges)
 
 
-def _check_vehicles(name: str, site: Site, messages: list[Message]) -> None:
+def _check_vehicles(name: str, site: Site, drove: set[str]) -> None:
     """InputError if the site knows none of the trucks; a warning for each that it does not know."""
     known = {vehicle.id for vehicle in site.vehicles}
-    drove = {message.key.identifier for message in messages}
     strangers = ", ".join(sorted(drove - known))
     if drove and not drove & known:
         raise InputError(f"{name}: {strangers} drove, but the site has no such vehicle")
@@ -137,31 +120,12 @@ def _check_vehicles(name: str, site: Site, messages: list[Message]) -> None:
         _log.warning("%s drove too, but the site has no such vehicle", strangers)
 
 
-def _as_it_happened(name: str, messages: list[Message]) -> list[Message]:
-    """Boot by boot, by the truck's clock: a recording keeps the order in which messages came."""
-
-    def moment(message: Message) -> tuple[int, str, str, int]:
-        try:
-            time_ns = -1  # what a truck says of itself holds for all of a boot
-            if message.key.stream != "info":
-                time_ns = device_time_ns(message.key.stream, message.payload)
-        except ValueError as error:
-            raise _malformed(name, message, error) from error
-        return message.boot_id, message.key.realm, message.key.identifier, time_ns
-
-    return sorted(messages, key=moment)
-
-
 def _said(name: str, engine: Engine, message: Message) -> Iterator[Said]:
     try:
         return engine.feed(message.key, message.payload)
     except ValueError as error:
-        wrong = _malformed(name, message, error)
+        wrong = malformed(name, message, error)
         if message.key.stream == "info":  # nothing that it could say is needed
             _log.warning("%s", wrong)
             return iter(())
         raise wrong from error
-
-
-def _malformed(name: str, message: Message, error: ValueError) -> InputError:
-    return InputError(f"{name}: {message.key.stream} {message.sequence}: {error}")

@@ -8,7 +8,8 @@ from schemas.results import Method
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.common.errors import InputError
-from services.execution.offline import identify_messages
+from services.execution.offline import identify_drives
+from services.execution.overview import Read, look_over, remembered
 from services.history.draws import Draws
 from services.notebook.read import Name, given_site, messages_of_paths, paths_of, site_of_paths
 from services.notebook.simulate import Simulation
@@ -38,11 +39,11 @@ def identify(
     settings = _settings(method, seed)
     if isinstance(source, Simulation):
         known, name = source.site if site is None else given_site(site), "simulation"
-        messages = source.messages()
+        read: Read = source.messages
     else:
         paths = paths_of([source] if isinstance(source, str | PathLike) else list(source))
         known, name = site_of_paths(paths, site), ", ".join(str(path) for path in paths)
-        messages = messages_of_paths(paths, known, site, vehicle)
+        read = remembered(lambda again: messages_of_paths(paths, known, site, vehicle))
     kept: dict[str, Draws] = {}
 
     def keep(crossing_id: str, chains: Draws) -> None:
@@ -53,7 +54,7 @@ def identify(
         if fraction < 1.0:
             say(f"{crossing_id}: {stage}")
 
-    found = identify_messages(messages, name, known, settings, report, keep)
+    found = identify_drives(look_over(name, read, known), known, settings, report, keep)
     solutions = (
         Solution(c, known.bridge(c.bridge), kept.get(c.crossing_id, {})) for c in found.crossings
     )

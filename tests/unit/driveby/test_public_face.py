@@ -275,7 +275,7 @@ def test_draws_may_be_forgotten(
         keep(exact.results.crossings[0].crossing_id, chains)
         return exact.results
 
-    monkeypatch.setattr(identifying, "identify_messages", found_at_once)
+    monkeypatch.setattr(identifying, "identify_drives", found_at_once)
     assert driveby.identify(simulation).solutions[0].draws == chains
     forgetful = driveby.identify(simulation, draws=False)
     assert forgetful.solutions[0].draws == {}

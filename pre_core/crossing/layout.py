@@ -1,0 +1,66 @@
+"""Where each group of a crossing's unknowns stands in the coordinates y."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.crossing.residuals import SWING_MODES
+from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE
+
+CHANNELS = 4
+
+
+class Layout(NamedTuple):
+    """Places of the groups of unknowns in y."""
+
+    theta: slice
+    bridge: NDArray[np.int64]
+    """Where in theta the bridge's unknowns are; `elements` are its last."""
+    elements: NDArray[np.int64]
+    half_normal: NDArray[np.int64]
+    """Coordinates that must not be negative."""
+    wheelbase: int
+    gains: slice
+    """Contrasts between the channels."""
+    common_gain: int
+    delays: slice
+    initial: slice
+    swing: slice
+    """The bridge's own motion when the truck comes."""
+    trajectory: slice
+    offset: int
+    size: int
+
+
+@lru_cache(maxsize=8)
+def laid_out(estimated: bytes, half_normal: bytes, coefficients: int) -> Layout:
+    """Of flags (p,) and so many coefficients of the trajectory: asked for at every evaluation."""
+    kept = np.flatnonzero(np.frombuffer(estimated, dtype=np.bool_))
+    t = kept.size
+    gains = slice(t + 1, t + 4)
+    delays = slice(gains.stop + 1, gains.stop + 1 + CHANNELS)
+    initial = slice(delays.stop, delays.stop + 3 * CHANNELS)
+    swing = slice(initial.stop, initial.stop + 2 * SWING_MODES)
+    trajectory = slice(swing.stop, swing.stop + coefficients)
+    places = (
+        np.flatnonzero(kept >= FIRST_OF_BRIDGE),
+        np.flatnonzero(kept >= EI_1),
+        np.flatnonzero(np.frombuffer(half_normal, dtype=np.bool_)[kept]),
+    )
+    for one in places:
+        one.flags.writeable = False
+    return Layout(
+        slice(0, t),
+        *places,
+        t,
+        gains,
+        gains.stop,
+        delays,
+        initial,
+        swing,
+        trajectory,
+        trajectory.stop,
+        trajectory.stop + 1,
+    )
