@@ -7,7 +7,6 @@ the worker's own engine, with its names and its states.
 """
 
 import contextlib
-import logging
 from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -174,38 +173,18 @@ def take(
 
 def _messages(path: Path, realm: str, vehicle: str, warnings: list[str]) -> Iterator[Message]:
     """What a file holds of a truck; what cannot be read of it is added to the warnings."""
-    with _heard() as said:
-        is_growing = False
-        try:
-            is_growing = is_being_written(path)
-            for message in read_messages(path):
-                where = message.key
-                if (where.realm, where.owner, where.identifier) == (realm, "vehicle", vehicle):
-                    yield message
-        except (InputError, OSError) as error:
-            said.append(str(error))
+    said: list[str] = []
+    is_growing = False
+    try:
+        is_growing = is_being_written(path)
+        for message in read_messages(path, warn=said.append):
+            where = message.key
+            if (where.realm, where.owner, where.identifier) == (realm, "vehicle", vehicle):
+                yield message
+    except (InputError, OSError) as error:
+        said.append(str(error))
     if not is_growing:  # it ends in the middle of a chunk as a rule
         warnings += said
-
-
-@contextlib.contextmanager
-def _heard() -> Iterator[list[str]]:
-    """What is said of damaged places, instead of saying it: the same file is read several times."""
-    said: list[str] = []
-
-    class Keep(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            said.append(record.getMessage())
-
-    log = logging.getLogger(read_messages.__module__)
-    keep, propagates = Keep(), log.propagate
-    log.addHandler(keep)
-    log.propagate = False
-    try:
-        yield said
-    finally:
-        log.removeHandler(keep)
-        log.propagate = propagates
 
 
 def _is_wanted(message: Message, stays: Sequence[Stayed]) -> bool:

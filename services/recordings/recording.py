@@ -49,6 +49,8 @@ _log = logging.getLogger(__name__)
 _BOOT_DIGITS = 20
 """A number of 64 bits has no more."""
 
+Warn = Callable[[str], None]
+"""Takes what is wrong with a file that can be read all the same, in one line."""
 Identities = dict[tuple[Key, int], Intervals]
 """By key and boot_id: the sequence numbers of the messages."""
 
@@ -84,16 +86,22 @@ class RecordingInfo(NamedTuple):
     """The file ends in the middle of a record or without MCAP's footer."""
 
 
-def read_messages(path: Path, progress: Offset = unwatched) -> Iterator[Message]:
+def _log_warning(text: str) -> None:
+    _log.warning("%s", text)
+
+
+def read_messages(
+    path: Path, progress: Offset = unwatched, *, warn: Warn = _log_warning
+) -> Iterator[Message]:
     """Yield the messages in the order of the file; `progress` is told how far that is.
 
     A file that was cut off is read up to its last whole chunk, damaged places are left out; both
-    are logged (and counted by `read_info`). InputError if the file is missing, is no MCAP file,
-    holds no message of ours, or one of a truck that is larger than its topic allows: taking apart
-    what fits the name of a message and nothing else can cost gigabytes.
+    are said to `warn` (and counted by `read_info`). InputError if the file is missing, is no MCAP
+    file, holds no message of ours, or one of a truck that is larger than its topic allows: taking
+    apart what fits the name of a message and nothing else can cost gigabytes.
     """
     found = False
-    for item in _scan(path, progress=progress):
+    for item in _scan(path, progress=progress, warn=warn):
         if isinstance(item, Message):
             found = True
             owner, stream = item.key.owner, item.key.stream
@@ -101,7 +109,7 @@ def read_messages(path: Path, progress: Offset = unwatched) -> Iterator[Message]
                 check_message(path, item)
             yield item
         elif isinstance(item, Damage):
-            _log.warning("%s: %s", path, item.text)
+            warn(f"{path}: {item.text}")
     if not found:
         raise InputError(f"{path}: holds no driveby message; a recording of a truck is expected")
 
@@ -249,7 +257,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def _scan(
-    path: Path, start: int = 0, progress: Offset = unwatched
+    path: Path, start: int = 0, progress: Offset = unwatched, warn: Warn = _log_warning
 ) -> Iterator[Message | Metadata | Attachment | Damage]:
     """Yield all that is of use in a file, in its order, and what is damaged."""
     with _opened(path) as file:
@@ -268,7 +276,7 @@ def _scan(
                     # files only the summary does.
                     everywhere = find_channels(path).items()
                     channels |= {
-                        n: our_channel(path, c) for n, c in everywhere if n not in channels
+                        n: our_channel(path, c, warn) for n, c in everywhere if n not in channels
                     }
                 known = channels.setdefault(item.channel_id, None)
                 if known is not None:
@@ -277,7 +285,7 @@ def _scan(
                     yield Message(where, data, boot_id, sequence, log_time_ns, publish_time_ns)
             elif isinstance(item, Channel):
                 if item.id not in channels:
-                    channels[item.id] = our_channel(path, item)
+                    channels[item.id] = our_channel(path, item, warn)
             elif isinstance(item, (Metadata, Attachment, Damage)):
                 yield item
 
@@ -302,13 +310,15 @@ def find_channels(path: Path) -> dict[int, Channel]:
     return channels
 
 
-def our_channel(path: Path | str, channel: Channel) -> tuple[Key, int] | None:
-    """Key and boot of a channel's messages; None and a warning if they are not ours."""
+def our_channel(
+    path: Path | str, channel: Channel, warn: Warn = _log_warning
+) -> tuple[Key, int] | None:
+    """Key and boot of a channel's messages; None, and `warn` is told, if they are not ours."""
     boot_id = channel.metadata.get("boot_id", "0")
     try:
         where = parse_key(channel.topic)
     except ValueError:
-        _log.warning("%s: topic %.80r is not ours and is left out", path, channel.topic)
+        warn(f"{path}: topic {channel.topic!r:.80} is not ours and is left out")
         return None
     is_number = boot_id.isascii() and boot_id.isdecimal() and len(boot_id) <= _BOOT_DIGITS
     return where, int(boot_id) if is_number else 0

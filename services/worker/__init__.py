@@ -103,6 +103,42 @@ class Editing(NamedTuple):
         return self.watch.edited(now_s, is_asked=is_asked)
 
 
+class Service(NamedTuple):
+    """What a run works with: who decides, who computes, and where what was found goes."""
+
+    id: str
+    engine: Engine
+    execution: Execution
+    certificates: Certificates
+    publisher: Publisher
+    files: ResultFiles
+
+    def tell(self, outputs: Iterable[Output]) -> None:
+        """Write each message to the disk and only then to the bus: nobody hears what may be lost.
+
+        FailureError: one cannot be written or published.
+        """
+        for output in _worked_out(outputs):
+            _, owner, identifier, stream = output.key
+            identity = self.files.next_identity(output.key, self.publisher.boot_id)
+            now_ns = time.time_ns()
+            message = Message(output.key, output.payload, *identity, now_ns, now_ns)
+            self.files.write(message, output.result, self.engine.bridges())
+            try:
+                self.publisher.put(owner, identifier, stream, output.payload, identity)
+            except ValueError as error:
+                raise FailureError(
+                    f"{stream} of {identifier} cannot be published: {error}"
+                ) from error
+            if output.result is not None:
+                result = output.result
+                _log.info("%s: %s", result.crossing_id, verdict_line(result))
+
+    def go_on(self, said: Iterable[Said]) -> None:
+        """Tell what the engine says, and have done what it wants done."""
+        self.tell(dispatched(self.engine, self.execution, said, self.certificates.want))
+
+
 class _Behind(NamedTuple):
     """What has come and has not been looked at."""
 
@@ -243,7 +279,8 @@ def run(
 
         receiver = threading.Thread(target=receive, name="receive", daemon=True)
         try:
-            _resume(engine, execution, earlier, publisher, files)
+            service = Service(service_id, engine, execution, certified, publisher, files)
+            _resume(service, earlier)
             del earlier  # of two days
             receiver.start()
 
@@ -259,19 +296,8 @@ def run(
                 yield from engine.retarget(edited.site, now, Fusing(edited.baselines), found)
 
             with set_by_signals(signal.SIGHUP) as asked:
-                _serve(
-                    engine,
-                    execution,
-                    certified,
-                    arrivals,
-                    publisher,
-                    service_id,
-                    files,
-                    stop,
-                    ready,
-                    catching_up,
-                    None if watch is None else Editing(watch, asked, retarget),
-                )
+                editing = None if watch is None else Editing(watch, asked, retarget)
+                _serve(service, arrivals, stop, ready, catching_up, editing)
         except BaseException:
             files.abandon()
             raise
@@ -361,13 +387,7 @@ def _put(arrivals: _Queue, item: Arrived | Token, closing: threading.Event) -> N
             return
 
 
-def _resume(
-    engine: Engine,
-    execution: Execution,
-    earlier: Earlier,
-    publisher: Publisher,
-    files: ResultFiles,
-) -> None:
+def _resume(service: Service, earlier: Earlier) -> None:
     """Take up what earlier runs left: say again what may not have been heard, finish the rest.
 
     States of bridges that they owe are told when they have been made, while others are listened to.
@@ -377,11 +397,11 @@ def _resume(
         _, owner, identifier, stream = message.key
         identity = Identity(message.boot_id, message.sequence)
         try:
-            publisher.put(owner, identifier, stream, message.payload, identity)
+            service.publisher.put(owner, identifier, stream, message.payload, identity)
         except ValueError as error:
             _log.warning("not published again: %s", error)
-    finished = list(engine.resume(earlier.crossings, earlier.states()))
-    _publish(dispatched(engine, execution, finished), engine, publisher, files)
+    finished = list(service.engine.resume(earlier.crossings, earlier.states()))
+    service.go_on(finished)
     if earlier.previous is not None:
         _log.info(
             "%d messages of earlier runs, the last in %s; published again %d, finished %d",
@@ -401,13 +421,8 @@ def _resume(
 
 
 def _serve(
-    engine: Engine,
-    execution: Execution,
-    certificates: Certificates,
+    service: Service,
     queued: _Queue,
-    publisher: Publisher,
-    service_id: str,
-    files: ResultFiles,
     stop: threading.Event,
     ready: Callable[[], None] | None,
     catching_up: CatchingUp | None = None,
@@ -417,12 +432,12 @@ def _serve(
 
     Of that only what comes until `GONE_AFTER_S` after the stop was seen.
     """
+    engine, execution, certificates = service.engine, service.execution, service.certificates
     arrivals = Arrivals()
     told: set[str] = set()
     next_health_s = soonest_health_s = next_catch_up_s = 0.0
     told_backlog: _Backlog | None = None
     leave_at_s = math.inf
-    want = certificates.want
     progress: tuple[Pair, float] | None = None
     now_s = time.monotonic()
     lag_s = 0.0
@@ -441,7 +456,7 @@ def _serve(
                 certificates.has_news = False
                 told_backlog = backlog
                 behind = _Behind(queued.qsize(), lag_s)
-                _say_health(publisher, service_id, behind, backlog, execution, certificates.note)
+                _say_health(service, behind, backlog)
                 lag_s = 0.0
         batch: list[Arrived] = []
         one = _next(queued)
@@ -464,15 +479,14 @@ def _serve(
             except ValueError as error:
                 _log.warning("refused %s: %s", name, error)
                 continue
-            _publish(dispatched(engine, execution, outputs, want), engine, publisher, files)
+            service.go_on(outputs)
         if stop.is_set():
             leave_at_s = min(leave_at_s, time.monotonic() + GONE_AFTER_S)
             arrivals.hurry()
             certificates.end()
         for gone in arrivals.gone(now_s):
-            said = engine.gone(gone.realm, gone.vehicle, for_good=gone.for_good)
-            _publish(dispatched(engine, execution, said, want), engine, publisher, files)
-        _publish(collected(engine, execution), engine, publisher, files)
+            service.go_on(engine.gone(gone.realm, gone.vehicle, for_good=gone.for_good))
+        service.tell(collected(engine, execution))
         if not stop.is_set():
             passed = certificates.advance(time.monotonic(), engine.pairs_that_wait)
             for pair, digest in passed.items():
@@ -480,30 +494,29 @@ def _serve(
             if certificates.progress not in (None, progress):
                 progress = certificates.progress
                 pair, share = progress
-                _say_progress(publisher, service_id, "", f"validating {pair}", share)
+                validating = f"validating {pair}"
+                _say_progress(service.publisher, service.id, "", validating, share)
             if engine.has_released and execution.has_room:
-                released = dispatched(engine, execution, engine.release(), want)
-                _publish(released, engine, publisher, files)
+                service.go_on(engine.release())
             if catching_up is not None and time.monotonic() >= next_catch_up_s:
                 next_catch_up_s = time.monotonic() + _CATCH_UP_EVERY_S
                 said = catching_up.advance(
                     engine,
                     time.monotonic(),
                     has_room=execution.is_idle and not engine.has_released,
-                    want=want,
+                    want=certificates.want,
                 )
-                _publish(dispatched(engine, execution, said, want), engine, publisher, files)
+                service.go_on(said)
         edited = None if stop.is_set() or editing is None else editing.edited(time.monotonic())
         if editing is not None and edited is not None:
             # Every result belongs to one site file: what is under way still to that of before.
-            _publish(awaited(engine, execution), engine, publisher, files)
-            said = editing.retarget(edited)
-            _publish(dispatched(engine, execution, said, want), engine, publisher, files)
+            service.tell(awaited(engine, execution))
+            service.go_on(editing.retarget(edited))
             told.clear()
         for vehicle in engine.unknown_vehicles - told:
             told.add(vehicle)
             _log.warning("%s drives, but the site file has no such vehicle", vehicle)
-    _publish(awaited(engine, execution), engine, publisher, files)
+    service.tell(awaited(engine, execution))
     waiting = [name for names in engine.waiting().values() for name in names]
     if waiting:
         _log.warning(
@@ -523,28 +536,6 @@ def _next(queued: _Queue) -> Arrived | Token | None:
 def _may_lose(engine: Engine, arrivals: Arrivals) -> bool:
     """Whether a truck that is about to leave may have a crossing that is not decided."""
     return any(waits or engine.has_undecided(*truck) for truck, waits in arrivals.leaving().items())
-
-
-def _publish(
-    outputs: Iterable[Output],
-    engine: Engine,
-    publisher: Publisher,
-    files: ResultFiles,
-) -> None:
-    """Write each message to the disk and only then to the bus: nobody hears what may be lost."""
-    for output in _worked_out(outputs):
-        _, owner, identifier, stream = output.key
-        identity = files.next_identity(output.key, publisher.boot_id)
-        now_ns = time.time_ns()
-        message = Message(output.key, output.payload, *identity, now_ns, now_ns)
-        files.write(message, output.result, engine.bridges())
-        try:
-            publisher.put(owner, identifier, stream, output.payload, identity)
-        except ValueError as error:
-            raise FailureError(f"{stream} of {identifier} cannot be published: {error}") from error
-        if output.result is not None:
-            result = output.result
-            _log.info("%s: %s", result.crossing_id, verdict_line(result))
 
 
 def _worked_out(outputs: Iterable[Output]) -> Iterator[Output]:
@@ -580,15 +571,8 @@ def _backlog(engine: Engine, execution: Execution, catching_up: CatchingUp | Non
     )
 
 
-def _say_health(
-    publisher: Publisher,
-    service_id: str,
-    behind: _Behind,
-    backlog: _Backlog,
-    execution: Execution,
-    note: str,
-) -> None:
-    under_way = execution.under_way
+def _say_health(service: Service, behind: _Behind, backlog: _Backlog) -> None:
+    under_way, note = service.execution.under_way, service.certificates.note
     notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in under_way]
     notes += [f"{backlog.waiting} wait for a process"] if backlog.waiting else []
     notes += [f"{backlog.in_recordings} wait in recordings"] if backlog.in_recordings else []
@@ -596,7 +580,7 @@ def _say_health(
     health = pb.Health(
         schema_version=1,
         time_ns=time.time_ns(),
-        service=service_id,
+        service=service.id,
         ok=True,
         figures={
             "queue": float(behind.messages),
@@ -609,4 +593,4 @@ def _say_health(
         },
         note="; ".join(notes)[:_LONGEST_NOTE],
     )
-    publisher.put("service", service_id, "health", health.SerializeToString())
+    service.publisher.put("service", service.id, "health", health.SerializeToString())

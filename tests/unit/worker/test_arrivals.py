@@ -111,6 +111,10 @@ def test_who_is_in_a_hurry_waits_as_for_a_token() -> None:
 NOBODY_WAITS = certificates(Path("not made"), Places())
 
 
+def service_of(engine: Engine, files: ResultFiles) -> worker.Service:
+    return worker.Service("w", engine, Here(), NOBODY_WAITS, Publisher(None, REALM), files)
+
+
 class Watched(Engine):
     """An engine that notes what it is given, and stops the service at a payload."""
 
@@ -155,9 +159,7 @@ def test_who_is_back_in_the_queue_has_not_gone(
         queued.put(one)
     stop = threading.Event()
     engine = Watched(stop, message(0.0, 3).payload)
-    worker._serve(
-        engine, Here(), NOBODY_WAITS, queued, Publisher(None, REALM), "w", files, stop, None
-    )
+    worker._serve(service_of(engine, files), queued, stop, None)
     assert engine.seen == [message(0.0, number).payload for number in (1, 2, 3)]
 
 
@@ -179,9 +181,7 @@ def test_a_truck_without_token_that_goes_on_talking_does_not_hold_up_the_end(
         queued.put(message(0.1 * number, number))
     stop = threading.Event()
     engine = Undecided(stop, message(0.0, 100).payload)
-    worker._serve(
-        engine, Here(), NOBODY_WAITS, queued, Publisher(None, REALM), "w", files, stop, None
-    )
+    worker._serve(service_of(engine, files), queued, stop, None)
     assert engine.seen == [message(0.0, number).payload for number in range(131)]
 
 
@@ -197,9 +197,7 @@ def test_who_fell_silent_just_before_a_stop_is_decided_before_the_end(
     queued.put(message(10.0, 2))
     stop = threading.Event()
     engine = Undecided(stop, message(0.0, 2).payload)
-    worker._serve(
-        engine, Here(), NOBODY_WAITS, queued, Publisher(None, REALM), "w", files, stop, None
-    )
+    worker._serve(service_of(engine, files), queued, stop, None)
     assert engine.seen == [message(0.0, 1).payload, message(0.0, 2).payload, gone()]
 
 
@@ -235,9 +233,7 @@ def test_an_error_of_the_program_is_not_blamed_on_a_message(
     stop = threading.Event()
     engine = Broken(stop, message(0.0, 1).payload)
     with pytest.raises(FailureError, match="could not be worked out: singular"):
-        worker._serve(
-            engine, Here(), NOBODY_WAITS, queued, Publisher(None, REALM), "w", files, stop, None
-        )
+        worker._serve(service_of(engine, files), queued, stop, None)
     assert "refused" not in caplog.text
 
 
@@ -251,7 +247,5 @@ def test_a_malformed_message_is_refused_and_named(
     engine = Engine(paper_site(), SETTINGS, HEADER)
     stop = threading.Event()
     ready = threading.Timer(0.5, stop.set)
-    worker._serve(
-        engine, Here(), NOBODY_WAITS, queued, Publisher(None, REALM), "w", files, stop, ready.start
-    )
+    worker._serve(service_of(engine, files), queued, stop, ready.start)
     assert caplog.text.count("refused accel of truck-1") == 2
