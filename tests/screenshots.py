@@ -148,7 +148,8 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
         if shot.chainage_mm is not None:
             viewer.set_time("chainage_mm", sequence=shot.chainage_mm, play_state="paused")
         taken = picture(viewer)
-        assert complaints(viewer) == []
+        said = complaints(viewer)
+        assert not said, said
         return taken
 
 
@@ -193,7 +194,8 @@ def take_live(folder: Path, size: str = "1400x850") -> dict[str, bytes]:
                 driving = viewer.take_screenshot()
                 shows(viewer, GOOD, 1500)
                 answered = viewer.take_screenshot()
-                assert complaints(viewer) == []
+                said = complaints(viewer)
+                assert not said, said
     return {"view-live": driving, "view-live-result": answered}
 
 
