@@ -2,7 +2,7 @@
 
 python -m tests.screenshots [NAME …]
 
-From recordings/sample and the demo; one from crossings that are not in the repository. Needs a
+From recordings/sample and the demo; two from crossings that are not in the repository. Needs a
 Vulkan driver, be it one that draws with the processor (Debian: mesa-vulkan-drivers), and for the
 report and the terminal a browser (Debian: chromium).
 """
@@ -28,7 +28,8 @@ from rich.console import Console
 from schemas.site_file import load_site
 from services.cli import main as cli
 from services.cli.watch_page import page
-from services.recordings.recording import read_site
+from services.recordings.recording import Message, read_messages, read_site
+from services.recordings.writer import write_recording
 from services.report.pdf import find_browser
 from services.viewer.view import convert
 from tests.endpoints import free_endpoint, free_port
@@ -58,12 +59,16 @@ SHOTS = (
     Shot("view-told", "good.rrd", ("2026-01-01", "Told", "Map"), 15_000),
     Shot("view-left-over", "suspect.rrd", ("2026-01-01", "Left over", "Map"), 15_000),
     Shot("view-suspect", "suspect.rrd", ("2026-01-01",), 9_000),
+    Shot("view-rejected", "rejected.rrd", ("2026-01-01",), None),
 )
 
 
-SHARED = ROOT.parent / "shared/crossings/d9_everything_16_runs"
+SHARED = ROOT.parent / "shared/crossings"
 """Crossings of an independent simulator, which are not in the repository."""
-OF_MANY = Shot("view-many", "many.rrd", ("Bridge",), 15_000)
+OF_SHARED = {
+    "d3_edge_damage_4_runs": Shot("view-four", "four.rrd", ("Bridge",), 15_000),
+    "d9_everything_16_runs": Shot("view-many", "many.rrd", ("Bridge",), 15_000),
+}
 
 
 def main() -> int:
@@ -72,17 +77,21 @@ def main() -> int:
         return 1
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        make_files(folder)
         takers: dict[str, Callable[[], bytes]] = {
             shot.name: partial(take, shot, folder) for shot in SHOTS
         }
         takers["report"] = partial(take_report, folder)
+        of_sample = set(takers)
         takers["demo"] = partial(take_demo, folder)
         takers["watch"] = partial(take_terminal, folder, columns=100)
         if SHARED.is_dir():
-            make_many(folder)
-            takers[OF_MANY.name] = partial(take, OF_MANY, folder)
-        for wanted in sys.argv[1:] or [*takers, "view-live"]:
+            takers |= {
+                shot.name: partial(take_shared, of, folder) for of, shot in OF_SHARED.items()
+            }
+        chosen = sys.argv[1:] or [*takers, "view-live"]
+        if of_sample & set(chosen):
+            make_files(folder)
+        for wanted in chosen:
             both = take_live(folder) if wanted == "view-live" else {wanted: takers[wanted]()}
             for shown, taken in both.items():
                 path = FOLDER / f"{shown}.png"
@@ -101,14 +110,29 @@ def make_files(folder: Path) -> None:
     for name, options in (("good", ()), ("suspect", ("--site", str(louder)))):
         outputs = ("--rrd", f"{folder / name}.rrd", "--json", f"{folder / name}.json")
         assert cli.main(["identify", str(SAMPLE), *outputs, *options]) == 0
+    write_recording(folder / "gap.mcap", with_a_gap(), site_toml=toml, reason="a gap")
+    rejected = str(folder / "rejected.rrd")
+    assert cli.main(["identify", str(folder / "gap.mcap"), "--rrd", rejected]) == 0
 
 
-def make_many(folder: Path) -> None:
-    """Sixteen crossings with everything at once: twin tyres, bearings that give, friction."""
-    drive = str(folder / "many.mcap")
-    imported = ["import", str(SHARED), "--site", str(SHARED / "site.toml"), "-o", drive]
+def with_a_gap() -> Iterator[Message]:
+    """The sample without the accelerations of 0.3 s while the truck is on the bridge."""
+    messages = list(read_messages(SAMPLE))
+    times = [one.log_time_ns for one in messages if one.key.stream == "accel"]
+    middle = times[len(times) // 2]
+    for one in messages:
+        if one.key.stream != "accel" or abs(one.log_time_ns - middle) > 150_000_000:
+            yield one
+
+
+def take_shared(name: str, folder: Path) -> bytes:
+    """The bridge of the four or the sixteen crossings of one truck."""
+    source, shot = SHARED / name, OF_SHARED[name]
+    drive = str(folder / f"{name}.mcap")
+    imported = ["import", str(source), "--site", str(source / "site.toml"), "-o", drive]
     assert cli.main(imported) == 0
-    assert cli.main(["identify", drive, "--rrd", str(folder / "many.rrd")]) == 0
+    assert cli.main(["identify", drive, "--rrd", str(folder / shot.file)]) == 0
+    return take(shot, folder)
 
 
 def take_demo(folder: Path) -> bytes:
@@ -124,7 +148,8 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
         if shot.chainage_mm is not None:
             viewer.set_time("chainage_mm", sequence=shot.chainage_mm, play_state="paused")
         taken = picture(viewer)
-        assert complaints(viewer) == []
+        said = complaints(viewer)
+        assert not said, said
         return taken
 
 
@@ -169,7 +194,8 @@ def take_live(folder: Path, size: str = "1400x850") -> dict[str, bytes]:
                 driving = viewer.take_screenshot()
                 shows(viewer, GOOD, 1500)
                 answered = viewer.take_screenshot()
-                assert complaints(viewer) == []
+                said = complaints(viewer)
+                assert not said, said
     return {"view-live": driving, "view-live-result": answered}
 
 

@@ -14,7 +14,7 @@ from tests.viewer_screen import has_driver, pixels
 
 def test_every_picture_is_there_small_and_named_on_the_page(project: Path) -> None:
     page = (project / "docs/viewer.md").read_text()
-    shots = (*screenshots.SHOTS, screenshots.OF_MANY)
+    shots = (*screenshots.SHOTS, *screenshots.OF_SHARED.values())
     for shot in shots:
         path = screenshots.FOLDER / f"{shot.name}.png"
         assert path.stat().st_size < screenshots.MOST_BYTES
@@ -41,15 +41,18 @@ def test_every_picture_can_be_made_and_shows_something(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.process
-def test_many_crossings_can_be_shown_with_what_is_not_resolved(
-    shared: Path, tmp_path: Path
+@pytest.mark.parametrize(("name", "orange"), [("d3_edge", 0.002), ("d9_everything", 0.002)])
+def test_bridges_of_many_crossings_can_be_shown(
+    shared: Path, tmp_path: Path, name: str, orange: float
 ) -> None:
     assert screenshots.SHARED.is_relative_to(shared)
     if not has_driver():
         pytest.skip("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)")
-    screenshots.make_many(tmp_path)
-    taken = pixels(screenshots.smaller(screenshots.take(screenshots.OF_MANY, tmp_path)))
+    (which,) = (one for one in screenshots.OF_SHARED if one.startswith(name))
+    taken = pixels(screenshots.smaller(screenshots.take_shared(which, tmp_path)))
     assert (taken.min(axis=2) > 0.95).mean() > 0.3  # the white picture of the bridge
+    weak = np.abs(taken - np.array([230, 159, 0]) / 255.0).max(axis=2) < 0.05
+    assert weak.mean() > orange  # the weak element's bar
 
 
 @pytest.mark.slow
