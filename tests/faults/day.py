@@ -330,7 +330,7 @@ class View(NamedTuple):
             process.wait()
 
     def picture(self) -> "Picture":
-        """What it shows so far."""
+        """What it shows so far; nothing, if there is no file yet or it ends amid a chunk."""
         known = site()
         lanes = {
             f"/{lane_entity(bridge.id, vehicle.id)}": (bridge.id, vehicle.id)
@@ -339,8 +339,8 @@ class View(NamedTuple):
         }
         pages = {f"/said/{bridge.id}": bridge.id for bridge in known.bridges}
         found = Picture(set(), Counter())
-        with warnings.catch_warnings(), contextlib.suppress(RuntimeError):
-            # The file is still being written: it has no footer, and ends in the middle of a chunk.
+        with warnings.catch_warnings(), contextlib.suppress(RuntimeError, ValueError):
+            # The file is still being written: it has no footer.
             warnings.simplefilter("ignore")
             for chunk in RrdReader(self.shown).stream():
                 if chunk.entity_path in pages:
@@ -489,12 +489,14 @@ def live(
             time.sleep(0.5)
         seconds = time.monotonic() - began
         deadline = time.monotonic() + LONGEST_S
-        while problems_of_view(view.picture(), plans) and time.monotonic() < deadline:
+        picture = view.picture()
+        while problems_of_view(picture, plans) and time.monotonic() < deadline:
             assert view.process.poll() is None, fleet.logs()
+            assert view.viewer.poll() is None, fleet.logs()
             time.sleep(0.5)
+            picture = view.picture()
         view.process.send_signal(signal.SIGTERM)
         assert view.process.wait(LONGEST_S) == 0, fleet.logs()
-        picture = view.picture()
         worker.send_signal(signal.SIGTERM)
         assert worker.wait(LONGEST_S) == 0, fleet.logs()
         logger.send_signal(signal.SIGTERM)
