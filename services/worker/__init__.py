@@ -30,7 +30,15 @@ from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Header, verdict_line
 from schemas.settings import IdentificationSettings
-from schemas.signals import Identity
+from schemas.signals import (
+    AccelBatch,
+    GnssFix,
+    Identity,
+    VehicleInfo,
+    decode_accel,
+    decode_gnss,
+    decode_info,
+)
 from schemas.site_file import parse_site, read_site_text, site_hash
 from schemas.topics import (
     HEALTH_PERIOD_S,
@@ -44,6 +52,7 @@ from services.bus.credentials import check_speaks_for
 from services.bus.listening import Elsewhere
 from services.bus.playback import leave_at_once, set_by_signals, stopped_by_signals
 from services.bus.publisher import Publisher
+from services.bus.hearing import DeafError, Hearing
 from services.bus.session import connected
 from services.bus.subscription import Seen, Subscription
 from services.common.errors import FailureError, InputError
@@ -75,6 +84,12 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 _Queue = queue.Queue[Arrived | Token]
+_DECODERS: dict[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]] = {
+    "accel": decode_accel,
+    "gnss": decode_gnss,
+    "info": decode_info,
+}
+"""By the streams of a truck that are looked at."""
 _POLL_S = 0.1
 """So late a stop, a token or a result is seen where no message comes."""
 _LONGEST_QUEUE = 200_000
@@ -337,7 +352,7 @@ def _receive(
     except Exception as error:  # whatever it is, nothing more would be heard
         if not closing.is_set():
             failed.set()
-            unforeseen = not isinstance(error, zenoh.ZError)
+            unforeseen = not isinstance(error, zenoh.ZError | DeafError)
             _log.error("the connection to the bus failed: %s", error, exc_info=unforeseen)
 
 
@@ -349,9 +364,11 @@ def _take_all(
 ) -> None:
     seen = Seen()
     elsewhere, is_told = Elsewhere(bus, realm), False
+    tokens = selector(realm, "vehicle", "alive")
     alive = bus.liveliness().declare_subscriber(
-        selector(realm, "vehicle", "alive"), zenoh.handlers.FifoChannel(1000), history=True
+        tokens, zenoh.handlers.FifoChannel(1000), history=True
     )
+    hearing = Hearing(bus, tokens)
     with Subscription(bus, selector(realm, "vehicle")) as vehicles:
         while not closing.is_set():
             received = vehicles.receive(_POLL_S)
@@ -361,22 +378,44 @@ def _take_all(
                 if token is not None:
                     key = parse_key(str(token.key_expr))
                     is_alive = token.kind == zenoh.SampleKind.PUT
+                    hearing.token(key.identifier, now_s, is_alive=is_alive)
                     _put(arrivals, Token(key.realm, key.identifier, is_alive, now_s), closing)
                 if received is None:
                     elsewhere.look()
+                    hearing.look(now_s)
                     if not is_told and not seen.streams and (line := elsewhere.line()):
                         is_told = True
                         _log.warning("%s", line)
                     continue
+                hearing.heard(now_s)
                 key, identity = received.key(), received.identity()
             except ValueError as error:
                 _log.warning("refused: %.200s", error)
                 continue
-            if key.stream in ("accel", "gnss", "info") and seen.add(key, identity):
+            if key.stream not in _DECODERS:
+                continue
+            try:
+                # A router that cuts off a reader in the middle of a message leaves the rest of it
+                # to whatever comes next. A good copy follows, which must not be taken for known.
+                _check_whole(received.payload, key, identity)
+            except ValueError as error:
+                _log.warning("refused %s of %s: %.200s", key.stream, key.identifier, error)
+                continue
+            if seen.add(key, identity):
                 arrived = Arrived(key, identity.boot_id, received.payload, now_s)
                 _put(arrivals, arrived, closing)
     alive.undeclare()  # type: ignore[no-untyped-call]
     elsewhere.close()
+
+
+def _check_whole(payload: bytes, key: Key, identity: Identity) -> None:
+    """ValueError: the payload is malformed, or of another message than its attachment says."""
+    message = _DECODERS[key.stream](payload)
+    if (message.boot_id, message.sequence) != identity:
+        raise ValueError(
+            f"says that it is {message.sequence} of boot {message.boot_id}, and came as "
+            f"{identity.sequence} of boot {identity.boot_id}"
+        )
 
 
 def _put(arrivals: _Queue, item: Arrived | Token, closing: threading.Event) -> None:

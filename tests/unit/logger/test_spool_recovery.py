@@ -194,12 +194,12 @@ def test_what_has_just_been_said_is_not_asked_for(
     gateway = Gateway(client, "live", "truck-1", Spool(tmp_path))
     drive(gateway, 10)
     logger = Logger(router)
-    now_s = time.monotonic()
     rounds: list[object] = []
     compare = logger.recovery._compare
     monkeypatch.setattr(logger.recovery, "_compare", lambda *of: (compare(*of), rounds.append(of)))
-    logger.run(lambda: bool(rounds), lambda: now_s)
-    assert logger.recovery.waiting() == 0
+    # Asked until the router knows who answers; two answers at once would be two rounds.
+    logger.run(lambda: bool(rounds))
+    assert logger.recovery.waiting() == 0 or len(rounds) > 1
     logger.run(lambda: len(logger.received) == 10)
     assert len(rounds) > 1
     gateway.close()
