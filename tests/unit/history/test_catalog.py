@@ -235,9 +235,9 @@ def test_files_that_are_no_rows_get_a_line_and_stay(fleet: Path) -> None:
     mended = mend(folder)
     assert len(mended.rows) == 3
     newer, cut = sorted(mended.problems)
-    assert newer.endswith("other.parquet: left out: is of edition 2 of the catalogue, this "
+    assert newer.endswith("other.parquet: left out: is of edition 2 of driveby.catalog, this "
                           "program knows 1")  # fmt: skip
-    assert "torn.parquet: left out: is no file of a catalogue" in cut
+    assert "torn.parquet: left out: is no file of driveby.catalog" in cut
     assert torn.exists()
     assert other.exists()
 
