@@ -124,6 +124,16 @@ def test_a_recording_far_from_bridges_is_hardly_read(tmp_path: Path, site: Site)
     assert found.chunks_read < 0.25 * found.chunks
 
 
+def test_who_is_away_at_both_ends_of_a_recording_may_have_been_at_the_bridge(
+    tmp_path: Path, site: Site
+) -> None:
+    """Out over the bridge and back to where the drive began, two kilometres from it."""
+    record(tmp_path / "a.mcap", drive(site, range(400), (100, 300)))
+    folder = folder_at(str(tmp_path))
+    found = crossings_of(folder, mend(folder).rows.values(), site)
+    assert [c.forward for c in found.crossings] == [True, False]
+
+
 def test_mending_names_what_is_gone_and_changed(fleet: Path, site: Site) -> None:
     folder = folder_at(str(fleet))
     assert mend(folder).added == 3
