@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo up test test-all faults soak day mutants validate lint docs bench lock clean
+.PHONY: help install demo up test test-all faults soak day year mutants validate lint docs bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -55,6 +55,9 @@ soak: $(STAMP) ## 50 kills of each kind and an hour of 100 trucks (KILLS=50 MINU
 
 day: $(STAMP) ## two trucks for an hour, a worker that is killed: one result per crossing (MINUTES=60)
 	$(BIN)/python -m tests.faults.day --minutes $(MINUTES)
+
+year: $(STAMP) ## a year of a fleet: 12 bridges, seasons, a loss, a repair: the right alarms (a minute)
+	$(BIN)/python -m tests.faults.year --out build/year
 
 MUTANTS ?= 40
 SEED ?= 1

@@ -93,6 +93,10 @@ TOPICS: tuple[Topic, ...] = (
         1, 1_000, 1 << 20, "the bridge's latest fused estimate; also answers queries",
     ),
     Topic(
+        "bridge", "alarm", "driveby.v1.Alarm", True, True, None, "reliable",
+        1, 1_000, 1 << 14, "the bridge has changed; stands until somebody acknowledges it",
+    ),
+    Topic(
         "service", "health", "driveby.v1.Health", False, False, 1 / HEALTH_PERIOD_S, "latest",
         1, 1_000, 1 << 16, "how a service is: rate, lag, queue, lost, recovered, disk left",
     ),

@@ -188,7 +188,7 @@ def _ready(
     of, b = part.likelihood, layout.bridge
     truck = layout.trucks[part.truck]
     # The mass scales truck and bridge alike: what is found of the bridge lies aside of what it is.
-    heavier = part.mass_spread * _with_mass(priors, centre)
+    heavier = part.mass_spread * with_mass(priors, centre)
     root = np.hstack(
         [
             of.root[:, : b + truck.size - 1],
@@ -211,7 +211,7 @@ def _ready(
     return Ready(precision, linear, places)
 
 
-def _with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
+def with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
     """How the bridge's coordinates (b,) at `centre` change with the logarithm of the total mass."""
     of, power = priors.coordinates, priors.mass_powers
     change = np.where(of.is_log, power / of.scale, power * centre)

@@ -493,6 +493,46 @@ class BridgeState(_message.Message):
     tracks: _containers.RepeatedCompositeFieldContainer[Track]
     def __init__(self, schema_version: _Optional[int] = ..., bridge: _Optional[str] = ..., time_ns: _Optional[int] = ..., flexural_rigidity_nm2: _Optional[_Mapping[str, ElementState]] = ..., between_crossing_std: _Optional[float] = ..., crossings_used: _Optional[_Iterable[str]] = ..., crossings_left_out: _Optional[_Iterable[_Union[LeftOut, _Mapping]]] = ..., crossings_left_out_count: _Optional[int] = ..., verdict: _Optional[_Union[Verdict, str]] = ..., reasons: _Optional[_Iterable[str]] = ..., reason_texts: _Optional[_Iterable[str]] = ..., finding: _Optional[str] = ..., weakest_element: _Optional[str] = ..., probability_of_loss: _Optional[_Mapping[str, Losses]] = ..., level: _Optional[_Union[ElementState, _Mapping]] = ..., left: _Optional[_Union[ElementState, _Mapping]] = ..., middle: _Optional[_Union[ElementState, _Mapping]] = ..., right: _Optional[_Union[ElementState, _Mapping]] = ..., between_crossing_std_q025: _Optional[float] = ..., between_crossing_std_q975: _Optional[float] = ..., tracks: _Optional[_Iterable[_Union[Track, _Mapping]]] = ...) -> None: ...
 
+class Alarm(_message.Message):
+    __slots__ = ("schema_version", "time_ns", "bridge", "alarm_id", "element", "is_stiffer", "since_ns", "raised_ns", "sum", "threshold", "ratio", "ratio_q025", "ratio_q975", "text", "is_acknowledged", "acknowledged_by", "acknowledged_ns", "note")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    BRIDGE_FIELD_NUMBER: _ClassVar[int]
+    ALARM_ID_FIELD_NUMBER: _ClassVar[int]
+    ELEMENT_FIELD_NUMBER: _ClassVar[int]
+    IS_STIFFER_FIELD_NUMBER: _ClassVar[int]
+    SINCE_NS_FIELD_NUMBER: _ClassVar[int]
+    RAISED_NS_FIELD_NUMBER: _ClassVar[int]
+    SUM_FIELD_NUMBER: _ClassVar[int]
+    THRESHOLD_FIELD_NUMBER: _ClassVar[int]
+    RATIO_FIELD_NUMBER: _ClassVar[int]
+    RATIO_Q025_FIELD_NUMBER: _ClassVar[int]
+    RATIO_Q975_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    IS_ACKNOWLEDGED_FIELD_NUMBER: _ClassVar[int]
+    ACKNOWLEDGED_BY_FIELD_NUMBER: _ClassVar[int]
+    ACKNOWLEDGED_NS_FIELD_NUMBER: _ClassVar[int]
+    NOTE_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    time_ns: int
+    bridge: str
+    alarm_id: str
+    element: int
+    is_stiffer: bool
+    since_ns: int
+    raised_ns: int
+    sum: float
+    threshold: float
+    ratio: float
+    ratio_q025: float
+    ratio_q975: float
+    text: str
+    is_acknowledged: bool
+    acknowledged_by: str
+    acknowledged_ns: int
+    note: str
+    def __init__(self, schema_version: _Optional[int] = ..., time_ns: _Optional[int] = ..., bridge: _Optional[str] = ..., alarm_id: _Optional[str] = ..., element: _Optional[int] = ..., is_stiffer: _Optional[bool] = ..., since_ns: _Optional[int] = ..., raised_ns: _Optional[int] = ..., sum: _Optional[float] = ..., threshold: _Optional[float] = ..., ratio: _Optional[float] = ..., ratio_q025: _Optional[float] = ..., ratio_q975: _Optional[float] = ..., text: _Optional[str] = ..., is_acknowledged: _Optional[bool] = ..., acknowledged_by: _Optional[str] = ..., acknowledged_ns: _Optional[int] = ..., note: _Optional[str] = ...) -> None: ...
+
 class Losses(_message.Message):
     __slots__ = ("ten", "twenty", "thirty")
     TEN_FIELD_NUMBER: _ClassVar[int]

@@ -15,10 +15,12 @@ from collections.abc import Sequence
 from typing import Final, NoReturn
 
 from services.cli.access import add_certs
+from services.cli.alarm import add_alarm
 from services.cli.catalog import add_catalog
 from services.cli.check import add_check
 from services.cli.completion import SHELLS, completion
 from services.cli.export import add_export
+from services.cli.history import add_history
 from services.cli.info import add_info
 from services.cli.live import (
     SERVICES,
@@ -51,6 +53,8 @@ _COMMANDS: Final = (
     add_import,
     add_identify,
     add_fuse,
+    add_history,
+    add_alarm,
     add_info,
     add_catalog,
     add_export,

@@ -7,7 +7,6 @@ is killed between the two leaves rows twice, which readers take once.
 """
 
 import hashlib
-import io
 import json
 import logging
 from collections import defaultdict
@@ -27,13 +26,14 @@ from services.common.stores import (
     remove,
 )
 from services.history.catalog_row import Row, content_of, details_text, row_of
+from services.history.parquet_files import decoded, encoded
 from services.identification.bridges import Box
 
 _log = logging.getLogger(__name__)
 CATALOG: Final = "_catalog"
 """No realm is called that."""
 EDITION: Final = "1"
-_EDITION_KEY = "driveby.catalog"
+_KEY = "driveby.catalog"
 
 
 class Stored(NamedTuple):
@@ -183,7 +183,6 @@ def _name(rows: list[Row]) -> str:
 
 def _file_of(rows: list[Row]) -> bytes:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     boxes = [row.box for row in rows]
     table = pa.table(
@@ -201,35 +200,15 @@ def _file_of(rows: list[Row]) -> bytes:
             "details": [details_text(row) for row in rows],
         }
     )
-    out = io.BytesIO()
-    # A file of one row would be mostly statistics and dictionaries of one value.
-    one = {"use_dictionary": False, "write_statistics": False, "store_schema": False}
-    compression = "zstd" if len(rows) > 1 else "none"
-    with pq.ParquetWriter(out, table.schema, compression=compression, **one) as writer:
-        writer.add_key_value_metadata({_EDITION_KEY: EDITION})
-        writer.write_table(table)
-    return out.getvalue()
+    return encoded(table, _KEY, EDITION, compression="zstd" if len(rows) > 1 else "none")
 
 
 def _rows_of(content: bytes) -> list[Row]:
     """The rows of a file; ValueError if it is none of this edition."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     try:
-        file = pq.ParquetFile(io.BytesIO(content))
-        told = file.metadata.metadata or {}
-        edition = told.get(_EDITION_KEY.encode(), b"").decode(errors="replace")
-        if edition != EDITION:
-            raise ValueError(
-                f"is of edition {edition[:20] or 'none'} of the catalogue, this program knows "
-                f"{EDITION}"
-            )
-        return [_row(one) for one in file.read().to_pylist()]
-    except (pa.ArrowException, OSError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"is no file of a catalogue ({' '.join(str(error).split())[:80]})"
-        ) from None
+        return [_row(one) for one in decoded(content, _KEY, EDITION).to_pylist()]
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"is no file of {_KEY} (lacks {error})") from None
 
 
 def _row(told: dict[str, Any]) -> Row:

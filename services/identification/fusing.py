@@ -177,6 +177,12 @@ def fused(sources: Sequence[Source], report: Report = lambda stage, fraction: No
     )
 
 
+def part_of(source: Source) -> tuple[Part, BridgePriors]:
+    """A crossing as fusion takes it, in its own coordinates."""
+    priors = _priors(source.likelihood)
+    return _part(source, priors.coordinates), priors
+
+
 def _tracks(found: Fused, vehicles: Mapping[str, str]) -> tuple[Track, ...]:
     """What runs share; `vehicles` are the trucks' names by their keys in the fusion."""
     return tuple(

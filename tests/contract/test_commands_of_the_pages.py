@@ -34,6 +34,14 @@ NOT_RUN = {
     "driveby catalog s3://bucket/fleet": "tests/unit/history/test_catalog.py has a store",
     'pip install "driveby[s3]"': NETWORK,
     "pytest tests/unit/history/test_catalog.py": ITSELF,
+    "python -m tests.benchmarks.fleet --out /tmp/fleet": LONG,
+    "python -m tests.benchmarks.alarms --figure docs/images/alarm-delay.png": LONG,
+    "python -m tests.faults.year --out build/year": LONG,
+    "make year": LONG,
+    "pytest tests/numerics/test_monitoring.py": ITSELF,
+    "driveby alarm ack BRIDGE --by NAME --note TEXT": (
+        "needs an alarm; tests/unit/history/test_alarms.py has one"
+    ),
     "make install": "installs what this test runs in; .ci/run begins with it",
     "make demo": "tests/process_replay/test_demo.py runs the command of the target",
     "make test": ITSELF,
@@ -222,7 +230,7 @@ def test_the_other_commands_run_in_the_order_of_the_page(
         code = cli.main(arguments)
         assert code == 0, command
         for flag, word in pairs(command):
-            if flag in ("-o", "--json", "--rrd", "--draws", "--to", "--figures"):
+            if flag in ("-o", "--json", "--rrd", "--draws", "--to", "--figures", "--csv"):
                 assert word.startswith("-") or Path(word).exists(), command
 
 

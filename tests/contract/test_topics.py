@@ -35,6 +35,7 @@ def test_the_streams_are_those_of_the_contract() -> None:
         ("bridge", "crossing"),
         ("bridge", "estimate"),
         ("bridge", "state"),
+        ("bridge", "alarm"),
         ("service", "health"),
         ("service", "progress"),
         ("service", "event"),
@@ -46,8 +47,8 @@ def test_the_streams_are_those_of_the_contract() -> None:
 def test_vehicle_data_results_and_events_are_logged() -> None:
     logged = {row.stream for row in TOPICS if row.logged}
     expected = {"accel", "gnss", "location", "info", "crossing", "estimate", "state", "event"}
-    assert logged == expected
-    assert {row.stream for row in TOPICS if row.latched} == {"info", "state", "durable"}
+    assert logged == expected | {"alarm"}
+    assert {row.stream for row in TOPICS if row.latched} == {"info", "state", "alarm", "durable"}
     # A logged message that may be dropped or outrun its cache at once would be a silent loss.
     assert all(row.delivery == "reliable" and row.cache >= 1 for row in TOPICS if row.logged)
 

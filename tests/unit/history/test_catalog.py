@@ -124,6 +124,16 @@ def test_a_recording_far_from_bridges_is_hardly_read(tmp_path: Path, site: Site)
     assert found.chunks_read < 0.25 * found.chunks
 
 
+def test_who_is_away_at_both_ends_of_a_recording_may_have_been_at_the_bridge(
+    tmp_path: Path, site: Site
+) -> None:
+    """Out over the bridge and back to where the drive began, two kilometres from it."""
+    record(tmp_path / "a.mcap", drive(site, range(400), (100, 300)))
+    folder = folder_at(str(tmp_path))
+    found = crossings_of(folder, mend(folder).rows.values(), site)
+    assert [c.forward for c in found.crossings] == [True, False]
+
+
 def test_mending_names_what_is_gone_and_changed(fleet: Path, site: Site) -> None:
     folder = folder_at(str(fleet))
     assert mend(folder).added == 3
@@ -235,9 +245,9 @@ def test_files_that_are_no_rows_get_a_line_and_stay(fleet: Path) -> None:
     mended = mend(folder)
     assert len(mended.rows) == 3
     newer, cut = sorted(mended.problems)
-    assert newer.endswith("other.parquet: left out: is of edition 2 of the catalogue, this "
+    assert newer.endswith("other.parquet: left out: is of edition 2 of driveby.catalog, this "
                           "program knows 1")  # fmt: skip
-    assert "torn.parquet: left out: is no file of a catalogue" in cut
+    assert "torn.parquet: left out: is no file of driveby.catalog" in cut
     assert torn.exists()
     assert other.exists()
 

@@ -1,0 +1,111 @@
+"""Alarms of bridges: as files of a history, and on the wire."""
+
+from datetime import UTC, datetime
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.topics import IDENTIFIER
+
+SCHEMA_VERSION: Final = 1
+_MAX_TEXT_CHARACTERS = 1000
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Fields(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Acknowledgement(_Fields):
+    """Somebody has taken note of an alarm: what is then is what later crossings are held to."""
+
+    edition: Literal[1] = 1
+    by: Annotated[str, Field(min_length=1, max_length=200)]
+    time: Finite
+    """Seconds since 1970 UTC."""
+    note: Annotated[str, Field(max_length=_MAX_TEXT_CHARACTERS)] = ""
+
+
+class Alarm(_Fields):
+    """A bridge is not what it was. Times are seconds since 1970 UTC."""
+
+    edition: Literal[1] = 1
+    alarm_id: Annotated[str, Field(pattern=rf"^{IDENTIFIER}$")]
+    realm: str
+    bridge: str
+    element: Annotated[int, Field(ge=1, le=99)]
+    direction: Literal["weaker", "stiffer"]
+    since: Finite
+    """Beginning of the period in which the change began, most likely."""
+    raised: Finite
+    """End of the period that raised it."""
+    sum: Finite
+    """Of the CUSUM, in standard deviations."""
+    threshold: Finite
+    ratio: Finite
+    """EI of the element now over before, with its 95 % interval."""
+    ratio_q025: Finite
+    ratio_q975: Finite
+    acknowledged: Acknowledgement | None = None
+
+    def sentence(self) -> str:
+        """What it says, in words."""
+        change = 100.0 * abs(1.0 - self.ratio)
+        ends = sorted(100.0 * abs(1.0 - end) for end in (self.ratio_q025, self.ratio_q975))
+        return (
+            f"element {self.element} is {change:.0f} % {self.direction} than before "
+            f"{datetime.fromtimestamp(self.since, UTC):%Y-%m-%d}, "
+            f"interval {ends[0]:.0f} to {ends[1]:.0f} %"
+        )
+
+
+def encode_alarm(alarm: Alarm, time_ns: int) -> bytes:
+    """Return the Alarm message."""
+    note = alarm.acknowledged
+    return pb.Alarm(
+        schema_version=SCHEMA_VERSION,
+        time_ns=time_ns,
+        bridge=alarm.bridge,
+        alarm_id=alarm.alarm_id,
+        element=alarm.element,
+        is_stiffer=alarm.direction == "stiffer",
+        since_ns=round(alarm.since * 1e9),
+        raised_ns=round(alarm.raised * 1e9),
+        sum=alarm.sum,
+        threshold=alarm.threshold,
+        ratio=alarm.ratio,
+        ratio_q025=alarm.ratio_q025,
+        ratio_q975=alarm.ratio_q975,
+        text=alarm.sentence(),
+        is_acknowledged=note is not None,
+        acknowledged_by="" if note is None else note.by,
+        acknowledged_ns=0 if note is None else round(note.time * 1e9),
+        note="" if note is None else note.note,
+    ).SerializeToString(deterministic=True)
+
+
+def alarm_of(message: pb.Alarm, realm: str) -> Alarm:
+    """The alarm of a message; ValueError if its version or its values are none of ours."""
+    if message.schema_version != SCHEMA_VERSION:
+        raise ValueError(f"Alarm has schema version {message.schema_version}, not 1")
+    note = None
+    if message.is_acknowledged:
+        note = Acknowledgement(
+            by=message.acknowledged_by, time=message.acknowledged_ns / 1e9, note=message.note
+        )
+    return Alarm(
+        alarm_id=message.alarm_id,
+        realm=realm,
+        bridge=message.bridge,
+        element=message.element,
+        direction="stiffer" if message.is_stiffer else "weaker",
+        since=message.since_ns / 1e9,
+        raised=message.raised_ns / 1e9,
+        sum=message.sum,
+        threshold=message.threshold,
+        ratio=message.ratio,
+        ratio_q025=message.ratio_q025,
+        ratio_q975=message.ratio_q975,
+        acknowledged=note,
+    )

@@ -1,0 +1,143 @@
+"""`driveby alarm`: has a bridge changed? Looked for in a history, told, and acknowledged."""
+
+import argparse
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from services.cli.history import add_history_folder, alarm_line
+from services.cli.parsing import add_endpoint, command, number, whole
+from services.common.endpoints import default_endpoint
+from services.common.errors import InputError
+
+if TYPE_CHECKING:
+    from services.history.alarms import Checked, Settings
+
+_WHAT = ("check", "list", "ack", "serve")
+
+
+def add_alarm(commands: Any) -> None:
+    """`driveby alarm`: check, list, acknowledge, or tell on the bus."""
+    p = command(
+        commands,
+        "alarm",
+        _alarm,
+        "look for bridges that have changed, list and acknowledge alarms, tell them on the bus",
+        "driveby alarm check --history history",
+    )
+    p.add_argument("what", choices=_WHAT, help="check | list | ack BRIDGE | serve")
+    p.add_argument("bridge", nargs="?", help="of which the alarm is acknowledged")
+    add_history_folder(p)
+    p.add_argument("--realm", help="of a bridge that is in several")
+    p.add_argument("--by", metavar="NAME", help="with ack: who takes note of it")
+    p.add_argument("--note", default="", metavar="TEXT", help="with ack: what was found or done")
+    p.add_argument(
+        "--period", choices=("day", "week", "month"), default="week", help="(default: week)"
+    )
+    p.add_argument(
+        "--false-alarms",
+        type=number("false alarms of a bridge in a year", low=1e-6, high=10.0),
+        default=0.01,
+        metavar="N",
+        help="that one bridge may have in a year (default: 0.01)",
+    )
+    p.add_argument(
+        "--learning",
+        type=whole("a number of periods", 2, 1000),
+        default=8,
+        metavar="PERIODS",
+        help="of which a bridge's baseline is made before it is watched (default: 8)",
+    )
+    p.add_argument("--all", action="store_true", help="look at all bridges again")
+    p.add_argument("--processes", type=whole("a number", 1, 256), default=1, help="(default: 1)")
+    p.add_argument(
+        "--every",
+        type=number("minutes", low=0.01, high=1e5),
+        default=60.0,
+        metavar="MINUTES",
+        help="with serve: between two checks (default: 60)",
+    )
+    add_endpoint(p)
+
+
+def _alarm(options: argparse.Namespace) -> int:
+    what: str = options.what
+    if (options.bridge is None) == (what == "ack"):
+        raise InputError("alarm: ack wants the name of a bridge, and nothing else does")
+    if what == "ack":
+        return _acknowledge(options)
+    if what == "list":
+        return _list(options.history)
+    if what == "serve":
+        return _serve(options)
+    checked = _checked(options)
+    many = "bridges" if checked.bridges != 1 else "bridge"
+    print(f"{checked.bridges} {many} looked at, {len(checked.raised)} new alarms")
+    for alarm in checked.standing:
+        print(alarm_line(alarm))
+    return 0
+
+
+def _settings(options: argparse.Namespace) -> "Settings":
+    from services.history.alarms import Settings
+
+    return Settings(options.period, options.false_alarms, options.learning)
+
+
+def _checked(options: argparse.Namespace) -> "Checked":
+    from services.execution.blas import one_blas_thread
+    from services.history.alarms import check
+
+    with one_blas_thread():
+        checked = check(
+            options.history,
+            _settings(options),
+            time.time(),
+            processes=options.processes,
+            everything=options.all,
+        )
+    for problem in checked.problems:
+        print(problem)
+    return checked
+
+
+def _list(folder: Path) -> int:
+    from services.history.alarm_files import alarms_of
+    from services.history.archive import bridges_of
+
+    number = 0
+    for realm, bridge in bridges_of(folder):
+        alarms, problems = alarms_of(folder, realm, bridge)
+        for line in (*problems, *map(alarm_line, alarms)):
+            print(line)
+        number += len(alarms)
+    if not number:
+        print("no alarms")
+    return 0
+
+
+def _acknowledge(options: argparse.Namespace) -> int:
+    from services.history.alarm_files import acknowledge, alarms_of
+    from services.history.archive import realm_of
+
+    if not options.by:
+        raise InputError("alarm ack: say who takes note of it with --by NAME")
+    realm = realm_of(options.history, options.bridge, options.realm)
+    alarms, problems = alarms_of(options.history, realm, options.bridge)
+    for problem in problems:
+        print(problem)
+    standing = [alarm for alarm in alarms if alarm.acknowledged is None]
+    if not standing:
+        raise InputError(f"{options.history}: no alarm of {options.bridge} stands")
+    for alarm in standing:
+        noted = acknowledge(options.history, alarm, options.by, options.note, time.time())
+        print(alarm_line(noted))
+    return 0
+
+
+def _serve(options: argparse.Namespace) -> int:
+    from services.cli.alarm_service import serve
+
+    endpoint = options.endpoint or default_endpoint(options.tls)
+    every_s = 60.0 * options.every
+    return serve(options.history, lambda: _checked(options), endpoint, options.tls, every_s)

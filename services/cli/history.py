@@ -1,0 +1,265 @@
+"""`driveby history`: results of years, and one bridge of them over time."""
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from services.cli.parsing import a_console, add_file, command
+from services.common.errors import InputError
+
+if TYPE_CHECKING:
+    from schemas.alarms import Alarm
+    from services.history.periods import FusedPeriod
+    from services.viewer.history_figure import History
+
+HISTORY = Path("history")
+_ADD = "add"
+
+
+def add_history(commands: Any) -> None:
+    """`driveby history`: add results, or show a bridge over time."""
+    p = command(
+        commands,
+        "history",
+        _history,
+        "keep results over years, and show EI of each element of a bridge over time",
+        "driveby history add drive.json --history history && "
+        "driveby history bridge-1 --history history",
+    )
+    p.add_argument(
+        "words",
+        nargs="*",
+        metavar="BRIDGE | add RESULTS.json …",
+        help="a bridge to show, or add and results to add; nothing: all bridges in a table",
+    )
+    add_history_folder(p)
+    p.add_argument("--realm", help="where a bridge is in several (default: the one there is)")
+    p.add_argument(
+        "--period", choices=("day", "week", "month"), default="month", help="(default: month)"
+    )
+    add_file(
+        p, "--temperature", "T.csv", "with add: time_s,temperature_deg_c[,bridge] beside crossings"
+    )
+    add_file(p, "--csv", "OUT.csv", "write a row for each period and element here")
+    add_file(p, "--json", "OUT.json", "write periods and alarms here")
+    add_file(p, "--figures", "DIR", "draw the bridge over time here, as PNG and SVG")
+    add_file(p, "--rrd", "OUT.rrd", "write EI over time for Rerun here")
+    p.add_argument("--sql", metavar="SELECT …", help="ask about the table crossings (DuckDB)")
+
+
+def add_history_folder(p: argparse.ArgumentParser) -> None:
+    """`--history`: where a history lies."""
+    p.add_argument(
+        "--history", type=Path, default=HISTORY, metavar="DIR", help="(default: history)"
+    )
+
+
+def _history(options: argparse.Namespace) -> int:
+    words: list[str] = options.words
+    if words[:1] == [_ADD] and len(words) > 1:
+        return _add(options, [Path(word) for word in words[1:]])
+    if options.temperature is not None:
+        raise InputError("--temperature: is for driveby history add RESULTS.json")
+    if len(words) > 1:
+        raise InputError(f"history: one bridge is expected, or {_ADD} RESULTS.json …")
+    return _show(options, words[0]) if words else _table(options)
+
+
+def _add(options: argparse.Namespace, paths: list[Path]) -> int:
+    from schemas.results import load_results
+    from services.history.archive import add_results
+    from services.history.temperatures import temperatures_of
+
+    files = [(path, load_results(path)) for path in paths]  # all of them, before any is written
+    for path, results in files:
+        known = {}
+        if options.temperature is not None:
+            known = temperatures_of(options.temperature, results.crossings)
+        added = add_results(options.history, results, known)
+        of = f" of {', '.join(added.bridges)}" if added.bridges else ""
+        there = f", {added.known} there already" if added.known else ""
+        beside = f", {len(known)} with a temperature" if options.temperature is not None else ""
+        print(f"{path}: {added.crossings} crossings{of} added{there}{beside}")
+    return 0
+
+
+def _table(options: argparse.Namespace) -> int:
+    from services.history.questions import ask, overview
+
+    answer = overview(options.history) if options.sql is None else ask(options.history, options.sql)
+    for problem in answer.problems:
+        print(problem)
+    rows = [answer.columns, *(tuple(map(str, row)) for row in answer.rows)]
+    widths = [max(len(row[n]) for row in rows) for n in range(len(answer.columns))]
+    for row in rows:
+        line = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        print("  ".join(line).rstrip())
+    return 0
+
+
+def _show(options: argparse.Namespace, bridge: str) -> int:
+    from services.common.files import check_writable, make_folder, write_atomically
+    from services.execution.blas import one_blas_thread
+    from services.history.alarm_files import alarms_of
+    from services.history.archive import partition, read_partition, realm_of
+    from services.history.periods import fused_periods
+
+    for path in (options.csv, options.json, options.rrd):
+        if path is not None:
+            check_writable(path)
+    folder: Path = options.history
+    realm = realm_of(folder, bridge, options.realm)
+    read = read_partition(partition(folder, realm, bridge), ("likelihood",))
+    alarms, problems = alarms_of(folder, realm, bridge)
+    for problem in (*read.problems, *problems):
+        print(problem)
+    console = a_console()
+    with console.status(f"fusing {len(read.crossings)} crossings"), one_blas_thread():
+        periods = fused_periods(folder, realm, bridge, read.crossings, options.period, print)
+    if not periods:
+        raise InputError(f"{folder}: no crossing of {bridge} can be read")
+    for line in _lines(bridge, realm, periods, alarms, options.period):
+        print(line)
+    if options.csv is not None:
+        write_atomically(options.csv, "".join(_csv(periods)))
+    if options.json is not None:
+        write_atomically(options.json, _json(bridge, realm, options.period, periods, alarms))
+    written = [path for path in (options.csv, options.json) if path is not None]
+    if options.figures is not None or options.rrd is not None:
+        drawn = history_view(bridge, options.period, periods, alarms)
+        if options.figures is not None:
+            from services.viewer.history_figure import history_figure
+
+            make_folder(options.figures)
+            for form in ("png", "svg"):
+                path = options.figures / f"{bridge}-history.{form}"
+                history_figure(path, drawn)
+                written.append(path)
+        if options.rrd is not None:
+            from services.viewer.rerun_history import write_history
+
+            write_history(options.rrd, drawn)
+            written.append(options.rrd)
+    for path in written:
+        print(path)
+    return 0
+
+
+def history_view(
+    bridge: str, unit: str, periods: "list[FusedPeriod]", alarms: "list[Alarm]"
+) -> "History":
+    """What is drawn of a bridge's past."""
+    from services.viewer.history_figure import History, Mark, Point
+
+    points = []
+    for one in periods:
+        if one.state is not None and one.state.elements:
+            of = list(one.state.elements.values())
+            points.append(
+                Point(
+                    0.5 * (one.begin_s + one.end_s),
+                    tuple(e.mean for e in of),
+                    tuple(e.q025 for e in of),
+                    tuple(e.q975 for e in of),
+                    one.state.verdict or "good",
+                    one.temperature_deg_c,
+                )
+            )
+    marks = tuple(
+        Mark(
+            alarm.element,
+            alarm.direction == "stiffer",
+            alarm.since,
+            alarm.raised,
+            alarm.sentence(),
+            "" if alarm.acknowledged is None else
+            f"{alarm.acknowledged.by}, {_day(alarm.acknowledged.time)}",
+        )
+        for alarm in alarms
+    )  # fmt: skip
+    return History(bridge, unit, tuple(points), marks)
+
+
+def _lines(
+    bridge: str, realm: str, periods: "list[FusedPeriod]", alarms: "list[Alarm]", unit: str
+) -> Iterator[str]:
+    number = sum(one.crossings for one in periods)
+    yield (
+        f"{bridge} in realm {realm}: {number} crossings in {len(periods)} "
+        f"{unit}{'s' if len(periods) != 1 else ''}; EI in GN·m², ± half of the 95 % interval"
+    )
+    elements = max((len(p.state.elements) for p in periods if p.state), default=0)
+    names = "".join(f"{f'EI_{n + 1}':>15}" for n in range(elements))
+    yield f"{unit:<10}  crossings    °C  verdict {names}"
+    for one in periods:
+        warm = "     " if one.temperature_deg_c is None else f"{one.temperature_deg_c:5.1f}"
+        used = 0 if one.state is None else len(one.state.crossings_used)
+        head = f"{_day(one.begin_s)}  {used:>3} of {one.crossings:<3} {warm}"
+        if one.state is None or not one.state.elements:
+            yield f"{head}  none of them tells of the bridge"
+            continue
+        cells = "".join(
+            f"{e.mean / 1e9:7.2f} ± {(e.q975 - e.q025) / 2e9:<5.2f}"
+            for e in one.state.elements.values()
+        )
+        yield f"{head}  {one.state.verdict:<8} {cells}"
+    for alarm in alarms:
+        yield alarm_line(alarm)
+
+
+def alarm_line(alarm: "Alarm") -> str:
+    """An alarm as it is printed."""
+    note = alarm.acknowledged
+    state = "stands" if note is None else f"acknowledged by {note.by} on {_day(note.time)}"
+    said = f": {note.note}" if note is not None and note.note else ""
+    return (
+        f"alarm {alarm.alarm_id} of {alarm.bridge}, raised {_day(alarm.raised)}, {state}{said}; "
+        f"{alarm.sentence()}"
+    )
+
+
+def _csv(periods: "list[FusedPeriod]") -> Iterator[str]:
+    yield (
+        "begin_time,end_time,element,mean_nm2,std_nm2,q025_nm2,q975_nm2,verdict,crossings_used,"
+        "crossings,temperature_deg_c\n"
+    )
+    for one in periods:
+        if one.state is None:
+            continue
+        warm = "" if one.temperature_deg_c is None else f"{one.temperature_deg_c:.2f}"
+        rest = f"{one.state.verdict},{len(one.state.crossings_used)},{one.crossings},{warm}"
+        for name, e in one.state.elements.items():
+            values = f"{e.mean:.6g},{e.std:.6g},{e.q025:.6g},{e.q975:.6g}"
+            yield f"{one.begin_s:.0f},{one.end_s:.0f},{name},{values},{rest}\n"
+
+
+def _json(
+    bridge: str, realm: str, unit: str, periods: "list[FusedPeriod]", alarms: "list[Alarm]"
+) -> str:
+    told = {
+        "bridge": bridge,
+        "realm": realm,
+        "period": unit,
+        "created": time.time(),
+        "periods": [
+            {
+                "begin_time": one.begin_s,
+                "end_time": one.end_s,
+                "crossings": one.crossings,
+                "vehicles": one.vehicles,
+                "temperature_deg_c": one.temperature_deg_c,
+                "state": None if one.state is None else one.state.model_dump(mode="json"),
+            }
+            for one in periods
+        ],
+        "alarms": [alarm.model_dump(mode="json") for alarm in alarms],
+    }
+    return json.dumps(told, indent=1) + "\n"
+
+
+def _day(time_s: float) -> str:
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"

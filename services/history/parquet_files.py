@@ -1,0 +1,45 @@
+"""Tables as bytes of Parquet that say of which edition they are."""
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+def encoded(table: "pa.Table", key: str, edition: str, *, compression: str = "zstd") -> bytes:
+    """The bytes of a file with a table in it, small as they are."""
+    import pyarrow.parquet as pq
+
+    out = io.BytesIO()
+    # A file of few rows would be mostly statistics and dictionaries of one value.
+    lean = {"use_dictionary": False, "write_statistics": False, "store_schema": False}
+    with pq.ParquetWriter(out, table.schema, compression=compression, **lean) as writer:
+        writer.add_key_value_metadata({key: edition})
+        writer.write_table(table)
+    return out.getvalue()
+
+
+def decoded(
+    source: "bytes | Path", key: str, edition: str, columns: list[str] | None = None
+) -> "pa.Table":
+    """The table of a file; ValueError if it is none, or of another edition."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        file = pq.ParquetFile(io.BytesIO(source) if isinstance(source, bytes) else source)
+        told = file.metadata.metadata or {}
+        theirs = told.get(key.encode(), b"").decode(errors="replace")
+        if theirs != edition:
+            raise ValueError(
+                f"is of edition {theirs[:20] or 'none'} of {key}, this program knows {edition}"
+            )
+        found: Any = file.read(columns=columns, use_threads=False)  # small files, and many
+        missing = set(columns or ()) - set(found.column_names)
+        if missing:
+            raise ValueError(f"lacks the column {min(missing)}")
+        return found
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"is no file of {key} ({' '.join(str(error).split())[:80]})") from None

@@ -1,0 +1,65 @@
+"""Temperatures beside crossings: a CSV file of a weather station or of a sensor on the bridge."""
+
+import csv
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Iterable
+from math import isfinite
+from pathlib import Path
+from typing import Final
+
+from schemas.results import Crossing
+from services.common.errors import InputError
+from services.common.files import read_text
+
+_FARTHEST_S: Final = 3 * 3600.0
+"""A temperature of longer before or behind a crossing says nothing of it."""
+_LOWEST, _HIGHEST = -60.0, 80.0
+
+
+def temperatures_of(path: Path, crossings: Iterable[Crossing]) -> dict[str, float]:
+    """°C by crossing id, between the rows before and behind it, where both are near enough.
+
+    Columns `time_s` (Unix time) and `temperature_deg_c`, and `bridge` where rows are of one bridge
+    alone. InputError names the line that is none.
+    """
+    rows = _rows(path)
+    found = {}
+    for crossing in crossings:
+        series = rows.get(crossing.bridge) or rows.get("") or []
+        value = _at(series, 0.5 * (crossing.entry_time + crossing.exit_time))
+        if value is not None:
+            found[crossing.crossing_id] = value
+    return found
+
+
+def _rows(path: Path) -> dict[str, list[tuple[float, float]]]:
+    lines = csv.DictReader(read_text(path).splitlines())
+    names = lines.fieldnames or ()
+    for wanted in ("time_s", "temperature_deg_c"):
+        if wanted not in names:
+            raise InputError(f"{path}: has no column {wanted}, but {', '.join(names)[:80]}")
+    found: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
+    for number, row in enumerate(lines, start=2):
+        try:
+            time_s, value = float(row["time_s"]), float(row["temperature_deg_c"])
+        except (TypeError, ValueError):
+            raise InputError(f"{path}: line {number}: two numbers are expected") from None
+        if not (isfinite(time_s) and _LOWEST <= value <= _HIGHEST):
+            raise InputError(
+                f"{path}: line {number}: {value:g} is no temperature of a bridge in °C "
+                f"({_LOWEST:g} to {_HIGHEST:g})"
+            )
+        found[row.get("bridge") or ""].append((time_s, value))
+    return {bridge: sorted(series) for bridge, series in found.items()}
+
+
+def _at(series: list[tuple[float, float]], time_s: float) -> float | None:
+    n = bisect_left(series, (time_s, 0.0))
+    near = [one for one in series[max(n - 1, 0) : n + 1] if abs(one[0] - time_s) <= _FARTHEST_S]
+    if not near:
+        return None
+    if len(near) == 1:
+        return near[0][1]
+    (a, low), (b, high) = near
+    return low + (high - low) * (time_s - a) / (b - a) if b > a else low

@@ -1,0 +1,208 @@
+"""The picture of a bridge's past: EI of each element over time, its alarms, temperature beneath."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+from matplotlib.figure import Figure
+
+from services.viewer.crossing_view import VERDICT_COLOURS
+from services.viewer.drawing import (
+    BAR_EDGE,
+    GRID,
+    INK,
+    LEFT,
+    MUTED,
+    RIGHT,
+    STYLE,
+    WEAK_EDGE,
+    WIDTH_IN,
+    write_figure,
+)
+
+_PANEL_IN, _TEMPERATURE_IN = 0.92, 0.75
+
+
+class Point(NamedTuple):
+    """A bridge in one period; time in s since 1970 UTC, EI in N·m²."""
+
+    time_s: float
+    mean: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    verdict: str
+    temperature_deg_c: float | None
+
+
+class Mark(NamedTuple):
+    """An alarm in the picture."""
+
+    element: int
+    """From 1."""
+    is_stiffer: bool
+    since_s: float
+    raised_s: float
+    sentence: str
+    acknowledged: str
+    """By whom and when; empty while it stands."""
+
+
+class History(NamedTuple):
+    """What a picture of a bridge's past is drawn from."""
+
+    bridge: str
+    unit: str
+    points: tuple[Point, ...]
+    marks: tuple[Mark, ...]
+
+
+def history_figure(path: Path, history: History) -> None:
+    """Draw a bridge's past into a PNG or SVG file; an existing file is replaced."""
+    with matplotlib.rc_context(STYLE):
+        figure = draw_history(history)
+    write_figure(path, figure)
+
+
+def draw_history(history: History) -> Figure:
+    """The figure itself, to be drawn in `STYLE`: a panel for each element, the same scale in all.
+
+    In per cent of each element's own median, so that elements can be compared.
+    """
+    elements = max((len(point.mean) for point in history.points), default=0)
+    has_temperature = any(p.temperature_deg_c is not None for p in history.points)
+    lines = _heading(history)
+    heading = 0.62 + 0.2 * len(lines)
+    bottom = 0.45
+    below = _TEMPERATURE_IN + 0.12 if has_temperature else 0.0
+    height = heading + _PANEL_IN * elements + below + bottom
+    figure = Figure(figsize=(WIDTH_IN, height))
+    FigureCanvasAgg(figure)
+    figure.text(
+        LEFT, 1.0 - 0.28 / height, f"{history.bridge}: rigidity over time", va="top",
+        fontsize=13, fontweight="bold", color=INK, parse_math=False,
+    )  # fmt: skip
+    for number, (text, colour) in enumerate(lines):
+        top = 1.0 - (0.58 + 0.2 * number) / height
+        figure.text(LEFT, top, text, va="top", fontsize=9.5, color=colour, parse_math=False)
+    limits = _limits(history, elements)
+    first = None
+    for n in range(elements):
+        at = 1.0 - (heading + _PANEL_IN * (n + 1)) / height
+        axes = figure.add_axes((LEFT, at, RIGHT - LEFT, (_PANEL_IN - 0.12) / height), sharex=first)
+        first = first or axes
+        _draw_element(axes, history, n, limits)
+        axes.tick_params(labelbottom=n == elements - 1 and not has_temperature)
+    if has_temperature and first is not None:
+        size = (LEFT, bottom / height, RIGHT - LEFT, (_TEMPERATURE_IN - 0.1) / height)
+        _draw_temperature(figure.add_axes(size, sharex=first), history)
+    return figure
+
+
+def _heading(history: History) -> list[tuple[str, str]]:
+    many = len(history.points)
+    said = f"{many} {history.unit}{'s' if many != 1 else ''} with crossings; bars: 95 % intervals"
+    lines = [(said + ", grey where no crossing was good", MUTED)]
+    for mark in history.marks:
+        begin = "noted" if mark.acknowledged else "ALARM"
+        by = f" ({mark.acknowledged})" if mark.acknowledged else ""
+        lines.append((f"{begin}: {mark.sentence}{by}", _colour(mark)))
+    if not history.marks:
+        lines.append(("no alarm: nothing has changed by more than chance", VERDICT_COLOURS["good"]))
+    return lines
+
+
+def _colour(mark: Mark) -> str:
+    if mark.acknowledged:
+        return INK
+    return BAR_EDGE if mark.is_stiffer else WEAK_EDGE
+
+
+def _limits(history: History, elements: int) -> tuple[float, float]:
+    values = [
+        100.0 * value[n] / _usual(history, n)
+        for n in range(elements)
+        for point in history.points
+        if len(point.mean) > n
+        for value in (point.low, point.high)
+    ]
+    if not values:
+        return 80.0, 120.0
+    low, high = np.quantile(values, [0.01, 0.99])
+    return float(min(low, 90.0) - 4.0), float(max(high, 110.0) + 4.0)
+
+
+def _usual(history: History, n: int) -> float:
+    return float(np.median([p.mean[n] for p in history.points if len(p.mean) > n]))
+
+
+def _draw_element(axes: Axes, history: History, n: int, limits: tuple[float, float]) -> None:
+    usual = _usual(history, n)
+    axes.axhline(100.0, color=MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
+    for is_good in (True, False):
+        some = [p for p in history.points if len(p.mean) > n and (p.verdict == "good") == is_good]
+        if not some:
+            continue
+        colour = BAR_EDGE if is_good else "#8a8f94"
+        times = _dates(p.time_s for p in some)
+        mean, low, high = (
+            np.array([100.0 * getattr(p, name)[n] / usual for p in some])
+            for name in ("mean", "low", "high")
+        )
+        axes.vlines(times, low, high, color=colour, linewidth=1.6, alpha=0.75)
+        axes.plot(times, mean, linestyle="none", marker="o", markersize=3.2, color=colour)
+    for mark in history.marks:
+        if mark.element == n + 1:
+            colour = _colour(mark)
+            since, raised = _dates([mark.since_s, mark.raised_s])
+            axes.axvspan(since, raised, color=colour, alpha=0.13, linewidth=0.0)
+            axes.axvline(raised, color=colour, linewidth=1.6)
+            axes.annotate(
+                "stiffer" if mark.is_stiffer else "weaker", (raised, limits[1]),
+                xytext=(4, -3), textcoords="offset points", va="top", fontsize=8.5,
+                color=colour, fontweight="bold",
+            )  # fmt: skip
+    axes.set_ylim(*limits)
+    axes.set_ylabel(f"EI_{n + 1}", rotation=0, ha="right", va="center", labelpad=6)
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0f} %")
+    axes.yaxis.tick_right()
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.text(
+        0.004, 0.06, f"100 % is {usual / 1e9:.2f} GN·m²", transform=axes.transAxes,
+        fontsize=7.5, color=MUTED,
+    )  # fmt: skip
+    _over_time(axes)
+
+
+def _draw_temperature(axes: Axes, history: History) -> None:
+    known = [p for p in history.points if p.temperature_deg_c is not None]
+    axes.plot(
+        _dates(p.time_s for p in known), [p.temperature_deg_c or 0.0 for p in known],
+        color="#CC79A7", marker="o", markersize=2.5, linewidth=1.0,
+    )  # fmt: skip
+    axes.set_ylabel("°C", rotation=0, ha="right", va="center", labelpad=6)
+    axes.yaxis.tick_right()
+    axes.grid(color=GRID, linewidth=0.8)
+    _over_time(axes)
+
+
+def _over_time(axes: Axes) -> None:
+    locator: Any = AutoDateLocator(tz=UTC)  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_locator(locator)
+    form: Any = ConciseDateFormatter(locator, tz=UTC)  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_formatter(form)
+    for side in ("top", "left", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def _dates(times_s: Iterable[float]) -> list[float]:
+    days: list[float] = [date2num(datetime.fromtimestamp(t, UTC)) for t in times_s]  # type: ignore[no-untyped-call]
+    return days

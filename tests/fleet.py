@@ -1,0 +1,177 @@
+"""A fleet whose crossings are drawn from the method's own statistics, not driven.
+
+    python -m tests.fleet RESULTS.json …
+
+writes the likelihoods of identified crossings to tests/data/fleet_likelihoods.json. A crossing of
+the fleet is one of them with another truth: -|R x - z|²/2 is its likelihood, so with x the truth
+and unit noise z = R x + noise. x has the bridge's EI on that day, what its truck is (the same in
+all its crossings), and the error of the truck's mass. Nothing is integrated and nothing searched:
+that takes seconds a crossing, and tests/numerics and docs/fusion.md say how true the likelihoods
+are.
+"""
+
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.fusion.joint import with_mass
+from schemas.fusion import FusionLikelihood
+from schemas.results import Crossing, Header, Parameter, Results, load_results, results
+from services.identification.fusing import Source, part_of
+from services.identification.observed import observation_of
+
+Floats = NDArray[np.float64]
+STORED = Path(__file__).parent / "data" / "fleet_likelihoods.json"
+DAY_S = 86_400.0
+WEEK_S = 7.0 * DAY_S
+HEADER = Header("0.1.0", 0.0, "0" * 64, {}, 1)
+
+
+class Template(NamedTuple):
+    """A crossing that was identified: what it tells, whatever it tells it of."""
+
+    likelihood: FusionLikelihood
+    direction: str
+    root: Floats  # (m, m)
+
+
+class Truck(NamedTuple):
+    """What a truck is beside what its site file says, in standard deviations of the priors."""
+
+    name: str
+    unknowns: Floats
+    mass: float
+
+
+class Bridge(NamedTuple):
+    """A bridge's truth."""
+
+    name: str
+    realm: str
+    ei_nm2: Floats  # (n,) at 10 °C
+    slope_per_k: float
+    others: Floats
+    """Its other unknowns, in standard deviations."""
+
+
+def templates() -> list[Template]:
+    """Those that are stored."""
+    found = []
+    for told in json.loads(STORED.read_text()):
+        likelihood = FusionLikelihood.model_validate(told["likelihood"])
+        m = len(likelihood.target)
+        root = np.zeros((m, m))
+        root[np.triu_indices(m)] = likelihood.root
+        found.append(Template(likelihood, told["direction"], root))
+    return found
+
+
+def trucks_of(rng: np.random.Generator, number: int) -> list[Truck]:
+    """Trucks as the priors have them."""
+    unknowns = len(templates()[0].likelihood.truck)
+    return [
+        Truck(f"truck-{n + 1}", rng.standard_normal(unknowns), float(rng.standard_normal()))
+        for n in range(number)
+    ]
+
+
+def bridge_of(rng: np.random.Generator, name: str, realm: str = "sim-fleet") -> Bridge:
+    """A sound bridge: each element by some per cent another than nominal."""
+    of = templates()[0].likelihood
+    elements = len(of.element_lengths_m)
+    nominal = np.array([c.location for c in of.bridge[-elements:]])
+    level = 0.1 * rng.standard_normal()
+    ei = nominal * np.exp(level + 0.05 * rng.standard_normal(elements))
+    others = rng.standard_normal(len(of.bridge) - elements)
+    is_log = np.array([c.is_log for c in of.bridge[:-elements]])
+    # Free bearings: what is half-normal and may be absent is absent.
+    slope = -0.003 + 0.0005 * rng.standard_normal()
+    return Bridge(name, realm, ei, float(slope), np.where(is_log, others, 0.0))
+
+
+def crossing_of(
+    rng: np.random.Generator,
+    template: Template,
+    truck: Truck,
+    bridge: Bridge,
+    entry_s: float,
+    ei_nm2: Floats,
+) -> Crossing:
+    """A crossing of a bridge that has a rigidity at that time."""
+    of = template.likelihood
+    name = f"{truck.name}.{bridge.name}.{entry_s:.3f}"
+    part, priors = part_of(Source(name, truck.name, 1, of))
+    n, b = priors.elements, len(of.bridge)
+    x = np.concatenate([bridge.others, priors.coordinates.location[b - n :] / ei_nm2])
+    # The mass scales truck and bridge alike: what is found of the bridge lies aside of what it is.
+    x = x + truck.mass * part.mass_spread * with_mass(priors, x)
+    target = template.root @ np.concatenate([x, truck.unknowns])
+    target = target + rng.standard_normal(target.size)
+    likelihood = of.model_copy(update={"target": tuple(float(f"{v:.9e}") for v in target)})
+    crossing = Crossing(
+        crossing_id=name,
+        realm=bridge.realm,
+        vehicle=truck.name,
+        bridge=bridge.name,
+        direction=template.direction,  # type: ignore[arg-type]
+        entry_time=entry_s,
+        exit_time=entry_s + 4.0,
+        speed_m_per_s=10.0,
+        method="pre",
+        verdict="good",
+        chi2_per_dof=1.0,
+        parameters=_parameters(dict(zip(_names(n), ei_nm2, strict=True)), 0.05),
+        fusion_likelihood=likelihood,
+    )
+    found = observation_of(crossing)
+    if found is None:  # twice as stiff or half, by its noise: then it tells nothing
+        return crossing
+    own = found.own + sum((s.loading @ s.loading.T for s in found.shared), np.zeros((n, n)))
+    values = dict(zip(_names(n), np.exp(found.value), strict=True))
+    return crossing.model_copy(update={"parameters": _parameters(values, np.sqrt(np.diag(own)))})
+
+
+def results_of(crossings: list[Crossing], created_s: float) -> Results:
+    """Crossings as a results file has them."""
+    return results(HEADER._replace(created=created_s), crossings, {})
+
+
+def season_deg_c(time_s: float) -> float:
+    """Coldest at the end of January, warmest half a year later."""
+    return 11.0 - 11.0 * float(np.cos(2.0 * np.pi * (time_s / DAY_S - 25.0) / 365.25))
+
+
+def _names(elements: int) -> list[str]:
+    return [f"EI_{n + 1}" for n in range(elements)]
+
+
+def _parameters(values: Mapping[str, float], spread: float | Floats) -> dict[str, Parameter]:
+    spreads = np.broadcast_to(spread, (len(values),))
+    return {
+        name: Parameter(
+            unit="N·m²",
+            mean=float(value),
+            std=float(value * s),
+            q025=float(value * np.exp(-1.96 * s)),
+            q50=float(value),
+            q975=float(value * np.exp(1.96 * s)),
+        )
+        for (name, value), s in zip(values.items(), spreads, strict=True)
+    }
+
+
+def _stored(paths: list[Path]) -> Iterator[dict[str, object]]:
+    for path in paths:
+        for crossing in load_results(path).crossings:
+            if crossing.fusion_likelihood is not None and crossing.verdict == "good":
+                likelihood = crossing.fusion_likelihood.model_dump(mode="json")
+                yield {"direction": crossing.direction, "likelihood": likelihood}
+
+
+if __name__ == "__main__":
+    STORED.write_text(json.dumps(list(_stored([Path(name) for name in sys.argv[1:]]))) + "\n")
