@@ -42,6 +42,7 @@ from schemas.signals import (
 from schemas.site_file import parse_site, read_site_text, site_hash
 from schemas.topics import (
     HEALTH_PERIOD_S,
+    Key,
     check_identifier,
     check_realm,
     is_replayed,
@@ -49,10 +50,10 @@ from schemas.topics import (
     selector,
 )
 from services.bus.credentials import check_speaks_for
+from services.bus.hearing import DeafError, Hearing
 from services.bus.listening import Elsewhere
 from services.bus.playback import leave_at_once, set_by_signals, stopped_by_signals
 from services.bus.publisher import Publisher
-from services.bus.hearing import DeafError, Hearing
 from services.bus.session import connected
 from services.bus.subscription import Seen, Subscription
 from services.common.errors import FailureError, InputError
