@@ -202,7 +202,8 @@ def _refreshed(rows: Rows, state: State, info: Info) -> tuple[State, Info]:
 
 
 def _square(residual: FloatArray) -> float:
-    return float(residual @ residual)
+    with np.errstate(over="ignore"):  # of a point far off: infinite, and no step is taken there
+        return float(residual @ residual)
 
 
 def _jacobian(

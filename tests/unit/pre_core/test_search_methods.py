@@ -4,6 +4,7 @@ The data are the paper's own set-up: simulated with the mesh and the step that t
 """
 
 import pickle
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -383,6 +384,20 @@ def test_slopes_that_are_led_on_end_at_the_same_bottom_for_less(seed: int) -> No
     assert found.state.objective == pytest.approx(exact.state.objective, rel=1e-6)
     np.testing.assert_allclose(found.state.y, exact.state.y, atol=1e-3)
     assert np.all(found.state.y >= lower)
+
+
+@pytest.mark.parametrize("is_followed", [False, True])
+def test_a_point_far_off_is_turned_back_from_without_a_word(is_followed: bool) -> None:
+    """Rows so large that their squares are infinite; warnings are errors here."""
+
+    def rows(y: np.ndarray) -> np.ndarray:
+        return np.where(np.abs(y) > 0.7, 1e200, np.tanh(y) - 0.5)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        start = np.array([0.69, -0.69])
+        found = levenberg_marquardt.minimised(rows, start, 50, 1e-9, is_followed=is_followed)
+    np.testing.assert_allclose(found.state.y, np.arctanh(0.5), atol=1e-4)
 
 
 def test_at_its_bounds_a_search_ends_at_once():
