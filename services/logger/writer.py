@@ -328,7 +328,8 @@ class FileWriter:
         self._closed_names[name] = opened.file.path.name
         _log.info("closed %s: %s", opened.file.path, reason)
         # Beside the writing: a file is read once more for its row, which nobody waits for.
-        self._cataloguing.submit(catalog_closed, self._folder(), opened.file.path)
+        if self._place.file is None:  # a file that somebody named belongs to no collection
+            self._cataloguing.submit(catalog_closed, self._folder(), opened.file.path)
 
     def _replace(self, name: FileName, what: Misplaced) -> None:
         """Begin a new file for one that somebody has deleted, cut or moved, and say so."""
