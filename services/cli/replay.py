@@ -118,11 +118,16 @@ def _replay(options: argparse.Namespace) -> int:
 
 
 def _print(found: "Statistics") -> None:
+    print("\n".join(summary(found)))
+
+
+def summary(found: "Statistics") -> list[str]:
+    """What was published, in lines; the pace is of what was played, and of no jump."""
     streams = ", ".join(f"{stream} {n}" for stream, n in found.by_stream.items()) or "none"
     rounds = f", {found.rounds} rounds" if found.rounds > 1 else ""
     pace = ""
-    if found.took_s > 0.0:
-        factor = found.drive_s / found.took_s
+    if found.took_s > 0.0 and not found.jumped_over:
+        factor = (found.drive_s - found.skipped_s) / found.took_s
         pace = (
             f", {factor:,.0f} times real speed"
             if factor >= 10
@@ -140,4 +145,4 @@ def _print(found: "Statistics") -> None:
         lines.append(f"{found.skipped_s:.1f} s of silence passed over")
     on_disk = "a logger has them on disk" if found.is_confirmed else "no logger confirmed them"
     lines.append(on_disk)
-    print("\n".join(lines))
+    return lines

@@ -30,6 +30,8 @@ KEYS: Final = {
 HELP: Final = "space pause · s step · + - speed · n next crossing · q quit"
 _ERASE = "\r\x1b[K"
 _BAR_CELLS: Final = 24
+_FEWEST_CELLS: Final = 6
+"""A shorter bar tells nothing."""
 
 
 def has_terminal() -> bool:
@@ -53,7 +55,7 @@ def terminal(realm: str, drive: Drive, stop: threading.Event) -> Iterator[Contro
 
     def show(status: Status) -> None:
         width = shutil.get_terminal_size().columns
-        sys.stdout.write(_ERASE + status_line(drive, status)[: width - 1])
+        sys.stdout.write(_ERASE + status_line(drive, status, width - 1))
         sys.stdout.flush()
 
     descriptor = sys.stdin.fileno()
@@ -66,8 +68,11 @@ def terminal(realm: str, drive: Drive, stop: threading.Event) -> Iterator[Contro
             sys.stdout.flush()
 
 
-def status_line(drive: Drive, status: Status) -> str:
-    """Where the replay is: ▶ 10×  0:12.3 / 0:35.9  ━━━◆━━━────◇──  crossing 1 of 2."""
+def status_line(drive: Drive, status: Status, width: int) -> str:
+    """Where the replay is: ▶ 10×  0:12.3 / 0:35.9  ━━━◆━━━────◇──  crossing 1 of 2.
+
+    In at most `width` columns: where they are few the bar is shorter, for the words say more.
+    """
     begin_ns, end_ns = drive.window
     length_s = (end_ns - begin_ns) * 1e-9
     at_s = min(max(0.0, (status.position_ns - begin_ns) * 1e-9), length_s)
@@ -75,21 +80,23 @@ def status_line(drive: Drive, status: Status) -> str:
     parts = [
         f"{'⏸' if status.is_paused else '▶'} {speed}",
         f"{_clock(at_s)} / {_clock(length_s)}",
-        _bar(at_s / length_s if length_s > 0.0 else 1.0, drive),
     ]
     if drive.crossings_ns:
         begun = sum(entry_ns <= status.position_ns for entry_ns in drive.crossings_ns)
         parts.append(f"crossing {begun} of {len(drive.crossings_ns)}")
     parts.append(status.note or f"{status.sent} messages")
-    return "  ".join(parts)
+    cells = min(_BAR_CELLS, width - len("  ".join(["", *parts])))
+    if cells >= _FEWEST_CELLS:
+        parts.insert(2, _bar(at_s / length_s if length_s > 0.0 else 1.0, drive, cells))
+    return "  ".join(parts)[:width]
 
 
-def _bar(share: float, drive: Drive) -> str:
+def _bar(share: float, drive: Drive, length: int) -> str:
     begin_ns, end_ns = drive.window
-    done = round(share * _BAR_CELLS)
-    cells = ["━" if cell < done else "─" for cell in range(_BAR_CELLS)]
+    done = round(share * length)
+    cells = ["━" if cell < done else "─" for cell in range(length)]
     for entry_ns in drive.crossings_ns:
-        cell = (entry_ns - begin_ns) * _BAR_CELLS // max(1, end_ns - begin_ns)
+        cell = (entry_ns - begin_ns) * length // max(1, end_ns - begin_ns)
         cells[cell] = "◆" if cell < done else "◇"
     return "".join(cells)
 

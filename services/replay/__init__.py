@@ -159,7 +159,7 @@ def _play_rounds(
             hold_back(delivery, sent.total())
 
         rounds.append(_Round(play(drive.messages(), put, course, controls), sent))
-        course = course._replace(start_paused=False)
+        course = rounds[-1].played.course
     return rounds
 
 

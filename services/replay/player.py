@@ -75,6 +75,8 @@ class Played(NamedTuple):
     skipped_ns: int
     """Silence that was not waited for."""
     has_quit: bool
+    course: Course
+    """How another round goes on: at the speed, and with the pause, that the user has chosen."""
 
 
 def play(
@@ -110,7 +112,8 @@ def play(
         first_ns = last_ns if first_ns is None else first_ns
     controls.show(tape.status())
     covered_ns = 0 if first_ns is None or last_ns is None else last_ns - first_ns
-    return Played(covered_ns, jumped_over, tape.skipped_ns, tape.has_quit)
+    chosen = course._replace(speed=tape.speed, start_paused=tape.is_paused)
+    return Played(covered_ns, jumped_over, tape.skipped_ns, tape.has_quit, chosen)
 
 
 def _wait_for_turn(tape: "_Tape", due_ns: int, controls: Controls) -> None:

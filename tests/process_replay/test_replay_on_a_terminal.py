@@ -172,6 +172,21 @@ def test_a_loop_is_logged_once_and_ends_with_a_signal(
     assert len(list(read_messages(tmp_path / "again.mcap"))) == 401
 
 
+def test_a_loop_keeps_the_pause_and_the_speed_of_the_round_before(
+    start: Start, on_a_terminal: Begin, endpoint: str, recording: Path, tmp_path: Path
+) -> None:
+    start_logger(start, endpoint, tmp_path / "again.mcap")
+    first_two = ("--duration", "0.07", "--topics", "accel")
+    shown = on_a_terminal(replay(recording, endpoint, "--loop", "--paused", *first_two))
+    shown.shows("⏸ 1×.* 0 messages")
+    for key, line in (("+", "⏸ 2×.* 0 messages"), ("s", "⏸ 2×.* 1 messages"), ("s", "2 messages")):
+        shown.type(key)
+        shown.shows(line)
+    assert shown.shows(r"([⏸▶] [^ ]+)[^\r]* 0 messages")[1] == "⏸ 2×"
+    shown.type("q")
+    assert shown.ends() == 0
+
+
 def test_a_damaged_file_in_a_folder_gives_what_is_intact(
     start: Start, terminate: End, endpoint: str, recording: Path, tmp_path: Path
 ) -> None:

@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 
 from services.cli import terminal
+from services.cli.replay import summary
+from services.replay import Statistics
 from services.replay.choice import Window
 from services.replay.drive import Drive
 from services.replay.player import Command, Status
@@ -27,27 +29,50 @@ def status(at_s: float, speed: float = 1.0, *, paused: bool = False, note: str =
 
 
 def test_the_line_says_where_it_is() -> None:
-    line = terminal.status_line(DRIVE, status(15.0, 2.0))
+    line = terminal.status_line(DRIVE, status(15.0, 2.0), 99)
     assert line.startswith("▶ 2×  0:15.0 / 1:00.0  ━━━━◆━──────")
     assert line.endswith("crossing 1 of 2  42 messages")
     bar = line.split("  ")[2]
     assert len(bar) == 24
     assert [bar.index(mark) for mark in "◆◇"] == [4, 16]
-    paused = terminal.status_line(DRIVE, status(0.0, 0.0, paused=True, note="no more"))
+    paused = terminal.status_line(DRIVE, status(0.0, 0.0, paused=True, note="no more"), 99)
     assert paused.startswith("⏸ max  0:00.0 / 1:00.0  ────◇")
     assert paused.endswith("crossing 0 of 2  no more")
 
 
+def test_where_columns_are_few_the_bar_gives_way_and_the_words_stay() -> None:
+    day = Drive((), {}, Window(0, 29_008 * S), (3 * S, 28_000 * S), ())
+    at_rest = Status(60 * S, 10.0, is_paused=True, sent=10_255, note="no crossing ahead")
+    wide, narrow, tiny = (terminal.status_line(day, at_rest, width) for width in (99, 79, 64))
+    assert [len(line.split("  ")[2]) for line in (wide, narrow)] == [24, 16]
+    assert [narrow.count(mark) for mark in "◆◇"] == [0, 2]
+    assert all(line.endswith("crossing 1 of 2  no crossing ahead") for line in (wide, narrow, tiny))
+    assert len(narrow) == 79
+    assert "─" not in tiny
+    assert len(terminal.status_line(day, at_rest, 20)) == 20
+
+
 def test_the_bar_is_full_at_the_end_and_never_fuller() -> None:
     for at_s in (60.0, 900.0):
-        line = terminal.status_line(DRIVE, status(at_s))
+        line = terminal.status_line(DRIVE, status(at_s), 99)
         assert "1:00.0 / 1:00.0" in line
         assert line.count("━") == 22
     hour = Drive((), {}, Window(0, 3700 * S), (), ())
-    assert "1:01:40.0" in terminal.status_line(hour, status(0.0))
-    assert "crossing" not in terminal.status_line(hour, status(0.0))
+    assert "1:01:40.0" in terminal.status_line(hour, status(0.0), 99)
+    assert "crossing" not in terminal.status_line(hour, status(0.0), 99)
     nothing = Drive((), {}, Window(5, 6), (5,), ())
-    assert "◆" in terminal.status_line(nothing, status(0.0))
+    assert "◆" in terminal.status_line(nothing, status(0.0), 99)
+
+
+def test_the_pace_counts_neither_silence_that_was_passed_over_nor_jumps() -> None:
+    of_all = Statistics("replay-x", {"accel": 9}, (), 1, 1800.0, 4.0, 0, 0.0, is_confirmed=True)
+    assert summary(of_all)[1] == "1800.0 s of the drive in 4.00 s, 450 times real speed"
+    lines = summary(of_all._replace(skipped_s=1760.0))
+    assert lines[1] == "1800.0 s of the drive in 4.00 s, 10 times real speed"
+    assert "1760.0 s of silence passed over" in lines
+    lines = summary(of_all._replace(jumped_over=7))
+    assert lines[1] == "1800.0 s of the drive in 4.00 s"
+    assert "7 messages left out by jumps" in lines
 
 
 @pytest.fixture

@@ -77,7 +77,7 @@ def test_as_fast_as_possible_waits_for_nothing() -> None:
     played, came = (user := User()).played(recorded(0.0, 1e6, 2e6), Course(0.0))
     assert [number for number, _ in came] == [0, 1, 2]
     assert user.now_s == 1000.0
-    assert played == Played(round(2e6 * S), 0, 0, has_quit=False)
+    assert played == Played(round(2e6 * S), 0, 0, has_quit=False, course=Course(0.0))
 
 
 def test_a_latched_message_neither_waits_nor_is_waited_for() -> None:
@@ -98,6 +98,16 @@ def test_a_step_is_one_message_each_also_when_two_are_asked_for_at_once() -> Non
     user = User(STEP_1=1.5, STEP_2=1.5, PAUSE_3=20.0)
     _, came = user.played(recorded(0.0, 1.0, 2.0, 3.0, 4.0, 6.0), Course(1.0))
     assert came == [(0, 0.0), (1, 1.0), (2, 1.5), (3, 1.5), (4, 21.0), (5, 23.0)]
+
+
+def test_the_next_round_goes_on_at_the_speed_and_with_the_pause_of_this_one() -> None:
+    begun = Course(1.0, start_paused=True, crossings_ns=(START_NS,))
+    played, _ = User(PAUSE=1.0, FASTER=1.5).played(recorded(0.0, 1.0), begun)
+    assert played.course == begun._replace(speed=2.0, start_paused=False)
+    stepping = User(STEP_1=0.5, STEP_2=0.5)
+    played, came = stepping.played(recorded(0.0, 1.0), begun)
+    assert len(came) == 2
+    assert played.course == begun
 
 
 def test_who_begins_paused_publishes_nothing_before_the_first_key() -> None:
