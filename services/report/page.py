@@ -224,17 +224,16 @@ def _caveats(report: BridgeReport) -> Iterator[Html]:
     yield tag("p", _HOW_TO_READ, class_="note")
     if comparison is None:
         return
+    compared = ""
     if comparison.reference == "others":
-        yield tag(
-            "p",
+        compared = (
             "No baseline is stored, and a nominal value is often a guess, so each element is "
             f"compared with the middle of the others. The middle of all is {comparison.level:.2f} "
             "of the nominal value: this says nothing where that is a guess, and is true of the "
             "whole bridge where it was measured. A loss that all elements share cannot be seen "
-            "without a baseline.",
-            class_="note",
+            "without a baseline. "
         )
-    yield tag("p", _visible(comparison), class_="note")
+    yield tag("p", compared + _visible(comparison), class_="note")
 
 
 def _next_steps(report: BridgeReport) -> Iterator[str]:

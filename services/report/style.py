@@ -40,7 +40,7 @@ svg { width: 100%; height: auto; display: block; }
   .first + .break + .crossing { break-before: avoid; }
   .crossing + .first { break-before: page; }
   figure, tr, .finding { break-inside: avoid; }
-  .first figure svg { max-height: 46mm; }
+  .first figure svg { max-height: 44mm; }
   .crossing figure svg { max-height: 85mm; }
   .crossing { break-inside: avoid; }
   h2 { margin-top: 2mm; }

@@ -18,6 +18,8 @@ from services.viewer.rerun_residuals import RESIDUALS_BOUNDS
 from services.viewer.strip import STRIP_HEIGHT, STRIP_PAPER, STRIP_WIDTH
 from services.viewer.vehicle_signals import VehicleSignals
 
+ENDS = "ends"
+"""Beside the channels of a crossing: the ends of the bridge."""
 LEARNED_ROW = 0.4
 """From one unknown to the next, in prior standard deviations: the view has one scale."""
 
@@ -262,7 +264,9 @@ def _plot(
         timelines = [TIME]
     shown = [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline in timelines]
     contents = (
-        "$origin/**" if only is None else [f"$origin/{only}_{axle}" for axle in ("front", "rear")]
+        "$origin/**"
+        if only is None
+        else [f"$origin/{only}_front", f"$origin/{only}_rear", f"$origin/{ENDS}"]
     )
     return rrb.TimeSeriesView(
         origin=origin,

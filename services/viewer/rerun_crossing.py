@@ -25,7 +25,7 @@ from services.viewer.crossing_view import (
     told_of_crossing,
 )
 from services.viewer.deflection import Passage, passage_of
-from services.viewer.layout import LEARNED_ROW, crossing_root, is_doubtful
+from services.viewer.layout import ENDS, LEARNED_ROW, crossing_root, is_doubtful
 from services.viewer.learned import Learned, learned_of
 from services.viewer.rerun_parts import (
     BASELINE,
@@ -39,6 +39,7 @@ from services.viewer.rerun_parts import (
     log_labels,
     log_line,
     log_markdown,
+    log_round_beginning,
     ratio_colours,
     rgb,
     send_scalars,
@@ -126,6 +127,31 @@ def log_acceleration(recording: Stream, root: str, crossing: OnBridge, channels:
             time_ns=time_ns[inside],
             chainage_m=front_axle_chainage(crossing, time_ns[inside] / 1e9),
         )
+    if channels:
+        _log_ends(recording, f"{root}/acceleration/{ENDS}", crossing)
+
+
+def _log_ends(recording: Stream, entity: str, crossing: OnBridge) -> None:
+    """When the first axle came onto the bridge and the last one left it.
+
+    Triangles on the line of zero, for a plot has no vertical lines (Rerun 0.41).
+    """
+    recording.log(
+        entity,
+        rr.SeriesPoints(
+            colors=[rgb("#E8EAED")],
+            markers=["up"],
+            marker_sizes=[6.0],
+            names="on, off the bridge",
+        ),
+        static=True,
+    )
+    times_s = np.array([crossing.entry_time_s, crossing.exit_time_s])
+    time_ns = np.rint(times_s * 1e9).astype(np.int64)
+    chainage_m = front_axle_chainage(crossing, times_s)
+    send_scalars(recording, entity, np.zeros(2), time_ns=time_ns, chainage_m=chainage_m)
+    shown_m = chainage_m[:, None] + WINDOW_S * crossing.speed_m_per_s * np.array([-1.0, 1.0])
+    log_round_beginning(recording, entity, shown_m)
 
 
 def log_position(
@@ -428,11 +454,13 @@ def _log_road(recording: Stream, root: str, crossing: CrossingView) -> None:
         width = 3.5 if wheel == "front" else 1.2
         log_line(recording, entity, f"{wheel} wheel", VEHICLE_COLOURS[wheel], width=width)
         send_scalars(recording, entity, height_m * 1e3, time_ns=time_ns, chainage_m=road.x_m)
+        log_round_beginning(recording, entity, road.x_m)
     entity = f"{root}/road_difference/front_minus_rear"
     log_line(recording, entity, "front − rear", MUTED)
     send_scalars(
         recording, entity, (road.front_m - road.rear_m) * 1e3, time_ns=time_ns, chainage_m=road.x_m
     )
+    log_round_beginning(recording, entity, road.x_m)
 
 
 def verdict_markdown(crossing: CrossingView, compared: Comparison | None = None) -> str:

@@ -115,6 +115,16 @@ def send_scalars(
         recording.send_columns(entity, indexes, rr.Scalars.columns(scalars=values))
 
 
+def log_round_beginning(recording: Stream, entity: str, chainage_m: FloatArray) -> None:
+    """Nothing, at the last multiple of 10 m that is not above any of a series' chainages.
+
+    Rerun counts the ticks of a plot from the first place that it has something for: they were
+    #50, #10 050 and so on for a road that begins 50 mm behind the start of the bridge.
+    """
+    first_m = 10.0 * np.floor(np.min(chainage_m, keepdims=True).ravel() / 10.0)
+    recording.send_columns(entity, [chainage_column(first_m)], rr.Scalars.columns(scalars=[np.nan]))
+
+
 def log_labels(
     recording: Stream,
     entity: str,

@@ -14,6 +14,7 @@ from schemas.results import Results, results_json
 from schemas.site import Site
 from schemas.site_file import load_site, site_toml
 from services.cli import main as cli
+from services.common.errors import FailureError
 from services.report import pdf
 from services.report.bridge import _ADVICE, bridge_reports
 from services.report.html import Html, inlined_svg, joined, tag
@@ -397,6 +398,29 @@ def fused(
 
 
 KNOWN = [0.02] * 7
+
+
+def test_on_paper_the_first_page_of_an_end_that_is_weak_is_one_sheet(
+    site: Site, tmp_path: Path
+) -> None:
+    """The longest: fused, and a bearing to be looked at. Then a sheet for each crossing."""
+    try:
+        browser = pdf.find_browser()
+    except FailureError as error:
+        pytest.skip(str(error))
+    nominal = site.bridges[0].nominal_flexural_rigidity_nm2
+    state = {}
+    for name, value in (("EI_4", 0.98 * nominal[3]), ("EI_7", 0.5 * nominal[6])):
+        near = {"q025": 0.96 * value, "q975": 1.04 * value}
+        state[name] = {"mean": value, "std": 0.02 * value, **near}
+    html = tmp_path / "r.html"
+    found = fused(site, KNOWN, **state)
+    reports = bridge_reports([(Path("drive.json"), found, site)], None)
+    html.write_text(page(reports))
+    assert "at the bearing there" in html.read_text()
+    pdf.write_pdf(html, tmp_path / "r.pdf", browser)
+    printed = (tmp_path / "r.pdf").read_bytes()
+    assert len(re.findall(rb"/Type\s*/Page\b", printed)) == 1 + len(found.crossings)
 
 
 def test_crossings_that_were_fused_are_said_to_be_and_how_they_agree(site: Site) -> None:

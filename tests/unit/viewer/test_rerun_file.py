@@ -160,13 +160,17 @@ def rejected() -> Crossing:
     return crossing(verdict="rejected", reasons=["channel_missing"], parameters=None, road=None)
 
 
-def rows(chunks: list[Chunk], entity: str) -> pa.RecordBatch:
-    """The rows over time of an entity."""
-    batches = [
+def batches_of(chunks: list[Chunk], entity: str) -> list[pa.RecordBatch]:
+    return [
         chunk.to_record_batch()
         for chunk in chunks
         if chunk.entity_path == f"/{entity}" and not chunk.is_static
     ]
+
+
+def rows(chunks: list[Chunk], entity: str) -> pa.RecordBatch:
+    """The rows over time of an entity."""
+    batches = [batch for batch in batches_of(chunks, entity) if "time" in batch.schema.names]
     assert batches, f"{entity} is not in the file, there are {sorted(paths(chunks))}"
     return pa.Table.from_batches(batches).combine_chunks().to_batches()[0]
 
@@ -225,6 +229,36 @@ def test_crossing_is_on_both_timelines(drive):
     assert scalars(road) == pytest.approx(1e3 * view.road.front_m)
     difference = rows(chunks, f"{crossing_root(view)}/road_difference/front_minus_rear")
     assert scalars(difference) == pytest.approx(np.full(69, 1e-2))
+
+
+def test_ticks_of_chainage_count_from_a_round_place(drive):
+    """Rerun counts them from the first row of a plot, also from one without a value."""
+    chunks, view = drive
+    root = crossing_root(view)
+    of_plots = {"road": ["front", "rear"], "road_difference": ["front_minus_rear"]}
+    of_plots["acceleration"] = ["ends", "sprung_front", "unsprung_rear"]
+    for plot, series in of_plots.items():
+        places, values = [], []
+        for entity in (f"{root}/{plot}/{one}" for one in series):
+            for batch in batches_of(chunks, entity):
+                places += batch.column("chainage_mm").to_pylist()
+                values += scalars(batch).tolist()
+        first_mm = min(places)
+        assert first_mm % 10_000 == 0
+        assert np.isnan(values[places.index(first_mm)])
+        with_value = [place for place, value in zip(places, values, strict=True) if value == value]
+        assert 0 <= min(with_value) - first_mm < 10_000
+
+
+def test_accelerations_say_when_the_truck_was_on_the_bridge(drive):
+    chunks, view = drive
+    ends = rows(chunks, f"{crossing_root(view)}/acceleration/ends")
+    assert times_ns(ends) / 1e9 == pytest.approx([view.entry_time_s, view.exit_time_s])
+    stay_s = view.exit_time_s - view.entry_time_s
+    on_mm, off_mm = ends.column("chainage_mm").to_pylist()
+    assert on_mm == 0
+    assert off_mm == pytest.approx(1e3 * view.speed_m_per_s * stay_s, abs=1.0)
+    assert scalars(ends).tolist() == [0.0, 0.0]
 
 
 def test_bars_begin_and_end_on_their_elements(drive):
