@@ -128,7 +128,7 @@ NOT_RUN = {
     "pytest tests/verdicts/test_foreign_vehicle.py -m slow": LONG,
     "pytest tests/verdicts/test_as_they_are.py -m slow": LONG,
     "python -m tests.benchmarks.detection": LONG,
-    "python -m tests.benchmarks.worker_load --seconds 90": LONG,
+    "python -m tests.benchmarks.worker_load --seconds 60": LONG,
     "driveby view live --listen ADDRESS": "is for an address of this machine; tests/unit/viewer",
     "pytest tests/numerics/test_pre_posterior.py -k rows_up": ITSELF,
     "pytest tests/faults/test_security.py -m faults -k noise -s": LONG,
