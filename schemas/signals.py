@@ -7,8 +7,9 @@ ValueError what `decode_*` would refuse.
 
 import math
 import struct
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -210,6 +211,14 @@ def decode_info(payload: bytes) -> VehicleInfo:
     )
     _check_info(info)
     return info
+
+
+TRUCK_DECODERS: Final[Mapping[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]]] = {
+    "accel": decode_accel,
+    "gnss": decode_gnss,
+    "info": decode_info,
+}
+"""By the streams of a truck of which an identification is made."""
 
 
 @cache

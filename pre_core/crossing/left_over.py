@@ -11,12 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing.optimum import chi2_per_dof
-from pre_core.crossing.posterior import (
-    Problem,
-    all_rows,
-    data_rows,
-    layout,
-)
+from pre_core.crossing.posterior import Problem, all_rows, data_rows, layout
 from pre_core.crossing.preparation import (
     Inputs,
     in_spreads,

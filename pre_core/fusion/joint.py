@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pre_core.crossing.compliances import Compliances, draws, marginal, of_normal
 from pre_core.fusion.between import Between, between_of, changed, may_be_zero, of_change, tau_draws
-from pre_core.fusion.likelihood import loosened, straightened
+from pre_core.fusion.likelihood import Likelihood, loosened, straightened
 from pre_core.fusion.sums import BridgePriors, Joint, Layout, Ready
 from pre_core.fusion.tracks import Key, Part, Shared, Track, key_of, tracks_of
 from pre_core.search.crank_nicolson import CHAINS
@@ -187,16 +187,7 @@ def _ready(
 ) -> Ready:
     of, b = part.likelihood, layout.bridge
     truck = layout.trucks[part.truck]
-    # The mass scales truck and bridge alike: what is found of the bridge lies aside of what it is.
-    heavier = part.mass_spread * with_mass(priors, centre)
-    root = np.hstack(
-        [
-            of.root[:, : b + truck.size - 1],
-            of.root[:, :b] @ heavier[:, None],
-            of.root[:, b + truck.size - 1 :],
-        ]
-    )
-    precision, linear = root.T @ root, root.T @ of.target
+    precision, linear = mass_freed(of, part.mass_spread, priors, centre)
     places = np.concatenate([np.arange(b), truck])
     key = key_of(part)
     if key in tracks:
@@ -209,6 +200,19 @@ def _ready(
         else:  # nothing else moves these waves
             precision, linear = precision[:-q, :-q], linear[:-q]
     return Ready(precision, linear, places)
+
+
+def mass_freed(
+    of: Likelihood, spread: float, priors: BridgePriors, centre: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Precision and linear part of bridge, truck, unit normal of the mass, and waves.
+
+    The mass scales truck and bridge alike: what is found of the bridge lies aside of what it is.
+    """
+    b, t = len(of.bridge.names), len(of.truck.names)
+    heavier = of.root[:, :b] @ (spread * with_mass(priors, centre))[:, None]
+    root = np.hstack([of.root[:, : b + t], heavier, of.root[:, b + t :]])
+    return root.T @ root, root.T @ of.target
 
 
 def with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.fusion.joint import with_mass
+from pre_core.fusion.joint import mass_freed
 from pre_core.fusion.likelihood import straightened
 from pre_core.fusion.sums import BridgePriors
 from pre_core.fusion.tracks import Part, key_of, tracks_of
@@ -61,10 +61,7 @@ def observation(
     waves = np.zeros((0, 0)) if track is None else track.whole
     if of.bends is not None:
         of = straightened(of, centre, waves)
-    heavier = part.mass_spread * with_mass(priors, centre)
-    mass = (of.root[:, :b] @ heavier)[:, None]
-    root = np.hstack([of.root[:, : b + t], mass, of.root[:, b + t :]])
-    precision, linear = root.T @ root, root.T @ of.target
+    precision, linear = mass_freed(of, part.mass_spread, priors, centre)
     x = np.arange(b - n, b)
     v = np.setdiff1d(np.arange(linear.size), x)
     before = np.eye(v.size)

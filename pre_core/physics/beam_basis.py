@@ -27,17 +27,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from pre_core.kernels.jacobi import diagonalise, diagonalise_one
-from pre_core.kernels.lanes import (
-    LANES,
-    add,
-    fma,
-    fma_scalar,
-    kernel,
-    load,
-    mul,
-    store,
-    sub,
-)
+from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store, sub
 from pre_core.physics.bridge import (
     element_cubics,
     held_nodes,

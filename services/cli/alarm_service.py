@@ -1,5 +1,6 @@
 """`driveby alarm serve`: tells on the bus which bridges have changed, until somebody takes note."""
 
+import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 from schemas.alarms import Alarm, encode_alarm
 from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.publisher import Publisher
-from services.bus.session import open_session
+from services.bus.session import connected
 from services.history.alarm_files import alarms_of, standing
 from services.history.alarms import Checked
 
@@ -47,10 +48,11 @@ def serve(
 ) -> int:
     """Check the history every so often and tell its alarms, until a signal; return 0."""
     publishers: dict[str, Publisher] = {}
-    with (
-        stopped_by_signals(leave_at_once) as stop,
-        open_session(connect=endpoint, tls=tls) as session,
-    ):
+    with stopped_by_signals(leave_at_once) as stop, contextlib.ExitStack() as stack:
+        bus = connected(endpoint, tls, stop.is_set)
+        if bus is None:
+            return 0
+        session = stack.enter_context(bus)
 
         def put(alarm: Alarm, payload: bytes) -> None:
             publisher = publishers.setdefault(alarm.realm, Publisher(session, alarm.realm))

@@ -9,7 +9,8 @@ from services.cli.parsing import add_file, add_site, command
 
 if TYPE_CHECKING:
     from services.history.catalog_row import Row
-    from services.history.positions import CrossingAt, Looked
+    from services.history.positions import Looked
+    from services.identification.bridges import Passing
 
 _MOST_LINES = 40
 _NS_PER_S = 1_000_000_000
@@ -90,7 +91,7 @@ def _table_of_rows(rows: "list[Row]") -> Iterator[tuple[object, ...]]:
         yield (row.path, " ".join(row.vehicles), *times, *counts, *box, row.content.hex())
 
 
-def _table_of_crossings(found: "tuple[CrossingAt, ...]") -> Iterator[tuple[object, ...]]:
+def _table_of_crossings(found: "tuple[Passing, ...]") -> Iterator[tuple[object, ...]]:
     yield (
         *("realm", "vehicle", "bridge", "direction", "entry_time", "exit_time", "passage"),
         "recordings",

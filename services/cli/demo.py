@@ -30,6 +30,7 @@ from schemas.results import Crossing, load_results
 from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import site_toml
+from services.bus.playback import set_by_signals
 from services.bus.session import open_session
 from services.bus.subscription import Received, Subscription
 from services.common.errors import FailureError, InputError
@@ -275,18 +276,9 @@ def _held_back() -> Iterator[None]:
 
     An interrupt inside of `Popen` would leave a process behind that nobody knows.
     """
-    if threading.current_thread() is not threading.main_thread():
+    with set_by_signals(signal.SIGINT, signal.SIGTERM) as caught:
         yield
-        return
-    caught: list[int] = []
-    both = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(one, lambda number, frame: caught.append(number)) for one in both]
-    try:
-        yield
-    finally:
-        for one, handler in zip(both, before, strict=True):
-            signal.signal(one, handler)
-    if caught:
+    if caught.is_set():
         raise KeyboardInterrupt
 
 

@@ -12,7 +12,8 @@ from services.cli.parsing import add_site, command
 from services.common.errors import InputError
 
 if TYPE_CHECKING:
-    from services.drives.survey import Gap, Passing, Survey, Truck
+    from services.drives.survey import Gap, Survey, Truck
+    from services.identification.bridges import Passing
 
 _NS_PER_S: Final = 1_000_000_000  # schemas.signals has it too, and takes numpy to import
 _MOST_LINES: Final = 20

@@ -17,8 +17,7 @@ from schemas.topics import Key, topic
 from services.common.errors import InputError
 from services.common.intervals import Intervals
 from services.common.progress import Offset, unwatched
-from services.identification.bridges import Bridges
-from services.identification.stays import Passage
+from services.identification.bridges import Bridges, Passing, passings_of
 from services.identification.streams import Boot, boot_of
 from services.recordings.recording import Message, RecordingInfo, read_info
 
@@ -58,19 +57,6 @@ class Truck(NamedTuple):
     streams: dict[str, Stream]
     channel_rates_hz: dict[str, float]
     """By accelerometer, as declared."""
-
-
-class Passing(NamedTuple):
-    """A stay of a truck on a bridge of the site file; times in ns since 1970 UTC."""
-
-    realm: str
-    vehicle: str
-    bridge: str
-    forward: bool
-    """From the bridge's start to its end."""
-    entry_ns: int
-    exit_ns: int
-    passage: Passage
 
 
 class Survey(NamedTuple):
@@ -225,17 +211,9 @@ def _passings(site: Site, boots: dict[tuple[str, str, int], Boot]) -> tuple[Pass
     trucks = {vehicle.id: vehicle for vehicle in site.vehicles}
     bridges = Bridges(site.bridges, site.receiver)
     found = [
-        Passing(
-            realm,
-            vehicle,
-            bridges.bridge(number).id,
-            stay.direction > 0,
-            boot.wall_time_ns(stay.entry_s),
-            boot.wall_time_ns(stay.exit_s),
-            stay.passage,
-        )
+        passing
         for (realm, vehicle, _), boot in boots.items()
         if vehicle in trucks and boot.fixes().time_s.size
-        for number, stay in bridges.all_stays(trucks[vehicle], boot.fixes())
+        for passing in passings_of(bridges, realm, trucks[vehicle], boot)
     ]
     return tuple(sorted(found, key=lambda passing: (passing.entry_ns, passing.vehicle)))

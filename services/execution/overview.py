@@ -112,11 +112,13 @@ def look_over(name: str, read: Read, site: Site) -> Overview:
             continue
         boots, times_ns = made.setdefault(_truck(key), (array("Q"), array("q")))
         try:
-            times_ns.append(device_time_ns(key.stream, message.payload))
             if key.stream == "gnss":
                 fix = decode_gnss(message.payload)
+                times_ns.append(fix.device_time_ns)
                 if bridges.around(fix.latitude_deg, fix.longitude_deg):
                     near.append(message)
+            else:
+                times_ns.append(device_time_ns(key.stream, message.payload))
         except ValueError as error:
             raise malformed(name, message, error) from error
         boots.append(message.boot_id)

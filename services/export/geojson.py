@@ -8,8 +8,8 @@ from typing import Any
 from schemas.results import Crossing, Results
 from schemas.site import Bridge, Site
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.drives.survey import Passing
 from services.export.found import places_of
+from services.identification.bridges import Passing
 
 _DECIMALS = 9
 """A tenth of a millimetre."""

@@ -171,8 +171,7 @@ def read_partition(where: Path, columns: Iterable[str] = ()) -> Read:
     problems: list[str] = []
     for path in sorted(where.glob("*.parquet")):
         try:
-            table = decoded(path, KEY, EDITION, names)
-            rows += [_from_row(told) for told in table.to_pylist()]
+            rows += _rows(path, names)
         except (ValueError, TypeError, KeyError) as error:
             problems.append(f"{path}: left out: {error}")
     if only_content:
@@ -184,6 +183,11 @@ def read_partition(where: Path, columns: Iterable[str] = ()) -> Read:
             newest[row.crossing_id] = row
     ordered = sorted(newest.values(), key=lambda one: (one.entry_s, one.crossing_id))
     return Read(tuple(ordered), tuple(problems))
+
+
+def _rows(path: Path, columns: list[str] | None = None) -> list[Kept]:
+    """The crossings of a file. ValueError, TypeError or KeyError: it is none of ours."""
+    return [_from_row(told) for told in decoded(path, KEY, EDITION, columns).to_pylist()]
 
 
 def write_batch(where: Path, rows: Iterable[Kept]) -> Path:
@@ -211,8 +215,7 @@ def _pack(where: Path, files: list[Path]) -> None:
     read: list[Path] = []
     for path in files:
         try:
-            table = decoded(path, KEY, EDITION)
-            some = [_from_row(told) for told in table.to_pylist()]
+            some = _rows(path)
         except (ValueError, TypeError, KeyError) as error:
             _log.warning("%s: left out: %s", path, error)
             continue
@@ -236,8 +239,9 @@ def kept_of(crossing: Crossing, header: Header, temperature_deg_c: float | None)
     )
     likelihood = crossing.fusion_likelihood
     found = observation_of(crossing)
+    search = search_hash(header)
     content = hashlib.sha256(
-        f"{search_hash(header)} {temperature_deg_c} {crossing.model_dump_json()}".encode()
+        f"{search} {temperature_deg_c} {crossing.model_dump_json()}".encode()
     ).hexdigest()[:32]
     return Kept(
         crossing.crossing_id,
@@ -253,7 +257,7 @@ def kept_of(crossing: Crossing, header: Header, temperature_deg_c: float | None)
         temperature_deg_c,
         header.created,
         header.site_hash,
-        search_hash(header),
+        search,
         header.version,
         content,
         tuple(tuple(getattr(parameters[n], field) for field in _ELEMENT) for n in names),

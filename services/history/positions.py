@@ -23,8 +23,7 @@ from schemas.topics import Key
 from services.common.errors import InputError
 from services.common.stores import Folder, opened
 from services.history.catalog_row import Row
-from services.identification.bridges import AWAY_S, Box, Bridges
-from services.identification.stays import Passage
+from services.identification.bridges import AWAY_S, Box, Bridges, Passing, passings_of
 from services.identification.streams import boot_of
 from services.recordings.mcap_ranges import chunk_messages, read_index
 from services.recordings.recording import our_channel
@@ -40,25 +39,10 @@ _Whose = tuple[str, str]
 _Span = tuple[int, int]
 
 
-class CrossingAt(NamedTuple):
-    """A stay of a truck on a bridge; times in ns since 1970 UTC."""
-
-    realm: str
-    vehicle: str
-    bridge: str
-    forward: bool
-    """From the bridge's start to its end."""
-    entry_ns: int
-    exit_ns: int
-    passage: Passage
-    recordings: tuple[str, ...]
-    """That hold its time."""
-
-
 class Looked(NamedTuple):
     """What was found, and what it took."""
 
-    crossings: tuple[CrossingAt, ...]
+    crossings: tuple[Passing, ...]
     """In order of their entries."""
     problems: tuple[str, ...]
     files_read: int
@@ -76,7 +60,7 @@ def crossings_of(folder: Folder, rows: Iterable[Row], site: Site) -> Looked:
     bridges = Bridges(site.bridges, site.receiver)
     trucks = {vehicle.id: vehicle for vehicle in site.vehicles}
     problems: list[str] = []
-    found: list[CrossingAt] = []
+    found: list[Passing] = []
     read = _Read(folder, bridges)
     near = [row for row in rows if row.box is not None and bridges.meeting(row.box)]
     by_vehicle: defaultdict[str, list[Row]] = defaultdict(list)
@@ -95,22 +79,13 @@ def crossings_of(folder: Folder, rows: Iterable[Row], site: Site) -> Looked:
                 problems.append(str(error) if where in str(error) else f"{where}: {error}")
         for (realm, _), of_boot in fixes.items():
             for part in _parts(of_boot, _merged(spans)):
-                boot = boot_of(part)
-                for number, stay in bridges.all_stays(trucks[vehicle], boot.fixes()):
-                    entry, leave = boot.wall_time_ns(stay.entry_s), boot.wall_time_ns(stay.exit_s)
-                    within = [r.path for r in some if r.first_ns <= leave and entry <= r.last_ns]
-                    found.append(
-                        CrossingAt(
-                            realm,
-                            vehicle,
-                            bridges.bridge(number).id,
-                            stay.direction > 0,
-                            entry,
-                            leave,
-                            stay.passage,
-                            tuple(within),
-                        )
-                    )
+                for one in passings_of(bridges, realm, trucks[vehicle], boot_of(part)):
+                    within = [
+                        r.path
+                        for r in some
+                        if r.first_ns <= one.exit_ns and one.entry_ns <= r.last_ns
+                    ]
+                    found.append(one._replace(recordings=tuple(within)))
     found.sort(key=lambda one: (one.entry_ns, one.vehicle, one.bridge))
     return Looked(tuple(found), tuple(problems), read.files, read.chunks_read, read.chunks)
 

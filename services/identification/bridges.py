@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from schemas.site import Bridge, Receiver
+from schemas.site import Bridge, Receiver, Vehicle
 from services.common.geodesy import BridgeFrame, bridge_frame, chainage_of, to_chainage
 from services.identification.stays import (
     CORRIDOR_M,
@@ -24,7 +24,7 @@ from services.identification.stays import (
     least_depth_m,
     stays_on,
 )
-from services.identification.streams import Fixes
+from services.identification.streams import Boot, Fixes
 
 _log = logging.getLogger(__name__)
 REACH_M: Final = 50.0
@@ -64,6 +64,21 @@ class Look(NamedTuple):
     """Chainage of the first fix on this side."""
     is_settled: bool
     """Fixes of a truck that stays on this side change nothing."""
+
+
+class Passing(NamedTuple):
+    """A stay of a truck on a bridge of the site file; times in ns since 1970 UTC."""
+
+    realm: str
+    vehicle: str
+    bridge: str
+    forward: bool
+    """From the bridge's start to its end."""
+    entry_ns: int
+    exit_ns: int
+    passage: Passage
+    recordings: tuple[str, ...] = ()
+    """That hold its time, where several were looked through."""
 
 
 class Bridges:
@@ -335,3 +350,19 @@ def _during(stay: Stay, fixes: Fixes) -> np.ndarray[tuple[int], np.dtype[np.bool
 
 def _overlap(one: Stay, other: Stay) -> bool:
     return one.entry_s <= other.exit_s and other.entry_s <= one.exit_s
+
+
+def passings_of(bridges: Bridges, realm: str, truck: Vehicle, boot: Boot) -> list[Passing]:
+    """All stays of a truck on bridges in one boot."""
+    return [
+        Passing(
+            realm,
+            truck.id,
+            bridges.bridge(number).id,
+            stay.direction > 0,
+            boot.wall_time_ns(stay.entry_s),
+            boot.wall_time_ns(stay.exit_s),
+            stay.passage,
+        )
+        for number, stay in bridges.all_stays(truck, boot.fixes())
+    ]

@@ -24,12 +24,11 @@ from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.settings import IdentificationSettings
 from schemas.signals import (
     MAX_BATCH_S,
+    TRUCK_DECODERS,
     AccelBatch,
     GnssFix,
     VehicleInfo,
-    decode_accel,
     decode_gnss,
-    decode_info,
 )
 from schemas.site import Bridge, Site, Vehicle
 from schemas.topics import Key
@@ -84,11 +83,6 @@ _ROUNDING_S = 1e-6
 """More than is lost when a time in nanoseconds becomes one in seconds."""
 _Name = tuple[str, str]
 """Realm and bridge."""
-_DECODERS: dict[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]] = {
-    "accel": decode_accel,
-    "gnss": decode_gnss,
-    "info": decode_info,
-}
 _Wait = Callable[[TruckBoot, Bridge, Stay, float], bool]
 """Whether a crossing that is over, at the truck's time of now (s), waits for more of its data."""
 
@@ -250,7 +244,7 @@ class Engine:
         ValueError, at once: malformed. What follows from the message comes from the iterator, as
         things happen, so that a state can be published before the long work begins.
         """
-        if key.owner != "vehicle" or key.stream not in _DECODERS:
+        if key.owner != "vehicle" or key.stream not in TRUCK_DECODERS:
             return iter(())
         vehicle = self._vehicles.get(key.identifier)
         if vehicle is None:
@@ -258,7 +252,7 @@ class Engine:
             return iter(())
         if self._expected is not None and self._expected[0] is payload:
             return self._take(key, vehicle, self._expected[1])
-        return self._take(key, vehicle, _DECODERS[key.stream](payload))
+        return self._take(key, vehicle, TRUCK_DECODERS[key.stream](payload))
 
     def _take(
         self, key: Key, vehicle: Vehicle, message: AccelBatch | GnssFix | VehicleInfo

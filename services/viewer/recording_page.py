@@ -6,7 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 
 from schemas.results import Crossing
-from services.drives.survey import Passing, Survey, Truck
+from services.drives.survey import Survey, Truck
+from services.identification.bridges import Passing
 from services.identification.stays import MERGE_S, Passage
 from services.viewer.crossing_view import PassingView
 

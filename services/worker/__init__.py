@@ -30,15 +30,7 @@ from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Header, verdict_line
 from schemas.settings import IdentificationSettings
-from schemas.signals import (
-    AccelBatch,
-    GnssFix,
-    Identity,
-    VehicleInfo,
-    decode_accel,
-    decode_gnss,
-    decode_info,
-)
+from schemas.signals import TRUCK_DECODERS, Identity
 from schemas.site_file import parse_site, read_site_text, site_hash
 from schemas.topics import (
     HEALTH_PERIOD_S,
@@ -85,12 +77,6 @@ __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 _Queue = queue.Queue[Arrived | Token]
-_DECODERS: dict[str, Callable[[bytes], AccelBatch | GnssFix | VehicleInfo]] = {
-    "accel": decode_accel,
-    "gnss": decode_gnss,
-    "info": decode_info,
-}
-"""By the streams of a truck that are looked at."""
 _POLL_S = 0.1
 """So late a stop, a token or a result is seen where no message comes."""
 _LONGEST_QUEUE = 200_000
@@ -393,7 +379,7 @@ def _take_all(
             except ValueError as error:
                 _log.warning("refused: %.200s", error)
                 continue
-            if key.stream not in _DECODERS:
+            if key.stream not in TRUCK_DECODERS:
                 continue
             try:
                 # A router that cuts off a reader in the middle of a message leaves the rest of it
@@ -411,7 +397,7 @@ def _take_all(
 
 def _check_whole(payload: bytes, key: Key, identity: Identity) -> None:
     """ValueError: the payload is malformed, or of another message than its attachment says."""
-    message = _DECODERS[key.stream](payload)
+    message = TRUCK_DECODERS[key.stream](payload)
     if (message.boot_id, message.sequence) != identity:
         raise ValueError(
             f"says that it is {message.sequence} of boot {message.boot_id}, and came as "
