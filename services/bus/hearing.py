@@ -5,6 +5,7 @@ Zenoh may take a client back, after it had cut it off, into a session that it is
 listens takes that for silence.
 """
 
+from collections.abc import Set
 from typing import Any
 
 import zenoh
@@ -23,11 +24,11 @@ class DeafError(Exception):
 class Hearing:
     """Asks the router, after a silence, for who is known to be there; from one thread."""
 
-    def __init__(self, session: zenoh.Session, selector: str) -> None:
-        """`selector` is of the tokens that are known."""
+    def __init__(self, session: zenoh.Session, selector: str, there: Set[str]) -> None:
+        """`selector` is of the tokens; `there` is who has one now, as far as its owner knows."""
         self._session = session
         self._selector = selector
-        self._there: set[str] = set()
+        self._there = there
         self._heard_s: float | None = None
         self._missed = 0
         self._replies: Any = None
@@ -35,11 +36,6 @@ class Hearing:
     def heard(self, now_s: float) -> None:
         """Something came."""
         self._heard_s, self._missed, self._replies = now_s, 0, None
-
-    def token(self, name: str, now_s: float, *, is_alive: bool) -> None:
-        """Somebody came or left, of whom the router will say so when it is asked."""
-        self.heard(now_s)
-        (self._there.add if is_alive else self._there.discard)(name)
 
     def look(self, now_s: float) -> None:
         """Ask or read an answer, without waiting. DeafError: none has come to several questions.

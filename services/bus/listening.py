@@ -1,19 +1,30 @@
 """What travels in a realm, for who only looks: a display must never hold anybody up.
 
-What comes too quickly is dropped, the oldest first, and nothing that was missed is asked for.
+What comes too quickly is dropped, the oldest first, and nothing that was missed is asked for. A
+connection that stands and brings nothing is made anew.
 """
 
+import contextlib
+import logging
 import math
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import zenoh
+from google.protobuf.message import DecodeError, Message
 from zenoh import handlers
 
+from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import Key, check_realm, parse_key, selector, topic
+from services.bus.hearing import DeafError, Hearing
+from services.bus.session import connected
 from services.bus.subscription import Received, Seen, subscribe_latest
 from services.common.errors import InputError
+
+_log = logging.getLogger(__name__)
 
 _SIGNALS: Final = ("accel", "gnss")
 _OTHERS: Final = (
@@ -24,6 +35,11 @@ _OTHERS: Final = (
     ("service", "health"),
     ("service", "progress"),
 )
+_OF_BRIDGES: Final[dict[str, type[Message]]] = {
+    "crossing": pb.Crossing,
+    "estimate": pb.Estimate,
+    "state": pb.BridgeState,
+}
 _SIGNALS_WAITING: Final = 12_000
 _OTHERS_WAITING: Final = 1_000
 _MOST_AT_ONCE: Final = 5_000
@@ -36,7 +52,7 @@ _TOKENS_WAITING: Final = 1_000
 
 
 class Heard(NamedTuple):
-    """A message of the topic table with its identity; its payload has not been looked at."""
+    """A message of the topic table with its identity; of a truck's the payload is not looked at."""
 
     key: Key
     identity: Identity
@@ -102,29 +118,50 @@ class Listening:
     """Hears one realm, and which trucks drive in others.
 
     `past_s` is how much of what trucks measured before is wanted, as far as they keep it; of all
-    else comes what its publishers keep.
+    else comes what its publishers keep. `again` gives another session in place of one that brings
+    nothing any more, or None where there shall be none; then nothing more is heard.
     """
 
-    def __init__(self, session: zenoh.Session, realm: str, *, past_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        realm: str,
+        *,
+        past_s: float = 0.0,
+        again: Callable[[], zenoh.Session | None] = lambda: None,
+    ) -> None:
         """Listen; InputError if that is no realm."""
         self.realm = check_listenable(realm)
+        self._past_s = past_s
+        self._again = again
         self._seen = Seen()
+        self._heard_s = time.monotonic()
+        self._is_open = False
+        self._begin(session, past_s)
+
+    def _begin(self, session: zenoh.Session, past_s: float) -> None:
         self._streams = [
             subscribe_latest(
-                session, selector(realm, "vehicle", stream), _SIGNALS_WAITING, _past(stream, past_s)
+                session,
+                selector(self.realm, "vehicle", stream),
+                _SIGNALS_WAITING,
+                _past(stream, past_s),
             )
             for stream in _SIGNALS
         ]
         self._streams += [
             subscribe_latest(
                 session,
-                selector(realm, owner, stream),
+                selector(self.realm, owner, stream),
                 _OTHERS_WAITING,
                 topic(owner, stream).cache,
             )
             for owner, stream in _OTHERS
         ]
-        self._elsewhere = Elsewhere(session, realm)
+        self._elsewhere = Elsewhere(session, self.realm)
+        tokens = selector(self.realm, "vehicle", "alive")
+        self._hearing = Hearing(session, tokens, self._elsewhere.alive)
+        self._is_open = True
 
     @property
     def alive(self) -> set[str]:
@@ -138,18 +175,42 @@ class Listening:
 
     def heard(self) -> Iterator[Heard]:
         """Yield what has come since the last call, each message once; return when there is none."""
+        if not self._is_open:
+            return
         self._elsewhere.look()
+        is_silent = True
         for stream in self._streams:
             for _ in range(_MOST_AT_ONCE):
                 received = next(stream)
                 if received is None:
                     break
+                is_silent = False
                 one = self._new(received)
                 if one is not None:
                     yield one
+        self._check_hearing(is_silent=is_silent)
+
+    def _check_hearing(self, *, is_silent: bool) -> None:
+        """Connect again if nothing comes through the connection that stands."""
+        now_s = time.monotonic()
+        if not is_silent:
+            self._heard_s = now_s
+            self._hearing.heard(now_s)
+            return
+        try:
+            self._hearing.look(now_s)
+        except DeafError as error:
+            _log.warning("%s; connecting again", error)
+            self.close()
+            session = self._again()
+            if session is not None:
+                self._begin(session, self._past_s + time.monotonic() - self._heard_s)
 
     def close(self) -> None:
         """Stop listening."""
+        if not self._is_open:
+            return
+        self._is_open = False
         for stream in self._streams:
             stream.close()  # type: ignore[attr-defined]
         self._elsewhere.close()
@@ -158,11 +219,52 @@ class Listening:
         """The message if it is one of the table and has not come before."""
         try:
             key, identity = received.key(), received.identity()
-        except ValueError:
+            if key.owner == "bridge":
+                # What a cut connection has mangled must not be taken for the good copy that comes.
+                _OF_BRIDGES[key.stream].FromString(received.payload)
+        except (ValueError, DecodeError):
             return None  # the logger counts and names what it refuses
         if len(self._seen.streams) > _MOST_SEEN:
             self._seen = Seen()
         return Heard(key, identity, received.payload) if self._seen.add(key, identity) else None
+
+
+@contextlib.contextmanager
+def listening(
+    endpoint: str,
+    tls: Path | None,
+    realm: str,
+    is_over: Callable[[], bool],
+    *,
+    past_s: float = 0.0,
+) -> Iterator[Listening | None]:
+    """Hear a realm as soon as a router answers; None if it is over before one does.
+
+    InputError: a bad realm, endpoint or credentials.
+    """
+    check_listenable(realm)
+    sessions: list[zenoh.Session] = []
+
+    def connect() -> zenoh.Session | None:
+        while sessions:
+            sessions.pop().close()  # type: ignore[no-untyped-call]
+        session = connected(endpoint, tls, is_over)
+        sessions.extend([] if session is None else [session])
+        return session
+
+    session = connect()
+    if session is None:
+        yield None
+        return
+    try:
+        heard = Listening(session, realm, past_s=past_s, again=connect)
+        try:
+            yield heard
+        finally:
+            heard.close()
+    finally:
+        while sessions:
+            sessions.pop().close()  # type: ignore[no-untyped-call]
 
 
 def check_listenable(realm: str) -> str:

@@ -49,24 +49,19 @@ def watch_command(*, endpoint: str, realm: str, tls: Path | None, console: "Cons
 
     InputError: a bad realm, endpoint or credentials.
     """
-    from services.bus.listening import Listening, check_listenable
+    from services.bus.listening import listening
     from services.bus.playback import leave_at_once, stopped_by_signals
-    from services.bus.session import connected
 
-    check_listenable(realm)
-    with stopped_by_signals(leave_at_once) as stop:
-        session = connected(endpoint, tls, stop.is_set)
-        if session is None:
+    with (
+        stopped_by_signals(leave_at_once) as stop,
+        listening(endpoint, tls, realm, stop.is_set) as heard,
+    ):
+        if heard is None:
             return 0
-        with session:
-            listening = Listening(session, realm)
-            try:
-                if console.is_terminal:
-                    _show_page(listening, endpoint, stop, console)
-                else:
-                    _print_lines(listening, stop, lambda line: print(line, flush=True))
-            finally:
-                listening.close()
+        if console.is_terminal:
+            _show_page(heard, endpoint, stop, console)
+        else:
+            _print_lines(heard, stop, lambda line: print(line, flush=True))
     return 0
 
 

@@ -23,9 +23,8 @@ from urllib.parse import quote
 import rerun as rr
 
 from schemas.site_file import load_site
-from services.bus.listening import Listening, check_listenable, elsewhere_line
+from services.bus.listening import Listening, check_listenable, elsewhere_line, listening
 from services.bus.playback import leave_at_once, stopped_by_signals
-from services.bus.session import connected
 from services.common.errors import FailureError, InputError
 from services.viewer.live_layout import WAITING, waiting_blueprint
 from services.viewer.live_picture import LivePicture
@@ -84,14 +83,13 @@ def live_command(
         log_markdown(recording, WAITING, f"Waiting for a router at {endpoint}.")
         say(f"realm {realm}, live at {sink.uri}; more viewers: rerun {sink.uri}")
         with _viewer(sink.uri, show, address, say) as viewer:
-            session = connected(endpoint, tls, lambda: stop.is_set() or _has_ended(viewer))
-            if session is not None:
-                with session:
-                    listening = Listening(session, realm, past_s=_PAST_S)
-                    try:
-                        _draw(recording, LivePicture(recording, known), listening, stop, viewer)
-                    finally:
-                        listening.close()
+
+            def is_over() -> bool:
+                return stop.is_set() or _has_ended(viewer)
+
+            with listening(endpoint, tls, realm, is_over, past_s=_PAST_S) as heard:
+                if heard is not None:
+                    _draw(recording, LivePicture(recording, known), heard, stop, is_over)
         recording.disconnect()
     if viewer is not None and not stop.is_set():
         check_ended_well(viewer.returncode)
@@ -101,21 +99,21 @@ def live_command(
 def _draw(
     recording: rr.RecordingStream,
     picture: LivePicture,
-    listening: Listening,
+    heard: Listening,
     stop: threading.Event,
-    viewer: subprocess.Popen[bytes] | None,
+    is_over: Callable[[], bool],
 ) -> None:
     """Draw what comes until the viewer is closed or a signal comes."""
     shown = ""
-    while not stop.is_set() and not _has_ended(viewer):
-        for heard in listening.heard():
-            picture.take(heard)
+    while not is_over():
+        for one in heard.heard():
+            picture.take(one)
             if stop.is_set():
                 return
         picture.flush()
         if picture.is_empty:
-            hint = elsewhere_line(listening.realm, listening.elsewhere)
-            page = f"# Realm {listening.realm}\n\nNobody drives yet.\n\n{hint or ''}"
+            hint = elsewhere_line(heard.realm, heard.elsewhere)
+            page = f"# Realm {heard.realm}\n\nNobody drives yet.\n\n{hint or ''}"
             if page != shown:
                 log_markdown(recording, WAITING, page)
                 shown = page

@@ -355,7 +355,7 @@ def _take_all(
     alive = bus.liveliness().declare_subscriber(
         tokens, zenoh.handlers.FifoChannel(1000), history=True
     )
-    hearing = Hearing(bus, tokens)
+    hearing = Hearing(bus, tokens, elsewhere.alive)
     with Subscription(bus, selector(realm, "vehicle")) as vehicles:
         while not closing.is_set():
             received = vehicles.receive(_POLL_S)
@@ -365,7 +365,7 @@ def _take_all(
                 if token is not None:
                     key = parse_key(str(token.key_expr))
                     is_alive = token.kind == zenoh.SampleKind.PUT
-                    hearing.token(key.identifier, now_s, is_alive=is_alive)
+                    hearing.heard(now_s)
                     _put(arrivals, Token(key.realm, key.identifier, is_alive, now_s), closing)
                 if received is None:
                     elsewhere.look()

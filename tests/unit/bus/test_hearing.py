@@ -26,16 +26,16 @@ def asked(hearing: Hearing, times: int) -> None:
 
 
 def test_who_should_be_there_and_does_not_answer(client: zenoh.Session) -> None:
-    hearing = Hearing(client, ALIVE)
-    hearing.token("truck-1", 0.0, is_alive=True)
+    hearing = Hearing(client, ALIVE, {"truck-1"})
+    hearing.heard(0.0)
     with pytest.raises(DeafError, match="truck-1 should be there, and nobody answers"):
         asked(hearing, _MISSES)
 
 
 def test_who_is_there_and_silent(client: zenoh.Session, router: zenoh.Session) -> None:
     token = router.liveliness().declare_token("driveby/v1/sim/vehicle/truck-1/alive")
-    hearing = Hearing(client, ALIVE)
-    hearing.token("truck-1", 0.0, is_alive=True)
+    hearing = Hearing(client, ALIVE, {"truck-1"})
+    hearing.heard(0.0)
     asked(hearing, 1)
     # Whatever was missed before, for the router may not know of it at once, is forgiven by then.
     deadline = time.monotonic() + LONGEST_S
@@ -47,17 +47,18 @@ def test_who_is_there_and_silent(client: zenoh.Session, router: zenoh.Session) -
 
 
 def test_nobody_is_asked_for_nobody(client: zenoh.Session) -> None:
-    hearing = Hearing(client, ALIVE)
-    hearing.token("truck-1", 0.0, is_alive=True)
-    hearing.token("truck-1", 1.0, is_alive=False)
+    there = {"truck-1"}
+    hearing = Hearing(client, ALIVE, there)
+    hearing.heard(0.0)
+    there.clear()
     for now_s in range(2, 2000, 7):
         hearing.look(float(now_s))
         assert hearing._replies is None
 
 
 def test_a_message_ends_a_question(client: zenoh.Session) -> None:
-    hearing = Hearing(client, ALIVE)
-    hearing.token("truck-1", 0.0, is_alive=True)
+    hearing = Hearing(client, ALIVE, {"truck-1"})
+    hearing.heard(0.0)
     for n in range(1, 4 * _MISSES):
         hearing.look(n * _SILENCE_S)
         assert hearing._replies is not None

@@ -5,12 +5,16 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
+from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import key
+from services.bus import hearing
 from services.bus.listening import Heard, Listening, elsewhere_line
 from services.bus.publisher import Publisher
+from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.common.errors import InputError
+from tests.endpoints import free_endpoint
 from tests.receiving import several
 from tests.waiting import until
 
@@ -39,22 +43,27 @@ def test_each_message_once_with_what_was_before(
 ) -> None:
     for number in range(100):
         publisher.put("vehicle", "truck-1", "accel", b"%d" % number)
-    publisher.put("bridge", "b-1", "state", b"before")
+    before, now, last = (
+        pb.BridgeState(finding="before").SerializeToString(),
+        pb.Estimate(crossing_id="now").SerializeToString(),
+        pb.Estimate(crossing_id="last").SerializeToString(),
+    )
+    publisher.put("bridge", "b-1", "state", before)
     arrived(router, 101)
     listening = Listening(router, "live", past_s=1.0)
     found = gathered(listening, 21)
-    publisher.put("bridge", "b-1", "estimate", b"now", Identity(7, 3))
-    publisher.put("bridge", "b-1", "estimate", b"now", Identity(7, 3))  # as after a new start
-    publisher.put("bridge", "b-1", "estimate", b"last")
+    publisher.put("bridge", "b-1", "estimate", now[:-1], Identity(7, 3))  # cut off in the middle
+    publisher.put("bridge", "b-1", "estimate", now, Identity(7, 3))
+    publisher.put("bridge", "b-1", "estimate", now, Identity(7, 3))  # as after a new start
+    publisher.put("bridge", "b-1", "estimate", last)
     found += gathered(listening, 2)
     listening.close()
     assert [one.payload for one in found if one.key.stream == "accel"] == [
         b"%d" % number
         for number in range(80, 100)  # a second of what the truck still has
     ]
-    assert [one.payload for one in found if one.key.owner == "bridge"] == [
-        b"before", b"now", b"last"
-    ]  # fmt: skip
+    told = [one.payload for one in found if one.key.owner == "bridge"]
+    assert told == [before, now, last]
 
 
 def test_who_does_not_look_holds_nobody_up(router: zenoh.Session, publisher: Publisher) -> None:
@@ -66,6 +75,24 @@ def test_who_does_not_look_holds_nobody_up(router: zenoh.Session, publisher: Pub
     until(lambda: found.extend(listening.heard()) or (found and found[-1].payload == b"29999"))
     listening.close()
     assert len(found) < 30_000
+
+
+def test_a_connection_that_brings_nothing_is_made_anew(
+    router: zenoh.Session, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hearing, "_SILENCE_S", 0.0)
+    endpoint = free_endpoint()
+    with open_session(listen=endpoint), open_session(connect=endpoint) as deaf:
+        asked: list[bool] = []
+        listening = Listening(deaf, "live", again=lambda: asked.append(True) or router)
+        publisher.put("vehicle", "truck-1", "accel", b"missed")
+        listening.alive.add("truck-1")  # and its leave is not heard either
+        found = gathered(listening, 1)
+        publisher.put("vehicle", "truck-1", "accel", b"now")
+        found += gathered(listening, 1)
+        listening.close()
+    assert [one.payload for one in found] == [b"missed", b"now"]
+    assert asked == [True]
 
 
 def test_a_truck_that_drives_in_another_realm_is_named(
