@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.crossing.splines import Spline, curves_at, integrals, slopes, through
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 
 FloatArray = NDArray[np.float64]
@@ -139,17 +140,19 @@ def read_between(samples: FloatArray, place: FloatArray) -> FloatArray:
 
 def _derivatives(acceleration: FloatArray, step_s: float) -> FloatArray:
     """The six signals (4, 6, n) of a quintic spline through (4, n)."""
-    from scipy.interpolate import make_interp_spline  # slow to import, seldom needed
-
     n = acceleration.shape[1]
-    t = step_s * np.arange(n)
-    middle = t[n // 2]
-    spline = make_interp_spline(t, acceleration, k=_DEGREE, axis=1)
-    velocity = spline.antiderivative(1)
-    displacement = spline.antiderivative(2)
-    v, z = velocity(t), displacement(t)
-    v_middle, z_middle = velocity(middle)[:, None], displacement(middle)[:, None]
-    z = z - z_middle - v_middle * (t - middle)
-    return np.stack(
-        [z, v - v_middle, acceleration, spline(t, 1), spline(t, 2), spline(t, 3)], axis=1
+    t, middle = step_s * np.arange(n, dtype=np.float64), n // 2
+    spline = through(t, acceleration.T, _DEGREE)
+    velocity = _from_zero(integrals(spline), t[middle])
+    displacement = _from_zero(integrals(velocity), t[middle])
+    first = slopes(spline)
+    second = slopes(first)
+    z, v, a_1, a_2, a_3 = (
+        curves_at(one, t).T for one in (displacement, velocity, first, second, slopes(second))
     )
+    return np.stack([z, v, acceleration, a_1, a_2, a_3], axis=1)
+
+
+def _from_zero(spline: Spline, x: float) -> Spline:
+    """The curves less what they are at x."""
+    return spline._replace(coefficients=spline.coefficients - curves_at(spline, np.array([x])))

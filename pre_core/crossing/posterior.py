@@ -24,6 +24,7 @@ from pre_core.crossing.residuals import (
     Work,
     evaluate,
     evaluate_white,
+    largest_deflections,
     roads_and_deflections,
 )
 from pre_core.crossing.whitening import (
@@ -54,6 +55,8 @@ measured."""
 _DEGREE = 5
 """The trajectory is a spline of this degree: load moves with its second derivative, which must not
 have kinks."""
+_AT_ONCE = 100
+"""Points whose trajectories are written out at once: they are long."""
 
 
 class Priors(NamedTuple):
@@ -378,15 +381,16 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
     n = crossing.signals.shape[2]
     step = crossing.step_s
     spread = problem.density * np.sqrt(0.5 / step)
-    a = spread[:, None] * rng.standard_normal((count, CHANNELS, n))
-    z = step * np.cumsum(step * np.cumsum(a, axis=2), axis=2)
     truck = truck_of(theta, crossing.total_mass_kg, float(at.wheelbase_m[0]), True)
-    errors = []
-    for w, m_ii in enumerate((truck.m_11, truck.m_22)):
-        force = m_ii * a[:, w] + truck.m_12 * a[:, 1 - w] + theta[M_U1 + w] * a[:, 2 + w]
-        errors.append(z[:, 2 + w] + force / theta[K_U1 + w])
     drawn = []
-    for front_error, rear_error in zip(*errors, strict=True):
+    for _ in range(count):  # one by one, to bound memory
+        a = spread[:, None] * rng.standard_normal((CHANNELS, n))
+        z = step * np.cumsum(step * np.cumsum(a, axis=1), axis=1)
+        front_error, rear_error = (
+            z[2 + w]
+            + (m_ii * a[w] + truck.m_12 * a[1 - w] + theta[M_U1 + w] * a[2 + w]) / theta[K_U1 + w]
+            for w, m_ii in enumerate((truck.m_11, truck.m_22))
+        )
         x, at_front, at_rear = _at_same_places(crossing, at, front_error, rear_error)
         mean = 0.5 * (at_front + at_rear)
         on_bridge = (x >= 0.0) & (x <= crossing.span_m)
@@ -395,10 +399,15 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
 
 
 def largest_deflections_m(problem: Problem, y: FloatArray) -> FloatArray:
-    """Largest deflection under a wheel (k,), positive downwards, of the points y (k, size)."""
-    at = points(problem, y)
-    largest = np.empty(y.shape[0])
-    for k in range(y.shape[0]):
-        _, deflection = roads_and_deflections(problem.crossing, problem.works[0], at, k)
-        largest[k] = -deflection.min()
+    """Largest deflection under a wheel (k,), positive downwards, of the points y (k, size).
+
+    Raises ValueError for an impossible point.
+    """
+    found = [
+        largest_deflections(problem.crossing, problem.works, points(problem, y[n : n + _AT_ONCE]))
+        for n in range(0, y.shape[0], _AT_ONCE)
+    ]
+    largest = np.concatenate(found)
+    if np.isnan(largest).any():
+        raise ValueError("the bridge of this point has no modes")
     return largest

@@ -740,3 +740,20 @@ def roads_and_deflections(
         raise ValueError("the bridge of this point has no modes")
     gain = points.common_gain[k]
     return -gain * work.road, gain * deflection
+
+
+def largest_deflections(crossing: Crossing, works: tuple[Work, ...], points: Points) -> FloatArray:
+    """Largest deflection (k,) in m under a wheel of every point, positive downwards; as `evaluate`.
+
+    NaN of an impossible point. One thread for each of `works`.
+    """
+    out = np.empty(points.theta.shape[0])
+
+    def part(work: Work, begin: int, stop: int) -> None:
+        deflection = np.empty_like(work.road)
+        for k in range(begin, stop):
+            found = _one(crossing, work, points, k, deflection)
+            out[k] = -deflection.min() if found else np.nan
+
+    _in_threads(part, works, out.size)
+    return points.common_gain * out

@@ -1,4 +1,4 @@
-"""B-splines: values and derivatives of a basis, of a curve.
+"""B-splines: values and derivatives of a basis, of a curve; curves through samples.
 
 Written out because `scipy.interpolate` takes as long to import as a crossing's search does
 (docs/benchmarks.md); tests/numerics/test_splines.py compares the two. The recurrences are those of
@@ -9,12 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_banded
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 class Spline(NamedTuple):
-    """A curve: knots (b + degree + 1,), increasing, and coefficients (b,)."""
+    """A curve: knots (b + degree + 1,), increasing, and coefficients (b,); (b, c) of c curves."""
 
     knots: FloatArray
     coefficients: FloatArray
@@ -37,23 +39,77 @@ def basis(knots: FloatArray, degree: int, x: FloatArray, derivative: int = 0) ->
         out[:, 1:] += lower * slope
         out[:, :-1] -= lower * slope
         return out
+    first, values = _not_zero(knots, degree, x)
+    out = np.zeros((x.size, knots.size - degree - 1))
+    for k, value in enumerate(values):
+        out[np.arange(x.size), first + k] = value
+    return out
+
+
+def _not_zero(knots: FloatArray, degree: int, x: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The first basis function (n,) that is not zero at x (n,), values (degree + 1, n) from it on.
+
+    The sums of the recurrence are built up in place, from the last function to the first.
+    """
     count = knots.size - degree - 1
     span = np.clip(np.searchsorted(knots, x, side="right") - 1, degree, count - 1)
-    values = np.zeros((x.size, degree + 1))
-    values[:, -1] = 1.0
+    below = [x - knots[span - k] for k in range(degree)]
+    above = [knots[span + 1 + k] - x for k in range(degree)]
+    values = np.zeros((degree + 1, x.size))
+    values[-1] = 1.0
     for k in range(1, degree + 1):
-        # Those of degree k - 1 that are not zero are the last k; the others stay zero.
-        of = span[:, None] + np.arange(-k, 1)
-        first, width = knots[of[:, 1:]], knots[of[:, 1:] + k] - knots[of[:, 1:]]
-        share = values[:, degree - k + 1 :] * ((x[:, None] - first) / width)
-        rest = values[:, degree - k + 1 :] - share
-        values[:, degree - k + 1 :] = share
-        values[:, degree - k : degree] += rest
-    out = np.zeros((x.size, count))
-    out[np.arange(x.size)[:, None], span[:, None] + np.arange(-degree, 1)] = values
-    return out
+        # Those of degree k - 1 that are not zero are the last k.
+        carried = np.zeros(x.size)
+        for i in range(k):
+            of = degree - k + 1 + i
+            share = values[of] / (above[i] + below[k - 1 - i])
+            values[of - 1] = carried + above[i] * share
+            carried = below[k - 1 - i] * share
+        values[-1] = carried
+    return span - degree, values
 
 
 def value_at(spline: Spline, x: FloatArray, derivative: int = 0) -> FloatArray:
     """Values (n,) of a curve or of its derivative at x (n,)."""
     return np.asarray(basis(spline.knots, spline.degree, x, derivative) @ spline.coefficients)
+
+
+def through(x: FloatArray, y: FloatArray, degree: int) -> Spline:
+    """The curves through y (n, c) at x (n,), increasing, n > degree; the degree is odd.
+
+    No derivative jumps at the (degree - 1)/2 places that are next to each end (de Boor's
+    "not a knot").
+    """
+    ends = (degree + 1) // 2
+    knots = clamped_knots(np.concatenate([x[:1], x[ends:-ends], x[-1:]]), degree)
+    first, values = _not_zero(knots, degree, x)
+    banded = np.zeros((2 * degree + 1, x.size))
+    for k, value in enumerate(values):
+        banded[degree + np.arange(x.size) - first - k, first + k] = value
+    return Spline(knots, solve_banded((degree, degree), banded, y), degree)
+
+
+def curves_at(spline: Spline, x: FloatArray) -> FloatArray:
+    """Values (n, c) of curves at x (n,)."""
+    first, values = _not_zero(spline.knots, spline.degree, x)
+    out = np.zeros((x.size, spline.coefficients.shape[1]))
+    for k, value in enumerate(values):
+        out += value[:, None] * spline.coefficients[first + k]
+    return out
+
+
+def slopes(spline: Spline) -> Spline:
+    """The curves' derivatives."""
+    knots, degree = spline.knots[1:-1], spline.degree
+    width = knots[degree:] - knots[:-degree]
+    rise = np.diff(spline.coefficients, axis=0) * (degree / width)[:, None]
+    return Spline(knots, rise, degree - 1)
+
+
+def integrals(spline: Spline) -> Spline:
+    """The curves' integrals from the first knot on."""
+    knots, degree = spline.knots, spline.degree + 1
+    width = (knots[degree:] - knots[:-degree]) / degree
+    sums = np.cumsum(spline.coefficients * width[:, None], axis=0)
+    around = np.concatenate([knots[:1], knots, knots[-1:]])
+    return Spline(around, np.concatenate([np.zeros_like(sums[:1]), sums]), degree)

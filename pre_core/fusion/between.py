@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.crossing.splines import curves_at, through
 from pre_core.fusion.sums import BridgePriors, Joint, Ready, told, with_priors
 
 FloatArray = NDArray[np.float64]
@@ -122,13 +123,11 @@ def _fine_taus(log: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     From the logarithm of the evidence (t, r), which is smooth between the cells.
     """
-    from scipy.interpolate import CubicSpline  # slow to import, seldom needed
-
     edges = _edges()
     part = (np.arange(_FINER) + 0.5) / _FINER
     fine = edges[:-1, None] + np.diff(edges)[:, None] * part
-    smooth = CubicSpline(np.log(_TAUS + _FIRST_TAU), log, axis=0)
-    density = smooth(np.log(fine.ravel() + _FIRST_TAU)).reshape(*fine.shape, -1)
+    smooth = through(np.log(_TAUS + _FIRST_TAU), log, 3)
+    density = curves_at(smooth, np.log(fine.ravel() + _FIRST_TAU)).reshape(*fine.shape, -1)
     density -= 0.5 * (fine[:, :, None] / BETWEEN_SCALE) ** 2
     weight = np.exp(density - density.max()) * np.diff(edges)[:, None, None]
     return fine, np.moveaxis(weight / weight.sum(), 2, 1)

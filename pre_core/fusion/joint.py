@@ -11,6 +11,8 @@ Longer than other modules: all of it goes by one layout of all unknowns.
 """
 
 from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -63,10 +65,11 @@ def fuse_joined(
     count: int,
     seed: int,
     report: Report = lambda stage, fraction: None,
+    threads: int = 1,
 ) -> Fused:
-    """As `fuse`, of crossings that are ready."""
+    """As `fuse`, of crossings that are ready; the draws do not depend on the number of threads."""
     between = between_of(joint, priors)
-    drawn = _drawn(joint, priors, between, count, seed, report)
+    drawn = _drawn(joint, priors, between, count, seed, report, threads)
     return Fused(*drawn, may_be_zero(between), joint.shared)
 
 
@@ -225,7 +228,13 @@ def with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
 
 
 def _drawn(
-    joint: Joint, priors: BridgePriors, between: Between, count: int, seed: int, report: Report
+    joint: Joint,
+    priors: BridgePriors,
+    between: Between,
+    count: int,
+    seed: int,
+    report: Report,
+    threads: int,
 ) -> tuple[FloatArray, FloatArray]:
     """Draws (count, chains, b) of the bridge's coordinates, and of tau (count, chains)."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
@@ -233,22 +242,38 @@ def _drawn(
     at = (np.arange(count) + rng.random()) / count
     chosen = np.minimum(np.searchsorted(np.cumsum(between.weight), at), between.weight.size - 1)
     of = of_change(joint)
-    out, taus = [], []
-    last: list[FloatArray | None] = [None] * CHAINS  # from one change to the next little moves
+    steps, taus = [], []
     for k in np.unique(chosen):
-        report("drawing the bridge", float((chosen < k).mean()))
         some = int((chosen == k).sum())
         tau, rho = float(between.tau[k]), float(between.rho[k])
         density = _posterior(joint, priors, *changed(joint, of, tau, rho)[:2])
-        of_chains = [
-            draws(density, some, seed, (int(k) + 1) * CHAINS + chain, last[chain])
-            for chain in range(CHAINS)
-        ]
-        last = [one[-1] for one in of_chains]
-        out.append(np.stack(of_chains, axis=1))
+        steps.append(_Step(density, some, (int(k) + 1) * CHAINS))
         taus.append(tau_draws(between, int(k), (some, CHAINS), rng))
+    of_chains: list[FloatArray] = []
+    with ThreadPoolExecutor(threads) as pool:
+        for one in pool.map(partial(_chain, steps, seed), range(CHAINS)):
+            of_chains.append(one)
+            report("drawing the bridge", len(of_chains) / CHAINS)
     order = rng.permutation(count)
-    return np.concatenate(out)[order], np.concatenate(taus)[order]
+    return np.stack(of_chains, axis=1)[order], np.concatenate(taus)[order]
+
+
+class _Step(NamedTuple):
+    """A change between crossings of which some draws are wanted."""
+
+    density: Compliances
+    number: int
+    stream: int
+    """Of the random numbers of the first chain."""
+
+
+def _chain(steps: Sequence[_Step], seed: int, chain: int) -> FloatArray:
+    """One chain's draws (count, b) of all steps: from one change to the next little moves."""
+    out: list[FloatArray] = []
+    for step in steps:
+        after = out[-1][-1] if out else None
+        out.append(draws(step.density, step.number, seed, step.stream + chain, after))
+    return np.concatenate(out)
 
 
 def _posterior(

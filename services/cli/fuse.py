@@ -15,12 +15,12 @@ from schemas.results import (
     results,
     results_json,
 )
+from schemas.settings import IdentificationSettings
 from services.cli.bridge_table import print_bridge
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
 from services.common.progress import Parts, Steps, parts_bar, steps_bar
 from services.identification.bridge_state import (
-    NOTHING_STORED,
     Counted,
     Fusing,
     count_in,
@@ -68,9 +68,8 @@ def fuse_command(
     realms = sorted({crossing.realm for crossing in crossings.values()})
     if len(realms) > 1:
         raise InputError(f"{paths[0]}: crossings of {', '.join(realms)}; fuse one realm at a time")
-    fusing = NOTHING_STORED._replace(with_suspect=fuse_suspect)
-    if baseline is not None:
-        fusing = Fusing(load_results(baseline).bridges, fuse_suspect)
+    stored = {} if baseline is None else load_results(baseline).bridges
+    fusing = Fusing(stored, fuse_suspect, IdentificationSettings().threads)
     ordered = sorted(crossings.values(), key=lambda crossing: crossing.entry_time)
     names = sorted({crossing.bridge for crossing in ordered})
     of_bridges = {name: [one for one in ordered if one.bridge == name] for name in names}

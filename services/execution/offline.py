@@ -85,6 +85,7 @@ def identify_drives(
         settings=settings.model_dump(mode="json"),
         seed=settings.seed,
     )
+    fusing = fusing._replace(threads=settings.threads)
     engine = Engine(site, settings, header, fusing, certificates=certificates, tells_states=False)
     execution = Here(report=report, keep=keep)
     _check_vehicles(drives.name, site, drives.drove)

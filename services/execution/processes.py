@@ -336,7 +336,8 @@ class _Place:
             if isinstance(task, Aside):
                 self.future = self._executor.submit(task.run)
             elif isinstance(task, Fuse):
-                made_of = (task.counted, task.bridge, task.fusing)
+                threads = max(1, task.fusing.threads // places)
+                made_of = (task.counted, task.bridge, task.fusing._replace(threads=threads))
                 self.future = self._executor.submit(self._begin.state_of, *made_of)
             else:
                 threads = max(1, task.settings.threads // places)

@@ -68,6 +68,8 @@ class Fusing(NamedTuple):
     """By bridge: a stored state, with which probabilities of loss are told."""
     with_suspect: bool = False
     """Whether suspect crossings are fused too."""
+    threads: int = 1
+    """The state does not depend on it."""
 
 
 NOTHING_STORED = Fusing()
@@ -159,7 +161,8 @@ def state_of(
             crossings_left_out=_named(left_out),
             crossings_left_out_count=counted.number,
         )
-    found = fused([one.source for one in wanted if one.source is not None], report)
+    sources = [one.source for one in wanted if one.source is not None]
+    found = fused(sources, report, fusing.threads)
     left_out |= dict.fromkeys(found.left_out, LeftOutReason.DISAGREES)
     left_out |= dict.fromkeys(found.other_model, LeftOutReason.OTHER_MODEL)
     reasons = []

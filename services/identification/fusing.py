@@ -133,7 +133,11 @@ def _stretches(off: of_crossing.OffBridge | None) -> tuple[fusion.Stretch, ...]:
     )
 
 
-def fused(sources: Sequence[Source], report: Report = lambda stage, fraction: None) -> FusedBridge:
+def fused(
+    sources: Sequence[Source],
+    report: Report = lambda stage, fraction: None,
+    threads: int = 1,
+) -> FusedBridge:
     """A bridge by crossings, of which the last says what the bridge's unknowns are.
 
     ValueError without crossings.
@@ -159,7 +163,7 @@ def fused(sources: Sequence[Source], report: Report = lambda stage, fraction: No
     def drawing(stage: str, fraction: float) -> None:
         report(stage, _JOINED + (1.0 - _JOINED) * fraction)
 
-    found = fuse_joined(joint, priors, _DRAWS_PER_CHAIN, _SEED, drawing)
+    found = fuse_joined(joint, priors, _DRAWS_PER_CHAIN, _SEED, drawing, threads)
     nominal = priors.coordinates.location[-priors.elements :]
     spread = priors.coordinates.scale[-priors.elements :]
     y = found.draws.reshape(-1, found.draws.shape[2])[:, -priors.elements :]

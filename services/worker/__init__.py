@@ -211,7 +211,7 @@ def run(
         settings=settings.model_dump(mode="json"),
         seed=settings.seed,
     )
-    fusing = Fusing(baselines_of(known, site.parent))
+    fusing = Fusing(baselines_of(known, site.parent), threads=settings.threads)
     earlier = Earlier()
     catches_up, age_s = False, 0.0
     watch: SiteWatch | None = None
@@ -295,7 +295,8 @@ def run(
                 if catching_up is not None:
                     catching_up.retarget(edited.site, now)
                 _log.info("%s was edited: %s counts now, results in %s", site, edited.hash, path)
-                yield from engine.retarget(edited.site, now, Fusing(edited.baselines), found)
+                anew = fusing._replace(baselines=edited.baselines)
+                yield from engine.retarget(edited.site, now, anew, found)
 
             with set_by_signals(signal.SIGHUP) as asked:
                 editing = None if watch is None else Editing(watch, asked, retarget)

@@ -2,9 +2,18 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, make_interp_spline
 
-from pre_core.crossing.splines import Spline, basis, clamped_knots, value_at
+from pre_core.crossing.splines import (
+    Spline,
+    basis,
+    clamped_knots,
+    curves_at,
+    integrals,
+    slopes,
+    through,
+    value_at,
+)
 
 
 @pytest.mark.parametrize("degree", [1, 3, 5])
@@ -30,3 +39,21 @@ def test_a_curve_is_the_sum_of_its_basis() -> None:
     for order in (0, 1, 2):
         ours = value_at(Spline(knots, coefficients, 3), x, order)
         assert np.allclose(ours, theirs(x, nu=order), rtol=1e-12, atol=1e-11)
+
+
+@pytest.mark.parametrize("degree", [1, 3, 5])
+def test_curves_through_samples_their_slopes_and_integrals(degree: int) -> None:
+    rng = np.random.default_rng(5)
+    x = np.cumsum(rng.uniform(0.5, 1.5, 40))
+    y = rng.standard_normal((40, 4))
+    theirs, ours = make_interp_spline(x, y, k=degree), through(x, y, degree)
+    at = np.concatenate([x, rng.uniform(x[0] - 0.2, x[-1] + 0.2, 100)])
+    assert np.allclose(ours.knots, theirs.t, rtol=0.0, atol=1e-12)
+    for _ in range(2):
+        ours, theirs = integrals(ours), theirs.antiderivative()
+        assert np.allclose(curves_at(ours, at), theirs(at), rtol=1e-11, atol=1e-11)
+    for _ in range(1 + degree):
+        ours, theirs = slopes(ours), theirs.derivative()
+        expected = theirs(at)
+        scale = np.abs(expected).max()
+        assert np.allclose(curves_at(ours, at), expected, rtol=1e-11, atol=1e-11 * scale)

@@ -35,6 +35,9 @@ from schemas.results import Crossing
 SOUND_NM2 = 1.56e10
 SCENARIO_6 = [1.0, 1.0, 1.0, 0.4, 1.0, 1.0, 1.0]
 
+SELDOM = ("k_rot_", "f_start", "f_end", "kappa")
+"""What most bridges do not have: at zero, or at its limit, in most draws."""
+
 # What a processor must have (as /proc/cpuinfo names it) to compute as this one does.
 AS_ANOTHER_PROCESSOR = {
     "Prescott": ({"OPENBLAS_CORETYPE": "Prescott"}, ["pni"]),
@@ -113,41 +116,69 @@ def test_least_squares_gives_the_reference(
     assert moved(maker.digest(noise_free), reference["noise_free"], {}) == {}
 
 
-@pytest.mark.process
-@pytest.mark.parametrize("which", AS_ANOTHER_PROCESSOR)
-def test_least_squares_gives_the_reference_on_other_processors(
-    which: str, maker: ModuleType, reference: dict[str, Any], noise_free: Crossing
-) -> None:
+def as_another_processor(which: str, maker: ModuleType, name: str) -> dict[str, Any]:
+    """What a process that computes like it makes of a source."""
     if platform.machine() != "x86_64":
         pytest.skip("only the kernels for x86-64 can be told apart by name")
     settings, needed = AS_ANOTHER_PROCESSOR[which]
     if missing := set(needed) - set(Path("/proc/cpuinfo").read_text().split()):
         pytest.skip(f"this processor has no {', '.join(sorted(missing))}")
     child = subprocess.run(
-        [sys.executable, str(maker.__file__), "--print", "noise_free"],
+        [sys.executable, str(maker.__file__), "--print", name],
         env={k: v for k, v in os.environ.items() if k != "NUMBA_CPU_FEATURES"} | settings,
         capture_output=True,
         text=True,
         check=True,
     )
-    found = json.loads(child.stdout)["noise_free"]
+    found: dict[str, Any] = json.loads(child.stdout)[name]
+    return found
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("which", AS_ANOTHER_PROCESSOR)
+def test_least_squares_gives_the_reference_on_other_processors(
+    which: str, maker: ModuleType, reference: dict[str, Any], noise_free: Crossing
+) -> None:
+    found = as_another_processor(which, maker, "noise_free")
     assert moved(found, reference["noise_free"], {}) == {}
     if which in ("Prescott", "numba's generic"):
         # No processor that has anything better than these rounds like them: they were in use.
         assert found != json.loads(json.dumps(maker.digest(noise_free)))
 
 
+def sample_tolerance(expected: dict[str, Any]) -> dict[str, float]:
+    """How far the sample may be from its reference, as rounding decides which draws are kept.
+
+    A thousand draws of a normal tell its quantile 2.5 % to 0.085 standard deviations, two sets
+    differ by 0.12: three times that is allowed. Of what is mostly nothing at all a few draws make
+    the spread and the quantiles: 1. Means are told three times better and held to 0.1.
+    """
+    tolerance = {}
+    for name, values in expected["estimates"].items():
+        seldom = name.startswith(SELDOM)
+        for what in values:
+            most = 0.1 if what == "mean" else 1.0 if seldom else 0.35
+            tolerance[f".estimates.{name}.{what}"] = most * values["std"]
+    # The road is drawn at the mean of the chains: micrometres follow from a tenth of all spreads.
+    tolerance |= {".road_front_m": 5e-6, ".road_rear_m": 5e-6, ".iri_m_per_km": 1e-2}
+    return tolerance | {".chi2_per_dof": 1e-4, ".scale_error": 0.02 * expected["scale_error"]}
+
+
 def test_the_sample_gives_the_reference(
     maker: ModuleType, reference: dict[str, Any], sample: Crossing
 ) -> None:
     expected = reference["sample"]
-    tolerance = {
-        f".estimates.{name}.": 0.1 * values["std"] for name, values in expected["estimates"].items()
-    }
-    # The road is drawn at the mean of the chains: micrometres follow from a tenth of all spreads.
-    tolerance |= {".road_front_m": 5e-6, ".road_rear_m": 5e-6, ".iri_m_per_km": 1e-2}
-    tolerance |= {".chi2_per_dof": 1e-4, ".scale_error": 0.02 * expected["scale_error"]}
-    assert moved(maker.digest(sample), expected, tolerance) == {}
+    assert moved(maker.digest(sample), expected, sample_tolerance(expected)) == {}
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("which", ["Prescott", "Haswell", "SkylakeX"])
+def test_the_sample_gives_the_reference_on_other_processors(
+    which: str, maker: ModuleType, reference: dict[str, Any]
+) -> None:
+    expected = reference["sample"]
+    found = as_another_processor(which, maker, "sample")
+    assert moved(found, expected, sample_tolerance(expected)) == {}
 
 
 def test_the_sample_is_small_good_and_true(maker: ModuleType, sample: Crossing) -> None:
