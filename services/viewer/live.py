@@ -35,10 +35,10 @@ _log = logging.getLogger(__name__)
 
 APPLICATION: Final = "driveby-live"
 _KEPT: Final = "256MB"
-"""For viewers that come late: some hours of a truck, or hundreds of results."""
+"""For viewers that come late."""
 _PAST_S: Final = 60.0
 """Of what trucks measured before this command began, as far as they keep it."""
-_PERIOD_S: Final = 0.25
+_PERIOD_S: Final = 0.5
 """How often what has come is drawn."""
 
 _TRIES: Final = 120

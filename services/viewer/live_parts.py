@@ -21,7 +21,7 @@ from services.viewer.rerun_parts import (
 )
 from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH
 
-PERIOD_S: Final = 0.01
+PERIOD_S: Final = 0.02
 """Of accelerations the smallest and the largest sample of each such time is drawn."""
 ROADS_MIDDLE: Final = STRIP_HEIGHT + 330.0
 """How far below the strip's top the roads stand, in its pixels; `ROADS_REACH` up and down."""

@@ -7,6 +7,7 @@ a server which keeps the newest for late viewers can let go of all that is old.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -77,6 +78,9 @@ _SOON_NS: Final = 120_000_000_000
 _TICKS_S: Final = 20.0
 """So long after the last that was heard time goes on, so that a state that has just begun is seen.
 Then it stands still, and the window of accelerations still has what came last."""
+_PLACES_EVERY_S: Final = 1.0
+"""How often a truck is moved on the map and the plans: each time takes a kilobyte at every place
+of a server that keeps what was for late viewers."""
 _GAP_NS: Final = 200_000_000
 """A line of accelerations is broken where nothing came for so long."""
 _LANE_STEP_NS: Final = 1_000_000
@@ -108,6 +112,7 @@ class _Truck:
         self.track: deque[tuple[float, float]] = deque(maxlen=_TRACK_FIXES)
         self.channels: set[str] = set()
         self.drawn_to_ns = 0
+        self.placed_s = -math.inf
         self.track_ns = 0
 
 
@@ -287,8 +292,10 @@ class LivePicture:
         truck.drawn_to_ns = last.wall_time_ns + round(1e9 * longest_s)
 
     def _draw_position(self, vehicle: str, truck: _Truck) -> None:
-        if not truck.fixes:
+        now_s = self._clock()
+        if not truck.fixes or now_s - truck.placed_s < _PLACES_EVERY_S:
             return
+        truck.placed_s = now_s
         fixes = sorted(truck.fixes, key=lambda one: one.wall_time_ns)
         truck.fixes = []
         places = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes])

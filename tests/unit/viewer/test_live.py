@@ -160,6 +160,16 @@ def test_peaks_are_kept_and_gaps_stay_gaps() -> None:
         assert extremes(*slow, 100.0)[1].size == slow[1].size  # nothing to be spared
 
 
+def test_a_truck_is_moved_once_a_second(live: Live) -> None:
+    for number in range(25):  # a fix and a look every eighth of a second
+        live.hears("vehicle", "gnss", fix(number))
+        live.picture.flush()
+        live.clock[0] += 0.125
+    places = [c for c in live.drawn() if c.entity_path == "/map/position/truck-1"]
+    looks = [chunk.to_record_batch().num_rows for chunk in places if not chunk.is_static]
+    assert looks == [1, 8, 8, 8]
+
+
 def test_a_drive_is_drawn_with_bounded_rates(live: Live) -> None:
     drives(live, 5)
     chunks = live.drawn()
