@@ -252,8 +252,8 @@ def _drawn(
     of_chains: list[FloatArray] = []
     with ThreadPoolExecutor(threads) as pool:
         for one in pool.map(partial(_chain, steps, seed), range(CHAINS)):
-            of_chains.append(one)
             report("drawing the bridge", len(of_chains) / CHAINS)
+            of_chains.append(one)
     order = rng.permutation(count)
     return np.stack(of_chains, axis=1)[order], np.concatenate(taus)[order]
 
