@@ -1,4 +1,4 @@
-"""Pieces of the live picture: what is dated, few points for many samples, roads, trends."""
+"""Pieces of the live picture: what is dated, few points for many samples, roads, trends, texts."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 import rerun as rr
 
+from schemas.results import Crossing, lowest_element
 from services.identification.comparison import Estimate
 from services.viewer.crossing_view import VEHICLE_COLOURS, CrossingView, FloatArray
 from services.viewer.rerun_parts import (
@@ -119,3 +120,23 @@ def log_trend(
     for name, values in (("mean", fused.mean), ("low", fused.low), ("high", fused.high)):
         ratio = float(values[lowest] / nominal[lowest])
         dated.log(f"{root}/lowest/{name}", rr.Scalars(ratio))
+
+
+def clock_text(crossing: Crossing) -> str:
+    """When a crossing was driven, in UTC."""
+    moment = np.datetime64(round(crossing.entry_time), "s")
+    return f"{str(moment).replace('T', ' ')} UTC"
+
+
+def result_text(crossing: Crossing) -> str:
+    """Verdict, reasons and lowest element of a crossing, as Markdown."""
+    way = "→" if crossing.direction == "start_to_end" else "←"
+    lines = [f"### {crossing.verdict.capitalize()}: {crossing.vehicle} {way} {crossing.bridge}"]
+    lines.append(clock_text(crossing))
+    if crossing.verdict == "suspect":
+        lines.append("**Doubtful: to be looked at, not to be relied upon.**")
+    lowest = lowest_element(crossing)
+    if lowest is not None:
+        lines.append(f"Lowest: {lowest}")
+    lines += [f"- {text}" for text in crossing.reason_texts]
+    return "\n\n".join(lines)

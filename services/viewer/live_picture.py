@@ -18,7 +18,7 @@ import rerun as rr
 from google.protobuf.message import DecodeError
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import BridgeResult, Crossing, lowest_element
+from schemas.results import BridgeResult, Crossing
 from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
 from schemas.signals import AccelBatch, GnssFix, decode_accel, decode_gnss
 from schemas.site import Site
@@ -42,7 +42,15 @@ from services.viewer.live_layout import (
     result_root,
     trend_root,
 )
-from services.viewer.live_parts import Dated, extremes, log_roads, log_trend, log_trend_look
+from services.viewer.live_parts import (
+    Dated,
+    clock_text,
+    extremes,
+    log_roads,
+    log_trend,
+    log_trend_look,
+    result_text,
+)
 from services.viewer.rerun_crossing import log_rigidity
 from services.viewer.rerun_file import acceleration_series
 from services.viewer.rerun_parts import (
@@ -230,13 +238,13 @@ class LivePicture:
         drawn_s, _ = self._drawn.get(crossing.bridge, (0.0, ""))
         if crossing.entry_time < drawn_s or crossing.bridge not in self._bridges:
             return
-        text = _result_text(crossing)
+        text = result_text(crossing)
         if elements is not None:
             view = view_of_crossing(crossing, elements)
             text += f"\n\n{summary_line(view)}"
             if view.rigidity_nm2 is not None:
                 text += self._draw_result(view, moment_ns)
-                self._below[crossing.bridge] = _clock_text(crossing)
+                self._below[crossing.bridge] = clock_text(crossing)
         if crossing.verdict == "rejected" and crossing.bridge in self._below:
             text += f"\n\nBelow: still the crossing of {self._below[crossing.bridge]}."
         self._drawn[crossing.bridge] = (crossing.entry_time, text)
@@ -437,21 +445,3 @@ def _of_site(site: Site | None) -> dict[str, _OnSite]:
         bridge.id: _OnSite(on_map, bridge, bridge_frame(bridge))
         for bridge, on_map in zip(site.bridges, bridges_of_site(site), strict=True)
     }
-
-
-def _clock_text(crossing: Crossing) -> str:
-    moment = np.datetime64(round(crossing.entry_time), "s")
-    return f"{str(moment).replace('T', ' ')} UTC"
-
-
-def _result_text(crossing: Crossing) -> str:
-    way = "→" if crossing.direction == "start_to_end" else "←"
-    lines = [f"### {crossing.verdict.capitalize()}: {crossing.vehicle} {way} {crossing.bridge}"]
-    lines.append(_clock_text(crossing))
-    if crossing.verdict == "suspect":
-        lines.append("**Doubtful: to be looked at, not to be relied upon.**")
-    lowest = lowest_element(crossing)
-    if lowest is not None:
-        lines.append(f"Lowest: {lowest}")
-    lines += [f"- {text}" for text in crossing.reason_texts]
-    return "\n\n".join(lines)
