@@ -22,6 +22,7 @@ from pydantic import (
 
 from schemas.signals import MAX_RATE_HZ
 from schemas.site_errors import at
+from schemas.site_ros2 import Ros2, check_ros2
 from schemas.topics import IDENTIFIER
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
 
@@ -399,6 +400,8 @@ class Site(_Table):
     bridges: Annotated[tuple[Bridge, ...], Field(alias="bridge", min_length=1)]
     sensor: Sensor
     receiver: Receiver = Receiver()
+    ros2: tuple[Ros2, ...] = ()
+    """Where messages of trucks with ROS 2 come from; says nothing of what they measure."""
 
     def vehicle(self, identifier: str) -> Vehicle:
         """Return the vehicle of that id; KeyError if the site has none."""
@@ -420,6 +423,7 @@ class Site(_Table):
                 if table.id in seen:
                     raise at(f"{name}.{index}.id", f'is "{table.id}" again, ids must be unique')
                 seen.add(table.id)
+        check_ros2(self.ros2, {vehicle.id for vehicle in self.vehicles})
         return self
 
 

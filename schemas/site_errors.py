@@ -133,6 +133,8 @@ def _expected(problem: Any, key: str, tables: Tables) -> str:
         return (
             'an identifier of a-z, 0-9, "_" and "-", at most 63, beginning with a letter or digit'
         )
+    if key in ("topic", "gnss", "velocity"):
+        return 'the whole name of a topic of ROS, e.g. "/imu/front"'
     if kind in ("float_type", "int_type", "int_from_float"):
         return _quantity(key) or "a number"
     if kind in ("tuple_type", "too_short", "too_long"):
@@ -150,12 +152,13 @@ def _expected(problem: Any, key: str, tables: Tables) -> str:
 
 _CHOICES: Final = {
     "bearings": '"unknown", "free" or "sprung"',
+    "axis": '"x", "y" or "z", with "-" before it if that axis points down',
     "road_class": 'an ISO 8608 class, "A" to "E"',
 }
 
 
 def _list_expected(key: str, tables: Tables) -> str:
-    if key in ("vehicle", "bridge"):
+    if key in ("vehicle", "bridge", "ros2"):
         return f"a table [{key}] or several [[{key}]]"
     if key in ("flexural_rigidity_per_element_nm2", "element_lengths_m"):
         return "a list with one number for each element"

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 from schemas.errors import InputError
 from schemas.site import MAX_ELEMENTS, MAX_TABLES, Bridge, Receiver, Sensor, Site, Vehicle
 from schemas.site_errors import Tables, all_lines, first_line
+from schemas.site_ros2 import Ros2
 from schemas.toml_text import parse_toml, read_toml_text
 
 _MOST_FIELDS: Final = 100
@@ -19,7 +20,10 @@ _TABLES: Final[Tables] = {
     "bridge": Bridge,
     "sensor": Sensor,
     "receiver": Receiver,
+    "ros2": Ros2,
 }
+_LISTS: Final = ("vehicle", "bridge", "ros2")
+"""Tables of which there may be several."""
 
 
 def load_site(path: Path) -> Site:
@@ -35,7 +39,7 @@ def read_site_text(path: Path) -> str:
 def parse_site(toml_text: str, source_name: str) -> Site:
     """Return the site that the text describes; raise InputError that begins with `source_name`."""
     table = parse_toml(toml_text, source_name)
-    single = {name for name in ("vehicle", "bridge") if isinstance(table.get(name), dict)}
+    single = {name for name in _LISTS if isinstance(table.get(name), dict)}
     for name in single:
         table[name] = [table[name]]
     too_many = _too_many(table)
@@ -59,7 +63,7 @@ def faults_of_site(toml_text: str, source_name: str) -> list[str]:
         if not isinstance(cause, ValidationError):
             return [str(error)]
         table = parse_toml(toml_text, source_name)
-        single = {name for name in ("vehicle", "bridge") if isinstance(table.get(name), dict)}
+        single = {name for name in _LISTS if isinstance(table.get(name), dict)}
         return [f"{source_name}: {line}" for line in all_lines(cause, single, _TABLES)]
     return []
 
@@ -82,8 +86,12 @@ def _too_many(table: dict[str, Any]) -> str | None:
 
 
 def site_hash(site: Site) -> str:
-    """Return 16 hex digits that change when any value changes, however the file is laid out."""
-    canonical = json.dumps(site.model_dump(by_alias=True), sort_keys=True, separators=(",", ":"))
+    """Return 16 hex digits that change when any value changes, however the file is laid out.
+
+    But for `[ros2]`, which says by which way messages come and nothing of what is in them.
+    """
+    values = site.model_dump(by_alias=True, exclude={"ros2"})
+    canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
@@ -93,7 +101,8 @@ def site_toml(site: Site) -> str:
     bridge = "[bridge]" if len(site.bridges) == 1 else "[[bridge]]"
     tables: list[tuple[str, BaseModel]] = [(vehicle, table) for table in site.vehicles]
     tables += [(bridge, table) for table in site.bridges]
-    return _toml([*tables, ("[sensor]", site.sensor), ("[receiver]", site.receiver)])
+    ros2 = [("[[ros2]]", table) for table in site.ros2]
+    return _toml([*tables, ("[sensor]", site.sensor), ("[receiver]", site.receiver), *ros2])
 
 
 def vehicle_toml(site: Site, vehicle_id: str) -> str:
@@ -120,7 +129,13 @@ def _table_text(heading: str, table: dict[str, Any]) -> str:
     lines = [heading]
     for key, value in table.items():
         if value is not None:
-            # JSON's numbers, strings, booleans and lists are TOML's; DEL alone must be escaped.
-            text = json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
-            lines.append(f"{key} = {text}")
+            lines.append(f"{key} = {_value_text(value)}")
     return "\n".join(lines) + "\n"
+
+
+def _value_text(value: Any) -> str:
+    if isinstance(value, dict):
+        pairs = (f"{key} = {_value_text(one)}" for key, one in value.items() if one is not None)
+        return f"{{ {', '.join(pairs)} }}"
+    # JSON's numbers, strings, booleans and lists are TOML's; DEL alone must be escaped.
+    return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")

@@ -3,7 +3,7 @@
 import argparse
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +13,8 @@ from services.common.errors import InputError
 
 if TYPE_CHECKING:
     from schemas.alarms import Alarm
+    from services.history.past import Past
     from services.history.periods import FusedPeriod
-    from services.viewer.history_figure import History
 
 HISTORY = Path("history")
 _ADD = "add"
@@ -44,10 +44,17 @@ def add_history(commands: Any) -> None:
     add_file(
         p, "--temperature", "T.csv", "with add: time_s,temperature_deg_c[,bridge] beside crossings"
     )
+    p.add_argument(
+        "--later",
+        action="store_true",
+        help="with add: fuse nothing now; who looks at a bridge first waits for it then",
+    )
     add_file(p, "--csv", "OUT.csv", "write a row for each period and element here")
     add_file(p, "--json", "OUT.json", "write periods and alarms here")
     add_file(p, "--figures", "DIR", "draw the bridge over time here, as PNG and SVG")
     add_file(p, "--rrd", "OUT.rrd", "write EI over time for Rerun here")
+    p.add_argument("--view", action="store_true", help="look at EI over time in the Rerun viewer")
+    p.add_argument("--web", action="store_true", help="look at it in the browser")
     p.add_argument("--sql", metavar="SELECT …", help="ask about the table crossings (DuckDB)")
 
 
@@ -84,6 +91,13 @@ def _add(options: argparse.Namespace, paths: list[Path]) -> int:
         there = f", {added.known} there already" if added.known else ""
         beside = f", {len(known)} with a temperature" if options.temperature is not None else ""
         print(f"{path}: {added.crossings} crossings{of} added{there}{beside}")
+    if not options.later:
+        from services.execution.blas import one_blas_thread
+        from services.history.past import fuse_ahead
+
+        crossings = [crossing for _, results in files for crossing in results.crossings]
+        with a_console().status("fusing what was added"), one_blas_thread():
+            fuse_ahead(options.history, crossings, options.period, print)
     return 0
 
 
@@ -102,91 +116,57 @@ def _table(options: argparse.Namespace) -> int:
 
 
 def _show(options: argparse.Namespace, bridge: str) -> int:
-    from services.common.files import check_writable, make_folder, write_atomically
+    from services.common.files import check_writable, write_atomically
     from services.execution.blas import one_blas_thread
-    from services.history.alarm_files import alarms_of
-    from services.history.archive import partition, read_partition, realm_of
-    from services.history.periods import fused_periods
+    from services.history.archive import realm_of
+    from services.history.past import past_of
 
     for path in (options.csv, options.json, options.rrd):
         if path is not None:
             check_writable(path)
     folder: Path = options.history
     realm = realm_of(folder, bridge, options.realm)
-    read = read_partition(partition(folder, realm, bridge), ("likelihood",))
-    alarms, problems = alarms_of(folder, realm, bridge)
-    for problem in (*read.problems, *problems):
-        print(problem)
     console = a_console()
-    with console.status(f"fusing {len(read.crossings)} crossings"), one_blas_thread():
-        periods = fused_periods(folder, realm, bridge, read.crossings, options.period, print)
-    if not periods:
+    with console.status("fusing crossings"), one_blas_thread():
+        past = past_of(folder, realm, bridge, options.period, print)
+    if not past.periods:
         raise InputError(f"{folder}: no crossing of {bridge} can be read")
-    for line in _lines(bridge, realm, periods, alarms, options.period):
+    for line in _lines(past):
         print(line)
     if options.csv is not None:
-        write_atomically(options.csv, "".join(_csv(periods)))
+        write_atomically(options.csv, "".join(_csv(past.periods)))
     if options.json is not None:
-        write_atomically(options.json, _json(bridge, realm, options.period, periods, alarms))
+        write_atomically(options.json, _json(past))
     written = [path for path in (options.csv, options.json) if path is not None]
-    if options.figures is not None or options.rrd is not None:
-        drawn = history_view(bridge, options.period, periods, alarms)
-        if options.figures is not None:
-            from services.viewer.history_figure import history_figure
-
-            make_folder(options.figures)
-            for form in ("png", "svg"):
-                path = options.figures / f"{bridge}-history.{form}"
-                history_figure(path, drawn)
-                written.append(path)
-        if options.rrd is not None:
-            from services.viewer.rerun_history import write_history
-
-            write_history(options.rrd, drawn)
-            written.append(options.rrd)
-    for path in written:
+    for path in (*written, *_drawn(options, past)):
         print(path)
+    if options.view or options.web:
+        from services.viewer.rerun_history import view_history
+
+        return view_history(past, web=options.web)
     return 0
 
 
-def history_view(
-    bridge: str, unit: str, periods: "list[FusedPeriod]", alarms: "list[Alarm]"
-) -> "History":
-    """What is drawn of a bridge's past."""
-    from services.viewer.history_figure import History, Mark, Point
+def _drawn(options: argparse.Namespace, past: "Past") -> Iterator[Path]:
+    """Draw what was asked for."""
+    if options.figures is not None:
+        from services.common.files import make_folder
+        from services.viewer.history_figure import history_figure
 
-    points = []
-    for one in periods:
-        if one.state is not None and one.state.elements:
-            of = list(one.state.elements.values())
-            points.append(
-                Point(
-                    0.5 * (one.begin_s + one.end_s),
-                    tuple(e.mean for e in of),
-                    tuple(e.q025 for e in of),
-                    tuple(e.q975 for e in of),
-                    one.state.verdict or "good",
-                    one.temperature_deg_c,
-                )
-            )
-    marks = tuple(
-        Mark(
-            alarm.element,
-            alarm.direction == "stiffer",
-            alarm.since,
-            alarm.raised,
-            alarm.sentence(),
-            "" if alarm.acknowledged is None else
-            f"{alarm.acknowledged.by}, {_day(alarm.acknowledged.time)}",
-        )
-        for alarm in alarms
-    )  # fmt: skip
-    return History(bridge, unit, tuple(points), marks)
+        make_folder(options.figures)
+        for form in ("png", "svg"):
+            path = options.figures / f"{past.bridge}-history.{form}"
+            history_figure(path, past)
+            yield path
+    if options.rrd is not None:
+        from services.viewer.rerun_history import write_history
+
+        write_history(options.rrd, past)
+        yield options.rrd
 
 
-def _lines(
-    bridge: str, realm: str, periods: "list[FusedPeriod]", alarms: "list[Alarm]", unit: str
-) -> Iterator[str]:
+def _lines(past: "Past") -> Iterator[str]:
+    bridge, realm, unit, periods, alarms = past
     number = sum(one.crossings for one in periods)
     yield (
         f"{bridge} in realm {realm}: {number} crossings in {len(periods)} "
@@ -222,7 +202,7 @@ def alarm_line(alarm: "Alarm") -> str:
     )
 
 
-def _csv(periods: "list[FusedPeriod]") -> Iterator[str]:
+def _csv(periods: "Sequence[FusedPeriod]") -> Iterator[str]:
     yield (
         "begin_time,end_time,element,mean_nm2,std_nm2,q025_nm2,q975_nm2,verdict,crossings_used,"
         "crossings,temperature_deg_c\n"
@@ -237,9 +217,8 @@ def _csv(periods: "list[FusedPeriod]") -> Iterator[str]:
             yield f"{one.begin_s:.0f},{one.end_s:.0f},{name},{values},{rest}\n"
 
 
-def _json(
-    bridge: str, realm: str, unit: str, periods: "list[FusedPeriod]", alarms: "list[Alarm]"
-) -> str:
+def _json(past: "Past") -> str:
+    bridge, realm, unit, periods, alarms = past
     told = {
         "bridge": bridge,
         "realm": realm,

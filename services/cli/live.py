@@ -1,4 +1,4 @@
-"""Commands on the bus: demo, logger, worker, truck, health."""
+"""Commands on the bus: demo, logger, worker, truck, gateway, health."""
 
 import argparse
 from pathlib import Path
@@ -232,6 +232,19 @@ def add_truck(commands: Any) -> None:
         help="what the truck will measure: a recording, or a folder of CSV files with --site",
     )
     add_site(p, "of a folder of CSV files (a recording carries its own)")
+    _add_spool(p)
+    add_endpoint(p)
+    add_realm(p)
+    add_speed(p, 1.0)
+    p.add_argument(
+        "--skip-gaps",
+        action="store_true",
+        help="do not wait where nothing was recorded for over 2 s, as between runs",
+    )
+    p.add_argument("--vehicle", metavar="ID", help="which one drives, if there are several")
+
+
+def _add_spool(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--spool",
         type=Path,
@@ -245,15 +258,6 @@ def add_truck(commands: Any) -> None:
         metavar="MIB",
         help="room for the spool; over it the oldest is given up (default: 4096)",
     )
-    add_endpoint(p)
-    add_realm(p)
-    add_speed(p, 1.0)
-    p.add_argument(
-        "--skip-gaps",
-        action="store_true",
-        help="do not wait where nothing was recorded for over 2 s, as between runs",
-    )
-    p.add_argument("--vehicle", metavar="ID", help="which one drives, if there are several")
 
 
 def _truck(options: argparse.Namespace) -> int:
@@ -270,6 +274,45 @@ def _truck(options: argparse.Namespace) -> int:
         spool_budget_bytes=options.spool_budget << 20,
         site=options.site,
         skip_gaps=options.skip_gaps,
+    )
+
+
+def add_gateway(commands: Any) -> None:
+    """`driveby gateway`: publish as a truck of ours what a truck of others says."""
+    p = command(
+        commands,
+        "gateway",
+        _gateway,
+        "publish what a truck with ROS 2 says, as a truck of ours",
+        "driveby gateway ros2 --ros tcp/127.0.0.1:7447 --endpoint tcp/office:7447 --site site.toml",
+    )
+    p.add_argument("what", choices=("ros2",), help="ros2: with rmw_zenoh, see docs/ros2.md")
+    p.add_argument(
+        "--ros",
+        required=True,
+        metavar="ENDPOINT",
+        help="where rmw_zenoh's router listens, e.g. tcp/127.0.0.1:7447",
+    )
+    add_site(p, "the truck, and its topics in [ros2]", required=True)
+    p.add_argument("--vehicle", metavar="ID", help="which of the site's vehicles it is")
+    _add_spool(p)
+    add_endpoint(p)
+    add_realm(p)
+
+
+def _gateway(options: argparse.Namespace) -> int:
+    from services.truck import ros2
+
+    return ros2.run(
+        ros=options.ros,
+        endpoint=options.endpoint or default_endpoint(options.tls),
+        realm=options.realm,
+        site=options.site,
+        vehicle=options.vehicle,
+        tls=options.tls,
+        spool=options.spool,
+        spool_budget_bytes=options.spool_budget << 20,
+        ready=lambda: print(f"ready, listening to ROS 2 at {options.ros}", flush=True),
     )
 
 
@@ -301,5 +344,5 @@ def _health(options: argparse.Namespace) -> int:
     return 0
 
 
-SERVICES: Final = (_logger, _worker, _truck)
+SERVICES: Final = (_logger, _worker, _truck, _gateway)
 """Run until they are stopped, and have nothing else to show for themselves than what they say."""

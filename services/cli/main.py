@@ -26,6 +26,7 @@ from services.cli.info import add_info
 from services.cli.live import (
     SERVICES,
     add_demo,
+    add_gateway,
     add_health,
     add_logger,
     add_truck,
@@ -68,6 +69,7 @@ _COMMANDS: Final = (
     add_logger,
     add_worker,
     add_truck,
+    add_gateway,
     add_replay,
     add_watch,
     add_health,

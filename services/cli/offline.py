@@ -246,8 +246,9 @@ def add_import(commands: Any) -> None:
         "sources",
         type=Path,
         nargs="+",
-        metavar="DIR | ACCEL.csv GPS.csv",
-        help="a folder with accel_NN.csv and gps_NN.csv, one such pair, or a comma2k19 segment",
+        metavar="DIR | ACCEL.csv GPS.csv | ROS",
+        help="a folder with accel_NN.csv and gps_NN.csv, one such pair, a comma2k19 segment, "
+        "or a recording of ROS 2 (a rosbag2 folder, .mcap, .db3)",
     )
     add_site(p, "what was driven, over which bridges; is stored in the recording", required=True)
     p.add_argument("--vehicle", metavar="ID", help="which of the site's vehicles drove")

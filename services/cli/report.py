@@ -32,6 +32,10 @@ def add_report(commands: Any) -> None:
     )
     add_site(p, "where bridges are (default: of a recording in the folder of the results)")
     add_file(p, "--baseline", "OLD.json", "results to compare with (default: the site file's)")
+    add_file(p, "--history", "DIR", "add a page with each bridge over time, from this history")
+    p.add_argument(
+        "--period", choices=("day", "week", "month"), default="month", help="(default: month)"
+    )
 
 
 def _report(options: argparse.Namespace) -> int:
@@ -40,7 +44,7 @@ def _report(options: argparse.Namespace) -> int:
     from services.common.files import check_writable, write_atomically
     from services.common.progress import steps_bar
     from services.history.site_of_results import site_of_results
-    from services.report.bridge import bridge_reports
+    from services.report.bridge import bridge_reports, with_pasts
     from services.report.page import page
     from services.report.pdf import find_browser, write_pdf
 
@@ -58,6 +62,8 @@ def _report(options: argparse.Namespace) -> int:
         files.append((path, results, site_of_results(path, results, options.site)))
     beside = None if options.site is None else options.site.parent
     reports = bridge_reports(files, options.baseline, beside)
+    if options.history is not None:
+        reports = with_pasts(reports, options.history, options.period, print)
     with steps_bar(f"drawing {output}") as progress:
         text = page(reports, progress)
     write_atomically(output, text)

@@ -1,5 +1,6 @@
 """`driveby import`: files of a drive become a recording."""
 
+import logging
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -12,10 +13,12 @@ from services.common.naming import checked_identifier, identifier_from
 from services.common.progress import Steps, unwatched_steps
 from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_import import read_folder, read_pair
+from services.drives.ros2_recording import is_ros2, messages_of_ros2
 from services.drives.runs import Run, normalised, run_to_messages
 from services.recordings.recording import Message
 from services.recordings.writer import write_recording
 
+_log = logging.getLogger(__name__)
 _LARGEST_RATE_ERROR = 0.05
 """Clocks of sensors are right to far less; wrong units and wrong site files are off by far more."""
 
@@ -31,7 +34,7 @@ def import_command(
     reading: Steps = unwatched_steps,
     writing: Steps = unwatched_steps,
 ) -> str:
-    """Write the recording of a folder, or of a pair of CSV files; return a line that says so.
+    """Write the recording of a folder, a pair of CSV files, or of ROS 2; return what was written.
 
     Nothing is written if anything is wrong (InputError). `reading` is told of the files that have
     been read, `writing` of the seconds of the drive that have been written.
@@ -41,6 +44,8 @@ def import_command(
     parsed = parse_site(text, str(site))
     vehicle_id = vehicle_of(parsed, str(site), vehicle)
     realm = _realm(sources, name)
+    if len(sources) == 1 and is_ros2(sources[0]):
+        return _import_ros2(sources[0], text, parsed, str(site), output, realm, vehicle_id, force)
     runs = normalised_runs(sources, parsed, str(site), reading)
     messages = write_recording(
         output,
@@ -54,6 +59,25 @@ def import_command(
     return (
         f"{output}: {drives} of {vehicle_id}, {seconds:.1f} s, {messages} messages, realm {realm}"
     )
+
+
+def _import_ros2(
+    source: Path,
+    site_text: str,
+    site: Site,
+    site_name: str,
+    output: Path,
+    realm: str,
+    vehicle_id: str,
+    force: bool,
+) -> str:
+    truck, messages = messages_of_ros2(source, site, site_name, realm, vehicle_id)
+    written = write_recording(
+        output, messages, site_toml=site_text, reason="import complete", force=force
+    )
+    for line in truck.complaints.news():
+        _log.warning("%s: %s", source, line)
+    return f"{output}: a drive of {vehicle_id} with ROS 2, {written} messages, realm {realm}"
 
 
 def messages_of(folder: Path, site: Path, vehicle: str | None) -> Iterator[Message]:
@@ -136,4 +160,6 @@ def _realm(sources: list[Path], name: str | None) -> str:
     if name is not None:
         return f"import-{checked_identifier(name, '--name')}"
     first = sources[0].resolve()
+    if first.suffix in (".mcap", ".db3"):
+        return f"import-{identifier_from(first.stem)}"
     return f"import-{identifier_from((first.parent if first.suffix == '.csv' else first).name)}"

@@ -63,7 +63,7 @@ def sampling_rate_hz(time_s: Floats) -> float:
 
     A rate that cannot be told from a whole number of Hz is that number.
     """
-    index = _grid_index(time_s)
+    index = grid_index(time_s)
     slope = _slope(index, time_s - time_s[0])
     rate = 1 / slope
     whole = max(round(rate), 1)
@@ -150,7 +150,7 @@ def _on_even_grid(run: Run) -> tuple[int, NDArray[np.int64], dict[str, Floats]]:
     Time stamps that leave the grid by little were rounded, and the samples are taken to be even.
     By more: the clock is a real one that wanders, and the samples are interpolated.
     """
-    index = _grid_index(run.accel_time_s)
+    index = grid_index(run.accel_time_s)
     relative = run.accel_time_s - run.accel_time_s[0]
     offset = float(np.mean(relative - index / run.rate_hz))
     jitter = (relative - offset) * run.rate_hz - index
@@ -186,8 +186,8 @@ def resample(
     return grid, {name: CubicSpline(position, v)(grid) for name, v in channels.items()}
 
 
-def _grid_index(time_s: Floats) -> NDArray[np.int64]:
-    """Number the samples; the numbers jump where samples are missing."""
+def grid_index(time_s: Floats) -> NDArray[np.int64]:
+    """Number samples (n,) at increasing times; the numbers jump where samples are missing."""
     steps = np.diff(time_s)
     usual = float(np.median(steps))
     # The mean of the steps that are none of a gap: the median of stamps rounded to ms is rounded.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +13,10 @@ from schemas.reasons import LEFT_OUT_TEXTS, Reason
 from schemas.results import BridgeResult, Crossing, Results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
+from services.execution.blas import one_blas_thread
+from services.history.archive import bridges_of
+from services.history.past import Past, past_of
+from services.history.periods import Unit
 from services.identification.comparison import Estimate, compare
 from services.viewer.baseline import named_baseline, stored_baseline
 from services.viewer.bridge_view import BridgeView, told, view_of_bridge
@@ -92,6 +96,8 @@ class BridgeReport(NamedTuple):
     baseline_name: str | None
     finding: Finding
     quality: str
+    past: Past | None = None
+    """What a history holds of it, if one was given."""
 
 
 def bridge_reports(
@@ -113,6 +119,26 @@ def bridge_reports(
         if any(crossing.bridge == bridge.id for crossing in results.crossings)
     )
     return [_report(name, files, baseline, beside) for name in names]
+
+
+def with_pasts(
+    reports: Iterable[BridgeReport], history: Path, unit: Unit, say: Callable[[str], None]
+) -> list[BridgeReport]:
+    """The reports with what a history holds of their bridges, in the realm of what is reported.
+
+    `say` is told of bridges that are not in it. InputError: there is no such folder.
+    """
+    known = bridges_of(history)
+    found = []
+    for report in reports:
+        bridge, realm = report.bridge.id, report.crossings[-1].realm
+        if (realm, bridge) in known:
+            with one_blas_thread():
+                report = report._replace(past=past_of(history, realm, bridge, unit, say))
+        else:
+            say(f"{history}: has no bridge {bridge} in realm {realm}; the report is without it")
+        found.append(report)
+    return found
 
 
 def _check(path: Path, results: Results, site: Site) -> None:

@@ -12,6 +12,7 @@ from services.common.progress import Steps, unwatched_steps
 from services.identification.comparison import Comparison
 from services.report.bridge import BridgeReport, advice
 from services.report.html import Html, inlined_svg, joined, table, tag
+from services.report.past import past_in_short, past_section
 from services.report.place import ends_of, place_of, start_of
 from services.report.style import CSS
 from services.report.words import words_of
@@ -87,7 +88,8 @@ def page(reports: Sequence[BridgeReport], progress: Steps = unwatched_steps) -> 
 def _pictures(report: BridgeReport) -> int:
     """How many there are of a bridge."""
     shown = sum(crossing.parameters is not None for crossing in report.crossings)
-    return (report.view.estimate is not None) + min(shown, _MOST_PICTURES)
+    past = report.past is not None
+    return (report.view.estimate is not None) + past + min(shown, _MOST_PICTURES)
 
 
 def _bridge(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Html:
@@ -122,7 +124,12 @@ def _bridge(report: BridgeReport, prefix: str, drawn: Callable[[], None]) -> Htm
             drawn()
     # What has no numbers fits on the first sheet.
     beginning = "break" if report.view.estimate is not None else "evidence"
-    body = joined(first, tag("section", heading, class_=beginning), *evidence)
+    past = Html("")
+    if report.past is not None:
+        past = past_section(report.past, f"{prefix}h-")
+        drawn()
+        beginning = "break" if past else beginning
+    body = joined(first, past, tag("section", heading, class_=beginning), *evidence)
     meanings = (tag("p", tag("strong", f"{word}:"), f" {text}") for word, text in words_of(body))
     return joined(body, tag("section", tag("h2", "Words"), *meanings, class_="words"))
 
@@ -153,6 +160,7 @@ def _facts(report: BridgeReport) -> Html:
         ("Quality", report.quality),
         *([] if report.view.estimate is None else [("Compared with", compared)]),
         ("Road", _road(crossings)),
+        *([] if report.past is None else [("Over time", past_in_short(report.past))]),
         ("Source", f"{', '.join(report.sources)}; {', '.join(report.programs)}"),
     ]
     return tag(

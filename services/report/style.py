@@ -38,8 +38,11 @@ svg { width: 100%; height: auto; display: block; }
   .evidence { break-after: avoid; }
   .crossing table { font-size: 8.4pt; }
   .first + .break + .crossing { break-before: avoid; }
+  .past + .break + .crossing { break-before: avoid; }
   .crossing + .first { break-before: page; }
   figure, tr, .finding { break-inside: avoid; }
+  .past { break-before: page; }
+  .past figure svg { max-height: 175mm; }
   .first figure svg { max-height: 44mm; }
   .crossing figure svg { max-height: 85mm; }
   .crossing { break-inside: avoid; }

@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
+from services.history.past import Past
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import (
     BAR_EDGE,
@@ -64,11 +65,42 @@ class History(NamedTuple):
     marks: tuple[Mark, ...]
 
 
-def history_figure(path: Path, history: History) -> None:
+def history_figure(path: Path, past: Past) -> None:
     """Draw a bridge's past into a PNG or SVG file; an existing file is replaced."""
     with matplotlib.rc_context(STYLE):
-        figure = draw_history(history)
+        figure = draw_history(history_of(past))
     write_figure(path, figure)
+
+
+def history_of(past: Past) -> History:
+    """What is drawn of a bridge's past: the periods that gave numbers."""
+    points = []
+    for one in past.periods:
+        if one.state is not None and one.state.elements:
+            of = list(one.state.elements.values())
+            points.append(
+                Point(
+                    0.5 * (one.begin_s + one.end_s),
+                    tuple(e.mean for e in of),
+                    tuple(e.q025 for e in of),
+                    tuple(e.q975 for e in of),
+                    one.state.verdict or "good",
+                    one.temperature_deg_c,
+                )
+            )
+    marks = tuple(
+        Mark(
+            alarm.element,
+            alarm.direction == "stiffer",
+            alarm.since,
+            alarm.raised,
+            alarm.sentence(),
+            "" if alarm.acknowledged is None else
+            f"{alarm.acknowledged.by}, {_day(alarm.acknowledged.time)}",
+        )
+        for alarm in past.alarms
+    )  # fmt: skip
+    return History(past.bridge, past.unit, tuple(points), marks)
 
 
 def draw_history(history: History) -> Figure:
@@ -201,6 +233,10 @@ def _over_time(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(form)
     for side in ("top", "left", "right"):
         axes.spines[side].set_visible(False)
+
+
+def _day(time_s: float) -> str:
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"
 
 
 def _dates(times_s: Iterable[float]) -> list[float]:

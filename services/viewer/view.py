@@ -74,7 +74,7 @@ def view_command(*, target: str | Path, web: bool, console: Console) -> int:
                         drawn, completed=done, total=steps, visible=True
                     ),
                 )
-        return _run_viewer(shown, web=web)
+        return run_viewer(shown, web=web)
 
 
 def convert(
@@ -232,7 +232,11 @@ def check_ended_well(code: int) -> None:
         raise FailureError(f"the Rerun viewer ended with code {code}; without a screen, try --web")
 
 
-def _run_viewer(shown: Path, *, web: bool) -> int:
+def run_viewer(shown: Path, *, web: bool) -> int:
+    """Show a Rerun file until it is closed; return the exit code.
+
+    FailureError: the viewer did not start, or ended badly.
+    """
     prepare_viewer()
     # The viewer would go on alone if this program were told to stop and only itself did, be it
     # while the viewer is being started.

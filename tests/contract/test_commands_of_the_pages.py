@@ -94,6 +94,13 @@ NOT_RUN = {
     "driveby replay drive.mcap": SERVICE,
     f"driveby replay {SAMPLE} --speed 4": SERVICE,
     "driveby truck drive.mcap --spool spool/truck-1": SERVICE,
+    "driveby gateway ros2 --ros tcp/127.0.0.1:7447 --endpoint tcp/office:7447 --site site.toml "
+    "--spool spool/truck-1": SERVICE,
+    "driveby import DRIVE --site site.toml -o drive.mcap": (
+        "needs a recording of ROS 2; tests/unit/drives/test_ros2_recording.py writes some"
+    ),
+    "python -m tests.benchmarks.ros2_rate": "measures; its figure is of one machine",
+    'pip install "driveby[ros2]"': NETWORK,
     "driveby truck FOLDER --site site.toml --spool spool/truck-1": SERVICE,
     "python docs/examples/decode_estimate.py recordings/replay-drive/results-TIME.mcap": (
         "its file has another name each time; tests/contract/test_site.py runs the example"

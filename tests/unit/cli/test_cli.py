@@ -23,7 +23,7 @@ from services.recordings.writer import RecordingWriter, write_recording
 EXAMPLE = Path(__file__).parents[2] / "data" / "csv_example"
 COMMANDS = (
     "survey", "check", "simulate", "import", "identify", "info", "export", "report", "validate",
-    "recover", "view", "demo", "logger", "worker", "truck", "replay", "health",
+    "recover", "view", "demo", "logger", "worker", "truck", "gateway", "replay", "health",
 )  # fmt: skip
 
 

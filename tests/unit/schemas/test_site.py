@@ -447,3 +447,74 @@ def test_what_the_site_allows_can_be_sent() -> None:
     assert complaint(with_line("rate_hz", "50001")).startswith("sensor.rate_hz")
     rates = parse_site(with_line("rate_hz", "50000"), "a").sensor.rate_hz
     assert rates[0] == MAX_RATE_HZ
+
+
+ROS2 = """
+[ros2]
+vehicle = "truck-1"
+gnss = "/gps/fix"
+velocity = "/gps/vel"
+[ros2.imu]
+sprung_front = { topic = "/imu/front", axis = "-z", frame = "front \\"left\\"" }
+unsprung_rear = { topic = "/imu/axle", gravity_included = false }
+"""
+
+
+def with_ros2(old: str = "", new: str = "") -> str:
+    text = ROS2.replace("truck-1", parse_site(TEXT, "site.toml").vehicles[0].id)
+    assert old in text
+    return TEXT + text.replace(old, new)
+
+
+def test_topics_of_ros_are_read_and_written_and_are_no_part_of_the_hash() -> None:
+    site = parse_site(with_ros2(), "site.toml")
+    (ros2,) = site.ros2
+    assert (ros2.domain, ros2.largest_delay_s, ros2.velocity) == (0, 1.0, "/gps/vel")
+    imus = ros2.imu.by_channel()
+    assert list(imus) == ["sprung_front", "unsprung_rear"]
+    front, rear = imus.values()
+    assert (front.axis, front.gravity_included, front.frame) == ("-z", True, 'front "left"')
+    assert (rear.axis, rear.gravity_included, rear.frame) == ("z", False, None)
+    assert ros2.topics() == ["/imu/front", "/imu/axle", "/gps/fix", "/gps/vel"]
+    assert parse_site(site_toml(site), "again") == site
+    without = parse_site(TEXT, "site.toml")
+    assert site_hash(site) == site_hash(without)
+    vehicle = site.vehicles[0].id
+    assert vehicle_toml(site, vehicle) == vehicle_toml(without, vehicle)
+
+
+def test_several_trucks_have_a_table_of_ros_each() -> None:
+    first = VEHICLE.replace("[vehicle]", "[[vehicle]]")
+    identifier = parse_site(TEXT, "site.toml").vehicles[0].id
+    second = first.replace(identifier, "other")
+    one = ROS2.replace("[ros2", "[[ros2", 1).replace("]", "]]", 1)
+    tables = one.replace("truck-1", identifier) + one.replace("truck-1", "other")
+    site = parse_site(first + second + BRIDGE + SENSOR + tables, "site.toml")
+    assert [table.vehicle for table in site.ros2] == [identifier, "other"]
+    assert parse_site(site_toml(site), "again") == site
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ('"/imu/front"', '"imu/front"', 'ros2.imu.sprung_front.topic is "imu/front", it must be'),
+        ('"/gps/fix"', "7", "ros2.gnss is 7, it must be the whole name of a topic of ROS"),
+        ('"-z"', '"up"', 'ros2.imu.sprung_front.axis is "up", it must be "x", "y" or "z"'),
+        ("sprung_front", "sprung_middle", "ros2.imu.sprung_middle is not a known field"),
+        ('"/imu/axle"', '"/gps/vel"', 'ros2 has the topic "/gps/vel" twice'),
+        ("gnss =", "gps =", "ros2.gps is not a known field"),
+        ("[ros2]", "[ros2]\ndomain = 300", "ros2.domain is 300"),
+        ("false", '"no"', 'ros2.imu.unsprung_rear.gravity_included is "no"'),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_topics_of_ros_is_named(old: str, new: str, line: str) -> None:
+    assert complaint(with_ros2(old, new)).startswith(line)
+
+
+def test_a_table_of_ros_is_of_a_vehicle_and_has_a_channel() -> None:
+    assert complaint(TEXT + ROS2.replace("truck-1", "nobody")).startswith(
+        'ros2.vehicle is "nobody", it must be one of '
+    )
+    head = with_ros2()[: with_ros2().index("[ros2.imu]")]
+    assert complaint(head).startswith("ros2.imu is missing")
+    assert complaint(head + "[ros2.imu]\n").startswith("ros2.imu names no channel")

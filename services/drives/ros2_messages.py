@@ -1,0 +1,160 @@
+"""Messages of ROS 2 that say what a truck measures, out of their CDR encoding (by rosbags).
+
+Their definitions have not changed since ROS 2 Humble: one hash each (REP 2016) stands for all
+distributions, and whatever has another hash is another message.
+"""
+
+import math
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from schemas.signals import NS_PER_S, check_wall_time
+from services.common.extras import check_installed
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+MAX_PAYLOAD_BYTES: Final = 4096
+"""Of these messages only the name of the frame has no fixed length."""
+NO_HASH: Final = "TypeHashNotSupported"
+"""What ROS 2 Humble says for the hash, as it has none."""
+_NO_FIX: Final = 0
+"""NavSatStatus: what is less is no fix."""
+
+
+class Imu(NamedTuple):
+    """sensor_msgs/Imu: what the accelerometer said, by its own axes."""
+
+    stamp_ns: int
+    frame: str
+    acceleration_m_per_s2: dict[str, float] | None
+    """By axis; None: the sensor has no accelerometer."""
+
+
+class Fix(NamedTuple):
+    """sensor_msgs/NavSatFix. Accuracies are one standard deviation, None where unknown."""
+
+    stamp_ns: int
+    is_fix: bool
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    horizontal_accuracy_m: float | None
+    vertical_accuracy_m: float | None
+
+
+class Velocity(NamedTuple):
+    """geometry_msgs/TwistStamped or TwistWithCovarianceStamped of a receiver."""
+
+    stamp_ns: int
+    speed_m_per_s: float
+    """Over ground, whatever the horizontal axes are."""
+
+
+class RosType(NamedTuple):
+    """A type of message: its names and its hash."""
+
+    name: str
+    """As recordings have it."""
+    dds_name: str
+    """As keys of Zenoh have it."""
+    hash: str
+
+
+def _type(package: str, name: str, digest: str) -> RosType:
+    return RosType(f"{package}/msg/{name}", f"{package}::msg::dds_::{name}_", f"RIHS01_{digest}")
+
+
+IMU: Final = _type(
+    "sensor_msgs", "Imu", "7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b"
+)
+FIX: Final = _type(
+    "sensor_msgs", "NavSatFix", "62223ab3fe210a15976021da7afddc9e200dc9ec75231c1b6a557fc598a65404"
+)
+TWIST: Final = _type(
+    "geometry_msgs",
+    "TwistStamped",
+    "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
+)
+TWIST_WITH_COVARIANCE: Final = _type(
+    "geometry_msgs",
+    "TwistWithCovarianceStamped",
+    "77b67434531e6529b7a0091357b186b6ebdb17fd9ffd3e0c7ce9d3fb11a44563",
+)
+VELOCITIES: Final = (TWIST, TWIST_WITH_COVARIANCE)
+
+
+def check_rosbags() -> None:
+    """InputError that says how to install what decodes ROS 2, if it is not there."""
+    check_installed("ROS 2", "rosbags", extra="ros2")
+
+
+def decode(of: RosType, payload: bytes) -> Imu | Fix | Velocity:
+    """Return what a message says; ValueError if it is not of that type or impossible."""
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise ValueError(f"has {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are expected")
+    try:
+        message: Any = _types().deserialize_cdr(payload, of.name)
+    except Exception as error:  # bytes of a stranger: whatever the decoder stumbles over
+        raise ValueError(f"is no {of.name}: {error}") from None
+    stamp_ns = _stamp_ns(message.header.stamp)
+    if of == IMU:
+        return _imu(stamp_ns, message)
+    if of == FIX:
+        return _fix(stamp_ns, message)
+    twist = message.twist if of == TWIST else message.twist.twist
+    speed = math.hypot(twist.linear.x, twist.linear.y)
+    if not math.isfinite(speed):
+        raise ValueError("has a velocity that is not finite")
+    return Velocity(stamp_ns, speed)
+
+
+def unknown_hash(of: RosType, told: str) -> str | None:
+    """What is wrong with the hash that somebody tells of a type; None: nothing."""
+    if told in (of.hash, NO_HASH):
+        return None
+    return f"{of.name} has the type hash {told[:80]}, known is {of.hash}"
+
+
+@cache
+def _types() -> "Typestore":
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def _stamp_ns(stamp: Any) -> int:
+    if stamp.sec == 0 and stamp.nanosec == 0:
+        raise ValueError("has no header.stamp: the driver must set it when it samples")
+    if not 0 <= stamp.nanosec < NS_PER_S:
+        raise ValueError(f"has a header.stamp of {stamp.nanosec} ns after the second")
+    return check_wall_time(stamp.sec * NS_PER_S + stamp.nanosec)
+
+
+def _imu(stamp_ns: int, message: Any) -> Imu:
+    # REP 145: -1 as the first covariance says that there is no such estimate.
+    if message.linear_acceleration_covariance[0] == -1.0:
+        return Imu(stamp_ns, message.header.frame_id, None)
+    measured = message.linear_acceleration
+    axes = {"x": measured.x, "y": measured.y, "z": measured.z}
+    return Imu(stamp_ns, message.header.frame_id, axes)
+
+
+def _fix(stamp_ns: int, message: Any) -> Fix:
+    covariance = message.position_covariance
+    is_known = message.position_covariance_type != 0
+    east, north, up = (float(covariance[i]) if is_known else math.nan for i in (0, 4, 8))
+    return Fix(
+        stamp_ns,
+        message.status.status >= _NO_FIX,
+        message.latitude,
+        message.longitude,
+        message.altitude,
+        _deviation((east + north) / 2),
+        _deviation(up),
+    )
+
+
+def _deviation(variance: float) -> float | None:
+    """None of what cannot be a variance, and where none is given."""
+    return math.sqrt(variance) if 0.0 < variance < 1e12 else None

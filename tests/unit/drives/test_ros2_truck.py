@@ -1,0 +1,155 @@
+"""What a ROS 2 truck says as one of ours would: axes, gravity, frames, stamps, fixes."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from schemas.signals import GnssFix, encode_gnss
+from schemas.site import Site
+from schemas.site_file import parse_site, site_toml
+from services.common.errors import InputError
+from services.drives.ros2_messages import FIX, IMU, TWIST
+from services.drives.ros2_truck import Accel, Ros2Truck
+from services.simulation.drive import paper_site
+from tests import ros2
+
+FIRST_NS = 1_700_000_000_000_000_000
+FRONT = ros2.TOPICS["sprung_front"]
+
+
+def site(text: str = ros2.ROS2, *, speed_noise: float = 0.07) -> Site:
+    declared = site_toml(paper_site())
+    noise = "speed_noise_m_per_s = 0.07"
+    assert noise in declared
+    declared = declared.replace(noise, f"speed_noise_m_per_s = {speed_noise}")
+    return parse_site(declared + text, "site.toml")
+
+
+def truck(text: str = ros2.ROS2, *, speed_noise: float = 0.07) -> Ros2Truck:
+    return Ros2Truck(site(text, speed_noise=speed_noise), "site.toml", "truck-1")
+
+
+def accelerations(of: Ros2Truck, make: Callable[[int], bytes], count: int = 20) -> np.ndarray:  # type: ignore[type-arg]
+    found: list[Accel | GnssFix] = []
+    for number in range(count):
+        stamp_ns = FIRST_NS + number * 1_000_000
+        found += of.take(FRONT, IMU, make(stamp_ns), stamp_ns)
+    found += of.finish()
+    batches = [one.channels["sprung_front"].samples for one in found if isinstance(one, Accel)]
+    return np.concatenate(batches) if batches else np.empty(0)
+
+
+@pytest.mark.parametrize(
+    ("extra", "gravity", "expected"),
+    [
+        ("", 9.80665, 1.5),
+        (', axis = "z"', 9.80665, 1.5),
+        (', axis = "-z"', -9.80665 - 3.0, 1.5),
+        (', axis = "x", gravity_included = false', 0.0, 0.25),
+        (', axis = "-y", gravity_included = false', 0.0, 0.5),
+        (', axis = "y"', 0.0, -0.5 - 9.80665),
+        (", gravity_included = false", 0.0, 1.5),
+    ],
+)
+def test_the_axis_that_is_up_is_taken_and_gravity_is_off(
+    extra: str, gravity: float, expected: float
+) -> None:
+    # The axis z says 1.5 m/s² and gravity as it is seen; x and y always 0.25 and −0.5.
+    text = ros2.ROS2.replace(f'"{FRONT}"', f'"{FRONT}"{extra}')
+    found = accelerations(truck(text), lambda at: ros2.imu(at, 1.5, gravity=gravity))
+    np.testing.assert_allclose(found, np.full(20, expected), atol=1e-12)
+
+
+def test_messages_of_another_frame_and_without_accelerometer_are_left_out() -> None:
+    text = ros2.ROS2.replace(f'"{FRONT}"', f'"{FRONT}", frame = "front"')
+    of = truck(text)
+    assert accelerations(of, lambda at: ros2.imu(at, 0.0, "front")).size == 20
+    of = truck(text)
+    assert accelerations(of, lambda at: ros2.imu(at, 0.0, "rear")).size == 0
+    kind = "messages of another frame, left out"
+    assert f"{FRONT}: 20 {kind} (the first 'rear', not 'front')" in of.complaints.news()
+    of = truck()
+    none = np.array([-1.0, *np.zeros(8)])
+    assert accelerations(of, lambda at: ros2.imu(at, 0.0, covariance=none)).size == 0
+    assert of.complaints.count(FRONT, "messages that say they have no acceleration, left out") == 20
+
+
+def test_stamps_must_be_near_the_time_of_sending() -> None:
+    of = truck()
+    payload = ros2.imu(FIRST_NS, 0.0)
+    for sent_ns in (FIRST_NS + 1_000_000_001, FIRST_NS - 1_000_000_001, 0):
+        assert of.take(FRONT, IMU, payload, sent_ns) == []
+    assert of.complaints.count(FRONT, "stamps too far from when they were sent") == 3
+    of.take(FRONT, IMU, payload, FIRST_NS + 1_000_000_000)
+    assert of.complaints.count(FRONT, "stamps too far from when they were sent") == 3
+
+
+def fixes(of: Ros2Truck, payloads: list[bytes]) -> list[GnssFix]:
+    found: list[Accel | GnssFix] = []
+    for number, payload in enumerate(payloads):
+        stamp_ns = FIRST_NS + number * 100_000_000
+        found += of.take(ros2.FIX_TOPIC, FIX, payload, stamp_ns)
+        if of.table.velocity is not None:
+            twist = ros2.twist(stamp_ns, 6.0, 8.0)
+            found += of.take(ros2.VELOCITY_TOPIC, TWIST, twist, stamp_ns)
+    found += of.finish()
+    return [one for one in found if isinstance(one, GnssFix)]
+
+
+def place(number: int, **changes: float) -> bytes:
+    at = {"latitude": 50.0 + number * 9e-6, "longitude": 8.0, "altitude": 100.0} | changes
+    return ros2.fix(FIRST_NS + number * 100_000_000, **at)  # type: ignore[arg-type]
+
+
+def test_fixes_have_place_speed_and_accuracies() -> None:
+    found = fixes(truck(), [place(number) for number in range(5)])
+    assert [one.wall_time_ns - FIRST_NS for one in found] == [n * 100_000_000 for n in range(5)]
+    for one in found:
+        assert (one.longitude_deg, one.altitude_m, one.speed_m_per_s) == (8.0, 100.0, 10.0)
+        assert one.heading_deg is None
+        assert one.horizontal_accuracy_m == pytest.approx(0.4)
+        assert one.vertical_accuracy_m == pytest.approx(0.8)
+        encode_gnss(one._replace(boot_id=1))  # nothing in it is impossible
+
+
+@pytest.mark.parametrize(
+    ("bad", "told"),
+    [
+        (place(2, status=-1), "messages without a fix, left out"),
+        (place(2, status=-2), "messages without a fix, left out"),
+        (place(2, altitude=math.nan), "fixes without an altitude, left out"),
+        (place(2, latitude=math.nan), "fixes without a latitude, left out"),
+        (place(2, longitude=math.inf), "fixes without a longitude, left out"),
+        (place(2, latitude=91.0), "fixes without a latitude, left out"),
+    ],
+)
+def test_what_is_no_place_is_left_out_and_told(bad: bytes, told: str) -> None:
+    of = truck()
+    found = fixes(of, [place(0), place(1), bad, place(3)])
+    assert len(found) == 3
+    assert of.complaints.count(ros2.FIX_TOPIC, told) == 1
+
+
+def test_slopes_of_positions_are_speeds_only_where_the_site_does_not_trust_them() -> None:
+    text = ros2.ROS2.replace(f'velocity = "{ros2.VELOCITY_TOPIC}"\n', "")
+    with pytest.raises(InputError) as caught:
+        truck(text)
+    assert "receiver.speed_noise_m_per_s is 0.07, it must be at least 0.5" in str(caught.value)
+    found = fixes(truck(text, speed_noise=0.5), [place(number) for number in range(30)])
+    assert [one.speed_m_per_s for one in found] == pytest.approx([10.01] * 30, abs=0.01)
+    assert max(abs(one.speed_m_per_s) for one in found) < 10.02
+
+
+def test_a_jump_of_the_position_is_no_speed() -> None:
+    text = ros2.ROS2.replace(f'velocity = "{ros2.VELOCITY_TOPIC}"\n', "")
+    of = truck(text, speed_noise=0.5)
+    assert fixes(of, [place(0), place(1, latitude=60.0)]) == []
+    told = "fixes with an impossible speed, left out"
+    assert of.complaints.count(ros2.FIX_TOPIC, told) == 2
+
+
+def test_a_truck_needs_its_table() -> None:
+    with pytest.raises(InputError, match=r'site.toml: has no \[ros2\] with vehicle = "truck-1"'):
+        truck("")

@@ -1,0 +1,198 @@
+"""A bridge's past: fused when crossings are added, on a page of a report, and in the viewer."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from schemas.alarms import Acknowledgement, Alarm
+from schemas.results import Results, results_json
+from services.cli import main as cli
+from services.history.archive import add_results
+from services.history.past import Past, past_of
+from services.report.past import past_in_short, past_section
+from services.viewer.rerun_history import write_history
+from tests.unit.history.test_archive import BEGIN_S, crossings
+from tests.unit.report.test_report import Seen
+from tests.viewer_screen import open_tab, opened, picture, pixels
+from tests.waiting import LONGEST_S
+
+DAY_S = 86_400.0
+
+
+def fused(folder: Path) -> list[Path]:
+    return sorted((folder / "fused").rglob("*.json"))
+
+
+def added(folder: Path, results: Results, *options: str) -> None:
+    found = folder / "results.json"
+    found.write_text(results_json(results))
+    words = ["history", "add", str(found), "--history", str(folder / "history"), *options]
+    assert cli.main(words) == 0
+
+
+def part(results: Results, first: int, last: int) -> Results:
+    return results.model_copy(update={"crossings": results.crossings[first:last]})
+
+
+def test_who_adds_crossings_fuses_their_months_and_who_looks_fuses_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # From 2 March on, a day apart: thirty in March, some in April.
+    some, history = crossings(34), tmp_path / "history"
+    added(tmp_path, part(some, 0, 20))
+    (march,) = fused(history)
+    added(tmp_path, part(some, 20, 25))
+    both = fused(history)
+    assert len(both) == 2  # of March with 20 and with 25 crossings
+    assert march in both
+    added(tmp_path, part(some, 30, 34))
+    assert len(fused(history)) == 3
+    assert set(both) < set(fused(history))  # April alone is new
+    before = {path: path.read_bytes() for path in fused(history)}
+    capsys.readouterr()
+    assert cli.main(["history", "bridge-1", "--history", str(history)]) == 0
+    assert "29 crossings in 2 months" in capsys.readouterr().out
+    assert {path: path.read_bytes() for path in fused(history)} == before
+
+
+def test_who_is_in_a_hurry_leaves_the_fusing_to_who_looks(tmp_path: Path) -> None:
+    history = tmp_path / "history"
+    added(tmp_path, crossings(3), "--later")
+    assert fused(history) == []
+    assert cli.main(["history", "bridge-1", "--history", str(history)]) == 0
+    looked = [path.read_bytes() for path in fused(history)]
+    other = tmp_path / "other"
+    other.mkdir()
+    added(other, crossings(3))
+    assert [path.read_bytes() for path in fused(other / "history")] == looked
+
+
+def alarm() -> Alarm:
+    return Alarm(
+        alarm_id="20260310-4-weaker",
+        realm="sim-fleet",
+        bridge="bridge-1",
+        element=4,
+        direction="weaker",
+        since=BEGIN_S + 3 * DAY_S,
+        raised=BEGIN_S + 8 * DAY_S,
+        sum=12.0,
+        threshold=8.0,
+        ratio=0.8,
+        ratio_q025=0.78,
+        ratio_q975=0.82,
+    )
+
+
+@pytest.fixture(scope="module")
+def past(tmp_path_factory: pytest.TempPathFactory) -> Past:
+    folder = tmp_path_factory.mktemp("history")
+    add_results(folder, crossings(34))
+    return past_of(folder, "sim-fleet", "bridge-1", "month", print)
+
+
+def test_the_page_of_a_report_tells_months_elements_and_alarms(past: Past) -> None:
+    found = Seen(past_section(past, "h-"))
+    assert "The bridge over time" in found.text
+    assert "34 crossings in 2 months, 2026-03-01 to 2026-05-01." in found.text
+    assert "No alarm: nothing has changed by more than chance." in found.text
+    assert "Median of all months (GN·m²) Newest month (GN·m²)" in found.text
+    assert found.tags.count("tr") == 1 + 7
+    newest, before = (
+        one.state.elements["EI_4"] for one in reversed(past.periods) if one.state is not None
+    )
+    usual = (newest.mean + before.mean) / 2
+    row = f"4 {usual / 1e9:.2f} {newest.mean / 1e9:.2f} {newest.q025 / 1e9:.2f}–"
+    assert row in found.text
+    assert f"{newest.mean / usual:.3f} 5 " in found.text
+    assert found.tags.count("figure") == 1
+    assert past_in_short(past) == (
+        "34 crossings in 2 months; no alarm stands (see the bridge over time)"
+    )
+
+
+def test_an_alarm_stands_until_somebody_has_taken_note_of_it(past: Past) -> None:
+    said = "element 4 is 20 % weaker than before 2026-03-05, interval 18 to 22 %."
+    standing = past._replace(alarms=(alarm(),))
+    text = Seen(past_section(standing, "h-")).text
+    assert f"Alarm of 2026-03-10: {said} It stands: nobody has taken note of it." in text
+    assert "; an alarm stands (see" in past_in_short(standing)
+    note = Acknowledgement(by="<b>Anna</b>", time=BEGIN_S + 9 * DAY_S, note="frozen")
+    noted = past._replace(alarms=(alarm().model_copy(update={"acknowledged": note}),))
+    found = Seen(past_section(noted, "h-"))
+    assert f"{said} <b>Anna</b> took note of it on 2026-03-11: frozen" in found.text
+    assert "b" not in found.tags  # what somebody wrote is text
+    assert "; no alarm stands (see" in past_in_short(noted)
+    both = past._replace(alarms=(alarm(), alarm()))
+    assert "; 2 alarms stand (see" in past_in_short(both)
+
+
+def test_the_command_puts_the_page_behind_the_first(
+    tmp_path: Path, project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    some = crossings(3)
+    added(tmp_path, some)
+    assert (
+        cli.main(["fuse", str(tmp_path / "results.json"), "--json", str(tmp_path / "f.json")]) == 0
+    )
+    output = tmp_path / "r.html"
+    words = ["report", str(tmp_path / "f.json"), "-o", str(output)]
+    words += ["--site", str(project / "docs/site.example.toml")]
+    assert cli.main([*words, "--history", str(tmp_path / "history")]) == 0
+    text = Seen(output.read_text()).text
+    assert "Over time 3 crossings in 1 month; no alarm stands" in text
+    places = [text.index(word) for word in ("What this does not mean", "The bridge over time",
+                                            "Evidence, crossing by crossing")]  # fmt: skip
+    assert places == sorted(places)
+    # A history that does not know the bridge: a line, and the page without it.
+    other = tmp_path / "other"
+    add_results(other, crossings(1, name="bridge-2"))
+    capsys.readouterr()
+    assert cli.main([*words, "--history", str(other)]) == 0
+    assert f"{other}: has no bridge bridge-1 in realm sim-fleet" in capsys.readouterr().out
+    assert "over time" not in Seen(output.read_text()).text
+    assert cli.main([*words, "--history", str(tmp_path / "nowhere")]) == 2
+    assert "no such folder" in capsys.readouterr().err
+
+
+@pytest.mark.process
+def test_the_viewer_shows_the_picture_and_each_element_over_the_whole_time(
+    past: Past, tmp_path: Path
+) -> None:
+    file = tmp_path / "past.rrd"
+    write_history(file, past._replace(alarms=(alarm(),)))
+    with opened(file, tmp_path) as viewer:
+        views = viewer.get_state().views
+        assert {view.view_class for view in views} == {"2D", "TextDocument", "TimeSeries"}
+        assert [view.reports for view in views if view.reports] == []
+        seen = pixels(picture(viewer))[:, :, :3]
+        assert (seen.min(axis=2) > 0.98).mean() > 0.3  # the picture's paper
+        open_tab(viewer, "EI_4")
+        lines = pixels(picture(viewer))[:, :, :3]
+        # Thin lines are mixed with the black behind them, so only their hue is certain.
+        blue = (lines[:, :, 2] - lines[:, :, 0] > 0.1).any(axis=0)
+        # Two months: the lines go from the middle of one to that of the other.
+        assert blue.mean() > 0.3
+
+
+@pytest.mark.process
+def test_view_opens_the_viewer_with_what_was_asked_for(tmp_path: Path) -> None:
+    """A stand-in for the viewer: the real one needs a screen."""
+    history = tmp_path / "history"
+    add_results(history, crossings(3))
+    shown, program = tmp_path / "shown.rrd", tmp_path / "viewer"
+    program.write_text(
+        f'#!/bin/sh\n[ $1 = analytics ] && exit\nfor last; do :; done\ncp "$last" {shown}\n'
+    )
+    program.chmod(0o755)
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from services.cli import main\nfrom services.viewer import view\n"
+        f"view.viewer_program = lambda: Path({str(program)!r})\n"
+        f"sys.exit(main.main(['history', 'bridge-1', '--history', {str(history)!r}, '--view']))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=LONGEST_S)
+    assert shown.read_bytes().startswith(b"RRF2")
+    assert shown.stat().st_size > 10_000
