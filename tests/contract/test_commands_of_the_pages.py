@@ -49,6 +49,7 @@ NOT_RUN = {
     "make faults": ITSELF,
     "make soak": LONG,
     "make day": LONG,
+    "python -m tests.faults.day --minutes 4 --speed 1 --kills 0 --folder build/day": LONG,
     "make validate": LONG,
     "driveby identify monday.mcap tuesday.mcap --json week.json": FUSES,
     "driveby fuse week.json lastweek.json --json both.json": FUSES,
