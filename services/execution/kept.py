@@ -49,7 +49,7 @@ class Kept:
         """Files that cannot be read, a line each."""
         self._places: dict[str, _Place] = {}
         self._read: tuple[Path, tuple[bytes, ...]] | None = None
-        for path in sorted(folder.glob("*.parquet")):
+        for path in files_of(folder):
             try:
                 contents = decoded(path, KEY, EDITION, ["content"]).column("content").to_pylist()
             except ValueError as error:
@@ -97,6 +97,11 @@ class Kept:
         if self._read is None or self._read[0] != path:
             self._read = path, tuple(decoded(path, KEY, EDITION, ["result"])["result"].to_pylist())
         return self._read[1]
+
+
+def files_of(folder: Path) -> list[Path]:
+    """The files of results in a folder; not what is being written, or was when its writer died."""
+    return [path for path in sorted(folder.glob("*.parquet")) if not path.name.startswith(".")]
 
 
 def _file_of(results: list[Result]) -> bytes:

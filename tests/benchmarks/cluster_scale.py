@@ -29,7 +29,7 @@ from schemas.settings import IdentificationSettings
 from services.common.parquet_files import decoded
 from services.execution.archive import Asked, identify_archive
 from services.execution.here import Here
-from services.execution.kept import EDITION, KEY, Kept
+from services.execution.kept import EDITION, KEY, Kept, files_of
 from services.execution.offline import site_of
 from services.identification.bridge_state import NOTHING_STORED
 from tests.drives import SAMPLE, drives
@@ -175,7 +175,7 @@ def finish(running: Running) -> None:
 def results(into: Path) -> dict[str, str]:
     """All results by what they were made from, without the seconds that they took."""
     found: dict[str, str] = {}
-    for path in into.glob("*.parquet"):
+    for path in files_of(into):
         rows = decoded(path, KEY, EDITION, ["content", "result"]).to_pylist()
         for row in rows:
             told = json.loads(zstandard.decompress(row["result"]))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from schemas.results import load_results
 from services.common.parquet_files import decoded
-from services.execution.kept import EDITION, KEY
+from services.execution.kept import EDITION, KEY, files_of
 from tests.endpoints import free_port
 from tests.parent import parent_environment
 from tests.waiting import LONGEST_S, until
@@ -87,7 +87,7 @@ def contents(into: Path) -> list[str]:
     """What the results of a folder were made from, one for each row of each file."""
     return [
         content
-        for path in sorted(into.glob("*.parquet"))
+        for path in files_of(into)
         for content in decoded(path, KEY, EDITION, ["content"])["content"].to_pylist()
     ]
 

@@ -66,6 +66,16 @@ def test_a_result_that_cannot_be_read_is_a_line_and_no_result(tmp_path: Path) ->
     assert f"{path}: row 1: left out" in kept.problems[0]
 
 
+def test_what_a_writer_that_was_killed_has_left_is_no_file(tmp_path: Path) -> None:
+    first, second = results(2)
+    path = Kept(tmp_path).put([first])
+    assert path is not None
+    (tmp_path / f".{path.stem}.0123abcd.part.parquet").write_bytes(path.read_bytes()[:100])
+    kept = Kept(tmp_path)
+    assert (len(kept), kept.problems) == (1, [])
+    assert kept.result(second.content) is None
+
+
 def test_where_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="file"):
