@@ -7,8 +7,10 @@ ARG BASE=python:3.11-slim-bookworm
 FROM ${BASE}
 ENV PYTHONUNBUFFERED=1 OPENBLAS_NUM_THREADS=1 NUMBA_CACHE_DIR=/tmp/kernels
 WORKDIR /app
-COPY requirements/runtime.txt requirements/build.txt requirements/
-RUN pip install --no-cache-dir --require-hashes -r requirements/runtime.txt -r requirements/build.txt
+# `runtime`, or `cluster` for what a Dask cluster needs, too.
+ARG REQUIREMENTS=runtime
+COPY requirements/runtime.txt requirements/cluster.txt requirements/build.txt requirements/
+RUN pip install --no-cache-dir --require-hashes -r requirements/${REQUIREMENTS}.txt -r requirements/build.txt
 COPY LICENSE README.md pyproject.toml setup.py entrypoint.sh ./
 COPY driveby driveby
 COPY pre_core pre_core

@@ -1,6 +1,7 @@
 """Who a process is on the bus: a folder with a certificate, its private key and the authority.
 
-`driveby certs` makes one such folder for each router, service and truck:
+`driveby certs` makes one such folder for each router, service and truck, and without the last file
+for each part of a Dask cluster:
 
     ca.pem        the authority's certificate: whom to believe
     cert.pem      this one's certificate; its common name is ROLE/NAME, e.g. truck/truck-1
@@ -29,9 +30,15 @@ from schemas.topics import check_identifier
 from services.common.errors import InputError
 from services.common.files import read_bytes
 
-ROLES = ("router", "logger", "worker", "viewer", "replay", "truck")
+BUS_ROLES = ("router", "logger", "worker", "viewer", "replay", "truck")
+CLUSTER_ROLES = ("scheduler", "cluster-worker", "client")
+"""Of a Dask cluster, which runs whatever it is sent: they have an authority of their own, which
+nobody on the bus has a certificate of."""
+ROLES = (*BUS_ROLES, *CLUSTER_ROLES)
 LISTENERS = ("router", "logger")
 """Roles to which others connect: their certificates are valid for servers and name hosts."""
+CLUSTER_LISTENERS = ("scheduler", "cluster-worker")
+"""Their certificates are valid for servers; Dask looks at the authority and not at hosts."""
 AUTHORITY, CERTIFICATE, KEY, CONFIGURATION = "ca.pem", "cert.pem", "key.pem", "zenoh.json5"
 
 _log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""The command that says who may say and hear what on the bus: certs."""
+"""The command that says who may say and hear what on the bus, or run on a cluster: certs."""
 
 import argparse
 from pathlib import Path
@@ -21,6 +21,11 @@ def add_certs(commands: Any) -> None:
         type=Path,
         metavar="FOLDER",
         help="made by the first run, with an authority, router, logger, worker, viewer and replay",
+    )
+    p.add_argument(
+        "--cluster",
+        action="store_true",
+        help="make an authority for a Dask cluster instead, with scheduler, cluster-worker, client",
     )
     p.add_argument("--trucks", type=names, default=(), metavar="ID,…", help="add these trucks")
     p.add_argument(
@@ -59,6 +64,7 @@ def _certs(options: argparse.Namespace) -> int:
         revoke=options.revoke,
         hosts=options.host,
         days=options.days,
+        is_cluster=options.cluster,
     )
     print("\n".join(lines))
     return 0

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,7 @@ from services.common.files import (
 )
 from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.drives.survey import survey
+from services.execution.dispatch import Execution
 from services.execution.offline import identify_drives, site_of
 from services.execution.overview import look_over, messages_of_trucks
 from services.history.baselines import baselines_of
@@ -55,17 +57,25 @@ def identify_command(
     seed: int,
     baseline: Path | None,
     fuse_suspect: bool,
+    executing: AbstractContextManager[Execution | None] | None = None,
     console: "Console",
 ) -> int:
     """Identify every crossing in the recordings, print a table and write what was asked for.
 
+    `executing` is entered when it is known that there is something to do: None, in this process.
     InputError: a file that cannot be read or written, or has no accelerations or positions; a
-    folder of certificates that is none.
+    folder of certificates that is none; draws are wanted from elsewhere.
     """
-    if certificates is not None and not certificates.is_dir():
-        raise InputError(f"--certificates: {certificates} is no folder of certificates")
+    check_certificates(certificates)
+    for source in recordings:
+        if source.is_dir():
+            raise InputError(
+                f"{source}: is a folder; give recordings, or --into DIR for its results"
+            )
     if draws_path is not None:
         check_draws(draws_path, method)
+        if executing is not None:
+            raise InputError("--draws: are kept in this process only, leave --scheduler out")
     for path in (json_path, rrd_path, draws_path):
         if path is not None:
             check_writable(path)
@@ -75,18 +85,17 @@ def identify_command(
     beside = None if site is None else site.parent
     fusing = Fusing(baselines_of(known, beside, baseline), fuse_suspect)
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
-    if method == "pre" and not any(known.sensor.noise_density_ug_per_rthz):
-        _log.warning(
-            "the site says that the sensors have no noise, which method pre cannot believe; "
-            "simulations without noise are for --method least-squares"
-        )
+    warn_of_no_noise(known, method)
     draws: dict[str, Draws] = {}
     seen = _crossings_seen(recordings, known, console)
     with reading_bar("reading", recordings, console) as next_file:
         drives = look_over(
             ", ".join(map(str, recordings)), messages_of_trucks(recordings, next_file), known
         )
-    with parts_bar("crossing", seen, console) as report:
+    with (
+        executing or nullcontext() as execution,
+        parts_bar("crossing", seen, console) as report,
+    ):
         found = identify_drives(
             drives,
             known,
@@ -95,6 +104,7 @@ def identify_command(
             keep=draws.__setitem__,
             fusing=fusing,
             certificates=found_in(certificates or CERTIFICATES, known, settings),
+            execution=execution,
         )
     _print(console, found, known)
     if json_path is not None:
@@ -114,6 +124,21 @@ def identify_command(
         )
         write_draws(draws_path, kept)
     return 0
+
+
+def check_certificates(certificates: Path | None) -> None:
+    """InputError if a folder of certificates is none."""
+    if certificates is not None and not certificates.is_dir():
+        raise InputError(f"--certificates: {certificates} is no folder of certificates")
+
+
+def warn_of_no_noise(site: Site, method: str) -> None:
+    """Say so where a method cannot believe in sensors without noise."""
+    if method == "pre" and not any(site.sensor.noise_density_ug_per_rthz):
+        _log.warning(
+            "the site says that the sensors have no noise, which method pre cannot believe; "
+            "simulations without noise are for --method least-squares"
+        )
 
 
 def _write_rerun(

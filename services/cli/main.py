@@ -1,6 +1,7 @@
 """The command `driveby`: reads the arguments, calls one function, turns errors into exit codes.
 
-0 it worked, 1 it failed, 2 the input was bad; 3 of `recover`: it worked, but something is lost.
+0 it worked, 1 it failed, 2 the input was bad; 3 of `recover` and `identify --into`: it worked, but
+something is lost.
 The functions are imported when they are called, so that `driveby --help` does not wait for
 compilers and viewers.
 """
@@ -19,6 +20,8 @@ from services.cli.access import add_certs
 from services.cli.alarm import add_alarm
 from services.cli.catalog import add_catalog
 from services.cli.check import add_check
+from services.cli.cluster import SERVICES as CLUSTERS
+from services.cli.cluster import add_cluster
 from services.cli.completion import SHELLS, completion
 from services.cli.export import add_export
 from services.cli.history import add_history
@@ -73,6 +76,7 @@ _COMMANDS: Final = (
     add_replay,
     add_watch,
     add_health,
+    add_cluster,
     add_certs,
 )
 """In the order in which `driveby --help` lists them."""
@@ -96,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _say(str(error), EXIT_BAD_INPUT)
     # A service has nothing else to show for itself than what it says.
-    _log(options.log_format, verbose=options.verbose or options.handler in SERVICES)
+    _log(options.log_format, verbose=options.verbose or options.handler in (*SERVICES, *CLUSTERS))
     handler: Handler = options.handler
     try:
         code = handler(options)

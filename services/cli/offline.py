@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from services.cli.cluster import add_scheduler, check_scheduler, execution_of
 from services.cli.parsing import (
     CERTIFICATES,
     a_console,
@@ -294,7 +295,13 @@ def add_identify(commands: Any) -> None:
         "find the flexural rigidity of each element from recordings",
         "driveby identify run.mcap --json result.json --rrd result.rrd",
     )
-    p.add_argument("recordings", type=Path, nargs="+", metavar="REC.mcap", help="recordings")
+    p.add_argument(
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="REC.mcap",
+        help="recordings; with --into also folders of them",
+    )
     add_site(p, "(default: the site stored in the recording)")
     add_method(p)
     add_file(p, "--json", "OUT.json", "write the results here")
@@ -306,6 +313,15 @@ def add_identify(commands: Any) -> None:
         p, f"certificates that results name where there are such (default: {CERTIFICATES})"
     )
     add_seed(p)
+    group = p.add_argument_group("many crossings")
+    add_file(
+        group,
+        "--into",
+        "DIR",
+        "keep every result here as soon as there is one, and go on from what is there; what "
+        "cannot be read is told and left out (exit code 3)",
+    )
+    add_scheduler(group)
 
 
 def _add_fusing(p: argparse.ArgumentParser) -> None:
@@ -350,7 +366,24 @@ def _fuse(options: argparse.Namespace) -> int:
 
 def _identify(options: argparse.Namespace) -> int:
     from services.cli.identify import identify_command
+    from services.cli.identify_archive import archive_command
 
+    check_scheduler(options)
+    if options.into is not None:
+        return archive_command(
+            sources=options.recordings,
+            into=options.into,
+            site=options.site,
+            method=options.method.replace("-", "_"),
+            json_path=options.json,
+            certificates=options.certificates,
+            seed=options.seed,
+            baseline=options.baseline,
+            fuse_suspect=options.fuse_suspect,
+            of_single={name: getattr(options, name) for name in ("rrd", "draws", "figures")},
+            executing=execution_of(options),
+            console=a_console(),
+        )
     return identify_command(
         recordings=options.recordings,
         site=options.site,
@@ -363,6 +396,7 @@ def _identify(options: argparse.Namespace) -> int:
         seed=options.seed,
         baseline=options.baseline,
         fuse_suspect=options.fuse_suspect,
+        executing=None if options.scheduler is None else execution_of(options),
         console=a_console(),
     )
 

@@ -89,7 +89,7 @@ def add_force(p: argparse.ArgumentParser) -> None:
     )
 
 
-def add_file(p: argparse.ArgumentParser, option: str, metavar: str, text: str) -> None:
+def add_file(p: Any, option: str, metavar: str, text: str) -> None:
     """An option that names a file."""
     p.add_argument(option, type=Path, metavar=metavar, help=text)
 

@@ -13,7 +13,7 @@ from schemas.site import Site
 from schemas.site_file import load_site, parse_site, site_hash
 from services.common.errors import InputError
 from services.execution.blas import one_blas_thread
-from services.execution.dispatch import awaited, dispatched
+from services.execution.dispatch import Execution, awaited, dispatched
 from services.execution.here import Here, Report
 from services.execution.overview import (
     Overview,
@@ -72,10 +72,12 @@ def identify_drives(
     keep: Keep = lambda crossing_id, draws: None,
     fusing: Fusing = NOTHING_STORED,
     certificates: Mapping[Pair, str] | None = None,
+    execution: Execution | None = None,
 ) -> Results:
     """Results of all crossings in the drives, which are read again, message by message.
 
-    `report` is told of every crossing how far it is, and in the end that all of it is done.
+    `report` is told of every crossing how far it is, and in the end that all of it is done; how far
+    and with which draws an `execution` elsewhere (None: here) tells by itself.
     InputError if the site knows none of the trucks.
     """
     header = Header(
@@ -87,7 +89,7 @@ def identify_drives(
     )
     fusing = fusing._replace(threads=settings.threads)
     engine = Engine(site, settings, header, fusing, certificates=certificates, tells_states=False)
-    execution = Here(report=report, keep=keep)
+    execution = Here(report=report, keep=keep) if execution is None else execution
     _check_vehicles(drives.name, site, drives.drove)
     for message in drives.near:
         engine.expect(message.key, message.payload, for_ever=True)
@@ -100,6 +102,7 @@ def identify_drives(
             dispatched(engine, execution, engine.finish()),
             awaited(engine, execution),
             dispatched(engine, execution, engine.fuse_all()),
+            awaited(engine, execution),
         )
         found = []
         for output in outputs:

@@ -25,7 +25,7 @@ from services.identification.bridges import Bridges
 from services.identification.streams import device_time_ns
 from services.recordings.recording import Message, read_messages
 
-_STREAMS = ("accel", "gnss", "info")
+STREAMS = ("accel", "gnss", "info")
 _SMALL_BYTES = 64 << 20
 """Recordings of which the messages take less are not read a second time."""
 _BESIDE_BYTES = 400
@@ -62,7 +62,7 @@ def messages_of_trucks(
     def of_files(watch: Callable[[], Offset]) -> Iterator[Message]:
         for path in recordings:
             for message in read_messages(path, watch()):
-                if message.key.owner == "vehicle" and message.key.stream in _STREAMS:
+                if message.key.owner == "vehicle" and message.key.stream in STREAMS:
                     yield message
 
     return remembered(lambda again: of_files((lambda: unwatched) if again else next_file))
@@ -104,7 +104,7 @@ def look_over(name: str, read: Read, site: Site) -> Overview:
     seen: set[str] = set()
     for message in read():
         key = message.key
-        if key.owner != "vehicle" or key.stream not in _STREAMS:
+        if key.owner != "vehicle" or key.stream not in STREAMS:
             continue
         seen.add(key.stream)
         if key.stream == "info":

@@ -43,6 +43,8 @@ from services.identification.outputs import Fuse, Work
 
 _log = logging.getLogger(__name__)
 _SPAWN = get_context("spawn")
+_STARTING = threading.Lock()
+"""Which process is new is told by which was not there before: one is started at a time."""
 _TRIES = 2
 """A process may be ended for what others do to the machine's memory; twice is no accident."""
 _WAITING_PER_PROCESS = 2
@@ -386,9 +388,10 @@ class _Place:
         self._executor = ProcessPoolExecutor(
             1, mp_context=_SPAWN, initializer=_prepare, initargs=(its_end, self._send, self._begin)
         )
-        others = set(active_children())
-        self.is_warm = self._executor.submit(os.getpid)  # which starts the process
-        (process,) = set(active_children()) - others
+        with _STARTING:
+            others = set(active_children())
+            self.is_warm = self._executor.submit(os.getpid)  # which starts the process
+            (process,) = set(active_children()) - others
         assert process.pid is not None  # noqa: S101 - it has been started
         self._pid = process.pid
         self._watch, self._next_look_s = None, 0.0

@@ -24,7 +24,7 @@ from schemas.results import Crossing, ElementState, Header, Results
 from schemas.topics import check_identifier, check_realm
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
-from services.history.parquet_files import decoded, encoded
+from services.common.parquet_files import decoded, encoded
 
 if TYPE_CHECKING:
     # Kernels are slow to import, and who reads a table needs none.

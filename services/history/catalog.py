@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from services.common.errors import FailureError, InputError
+from services.common.parquet_files import decoded, encoded
 from services.common.stores import (
     Entry,
     Folder,
@@ -26,7 +27,6 @@ from services.common.stores import (
     remove,
 )
 from services.history.catalog_row import Row, content_of, details_text, row_of
-from services.history.parquet_files import decoded, encoded
 from services.identification.bridges import Box
 
 _log = logging.getLogger(__name__)

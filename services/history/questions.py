@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from services.common.errors import InputError
+from services.common.parquet_files import decoded
 from services.history.archive import CROSSINGS, EDITION, KEY, bridges_of
-from services.history.parquet_files import decoded
 
 
 class Answer(NamedTuple):

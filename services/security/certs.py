@@ -10,6 +10,9 @@ What lies in the folder afterwards:
 
 Zenoh knows no list of revoked certificates. What keeps somebody out is the access control of the
 routers, which lists those who may take part; it is written anew by every run.
+
+A Dask cluster runs whatever it is sent by anybody with a certificate of its authority. So that is
+another one, in another folder (`--cluster`): a stolen truck must not come in there.
 """
 
 import ipaddress
@@ -38,7 +41,10 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from schemas.topics import check_identifier
 from services.bus.credentials import (
     AUTHORITY,
+    BUS_ROLES,
     CERTIFICATE,
+    CLUSTER_LISTENERS,
+    CLUSTER_ROLES,
     CONFIGURATION,
     KEY,
     LISTENERS,
@@ -55,6 +61,8 @@ from services.security.access_control import access_control
 AUTHORITY_DAYS = 3650
 FIRST = tuple(Subject(role, role) for role in ("router", "logger", "worker", "viewer", "replay"))
 """Made together with the authority."""
+FIRST_OF_CLUSTER = tuple(Subject(role, role) for role in CLUSTER_ROLES)
+"""Made together with the authority of a cluster."""
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 PLACE = "/etc/driveby/tls"
 """Where the ready-made configurations expect the folder on its machine."""
@@ -109,16 +117,19 @@ def certs_command(
     revoke: Sequence[str] = (),
     hosts: Sequence[str] = (),
     days: int = 365,
+    is_cluster: bool = False,
 ) -> list[str]:
     """Make credentials in `folder` and return lines that say what there is now.
 
-    The first run makes the authority, `FIRST` and the trucks named. A later one adds `trucks` and
+    The first run makes the authority, `FIRST` and the trucks named, or with `is_cluster` the
+    authority of a cluster and `FIRST_OF_CLUSTER`. A later one adds `trucks` and
     `others` (ROLE/NAME), gives the names in `renew` a new key and certificate and takes those in
     `revoke` off the list, and leaves everything else as it is. Certificates of routers and loggers
     name this machine and `hosts`.
 
     InputError: a malformed name, one that exists already or was revoked, a name that is not there
-    to be renewed or revoked, no authority's key. Nothing is made then.
+    to be renewed or revoked, a role of a cluster in a folder of the bus or the other way round, no
+    authority's key. Nothing is made then.
     """
     for host in hosts:
         _check_host(host)
@@ -127,10 +138,13 @@ def certs_command(
     if authority is None:
         if renew or revoke:
             raise InputError(f"{folder}: has no authority yet, so there is nothing to change")
-        wanted = [*FIRST, *wanted]
+        wanted = [*(FIRST_OF_CLUSTER if is_cluster else FIRST), *wanted]
+    _check_kind(folder, authority, wanted, is_cluster=is_cluster)
     _check_new(folder, authority, wanted)
     renewed = [] if authority is None else _known(authority, renew)
     revoked = [] if authority is None else _known(authority, revoke)
+    if revoked and revoked[0].role in CLUSTER_ROLES:
+        raise InputError("--revoke: Dask knows no revoked certificates; make a new authority")
     if both := set(renewed) & set(revoked):
         raise InputError(f"{min(both).name}: either renew or revoke it")
     if hosts and not any(subject.role in LISTENERS for subject in [*wanted, *renewed]):
@@ -148,6 +162,26 @@ def certs_command(
     except OSError as error:
         raise FailureError(f"{folder}: {error.strerror}: {error.filename}") from None
     return _summary(folder, authority)
+
+
+def _check_kind(
+    folder: Path, authority: _Authority | None, wanted: Iterable[Subject], *, is_cluster: bool
+) -> None:
+    """One authority is of the bus or of a cluster, never of both."""
+    if authority is not None:
+        is_of_cluster = any(one.role in CLUSTER_ROLES for one in authority.subjects().values())
+        if is_cluster and not is_of_cluster:
+            raise InputError(
+                f"{folder}: is an authority of the bus; --cluster needs another folder"
+            )
+        is_cluster = is_of_cluster
+    kind, roles = ("a cluster", CLUSTER_ROLES) if is_cluster else ("the bus", BUS_ROLES)
+    for subject in wanted:
+        if subject.role not in roles:
+            raise InputError(
+                f"{subject}: {folder} is an authority of {kind}, where everybody is one of "
+                f"{', '.join(roles)}; a cluster has a folder of its own (--cluster)"
+            )
 
 
 def _truck(name: str) -> Subject:
@@ -257,7 +291,8 @@ def _issue(
     now = datetime.now(UTC)
     until = min(now + timedelta(days=days), authority.certificate.not_valid_after_utc)
     usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    if listens:  # or a truck could pose as the router
+    # Or a truck could pose as the router, and who only asks as the scheduler.
+    if listens or subject.role in CLUSTER_LISTENERS:
         usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
     builder = (
         _builder(key, now, until)
@@ -278,7 +313,7 @@ def _issue(
         (new / CERTIFICATE).write_bytes(certificate)
         public = authority.certificate.public_bytes(Encoding.PEM)
         (new / AUTHORITY).write_bytes(public)
-        if not listens:
+        if not listens and subject.role in BUS_ROLES:
             (new / CONFIGURATION).write_text(_client_configuration(_router_host(authority)))
         # On the list before the folder is there: a name that is listed is never issued twice.
         write_atomically(copy, certificate)
@@ -410,6 +445,6 @@ def _summary(folder: Path, authority: _Authority) -> list[str]:
         lines.append(f"  {place:<20} {subject!s:<28} until {until:%Y-%m-%d}")
     lines.append(
         f"  {_FOLDER}/{_AUTHORITY_KEY} makes certificates: keep it off line. "
-        "Each other folder goes to its machine; routers and loggers are to be started anew."
+        "Each other folder goes to its machine; who listens is to be started anew."
     )
     return lines

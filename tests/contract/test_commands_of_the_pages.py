@@ -26,6 +26,7 @@ SERVICE = "runs until it is stopped; tests/process_replay starts it as a process
 FOUR = "is one of four at once; tests/process_replay/test_four_terminals.py runs them as they stand"
 MACHINES = "is for machines that are not here; tests/process_replay and tests/faults do it on one"
 NETWORK = "needs a network"
+CLUSTER = "needs a cluster; tests/faults/test_cluster.py has one"
 FUSES = "is of many drives; tests/unit/identification/test_fusing.py runs the commands"
 CERTIFIES = "takes a minute; tests/process_replay and tests/unit/validation run it"
 ITSELF = "runs the tests, of which this is one"
@@ -42,6 +43,16 @@ NOT_RUN = {
     "driveby alarm ack BRIDGE --by NAME --note TEXT": (
         "needs an alarm; tests/unit/history/test_alarms.py has one"
     ),
+    "driveby cluster --workers 2": SERVICE,
+    "driveby cluster --workers 2 --tls cluster-certs": SERVICE,
+    "driveby identify recordings --site site.toml --scheduler tcp://127.0.0.1:8786 "
+    "--into identified": CLUSTER,
+    "driveby identify recordings --site site.toml --scheduler tls://127.0.0.1:8786 "
+    "--tls cluster-certs/client --into identified": CLUSTER,
+    "pytest tests/faults/test_cluster.py": ITSELF,
+    'pip install "driveby[cluster]"': NETWORK,
+    "python -m tests.benchmarks.cluster_scale --crossings 2000": LONG,
+    "python -m tests.benchmarks.cluster_scale --crossings 120 --alone 20 --batch 10": LONG,
     "make install": "installs what this test runs in; .ci/run begins with it",
     "make demo": "tests/process_replay/test_demo.py runs the command of the target",
     "make test": ITSELF,

@@ -14,6 +14,7 @@ from typing import Any
 import jsonschema
 import pytest
 import yaml
+from distributed.cli import dask_scheduler, dask_worker
 
 from services.cli import main as cli
 
@@ -22,6 +23,7 @@ COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 LASTING = ("router", "logger", "worker")
+OF_DASK = ("scheduler", "cluster-worker-1", "cluster-worker-2")
 VERSIONS = ROOT / "docs" / "scripts" / "container_versions.py"
 
 
@@ -104,9 +106,33 @@ def test_it_comes_up_a_second_time() -> None:
     assert cli._parser().parse_args(SERVICES["simulation"]["command"]).force
 
 
-@pytest.mark.parametrize("name", [n for n in SERVICES if n != "router"])
+@pytest.mark.parametrize("name", [n for n in SERVICES if n not in ("router", *OF_DASK)])
 def test_every_command_is_one_of_ours(name: str) -> None:
     cli._parser().parse_args(SERVICES[name]["command"])
+
+
+@pytest.mark.parametrize("name", OF_DASK)
+def test_dask_takes_the_others_and_they_ask_for_certificates(name: str, tmp_path: Path) -> None:
+    program, which, *arguments = SERVICES[name]["command"]
+    assert program == "dask"
+    for file in ("ca", "cert", "key"):
+        (tmp_path / f"{file}.pem").touch()
+    here = [argument.replace("/etc/driveby/tls", str(tmp_path)) for argument in arguments]
+    command = {"scheduler": dask_scheduler.main, "worker": dask_worker.main}[which]
+    options = command.make_context(which, here).params
+    for option, file in (("tls_ca_file", "ca"), ("tls_cert", "cert"), ("tls_key", "key")):
+        assert options[option] == str(tmp_path / f"{file}.pem")
+    assert options["dashboard_address"] == "127.0.0.1:0"
+    if which == "worker":
+        assert options["scheduler"] == "tls://scheduler:8786"
+        assert options["nanny"] is False
+        assert '[ "$1" = dask ] && exec "$@"' in (ROOT / "entrypoint.sh").read_text()
+
+
+def test_the_client_of_the_cluster_finds_its_scheduler() -> None:
+    options = cli._parser().parse_args(SERVICES["client"]["command"])
+    assert options.scheduler == "tls://scheduler:8786"
+    assert str(options.tls) == "/etc/driveby/tls"
 
 
 def test_only_loopback_is_published() -> None:

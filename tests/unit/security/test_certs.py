@@ -383,3 +383,36 @@ def test_every_topic_has_exactly_the_publishers_that_it_should() -> None:
             assert may
             assert may <= {"logger", "worker"}
             assert row.stream != "durable" or may == {"logger"}
+
+
+@pytest.fixture
+def of_cluster(tmp_path: Path) -> Path:
+    made = tmp_path / "cluster-certs"
+    certs_command(folder=made, is_cluster=True)
+    return made
+
+
+def test_a_cluster_has_an_authority_and_roles_of_its_own(of_cluster: Path) -> None:
+    for role, listens in (("scheduler", True), ("cluster-worker", True), ("client", False)):
+        assert check_credentials(of_cluster / role) == (role, role)
+        assert not (of_cluster / role / "zenoh.json5").exists()
+        usages = read_certificate(of_cluster / role / CERTIFICATE).extensions
+        kinds = usages.get_extension_for_class(x509.ExtendedKeyUsage).value
+        assert (ExtendedKeyUsageOID.SERVER_AUTH in kinds) == listens
+    certs_command(folder=of_cluster, others=["cluster-worker/two"], renew=["client"])
+    assert check_credentials(of_cluster / "two") == ("cluster-worker", "two")
+
+
+def test_nobody_of_the_bus_is_of_a_cluster(of_cluster: Path, folder: Path) -> None:
+    """Whoever has a certificate of a cluster's authority runs programs on it."""
+    with pytest.raises(InputError, match=r"truck/truck-1: .* is an authority of a cluster"):
+        certs_command(folder=of_cluster, trucks=["truck-1"])
+    with pytest.raises(InputError, match=r"client/anna: .* is an authority of the bus"):
+        certs_command(folder=folder, others=["client/anna"])
+    with pytest.raises(InputError, match=r"--cluster needs another folder"):
+        certs_command(folder=folder, is_cluster=True)
+    with pytest.raises(InputError, match=r"is an authority of a cluster"):
+        certs_command(folder=folder.parent / "new", trucks=["truck-1"], is_cluster=True)
+    assert not (folder.parent / "new").exists()
+    with pytest.raises(InputError, match=r"knows no revoked certificates"):
+        certs_command(folder=of_cluster, revoke=["client"])

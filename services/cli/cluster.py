@@ -1,0 +1,182 @@
+"""`driveby cluster`, and `--scheduler`: where crossings are identified beside this process."""
+
+import argparse
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from services.cli.parsing import command, whole
+from services.common.endpoints import LOOPBACK
+from services.common.errors import InputError
+
+if TYPE_CHECKING:
+    from services.cluster import Roles
+    from services.execution.dispatch import Execution
+    from services.execution.scheduler import Credentials
+
+_PROCESSES: Final = "processes"
+_MOST: Final = 256
+
+
+def add_cluster(commands: Any) -> None:
+    """`driveby cluster`: run a Dask scheduler and workers on this machine."""
+    p = command(
+        commands,
+        "cluster",
+        _cluster,
+        "run a Dask scheduler and workers on this machine, for `identify --scheduler`",
+        "driveby cluster --workers 4",
+    )
+    p.add_argument(
+        "--workers",
+        type=whole("a number of workers", 1, _MOST),
+        default=_cores(),
+        metavar="N",
+        help="(default: as many as there are processors)",
+    )
+    p.add_argument(
+        "--port",
+        type=whole("a port", 1, 65535),
+        default=8786,
+        help="of the scheduler (default: 8786)",
+    )
+    p.add_argument(
+        "--listen",
+        default=LOOPBACK,
+        metavar="ADDRESS",
+        help=f"of this machine; any other than {LOOPBACK} needs --tls (default: {LOOPBACK})",
+    )
+    p.add_argument(
+        "--tls",
+        type=Path,
+        metavar="FOLDER",
+        help="made by `driveby certs FOLDER --cluster`: scheduler, cluster-worker and client in it",
+    )
+    p.add_argument(
+        "--memory",
+        default="auto",
+        metavar="SIZE",
+        help="what a worker may hold, e.g. 2GiB (default: auto, its share of this machine's)",
+    )
+
+
+def add_scheduler(p: Any) -> None:
+    """`--scheduler` and what belongs to it."""
+    p.add_argument(
+        "--scheduler",
+        metavar="processes|processes:N|tcp://…|tls://…",
+        help="identify in so many processes of this machine (default N: as many as there are "
+        "processors), or on a Dask cluster; the results are the same",
+    )
+    p.add_argument(
+        "--batch",
+        type=whole("a number of crossings", 1, 200),
+        metavar="N",
+        help="crossings in one task of a cluster (default: 50)",
+    )
+    p.add_argument(
+        "--patience",
+        type=whole("seconds", 1, 86_400),
+        metavar="S",
+        help="so long a scheduler that is gone, or workers, are waited for (default: 300)",
+    )
+    p.add_argument(
+        "--tls", type=Path, metavar="FOLDER", help="credentials of a client of a cluster"
+    )
+
+
+def check_scheduler(options: argparse.Namespace) -> None:
+    """InputError if `--scheduler` says nothing that there is, before anything is started."""
+    said: str | None = options.scheduler
+    is_cluster = said is not None and said.partition(":")[0] != _PROCESSES
+    for name in ("tls", "batch", "patience"):
+        if getattr(options, name) is not None and not is_cluster:
+            raise InputError(f"--{name}: belongs to a cluster, --scheduler tcp://… or tls://…")
+    if said is not None and not is_cluster:
+        _number(said)
+    if is_cluster:
+        from services.execution.scheduler import check_address
+
+        check_address(str(said), _credentials(options))
+
+
+@contextmanager
+def execution_of(options: argparse.Namespace) -> "Iterator[Execution | None]":
+    """What `--scheduler` says, started as late as it is entered; None without."""
+    said: str | None = options.scheduler
+    if said is None:
+        yield None
+    elif said.partition(":")[0] == _PROCESSES:
+        from services.execution.processes import Processes
+
+        with Processes(_number(said)) as processes:
+            yield processes
+    else:
+        from services.execution.cluster import BATCH, PATIENCE_S, Cluster
+
+        with Cluster(
+            said,
+            credentials=_credentials(options),
+            batch=options.batch or BATCH,
+            patience_s=options.patience or PATIENCE_S,
+        ) as cluster:
+            yield cluster
+
+
+def _credentials(options: argparse.Namespace) -> "Credentials | None":
+    return None if options.tls is None else credentials_of(options.tls, "client")
+
+
+def credentials_of(folder: Path, role: str) -> "Credentials":
+    """The files of a folder of credentials; InputError unless they are those of this role."""
+    from services.bus.credentials import AUTHORITY, CERTIFICATE, KEY, check_speaks_for
+    from services.execution.scheduler import Credentials
+
+    check_speaks_for(folder, role)
+    return Credentials(folder / AUTHORITY, folder / CERTIFICATE, folder / KEY)
+
+
+def _number(said: str) -> int:
+    _, _, text = said.partition(":")
+    if said == _PROCESSES:
+        return _cores()
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if not 1 <= number <= _MOST:
+        raise InputError(f"--scheduler: is {said!r}, the number must be from 1 to {_MOST}")
+    return number
+
+
+def _cores() -> int:
+    return min(os.cpu_count() or 1, _MOST)
+
+
+def _roles(folder: Path) -> "Roles":
+    from services.cluster import Roles
+
+    if not folder.is_dir():
+        raise InputError(f"--tls: {folder} is no folder; driveby certs {folder} --cluster makes it")
+    names = ("scheduler", "cluster-worker", "client")
+    return Roles(*(credentials_of(folder / name, name) for name in names))
+
+
+def _cluster(options: argparse.Namespace) -> int:
+    from services.cluster import Wanted, run
+
+    return run(
+        Wanted(
+            options.workers,
+            options.listen,
+            options.port,
+            None if options.tls is None else _roles(options.tls),
+            options.memory,
+        )
+    )
+
+
+SERVICES: Final = (_cluster,)
+"""Run until they are stopped, and have nothing else to show for themselves than what they say."""

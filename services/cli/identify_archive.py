@@ -1,0 +1,161 @@
+"""`driveby identify --into DIR`: an archive of recordings, whose results are kept as they come."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from schemas.results import Crossing, Header, results, results_json
+from schemas.settings import IdentificationSettings
+from schemas.site import Site
+from schemas.site_file import load_site, parse_site
+from services.cli.bridge_table import print_bridge
+from services.cli.identify import check_certificates, warn_of_no_noise
+from services.cli.parsing import CERTIFICATES
+from services.common.errors import InputError
+from services.common.files import check_writable, write_atomically
+from services.common.progress import progress_bar
+from services.common.stores import folder_at
+from services.execution.archive import Archive, Asked, identify_archive
+from services.execution.dispatch import Execution
+from services.execution.here import Here
+from services.execution.kept import Kept
+from services.history.baselines import baselines_of
+from services.history.catalog import mend
+from services.history.certificates import found_in
+from services.history.positions import crossings_of
+from services.identification.bridge_state import Fusing, with_common_shares
+from services.recordings.recording import read_site
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+EXIT_SOMETHING_LOST: Final = 3
+"""As of `recover`: it worked, but something could not be read or identified."""
+BRIDGES: Final = "bridges.json"
+_MOST_BRIDGES = 20
+"""So many are printed; all are in the file."""
+
+
+def archive_command(
+    *,
+    sources: Sequence[Path],
+    into: Path,
+    site: Path | None,
+    method: str,
+    json_path: Path | None,
+    certificates: Path | None,
+    seed: int,
+    baseline: Path | None,
+    fuse_suspect: bool,
+    of_single: Mapping[str, Path | None],
+    executing: AbstractContextManager[Execution | None],
+    console: "Console",
+) -> int:
+    """Identify what has no result in a folder yet, say what came of it; 3 if something is lost.
+
+    `of_single` are outputs that are made of single crossings only. InputError: one of these, a file
+    or folder that cannot be written, no site file, a catalogue that cannot be made.
+    """
+    for name, path in of_single.items():
+        if path is not None:
+            raise InputError(
+                f"--{name}: is for recordings one looks at; identify these without --into"
+            )
+    check_certificates(certificates)
+    if json_path is not None:
+        check_writable(json_path)
+    problems: list[str] = []
+    known = _site_of(sources, site)
+    recordings = _recordings(sources, known, problems)
+    settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
+    warn_of_no_noise(known, method)
+    asked = Asked(
+        tuple(recordings),
+        known,
+        settings,
+        Fusing(baselines_of(known, None if site is None else site.parent, baseline), fuse_suspect),
+        found_in(certificates or CERTIFICATES, known, settings),
+    )
+    kept = Kept(into)
+    crossings: list[Crossing] = []
+    with executing as execution, progress_bar(console) as bar:
+        task = bar.add_task("crossings", total=None)
+        found = identify_archive(
+            asked,
+            Here() if execution is None else execution,
+            kept,
+            take=crossings.append if json_path is not None else lambda crossing: None,
+            report=lambda number: bar.update(task, description=f"{number} crossings"),
+        )
+    header = asked.header
+    _write(into / BRIDGES, header, [], found)
+    if json_path is not None:
+        crossings.sort(key=lambda one: (one.entry_time, one.crossing_id))
+        _write(json_path, header, with_common_shares(crossings, found.bridges), found)
+    return _told(found, [*problems, *found.problems], known, into, console)
+
+
+def _site_of(sources: Sequence[Path], site: Path | None) -> Site:
+    """The site file given, or the first one that a recording has; one that is damaged has none."""
+    if site is not None:
+        return load_site(site)
+    for source in sources:
+        for path in sorted(source.rglob("*.mcap")) if source.is_dir() else [source]:
+            try:
+                text = read_site(path)
+            except InputError:  # told where it is read
+                continue
+            if text is not None:
+                return parse_site(text, f"{path}: site.toml")
+    raise InputError(f"{sources[0]}: no recording has a site file in it, give one with --site")
+
+
+def _recordings(sources: Sequence[Path], site: Site, problems: list[str]) -> list[Path]:
+    """Recordings that are named; of folders those in which positions show a crossing.
+
+    A folder's catalogue is mended first: what it said that was not so is a problem, a line each.
+    """
+    found: list[Path] = []
+    for source in sources:
+        if not source.is_dir():
+            found.append(source)
+            continue
+        folder = folder_at(str(source))
+        mended = mend(folder)
+        looked = crossings_of(folder, mended.rows.values(), site)
+        problems += (*mended.problems, *looked.problems)
+        with_crossings = {path for one in looked.crossings for path in one.recordings}
+        found += (source / path for path in sorted(with_crossings))
+    return found
+
+
+def _write(path: Path, header: Header, crossings: list[Crossing], found: Archive) -> None:
+    write_atomically(path, results_json(results(header, crossings, found.bridges)))
+
+
+def _told(
+    found: Archive, problems: Sequence[str], site: Site, into: Path, console: "Console"
+) -> int:
+    def say(line: str) -> None:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    for number, (name, state) in enumerate(found.bridges.items()):
+        if number == _MOST_BRIDGES:
+            say(f"… and {len(found.bridges) - number} bridges more")
+            break
+        print_bridge(console, site.bridge(name), state)
+        console.print()
+    for problem in problems:
+        say(problem)
+    for crossing_id in found.failed:
+        say(f"{crossing_id}: its identification failed, see the log; it is tried again next time")
+    verdicts = ", ".join(
+        f"{number} {verdict}" for verdict, number in sorted(found.verdicts.items())
+    )
+    number = found.verdicts.total()
+    say(
+        f"{number} crossing{'s' if number != 1 else ''}, {found.there} known from before"
+        f"{verdicts and f': {verdicts}'}; results in {into}, bridges in {into / BRIDGES}"
+    )
+    return EXIT_SOMETHING_LOST if problems or found.failed else 0

@@ -1,0 +1,72 @@
+"""Recordings of many drives, made from one: the same crossing again and again, at other times."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from schemas.signals import (
+    NS_PER_S,
+    AccelBatch,
+    GnssFix,
+    VehicleInfo,
+    decode_accel,
+    decode_gnss,
+    decode_info,
+    encode_accel,
+    encode_gnss,
+    encode_info,
+)
+from services.recordings.recording import Message, read_messages, read_site
+from services.recordings.writer import RecordingWriter
+
+SAMPLE = Path(__file__).parents[1] / "recordings" / "sample" / "crossing.mcap"
+EXACT = Path(__file__).parent / "data" / "noise_free.mcap"
+"""For least squares: 0.1 s a crossing and not one."""
+APART_NS = 600 * NS_PER_S
+_DECODE = {"accel": decode_accel, "gnss": decode_gnss, "info": decode_info}
+
+
+def drives(folder: Path, crossings: int, each: int = 1, source: Path = EXACT) -> list[Path]:
+    """Write so many crossings, `each` in a recording, ten minutes apart; the recordings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    once = [
+        (message, _DECODE[message.key.stream](message.payload))
+        for message in read_messages(source)
+        if message.key.stream in _DECODE
+    ]
+    site = read_site(source)
+    paths = []
+    for first in range(0, crossings, each):
+        path = folder / f"drive-{first:05d}.mcap"
+        key = once[0][0].key
+        writer = RecordingWriter(
+            path, reason="test", realm=key.realm, vehicle=key.identifier, site_toml=site
+        )
+        for number in range(first, min(first + each, crossings)):
+            for message in _later(once, number):
+                writer.write(message)
+        writer.finish("done")
+        paths.append(path)
+    return paths
+
+
+def _later(
+    once: list[tuple[Message, AccelBatch | GnssFix | VehicleInfo]], number: int
+) -> Iterator[Message]:
+    """The messages of a drive `number` times ten minutes later, as of another boot."""
+    by = number * APART_NS
+    for message, said in once:
+        boot_id = message.boot_id + number
+        times = {"boot_id": boot_id, "wall_time_ns": said.wall_time_ns + by}
+        match said:
+            case AccelBatch():
+                payload = encode_accel(said._replace(**times))
+            case GnssFix():
+                payload = encode_gnss(said._replace(**times))
+            case VehicleInfo():
+                payload = encode_info(said._replace(**times))
+        yield message._replace(
+            payload=payload,
+            boot_id=boot_id,
+            log_time_ns=message.log_time_ns + by,
+            publish_time_ns=message.publish_time_ns + by,
+        )

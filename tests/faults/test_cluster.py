@@ -1,0 +1,295 @@
+"""A Dask cluster of real processes: the results of one process, whoever of them is killed."""
+
+import os
+import re
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from services.cli import main as cli
+from services.common.errors import FailureError
+from services.execution.scheduler import Credentials, connected
+from services.security.certs import certs_command
+from tests.drives import drives
+from tests.faults.clusters import (
+    Running,
+    RunningCluster,
+    cluster,
+    contents,
+    of,
+    other_worker,
+    results_of,
+    start,
+)
+from tests.waiting import until
+
+pytestmark = pytest.mark.process
+
+CROSSINGS = 30
+HELD = "20260101T032003"
+"""When the first crossing begins that workers can be made to hold, as all later ones."""
+_HOLDING = """
+import time
+from pathlib import Path
+
+from services.execution import cluster_worker
+
+
+def holding(batch):
+    works = of_others(batch)
+    while Path(FILE).exists() and any(w.crossing_id.split(".")[2] >= HELD for w in works):
+        time.sleep(0.02)
+    return works
+
+
+if cluster_worker.unpacked.__name__ != "holding":  # Dask runs this twice
+    of_others = cluster_worker.unpacked
+    cluster_worker.unpacked = holding
+"""
+_OTHER_VERSION = """
+from services.execution import cluster_worker, program
+
+of_this = program.program()
+
+
+def of_another() -> dict[str, str]:
+    return of_this | {"driveby": "0.0.9 (code 0123456789)"}
+
+
+cluster_worker.program = of_another
+"""
+_DEADLY = """
+import os
+import signal
+
+from services.execution import cluster_worker
+
+
+def deadly(batch):
+    works = of_others(batch)
+    if any(NAME in work.crossing_id for work in works):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return works
+
+
+if cluster_worker.unpacked.__name__ != "deadly":  # Dask runs this twice
+    of_others = cluster_worker.unpacked
+    cluster_worker.unpacked = deadly
+"""
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return drives(tmp_path_factory.mktemp("drives"), CROSSINGS, each=4)
+
+
+@pytest.fixture(scope="module")
+def of_one_process(
+    recordings: list[Path], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
+    path = tmp_path_factory.mktemp("one") / "one.json"
+    assert cli.main(of(recordings, "--json", str(path))) == 0
+    return results_of(path)
+
+
+class Held(NamedTuple):
+    """A cluster whose workers hold a batch while there is a file."""
+
+    cluster: RunningCluster
+    file: Path
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Held]:
+    folder = tmp_path_factory.mktemp("cluster")
+    file, preload = folder / "hold", folder / "holding.py"
+    preload.write_text(_HOLDING.replace("FILE", repr(str(file))).replace("HELD", repr(HELD)))
+    preloaded = {"DASK_DISTRIBUTED__WORKER__PRELOAD": f"['{preload}']"}
+    with cluster(folder, env=preloaded) as running:
+        yield Held(running, file)
+
+
+@pytest.fixture
+def two(held: Held) -> RunningCluster:
+    held.file.unlink(missing_ok=True)
+    return held.cluster
+
+
+@pytest.fixture
+def begin(tmp_path: Path) -> Iterator[Callable[..., Running]]:
+    """Start a command; what has not ended is killed with the test."""
+    started: list[Running] = []
+
+    def one(*arguments: str) -> Running:
+        started.append(start(tmp_path / f"{len(started)}.log", *arguments))
+        return started[-1]
+
+    yield one
+    for running in started:
+        if running.process.poll() is None:
+            running.process.kill()
+        running.wait()
+
+
+def in_the_middle(running: Running, into: Path) -> None:
+    """Wait until some crossings are kept; others are held."""
+    until(lambda: contents(into) or running.process.poll() is not None)
+    assert running.process.poll() is None, running.said()
+    assert 0 < len(contents(into)) < CROSSINGS
+
+
+def on(two: RunningCluster, into: Path, *options: str) -> list[str]:
+    return ["--scheduler", two.address, "--into", str(into), "--batch", "5", *options]
+
+
+def test_a_drive_gives_what_it_gives_in_one_process(
+    two: RunningCluster, recordings: list[Path], tmp_path: Path
+) -> None:
+    found = []
+    for number, options in enumerate(
+        ([], ["--scheduler", two.address], ["--scheduler", "processes:2"])
+    ):
+        path = tmp_path / f"{number}.json"
+        assert cli.main(of(recordings[:1], *options, "--json", str(path))) == 0
+        found.append(results_of(path))
+    assert len(found[0]["crossings"]) == 4
+    assert found[0]["bridges"] != {}
+    assert found[1:] == found[:1] * 2
+
+
+@pytest.mark.parametrize("whom", ["worker 1", "scheduler"])
+def test_who_is_killed_costs_nothing(
+    two: RunningCluster,
+    held: Held,
+    begin: Callable[..., Running],
+    recordings: list[Path],
+    tmp_path: Path,
+    of_one_process: dict[str, Any],
+    whom: str,
+) -> None:
+    into, path = tmp_path / "into", tmp_path / "found.json"
+    held.file.touch()
+    running = begin(*of(recordings, *on(two, into, "--json", str(path))))
+    in_the_middle(running, into)
+    before = two.pids(whom)
+    os.kill(before[-1], signal.SIGKILL)
+    until(lambda: len(two.pids(whom)) > len(before))
+    held.file.unlink()
+    assert running.wait() == 0, running.said()
+    assert results_of(path) == of_one_process
+    assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
+    is_told = "the scheduler at " in running.said()
+    assert is_told == (whom == "scheduler"), running.said()
+
+
+def test_a_client_that_is_killed_goes_on(
+    two: RunningCluster,
+    held: Held,
+    begin: Callable[..., Running],
+    recordings: list[Path],
+    tmp_path: Path,
+    of_one_process: dict[str, Any],
+) -> None:
+    into, path = tmp_path / "into", tmp_path / "found.json"
+    held.file.touch()
+    first = begin(*of(recordings, *on(two, into)))
+    in_the_middle(first, into)
+    first.process.kill()
+    assert first.wait() == -signal.SIGKILL
+    there = len(contents(into))
+    assert 0 < there < CROSSINGS
+    second = begin(*of(recordings, *on(two, into, "--json", str(path))))
+    held.file.unlink()
+    assert second.wait() == 0, second.said()
+    assert f"{CROSSINGS} crossings, {there} known from before" in second.said()
+    assert results_of(path) == of_one_process
+    assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
+
+
+def test_a_worker_of_another_version_is_refused_by_name(
+    two: RunningCluster, recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    preload = tmp_path / "other_version.py"
+    preload.write_text(_OTHER_VERSION)
+    into = tmp_path / "into"
+    with other_worker(two.address, tmp_path, preload) as address:
+        assert cli.main(of(recordings, *on(two, into))) == 1
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert f"worker {address}: has driveby 0.0.9 (code 0123456789); here is driveby " in line
+    assert contents(into) == []
+
+
+@pytest.mark.faults
+def test_a_worker_of_another_version_that_comes_later_is_sent_away(
+    two: RunningCluster,
+    held: Held,
+    begin: Callable[..., Running],
+    recordings: list[Path],
+    tmp_path: Path,
+    of_one_process: dict[str, Any],
+) -> None:
+    """While the workers that were there hold a batch each, it gets another one."""
+    preload = tmp_path / "other_version.py"
+    preload.write_text(_OTHER_VERSION)
+    into, path = tmp_path / "into", tmp_path / "found.json"
+    held.file.touch()
+    running = begin(*of(recordings, *on(two, into, "--json", str(path))), "--batch", "1")
+    in_the_middle(running, into)
+    with other_worker(two.address, tmp_path, preload) as address:
+        refused = f"worker {address}: has driveby 0.0.9"
+        until(lambda: refused in running.said() or running.process.poll() is not None)
+        held.file.unlink()
+        assert running.wait() == 0, running.said()
+    assert refused in running.said()
+    assert "it is sent away" in running.said()
+    assert results_of(path) == of_one_process
+
+
+@pytest.mark.faults
+def test_with_tls_only_who_has_a_certificate_of_the_cluster_comes_in(
+    credentials: Path, recordings: list[Path], tmp_path: Path
+) -> None:
+    certs = tmp_path / "certs"
+    certs_command(folder=certs, is_cluster=True)
+    with cluster(tmp_path, "--tls", str(certs), scheme="tls") as running:
+        into = tmp_path / "into"
+        options = on(running, into, "--tls", str(certs / "client"))
+        assert cli.main(of(recordings[:1], *options)) == 0
+        assert len(contents(into)) == 4
+        truck = credentials / "truck-1"
+        for files in (
+            Credentials(truck / "ca.pem", truck / "cert.pem", truck / "key.pem"),
+            Credentials(certs / "client" / "ca.pem", truck / "cert.pem", truck / "key.pem"),
+            None,
+        ):
+            address = running.address if files else running.address.replace("tls", "tcp")
+            with pytest.raises(FailureError, match="no scheduler answers"):
+                connected(address, files, 2.0)
+
+
+@pytest.mark.faults
+def test_a_crossing_that_ends_every_worker_costs_itself_only(
+    begin: Callable[..., Running],
+    recordings: list[Path],
+    tmp_path: Path,
+    of_one_process: dict[str, Any],
+) -> None:
+    preload = tmp_path / "deadly.py"
+    preload.write_text(_DEADLY.replace("NAME", repr("T002003")))
+    into, path = tmp_path / "into", tmp_path / "found.json"
+    with cluster(tmp_path, env={"DASK_DISTRIBUTED__WORKER__PRELOAD": f"['{preload}']"}) as running:
+        options = on(running, into, "--json", str(path))
+        first = begin(*of(recordings[:2], *options))
+        assert first.wait() == 3, first.said()
+    (name,) = re.findall(r"(\S+): its identification failed", first.said())
+    assert "T002003" in name
+    found = results_of(path)["crossings"]
+    failed = [one for one in found if one["reasons"] == ["failed"]]
+    assert [one["crossing_id"] for one in failed] == [name]
+    others = [one for one in of_one_process["crossings"][:8] if one["crossing_id"] != name]
+    assert [one for one in found if one not in failed] == others
+    assert len(contents(into)) == len(set(contents(into))) == 7

@@ -1,0 +1,143 @@
+"""`driveby cluster`, `identify --scheduler` and `--into`: what is refused, and what is told."""
+
+import importlib.util
+import socket
+from pathlib import Path
+
+import pytest
+
+from services.cli import main as cli
+from services.cli.identify_archive import BRIDGES, EXIT_SOMETHING_LOST
+from services.common.stores import folder_at
+from services.execution import cluster
+from services.history.catalog import CATALOG, mend
+from services.security.certs import certs_command
+from tests.drives import EXACT, drives
+
+QUICK = ("--method", "least-squares")
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str]:
+    code = cli.main([str(one) for one in arguments])
+    return code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["--scheduler", "proceses"], "it must be processes, processes:N, tcp://HOST:PORT"),
+        (["--scheduler", "processes:0"], "the number must be from 1 to 256"),
+        (["--scheduler", "processes:x"], "the number must be from 1 to 256"),
+        (["--scheduler", "tcp://127.0.0.1"], "it must be processes"),
+        (["--scheduler", "tcp://127.0.0.1:99999"], "it must be processes"),
+        (["--scheduler", "http://127.0.0.1:8786"], "it must be processes"),
+        (["--scheduler", "tcp://10.0.0.1:8786"], "is another machine: without TLS whoever"),
+        (["--scheduler", "tcp://scheduler:8786"], "is another machine"),
+        (["--scheduler", "tls://127.0.0.1:8786"], "needs --tls FOLDER"),
+        (["--batch", "5"], "--batch: belongs to a cluster"),
+        (["--scheduler", "processes", "--patience", "5"], "--patience: belongs to a cluster"),
+        (["--scheduler", "tcp://127.0.0.1:1", "--batch", "201"], "from 1 to 200"),
+        (["--into", "new", "--rrd", "x.rrd"], "--rrd: is for recordings one looks at"),
+        (["--scheduler", "processes", "--draws", "x.npz"], "--draws"),
+    ],
+)
+def test_what_is_refused_is_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, options: list[str], line: str
+) -> None:
+    code, err = said(capsys, "identify", EXACT, *options)
+    assert (code, err.count("\n")) == (2, 1)
+    assert line in err
+
+
+def test_credentials_must_be_those_of_a_client(
+    capsys: pytest.CaptureFixture[str], credentials: Path, tmp_path: Path
+) -> None:
+    certs = tmp_path / "certs"
+    certs_command(folder=certs, is_cluster=True)
+    for folder in (credentials / "truck-1", certs / "scheduler", tmp_path / "none"):
+        where = ("--scheduler", "tls://127.0.0.1:8786", "--tls", folder)
+        code, err = said(capsys, "identify", EXACT, *where)
+        assert (code, err.count("\n")) == (2, 1)
+        assert str(folder) in err
+    where = ("--scheduler", "tcp://127.0.0.1:8786", "--tls", certs / "client")
+    assert "is spoken to without TLS" in said(capsys, "identify", EXACT, *where)[1]
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with socket.socket() as taken:  # bound, and nobody listens
+        taken.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        code, err = said(capsys, "identify", EXACT, *QUICK, "--scheduler", address, "--patience", 1)
+    assert (code, err.count("\n")) == (1, 1)
+    assert f"{address}: no scheduler answers" in err
+
+
+def test_without_dask_it_is_said_how_to_install_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        "services.common.extras.find_spec",
+        lambda name: None if name == "distributed" else find(name),
+    )
+    scheduler = ["--scheduler", "tcp://127.0.0.1:8786"]
+    for arguments in (["cluster"], ["identify", EXACT, *QUICK, *scheduler]):
+        code, err = said(capsys, *arguments)
+        assert (code, err.count("\n")) == (2, 1)
+        assert 'pip install "driveby[cluster]"' in err
+    assert cluster.BATCH == 50
+
+
+def test_a_cluster_listens_here_only_unless_it_has_certificates(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    code, err = said(capsys, "cluster", "--listen", "0.0.0.0")  # noqa: S104 - it is refused
+    assert (code, err.count("\n")) == (2, 1)
+    assert "without TLS whoever reaches it runs programs" in err
+    code, err = said(capsys, "cluster", "--tls", tmp_path / "none")
+    assert (code, err.count("\n")) == (2, 1)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        code, err = said(capsys, "cluster", "--port", taken.getsockname()[1])
+    assert (code, err.count("\n")) == (2, 1)
+    assert "cannot listen at 127.0.0.1 port" in err
+
+
+def test_a_folder_needs_a_place_for_its_results(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    drives(tmp_path / "recordings", 1)
+    code, err = said(capsys, "identify", tmp_path / "recordings", *QUICK)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "--into" in err
+
+
+def test_a_folder_is_identified_by_its_catalogue_and_gone_on_with(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder, into = tmp_path / "recordings", tmp_path / "into"
+    first, second, third = drives(folder, 3)
+    mend(folder_at(str(folder)))
+    third.unlink()  # the catalogue does not know
+    second.write_bytes(first.read_bytes())  # nor that
+    (folder / "none.mcap").write_bytes(b"no recording")
+    (folder / CATALOG / "bad.parquet").write_bytes(b"no rows")
+    assert cli.main(["identify", str(folder), *QUICK, "--into", str(into)]) == EXIT_SOMETHING_LOST
+    out = capsys.readouterr().out
+    for path, line in (
+        (third, "is gone"),
+        (second, "its row is made anew"),
+        (folder / "none.mcap", ""),
+        (folder / CATALOG / "bad.parquet", "left out"),
+    ):
+        assert sum(f"{path}: " in one and line in one for one in out.splitlines()) == 1, out
+    assert "1 crossing, 0 known from before: 1 suspect" in out
+    assert (into / BRIDGES).is_file()
+    (folder / "none.mcap").unlink()
+    (folder / CATALOG / "bad.parquet").unlink()
+    drives(tmp_path / "later", 2)[1].rename(folder / "later.mcap")
+    assert cli.main(["identify", str(folder), *QUICK, "--into", str(into)]) == 0
+    assert "2 crossings, 1 known from before: 2 suspect" in capsys.readouterr().out

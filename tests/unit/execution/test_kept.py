@@ -1,0 +1,82 @@
+"""Results in a folder: read as they were written, whatever becomes of other files there."""
+
+from pathlib import Path
+
+import pytest
+
+from services.common.errors import InputError
+from services.execution.kept import Kept, Result
+from tests.unit.identification.test_fusing import crossing
+
+
+def results(number: int) -> list[Result]:
+    return [Result(f"content-{n}", crossing(n)) for n in range(number)]
+
+
+def test_what_was_put_is_there_to_the_last_bit(tmp_path: Path) -> None:
+    found = results(5)
+    kept = Kept(tmp_path / "new" / "folder")
+    kept.put(found[:2])
+    kept.put(found[2:])
+    assert kept.put([]) is None
+    for one in (kept, Kept(tmp_path / "new" / "folder")):
+        assert len(one) == 5
+        assert [one.result(content) for content, _ in found] == [c for _, c in found]
+        assert one.result("another") is None
+        assert list(one.problems) == []
+
+
+def test_the_same_results_are_the_same_file(tmp_path: Path) -> None:
+    found = results(3)
+    first = Kept(tmp_path).put(found)
+    assert Kept(tmp_path).put(reversed(found)) == first
+    assert list(tmp_path.iterdir()) == [first]
+
+
+@pytest.mark.parametrize("how", ["cut", "other"])
+def test_a_damaged_file_is_a_line_and_costs_itself_only(tmp_path: Path, how: str) -> None:
+    first, second = results(2)
+    kept = Kept(tmp_path)
+    path = kept.put([first])
+    kept.put([second])
+    assert path is not None
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2] if how == "cut" else b"something else")
+    again = Kept(tmp_path)
+    assert again.result(first.content) is None
+    assert len(again.problems) == 1
+    assert str(path) in again.problems[0]
+    assert again.result(second.content) == second.crossing
+    again.put([first])  # it is made again, in the place of the damaged one
+    assert Kept(tmp_path).result(first.content) == first.crossing
+    assert Kept(tmp_path).problems == []
+
+
+def test_a_result_that_cannot_be_read_is_a_line_and_no_result(tmp_path: Path) -> None:
+    first = results(1)[0]
+    path = Kept(tmp_path).put([first])
+    assert path is not None
+    content = path.read_bytes()
+    at = content.index(b"\x28\xb5\x2f\xfd") + 40  # in the middle of what zstd has made
+    path.write_bytes(content[:at] + bytes(64) + content[at + 64 :])
+    kept = Kept(tmp_path)
+    assert kept.result(first.content) is None
+    assert kept.result(first.content) is None
+    assert len(kept.problems) == 1
+    assert f"{path}: row 1: left out" in kept.problems[0]
+
+
+def test_what_a_writer_that_was_killed_has_left_is_no_file(tmp_path: Path) -> None:
+    first, second = results(2)
+    path = Kept(tmp_path).put([first])
+    assert path is not None
+    (tmp_path / f".{path.stem}.0123abcd.part.parquet").write_bytes(path.read_bytes()[:100])
+    kept = Kept(tmp_path)
+    assert (len(kept), kept.problems) == (1, [])
+    assert kept.result(second.content) is None
+
+
+def test_where_nothing_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file"):
+        Kept(tmp_path / "file")
