@@ -2,10 +2,14 @@
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+FILES: Final = "[!.]*.parquet"
+"""The files of a folder, for Python and DuckDB; none that is being written, or was when its writer
+died."""
 
 
 def encoded(table: "pa.Table", key: str, edition: str, *, compression: str = "zstd") -> bytes:

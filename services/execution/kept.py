@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from schemas.results import Crossing
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
-from services.common.parquet_files import decoded, encoded
+from services.common.parquet_files import FILES, decoded, encoded
 from services.execution.content import content_of_all
 
 EDITION: Final = "1"
@@ -100,8 +100,8 @@ class Kept:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """The files of results in a folder; not what is being written, or was when its writer died."""
-    return [path for path in sorted(folder.glob("*.parquet")) if not path.name.startswith(".")]
+    """The files of results in a folder."""
+    return sorted(folder.glob(FILES))
 
 
 def _file_of(results: list[Result]) -> bytes:

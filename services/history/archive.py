@@ -24,7 +24,7 @@ from schemas.results import Crossing, ElementState, Header, Results
 from schemas.topics import check_identifier, check_realm
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
-from services.common.parquet_files import decoded, encoded
+from services.common.parquet_files import FILES, decoded, encoded
 
 if TYPE_CHECKING:
     # Kernels are slow to import, and who reads a table needs none.
@@ -169,7 +169,7 @@ def read_partition(where: Path, columns: Iterable[str] = ()) -> Read:
     names = ["content"] if only_content else [*_PLAIN, *_OF_ELEMENTS, *wanted]
     rows: list[Kept] = []
     problems: list[str] = []
-    for path in sorted(where.glob("*.parquet")):
+    for path in sorted(where.glob(FILES)):
         try:
             rows += _rows(path, names)
         except (ValueError, TypeError, KeyError) as error:
@@ -193,7 +193,7 @@ def _rows(path: Path, columns: list[str] | None = None) -> list[Kept]:
 def write_batch(where: Path, rows: Iterable[Kept]) -> Path:
     """Write crossings of one bridge as one file, whole or not at all; pack if there are many."""
     path = _write(where, rows)
-    files = sorted(where.glob("*.parquet"))
+    files = sorted(where.glob(FILES))
     if len(files) > _MOST_FILES:
         _pack(where, files)
     return path

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from services.common.errors import InputError
-from services.common.parquet_files import decoded
+from services.common.parquet_files import FILES, decoded
 from services.history.archive import CROSSINGS, EDITION, KEY, bridges_of
 
 
@@ -42,7 +42,7 @@ def ask(folder: Path, question: str) -> Answer:
     """
     if not bridges_of(folder):
         raise InputError(f"{folder}: is no history; driveby history add RESULTS makes one")
-    files = f"{folder / CROSSINGS}/*/*/*.parquet"
+    files = f"{folder / CROSSINGS}/*/*/{FILES}"
     try:
         return _asked(question, files, ())
     except InputError:
@@ -71,7 +71,7 @@ def _asked(question: str, files: str | list[str], problems: tuple[str, ...]) -> 
 
 def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
     good, problems = [], []
-    for path in sorted((folder / CROSSINGS).glob("*/*/*.parquet")):
+    for path in sorted((folder / CROSSINGS).glob(f"*/*/{FILES}")):
         try:
             decoded(path, KEY, EDITION, ["crossing_id"])
             good.append(str(path))

@@ -287,3 +287,12 @@ def test_a_history_that_is_none(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "history", ignore_errors=True)
     with pytest.raises(InputError, match="is no history"):
         overview(tmp_path)
+
+
+def test_what_a_killed_writer_left_is_no_damage(tmp_path: Path) -> None:
+    add_results(tmp_path, crossings(3))
+    (file,) = files(tmp_path)
+    file.with_name(".0123.abcd.part.parquet").write_bytes(file.read_bytes()[:100])
+    read = read_partition(where(tmp_path))
+    assert (len(read.crossings), read.problems) == (3, ())
+    assert ask(tmp_path, "SELECT count(*) FROM crossings").rows == ((3,),)
