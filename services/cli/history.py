@@ -3,17 +3,18 @@
 import argparse
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from services.cli.parsing import a_console, add_file, command
+from services.cli.parsing import EXIT_SOMETHING_LOST, a_console, add_file, command
 from services.common.errors import InputError
 
 if TYPE_CHECKING:
     from schemas.alarms import Alarm
-    from services.history.past import Past
+    from schemas.results import Results
+    from services.history.past import Driven, Past
     from services.history.periods import FusedPeriod
 
 HISTORY = Path("history")
@@ -33,8 +34,9 @@ def add_history(commands: Any) -> None:
     p.add_argument(
         "words",
         nargs="*",
-        metavar="BRIDGE | add RESULTS.json …",
-        help="a bridge to show, or add and results to add; nothing: all bridges in a table",
+        metavar="BRIDGE | add RESULTS …",
+        help="a bridge to show, or add and results to add: files, or folders of identify --into; "
+        "nothing: all bridges in a table",
     )
     add_history_folder(p)
     p.add_argument("--realm", help="where a bridge is in several (default: the one there is)")
@@ -70,35 +72,65 @@ def _history(options: argparse.Namespace) -> int:
     if words[:1] == [_ADD] and len(words) > 1:
         return _add(options, [Path(word) for word in words[1:]])
     if options.temperature is not None:
-        raise InputError("--temperature: is for driveby history add RESULTS.json")
+        raise InputError("--temperature: is for driveby history add RESULTS")
     if len(words) > 1:
-        raise InputError(f"history: one bridge is expected, or {_ADD} RESULTS.json …")
+        raise InputError(f"history: one bridge is expected, or {_ADD} RESULTS …")
     return _show(options, words[0]) if words else _table(options)
 
 
 def _add(options: argparse.Namespace, paths: list[Path]) -> int:
-    from schemas.results import load_results
-    from services.history.archive import add_results
-    from services.history.temperatures import temperatures_of
-
-    files = [(path, load_results(path)) for path in paths]  # all of them, before any is written
-    for path, results in files:
-        known = {}
-        if options.temperature is not None:
-            known = temperatures_of(options.temperature, results.crossings)
-        added = add_results(options.history, results, known)
-        of = f" of {', '.join(added.bridges)}" if added.bridges else ""
-        there = f", {added.known} there already" if added.known else ""
-        beside = f", {len(known)} with a temperature" if options.temperature is not None else ""
-        print(f"{path}: {added.crossings} crossings{of} added{there}{beside}")
+    problems: list[str] = []
+    # All of them are looked at before any is written.
+    sources = [(path, _results_of(path, problems.append)) for path in paths]
+    driven: set[Driven] = set()
+    for path, some in sources:
+        print(_add_one(options, path, some, driven))
+    for problem in problems:
+        print(problem)
     if not options.later:
         from services.execution.blas import one_blas_thread
         from services.history.past import fuse_ahead
 
-        crossings = [crossing for _, results in files for crossing in results.crossings]
         with a_console().status("fusing what was added"), one_blas_thread():
-            fuse_ahead(options.history, crossings, options.period, print)
-    return 0
+            fuse_ahead(options.history, driven, options.period, print)
+    return EXIT_SOMETHING_LOST if problems else 0
+
+
+def _results_of(path: Path, problem: Callable[[str], object]) -> "Iterable[Results]":
+    """What a results file holds, or a folder of `identify --into`; InputError if it is neither."""
+    from schemas.results import load_results
+    from services.execution.kept import files_of, kept_results
+
+    if not path.is_dir():
+        return (load_results(path),)
+    if not files_of(path):
+        raise InputError(
+            f"{path}: has no results, HASH.parquet of driveby identify --into are expected"
+        )
+    return kept_results(path, problem)
+
+
+def _add_one(
+    options: argparse.Namespace, path: Path, some: "Iterable[Results]", driven: "set[Driven]"
+) -> str:
+    """Add what a file or a folder holds, note where the crossings are, and say what was added."""
+    from services.history.archive import add_results
+    from services.history.past import Driven
+    from services.history.temperatures import temperatures_of
+
+    new, there, warm, bridges = 0, 0, 0, set[str]()
+    for results in some:
+        known = {}
+        if options.temperature is not None:
+            known = temperatures_of(options.temperature, results.crossings)
+        added = add_results(options.history, results, known)
+        new, there, warm = new + added.crossings, there + added.known, warm + len(known)
+        bridges.update(added.bridges)
+        driven.update(Driven(one.realm, one.bridge, one.entry_time) for one in results.crossings)
+    of = f" of {', '.join(sorted(bridges))}" if bridges else ""
+    before = f", {there} there already" if there else ""
+    beside = f", {warm} with a temperature" if options.temperature is not None else ""
+    return f"{path}: {new} crossings{of} added{before}{beside}"
 
 
 def _table(options: argparse.Namespace) -> int:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from schemas.results import Crossing, Header, results, results_json
 from schemas.settings import IdentificationSettings
@@ -11,7 +11,7 @@ from schemas.site import Site
 from schemas.site_file import load_site, parse_site
 from services.cli.bridge_table import print_bridge
 from services.cli.identify import check_certificates, warn_of_no_noise
-from services.cli.parsing import CERTIFICATES
+from services.cli.parsing import CERTIFICATES, EXIT_SOMETHING_LOST
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
 from services.common.progress import progress_bar
@@ -19,7 +19,7 @@ from services.common.stores import folder_at
 from services.execution.archive import Archive, Asked, identify_archive
 from services.execution.dispatch import Execution
 from services.execution.here import Here
-from services.execution.kept import Kept
+from services.execution.kept import BRIDGES, Kept
 from services.history.baselines import baselines_of
 from services.history.catalog import mend
 from services.history.certificates import found_in
@@ -30,9 +30,6 @@ from services.recordings.recording import read_site
 if TYPE_CHECKING:
     from rich.console import Console
 
-EXIT_SOMETHING_LOST: Final = 3
-"""As of `recover`: it worked, but something could not be read or identified."""
-BRIDGES: Final = "bridges.json"
 _MOST_BRIDGES = 20
 """So many are printed; all are in the file."""
 

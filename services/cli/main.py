@@ -1,7 +1,7 @@
 """The command `driveby`: reads the arguments, calls one function, turns errors into exit codes.
 
-0 it worked, 1 it failed, 2 the input was bad; 3 of `recover` and `identify --into`: it worked, but
-something is lost.
+0 it worked, 1 it failed, 2 the input was bad; 3 of `recover`, `identify --into` and `history
+add`: it worked, but something is lost.
 The functions are imported when they are called, so that `driveby --help` does not wait for
 compilers and viewers.
 """

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 RECORDINGS: Final = Path("recordings")
 SCENARIOS: Final = range(1, 13)
 CERTIFICATES: Final = RECORDINGS / "certificates"
+EXIT_SOMETHING_LOST: Final = 3
+"""As of `recover`: it worked, but something could not be read or identified."""
 METHODS: Final = ("pre", "least-squares", "random-walk")
 
 Handler = Callable[[argparse.Namespace], int]

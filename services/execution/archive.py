@@ -104,7 +104,7 @@ def identify_archive(
     there, failed = 0, []
     counted: dict[tuple[str, str], Counted] = {}
     with one_blas_thread():
-        for crossing, was_there in _identified(works_of(asked, problems), execution, kept):
+        for crossing, was_there in _identified(asked, problems, execution, kept):
             told = against(crossing, asked.fusing.baselines.get(crossing.bridge))
             verdicts[told.verdict] += 1
             there += was_there
@@ -240,13 +240,15 @@ def _what_is_wrong(message: Message) -> str:
     return ""
 
 
-def _identified(works: Iterable[Work], execution: Execution, kept: Kept) -> Iterator[_Done]:
+def _identified(
+    asked: Asked, problems: list[str], execution: Execution, kept: Kept
+) -> Iterator[_Done]:
     """Every crossing once with its result, as they come, after that is on the disk."""
     ours = program()
     seen: set[str] = set()
-    under_way = _UnderWay(execution, kept)
+    under_way = _UnderWay(execution, kept, asked.header)
     try:
-        for number, work in enumerate(works, start=1):
+        for number, work in enumerate(works_of(asked, problems), start=1):
             content = content_of(work, ours)
             if content in seen:
                 continue  # the same recording by two names
@@ -269,9 +271,10 @@ def _identified(works: Iterable[Work], execution: Execution, kept: Kept) -> Iter
 class _UnderWay:
     """Crossings between their start and the moment in which their results are on the disk."""
 
-    def __init__(self, execution: Execution, kept: Kept) -> None:
+    def __init__(self, execution: Execution, kept: Kept, header: Header) -> None:
         self._execution = execution
         self._kept = kept
+        self._header = header
         self._contents: dict[int, str] = {}
         self._unsaved: list[Result] = []
         self._since_s = 0.0
@@ -297,7 +300,7 @@ class _UnderWay:
 
     def saved(self) -> list[_Done]:
         """Put on the disk what is not there yet."""
-        self._kept.put(self._unsaved)
+        self._kept.put(self._unsaved, self._header)
         done = [_Done(one.crossing, was_there=False) for one in self._unsaved]
         self._unsaved = []
         return done

@@ -2,26 +2,35 @@
 
 Immutable Parquet files, `HASH.parquet`, called by what is in them and written beside and renamed:
 they are whole or absent. A row has the content that a result was made from (`content`), what a
-table tells of the crossing, and the result itself, JSON compressed by zstd. Any number of processes
-may write; a crossing that two have written is read once. A file that cannot be read is a problem
-and not a loss: its crossings are identified again.
+table tells of the crossing, the result itself, and what a results file says at its head (`header`),
+both JSON compressed by zstd. Any number of processes may write; a crossing that two have written is
+read once. A file that cannot be read is a problem and not a loss: its crossings are identified
+again.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import zstandard
 from pydantic import ValidationError
 
-from schemas.results import Crossing
+from schemas.results import Crossing, Header, Results, load_results, results
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
 from services.common.parquet_files import FILES, decoded, encoded
 from services.execution.content import content_of_all
+from services.identification.bridge_state import with_common_shares
+from services.identification.known import search_hash
 
 EDITION: Final = "1"
 KEY: Final = "driveby.identified"
+BRIDGES: Final = "bridges.json"
+"""Beside the results: a results file with the bridges alone, by the run that ended last."""
+_MOST_AT_ONCE = 1000
+"""Crossings that are read before they are handed over: some 20 MB."""
+_UNREADABLE = (ValueError, TypeError, IndexError, InputError, zstandard.ZstdError, ValidationError)
 
 
 class Result(NamedTuple):
@@ -66,22 +75,19 @@ class Kept:
         if place is None:
             return None
         try:
-            return Crossing.model_validate_json(
-                zstandard.decompress(self._rows(place.path)[place.row])
-            )
-        except (ValueError, IndexError, InputError, zstandard.ZstdError, ValidationError) as error:
-            line = " ".join(str(error).split())[:120]
-            self.problems.append(f"{place.path}: row {place.row + 1}: left out: {line}")
+            return _crossing_of(self._rows(place.path)[place.row])
+        except _UNREADABLE as error:
+            self.problems.append(_line_of(place.path, place.row, error))
             del self._places[content]
             return None
 
-    def put(self, found: Iterable[Result]) -> Path | None:
-        """Write results as one file, on the disk when this returns; None if there are none."""
+    def put(self, found: Iterable[Result], header: Header) -> Path | None:
+        """A run's results as one file, on the disk when this returns; None if there are none."""
         ordered = sorted(found, key=lambda one: (one.crossing.entry_time, one.content))
         if not ordered:
             return None
         path = self._folder / f"{content_of_all(one.content for one in ordered)}.parquet"
-        write_atomically(path, _file_of(ordered))
+        write_atomically(path, _file_of(ordered, header))
         self._places |= {one.content: _Place(path, row) for row, one in enumerate(ordered)}
         return path
 
@@ -104,13 +110,90 @@ def files_of(folder: Path) -> list[Path]:
     return sorted(folder.glob(FILES))
 
 
-def _file_of(results: list[Result]) -> bytes:
+def kept_results(folder: Path, problem: Callable[[str], object]) -> Iterator[Results]:
+    """All results of a folder, each once, as results files of a thousand crossings at most.
+
+    Crossings have the shares of their tracks from the folder's bridges, as in what `identify`
+    writes as JSON; these then are as new as the bridges. `problem` is given a line for each file,
+    or row of one, that cannot be read.
+    """
+    bridges = _bridges_of(folder, problem)
+    waiting: dict[bytes, list[Crossing]] = {}
+    for header, crossing in _rows_of(folder, problem):
+        some = waiting.setdefault(header, [])
+        some.append(crossing)
+        if len(some) >= _MOST_AT_ONCE:
+            yield _as_file(header, waiting.pop(header), bridges)
+    for header, some in waiting.items():
+        yield _as_file(header, some, bridges)
+
+
+def _bridges_of(folder: Path, problem: Callable[[str], object]) -> Results | None:
+    try:
+        return load_results(folder / BRIDGES)
+    except InputError as error:
+        problem(f"{error}; crossings have no shares of their tracks, run identify --into again")
+        return None
+
+
+def _rows_of(folder: Path, problem: Callable[[str], object]) -> Iterator[tuple[bytes, Crossing]]:
+    """Each result once, with its header; one that two files have counts where it can be read."""
+    seen: set[str] = set()
+    for path in files_of(folder):
+        try:
+            rows = decoded(path, KEY, EDITION, ["content", "header", "result"]).to_pylist()
+        except ValueError as error:
+            problem(f"{path}: left out: {error}")
+            continue
+        for number, row in enumerate(rows):
+            if row["content"] in seen:
+                continue
+            try:
+                _header_of(row["header"])
+                crossing = _crossing_of(row["result"])
+            except _UNREADABLE as error:
+                problem(_line_of(path, number, error))
+                continue
+            seen.add(row["content"])
+            yield row["header"], crossing
+
+
+def _as_file(header: bytes, crossings: list[Crossing], bridges: Results | None) -> Results:
+    told = _header_of(header)
+    if bridges is None or _search_of(told) != _search_of(bridges):
+        return told.model_copy(update={"crossings": tuple(crossings)})
+    shared = with_common_shares(crossings, bridges.bridges)
+    return told.model_copy(update={"crossings": tuple(shared), "created": bridges.created})
+
+
+def _search_of(told: Results) -> tuple[str, str]:
+    """What two runs have in common whose results may be fused."""
+    header = Header(told.version, told.created, told.site_hash, told.settings, told.seed)
+    return told.version, search_hash(header)
+
+
+@cache
+def _header_of(compressed: bytes) -> Results:
+    """A results file without crossings, which says what is at the head of one."""
+    return Results.model_validate_json(zstandard.decompress(compressed))
+
+
+def _crossing_of(compressed: bytes) -> Crossing:
+    return Crossing.model_validate_json(zstandard.decompress(compressed))
+
+
+def _line_of(path: Path, row: int, error: Exception) -> str:
+    return f"{path}: row {row + 1}: left out: {' '.join(str(error).split())[:120]}"
+
+
+def _file_of(found: list[Result], header: Header) -> bytes:
     import pyarrow as pa
 
-    crossings = [one.crossing for one in results]
+    crossings = [one.crossing for one in found]
+    head = zstandard.compress(results(header, [], {}).model_dump_json().encode())
     table = pa.table(
         {
-            "content": [one.content for one in results],
+            "content": [one.content for one in found],
             **{
                 name: [getattr(crossing, name) for crossing in crossings]
                 for name in ("crossing_id", "realm", "vehicle", "bridge", "entry_time", "verdict")
@@ -118,6 +201,7 @@ def _file_of(results: list[Result]) -> bytes:
             "result": pa.array(
                 [zstandard.compress(c.model_dump_json().encode()) for c in crossings], pa.binary()
             ),
+            "header": pa.array([head] * len(found), pa.binary()),
         }
     )
     return encoded(table, KEY, EDITION, compression="none")

@@ -6,10 +6,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from schemas.alarms import Alarm
-from schemas.results import Crossing
 from services.history.alarm_files import alarms_of
 from services.history.archive import partition, read_partition
 from services.history.periods import FusedPeriod, Unit, begin_of, fused_periods
+
+
+class Driven(NamedTuple):
+    """Where a crossing is in a history."""
+
+    realm: str
+    bridge: str
+    entry_s: float
 
 
 class Past(NamedTuple):
@@ -33,13 +40,13 @@ def past_of(folder: Path, realm: str, bridge: str, unit: Unit, say: Callable[[st
 
 
 def fuse_ahead(
-    folder: Path, added: Iterable[Crossing], unit: Unit, say: Callable[[str], None]
+    folder: Path, added: Iterable[Driven], unit: Unit, say: Callable[[str], None]
 ) -> int:
     """Fuse the periods to which crossings were added, so that who looks need not wait; how many."""
     touched: defaultdict[tuple[str, str], set[float]] = defaultdict(set)
     for crossing in added:
         where = (crossing.realm, crossing.bridge)
-        touched[where].add(begin_of(crossing.entry_time, unit))
+        touched[where].add(begin_of(crossing.entry_s, unit))
     for (realm, bridge), begins in sorted(touched.items()):
         read = read_partition(partition(folder, realm, bridge), ("likelihood",))
         some = [one for one in read.crossings if begin_of(one.entry_s, unit) in begins]

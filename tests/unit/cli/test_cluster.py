@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from services.cli import main as cli
-from services.cli.identify_archive import BRIDGES, EXIT_SOMETHING_LOST
+from services.cli.parsing import EXIT_SOMETHING_LOST
 from services.common.stores import folder_at
 from services.execution import cluster
+from services.execution.kept import BRIDGES
 from services.history.catalog import CATALOG, mend
 from services.security.certs import certs_command
 from tests.drives import EXACT, drives

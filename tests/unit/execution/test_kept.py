@@ -4,9 +4,12 @@ from pathlib import Path
 
 import pytest
 
+from schemas.results import Header
 from services.common.errors import InputError
 from services.execution.kept import Kept, Result
 from tests.unit.identification.test_fusing import crossing
+
+HEADER = Header("0.1.0", 1.79e9, "hash", {"method": "pre"}, 1)
 
 
 def results(number: int) -> list[Result]:
@@ -16,9 +19,9 @@ def results(number: int) -> list[Result]:
 def test_what_was_put_is_there_to_the_last_bit(tmp_path: Path) -> None:
     found = results(5)
     kept = Kept(tmp_path / "new" / "folder")
-    kept.put(found[:2])
-    kept.put(found[2:])
-    assert kept.put([]) is None
+    kept.put(found[:2], HEADER)
+    kept.put(found[2:], HEADER)
+    assert kept.put([], HEADER) is None
     for one in (kept, Kept(tmp_path / "new" / "folder")):
         assert len(one) == 5
         assert [one.result(content) for content, _ in found] == [c for _, c in found]
@@ -28,8 +31,8 @@ def test_what_was_put_is_there_to_the_last_bit(tmp_path: Path) -> None:
 
 def test_the_same_results_are_the_same_file(tmp_path: Path) -> None:
     found = results(3)
-    first = Kept(tmp_path).put(found)
-    assert Kept(tmp_path).put(reversed(found)) == first
+    first = Kept(tmp_path).put(found, HEADER)
+    assert Kept(tmp_path).put(reversed(found), HEADER) == first
     assert list(tmp_path.iterdir()) == [first]
 
 
@@ -37,8 +40,8 @@ def test_the_same_results_are_the_same_file(tmp_path: Path) -> None:
 def test_a_damaged_file_is_a_line_and_costs_itself_only(tmp_path: Path, how: str) -> None:
     first, second = results(2)
     kept = Kept(tmp_path)
-    path = kept.put([first])
-    kept.put([second])
+    path = kept.put([first], HEADER)
+    kept.put([second], HEADER)
     assert path is not None
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2] if how == "cut" else b"something else")
@@ -47,14 +50,14 @@ def test_a_damaged_file_is_a_line_and_costs_itself_only(tmp_path: Path, how: str
     assert len(again.problems) == 1
     assert str(path) in again.problems[0]
     assert again.result(second.content) == second.crossing
-    again.put([first])  # it is made again, in the place of the damaged one
+    again.put([first], HEADER)  # it is made again, in the place of the damaged one
     assert Kept(tmp_path).result(first.content) == first.crossing
     assert Kept(tmp_path).problems == []
 
 
 def test_a_result_that_cannot_be_read_is_a_line_and_no_result(tmp_path: Path) -> None:
     first = results(1)[0]
-    path = Kept(tmp_path).put([first])
+    path = Kept(tmp_path).put([first], HEADER)
     assert path is not None
     content = path.read_bytes()
     at = content.index(b"\x28\xb5\x2f\xfd") + 40  # in the middle of what zstd has made
@@ -68,7 +71,7 @@ def test_a_result_that_cannot_be_read_is_a_line_and_no_result(tmp_path: Path) ->
 
 def test_what_a_writer_that_was_killed_has_left_is_no_file(tmp_path: Path) -> None:
     first, second = results(2)
-    path = Kept(tmp_path).put([first])
+    path = Kept(tmp_path).put([first], HEADER)
     assert path is not None
     (tmp_path / f".{path.stem}.0123abcd.part.parquet").write_bytes(path.read_bytes()[:100])
     kept = Kept(tmp_path)

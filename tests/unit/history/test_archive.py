@@ -255,7 +255,7 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     [
         (["bridge-9"], "has no bridge bridge-9; there are bridge-1"),
         (["bridge-1", "--realm", "live"], "has no bridge bridge-1 in realm live"),
-        (["bridge-1", "bridge-2"], "one bridge is expected, or add RESULTS.json …"),
+        (["bridge-1", "bridge-2"], "one bridge is expected, or add RESULTS …"),
         (["--sql", "SELECT nothing"], "--sql: "),
         (["--sql", "DROP VIEW crossings"], "SELECT … is expected"),
         (["add", "nowhere.json"], "nowhere.json: no such file, a results file (JSON)"),

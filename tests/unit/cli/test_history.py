@@ -1,0 +1,128 @@
+"""`driveby history add` of a folder that `driveby identify --into` keeps."""
+
+from pathlib import Path
+
+import pytest
+
+from schemas.results import (
+    BridgeResult,
+    Crossing,
+    Header,
+    Results,
+    Road,
+    RoadMismatch,
+    Track,
+    results,
+    results_json,
+)
+from services.cli import main as cli
+from services.cli.parsing import EXIT_SOMETHING_LOST
+from services.execution import kept as kept_module
+from services.execution.kept import BRIDGES, Kept, Result, kept_results
+from services.history.archive import partition, read_partition
+from services.identification.bridge_state import with_common_shares
+from services.identification.known import search_hash
+from tests.fleet import DAY_S
+from tests.unit.history.test_archive import BEGIN_S, crossings
+
+HEADER = Header("0.1.0", BEGIN_S + 50 * DAY_S, "1" * 64, {"method": "pre"}, 7)
+ENDED = HEADER._replace(created=BEGIN_S + 60 * DAY_S)
+"""Of the run that ended last."""
+
+
+@pytest.fixture
+def found() -> list[Crossing]:
+    """Four crossings of one truck, on roads that differ under the axles."""
+    mismatch = RoadMismatch(A_m3=1e-6, n_0_per_m=0.1)
+    flat = (0.0, 0.0)
+    road = Road(x_m=(0.0, 1.0), front_m=flat, rear_m=flat, mean_m=flat, mismatch=mismatch)
+    return [one.model_copy(update={"road": road}) for one in crossings(4).crossings]
+
+
+@pytest.fixture
+def into(tmp_path: Path, found: list[Crossing]) -> Path:
+    """Two files of two runs, one crossing in both, as after a client that was killed."""
+    folder = tmp_path / "identified"
+    rows = [Result(f"content-{n}", one) for n, one in enumerate(found)]
+    kept = Kept(folder)
+    kept.put(rows[:2], HEADER)
+    kept.put(rows[1:], HEADER._replace(created=HEADER.created + 60.0))
+    (folder / BRIDGES).write_text(results_json(results(ENDED, [], bridges(found))))
+    return folder
+
+
+def bridges(found: list[Crossing]) -> dict[str, BridgeResult]:
+    track = Track(vehicle=found[0].vehicle, direction=found[0].direction, common_share=0.4)
+    return {"bridge-1": BridgeResult(tracks=(track,))}
+
+
+def add(what: Path, folder: Path) -> int:
+    return cli.main(["history", "add", str(what), "--history", str(folder / "history"), "--later"])
+
+
+def test_a_folder_is_added_once_and_is_what_its_json_is(
+    tmp_path: Path, into: Path, found: list[Crossing], capsys: pytest.CaptureFixture[str]
+) -> None:
+    as_json = tmp_path / "all.json"
+    shared = with_common_shares(found, bridges(found))
+    assert shared != found
+    as_json.write_text(results_json(results(ENDED, shared, bridges(found))))
+    assert add(into, tmp_path) == 0
+    assert add(into, tmp_path) == 0
+    assert add(as_json, tmp_path) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{into}: 4 crossings of bridge-1 added",
+        f"{into}: 0 crossings added, 4 there already",
+        f"{as_json}: 0 crossings added, 4 there already",
+    ]
+    rows = read_partition(partition(tmp_path / "history", "sim-fleet", "bridge-1")).crossings
+    assert [one.crossing_id for one in rows] == [one.crossing_id for one in found]
+    assert {(one.created_s, one.search_hash) for one in rows} == {
+        (ENDED.created, search_hash(HEADER))
+    }
+
+
+def test_each_file_that_cannot_be_read_is_one_line(
+    tmp_path: Path, into: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (into / "0.parquet").write_bytes(b"no rows")
+    torn = the_larger_of(into)  # three crossings; the other file has one of them, too
+    torn.write_bytes(torn.read_bytes()[:200])
+    (into / BRIDGES).unlink()
+    assert add(into, tmp_path) == EXIT_SOMETHING_LOST
+    first, *lines = capsys.readouterr().out.splitlines()
+    assert first == f"{into}: 2 crossings of bridge-1 added"
+    for path in (into / "0.parquet", torn, into / BRIDGES):
+        assert sum(one.startswith(f"{path}: ") for one in lines) == 1
+    assert len(lines) == 3
+
+
+def the_larger_of(into: Path) -> Path:
+    return max(into.glob("*.parquet"), key=lambda one: one.stat().st_size)
+
+
+def test_results_of_another_search_keep_their_own_head(
+    into: Path, found: list[Crossing], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = HEADER._replace(seed=8, created=BEGIN_S)
+    Kept(into).put([Result("other", found[0])], other)
+    monkeypatch.setattr(kept_module, "_MOST_AT_ONCE", 2)
+    problems: list[str] = []
+    files: list[Results] = list(kept_results(into, problems.append))
+    assert problems == []
+    assert max(len(one.crossings) for one in files) == 2
+    (alone,) = [one for one in files if one.seed == 8]
+    assert (alone.created, alone.crossings) == (other.created, (found[0],))
+    rest = [crossing for one in files if one.seed == 7 for crossing in one.crossings]
+    assert sorted(one.crossing_id for one in rest) == sorted(one.crossing_id for one in found)
+    assert {one.created for one in files if one.seed == 7} == {ENDED.created}
+
+
+def test_a_folder_without_results_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert add(tmp_path, tmp_path) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"{tmp_path}: has no results, HASH.parquet of driveby identify --into" in said
+    assert not (tmp_path / "history").exists()
