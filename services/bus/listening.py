@@ -32,6 +32,7 @@ _OTHERS: Final = (
     ("bridge", "crossing"),
     ("bridge", "estimate"),
     ("bridge", "state"),
+    ("bridge", "alarm"),
     ("service", "health"),
     ("service", "progress"),
 )
@@ -39,6 +40,7 @@ _OF_BRIDGES: Final[dict[str, type[Message]]] = {
     "crossing": pb.Crossing,
     "estimate": pb.Estimate,
     "state": pb.BridgeState,
+    "alarm": pb.Alarm,
 }
 _SIGNALS_WAITING: Final = 12_000
 _OTHERS_WAITING: Final = 1_000

@@ -1,6 +1,6 @@
 """The page of `driveby watch`: what is known of a realm, as tables of a given width and height."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Final, Protocol
 
@@ -8,9 +8,19 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from schemas.alarms import Alarm
 from schemas.topics import is_replayed
 from services.bus.listening import elsewhere_line
-from services.cli.watched import SILENT_S, BridgeRow, Row, Truck, Watched, service_figures, way
+from services.cli.watched import (
+    SILENT_S,
+    BridgeRow,
+    Row,
+    Truck,
+    Watched,
+    alarm_state,
+    service_figures,
+    way,
+)
 
 _BLOCKS: Final = "▁▂▃▄▅▆▇█"
 _STEP: Final = 0.2
@@ -21,6 +31,8 @@ _OLD_S: Final = 60.0
 """Samples that are older when they come are not of now."""
 _LATE_S: Final = 150.0
 """A service that has said nothing for so long is not well, as for `driveby health`."""
+_MOST_ALARMS: Final = 4
+"""Lines of them at the head of a page, fewer on a low one."""
 _VERDICTS: Final = {"good": "green", "suspect": "yellow", "rejected": "red"}
 
 
@@ -48,9 +60,11 @@ def page(
     """The page at a moment; where there is no room the newest crossings and first trucks."""
     is_wide = width >= _WIDE
     trucks, rows = _sorted_trucks(watched, now_s), watched.rows()
-    room = max(8, height - 11 - len(watched.services) - 3 * min(len(watched.bridges), 4))
+    alarms = _alarms(watched.alarms.values(), max(1, min(_MOST_ALARMS, height // 10)))
+    taken = 11 + len(watched.services) + 3 * min(len(watched.bridges), 4) + len(alarms)
+    room = max(8 - len(alarms), height - taken)
     most_trucks = max(2, min(len(trucks), room // 3))
-    parts: list[RenderableType] = [_headline(watched, where, now_ns)]
+    parts: list[RenderableType] = [_headline(watched, where, now_ns), *alarms]
     hint = elsewhere_line(listening.realm, listening.elsewhere)
     if not trucks and not rows:
         parts.append(Text(hint or "Nobody drives yet.", style="yellow" if hint else "dim"))
@@ -175,6 +189,25 @@ def _bridges(bridges: dict[str, BridgeRow], *, is_wide: bool) -> Table:
         heights = bars(row.ratios, row.weak, doubtful=not is_good)
         table.add_row(name, f"{row.used}", heights, found)
     return table
+
+
+def _alarms(alarms: Iterable[Alarm], most: int) -> list[Text]:
+    """A line for each, those that stand first: they are for whoever looks at nothing else."""
+    known = sorted(alarms, key=lambda one: (one.acknowledged is not None, -one.raised, one.bridge))
+    lines = [
+        Text(
+            f"alarm of {one.bridge}: {alarm_state(one)}; {one.sentence()}",
+            style="bold red" if one.acknowledged is None else "dim",
+            no_wrap=True,
+            overflow="ellipsis",
+        )
+        for one in known[:most]
+    ]
+    if len(known) > most:
+        standing = sum(one.acknowledged is None for one in known[most:])
+        more = f"  and {len(known) - most} more alarms, of which {standing} stand"
+        lines.append(Text(more, style="red" if standing else "dim"))
+    return lines
 
 
 def _services(watched: Watched, now_ns: int) -> Table:

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from schemas.alarms import Alarm, alarm_of
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import BridgeResult, Crossing, Lowest, lowest_element, verdict_line
 from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
@@ -107,6 +108,8 @@ class Watched:
         self.crossings: dict[str, Row] = {}
         """By identity, in the order in which they were heard of."""
         self.bridges: dict[str, BridgeRow] = {}
+        self.alarms: dict[str, Alarm] = {}
+        """The last one of each bridge, acknowledged or not."""
         self.services: dict[str, Service] = {}
         self.work: dict[str, str] = {}
         """What a service is doing besides crossings, such as a certificate."""
@@ -132,6 +135,8 @@ class Watched:
                 case ("bridge", "state"):
                     bridge, _, state = state_to_bridge(pb.BridgeState.FromString(payload))
                     return self._take_bridge(bridge, state)
+                case ("bridge", "alarm"):
+                    return self._take_alarm(alarm_of(pb.Alarm.FromString(payload), key.realm))
                 case ("service", "health"):
                     return self._take_health(key.identifier, pb.Health.FromString(payload))
                 case ("service", "progress"):
@@ -232,6 +237,15 @@ class Watched:
         crossings = f"{used} crossing{'' if used == 1 else 's'}"
         return f"{bridge} by {crossings}: {row.finding or row.lowest or row.verdict}"
 
+    def _take_alarm(self, alarm: Alarm) -> str | None:
+        before = self.alarms.get(alarm.bridge)
+        if before == alarm:
+            return None  # as it is told again after a new start of who tells it
+        if before is None and len(self.alarms) >= _MOST_BRIDGES:
+            self.alarms.pop(min(self.alarms, key=lambda name: _weight(self.alarms[name])))
+        self.alarms[alarm.bridge] = alarm
+        return f"alarm of {alarm.bridge}: {alarm.sentence()}: {alarm_state(alarm)}"
+
     def _take_health(self, name: str, message: pb.Health) -> str:
         if name not in self.services and len(self.services) >= _MOST_SERVICES:
             self.services.pop(next(iter(self.services)))
@@ -257,6 +271,17 @@ class Watched:
 def way(row: Row) -> str:
     """Who drove over which bridge, and in which direction."""
     return f"{row.vehicle} {'→' if row.forward else '←'} {row.bridge}"
+
+
+def _weight(alarm: Alarm) -> tuple[bool, float]:
+    """The least goes where there is no room: acknowledged before standing ones, then the oldest."""
+    return alarm.acknowledged is None, alarm.raised
+
+
+def alarm_state(alarm: Alarm) -> str:
+    """Whether an alarm stands, or who has taken note of it."""
+    note = alarm.acknowledged
+    return "stands" if note is None else f"acknowledged by {note.by}"
 
 
 def service_figures(service: Service) -> str:

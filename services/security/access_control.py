@@ -32,9 +32,9 @@ def access_control(subjects: Iterable[Subject]) -> dict[str, Any]:
     """Return the value of Zenoh's key `access_control` that lets these in, and nobody else.
 
     A truck publishes its own keys and reads `durable`, for that tells it what it may forget. A
-    logger publishes about itself and reads everything; a worker publishes results and reads
-    trucks, results and its own health; a viewer reads results. A replay publishes in realms of
-    replays only.
+    logger publishes about itself and reads everything; a worker publishes results and alarms and
+    reads trucks, those and its own health; a viewer reads results and alarms. A replay publishes in
+    realms of replays only.
     Routers trust each other: each filters what its own clients say.
     """
     rules: list[dict[str, Any]] = []

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
 
+from schemas.alarms import Alarm
 from schemas.results import Crossing, lowest_element
+from schemas.site import Site
+from services.common.geodesy import BridgeFrame, bridge_frame
 from services.identification.comparison import Estimate
-from services.viewer.crossing_view import VEHICLE_COLOURS, CrossingView, FloatArray
+from services.viewer.crossing_view import VEHICLE_COLOURS, CrossingView, Elements, FloatArray
 from services.viewer.rerun_parts import (
     MUTED,
     TIME,
@@ -20,6 +23,7 @@ from services.viewer.rerun_parts import (
     log_line,
     rgb,
 )
+from services.viewer.rerun_places import BridgeOnMap, bridges_of_site
 from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH
 
 PERIOD_S: Final = 0.02
@@ -28,6 +32,26 @@ ROADS_MIDDLE: Final = STRIP_HEIGHT + 330.0
 """How far below the strip's top the roads stand, in its pixels; `ROADS_REACH` up and down."""
 ROADS_REACH: Final = 120.0
 _QUALITY: Final = 95
+_MOST_ALARMS: Final = 1000
+NO_RESULT: Final = "No result yet. One comes some seconds after a truck has left the bridge."
+
+
+class OnSite(NamedTuple):
+    """A bridge of the site file."""
+
+    on_map: BridgeOnMap
+    elements: Elements
+    frame: BridgeFrame
+
+
+def of_site(site: Site | None) -> dict[str, OnSite]:
+    """The bridges of a site file by name; none without one."""
+    if site is None:
+        return {}
+    return {
+        bridge.id: OnSite(on_map, bridge, bridge_frame(bridge))
+        for bridge, on_map in zip(site.bridges, bridges_of_site(site), strict=True)
+    }
 
 
 class Dated:
@@ -120,6 +144,30 @@ def log_trend(
     for name, values in (("mean", fused.mean), ("low", fused.low), ("high", fused.high)):
         ratio = float(values[lowest] / nominal[lowest])
         dated.log(f"{root}/lowest/{name}", rr.Scalars(ratio))
+
+
+def bridge_text(alarm: Alarm | None, *found: str) -> str:
+    """All that is said of a bridge, as Markdown: an alarm that stands, then what was found."""
+    texts = [_alarm_text(alarm), "\n\n".join(filter(None, found)) or NO_RESULT]
+    return "\n\n".join(filter(None, texts))
+
+
+def note_alarm(standing: dict[str, Alarm], alarm: Alarm) -> None:
+    """Keep the alarm of each bridge until somebody acknowledges it; not more than so many."""
+    standing.pop(alarm.bridge, None)
+    if alarm.acknowledged is not None:
+        return
+    if len(standing) >= _MOST_ALARMS:
+        standing.pop(min(standing, key=lambda bridge: standing[bridge].raised))
+    standing[alarm.bridge] = alarm
+
+
+def _alarm_text(alarm: Alarm | None) -> str:
+    if alarm is None:
+        return ""
+    raised = np.datetime64(round(alarm.raised), "s").astype("datetime64[D]")
+    said = alarm.sentence()
+    return f"### Alarm\n\n**{said[0].upper()}{said[1:]}.** Raised {raised}, not acknowledged."
 
 
 def clock_text(crossing: Crossing) -> str:

@@ -11,19 +11,20 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import rerun as rr
 from google.protobuf.message import DecodeError
 
+from schemas.alarms import Alarm, alarm_of
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import BridgeResult, Crossing
 from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
 from schemas.signals import AccelBatch, GnssFix, decode_accel, decode_gnss
 from schemas.site import Site
 from services.bus.listening import Heard
-from services.common.geodesy import BridgeFrame, bridge_frame, to_chainage
+from services.common.geodesy import to_chainage
 from services.identification.comparison import compare, estimate_of_state, sentences
 from services.viewer.crossing_view import (
     VERDICT_COLOURS,
@@ -44,11 +45,14 @@ from services.viewer.live_layout import (
 )
 from services.viewer.live_parts import (
     Dated,
+    bridge_text,
     clock_text,
     extremes,
     log_roads,
     log_trend,
     log_trend_look,
+    note_alarm,
+    of_site,
     result_text,
 )
 from services.viewer.rerun_crossing import log_rigidity
@@ -64,7 +68,6 @@ from services.viewer.rerun_parts import (
 from services.viewer.rerun_places import (
     M_PER_DEGREE,
     BridgeOnMap,
-    bridges_of_site,
     log_bridge,
     log_marker,
     log_surroundings,
@@ -94,8 +97,6 @@ _GAP_NS: Final = 200_000_000
 _LANE_STEP_NS: Final = 1_000_000
 """Two states of a crossing are not at the same moment, or the first one would not be seen."""
 
-_NO_RESULT: Final = "No result yet. One comes some seconds after a truck has left the bridge."
-
 LANE_STATES: Final = {
     "on the bridge": "#0072B2",
     "complete": "#56B4E9",
@@ -124,14 +125,6 @@ class _Truck:
         self.track_ns = 0
 
 
-class _OnSite(NamedTuple):
-    """A bridge of the site file."""
-
-    on_map: BridgeOnMap
-    elements: Elements
-    frame: BridgeFrame
-
-
 class LivePicture:
     """Draws into a stream of Rerun; its own memory does not grow with time."""
 
@@ -146,7 +139,7 @@ class LivePicture:
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
         self._trucks: dict[str, _Truck] = {}
-        self._site = _of_site(site)
+        self._site = of_site(site)
         self._starts = np.array([one.on_map.start for one in self._site.values()]).reshape(-1, 2)
         self._told: dict[str, Elements] = {}
         """Of bridges that are in no site file, by their results."""
@@ -157,6 +150,8 @@ class LivePicture:
         self._below: dict[str, str] = {}
         """Of each bridge, which crossing's numbers are shown: a rejected one has none."""
         self._findings: dict[str, str] = {}
+        self._alarms: dict[str, Alarm] = {}
+        """Those that stand."""
         self._trends: set[str] = set()
         self._lanes: dict[tuple[str, str], int] = {}
         """Of each bridge and truck, up to when its crossings are drawn."""
@@ -186,6 +181,8 @@ class LivePicture:
                     self._take_result(estimate_to_crossing(pb.Estimate.FromString(payload))[0])
                 case ("bridge", "state"):
                     self._take_bridge(*state_to_bridge(pb.BridgeState.FromString(payload)))
+                case ("bridge", "alarm"):
+                    self._take_alarm(alarm_of(pb.Alarm.FromString(payload), key.realm))
         except (ValueError, DecodeError):
             return
 
@@ -274,6 +271,13 @@ class LivePicture:
         if found is not None:
             is_doubtful = state.verdict not in (None, "good")
             self._draw_bridge(found.on_map, estimate.mean / nominal, moment_ns, is_doubtful)
+
+    def _take_alarm(self, alarm: Alarm) -> None:
+        """Alarms stand for months: one alone gives a bridge no tab, a truck does."""
+        note_alarm(self._alarms, alarm)
+        if alarm.bridge in self._bridges:
+            now_ns = self._now_ns() if self._latest_ns else 0
+            self._draw_text(alarm.bridge, max(now_ns, self._lanes_end_ns(alarm.bridge)))
 
     def _tick(self) -> None:
         if self._latest_ns and self._clock() - self._heard_s < _TICKS_S:
@@ -365,7 +369,7 @@ class LivePicture:
 
     def _draw_text(self, bridge: str, moment_ns: int) -> None:
         texts = (self._drawn.get(bridge, (0.0, ""))[1], self._findings.get(bridge, ""))
-        text = "\n\n".join(one for one in texts if one) or _NO_RESULT
+        text = bridge_text(self._alarms.get(bridge), *texts)
         document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         Dated(self._recording, moment_ns).log(f"said/{bridge}", document)
 
@@ -436,12 +440,3 @@ class LivePicture:
 
     def _lanes_end_ns(self, bridge: str) -> int:
         return max((ns for (name, _), ns in self._lanes.items() if name == bridge), default=0)
-
-
-def _of_site(site: Site | None) -> dict[str, _OnSite]:
-    if site is None:
-        return {}
-    return {
-        bridge.id: _OnSite(on_map, bridge, bridge_frame(bridge))
-        for bridge, on_map in zip(site.bridges, bridges_of_site(site), strict=True)
-    }

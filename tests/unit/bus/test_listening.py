@@ -48,10 +48,13 @@ def test_each_message_once_with_what_was_before(
         pb.Estimate(crossing_id="now").SerializeToString(),
         pb.Estimate(crossing_id="last").SerializeToString(),
     )
+    alarm = pb.Alarm(bridge="b-1", text="stands").SerializeToString()
     publisher.put("bridge", "b-1", "state", before)
-    arrived(router, 101)
+    publisher.put("bridge", "b-1", "alarm", alarm)
+    arrived(router, 102)
     listening = Listening(router, "live", past_s=1.0)
-    found = gathered(listening, 21)
+    found = gathered(listening, 22)
+    publisher.put("bridge", "b-1", "alarm", alarm[:-1], Identity(7, 3))
     publisher.put("bridge", "b-1", "estimate", now[:-1], Identity(7, 3))  # cut off in the middle
     publisher.put("bridge", "b-1", "estimate", now, Identity(7, 3))
     publisher.put("bridge", "b-1", "estimate", now, Identity(7, 3))  # as after a new start
@@ -63,7 +66,7 @@ def test_each_message_once_with_what_was_before(
         for number in range(80, 100)  # a second of what the truck still has
     ]
     told = [one.payload for one in found if one.key.owner == "bridge"]
-    assert told == [before, now, last]
+    assert told == [before, alarm, now, last]
 
 
 def test_who_does_not_look_holds_nobody_up(router: zenoh.Session, publisher: Publisher) -> None:

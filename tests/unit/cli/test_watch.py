@@ -18,6 +18,7 @@ from tests.unit.cli.watching import (
     NOW_S,
     Listened,
     a_morning,
+    alarm,
     drives,
     estimate,
     health,
@@ -186,11 +187,52 @@ def test_what_cannot_be_read_is_left_out() -> None:
     watched = Watched()
     for owner, stream in (
         ("vehicle", "accel"), ("vehicle", "gnss"), ("bridge", "crossing"), ("bridge", "estimate"),
-        ("bridge", "state"), ("service", "health"), ("service", "progress"),
+        ("bridge", "state"), ("bridge", "alarm"), ("service", "health"), ("service", "progress"),
     ):  # fmt: skip
         assert tell(watched, heard(owner, "x", stream, b"\xff\x00nonsense")) is None
     assert not watched.crossings
+    assert not watched.alarms
     assert not watched.services
+
+
+SENTENCE = "element 4 is 10 % weaker than before 2026-08-27, interval 8 to 12 %"
+
+
+def test_an_alarm_is_a_line_until_it_is_another(site: Site) -> None:
+    watched = Watched()
+    said = [tell(watched, one) for one in (alarm(), alarm(), alarm(by="owner"), alarm(by="owner"))]
+    assert said == [
+        f"alarm of bridge-1: {SENTENCE}: stands",
+        None,
+        f"alarm of bridge-1: {SENTENCE}: acknowledged by owner",
+        None,
+    ]
+
+
+def test_alarms_that_stand_come_first_on_the_page(site: Site) -> None:
+    watched = a_morning(site)
+    for number in range(5):
+        tell(watched, alarm(f"old-{number}", by="owner", raised=1.7899e9 + number))
+    tell(watched, alarm())
+    lines = drawn(watched)
+    assert lines[1] == f"alarm of bridge-1: stands; {SENTENCE}"
+    assert lines[2] == f"alarm of old-4: acknowledged by owner; {SENTENCE}"
+    assert "  and 2 more alarms, of which 0 stand" in lines
+    for number in range(5):
+        tell(watched, alarm(f"new-{number}"))
+    assert "  and 7 more alarms, of which 2 stand" in drawn(watched)
+    assert len(drawn(watched, 80, 24)) <= 26
+
+
+def test_where_there_is_no_room_an_alarm_that_stands_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(watched_module, "_MOST_BRIDGES", 2)
+    watched = Watched()
+    tell(watched, alarm("stands", raised=1.0))
+    for number in range(4):
+        tell(watched, alarm(f"old-{number}", by="owner", raised=2.0 + number))
+    assert set(watched.alarms) == {"stands", "old-3"}
 
 
 def test_bad_options_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:

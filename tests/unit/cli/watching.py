@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from schemas.alarms import Acknowledgement, Alarm, encode_alarm
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Crossing, Header
 from schemas.results_on_the_wire import bridge_to_protobuf, crossing_to_protobuf
@@ -92,6 +93,17 @@ def bridge_state(site: Site) -> Heard:
     )
     payload = bridge_to_protobuf("bridge-1", NOW_NS, fused).SerializeToString()
     return heard("bridge", "bridge-1", "state", payload)
+
+
+def alarm(bridge: str = "bridge-1", *, by: str = "", raised: float = 1.7899e9) -> Heard:
+    """Element 4 has lost a tenth; acknowledged if it is said by whom."""
+    note = Acknowledgement(by=by, time=raised + 1.0) if by else None
+    found = Alarm(
+        alarm_id=f"a-{raised:.0f}", realm="live", bridge=bridge, element=4, direction="weaker",
+        since=1.7878e9, raised=raised, sum=11.0, threshold=9.3, ratio=0.9, ratio_q025=0.88,
+        ratio_q975=0.92, acknowledged=note,
+    )  # fmt: skip
+    return heard("bridge", bridge, "alarm", encode_alarm(found, NOW_NS))
 
 
 def health(name: str, *, ok: bool = True, note: str = "", **figures: float) -> Heard:

@@ -33,6 +33,7 @@ from services.viewer.live import APPLICATION, live_command
 from services.viewer.live_parts import PERIOD_S, extremes
 from services.viewer.live_picture import MOST_TRUCKS, LivePicture
 from tests.endpoints import free_port
+from tests.unit.cli.watching import alarm
 from tests.unit.viewer.found import results_of, some_crossing
 
 START_NS = 1_790_000_000_000_000_000
@@ -283,6 +284,23 @@ def test_the_state_of_a_bridge_over_the_day(live: Live, site: Site) -> None:
     assert lowest == pytest.approx([0.943 * 0.4, 1.06 * 0.4])
 
 
+def test_an_alarm_heads_the_text_of_its_bridge_while_it_stands(live: Live, site: Site) -> None:
+    live.picture.take(alarm())
+    live.picture.take(alarm("elsewhere"))
+    assert live.picture.is_empty  # nobody drives: an alarm of months ago is no reason for a tab
+    live.hears("bridge", "estimate", estimate(result(site)))
+    live.picture.take(alarm(by="owner"))
+    live.picture.take(alarm())
+    chunks = live.drawn()
+    heads = "### Alarm\n\n**Element 4 is 10 % weaker than before 2026-08-27, interval 8 to 12 %.**"
+    raised = f"{heads} Raised 2026-09-20, not acknowledged.\n\n"
+    texts = values(rows(chunks, "said/bridge-1"), "TextDocument:text")
+    assert "No result yet" in texts[0]
+    assert [text.startswith(raised) for text in texts] == [True, True, False, True]
+    assert all("60 % less stiff than the other" in text for text in texts[1:])
+    assert not any("elsewhere" in chunk.entity_path for chunk in chunks)
+
+
 def test_without_a_site_file_the_result_tells_the_elements(tmp_path: Path, site: Site) -> None:
     nominal = site.bridges[0].nominal_flexural_rigidity_nm2[0]
     prior = {"distribution": "log_normal", "location": nominal, "scale": 0.55}
@@ -323,7 +341,7 @@ def test_of_many_trucks_all_have_positions_and_some_accelerations(live: Live) ->
 def test_what_cannot_be_read_is_left_out(live: Live) -> None:
     for owner, stream in (
         ("vehicle", "accel"), ("vehicle", "gnss"), ("bridge", "crossing"), ("bridge", "estimate"),
-        ("bridge", "state"),
+        ("bridge", "state"), ("bridge", "alarm"),
     ):  # fmt: skip
         live.hears(owner, stream, b"\xff\x00nonsense")
     assert live.picture.is_empty
