@@ -62,6 +62,7 @@ NOT_RUN = {
     "make day": LONG,
     "python -m tests.faults.day --minutes 4 --speed 1 --kills 0 --folder build/day": LONG,
     "make validate": LONG,
+    "make validate WORLDS=30": LONG,
     "driveby identify monday.mcap tuesday.mcap --json week.json": FUSES,
     "driveby fuse week.json lastweek.json --json both.json": FUSES,
     "driveby fuse both.json --baseline lastyear.json": FUSES,
