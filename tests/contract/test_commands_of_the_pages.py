@@ -127,7 +127,7 @@ NOT_RUN = {
     "scp -rp certs/viewer laptop.example.org:tls": MACHINES,
     "driveby validate --json validation.json --figures figures/": LONG,
     "driveby validate --scenarios 1,6,12 --noise 25": LONG,
-    "driveby validate --method pre --crossings 200 --control 20 --worlds 64 "
+    "driveby validate --method pre --crossings 200 --control 20 --worlds 30 "
     "--page docs/validation.md": LONG,
     "driveby validate --method pre --crossings 0 --control 0 --scenarios 1 --worlds 200 "
     "--effects free,sprung": LONG,
