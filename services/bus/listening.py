@@ -245,28 +245,22 @@ def listening(
     InputError: a bad realm, endpoint or credentials.
     """
     check_listenable(realm)
-    sessions: list[zenoh.Session] = []
+    with contextlib.ExitStack() as open_now:
 
-    def connect() -> zenoh.Session | None:
-        while sessions:
-            sessions.pop().close()  # type: ignore[no-untyped-call]
-        session = connected(endpoint, tls, is_over)
-        sessions.extend([] if session is None else [session])
-        return session
+        def connect() -> zenoh.Session | None:
+            open_now.close()
+            session = connected(endpoint, tls, is_over)
+            return None if session is None else open_now.enter_context(session)
 
-    session = connect()
-    if session is None:
-        yield None
-        return
-    try:
+        session = connect()
+        if session is None:
+            yield None
+            return
         heard = Listening(session, realm, past_s=past_s, again=connect)
         try:
             yield heard
         finally:
             heard.close()
-    finally:
-        while sessions:
-            sessions.pop().close()  # type: ignore[no-untyped-call]
 
 
 def check_listenable(realm: str) -> str:

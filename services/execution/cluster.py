@@ -22,9 +22,9 @@ from services.common.extras import check_installed
 from services.execution.cluster_worker import Broken, Refused, packed, unpacked
 from services.execution.content import content_of, content_of_all
 from services.execution.dispatch import Begun, Finished, Fused, failed
+from services.execution.here import Here
 from services.execution.program import program
 from services.execution.scheduler import Credentials, check_address, connected
-from services.identification.bridge_state import state_of
 from services.identification.outputs import Fuse, Work
 
 _log = logging.getLogger(__name__)
@@ -82,7 +82,7 @@ class Cluster:
         """Those that are to be sent alone."""
         self._sent: dict[str, _Sent] = {}
         self._finished: list[Finished] = []
-        self._fused: list[Fused] = []
+        self._here = Here()
         self._workers = 1
         """How many batches they take at once."""
         self._connect(min(_FIRST_S, patience_s))
@@ -91,7 +91,7 @@ class Cluster:
     def is_busy(self) -> bool:
         """Whether there is something that `finished` or `fused` has not given back yet."""
         waiting = self._pending or self._to_send or self._suspects or self._sent
-        return bool(waiting or self._finished or self._fused)
+        return bool(waiting or self._finished or self._here.is_busy)
 
     @property
     def is_full(self) -> bool:
@@ -143,12 +143,11 @@ class Cluster:
 
     def fuse(self, fuse: Fuse) -> None:
         """Fuse the crossings, here. Raises what `state_of` does."""
-        self._fused.append(Fused(fuse, state_of(fuse.counted, fuse.bridge, fuse.fusing)))
+        self._here.fuse(fuse)
 
     def fused(self) -> list[Fused]:
         """What was fused since the last call."""
-        fused, self._fused = self._fused, []
-        return fused
+        return self._here.fused()
 
     def close(self) -> None:
         """Leave the cluster; what it works on for this one is given up."""
