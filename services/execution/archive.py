@@ -22,12 +22,12 @@ from schemas.results import BridgeResult, Crossing, Header
 from schemas.settings import IdentificationSettings
 from schemas.signals import NS_PER_S, TRUCK_DECODERS
 from schemas.site import Site
-from schemas.site_file import site_hash
 from services.common.errors import InputError
 from services.execution.blas import one_blas_thread
 from services.execution.content import content_of
 from services.execution.dispatch import Execution
 from services.execution.kept import Kept, Result
+from services.execution.offline import header_of
 from services.execution.overview import STREAMS, as_they_were_made, look_over, remembered
 from services.execution.program import program
 from services.identification.bridge_state import Counted, Fusing, against, count_in, usable
@@ -35,7 +35,7 @@ from services.identification.engine import Engine
 from services.identification.known import LONGEST_STAY_S
 from services.identification.outputs import Fuse, Work
 from services.recordings.mcap_ranges import read_index
-from services.recordings.recording import Message, program_version, read_info, read_messages
+from services.recordings.recording import Message, read_info, read_messages
 
 _log = logging.getLogger(__name__)
 APART_NS: Final = round((LONGEST_STAY_S + 60.0) * NS_PER_S)
@@ -59,13 +59,7 @@ class Asked(NamedTuple):
     @property
     def header(self) -> Header:
         """What every result says of how it came about."""
-        return Header(
-            version=program_version(),
-            created=time.time(),
-            site_hash=site_hash(self.site),
-            settings=self.settings.model_dump(mode="json"),
-            seed=self.settings.seed,
-        )
+        return header_of(self.site, self.settings, time.time())
 
 
 class Archive(NamedTuple):

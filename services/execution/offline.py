@@ -46,6 +46,17 @@ def site_of(recordings: list[Path], site: Path | None) -> Site:
     raise InputError(f"{recordings[0]}: no site file is stored in it, give one with --site")
 
 
+def header_of(site: Site, settings: IdentificationSettings, created_s: float) -> Header:
+    """What results say of how they came about; `created_s` is in seconds since 1970 UTC."""
+    return Header(
+        version=program_version(),
+        created=created_s,
+        site_hash=site_hash(site),
+        settings=settings.model_dump(mode="json"),
+        seed=settings.seed,
+    )
+
+
 def identify_recordings(
     recordings: list[Path],
     site: Site,
@@ -80,13 +91,7 @@ def identify_drives(
     and with which draws an `execution` elsewhere (None: here) tells by itself.
     InputError if the site knows none of the trucks.
     """
-    header = Header(
-        version=program_version(),
-        created=time.time(),
-        site_hash=site_hash(site),
-        settings=settings.model_dump(mode="json"),
-        seed=settings.seed,
-    )
+    header = header_of(site, settings, time.time())
     fusing = fusing._replace(threads=settings.threads)
     engine = Engine(site, settings, header, fusing, certificates=certificates, tells_states=False)
     execution = Here(report=report, keep=keep) if execution is None else execution

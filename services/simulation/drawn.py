@@ -27,19 +27,18 @@ from pre_core.physics.sensors import Accelerometer, Receiver
 from pre_core.physics.simulate import Motion
 from pre_core.physics.vehicle import HalfCar
 from schemas.reasons import Reason
-from schemas.results import Crossing, Header
+from schemas.results import Crossing
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
-from schemas.site_file import site_hash
 from services.drives.runs import Run, run_to_messages
 from services.execution.dispatch import feed_all
 from services.execution.here import Here
+from services.execution.offline import header_of
 from services.identification.crossing_data import CrossingData, Passing, rejected
 from services.identification.engine import Engine
 from services.identification.identify import Identify, identify
 from services.identification.pre_method import absence, inputs_of
-from services.recordings.recording import program_version
 from services.simulation.drive import (
     LONGEST_STEP_S,
     SETTLE_S,
@@ -355,13 +354,7 @@ def see(
         kept[data.crossing_id] = data
         return identify(data, settings, **others)
 
-    header = Header(
-        version=program_version(),
-        created=0.0,
-        site_hash=site_hash(site),
-        settings=settings.model_dump(mode="json"),
-        seed=settings.seed,
-    )
+    header = header_of(site, settings, 0.0)
     messages = run_to_messages(runs, site, REALM, site.vehicles[0].id)
     outputs = feed_all(
         Engine(site, settings, header),

@@ -28,10 +28,10 @@ import zenoh
 
 from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Header, verdict_line
+from schemas.results import verdict_line
 from schemas.settings import IdentificationSettings
 from schemas.signals import TRUCK_DECODERS, Identity
-from schemas.site_file import parse_site, read_site_text, site_hash
+from schemas.site_file import parse_site, read_site_text
 from schemas.topics import (
     HEALTH_PERIOD_S,
     Key,
@@ -51,6 +51,7 @@ from services.bus.subscription import Seen, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
 from services.execution.dispatch import Execution, awaited, collected, dispatched
+from services.execution.offline import header_of
 from services.execution.processes import Processes
 from services.execution.watch import LIMIT_S, Limits
 from services.history.baselines import baselines_of
@@ -67,7 +68,7 @@ from services.identification.bridge_state import Fusing
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.outputs import Output, Said
-from services.recordings.recording import Message, program_version
+from services.recordings.recording import Message
 from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
 from services.worker.catching_up import DAYS, MARGIN_S, CatchingUp, Source
 from services.worker.certificates import Certificates
@@ -204,13 +205,7 @@ def run(
     text = read_site_text(site)
     known = parse_site(text, str(site))
     settings = IdentificationSettings.model_validate({"method": method})
-    header = Header(
-        version=program_version(),
-        created=time.time(),
-        site_hash=site_hash(known),
-        settings=settings.model_dump(mode="json"),
-        seed=settings.seed,
-    )
+    header = header_of(known, settings, time.time())
     fusing = Fusing(baselines_of(known, site.parent), threads=settings.threads)
     earlier = Earlier()
     catches_up, age_s = False, 0.0
