@@ -344,7 +344,8 @@ def roads(problem: Problem, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     at = points(problem, y[None, :])
     height, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
     x, front, rear = _at_same_places(crossing, at, height[0], height[1])
-    bend = _parabola(x, 0.5 * (front + rear))
+    basis = _parabolas(x)
+    bend = basis @ (basis.T @ (0.5 * (front + rear)))
     on_bridge = (x >= 0.0) & (x <= crossing.span_m)
     return x[on_bridge], (front - bend)[on_bridge], (rear - bend)[on_bridge]
 
@@ -363,10 +364,10 @@ def _at_same_places(
     )
 
 
-def _parabola(x: FloatArray, height: FloatArray) -> FloatArray:
-    """The parabola (m,) that fits the heights (m,) best, at x."""
+def _parabolas(x: FloatArray) -> FloatArray:
+    """Orthonormal columns (m, 3) of which all parabolas at x (m,) are made."""
     basis, _ = np.linalg.qr(np.vander((x - x.mean()) / np.ptp(x), 3))
-    return np.asarray(basis @ (basis.T @ height))
+    return np.asarray(basis)
 
 
 def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
@@ -382,6 +383,9 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
     step = crossing.step_s
     spread = problem.density * np.sqrt(0.5 / step)
     truck = truck_of(theta, crossing.total_mass_kg, float(at.wheelbase_m[0]), True)
+    x, *_ = _at_same_places(crossing, at, np.zeros(n), np.zeros(n))
+    on_bridge = (x >= 0.0) & (x <= crossing.span_m)
+    basis = _parabolas(x)
     drawn = []
     for _ in range(count):  # one by one, to bound memory
         a = spread[:, None] * rng.standard_normal((CHANNELS, n))
@@ -391,10 +395,9 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
             + (m_ii * a[w] + truck.m_12 * a[1 - w] + theta[M_U1 + w] * a[2 + w]) / theta[K_U1 + w]
             for w, m_ii in enumerate((truck.m_11, truck.m_22))
         )
-        x, at_front, at_rear = _at_same_places(crossing, at, front_error, rear_error)
+        _, at_front, at_rear = _at_same_places(crossing, at, front_error, rear_error)
         mean = 0.5 * (at_front + at_rear)
-        on_bridge = (x >= 0.0) & (x <= crossing.span_m)
-        drawn.append((mean - _parabola(x, mean))[on_bridge])
+        drawn.append((mean - basis @ (basis.T @ mean))[on_bridge])
     return np.stack(drawn)
 
 

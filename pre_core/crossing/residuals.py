@@ -59,6 +59,12 @@ _STEP_REACH = 8
 SWING_MODES = 3
 """Modes that may swing before the truck comes: what has left swings the j-th by 1/j^2 as much."""
 _FEW = 4  # points that are not worth starting a thread
+_WHITE, _PLAIN, _DEFLECTIONS = range(3)
+"""What is asked of `_evaluate`: white rows (3 m or more,), residuals (3 rows,), or the bridge's
+deflections at every sample (2 n,)."""
+_NOTHING = np.zeros(0)
+_NO_ROWS = RowFilter(_NOTHING, 1, 0.0, _NOTHING, _NOTHING, np.zeros((0, 0), dtype=np.complex128))
+_NO_NOISE = Whitener(np.zeros((0, 0)), _NOTHING)
 
 
 class Crossing(NamedTuple):
@@ -601,21 +607,55 @@ def _compare(crossing: Crossing, work: Work, out: FloatArray) -> None:
 
 
 @kernel
-def _residuals(crossing: Crossing, work: Work, points: Points, k: int, out: FloatArray) -> bool:
-    """Residuals of point k into `out` (3, rows); False if the point is impossible."""
-    theta = points.theta[k]
-    if not theta[D_1] < points.wheelbase_m[k]:
-        return False
+def _evaluate(
+    crossing: Crossing,
+    rows: RowFilter,
+    noise: Whitener,
+    work: Work,
+    points: Points,
+    begin: int,
+    stop: int,
+    what: int,
+    out: FloatArray,
+) -> None:
+    """What is asked for of some points into their rows of `out`; NaN where a point is impossible.
+
+    One kernel for all three: each would hold a copy of the model, and take as long to load.
+    """
+    for k in range(begin, stop):
+        row = out[k]
+        if not (
+            _is_possible(points.theta[k], points.wheelbase_m[k])
+            and _roads(crossing, work, points, k)
+        ):
+            row[:] = np.nan
+            continue
+        road = work.road.reshape(work.road.size)
+        if what == _DEFLECTIONS:
+            row[:] = road
+        elif not _find(
+            crossing, points.position_m[k], points.wheelbase_m[k], work.begin, work.between
+        ):
+            row[:] = np.nan
+            continue
+        _deflect(crossing, work, points, k)
+        if what == _DEFLECTIONS:
+            for i in range(row.size):
+                row[i] = road[i] - row[i]
+            continue
+        _compare(crossing, work, work.residual)
+        if what == _PLAIN:
+            row[:] = work.residual.reshape(work.residual.size)
+        else:
+            whiten_into(rows, noise, work.residual, work.row, row[: noise.reciprocal.size])
+
+
+@kernel
+def _is_possible(theta: FloatArray, wheelbase_m: float) -> bool:
     for i in range(theta.size):
         if not np.isfinite(theta[i]):
             return False
-    if not _roads(crossing, work, points, k):
-        return False
-    if not _find(crossing, points.position_m[k], points.wheelbase_m[k], work.begin, work.between):
-        return False
-    _deflect(crossing, work, points, k)
-    _compare(crossing, work, out)
-    return True
+    return theta[D_1] < wheelbase_m
 
 
 @kernel
@@ -641,45 +681,18 @@ def _roads(crossing: Crossing, work: Work, points: Points, k: int) -> bool:
     return _bridge(crossing, work, points.theta[k])
 
 
-@kernel
-def _evaluate(
-    crossing: Crossing, work: Work, points: Points, begin: int, stop: int, out: FloatArray
-) -> None:
-    for k in range(begin, stop):
-        if not _residuals(crossing, work, points, k, out[k]):
-            out[k] = np.nan
-
-
-@kernel
-def _evaluate_white(
-    crossing: Crossing,
-    rows: RowFilter,
-    noise: Whitener,
-    work: Work,
-    points: Points,
-    begin: int,
-    stop: int,
-    out: FloatArray,
-) -> None:
-    for k in range(begin, stop):
-        if not _residuals(crossing, work, points, k, work.residual):
-            out[k] = np.nan
-            continue
-        whiten_into(rows, noise, work.residual, work.row, out[k, : noise.reciprocal.size])
-
-
 def evaluate(crossing: Crossing, works: tuple[Work, ...], points: Points) -> FloatArray:
     """Residuals (k, 3, rows) in m: R_1 - R_2, front and rear body equation over k_s.
 
     NaN where a point is impossible (or its trajectory turns round). One thread for each of `works`.
     """
-    out = np.empty((points.theta.shape[0], RESIDUALS, crossing.rows))
+    out = np.empty((points.theta.shape[0], RESIDUALS * crossing.rows))
 
     def part(work: Work, begin: int, stop: int) -> None:
-        _evaluate(crossing, work, points, begin, stop, out)
+        _evaluate(crossing, _NO_ROWS, _NO_NOISE, work, points, begin, stop, _PLAIN, out)
 
     _in_threads(part, works, out.shape[0])
-    return out
+    return out.reshape(-1, RESIDUALS, crossing.rows)
 
 
 def evaluate_white(
@@ -693,7 +706,7 @@ def evaluate_white(
     """White rows of k points into the first columns of `out` (k, 3 m or more); NaN as above."""
 
     def part(work: Work, begin: int, stop: int) -> None:
-        _evaluate_white(crossing, rows, noise, work, points, begin, stop, out)
+        _evaluate(crossing, rows, noise, work, points, begin, stop, _WHITE, out)
 
     _in_threads(part, works, out.shape[0])
 
@@ -715,19 +728,6 @@ def _in_threads(
         thread.join()
 
 
-@kernel
-def _one(crossing: Crossing, work: Work, points: Points, k: int, deflection: FloatArray) -> bool:
-    """Leave point k's roads in `work.road` (minus the road) and the deflections in (2, n)."""
-    if not _roads(crossing, work, points, k):
-        return False
-    deflection[:] = work.road
-    _deflect(crossing, work, points, k)
-    for w in range(2):
-        for i in range(deflection.shape[1]):
-            deflection[w, i] = work.road[w, i] - deflection[w, i]
-    return True
-
-
 def roads_and_deflections(
     crossing: Crossing, work: Work, points: Points, k: int
 ) -> tuple[FloatArray, FloatArray]:
@@ -735,8 +735,8 @@ def roads_and_deflections(
 
     Raises ValueError for an impossible point.
     """
-    deflection = np.empty_like(work.road)
-    if not _one(crossing, work, points, k, deflection):
+    deflection = _deflections(crossing, work, points, k)
+    if np.isnan(deflection[0, 0]):
         raise ValueError("the bridge of this point has no modes")
     gain = points.common_gain[k]
     return -gain * work.road, gain * deflection
@@ -750,10 +750,16 @@ def largest_deflections(crossing: Crossing, works: tuple[Work, ...], points: Poi
     out = np.empty(points.theta.shape[0])
 
     def part(work: Work, begin: int, stop: int) -> None:
-        deflection = np.empty_like(work.road)
         for k in range(begin, stop):
-            found = _one(crossing, work, points, k, deflection)
-            out[k] = -deflection.min() if found else np.nan
+            out[k] = -_deflections(crossing, work, points, k).min()
 
     _in_threads(part, works, out.size)
     return points.common_gain * out
+
+
+def _deflections(crossing: Crossing, work: Work, points: Points, k: int) -> FloatArray:
+    """Those of point k (2, n), its roads in `work.road` (minus the road); NaN if impossible."""
+    one = Points(*(of[k : k + 1] for of in points))
+    out = np.empty((1, work.road.size))
+    _evaluate(crossing, _NO_ROWS, _NO_NOISE, work, one, 0, 1, _DEFLECTIONS, out)
+    return out.reshape(work.road.shape)

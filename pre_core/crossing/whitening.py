@@ -253,7 +253,8 @@ def _spectrum(
     sources = np.concatenate([density, density[[1, 0]]])
     weighted = responses * (sources**2)[None, :, None]
     spectrum = np.asarray(np.einsum("icf,jcf->ijf", weighted, responses.conj()))
-    spectrum[[1, 2], [1, 2]] += _of_force(truck, force, omega)
+    if force.any():
+        spectrum[[1, 2], [1, 2]] += _of_force(truck, force, omega)
     if road is not None:
         spectrum[0, 0] += omega**4 * _mismatch.spectrum(road, omega)
     return spectrum
@@ -351,10 +352,12 @@ def noise_power(
     of an endless record, folded at half the rate of the rows.
     """
     at = _folded(rows, _FEW_FREQUENCIES)
+    both = np.concatenate([at.below, at.above])
+    power = np.concatenate([at.power_below, at.power_above])
 
     def folded(truck: int) -> NDArray[np.complex128]:
-        low = _spectrum(trucks[truck], density[truck], force, road, at.below) * at.power_below
-        high = _spectrum(trucks[truck], density[truck], force, road, at.above) * at.power_above
+        whole = _spectrum(trucks[truck], density[truck], force, road, both) * power
+        low, high = np.split(whole, 2, axis=2)
         return np.moveaxis(low + high.conj(), 2, 0)
 
     first = np.linalg.inv(folded(0))

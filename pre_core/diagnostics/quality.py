@@ -278,22 +278,23 @@ def least_squares_in_a_box(
     it for any number, and takes longer to import than a tenth of a crossing takes.)
     """
     k = low.size
-    root = np.linalg.qr(np.column_stack([matrix, right])).R
+    root = np.linalg.qr(np.column_stack([matrix, right]), mode="r")
     triangle, image = root[:k, :k], root[:k, k]
     best, least = low, np.inf
-    for face in product((0, -1, 1), repeat=k):
-        free = np.array(face) == 0
-        x = np.where(np.array(face) < 0, low, high)
+    for is_free in product((True, False), repeat=k):  # all of them first
+        free = np.array(is_free)
+        ends = [(np.nan,) if one else (low[i], high[i]) for i, one in enumerate(is_free)]
+        x = np.array(list(product(*ends))).T  # (k, faces): those with the same unknowns free
         if free.any():
-            x[free] = np.linalg.lstsq(
-                triangle[:, free], image - triangle[:, ~free] @ x[~free], rcond=None
-            )[0]
-        if np.any(x < low) or np.any(x > high):
-            continue
-        cost = float(np.sum((triangle @ x - image) ** 2))
-        if cost < least:
-            best, least = x, cost
-        if free.all():
+            rest = image[:, None] - triangle[:, ~free] @ x[~free]
+            x[free] = np.linalg.lstsq(triangle[:, free], rest, rcond=None)[0]
+        inside = np.all((x >= low[:, None]) & (x <= high[:, None]), axis=0)
+        cost = np.sum((triangle @ x - image[:, None]) ** 2, axis=0)
+        cost[~inside] = np.inf
+        face = int(np.argmin(cost))
+        if cost[face] < least:
+            best, least = x[:, face], float(cost[face])
+        if free.all() and inside[0]:
             break
     return best, least + float(np.sum(root[k:, k] ** 2))
 

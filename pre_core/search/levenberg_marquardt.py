@@ -110,11 +110,14 @@ def move(rows: Rows, state: State, lower: FloatArray | None = None) -> Move | tu
     if lower is not None:
         free = (state.y > lower) | (state.jacobian.T @ state.residual <= 0.0)
     count = int(free.sum())
-    jacobian = state.jacobian[:, free]
-    scale = np.linalg.norm(jacobian, axis=0)
+    # LAPACK works column by column, in place.
+    rows_of = np.empty((state.residual.size, count + 1), order="F")
+    rows_of[:, :count] = state.jacobian[:, free] if count < f else state.jacobian
+    rows_of[:, count] = state.residual
+    scale = np.sqrt(np.einsum("ij,ij->j", rows_of[:, :count], rows_of[:, :count]))
     scale[scale == 0.0] = 1.0
-    (r,) = qr(np.column_stack([jacobian / scale, state.residual]), mode="r")
-    triangle, projected = r[:count, :count], r[:count, count]
+    rows_of[:, :count] /= scale
+    triangle, projected = _triangle(rows_of)
     # Where even the full linear step promises next to nothing, the search is at the bottom.
     if _square(projected) <= state.differences.converged_gain * state.objective:
         return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.CONVERGED)
@@ -179,7 +182,8 @@ def _follow(rows: Rows, state: State, lower: FloatArray | None) -> tuple[State, 
     following = state._replace(
         y=there.y,
         residual=there.residual,
-        jacobian=state.jacobian + np.outer(missed, change / max(_square(change), 1e-300)),
+        # Column by column, as the Jacobian stands.
+        jacobian=state.jacobian + np.outer(change / max(_square(change), 1e-300), missed).T,
         objective=there.objective,
         damping=there.damping,
         is_fresh=False,
@@ -223,9 +227,19 @@ def _evaluations(differences: Differences, f: int) -> int:
 def _damped(triangle: FloatArray, projected: FloatArray, damping: float) -> FloatArray:
     """Minimiser of |R x + p|^2 + damping |x|^2."""
     f = projected.size
-    stacked = np.vstack([triangle, np.sqrt(damping) * np.eye(f)])
-    q, small = qr(stacked, mode="economic")
-    return np.asarray(solve_triangular(small, q.T @ np.concatenate([-projected, np.zeros(f)])))
+    stacked = np.zeros((2 * f, f + 1), order="F")
+    stacked[:f, :f] = triangle
+    stacked[:f, f] = projected
+    stacked[np.arange(f, 2 * f), np.arange(f)] = np.sqrt(damping)
+    small, image = _triangle(stacked)
+    return np.asarray(-solve_triangular(small, image, check_finite=False))
+
+
+def _triangle(stacked: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """R (f, f) and Q'b (f,) of columns A and b side by side (m, f + 1), which are overwritten."""
+    f = stacked.shape[1] - 1
+    _, r = qr(stacked, mode="raw", overwrite_a=True, check_finite=False)
+    return r[:f, :f], r[:f, f]
 
 
 def polish(rows: Rows, state: State, info: Info) -> tuple[State, Info]:

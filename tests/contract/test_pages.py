@@ -111,7 +111,7 @@ def test_help_does_not_import_the_heavy_libraries():
         "xarray",
     }
     code = (
-        "import sys\nfrom driveby.__main__ import main\n"
+        "import sys\nfrom services.cli.main import main\n"
         "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
         f"print('LOADED', sorted({heavy!r} & sys.modules.keys()))"
     )
