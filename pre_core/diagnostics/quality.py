@@ -278,7 +278,7 @@ def least_squares_in_a_box(
     it for any number, and takes longer to import than a tenth of a crossing takes.)
     """
     k = low.size
-    root = np.linalg.qr(np.column_stack([matrix, right]), mode="r")
+    root = np.asarray(np.linalg.qr(np.column_stack([matrix, right]), mode="r"))
     triangle, image = root[:k, :k], root[:k, k]
     best, least = low, np.inf
     for is_free in product((True, False), repeat=k):  # all of them first
