@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 from pydantic import ValidationError
 
 from schemas.results import BridgeResult
+from schemas.settings import IdentificationSettings
 from services.common.errors import FailureError, InputError
 from services.common.files import make_folder, write_atomically
 from services.history.archive import EDITION, Kept, usable_of
@@ -103,7 +104,7 @@ def _fused(
     except (OSError, ValidationError):
         pass  # not fused yet, or what is there was cut off
     # Kernels are slow to import, and mostly there is nothing to fuse.
-    from services.identification.bridge_state import Counted, count_in, state_of
+    from services.identification.bridge_state import Counted, Fusing, count_in, state_of
 
     some = []
     for one in crossings:
@@ -112,7 +113,7 @@ def _fused(
         except ValueError as error:
             say(f"{one.crossing_id}: left out: {' '.join(str(error).split())[:120]}")
     counted = count_in(Counted(), [one for one in some if one is not None])
-    state = state_of(counted, bridge)
+    state = state_of(counted, bridge, Fusing(threads=IdentificationSettings().threads))
     if state is not None:
         try:
             make_folder(cache)

@@ -112,6 +112,7 @@ def told(records: list[Record]) -> str:
     verdicts = sum(a["verdict"] != b["verdict"] for a, b in pairs) // 2
     fell_back = (len(both) - len(weighted)) // 2
     spread = float(np.sqrt(np.mean(apart**2)))
+    low, middle, high = np.quantile(ratio, [0.0, 0.5, 1.0])
     return "\n".join(
         [
             *text,
@@ -119,8 +120,7 @@ def told(records: list[Record]) -> str:
             f"{len(both) // 2} crossings with an answer, {fell_back} fell back on chains.",
             f"Weights are worth {np.median(ess):.0f} draws (median), {min(ess):.0f} at least.",
             f"Means of EI are apart by {spread:.3f} std (rms), {np.abs(apart).max():.2f} at most.",
-            f"std by weights over std by chains: {np.median(ratio):.3f} (median), {ratio.min():.2f} "
-            + f"to {ratio.max():.2f}.",
+            f"std by weights over chains: {middle:.3f} (median), {low:.2f} to {high:.2f}.",
             f"{verdicts} verdicts differ.",
         ]
     )
