@@ -163,7 +163,7 @@ def _targets(found: dict[str, Entry]) -> str:
     walk = found["test_paper_search"]
     one, two = (_a_minute(found[f"test_crossings_in_processes[{n}]"]) for n in (1, 2))
     fused = found["test_fusing"]["extra_info"]
-    peaks = pre["extra_info"]["peaks"]
+    at_start = pre["extra_info"]["start"][-1][2]
     rows = [
         _Row(
             "`driveby identify` of one crossing, 10 s at 1 kHz, everything included",
@@ -179,10 +179,10 @@ def _targets(found: dict[str, Entry]) -> str:
             "its memory",
             200e6,
             None,
-            peaks[2],
+            pre["extra_info"]["with_one"],
             _size,
-            f"{_size(peaks[0])} of it imported, {_size(peaks[1] - peaks[0])} numba's as soon as a "
-            f"kernel is called; after five more {_size(peaks[3])}",
+            f"{_size(at_start)} before a recording is opened, see below; after five more "
+            f"{_size(pre['extra_info']['at_last'])}",
         ),
         _Row(
             "200 crossings on 2 processes, seconds a crossing",
@@ -400,19 +400,28 @@ def _where(found: dict[str, Entry]) -> str:
                 ["place", "time", "share"],
                 [(place, _time(t), f"{t / total:.0%}") for place, t in info["profile"].items()],
             ),
-            f"The same with method pre and real sensors, {_time(_median(pre))} by the clock:",
-            _table(["stage", "time"], [(stage, _time(t)) for stage, t in _stages(pre, info)]),
+            (
+                f"The same with method pre and real sensors, {_time(_median(pre))} by the clock. "
+                "What comes before the reading is the floor of any program with these libraries; "
+                "beside it the most memory up to there."
+            ),
+            _table(["stage", "time", "memory"], _stages(pre, info)),
         ]
     )
 
 
-def _stages(pre: Entry, plain: dict[str, Any]) -> list[tuple[str, float]]:
+def _stages(pre: Entry, plain: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What a cold command does, and the most memory up to there; one process of its own."""
     info = pre["extra_info"]
+    begin = [("Python starts", plain["python"], info["bare"]), *map(tuple, info["start"])]
+    floor = sum(seconds for _, seconds, _ in begin)
+    rest = _median(pre) - floor - info["first"]
     return [
-        ("Python starts", plain["python"]),
-        ("imports", info["imports"]),
-        ("kernels loaded from the cache, other first calls", info["first"] - info["work"]),
-        *info["stages"].items(),
+        *((stage, _time(seconds), _size(peak)) for stage, seconds, peak in begin),
+        ("**all of that**", f"**{_time(floor)}**", f"**{_size(begin[-1][2])}**"),
+        *((stage, _time(seconds), "") for stage, seconds in info["stages"].items()),
+        ("what is done for the first time", _time(info["first"] - info["work"]), ""),
+        ("arguments, results as JSON, Python ends", _time(rest), _size(info["with_one"])),
     ]
 
 
