@@ -4,8 +4,30 @@ Nothing here opens a file or a socket, reads a clock or prints; numpy, numba and
 imports. Units are SI throughout; `x` is the chainage of `docs/contract.md`.
 """
 
+import sys
+from importlib.util import LazyLoader, find_spec, module_from_spec
+
 import numba
+import numpy as np
 
 # The particle kernels hold four particles in tuples of four floats (lanes.py); LLVM packs them into
 # vector registers only with its superword pass, which numba leaves off. It changes speed alone.
 setattr(numba.config, "SLP_VECTORIZE", 1)  # noqa: B010 - the type stubs do not know it
+
+
+def _put_off(*names: str) -> None:
+    """Let parts of NumPy be imported when somebody looks into them."""
+    for name in names:
+        spec = None if name in sys.modules else find_spec(name)
+        if spec is None or spec.loader is None:
+            continue
+        spec.loader = LazyLoader(spec.loader)
+        module = module_from_spec(spec)
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+        setattr(np, name.rpartition(".")[2], module)
+
+
+# SciPy takes all names that NumPy has, and so would import what nobody here uses: a twentieth of a
+# start, and 9 MB.
+_put_off("numpy.f2py", "numpy.testing", "numpy.ctypeslib")

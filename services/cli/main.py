@@ -92,6 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Our matrices are small: threads that wait for each other at every column cost up to fifty
     # times the work itself when other processes want the cores too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Nobody's plugins look into our models, and looking for some takes time.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     # Imports make a million objects that stay: to look for circles among them at every 700 takes
     # 0.1 s of an identification.
     gc.set_threshold(_OBJECTS_BETWEEN_LOOKS)

@@ -139,7 +139,7 @@ NOT_RUN = {
     "python tests/numerics/table.py": LONG,
     "python docs/scripts/reproduction.py frequencies": LONG,
     "python -m pytest -m slow tests/unit/validation/test_validation.py": LONG,
-    "python -m tests.verdicts.both_ways --crossings 200 --worlds 20 --records build/both_ways.jsonl": LONG,
+    "python -m tests.verdicts.both_ways --records build/both_ways.jsonl": LONG,
     "python -m tests.verdicts.measure": LONG,
     "python -m tests.verdicts.measure signals 300": LONG,
     "python -m tests.verdicts.measure sound 14": LONG,

@@ -1,6 +1,6 @@
 """Weighted draws and chains on the same crossings, side by side.
 
-    python -m tests.verdicts.both_ways --crossings 200 --worlds 30 --records build/both_ways.jsonl
+    python -m tests.verdicts.both_ways --records build/both_ways.jsonl
 
 Crossings drawn from the priors, and of each effect that `driveby validate --method pre` has, but
 those on roads that differ: there draws come neither by weights nor by chains. Each is identified as
@@ -9,6 +9,7 @@ they come, and what is in it is not run again.
 """
 
 import argparse
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -68,7 +69,7 @@ def main() -> int:
 def _options() -> argparse.Namespace:
     p = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     p.add_argument("--crossings", type=int, default=200)
-    p.add_argument("--worlds", type=int, default=30, help="of each effect")
+    p.add_argument("--worlds", type=int, default=20, help="of each effect")
     p.add_argument("--records", type=Path, required=True)
     p.add_argument("--processes", type=int, default=2)
     return p.parse_args()
@@ -145,4 +146,6 @@ def _differences(pairs: list[tuple[Record, Record]]) -> tuple[Any, Any]:
 
 
 if __name__ == "__main__":
+    # The processes that are started inherit it: matrices are small, threads would only wait.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.exit(main())

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.fft import dct
 
 from pre_core.diagnostics import quality
 from schemas.reasons import Reason
@@ -130,6 +131,13 @@ def test_an_axle_load_is_what_stands_on_it_and_the_axle_itself(
     )
     uninformed = fit(normals(), rigidity_spread=np.full(7, 0.95))
     assert (Reason.AXLES_ALIKE in reasons_after_fit(truck, uninformed)) is alike
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 500])
+def test_the_cosine_transform_is_that_of_scipy(count: int) -> None:
+    rows = np.random.default_rng(count).standard_normal((count, 3))
+    theirs = dct(rows, type=2, axis=0, norm="ortho")
+    np.testing.assert_allclose(quality.cosine_transform(rows), theirs, rtol=0.0, atol=1e-13)
 
 
 def test_cells_hold_all_the_power() -> None:
