@@ -50,6 +50,7 @@ NOT_RUN = {
     "driveby identify recordings --site site.toml --scheduler tls://127.0.0.1:8786 "
     "--tls cluster-certs/client --into identified": CLUSTER,
     "pytest tests/faults/test_cluster.py": ITSELF,
+    "pytest tests/faults/test_cluster.py -m faults": ITSELF,
     'pip install "driveby[cluster]"': NETWORK,
     "python -m tests.benchmarks.cluster_scale --crossings 2000": LONG,
     "python -m tests.benchmarks.cluster_scale --crossings 120 --alone 20 --batch 10": LONG,

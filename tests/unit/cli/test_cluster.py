@@ -31,6 +31,8 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
         (["--scheduler", "processes:x"], "the number must be from 1 to 256"),
         (["--scheduler", "tcp://127.0.0.1"], "it must be processes"),
         (["--scheduler", "tcp://127.0.0.1:99999"], "it must be processes"),
+        (["--scheduler", "tcp://127.0.0.1:8786#@10.0.0.1:8786"], "it must be processes"),
+        (["--scheduler", "tcp://somebody@127.0.0.1:8786"], "it must be processes"),
         (["--scheduler", "http://127.0.0.1:8786"], "it must be processes"),
         (["--scheduler", "tcp://10.0.0.1:8786"], "is another machine: without TLS whoever"),
         (["--scheduler", "tcp://scheduler:8786"], "is another machine"),
