@@ -33,6 +33,9 @@ ITSELF = "runs the tests, of which this is one"
 
 NOT_RUN = {
     "driveby catalog s3://bucket/fleet": "tests/unit/history/test_catalog.py has a store",
+    "driveby identify s3://bucket/fleet --into identified": (
+        "tests/unit/cli/test_cluster.py has a store"
+    ),
     'pip install "driveby[s3]"': NETWORK,
     "pytest tests/unit/history/test_catalog.py": ITSELF,
     "python -m tests.benchmarks.fleet --out /tmp/fleet": LONG,
