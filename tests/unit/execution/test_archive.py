@@ -1,5 +1,6 @@
 """An archive of recordings: the results of one drive, gone on with, whatever cannot be read."""
 
+import io
 import os
 import resource
 import tempfile
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.writer import Writer
 
 from schemas.reasons import Reason
 from schemas.results import Crossing
@@ -321,7 +323,14 @@ def test_what_is_wrong_elsewhere_is_told_by_its_address(
     put(folder, "bad.mcap", b"no recording at all")
     whole = folder.files.cat_file(folder.path("drive-00004.mcap"))
     put(folder, "cut.mcap", whole[: len(whole) // 2])
-    names = ("gone.mcap", "bad.mcap", "cut.mcap")
+    other = io.BytesIO()
+    writer = Writer(other)
+    writer.start()
+    channel = writer.register_channel("/imu", "json", writer.register_schema("imu", "", b""))
+    writer.add_message(channel, 0, b"{}", 0)
+    writer.finish()
+    put(folder, "other.mcap", other.getvalue())
+    names = ("gone.mcap", "bad.mcap", "cut.mcap", "other.mcap")
     wrong = [Away(folder, name) for name in names]
     found, crossings = done(tmp_path / "into", *away[:2], *wrong)
     assert len(crossings) >= 4
@@ -329,6 +338,7 @@ def test_what_is_wrong_elsewhere_is_told_by_its_address(
     of_each = {name: [p for p in found.problems if f"/{name}: " in p] for name in names}
     assert of_each["gone.mcap"] == [f"{wrong[0]}: no such file"]
     assert len(of_each["bad.mcap"]) == 1
+    assert any("holds no driveby message" in line for line in of_each["other.mcap"])
     assert all(str(tmp_path / "temporary") not in line for line in found.problems)
 
 
