@@ -1,12 +1,13 @@
 """`driveby identify`: identifies the crossings of recordings, prints and writes what was found."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+from schemas.certificates import Pair
 from schemas.results import (
     AtEnds,
     Crossing,
@@ -35,6 +36,7 @@ from services.history.baselines import baselines_of
 from services.history.certificates import found_in
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
 from services.identification.bridge_state import Fusing
+from services.recordings.away import Source, all_at_hand, is_folder_of_recordings
 from services.recordings.recording import read_messages
 
 if TYPE_CHECKING:
@@ -46,7 +48,7 @@ _log = logging.getLogger(__name__)
 
 def identify_command(
     *,
-    recordings: list[Path],
+    recordings: Sequence[Source],
     site: Path | None,
     method: str,
     json_path: Path | None,
@@ -68,7 +70,7 @@ def identify_command(
     """
     check_certificates(certificates)
     for source in recordings:
-        if source.is_dir():
+        if is_folder_of_recordings(source):
             raise InputError(
                 f"{source}: is a folder; give recordings, or --into DIR for its results"
             )
@@ -81,36 +83,26 @@ def identify_command(
             check_writable(path)
     if figures is not None:
         check_folder_writable(figures)
-    known = site_of(recordings, site)
-    beside = None if site is None else site.parent
-    fusing = Fusing(baselines_of(known, beside, baseline), fuse_suspect)
-    settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
-    warn_of_no_noise(known, method)
-    draws: dict[str, Draws] = {}
-    seen = _crossings_seen(recordings, known, console)
-    with reading_bar("reading", recordings, console) as next_file:
-        drives = look_over(
-            ", ".join(map(str, recordings)), messages_of_trucks(recordings, next_file), known
-        )
-    with (
-        executing or nullcontext() as execution,
-        parts_bar("crossing", seen, console) as report,
-    ):
-        found = identify_drives(
-            drives,
+    with all_at_hand(recordings) as files:
+        known = site_of(files, site)
+        beside = None if site is None else site.parent
+        fusing = Fusing(baselines_of(known, beside, baseline), fuse_suspect)
+        settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
+        warn_of_no_noise(known, method)
+        asked = _Asked(
+            files,
             known,
             settings,
-            report,
-            keep=draws.__setitem__,
-            fusing=fusing,
-            certificates=found_in(certificates or CERTIFICATES, known, settings),
-            execution=execution,
+            fusing,
+            found_in(certificates or CERTIFICATES, known, settings),
         )
-    _print(console, found, known)
-    if json_path is not None:
-        write_atomically(json_path, results_json(found))
-    if rrd_path is not None:
-        _write_rerun(rrd_path, recordings, found, known, (site or recordings[0]).parent, console)
+        draws: dict[str, Draws] = {}
+        found = _found(asked, draws, executing, console)
+        _print(console, found, known)
+        if json_path is not None:
+            write_atomically(json_path, results_json(found))
+        if rrd_path is not None:
+            _write_rerun(rrd_path, files, found, known, (site or files[0]).parent, console)
     if figures is not None:
         from services.viewer.pictures import write_pictures
 
@@ -124,6 +116,45 @@ def identify_command(
         )
         write_draws(draws_path, kept)
     return 0
+
+
+class _Asked(NamedTuple):
+    """What is to be identified, and how."""
+
+    recordings: list[Path]
+    site: Site
+    settings: IdentificationSettings
+    fusing: Fusing
+    certificates: Mapping[Pair, str]
+
+
+def _found(
+    asked: _Asked,
+    draws: dict[str, Draws],
+    executing: AbstractContextManager[Execution | None] | None,
+    console: "Console",
+) -> Results:
+    """What the recordings give; `draws` gets those of each crossing."""
+    recordings, known = asked.recordings, asked.site
+    seen = _crossings_seen(recordings, known, console)
+    with reading_bar("reading", recordings, console) as next_file:
+        drives = look_over(
+            ", ".join(map(str, recordings)), messages_of_trucks(recordings, next_file), known
+        )
+    with (
+        executing or nullcontext() as execution,
+        parts_bar("crossing", seen, console) as report,
+    ):
+        return identify_drives(
+            drives,
+            known,
+            asked.settings,
+            report,
+            keep=draws.__setitem__,
+            fusing=asked.fusing,
+            certificates=asked.certificates,
+            execution=execution,
+        )
 
 
 def check_certificates(certificates: Path | None) -> None:

@@ -1,7 +1,8 @@
 """`driveby identify --into DIR`: an archive of recordings, whose results are kept as they come."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +14,9 @@ from services.cli.bridge_table import print_bridge
 from services.cli.identify import check_certificates, warn_of_no_noise
 from services.cli.parsing import CERTIFICATES, EXIT_SOMETHING_LOST
 from services.common.errors import InputError
-from services.common.files import check_writable, write_atomically
+from services.common.files import check_writable, make_folder, write_atomically
 from services.common.progress import progress_bar
-from services.common.stores import folder_at
+from services.common.stores import Folder, files_below, folder_at
 from services.execution.archive import Archive, Asked, identify_archive
 from services.execution.dispatch import Execution
 from services.execution.here import Here
@@ -25,7 +26,14 @@ from services.history.catalog import mend
 from services.history.certificates import found_in
 from services.history.positions import crossings_of
 from services.identification.bridge_state import Fusing, with_common_shares
-from services.recordings.recording import read_site
+from services.recordings.away import (
+    Away,
+    Recording,
+    Source,
+    is_folder_of_recordings,
+    recording_at,
+    stored_site,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,7 +44,7 @@ _MOST_BRIDGES = 20
 
 def archive_command(
     *,
-    sources: Sequence[Path],
+    sources: Sequence[Source],
     into: Path,
     site: Path | None,
     method: str,
@@ -62,6 +70,8 @@ def archive_command(
     check_certificates(certificates)
     if json_path is not None:
         check_writable(json_path)
+    make_folder(into)
+    check_writable(into / BRIDGES)
     problems: list[str] = []
     known = _site_of(sources, site)
     recordings = _recordings(sources, known, problems)
@@ -93,37 +103,50 @@ def archive_command(
     return _told(found, [*problems, *found.problems], known, into, console)
 
 
-def _site_of(sources: Sequence[Path], site: Path | None) -> Site:
+def _site_of(sources: Sequence[Source], site: Path | None) -> Site:
     """The site file given, or the first one that a recording has; one that is damaged has none."""
     if site is not None:
         return load_site(site)
-    for source in sources:
-        for path in sorted(source.rglob("*.mcap")) if source.is_dir() else [source]:
-            try:
-                text = read_site(path)
-            except InputError:  # told where it is read
-                continue
-            if text is not None:
-                return parse_site(text, f"{path}: site.toml")
+    for recording in chain.from_iterable(map(_all_of, sources)):
+        try:
+            text = stored_site(recording)
+        except InputError:  # told where it is read
+            continue
+        if text is not None:
+            return parse_site(text, f"{recording}: site.toml")
     raise InputError(f"{sources[0]}: no recording has a site file in it, give one with --site")
 
 
-def _recordings(sources: Sequence[Path], site: Site, problems: list[str]) -> list[Path]:
+def _all_of(source: Source) -> Iterator[Recording]:
+    """The recording that is named, or all of a folder."""
+    if not is_folder_of_recordings(source):
+        yield recording_at(source)
+        return
+    folder = folder_at(str(source))
+    for entry in files_below(folder, ".mcap"):
+        yield _in_folder(source, folder, entry.name)
+
+
+def _in_folder(source: Source, folder: Folder, name: str) -> Recording:
+    return source / name if isinstance(source, Path) else Away(folder, name)
+
+
+def _recordings(sources: Sequence[Source], site: Site, problems: list[str]) -> list[Recording]:
     """Recordings that are named; of folders those in which positions show a crossing.
 
     A folder's catalogue is mended first: what it said that was not so is a problem, a line each.
     """
-    found: list[Path] = []
+    found: list[Recording] = []
     for source in sources:
-        if not source.is_dir():
-            found.append(source)
+        if not is_folder_of_recordings(source):
+            found.append(recording_at(source))
             continue
         folder = folder_at(str(source))
         mended = mend(folder)
         looked = crossings_of(folder, mended.rows.values(), site)
         problems += (*mended.problems, *looked.problems)
         with_crossings = {path for one in looked.crossings for path in one.recordings}
-        found += (source / path for path in sorted(with_crossings))
+        found += (_in_folder(source, folder, path) for path in sorted(with_crossings))
     return found
 
 

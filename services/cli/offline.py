@@ -17,9 +17,11 @@ from services.cli.parsing import (
     add_seed,
     add_site,
     command,
+    folder_here,
     number,
     numbers,
     scenario,
+    source,
     whole,
 )
 from services.common.errors import InputError
@@ -297,10 +299,10 @@ def add_identify(commands: Any) -> None:
     )
     p.add_argument(
         "recordings",
-        type=Path,
+        type=source,
         nargs="+",
         metavar="REC.mcap",
-        help="recordings; with --into also folders of them",
+        help="recordings, also as s3://…; with --into also folders of them",
     )
     add_site(p, "(default: the site stored in the recording)")
     add_method(p)
@@ -314,11 +316,11 @@ def add_identify(commands: Any) -> None:
     )
     add_seed(p)
     group = p.add_argument_group("many crossings")
-    add_file(
-        group,
+    group.add_argument(
         "--into",
-        "DIR",
-        "keep every result here as soon as there is one, and go on from what is there; what "
+        type=folder_here,
+        metavar="DIR",
+        help="keep every result here as soon as there is one, and go on from what is there; what "
         "cannot be read is told and left out (exit code 3)",
     )
     add_scheduler(group)

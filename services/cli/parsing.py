@@ -69,6 +69,18 @@ def add_common(parser: argparse.ArgumentParser, *, suppressed: bool) -> None:
     )
 
 
+def source(text: str) -> Path | str:
+    """A file or folder; an address such as s3://bucket/fleet stays as it is."""
+    return text if "://" in text else Path(text)
+
+
+def folder_here(text: str) -> Path:
+    """A folder of this machine; an address of a store would else become a folder called s3:."""
+    if "://" in text:
+        raise argparse.ArgumentTypeError(f"is {text!r}, a folder of this machine is expected")
+    return Path(text)
+
+
 def add_site(p: Any, text: str, *, required: bool = False) -> None:
     """`--site`: a site file."""
     p.add_argument("--site", type=Path, required=required, metavar="SITE.toml", help=text)

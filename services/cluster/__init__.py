@@ -2,13 +2,15 @@
 
 They are processes of their own, started as `dask scheduler` and `dask worker` start them, and end
 with this one, however it ends (`services.common.leash`). One that dies is started again: a worker
-leaves when its scheduler does, so after a dead scheduler all are new.
+leaves when its scheduler does, so after a dead scheduler all are new. One that is frozen is ended,
+so it dies as well.
 
 Dask runs whatever it is sent. They listen on this machine only, unless they have credentials: then
 everybody who connects shows a certificate of the same authority.
 """
 
 import logging
+import math
 import os
 import socket
 import subprocess
@@ -23,6 +25,7 @@ from services.bus.playback import leave_at_once, stopped_by_signals
 from services.common.errors import FailureError, InputError
 from services.common.extras import check_installed
 from services.execution.scheduler import Credentials, is_loopback, threads_of
+from services.execution.watch import Limits, Watch
 
 _log = logging.getLogger(__name__)
 DEFAULT_PORT: Final = 8786
@@ -33,6 +36,9 @@ _LONGEST_PAUSE_S = 10.0
 _TRIES = 5
 """So often may something die soon before all were there for the first time."""
 _END_S = 10.0
+FROZEN_S = 60.0
+"""A scheduler and a worker do something every half second, whether or not there is work: who has
+taken no processor time for so long is stopped, or waits for what will not come."""
 
 
 class Roles(NamedTuple):
@@ -166,6 +172,7 @@ class _Child:
         self.name = name
         self._arguments = [module, *arguments]
         self._process: subprocess.Popen[bytes] | None = None
+        self._watch: Watch | None = None
         self._began_s = 0.0
         self._again_s: float | None = None
         self.died_soon = 0
@@ -179,6 +186,7 @@ class _Child:
             env=_ENVIRONMENT | os.environ,
         )
         self._began_s, self._again_s = time.monotonic(), None
+        self._watch = Watch(self._process.pid, Limits(math.inf, FROZEN_S), self._began_s)
         _log.info("%s is process %d", self.name, self._process.pid)
 
     def look_after(self) -> None:
@@ -190,11 +198,20 @@ class _Child:
             return
         code = None if self._process is None else self._process.poll()
         if code is None:
+            self._end_if_frozen(now_s)
             return
         self.died_soon = self.died_soon + 1 if now_s < self._began_s + _SOON_S else 0
         pause_s = min(2.0**self.died_soon - 1.0, _LONGEST_PAUSE_S)
         self._again_s = now_s + pause_s
         _log.warning("the %s has ended (exit code %d); it is started again", self.name, code)
+
+    def _end_if_frozen(self, now_s: float) -> None:
+        """Kill it if it does nothing; it is started again when it has ended."""
+        why = "" if self._watch is None else self._watch.why_hung(now_s)
+        if why and self._process is not None:
+            self._watch = None
+            _log.warning("the %s %s and is ended", self.name, why)
+            self._process.kill()
 
     def let_go(self) -> None:
         """Let it end: it does when nobody holds its leash."""
@@ -217,6 +234,8 @@ _ENVIRONMENT: Final = {
     "OPENBLAS_NUM_THREADS": "1",
     # So many workers may die of a batch besides the first: with Dask's 3 finding out takes long.
     "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+    # What a worker has that says nothing is given to another one: with Dask's 5 minutes, late.
+    "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": f"{FROZEN_S:.0f}s",
     "DASK_LOGGING__DISTRIBUTED": "critical",  # of who comes and goes it is told here
     "PYTHONWARNINGS": "ignore:resource_tracker",  # it puts away what a worker that is ended leaves
 }

@@ -2,7 +2,7 @@
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -25,10 +25,22 @@ def encoded(table: "pa.Table", key: str, edition: str, *, compression: str = "zs
     return out.getvalue()
 
 
+class Most(NamedTuple):
+    """What a file may hold; one that says it holds more is not read."""
+
+    rows: int
+    bytes: int
+    """When it is no longer compressed."""
+
+
 def decoded(
-    source: "bytes | Path", key: str, edition: str, columns: list[str] | None = None
+    source: "bytes | Path",
+    key: str,
+    edition: str,
+    columns: list[str] | None = None,
+    most: Most | None = None,
 ) -> "pa.Table":
-    """The table of a file; ValueError if it is none, or of another edition."""
+    """The table of a file; ValueError if it is none, of another edition, or larger than `most`."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -40,6 +52,8 @@ def decoded(
             raise ValueError(
                 f"is of edition {theirs[:20] or 'none'} of {key}, this program knows {edition}"
             )
+        if most is not None:
+            _check_size(file.metadata, most)
         found: Any = file.read(columns=columns, use_threads=False)  # small files, and many
         missing = set(columns or ()) - set(found.column_names)
         if missing:
@@ -47,3 +61,12 @@ def decoded(
         return found
     except (pa.ArrowException, OSError) as error:
         raise ValueError(f"is no file of {key} ({' '.join(str(error).split())[:80]})") from None
+
+
+def _check_size(metadata: Any, most: Most) -> None:
+    size = sum(metadata.row_group(n).total_byte_size for n in range(metadata.num_row_groups))
+    if metadata.num_rows > most.rows or size > most.bytes:
+        raise ValueError(
+            f"holds {metadata.num_rows} rows of {size / 1e6:.0f} MB, at most {most.rows} of "
+            f"{most.bytes / 1e6:.0f} MB are expected"
+        )

@@ -4,6 +4,8 @@ A file appears whole or not at all: locally it is written beside and renamed, an
 an object when all of it has come. Nothing is ever changed in place.
 """
 
+import errno
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -20,6 +22,7 @@ READ_AHEAD_BYTES: Final = 64 * 1024
 """As long as a chunk of a recording: more would be fetched for nothing where chunks are skipped."""
 _EXTRAS: Final = {"s3": ("s3fs", "s3"), "s3a": ("s3fs", "s3")}
 """By protocol: what it needs, and which extra of the program brings it."""
+_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Folder(NamedTuple):
@@ -72,9 +75,14 @@ def folder_at(name: str) -> Folder:
 
 def check_folder(folder: Folder) -> None:
     """InputError if there is no such folder."""
+    if not is_folder(folder):
+        raise InputError(f"{folder.name}: no such folder")
+
+
+def is_folder(folder: Folder) -> bool:
+    """Whether there is one. InputError if the store cannot be reached."""
     with _told(folder, ""):
-        if not folder.files.isdir(folder.root):
-            raise InputError(f"{folder.name}: no such folder")
+        return bool(folder.files.isdir(folder.root))
 
 
 def files_below(folder: Folder, suffix: str, below: str = "") -> list[Entry]:
@@ -114,6 +122,43 @@ def read(folder: Folder, name: str) -> bytes:
     with _told(folder, name):
         content: bytes = folder.files.cat_file(folder.path(name))
         return content
+
+
+def read_head(folder: Folder, name: str, most: int) -> bytes:
+    """The first bytes of a file, `most` of them. InputError if it cannot be read."""
+    with _told(folder, name):
+        content: bytes = folder.files.cat_file(folder.path(name), start=0, end=most)
+        return content
+
+
+def size_of(folder: Folder, name: str) -> int:
+    """How many bytes a file has. InputError if it cannot be read."""
+    with _told(folder, name):
+        return int(folder.files.size(folder.path(name)) or 0)
+
+
+def fetch(folder: Folder, name: str, to: Path) -> None:
+    """Copy a file of the folder to this machine.
+
+    InputError if it cannot be read, or changes meanwhile; FailureError if there is no room.
+    """
+    size, where = size_of(folder, name), f"{folder.name.rstrip('/')}/{name}"
+    free = shutil.disk_usage(to.parent).free
+    if size > free:
+        raise FailureError(_no_room(where, size, to) + f", which has {free / 1e6:.1f} MB left")
+    with _told(folder, name):
+        try:
+            folder.files.get_file(folder.path(name), str(to))
+        except OSError as error:
+            if error.errno in _NO_ROOM:
+                raise FailureError(f"{_no_room(where, size, to)}: {error.strerror}") from error
+            raise
+    if to.stat().st_size != size:
+        raise InputError(f"{where}: has changed while it was copied")
+
+
+def _no_room(where: str, size: int, to: Path) -> str:
+    return f"{where}: {size / 1e6:.1f} MB have no room in {to.parent.parent} (TMPDIR)"
 
 
 def put(folder: Folder, name: str, content: bytes) -> bool:

@@ -11,6 +11,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -23,19 +24,26 @@ from schemas.settings import IdentificationSettings
 from schemas.signals import NS_PER_S, TRUCK_DECODERS
 from schemas.site import Site
 from services.common.errors import InputError
+from services.common.stores import opened, size_of
 from services.execution.blas import one_blas_thread
 from services.execution.content import content_of
 from services.execution.dispatch import Execution
 from services.execution.kept import Kept, Result
 from services.execution.offline import header_of
-from services.execution.overview import STREAMS, as_they_were_made, look_over, remembered
+from services.execution.overview import (
+    STREAMS,
+    as_they_were_made,
+    look_over,
+    remembered,
+)
 from services.execution.program import program
 from services.identification.bridge_state import Counted, Fusing, against, count_in, usable
 from services.identification.engine import Engine
 from services.identification.known import LONGEST_STAY_S
-from services.identification.outputs import Fuse, Work
-from services.recordings.mcap_ranges import read_index
-from services.recordings.recording import Message, read_info, read_messages
+from services.identification.outputs import Fuse, Said, Work
+from services.recordings.away import AtHand, Away, Recording, at_hand
+from services.recordings.mcap_ranges import ChunkIndexes, read_index
+from services.recordings.recording import Message, is_being_written, read_info, read_messages
 
 _log = logging.getLogger(__name__)
 APART_NS: Final = round((LONGEST_STAY_S + 60.0) * NS_PER_S)
@@ -50,7 +58,7 @@ _NAMES = 2
 class Asked(NamedTuple):
     """What is to be identified, and how."""
 
-    recordings: tuple[Path, ...]
+    recordings: tuple[Recording, ...]
     site: Site
     settings: IdentificationSettings
     fusing: Fusing
@@ -125,43 +133,93 @@ def works_of(asked: Asked, problems: list[str]) -> Iterator[Work]:
         yield from _works_of_drive(drive, asked, problems)
 
 
-def drives_of(recordings: Iterable[Path], problems: list[str]) -> Iterator[list[Path]]:
+def drives_of(recordings: Iterable[Recording], problems: list[str]) -> Iterator[list[Recording]]:
     """Recordings that overlap or follow each other within minutes, together, by time."""
-    spans: list[tuple[int, int, Path]] = []
-    for path in dict.fromkeys(recordings):
+    spans: list[tuple[int, int, Recording]] = []
+    for recording in dict.fromkeys(recordings):
         try:
-            spans.append((*_times_of(path), path))
+            spans.append((*_times_of(recording), recording))
         except InputError as error:
             problems.append(str(error))
-    drive: list[Path] = []
+    drive: list[Recording] = []
     until_ns = 0
-    for first_ns, last_ns, path in sorted(spans):
+    for first_ns, last_ns, recording in sorted(spans, key=lambda one: (*one[:2], str(one[2]))):
         if drive and first_ns > until_ns + APART_NS:
             yield drive
             drive = []
         until_ns = max(until_ns, last_ns) if drive else last_ns
-        drive.append(path)
+        drive.append(recording)
     if drive:
         yield drive
 
 
-def _times_of(path: Path) -> tuple[int, int]:
+def _times_of(recording: Recording) -> tuple[int, int]:
     """Between which times something stands in a recording, ns since 1970 UTC."""
-    try:
-        with path.open("rb") as file:
-            index = read_index(file, path.stat().st_size)
-    except OSError:
-        index = None  # what is wrong with it is said where it is read
+    index = _index_of(recording)
     if index is not None and index.chunks:
         first_ns = min(chunk.message_start_time for chunk in index.chunks)
         return first_ns, max(chunk.message_end_time for chunk in index.chunks)
-    info = read_info(path)
+    with at_hand(recording) as file, _named(file):
+        info = read_info(file.path)
     return info.first_time_ns, info.last_time_ns
 
 
-def _works_of_drive(drive: list[Path], asked: Asked, problems: list[str]) -> Iterator[Work]:
-    name = ", ".join(map(str, drive[:_NAMES])) + (" …" if len(drive) > _NAMES else "")
-    reading = _Reading(drive, problems)
+def _index_of(recording: Recording) -> ChunkIndexes | None:
+    """The index of a recording, read by ranges; None if it has none that holds."""
+    if isinstance(recording, Away):
+        size = size_of(recording.folder, recording.name)
+        with opened(recording.folder, recording.name) as file:
+            return read_index(file, size)
+    try:
+        # A crossing that is not over would be identified now, and as another one later.
+        if is_being_written(recording):
+            raise InputError(f"{recording}: is being written; it is identified when it is closed")
+        with recording.open("rb") as file:
+            return read_index(file, recording.stat().st_size)
+    except OSError:
+        return None  # what is wrong with it is said where it is read
+
+
+@contextmanager
+def _named(file: AtHand) -> Iterator[None]:
+    """Let an InputError call a recording as the user does."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(file.told(str(error))) from None
+
+
+def _works_of_drive(drive: list[Recording], asked: Asked, problems: list[str]) -> Iterator[Work]:
+    with ExitStack() as stack:
+        files = []
+        for recording in drive:
+            try:
+                files.append(stack.enter_context(at_hand(recording)))
+            except InputError as error:
+                problems.append(str(error))
+        if files:
+            before = [_state_of(file) for file in files]
+            yield from _works_of_files(files, asked, problems)
+            problems += (
+                f"{file.name}: has changed while it was read; the same command again reads it anew"
+                for file, was in zip(files, before, strict=True)
+                if _state_of(file) != was
+            )
+
+
+def _state_of(file: AtHand) -> tuple[int, int, int] | None:
+    """By what it is told that a file has changed; None if it is gone."""
+    try:
+        status = file.path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _works_of_files(files: list[AtHand], asked: Asked, problems: list[str]) -> Iterator[Work]:
+    names = [file.name for file in files]
+    name = ", ".join(names[:_NAMES]) + (" …" if len(names) > _NAMES else "")
+    reading = _Reading(files, problems)
     try:
         drives = look_over(name, remembered(reading.messages), asked.site)
     except InputError as error:
@@ -180,33 +238,53 @@ def _works_of_drive(drive: list[Path], asked: Asked, problems: list[str]) -> Ite
     for message in drives.near:
         engine.expect(message.key, message.payload, for_ever=True)
     said = chain.from_iterable(
-        engine.feed(message.key, message.payload) for message in as_they_were_made(drives)
+        _said(engine, message, reading) for message in as_they_were_made(drives)
     )
     for one in chain(said, engine.finish()):
         if isinstance(one, Work):
             yield one
+    if reading.changed:
+        number = f"{reading.changed} message{' has' if reading.changed == 1 else 's have'}"
+        problems.append(f"{name}: {number} changed while it was read")
+
+
+def _said(engine: Engine, message: Message, reading: "_Reading") -> Iterator[Said]:
+    """What the engine says of a message; one that was sound at the first reading may not be now."""
+    try:
+        return engine.feed(message.key, message.payload)
+    except ValueError:
+        reading.changed += 1
+        return iter(())
 
 
 class _Reading:
     """Messages of a drive, without those that cannot be decoded: a line for each recording."""
 
-    def __init__(self, drive: list[Path], problems: list[str]) -> None:
-        self._drive = drive
+    def __init__(self, files: list[AtHand], problems: list[str]) -> None:
+        self._files = files
         self._problems = problems
+        self.changed = 0
+        """Messages that could be decoded at the first reading only."""
         self._wrong: set[tuple[Path, int]] = set()
         """Messages that cannot be decoded, by their numbers in their files."""
 
     def messages(self, is_again: bool) -> Iterator[Message]:
-        for path in self._drive:
+        for file in self._files:
             try:
-                yield from self._of_file(path, is_again)
+                yield from self._of_file(file, is_again)
             except InputError as error:
-                if str(error) not in self._problems:
-                    self._problems.append(str(error))
+                line = file.told(str(error))
+                if line not in self._problems:
+                    self._problems.append(line)
 
-    def _of_file(self, path: Path, is_again: bool) -> Iterator[Message]:
+    def _of_file(self, file: AtHand, is_again: bool) -> Iterator[Message]:
         wrong: list[str] = []
-        warn = (lambda text: None) if is_again else (lambda text: _log.warning("%s", text))
+        path = file.path
+
+        def warn(text: str) -> None:
+            if not is_again:
+                _log.warning("%s", file.told(text))
+
         for number, message in enumerate(read_messages(path, warn=warn)):
             if message.key.owner != "vehicle" or message.key.stream not in STREAMS:
                 continue
@@ -219,7 +297,7 @@ class _Reading:
             are = "is" if len(wrong) == 1 else "are"
             messages = "message" if len(wrong) == 1 else "messages"
             self._problems.append(
-                f"{path}: {len(wrong)} {messages} {are} left out, first {wrong[0]}"
+                f"{file.name}: {len(wrong)} {messages} {are} left out, first {wrong[0]}"
             )
 
 

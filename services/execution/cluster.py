@@ -24,7 +24,7 @@ from services.execution.content import content_of, content_of_all
 from services.execution.dispatch import Begun, Finished, Fused, failed
 from services.execution.here import Here
 from services.execution.program import program
-from services.execution.scheduler import Credentials, check_address, connected
+from services.execution.scheduler import AwayError, Credentials, check_address, connected
 from services.identification.outputs import Fuse, Work
 
 _log = logging.getLogger(__name__)
@@ -35,8 +35,12 @@ PATIENCE_S: Final = 300.0
 _FIRST_S: Final = 20.0
 """So long at the beginning: an address may be wrong."""
 _ASK_EVERY_S: Final = 5.0
+_RETRY_S: Final = 1.0
 _LOOK_S: Final = 0.05
 _GIVEN: Final = ("finished", "error")
+_KNOWN: Final = ("pending", "lost", *_GIVEN)
+"""What a scheduler says of a batch. `lost` is a result that has gone with its worker before it was
+asked for: the scheduler has it made again. Any other status is of a scheduler that is gone."""
 
 
 class _Batch(NamedTuple):
@@ -133,9 +137,7 @@ class Cluster:
         if timeout_s > 0.0 and not self.is_full:
             self._send(is_all=True)
         self._wait(timeout_s)
-        for sent in list(self._sent.values()):
-            if sent.future.status in _GIVEN:
-                self._take(sent)
+        self._take_all()
         self._look_after_scheduler()
         self._send()
         finished, self._finished = self._finished, []
@@ -171,13 +173,27 @@ class Cluster:
         return not suspect and len(self._sent) < self._window
 
     def _connect(self, longest_s: float) -> None:
-        self._scheduler = connected(self._address, self._credentials, longest_s)
-        try:
-            self._scheduler.wait_for_workers(self._patience_s)
-            self._scheduler.check_workers(self._program)
-        except BaseException:
-            self.close()
-            raise
+        """Wait for a scheduler with workers of this program, also if one of them goes meanwhile."""
+        deadline = time.monotonic() + self._patience_s
+        is_told = False
+        while True:
+            self._scheduler = connected(self._address, self._credentials, longest_s)
+            try:
+                self._scheduler.wait_for_workers(self._patience_s)
+                self._scheduler.check_workers(self._program)
+                break
+            except AwayError as error:
+                self.close()
+                longest_s = deadline - time.monotonic()
+                if longest_s <= 0.0:
+                    raise
+                if not is_told:
+                    is_told = True
+                    _log.warning("%s; asked again for %.0f s", error, longest_s)
+                time.sleep(_RETRY_S)
+            except BaseException:
+                self.close()
+                raise
         self._asked_s = self._with_workers_s = time.monotonic()
         self._workers = self._scheduler.threads or 1
 
@@ -213,22 +229,34 @@ class Cluster:
                 return
             time.sleep(_LOOK_S)
 
-    def _take(self, sent: _Sent) -> None:
-        """Keep what a task has given, or send it anew; what does not come is seen to later."""
+    def _take_all(self) -> None:
+        """Take what tasks have given.
+
+        An answer that does not come is with a worker, or a scheduler, that is frozen. It takes long
+        to find out, so then the scheduler is looked after first; and the answer is asked for again
+        after all others.
+        """
+        for content, sent in list(self._sent.items()):
+            if sent.future.status in _GIVEN and not self._take(sent):
+                self._sent[content] = self._sent.pop(content)
+                return
+
+    def _take(self, sent: _Sent) -> bool:
+        """Keep what a task has given, or send it anew; False if it does not come."""
         from distributed import KilledWorker
 
-        is_error = sent.future.status == "error"
+        is_error: bool = sent.future.status == "error"
         try:
             answer = self._scheduler.answer(sent.future)
         except KilledWorker:
             self._forget(sent)
             self._killed(sent.batch)
-            return
+            return True
         except Exception as error:
             if is_error:
                 self._forget(sent)
                 self._failed(sent.batch, f"{type(error).__name__}: {error}")
-            return
+            return is_error
         self._forget(sent)
         if isinstance(answer, Refused):
             _log.warning("worker %s: %s; it is sent away", answer.worker, answer.why)
@@ -239,6 +267,7 @@ class Cluster:
         else:
             results: tuple[Crossing, ...] = unpacked(answer)
             self._finished += map(Finished, sent.batch.works, results)
+        return True
 
     def _killed(self, batch: _Batch) -> None:
         if batch.is_suspect:
@@ -270,8 +299,7 @@ class Cluster:
 
     def _look_after_scheduler(self) -> None:
         """Wait for a scheduler that is gone; count its workers."""
-        known = ("pending", *_GIVEN)
-        is_lost = any(sent.future.status not in known for sent in self._sent.values())
+        is_lost = any(sent.future.status not in _KNOWN for sent in self._sent.values())
         now_s = time.monotonic()
         if not is_lost and now_s < self._asked_s + _ASK_EVERY_S:
             return

@@ -11,18 +11,21 @@ again.
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zstandard
 from pydantic import ValidationError
 
 from schemas.results import Crossing, Header, Results, load_results, results
 from services.common.errors import InputError
-from services.common.files import make_folder, write_atomically
-from services.common.parquet_files import FILES, decoded, encoded
+from services.common.files import check_ordinary, make_folder, write_atomically
+from services.common.parquet_files import FILES, Most, decoded, encoded
 from services.execution.content import content_of_all
 from services.identification.bridge_state import with_common_shares
 from services.identification.known import search_hash
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 EDITION: Final = "1"
 KEY: Final = "driveby.identified"
@@ -30,6 +33,19 @@ BRIDGES: Final = "bridges.json"
 """Beside the results: a results file with the bridges alone, by the run that ended last."""
 _MOST_AT_ONCE = 1000
 """Crossings that are read before they are handed over: some 20 MB."""
+_MOST: Final = Most(rows=1_000_000, bytes=4 << 30)
+"""Of a file; ours have some hundred rows, and 50 kB for each."""
+_MOST_BYTES: Final = 64 << 20
+"""Of one result as text."""
+_STRING: Final = "string"
+_BINARY: Final = "binary"
+_KINDS: Final = {
+    "content": _STRING,
+    "crossing_id": _STRING,
+    "realm": _STRING,
+    "result": _BINARY,
+    "header": _BINARY,
+}
 _UNREADABLE = (ValueError, TypeError, IndexError, InputError, zstandard.ZstdError, ValidationError)
 
 
@@ -60,7 +76,7 @@ class Kept:
         self._read: tuple[Path, tuple[bytes, ...]] | None = None
         for path in files_of(folder):
             try:
-                contents = decoded(path, KEY, EDITION, ["content"]).column("content").to_pylist()
+                contents = _table(path, "content").column("content").to_pylist()
             except ValueError as error:
                 self.problems.append(f"{path}: left out: {error}")
                 continue
@@ -101,7 +117,7 @@ class Kept:
     def _rows(self, path: Path) -> tuple[bytes, ...]:
         """The results of a file, which is kept: neighbours are asked for one after another."""
         if self._read is None or self._read[0] != path:
-            self._read = path, tuple(decoded(path, KEY, EDITION, ["result"])["result"].to_pylist())
+            self._read = path, tuple(_table(path, "result")["result"].to_pylist())
         return self._read[1]
 
 
@@ -137,16 +153,21 @@ def _bridges_of(folder: Path, problem: Callable[[str], object]) -> Results | Non
 
 
 def _rows_of(folder: Path, problem: Callable[[str], object]) -> Iterator[tuple[bytes, Crossing]]:
-    """Each result once, with its header; one that two files have counts where it can be read."""
+    """The newest result of each crossing by each search, with its header.
+
+    A recording that has become longer, or whole, gives another result of the same crossing. One
+    that two files have counts where it can be read.
+    """
+    newest = _newest_of(folder)
     seen: set[str] = set()
     for path in files_of(folder):
         try:
-            rows = decoded(path, KEY, EDITION, ["content", "header", "result"]).to_pylist()
+            rows = _table(path, "content", "header", "result").to_pylist()
         except ValueError as error:
             problem(f"{path}: left out: {error}")
             continue
         for number, row in enumerate(rows):
-            if row["content"] in seen:
+            if row["content"] in seen or row["content"] not in newest:
                 continue
             try:
                 _header_of(row["header"])
@@ -156,6 +177,28 @@ def _rows_of(folder: Path, problem: Callable[[str], object]) -> Iterator[tuple[b
                 continue
             seen.add(row["content"])
             yield row["header"], crossing
+
+
+def _newest_of(folder: Path) -> set[str]:
+    """The contents of the results that count; what cannot be read is told by who reads it all."""
+    newest: dict[tuple[str, ...], tuple[float, str]] = {}
+    unknown: set[str] = set()
+    for path in files_of(folder):
+        try:
+            rows = _table(path, "content", "crossing_id", "realm", "header").to_pylist()
+        except ValueError:
+            continue
+        for row in rows:
+            content = row["content"]
+            try:
+                told = _header_of(row["header"])
+            except _UNREADABLE:
+                unknown.add(content)
+                continue
+            whose = (row["realm"], row["crossing_id"], *_search_of(told))
+            made = (told.created, content)
+            newest[whose] = max(newest.get(whose, made), made)
+    return unknown | {content for _, content in newest.values()}
 
 
 def _as_file(header: bytes, crossings: list[Crossing], bridges: Results | None) -> Results:
@@ -175,11 +218,32 @@ def _search_of(told: Results) -> tuple[str, str]:
 @cache
 def _header_of(compressed: bytes) -> Results:
     """A results file without crossings, which says what is at the head of one."""
-    return Results.model_validate_json(zstandard.decompress(compressed))
+    return Results.model_validate_json(_text_of(compressed))
 
 
 def _crossing_of(compressed: bytes) -> Crossing:
-    return Crossing.model_validate_json(zstandard.decompress(compressed))
+    return Crossing.model_validate_json(_text_of(compressed))
+
+
+def _text_of(compressed: bytes) -> bytes:
+    """What was compressed; ValueError if it says that it is larger than any result."""
+    size = zstandard.frame_content_size(compressed)
+    if not 0 <= size <= _MOST_BYTES:
+        raise ValueError(f"{size} bytes are no result")
+    return zstandard.decompress(compressed)
+
+
+def _table(path: Path, *columns: str) -> "pa.Table":
+    """Columns of a file of results; ValueError if it is none."""
+    try:
+        check_ordinary(path)
+    except InputError as error:
+        raise ValueError(str(error).removeprefix(f"{path}: ")) from None
+    table = decoded(path, KEY, EDITION, list(columns), _MOST)
+    kinds = [(field.name, str(field.type)) for field in table.schema]
+    if sorted(kinds) != sorted((name, _KINDS[name]) for name in columns):
+        raise ValueError(f"has columns {kinds} where results have others")
+    return table
 
 
 def _line_of(path: Path, row: int, error: Exception) -> str:

@@ -381,6 +381,9 @@ class _Place:
         self._send.close()
         # A thread that is still publishing when the interpreter ends would abort the process.
         self._reader.join(_LONGEST_END_S)
+        if self._reader.is_alive():  # it is frozen, and who started it would wait for its end
+            self._process.kill()
+            self._reader.join(_LONGEST_END_S)
 
     def _open(self) -> None:
         receive, self._send = _SPAWN.Pipe(duplex=False)
@@ -391,9 +394,9 @@ class _Place:
         with _STARTING:
             others = set(active_children())
             self.is_warm = self._executor.submit(os.getpid)  # which starts the process
-            (process,) = set(active_children()) - others
-        assert process.pid is not None  # noqa: S101 - it has been started
-        self._pid = process.pid
+            (self._process,) = set(active_children()) - others
+        assert self._process.pid is not None  # noqa: S101 - it has been started
+        self._pid = self._process.pid
         self._watch, self._next_look_s = None, 0.0
         its_end.close()
         self._reader = threading.Thread(

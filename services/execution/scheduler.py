@@ -9,6 +9,7 @@ import ipaddress
 import logging
 import time
 import warnings
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
@@ -18,7 +19,7 @@ from services.execution.cluster_worker import About, about, identify_batch
 from services.execution.program import PYTHON, another_program, processor
 
 _log = logging.getLogger(__name__)
-_CALL_S: Final = 20.0
+CALL_S = 20.0
 """A scheduler that answers nothing for so long is taken to be gone."""
 _RETRY_S: Final = 1.0
 _SOON_S: Final = 5.0
@@ -31,6 +32,20 @@ class Credentials(NamedTuple):
     authority: Path
     certificate: Path
     key: Path
+
+
+class AwayError(FailureError):
+    """A scheduler, or one of its workers, has gone while it was asked, or is frozen."""
+
+
+class Gone(NamedTuple):
+    """The future of a batch that could not be given to a scheduler."""
+
+    status: str = "cancelled"
+    """As Dask calls that of all batches of a scheduler that is gone."""
+
+    def release(self) -> None:
+        """Nobody keeps it."""
 
 
 class Scheduler:
@@ -46,7 +61,7 @@ class Scheduler:
         if self._client.status != "running":
             return None
         try:
-            said = self._client.sync(self._client.scheduler.identity, callback_timeout=_CALL_S)
+            said = self._in_time(self._client.scheduler.identity)
         except Exception as error:  # whatever it is, there is no answer
             _log.debug("the scheduler does not answer: %s", error)
             return None
@@ -54,21 +69,30 @@ class Scheduler:
 
     def submit(self, key: str, batch: bytes, program: dict[str, str]) -> Any:
         """Have a batch identified; its future."""
-        return self._client.submit(identify_batch, batch, program, key=key, pure=False)
+        try:
+            return self._client.submit(identify_batch, batch, program, key=key, pure=False)
+        except Exception as error:  # whatever it is, the batch has not been given away
+            _log.debug("a batch could not be sent: %s", error)
+            return Gone()
 
     def answer(self, future: Any) -> Any:
         """What a batch gave. Raises what its task has raised, or that it does not come."""
-        return future.result(timeout=_CALL_S)
+        return future.result(timeout=CALL_S)
 
     def send_away(self, worker: str) -> None:
         """Have a worker end: it would take a batch after the other, and give all back."""
-        self._client.retire_workers([worker], close_workers=True)
+        try:
+            self._in_time(self._client.retire_workers, [worker], close_workers=True)
+        except Exception as error:  # it may have gone by itself, or the scheduler has
+            _log.debug("worker %s could not be sent away: %s", worker, error)
 
     def wait_for_workers(self, longest_s: float) -> None:
-        """FailureError if there are none for so long."""
+        """FailureError if there are none for so long; AwayError if the scheduler goes meanwhile."""
         deadline = time.monotonic() + longest_s
         is_told = False
-        while not self.threads:
+        while not (threads := self.threads):
+            if threads is None:
+                raise AwayError(f"{self._address}: the scheduler is gone again")
             if time.monotonic() > deadline:
                 raise FailureError(
                     f"{self._address}: has no worker; start some (dask worker {self._address}), "
@@ -85,8 +109,8 @@ class Scheduler:
     def check_workers(self, program: dict[str, str]) -> None:
         """FailureError that names those of another program, if there are any.
 
-        Versions are asked for first, which runs nothing that is sent: what one Python has packed
-        may end another one.
+        AwayError if they do not answer. Versions are asked for first, which runs nothing that is
+        sent: what one Python has packed may end another one.
         """
         packages = [name for name in program if name != PYTHON]
         told = self._asked("its workers' versions", self._client.get_versions, packages=packages)
@@ -123,11 +147,17 @@ class Scheduler:
 
     def _asked(self, what: str, ask: Any, *arguments: Any, **named: Any) -> Any:
         try:
-            return ask(*arguments, **named)
+            return self._in_time(ask, *arguments, **named)
         except Exception as error:
-            raise FailureError(
-                f"{self._address}: could not ask for {what}: {reason(error)}"
-            ) from None
+            raise AwayError(f"{self._address}: could not ask for {what}: {reason(error)}") from None
+
+    def _in_time(self, ask: Any, *arguments: Any, **named: Any) -> Any:
+        """What a question to the scheduler gives; by itself it would wait for a frozen one."""
+
+        async def asking() -> Any:
+            return await ask(*arguments, **named)
+
+        return self._client.sync(asking, callback_timeout=CALL_S)
 
 
 def connected(address: str, credentials: Credentials | None, longest_s: float) -> Scheduler:
@@ -136,7 +166,7 @@ def connected(address: str, credentials: Credentials | None, longest_s: float) -
     while True:
         left_s = max(deadline - time.monotonic(), _RETRY_S)
         try:
-            return Scheduler(address, _client(address, credentials, min(left_s, _CALL_S)))
+            return Scheduler(address, _client(address, credentials, min(left_s, CALL_S)))
         except Exception as error:  # a refused connection, a handshake, a time-out
             if time.monotonic() + _RETRY_S > deadline:
                 raise FailureError(
@@ -166,7 +196,7 @@ def check_address(address: str, credentials: Credentials | None) -> None:
         is_one = parts.scheme in _SCHEMES and parts.hostname and parts.port
     except ValueError:
         is_one = False
-    if not is_one or parts.path or parts.query:
+    if not is_one or address != f"{parts.scheme}://{parts.netloc}" or "@" in address:
         raise InputError(
             f"--scheduler: is {address[:80]!r}, it must be processes, processes:N, tcp://HOST:PORT "
             "or tls://HOST:PORT"
@@ -209,11 +239,48 @@ def _client(address: str, credentials: Credentials | None, timeout_s: float) -> 
             tls_client_key=str(credentials.key),
             require_encryption=True,
         )
+    _check_that_it_answers(address, security, timeout_s)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of versions: they are told by name
         return Client(
-            address, timeout=timeout_s, security=security, set_as_default=False, name="driveby"
+            address,
+            loop=_loop(),
+            timeout=timeout_s,
+            security=security,
+            set_as_default=False,
+            name="driveby",
         )
+
+
+def _check_that_it_answers(address: str, security: Any, timeout_s: float) -> None:
+    """Raise what Dask does, or TimeoutError, if nobody answers.
+
+    Its client limits the time to reach a port, and then waits without end for a scheduler that is
+    frozen: the port of that one is still open.
+    """
+    from distributed.comm import connect
+    from distributed.utils import sync
+
+    arguments = {} if security is None else security.get_connection_args("client")
+
+    async def greet() -> None:
+        comm = await connect(address, timeout=timeout_s, **arguments)
+        await comm.close()
+
+    sync(_loop(), greet, callback_timeout=timeout_s + _RETRY_S)
+
+
+@cache
+def _loop() -> Any:
+    """The loop of all connections, in a thread of its own.
+
+    A client without one starts another such thread, and leaves it behind if it cannot connect.
+    """
+    from distributed.utils import LoopRunner
+
+    runner = LoopRunner()
+    runner.start()
+    return runner.loop
 
 
 def _quieten() -> None:

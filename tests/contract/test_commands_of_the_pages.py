@@ -33,6 +33,9 @@ ITSELF = "runs the tests, of which this is one"
 
 NOT_RUN = {
     "driveby catalog s3://bucket/fleet": "tests/unit/history/test_catalog.py has a store",
+    "driveby identify s3://bucket/fleet --into identified": (
+        "tests/unit/cli/test_cluster.py has a store"
+    ),
     'pip install "driveby[s3]"': NETWORK,
     "pytest tests/unit/history/test_catalog.py": ITSELF,
     "python -m tests.benchmarks.fleet --out /tmp/fleet": LONG,
@@ -50,6 +53,7 @@ NOT_RUN = {
     "driveby identify recordings --site site.toml --scheduler tls://127.0.0.1:8786 "
     "--tls cluster-certs/client --into identified": CLUSTER,
     "pytest tests/faults/test_cluster.py": ITSELF,
+    "pytest tests/faults/test_cluster.py -m faults": ITSELF,
     'pip install "driveby[cluster]"': NETWORK,
     "python -m tests.benchmarks.cluster_scale --crossings 2000": LONG,
     "make install": "installs what this test runs in; .ci/run begins with it",

@@ -106,6 +106,20 @@ def of(recordings: Sequence[Path], *options: str) -> list[str]:
     return ["identify", *map(str, recordings), "--method", "least-squares", *options]
 
 
+def computing(worker: int) -> list[int]:
+    """The processes that compute for a process."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+            is_one = parent == worker and b"spawn_main" in (path / "cmdline").read_bytes()
+        except (OSError, ValueError, IndexError):
+            continue  # it has just ended
+        if is_one:
+            found.append(int(path.name))
+    return found
+
+
 @contextmanager
 def other_worker(address: str, folder: Path, preload: Path) -> Iterator[str]:
     """A worker that is started as on any machine, with something changed; its address."""

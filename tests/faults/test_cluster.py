@@ -4,6 +4,7 @@ import os
 import re
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,13 +12,15 @@ import pytest
 
 from services.cli import main as cli
 from services.common.errors import FailureError
-from services.execution.scheduler import Credentials, connected
+from services.execution.kept import kept_results
+from services.execution.scheduler import Credentials, connected, threads_of
 from services.security.certs import certs_command
 from tests.drives import drives
 from tests.faults.clusters import (
     Running,
     RunningCluster,
     cluster,
+    computing,
     contents,
     of,
     other_worker,
@@ -48,6 +51,12 @@ def holding(batch):
 if cluster_worker.unpacked.__name__ != "holding":  # Dask runs this twice
     of_others = cluster_worker.unpacked
     cluster_worker.unpacked = holding
+"""
+_SOON_HUNG = """
+from services.execution.processes import Processes
+from services.execution.watch import Limits
+
+cluster_worker.new_pool = lambda: Processes(1, limits=Limits(idle_s=5.0))
 """
 _OTHER_VERSION = """
 from services.execution import cluster_worker, program
@@ -102,14 +111,21 @@ class Held(NamedTuple):
     file: Path
 
 
+@contextmanager
+def holding(folder: Path, more: str = "", **env: str) -> Iterator[Held]:
+    """`more` is run on every worker."""
+    file, preload = folder / "hold", folder / "holding.py"
+    text = _HOLDING.replace("FILE", repr(str(file))).replace("HELD", repr(HELD))
+    preload.write_text(text + more)
+    preloaded = {"DASK_DISTRIBUTED__WORKER__PRELOAD": f"['{preload}']"}
+    with cluster(folder, env=preloaded | env) as running:
+        yield Held(running, file)
+
+
 @pytest.fixture(scope="module")
 def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Held]:
-    folder = tmp_path_factory.mktemp("cluster")
-    file, preload = folder / "hold", folder / "holding.py"
-    preload.write_text(_HOLDING.replace("FILE", repr(str(file))).replace("HELD", repr(HELD)))
-    preloaded = {"DASK_DISTRIBUTED__WORKER__PRELOAD": f"['{preload}']"}
-    with cluster(folder, env=preloaded) as running:
-        yield Held(running, file)
+    with holding(tmp_path_factory.mktemp("cluster")) as one:
+        yield one
 
 
 @pytest.fixture
@@ -123,8 +139,8 @@ def begin(tmp_path: Path) -> Iterator[Callable[..., Running]]:
     """Start a command; what has not ended is killed with the test."""
     started: list[Running] = []
 
-    def one(*arguments: str) -> Running:
-        started.append(start(tmp_path / f"{len(started)}.log", *arguments))
+    def one(*arguments: str, **env: str) -> Running:
+        started.append(start(tmp_path / f"{len(started)}.log", *arguments, env=env))
         return started[-1]
 
     yield one
@@ -207,6 +223,31 @@ def test_a_client_that_is_killed_goes_on(
     assert f"{CROSSINGS} crossings, {there} known from before" in second.said()
     assert results_of(path) == of_one_process
     assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
+
+
+@pytest.mark.faults
+def test_two_clients_with_one_folder_do_each_other_no_harm(
+    two: RunningCluster,
+    held: Held,
+    begin: Callable[..., Running],
+    recordings: list[Path],
+    tmp_path: Path,
+    of_one_process: dict[str, Any],
+) -> None:
+    """They ask for the same batches at the same time, and the first to end leaves the other one."""
+    into = tmp_path / "into"
+    held.file.touch()
+    paths = [tmp_path / f"found-{n}.json" for n in range(2)]
+    both = [begin(*of(recordings, *on(two, into, "--json", str(path)))) for path in paths]
+    for running in both:
+        in_the_middle(running, into)
+    held.file.unlink()
+    assert [running.wait() for running in both] == [0, 0], [one.said() for one in both]
+    assert [results_of(path) for path in paths] == [of_one_process] * 2
+    assert len(set(contents(into))) == CROSSINGS
+    problems: list[str] = []
+    found = [one for file in kept_results(into, problems.append) for one in file.crossings]
+    assert (len(found), problems) == (CROSSINGS, [])
 
 
 def test_a_worker_of_another_version_is_refused_by_name(
@@ -293,3 +334,127 @@ def test_a_crossing_that_ends_every_worker_costs_itself_only(
     others = [one for one in of_one_process["crossings"][:8] if one["crossing_id"] != name]
     assert [one for one in found if one not in failed] == others
     assert len(contents(into)) == len(set(contents(into))) == 7
+
+
+@pytest.fixture
+def checked(
+    begin: Callable[..., Running],
+    recordings: list[Path],
+    tmp_path: Path,
+    of_one_process: dict[str, Any],
+) -> Callable[..., str]:
+    """Identify on a cluster, let something be done to that in the middle, compare the results."""
+
+    def one(held: Held, do: Callable[[Running], object], **env: str) -> str:
+        into, path = tmp_path / "into", tmp_path / "found.json"
+        held.file.touch()
+        running = begin(*of(recordings, *on(held.cluster, into, "--json", str(path))), **env)
+        in_the_middle(running, into)
+        do(running)
+        held.file.unlink()
+        assert running.wait() == 0, running.said()
+        assert results_of(path) == of_one_process
+        assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
+        return running.said()
+
+    return one
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("whom", ["worker 1", "scheduler"])
+def test_who_is_frozen_for_ever_is_ended_and_costs_nothing(
+    checked: Callable[..., str], tmp_path: Path, whom: str
+) -> None:
+    with holding(tmp_path, DRIVEBY_TEST_FROZEN_S="5") as one:
+
+        def freeze(_: Running) -> None:
+            before = one.cluster.pids(whom)
+            os.kill(before[-1], signal.SIGSTOP)
+            until(lambda: len(one.cluster.pids(whom)) > len(before))
+            assert f"the {whom} has done nothing for 5 s and is ended" in one.cluster.command.said()
+
+        said = checked(one, freeze, DRIVEBY_TEST_CALL_S="2")
+    assert ("the scheduler at " in said) == (whom == "scheduler"), said
+
+
+@pytest.mark.faults
+def test_a_worker_that_is_frozen_and_goes_on_leaves_what_was_its_own_to_others(
+    checked: Callable[..., str], tmp_path: Path
+) -> None:
+    """The scheduler takes it to be gone after a while; then it comes back, and is started anew."""
+    with holding(tmp_path, DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL="5s") as one:
+
+        def freeze(_: Running) -> None:
+            before = one.cluster.pids("worker 1")
+            os.kill(before[-1], signal.SIGSTOP)
+            until(lambda: threads_of(one.cluster.address, None) == 1)
+            os.kill(before[-1], signal.SIGCONT)
+            until(lambda: len(one.cluster.pids("worker 1")) > len(before))
+
+        said = checked(one, freeze)
+    assert "the scheduler at " not in said, said
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("ttl", ["60s", "5s"])
+def test_a_scheduler_that_is_frozen_and_goes_on_costs_nothing(
+    checked: Callable[..., str], tmp_path: Path, ttl: str
+) -> None:
+    """By the shorter time it takes all its workers to be gone when it goes on."""
+    with holding(tmp_path, DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL=ttl) as one:
+
+        def freeze(running: Running) -> None:
+            (scheduler,) = one.cluster.pids("scheduler")
+            os.kill(scheduler, signal.SIGSTOP)
+            until(lambda: "the scheduler at " in running.said())
+            os.kill(scheduler, signal.SIGCONT)
+
+        checked(one, freeze, DRIVEBY_TEST_CALL_S="6")
+
+
+@pytest.mark.faults
+def test_a_scheduler_that_is_frozen_for_ever_and_nobody_ends_is_a_line(
+    begin: Callable[..., Running],
+    recordings: list[Path],
+    tmp_path: Path,
+    of_one_process: dict[str, Any],
+) -> None:
+    into, path = tmp_path / "into", tmp_path / "found.json"
+    with holding(tmp_path) as one:
+        one.file.touch()
+        options = on(one.cluster, into, "--json", str(path))
+        first = begin(*of(recordings, *options, "--patience", "1"), DRIVEBY_TEST_CALL_S="2")
+        in_the_middle(first, into)
+        (scheduler,) = one.cluster.pids("scheduler")
+        os.kill(scheduler, signal.SIGSTOP)
+        assert first.wait() == 1, first.said()
+        assert re.search(
+            r"^driveby: .*: no scheduler answers \(.*\); start one", first.said(), re.M
+        )
+        assert "Traceback" not in first.said()
+        assert 0 < len(contents(into)) < CROSSINGS
+        os.kill(scheduler, signal.SIGCONT)
+        one.file.unlink()
+        second = begin(*of(recordings, *options))
+        assert second.wait() == 0, second.said()
+    assert results_of(path) == of_one_process
+    assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
+
+
+@pytest.mark.faults
+def test_frozen_processes_below_workers_are_ended_and_cost_nothing(
+    checked: Callable[..., str], tmp_path: Path
+) -> None:
+    with holding(tmp_path, _SOON_HUNG) as one:
+        frozen: list[int] = []
+
+        def freeze(_: Running) -> None:
+            for name in ("worker 1", "worker 2"):
+                frozen.extend(computing(one.cluster.pids(name)[-1]))
+            for pid in frozen:
+                os.kill(pid, signal.SIGSTOP)
+
+        said = checked(one, freeze)
+        assert frozen != []
+        assert not [pid for pid in frozen if Path(f"/proc/{pid}").exists()]
+    assert "the scheduler at " not in said, said

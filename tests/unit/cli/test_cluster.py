@@ -2,18 +2,21 @@
 
 import importlib.util
 import socket
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from services.cli import main as cli
 from services.cli.parsing import EXIT_SOMETHING_LOST
-from services.common.stores import folder_at
+from services.common.stores import folder_at, put
 from services.execution import cluster
 from services.execution.kept import BRIDGES
 from services.history.catalog import CATALOG, mend
 from services.security.certs import certs_command
 from tests.drives import EXACT, drives
+from tests.faults.clusters import results_of
+from tests.object_store import object_store
 
 QUICK = ("--method", "least-squares")
 
@@ -31,6 +34,8 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
         (["--scheduler", "processes:x"], "the number must be from 1 to 256"),
         (["--scheduler", "tcp://127.0.0.1"], "it must be processes"),
         (["--scheduler", "tcp://127.0.0.1:99999"], "it must be processes"),
+        (["--scheduler", "tcp://127.0.0.1:8786#@10.0.0.1:8786"], "it must be processes"),
+        (["--scheduler", "tcp://somebody@127.0.0.1:8786"], "it must be processes"),
         (["--scheduler", "http://127.0.0.1:8786"], "it must be processes"),
         (["--scheduler", "tcp://10.0.0.1:8786"], "is another machine: without TLS whoever"),
         (["--scheduler", "tcp://scheduler:8786"], "is another machine"),
@@ -38,6 +43,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
         (["--batch", "5"], "--batch: belongs to a cluster"),
         (["--scheduler", "processes", "--patience", "5"], "--patience: belongs to a cluster"),
         (["--scheduler", "tcp://127.0.0.1:1", "--batch", "201"], "from 1 to 200"),
+        (["--into", "s3://bucket/new"], "a folder of this machine is expected"),
         (["--into", "new", "--rrd", "x.rrd"], "--rrd: is for recordings one looks at"),
         (["--scheduler", "processes", "--draws", "x.npz"], "--draws"),
     ],
@@ -142,3 +148,58 @@ def test_a_folder_is_identified_by_its_catalogue_and_gone_on_with(
     drives(tmp_path / "later", 2)[1].rename(folder / "later.mcap")
     assert cli.main(["identify", str(folder), *QUICK, "--into", str(into)]) == 0
     assert "2 crossings, 1 known from before: 2 suspect" in capsys.readouterr().out
+
+
+def test_what_cannot_be_written_in_the_end_is_told_at_the_beginning(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    into = tmp_path / "into"
+    (into / BRIDGES).mkdir(parents=True)
+    code, err = said(capsys, "identify", EXACT, *QUICK, "--into", into)
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"{into / BRIDGES}: is a folder" in err
+    assert [path.name for path in into.iterdir()] == [BRIDGES]
+
+
+def test_recordings_in_an_object_store_give_what_they_give_here(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder by its catalogue, and a recording by its address; site files are in them."""
+    paths = drives(tmp_path / "recordings", 3)
+    found = [tmp_path / f"{n}.json" for n in range(4)]
+    here = ("identify", *paths, *QUICK, "--into", tmp_path / "here", "--json", found[0])
+    assert said(capsys, *here) == (0, "")
+    assert said(capsys, "identify", paths[0], *QUICK, "--json", found[1]) == (0, "")
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    with object_store(monkeypatch) as address:
+        fleet = f"{address}/fleet"
+        for path in paths:
+            put(folder_at(fleet), f"day/{path.name}", path.read_bytes())
+        there = ("identify", fleet, *QUICK, "--into", tmp_path / "there", "--json", found[2])
+        assert said(capsys, *there) == (0, "")
+        one = f"{fleet}/day/{paths[0].name}"
+        assert said(capsys, "identify", one, *QUICK, "--json", found[3]) == (0, "")
+        gone = f"{fleet}/day/gone.mcap"
+        assert said(capsys, "identify", gone, *QUICK) == (2, f"driveby: {gone}: no such file\n")
+        put(folder_at(fleet), "bad.mcap", b"no recording at all")
+        bad = f"{fleet}/bad.mcap"
+        code, err = said(capsys, "identify", bad, *QUICK)
+        assert (code, err) == (
+            2,
+            f"driveby: {bad}: is not an MCAP file; a recording (.mcap) is expected\n",
+        )
+        assert said(capsys, "identify", fleet, *QUICK) == (
+            2,
+            f"driveby: {fleet}: is a folder; give recordings, or --into DIR for its results\n",
+        )
+        capsys.readouterr()
+        assert cli.main([str(a) for a in there]) == EXIT_SOMETHING_LOST  # bad.mcap
+        out = capsys.readouterr().out
+        assert "3 crossings, 3 known from before" in out
+        assert sum(line.startswith(f"{bad}: ") for line in out.splitlines()) == 1
+    assert list(temporary.iterdir()) == []
+    whole, alone, from_there, one_from_there = map(results_of, found)
+    assert from_there == whole
+    assert one_from_there == alone

@@ -1,14 +1,22 @@
 """An archive of recordings: the results of one drive, gone on with, whatever cannot be read."""
 
-from collections.abc import Callable
+import io
+import os
+import resource
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.writer import Writer
 
 from schemas.reasons import Reason
 from schemas.results import Crossing
 from schemas.settings import IdentificationSettings
+from services.common.errors import FailureError
+from services.common.stores import folder_at, put
+from services.execution import archive, overview
 from services.execution.archive import Archive, Asked, drives_of, identify_archive, is_failed
 from services.execution.dispatch import failed
 from services.execution.here import Here
@@ -18,8 +26,9 @@ from services.identification.bridge_state import NOTHING_STORED, with_common_sha
 from services.identification.crossing_data import CrossingData
 from services.identification.identify import identify
 from services.identification.outputs import Work
+from services.recordings.away import Away, Recording, recording_at
 from services.recordings.recording import Message, read_messages
-from services.recordings.writer import write_recording
+from services.recordings.writer import RecordingWriter, write_recording
 from tests.drives import EXACT, drives
 
 LEAST_SQUARES = IdentificationSettings(method="least_squares")
@@ -38,12 +47,12 @@ class Counting:
         return identify(data, settings, **others)
 
 
-def asked(*recordings: Path) -> Asked:
+def asked(*recordings: Recording) -> Asked:
     return Asked(recordings, site_of([EXACT], None), LEAST_SQUARES, NOTHING_STORED, {})
 
 
 def done(
-    into: Path, *recordings: Path, identify: Callable[..., Crossing] = identify
+    into: Path, *recordings: Recording, identify: Callable[..., Crossing] = identify
 ) -> tuple[Archive, list[Crossing]]:
     crossings: list[Crossing] = []
     found = identify_archive(
@@ -186,6 +195,179 @@ def test_recordings_that_follow_each_other_are_one_drive(tmp_path: Path) -> None
         site_toml=None,
     )
     problems: list[str] = []
-    found = [set(drive) for drive in drives_of([longer, *reversed(paths)], problems)]
+    found: list[set[Recording]] = [
+        set(drive) for drive in drives_of([longer, *reversed(paths)], problems)
+    ]
     assert found == [{paths[0]}, {longer, *paths[1:4]}, {paths[4]}, {paths[5]}]
     assert problems == []
+
+
+def test_a_pipe_is_a_line(five: list[Path], tmp_path: Path) -> None:
+    """Whoever opened it would wait for somebody who writes into it."""
+    pipe = tmp_path / "pipe.mcap"
+    os.mkfifo(pipe)
+    found, crossings = done(tmp_path / "into", pipe, five[0])
+    assert len(crossings) == 2
+    assert found.problems == (
+        f"{pipe}: is no ordinary file (a pipe or a device), give one that is",
+    )
+
+
+def test_a_recording_that_is_being_written_waits_until_it_is_closed(
+    five: list[Path], tmp_path: Path
+) -> None:
+    """Else a crossing that is not over would get a result, and later another one."""
+    path = tmp_path / "new.mcap"
+    messages = list(read_messages(five[1]))
+    writer = RecordingWriter(path, reason="test", realm=messages[0].key.realm)
+    for message in messages[: len(messages) // 4]:
+        writer.write(message)
+    writer.sync()
+    found, crossings = done(tmp_path / "into", five[0], path)
+    assert len(crossings) == 2
+    assert found.problems == (f"{path}: is being written; it is identified when it is closed",)
+    for message in messages[len(messages) // 4 :]:
+        writer.write(message)
+    writer.finish("done")
+    found, crossings = done(tmp_path / "into", five[0], path)
+    assert (len(crossings), found.there, found.problems) == (4, 2, ())
+
+
+def test_a_recording_that_changes_while_it_is_read_is_a_line(
+    same: list[Path], tmp_path: Path
+) -> None:
+    def changing(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+        with same[1].open("ab") as file:
+            file.write(b"more")
+        return identify(data, settings, **others)
+
+    found, crossings = done(tmp_path / "into", *same[:2], identify=changing)
+    assert len(crossings) == 4
+    (line,) = found.problems
+    assert line.startswith(f"{same[1]}: has changed while it was read; ")
+
+
+def test_a_message_that_is_none_at_the_second_reading_is_a_line(
+    five: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    readings = 0
+
+    def changing(path: Path, **others: Any) -> Iterator[Message]:
+        nonlocal readings
+        readings += 1
+        for number, message in enumerate(read_messages(path, **others)):
+            is_other = readings == 2 and number == 100
+            yield message._replace(payload=b"\xff" * 30) if is_other else message
+
+    monkeypatch.setattr(overview, "_SMALL_BYTES", 0)
+    monkeypatch.setattr(archive, "read_messages", changing)
+    found, _ = done(tmp_path / "into", five[2])
+    assert readings == 2
+    assert found.problems == (f"{five[2]}: 1 message has changed while it was read",)
+
+
+def test_a_full_disk_is_a_line_and_costs_what_was_not_on_it(
+    five: list[Path], tmp_path: Path
+) -> None:
+    into = tmp_path / "into"
+    done(into, five[0])
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limit[1]))
+    try:
+        with pytest.raises(FailureError, match=rf"^{into}/.*: could not be written: "):
+            done(into, *five)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert [path.suffix for path in into.iterdir()] == [".parquet"]
+    found, crossings = done(into, *five)
+    assert (len(crossings), found.there, found.problems) == (5, 2, ())
+
+
+# Recordings that are elsewhere
+
+
+@pytest.fixture
+def away(five: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Recording]:
+    """The same in a store; and a temporary folder of the test's own."""
+    folder = folder_at(f"memory://{tmp_path.name}/fleet")
+    for path in five:
+        put(folder, path.name, path.read_bytes())
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    return [Away(folder, path.name) for path in five]
+
+
+def test_recordings_elsewhere_give_what_they_give_here(
+    five: list[Path], away: list[Recording], tmp_path: Path
+) -> None:
+    """They are copied drive by drive, and the copies removed."""
+    at_once = []
+
+    def looking(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+        at_once.append(len(list((tmp_path / "temporary").rglob("*.mcap"))))
+        return identify(data, settings, **others)
+
+    found, crossings = done(tmp_path / "into", *away, identify=looking)
+    assert found.problems == ()
+    assert at_once == [1] * 5
+    assert list((tmp_path / "temporary").iterdir()) == []
+    again, there = done(tmp_path / "into", *five)
+    assert again.there == 5
+    assert there == crossings
+
+
+def test_what_is_wrong_elsewhere_is_told_by_its_address(
+    away: list[Recording], tmp_path: Path
+) -> None:
+    folder = folder_at(f"memory://{tmp_path.name}/fleet")
+    put(folder, "bad.mcap", b"no recording at all")
+    whole = folder.files.cat_file(folder.path("drive-00004.mcap"))
+    put(folder, "cut.mcap", whole[: len(whole) // 2])
+    other = io.BytesIO()
+    writer = Writer(other)
+    writer.start()
+    channel = writer.register_channel("/imu", "json", writer.register_schema("imu", "", b""))
+    writer.add_message(channel, 0, b"{}", 0)
+    writer.finish()
+    put(folder, "other.mcap", other.getvalue())
+    names = ("gone.mcap", "bad.mcap", "cut.mcap", "other.mcap")
+    wrong = [Away(folder, name) for name in names]
+    found, crossings = done(tmp_path / "into", *away[:2], *wrong)
+    assert len(crossings) >= 4
+    assert list((tmp_path / "temporary").iterdir()) == []
+    of_each = {name: [p for p in found.problems if f"/{name}: " in p] for name in names}
+    assert of_each["gone.mcap"] == [f"{wrong[0]}: no such file"]
+    assert len(of_each["bad.mcap"]) == 1
+    assert any("holds no driveby message" in line for line in of_each["other.mcap"])
+    assert all(str(tmp_path / "temporary") not in line for line in found.problems)
+
+
+def test_a_recording_by_its_address(tmp_path: Path) -> None:
+    one = recording_at("memory://bucket/fleet/day/one.mcap")
+    assert isinstance(one, Away)
+    assert str(one) == "memory://bucket/fleet/day/one.mcap"
+    assert one.folder.path(one.name) == "/bucket/fleet/day/one.mcap"
+    assert recording_at(tmp_path) == tmp_path
+
+
+def test_without_room_for_a_copy_nothing_is_begun(
+    away: list[Recording], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = type("Usage", (), {"free": 1000})
+    monkeypatch.setattr("services.common.stores.shutil.disk_usage", lambda _: usage)
+    with pytest.raises(FailureError, match=r"drive-00000.mcap: .* MB have no room in .*TMPDIR"):
+        done(tmp_path / "into", *away)
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def test_a_disk_that_gets_full_while_it_is_copied_to_is_told_as_that(
+    away: list[Recording], tmp_path: Path
+) -> None:
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limit[1]))
+    try:
+        with pytest.raises(FailureError, match=r"drive-00000.mcap: .* MB have no room in .*TMPDIR"):
+            done(tmp_path / "into", *away)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert list((tmp_path / "temporary").iterdir()) == []

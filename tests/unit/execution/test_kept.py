@@ -1,12 +1,18 @@
 """Results in a folder: read as they were written, whatever becomes of other files there."""
 
+import os
+import struct
 from pathlib import Path
+from typing import Any
 
+import pyarrow as pa
 import pytest
 
 from schemas.results import Header
 from services.common.errors import InputError
-from services.execution.kept import Kept, Result
+from services.common.parquet_files import Most, encoded
+from services.execution import kept as kept_module
+from services.execution.kept import BRIDGES, EDITION, KEY, Kept, Result, kept_results
 from tests.unit.identification.test_fusing import crossing
 
 HEADER = Header("0.1.0", 1.79e9, "hash", {"method": "pre"}, 1)
@@ -83,3 +89,94 @@ def test_where_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="file"):
         Kept(tmp_path / "file")
+
+
+def foreign(**columns: Any) -> bytes:
+    return encoded(pa.table(columns), KEY, EDITION)
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"content": [1, 2]},
+        {"content": [["a"], ["b"]]},
+        {"content": ["a"], "crossing_id": [1], "realm": [2], "header": [3], "result": [4]},
+        {"other": ["a"]},
+    ],
+)
+def test_a_table_of_another_kind_is_a_line_and_harms_nobody(
+    tmp_path: Path, columns: dict[str, Any]
+) -> None:
+    (first,) = results(1)
+    Kept(tmp_path).put([first], HEADER)
+    (tmp_path / "foreign.parquet").write_bytes(foreign(**columns))
+    kept = Kept(tmp_path)
+    assert list(kept.crossings()) == [first.crossing]
+    problems: list[str] = []
+    (file,) = kept_results(tmp_path, problems.append)
+    assert file.crossings == (first.crossing,)
+    for lines in (kept.problems, problems):
+        (line,) = [line for line in lines if BRIDGES not in line]
+        assert line.startswith(f"{tmp_path / 'foreign.parquet'}: ")
+        assert "\n" not in line
+
+
+def test_what_is_no_file_is_a_line(tmp_path: Path) -> None:
+    """A pipe would be waited for without end."""
+    (first,) = results(1)
+    path = Kept(tmp_path).put([first], HEADER)
+    os.mkfifo(tmp_path / "pipe.parquet")
+    (tmp_path / "folder.parquet").mkdir()
+    (tmp_path / "circle.parquet").symlink_to(tmp_path / "circle.parquet")
+    kept = Kept(tmp_path)
+    assert list(kept.crossings()) == [first.crossing]
+    assert len(kept.problems) == 3
+    assert str(path) not in "".join(kept.problems)
+
+
+def test_what_a_link_leads_to_is_not_written_to(tmp_path: Path) -> None:
+    (first,) = results(1)
+    path = Kept(tmp_path / "one").put([first], HEADER)
+    assert path is not None
+    other = tmp_path / "other"
+    other.write_text("somebody else's")
+    path.unlink()
+    path.symlink_to(other)
+    Kept(tmp_path / "one").put([first], HEADER)
+    assert other.read_text() == "somebody else's"
+    assert not path.is_symlink()
+
+
+def test_what_says_that_it_is_huge_is_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A result of 2⁴⁰ bytes in twenty; more rows than there may be."""
+    # The header of a frame: magic, what follows, the window, the size.
+    frame = struct.pack("<IBBQ", 0xFD2FB528, 0b1100_0000, 0, 1 << 40)
+    content = foreign(content=["a"], result=pa.array([frame], pa.binary()))
+    (tmp_path / "bomb.parquet").write_bytes(content)
+    kept = Kept(tmp_path)
+    assert kept.result("a") is None
+    assert kept.problems == [
+        f"{tmp_path / 'bomb.parquet'}: row 1: left out: {1 << 40} bytes are no result"
+    ]
+    monkeypatch.setattr(kept_module, "_MOST", Most(1, 1 << 20))
+    found = results(3)
+    path = Kept(tmp_path).put(found, HEADER)
+    again = Kept(tmp_path)
+    assert again.result(found[0].content) is None
+    assert any(line.startswith(f"{path}: left out: holds 3 rows of") for line in again.problems)
+
+
+def test_of_two_results_of_one_crossing_by_one_search_the_newer_one_counts(
+    tmp_path: Path,
+) -> None:
+    """Its recording was cut off, and then made whole: the same crossing, from other data."""
+    for name, wanted in (("a", "b"), ("b", "a")):  # whichever comes first in the folder
+        folder = tmp_path / name
+        old, new = crossing(0), crossing(0).model_copy(update={"speed_m_per_s": 9.0})
+        Kept(folder).put([Result(name, old)], HEADER)
+        Kept(folder).put([Result(wanted, new)], HEADER._replace(created=HEADER.created + 60.0))
+        problems: list[str] = []
+        found = [c for file in kept_results(folder, problems.append) for c in file.crossings]
+        assert found == [new]

@@ -296,25 +296,30 @@ def test_more_than_a_few_wait_elsewhere() -> None:
 
 
 STARTER = """
-import sys, time
+import os, signal, sys, time
 from services.execution.processes import Processes
 from tests.unit.execution.test_processes import nothing, slow, works
 processes = Processes(1, identify=slow, prepare=nothing)
 processes.wait_until_warm()
 processes.start(works()[0])
 import multiprocessing
-print(multiprocessing.active_children()[0].pid, flush=True)
-if sys.argv[1] == "close":
-    processes.close()
-else:
+pid = multiprocessing.active_children()[0].pid
+print(pid, flush=True)
+if sys.argv[1] == "kill":
     time.sleep(1000.0)
+if sys.argv[1] == "close one that is frozen":
+    os.kill(pid, signal.SIGSTOP)
+processes.close()
 """
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("end", ["close", "kill"])
+@pytest.mark.parametrize("end", ["close", "close one that is frozen", "kill"])
 def test_no_process_outlives_who_started_it(end: str) -> None:
-    """Neither one that is closed in the middle of an identification, nor one that is killed."""
+    """Neither one that is closed in the middle of an identification, nor one that is killed.
+
+    One that is frozen sees nothing of that, and its starter would wait for it when it ends.
+    """
     command = [sys.executable, "-c", STARTER, end]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as starter:
         assert starter.stdout is not None

@@ -23,6 +23,7 @@ from services.history.positions import crossings_of
 from services.identification.stays import Passage
 from services.recordings.recording import Message
 from services.recordings.writer import write_recording
+from tests.object_store import object_store
 
 S = 1_000_000_000
 START_NS = 1_700_000_000 * S
@@ -286,27 +287,8 @@ def test_in_the_memory_of_fsspec(fleet: Path, site: Site) -> None:
 
 
 def test_in_an_object_store(fleet: Path, site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    """moto: a server on this machine that talks as S3 does."""
-    from moto.server import ThreadedMotoServer
-
-    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    try:
-        host, port = server.get_host_and_port()
-        for name, value in {
-            "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-            "AWS_ACCESS_KEY_ID": "nobody",
-            "AWS_SECRET_ACCESS_KEY": "nothing",
-            "AWS_DEFAULT_REGION": "us-east-1",
-        }.items():
-            monkeypatch.setenv(name, value)
-        import s3fs
-
-        s3fs.S3FileSystem.clear_instance_cache()
-        s3fs.S3FileSystem().mkdir("bucket")
-        check_away(fleet, "s3://bucket/fleet", site)
-    finally:
-        server.stop()
+    with object_store(monkeypatch) as address:
+        check_away(fleet, f"{address}/fleet", site)
 
 
 def test_without_what_a_store_needs_a_line_says_how_to_get_it(
