@@ -102,11 +102,12 @@ def _checked(options: argparse.Namespace) -> "Checked":
 
 
 def _list(folder: Path) -> int:
-    from services.history.alarm_files import alarms_of
+    from services.history.alarm_files import alarms_of, bridges_with_alarms
     from services.history.archive import bridges_of
 
+    bridges_of(folder)  # says so where there is no such folder
     number = 0
-    for realm, bridge in bridges_of(folder):
+    for realm, bridge in bridges_with_alarms(folder):
         alarms, problems = alarms_of(folder, realm, bridge)
         for line in (*problems, *map(alarm_line, alarms)):
             print(line)
@@ -118,11 +119,10 @@ def _list(folder: Path) -> int:
 
 def _acknowledge(options: argparse.Namespace) -> int:
     from services.history.alarm_files import acknowledge, alarms_of
-    from services.history.archive import realm_of
 
     if not options.by:
         raise InputError("alarm ack: say who takes note of it with --by NAME")
-    realm = realm_of(options.history, options.bridge, options.realm)
+    realm = _realm_of(options.history, options.bridge, options.realm)
     alarms, problems = alarms_of(options.history, realm, options.bridge)
     for problem in problems:
         print(problem)
@@ -133,6 +133,15 @@ def _acknowledge(options: argparse.Namespace) -> int:
         noted = acknowledge(options.history, alarm, options.by, options.note, time.time())
         print(alarm_line(noted))
     return 0
+
+
+def _realm_of(folder: Path, bridge: str, realm: str | None) -> str:
+    """The realm of a bridge's alarms; they stand whatever became of its crossings."""
+    from services.history.alarm_files import bridges_with_alarms
+    from services.history.archive import realm_of
+
+    realms = [r for r, b in bridges_with_alarms(folder) if b == bridge and realm in (None, r)]
+    return realms[0] if len(realms) == 1 else realm_of(folder, bridge, realm)
 
 
 def _serve(options: argparse.Namespace) -> int:
