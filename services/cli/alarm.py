@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from services.history.alarms import Checked, Settings
 
 _WHAT = ("check", "list", "ack", "serve")
+_HOW = (
+    "see it: driveby history BRIDGE --period week --figures DIR; look at the bridge, then: "
+    "driveby alarm ack BRIDGE --by NAME --note TEXT"
+)
 
 
 def add_alarm(commands: Any) -> None:
@@ -72,9 +76,12 @@ def _alarm(options: argparse.Namespace) -> int:
         return _serve(options)
     checked = _checked(options)
     many = "bridges" if checked.bridges != 1 else "bridge"
-    print(f"{checked.bridges} {many} looked at, {len(checked.raised)} new alarms")
+    alarms = "alarms" if len(checked.raised) != 1 else "alarm"
+    print(f"{checked.bridges} {many} looked at, {len(checked.raised)} new {alarms}")
     for alarm in checked.standing:
         print(alarm_line(alarm))
+    if checked.standing:
+        print(_HOW)
     return 0
 
 
@@ -106,12 +113,15 @@ def _list(folder: Path) -> int:
     from services.history.archive import bridges_of
 
     bridges_of(folder)  # says so where there is no such folder
-    number = 0
+    number = standing = 0
     for realm, bridge in bridges_with_alarms(folder):
         alarms, problems = alarms_of(folder, realm, bridge)
         for line in (*problems, *map(alarm_line, alarms)):
             print(line)
         number += len(alarms)
+        standing += sum(alarm.acknowledged is None for alarm in alarms)
+    if standing:
+        print(_HOW)
     if not number:
         print("no alarms")
     return 0

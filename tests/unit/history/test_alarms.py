@@ -146,10 +146,16 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     assert capsys.readouterr().out == "no alarms\n"
     assert cli.main(["alarm", "check", *there]) == 0
     said = capsys.readouterr().out
-    assert said.startswith("2 bridges looked at, 1 new alarms\nalarm 2025")
+    assert said.startswith("2 bridges looked at, 1 new alarm\nalarm 2025")
     assert "-4-weaker of bridge-2, raised 2025-" in said
+    how = "look at the bridge, then: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
+    assert said.endswith(how)
+    assert cli.main(["alarm", "list", *there]) == 0
+    assert capsys.readouterr().out.endswith(how)
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", "--note", "props", *there]) == 0
     assert "acknowledged by owner on" in capsys.readouterr().out
+    assert cli.main(["alarm", "list", *there]) == 0
+    assert how not in capsys.readouterr().out
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 2
     assert capsys.readouterr().err == f"driveby: {history}: no alarm of bridge-2 stands\n"
     assert cli.main(["alarm", "ack", "bridge-2", *there]) == 2
