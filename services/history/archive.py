@@ -176,10 +176,15 @@ def read_partition(where: Path, columns: Iterable[str] = ()) -> Read:
     newest: dict[str, Kept] = {}
     for row in rows:
         before = newest.get(row.crossing_id)
-        if before is None or (before.created_s, before.content) < (row.created_s, row.content):
+        if before is None or _rank(before) < _rank(row):
             newest[row.crossing_id] = row
     ordered = sorted(newest.values(), key=lambda one: (one.entry_s, one.crossing_id))
     return Read(tuple(ordered), tuple(problems))
+
+
+def _rank(row: Kept) -> tuple[float, bool, str]:
+    """The newer result counts; of the same one that was added twice, where a temperature is."""
+    return row.created_s, row.temperature_deg_c is not None, row.content
 
 
 def _contents(where: Path) -> set[str]:

@@ -263,3 +263,21 @@ def test_from_the_history_to_those_who_watch(
         publisher.close()
         early.ends_well()
         view.ends_well()
+
+
+def test_a_history_that_is_away_for_a_while_ends_nothing(
+    start: Start, endpoint: str, tmp_path: Path
+) -> None:
+    """As a folder of another machine is."""
+    history = tmp_path / "history"
+    make_folder(history / "crossings")
+    start_logger(start, endpoint, tmp_path / "live.mcap")
+    serve = ["alarm", "serve", "--history", str(history), "--endpoint", endpoint]
+    with Told(*serve, "--every", "0.01") as serving:
+        until((history / "alarms/checked.json").exists, "the first look")
+        history.rename(tmp_path / "away")
+        serving.says(r"history: no such folder.*; it is looked at again in 1 s$")
+        (tmp_path / "away/alarms/checked.json").unlink()
+        (tmp_path / "away").rename(history)
+        until((history / "alarms/checked.json").exists, "the next look")
+        serving.ends_well()

@@ -416,3 +416,11 @@ def test_a_time_that_is_none_is_not_added(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"1e\+18 is no time of a crossing"):
         add_results(tmp_path, some.model_copy(update={"crossings": (some.crossings[0], bad)}))
     assert files(tmp_path) == []
+
+
+def test_adding_again_without_temperatures_takes_none_away(tmp_path: Path) -> None:
+    some = crossings(8)
+    add_results(tmp_path, some, {one.crossing_id: 7.0 for one in some.crossings})
+    add_results(tmp_path, some)
+    kept = read_partition(where(tmp_path)).crossings
+    assert [one.temperature_deg_c for one in kept] == [7.0] * 8
