@@ -21,7 +21,7 @@ from schemas.site import Site
 from schemas.site_file import vehicle_toml
 from schemas.topics import Key
 from services.common.errors import InputError
-from services.common.files import check_ordinary
+from services.common.files import check_ordinary, read_text
 from services.drives.ros2_messages import RosType, check_rosbags, unknown_hash
 from services.drives.ros2_truck import Accel, Ros2Truck
 from services.drives.ros2_unpacking import bound_unpacking
@@ -72,6 +72,8 @@ def read_ros2(source: Path, truck: Ros2Truck) -> Iterator[RosMessage]:
 
     for path in _files_of(source):
         _check_file(path)
+    if source.is_dir():
+        _check_metadata(source / "metadata.yaml")
     bound_unpacking()
     try:
         reader = Reader(source)
@@ -116,6 +118,23 @@ def _check_file(path: Path) -> None:
             f"{path}: its last messages are in {log.name} beside it, as its writer did not end "
             f"well; sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)' puts them into it"
         )
+
+
+def _check_metadata(path: Path) -> None:
+    """InputError if it has aliases: a few of them of each other are billions of words when told."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import AliasEvent
+
+    text = read_text(path)
+    if "*" not in text:
+        return
+    try:
+        found = any(isinstance(e, AliasEvent) for e in YAML(typ="safe", pure=True).parse(text))
+    except YAMLError:
+        return  # said where it is read
+    if found:
+        raise InputError(f"{path}: has aliases (*NAME), which rosbag2 does not write")
 
 
 def _unreadable(source: Path, error: Exception) -> InputError:

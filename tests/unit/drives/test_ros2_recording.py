@@ -386,6 +386,24 @@ def test_metadata_that_names_files_elsewhere_reads_none_of_them(
         complaint(folder)
 
 
+def test_metadata_with_aliases_is_refused(
+    messages: list[ros2.Ros], site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ten of ten of ten …: its words would fill the memory when what is wrong with it is told."""
+    folder = ros2.record(tmp_path / "bag", messages[:100], StoragePlugin.MCAP)
+    metadata = folder / "metadata.yaml"
+    nested = ", ".join(f"&a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 10))
+    changed = metadata.read_text().replace("compression_mode: ''", "compression_mode: FILE")
+    line = f"compression_format: [&a0 [x, x], {nested}]"
+    changed, number = re.subn(r"compression_format: ''", line, changed)
+    assert number == 1
+    metadata.write_text(changed)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rosbags.rosbag2.Reader.open", lambda reader: pytest.fail("opened"))
+        assert imported(folder, site, tmp_path / "out.mcap") == 2
+    assert f"{metadata}: has aliases (*NAME)" in capsys.readouterr().err
+
+
 def test_a_pipe_in_the_folder_is_not_waited_for(
     messages: list[ros2.Ros], site: Path, tmp_path: Path
 ) -> None:
