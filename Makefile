@@ -57,6 +57,7 @@ day: $(STAMP) ## two trucks for an hour, a worker that is killed: one result per
 	$(BIN)/python -m tests.faults.day --minutes $(MINUTES)
 
 year: $(STAMP) ## a year of a fleet: 12 bridges, seasons, a loss, a repair: the right alarms (a minute)
+	rm -rf build/year
 	$(BIN)/python -m tests.faults.year --out build/year
 
 MUTANTS ?= 40

@@ -3,10 +3,10 @@
 from datetime import UTC, datetime
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.topics import IDENTIFIER
+from schemas.topics import IDENTIFIER, check_realm
 
 SCHEMA_VERSION: Final = 1
 _MAX_TEXT_CHARACTERS = 1000
@@ -32,8 +32,8 @@ class Alarm(_Fields):
 
     edition: Literal[1] = 1
     alarm_id: Annotated[str, Field(pattern=rf"^{IDENTIFIER}$")]
-    realm: str
-    bridge: str
+    realm: Annotated[str, AfterValidator(check_realm)]
+    bridge: Annotated[str, Field(pattern=rf"^{IDENTIFIER}$")]
     element: Annotated[int, Field(ge=1, le=99)]
     direction: Literal["weaker", "stiffer"]
     since: Finite

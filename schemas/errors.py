@@ -8,4 +8,13 @@ class InputError(ValueError):
     """
 
     def __init__(self, line: str) -> None:
-        super().__init__(" ".join(line.split()))
+        super().__init__(one_line(line))
+
+
+def one_line(text: str) -> str:
+    """A text without line breaks, and without what a terminal would obey rather than show.
+
+    Names in files and messages may be anybody's.
+    """
+    spaced = " ".join(text.split())
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in spaced)

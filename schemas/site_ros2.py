@@ -27,7 +27,7 @@ class RosImu(_Table):
     gravity_included: StrictBool = True
     """Whether the axis reads +g at rest if it points up, as REP 145 wants it."""
     frame: Annotated[str, StringConstraints(min_length=1, max_length=255)] | None = None
-    """The `frame_id` that its messages must have; None: whatever it is."""
+    """The `frame_id` that its messages must have; None: that of the first one."""
 
 
 class RosImus(_Table):

@@ -141,6 +141,23 @@ def results_of(crossings: list[Crossing], created_s: float) -> Results:
     return results(HEADER._replace(created=created_s), crossings, {})
 
 
+def losses_of(names: Mapping[str, int | None], begin_s: float, weeks: int) -> Results:
+    """Two crossings a week of bridges by two trucks; a fifth of element 4 is lost in a week, or
+    nothing (None)."""
+    rng = np.random.default_rng(2)
+    trucks, kinds, some = trucks_of(rng, 2), templates(), []
+    for name, loses_at in names.items():
+        bridge = bridge_of(rng, name)
+        for week in range(weeks):
+            ei = bridge.ei_nm2.copy()
+            ei[3] *= 0.8 if loses_at is not None and week >= loses_at else 1.0
+            for day in (1, 4):
+                entry_s = begin_s + week * WEEK_S + day * DAY_S
+                truck, kind = trucks[int(rng.integers(2))], kinds[int(rng.integers(3))]
+                some.append(crossing_of(rng, kind, truck, bridge, entry_s, ei))
+    return results_of(some, begin_s + weeks * WEEK_S)
+
+
 def season_deg_c(time_s: float) -> float:
     """Coldest at the end of January, warmest half a year later."""
     return 11.0 - 11.0 * float(np.cos(2.0 * np.pi * (time_s / DAY_S - 25.0) / 365.25))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import zenoh
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from zenoh import ext
 
@@ -141,9 +141,17 @@ def of_fix(known: GnssFix) -> Iterator[Ros]:
     yield Ros(VELOCITY_TOPIC, TWIST, velocity, stamp_ns)
 
 
-def record(folder: Path, messages: Iterable[Ros], storage: StoragePlugin) -> Path:
+def record(
+    folder: Path,
+    messages: Iterable[Ros],
+    storage: StoragePlugin,
+    compression: CompressionMode = CompressionMode.NONE,
+) -> Path:
     """Write a folder as rosbag2 does."""
-    with Writer(folder, version=9, storage_plugin=storage) as writer:
+    writer = Writer(folder, version=9, storage_plugin=storage)
+    if compression != CompressionMode.NONE:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         connections: dict[str, Any] = {}
         for topic, of, payload, stamp_ns in messages:
             if topic not in connections:

@@ -33,7 +33,7 @@ from services.recordings.writer import write_recording
 from services.report.pdf import find_browser
 from services.viewer.view import convert
 from tests.endpoints import free_endpoint, free_port
-from tests.unit.cli.watching import NOW_NS, NOW_S, Listened, a_morning
+from tests.unit.cli.watching import NOW_NS, NOW_S, Listened, a_fleet
 from tests.viewer_screen import complaints, has_driver, open_tab, opened, picture, pixels
 from tests.waiting import LONGEST_S, until
 
@@ -230,11 +230,11 @@ def running(folder: Path, *arguments: str) -> Iterator[Path]:
         process.wait(timeout=LONGEST_S)
 
 
-def take_terminal(folder: Path, columns: int, lines: int = 30) -> bytes:
+def take_terminal(folder: Path, columns: int, lines: int = 36) -> bytes:
     """A made-up morning on the page of `driveby watch`, as PNG, drawn by a browser."""
     shown = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True)
     listened = Listened(alive={"truck-1", "truck-2"})
-    watched = a_morning(load_site(ROOT / "docs/site.example.toml"))
+    watched = a_fleet(load_site(ROOT / "docs/site.example.toml"))
     where = "realm live at tcp/127.0.0.1:7447"
     moment = {"now_s": NOW_S, "now_ns": NOW_NS}
     shown.print(page(watched, where, listened, **moment, width=columns, height=lines))

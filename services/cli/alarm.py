@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from services.history.alarms import Checked, Settings
 
 _WHAT = ("check", "list", "ack", "serve")
+_HOW = (
+    "see it: driveby history BRIDGE --period week --figures DIR; look at the bridge, then: "
+    "driveby alarm ack BRIDGE --by NAME --note TEXT"
+)
 
 
 def add_alarm(commands: Any) -> None:
@@ -72,9 +76,12 @@ def _alarm(options: argparse.Namespace) -> int:
         return _serve(options)
     checked = _checked(options)
     many = "bridges" if checked.bridges != 1 else "bridge"
-    print(f"{checked.bridges} {many} looked at, {len(checked.raised)} new alarms")
+    alarms = "alarms" if len(checked.raised) != 1 else "alarm"
+    print(f"{checked.bridges} {many} looked at, {len(checked.raised)} new {alarms}")
     for alarm in checked.standing:
         print(alarm_line(alarm))
+    if checked.standing:
+        print(_HOW)
     return 0
 
 
@@ -102,15 +109,19 @@ def _checked(options: argparse.Namespace) -> "Checked":
 
 
 def _list(folder: Path) -> int:
-    from services.history.alarm_files import alarms_of
+    from services.history.alarm_files import alarms_of, bridges_with_alarms
     from services.history.archive import bridges_of
 
-    number = 0
-    for realm, bridge in bridges_of(folder):
+    bridges_of(folder)  # says so where there is no such folder
+    number = standing = 0
+    for realm, bridge in bridges_with_alarms(folder):
         alarms, problems = alarms_of(folder, realm, bridge)
         for line in (*problems, *map(alarm_line, alarms)):
             print(line)
         number += len(alarms)
+        standing += sum(alarm.acknowledged is None for alarm in alarms)
+    if standing:
+        print(_HOW)
     if not number:
         print("no alarms")
     return 0
@@ -118,11 +129,10 @@ def _list(folder: Path) -> int:
 
 def _acknowledge(options: argparse.Namespace) -> int:
     from services.history.alarm_files import acknowledge, alarms_of
-    from services.history.archive import realm_of
 
     if not options.by:
         raise InputError("alarm ack: say who takes note of it with --by NAME")
-    realm = realm_of(options.history, options.bridge, options.realm)
+    realm = _realm_of(options.history, options.bridge, options.realm)
     alarms, problems = alarms_of(options.history, realm, options.bridge)
     for problem in problems:
         print(problem)
@@ -133,6 +143,15 @@ def _acknowledge(options: argparse.Namespace) -> int:
         noted = acknowledge(options.history, alarm, options.by, options.note, time.time())
         print(alarm_line(noted))
     return 0
+
+
+def _realm_of(folder: Path, bridge: str, realm: str | None) -> str:
+    """The realm of a bridge's alarms; they stand whatever became of its crossings."""
+    from services.history.alarm_files import bridges_with_alarms
+    from services.history.archive import realm_of
+
+    realms = [r for r, b in bridges_with_alarms(folder) if b == bridge and realm in (None, r)]
+    return realms[0] if len(realms) == 1 else realm_of(folder, bridge, realm)
 
 
 def _serve(options: argparse.Namespace) -> int:

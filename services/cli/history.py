@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from services.cli.parsing import EXIT_SOMETHING_LOST, a_console, add_file, command
-from services.common.errors import InputError
+from services.common.errors import InputError, one_line
 
 if TYPE_CHECKING:
     from schemas.alarms import Alarm
@@ -228,7 +228,7 @@ def alarm_line(alarm: "Alarm") -> str:
     note = alarm.acknowledged
     state = "stands" if note is None else f"acknowledged by {note.by} on {_day(note.time)}"
     said = f": {note.note}" if note is not None and note.note else ""
-    return (
+    return one_line(
         f"alarm {alarm.alarm_id} of {alarm.bridge}, raised {_day(alarm.raised)}, {state}{said}; "
         f"{alarm.sentence()}"
     )

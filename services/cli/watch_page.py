@@ -1,6 +1,6 @@
 """The page of `driveby watch`: what is known of a realm, as tables of a given width and height."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from datetime import UTC, datetime
 from typing import Final, Protocol
 
@@ -33,6 +33,7 @@ _LATE_S: Final = 150.0
 """A service that has said nothing for so long is not well, as for `driveby health`."""
 _MOST_ALARMS: Final = 4
 """Lines of them at the head of a page, fewer on a low one."""
+_MOST_BRIDGES: Final = 4
 _VERDICTS: Final = {"good": "green", "suspect": "yellow", "rejected": "red"}
 
 
@@ -61,7 +62,7 @@ def page(
     is_wide = width >= _WIDE
     trucks, rows = _sorted_trucks(watched, now_s), watched.rows()
     alarms = _alarms(watched.alarms.values(), max(1, min(_MOST_ALARMS, height // 10)))
-    taken = 11 + len(watched.services) + 3 * min(len(watched.bridges), 4) + len(alarms)
+    taken = 11 + len(watched.services) + 3 * min(len(watched.bridges), _MOST_BRIDGES) + len(alarms)
     room = max(8 - len(alarms), height - taken)
     most_trucks = max(2, min(len(trucks), room // 3))
     parts: list[RenderableType] = [_headline(watched, where, now_ns), *alarms]
@@ -79,7 +80,8 @@ def page(
         if len(rows) > len(shown):
             parts.append(Text(f"  and {len(rows) - len(shown)} earlier", style="dim"))
     if watched.bridges:
-        parts.append(_bridges(watched.bridges, is_wide=is_wide))
+        standing = {name for name, one in watched.alarms.items() if one.acknowledged is None}
+        parts.append(_bridges(watched.bridges, standing))
     if watched.services:
         parts.append(_services(watched, now_ns))
     spaced = [
@@ -179,15 +181,20 @@ def _crossings(rows: Sequence[Row], *, is_wide: bool) -> Table:
     return table
 
 
-def _bridges(bridges: dict[str, BridgeRow], *, is_wide: bool) -> Table:
+def _bridges(bridges: dict[str, BridgeRow], standing: Set[str]) -> Table:
+    """Those of which an alarm stands, then those that were heard of last."""
     table = _table("bridge", "crossings", "EI", "by all crossings")
-    for name, row in list(bridges.items())[-4:]:
+    alarmed = [name for name in bridges if name in standing][-_MOST_BRIDGES:]
+    quiet = [name for name in bridges if name not in standing]
+    for name in (*alarmed, *quiet[max(0, len(quiet) + len(alarmed) - _MOST_BRIDGES) :]):
+        row = bridges[name]
         said = row.finding or row.lowest
         is_good = row.verdict in ("", "good")
         found = Text(said if is_good else f"{row.verdict}: {said}", overflow="fold")
         found.no_wrap = False
         heights = bars(row.ratios, row.weak, doubtful=not is_good)
-        table.add_row(name, f"{row.used}", heights, found)
+        head = Text(name, style="bold red" if name in standing else "")
+        table.add_row(head, f"{row.used}", heights, found)
     return table
 
 

@@ -15,6 +15,7 @@ from schemas.results import BridgeResult, Crossing, Lowest, lowest_element, verd
 from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
 from schemas.signals import decode_accel, decode_gnss
 from services.bus.listening import Heard
+from services.common.errors import one_line
 from services.identification.comparison import Estimate, compare, estimate_of_state
 from services.viewer.crossing_view import ToldElements, elements_of_result, view_of_crossing
 
@@ -281,7 +282,7 @@ def _weight(alarm: Alarm) -> tuple[bool, float]:
 def alarm_state(alarm: Alarm) -> str:
     """Whether an alarm stands, or who has taken note of it."""
     note = alarm.acknowledged
-    return "stands" if note is None else f"acknowledged by {note.by}"
+    return "stands" if note is None else f"acknowledged by {one_line(note.by)}"
 
 
 def service_figures(service: Service) -> str:

@@ -60,7 +60,8 @@ def decoded(
             raise ValueError(f"lacks the column {min(missing)}")
         return found
     except (pa.ArrowException, OSError) as error:
-        raise ValueError(f"is no file of {key} ({' '.join(str(error).split())[:80]})") from None
+        why = " ".join(str(error).split()).split(". ")[0][:100]
+        raise ValueError(f"is no file of {key} ({why})") from None
 
 
 def _check_size(metadata: Any, most: Most) -> None:

@@ -71,6 +71,8 @@ def _import_ros2(
     vehicle_id: str,
     force: bool,
 ) -> str:
+    if output.resolve() in (source.resolve(), *(path.resolve() for path in source.glob("*"))):
+        raise InputError(f"{output}: is what is to be imported, give another file to write")
     truck, messages = messages_of_ros2(source, site, site_name, realm, vehicle_id)
     written = write_recording(
         output, messages, site_toml=site_text, reason="import complete", force=force

@@ -66,6 +66,10 @@ class Positions:
     def add_velocity(self, velocity: Velocity) -> list[FixWithSpeed]:
         """Take a velocity; return those fixes of which the speed is known now."""
         if velocity.stamp_ns <= self._latest_velocity_ns:
+            if self._velocity_topic is not None:
+                self._complaints.add(
+                    self._velocity_topic, "stamps repeated or in the past, left out"
+                )
             self._velocities_behind += 1
             if self._velocities_behind <= _BACK:
                 return []

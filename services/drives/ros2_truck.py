@@ -31,6 +31,8 @@ the same from fix to fix."""
 _FASTEST_M_PER_S: Final = 200.0
 _BEFORE_FIRST_NS: Final = 100 * NS_PER_S
 """The truck's own clock shows so much at its first message: others may be stamped before it."""
+_HANDOVER_S: Final = 1.0
+"""After so long without a message of a topic's sensor another one may speak there."""
 
 
 class Accel(NamedTuple):
@@ -39,6 +41,14 @@ class Accel(NamedTuple):
     device_time_ns: int
     wall_time_ns: int
     channels: dict[str, Channel]
+
+
+class _Source(NamedTuple):
+    """Who spoke on a topic, and the stamp of what it said last."""
+
+    publisher: bytes
+    frame: str
+    stamp_ns: int
 
 
 class Ros2Truck:
@@ -57,7 +67,9 @@ class Ros2Truck:
             for topic, name in self._channels.items()
         }
         self._positions = Positions(self.table.gnss, self.table.velocity, self.complaints)
+        self._sources: dict[str, _Source] = {}
         self._zero_ns: int | None = None
+        self._latest_device_ns = 0
 
     def types(self, topic: str) -> tuple[RosType, ...]:
         """The types that the messages of a topic may have."""
@@ -65,11 +77,13 @@ class Ros2Truck:
             return (IMU,)
         return (FIX,) if topic == self.table.gnss else VELOCITIES
 
-    def take(self, topic: str, of: RosType, payload: bytes, sent_ns: int) -> list[Accel | GnssFix]:
+    def take(
+        self, topic: str, of: RosType, payload: bytes, sent_ns: int, publisher: bytes = b""
+    ) -> list[Accel | GnssFix]:
         """Take a message; return what can be published now. Identities are for others to set.
 
-        What is wrong with a message is counted in `complaints`. InputError: the rate of a channel
-        is not the one that the site file declares.
+        `publisher` is who sent it, where that is known. What is wrong with a message is counted in
+        `complaints`. InputError: the rate of a channel is not the one that the site file declares.
         """
         try:
             message = decode(of, payload)
@@ -79,6 +93,8 @@ class Ros2Truck:
         if abs(message.stamp_ns - sent_ns) > self.table.largest_delay_s * NS_PER_S:
             apart = f"the first by {(sent_ns - message.stamp_ns) / NS_PER_S:.3f} s"
             self.complaints.add(topic, "stamps too far from when they were sent", example=apart)
+            return []
+        if not self._is_of_its_sensor(topic, message, publisher):
             return []
         if self._zero_ns is None:
             self._zero_ns = message.stamp_ns - _BEFORE_FIRST_NS
@@ -97,16 +113,35 @@ class Ros2Truck:
             found += self._batches(topic, samples.finish())
         return found + self._fixes(self._positions.finish())
 
-    def _accelerations(self, topic: str, message: Imu) -> list[Accel | GnssFix]:
-        imu = self._imus[topic]
-        if imu.frame is not None and message.frame != imu.frame:
-            other = f"the first {message.frame[:60]!r}, not {imu.frame!r}"
+    def _is_of_its_sensor(
+        self, topic: str, message: Imu | Fix | Velocity, publisher: bytes
+    ) -> bool:
+        """Whether a message is of the sensor that has the topic; what others say is counted.
+
+        Samples of two are no signal. So a topic is the first one's, by publisher and frame, until
+        it has been silent for a while: a node that was started anew is another publisher.
+        """
+        frame = message.frame if isinstance(message, Imu) else ""
+        imu = self._imus.get(topic)
+        if imu is not None and imu.frame is not None and frame != imu.frame:
+            other = f"the first {frame[:60]!r}, not {imu.frame!r}"
             self.complaints.add(topic, "messages of another frame, left out", example=other)
-            return []
+            return False
+        now, before = _Source(publisher, frame, message.stamp_ns), self._sources.get(topic)
+        if before is not None and (publisher, frame) != (before.publisher, before.frame):
+            if abs(now.stamp_ns - before.stamp_ns) <= _HANDOVER_S * NS_PER_S:
+                other = f"the first of frame {frame[:60]!r}" if frame != before.frame else ""
+                self.complaints.add(topic, "messages of a second sensor, left out", example=other)
+                return False
+            self.complaints.add(topic, "times that another sensor went on")
+        self._sources[topic] = now
+        return True
+
+    def _accelerations(self, topic: str, message: Imu) -> list[Accel | GnssFix]:
         if message.acceleration_m_per_s2 is None:
             self.complaints.add(topic, "messages that say they have no acceleration, left out")
             return []
-        up = _up(imu, message.acceleration_m_per_s2)
+        up = _up(self._imus[topic], message.acceleration_m_per_s2)
         return self._batches(topic, self._samples[topic].add(message.stamp_ns, up))
 
     def _batches(self, topic: str, pieces: list[Piece]) -> list[Accel | GnssFix]:
@@ -153,8 +188,15 @@ class Ros2Truck:
         return found
 
     def _device_ns(self, wall_time_ns: int) -> int:
-        """ROS stamps with one clock; the truck's own is that one from the first message on."""
-        return max(0, wall_time_ns - (self._zero_ns or 0))
+        """ROS stamps with one clock; the truck's own is that one from the first message on.
+
+        Where that was set back to before the beginning, the truck's own goes on from where it was.
+        """
+        zero_ns = wall_time_ns if self._zero_ns is None else self._zero_ns
+        if wall_time_ns < zero_ns:
+            zero_ns = self._zero_ns = wall_time_ns - self._latest_device_ns - NS_PER_S
+        self._latest_device_ns = max(self._latest_device_ns, wall_time_ns - zero_ns)
+        return wall_time_ns - zero_ns
 
 
 def ros2_of(site: Site, site_name: str, vehicle: str) -> Ros2:

@@ -72,30 +72,34 @@ class Kept:
         self._folder = folder
         self.problems: list[str] = []
         """Files that cannot be read, a line each."""
-        self._places: dict[str, _Place] = {}
-        self._read: tuple[Path, tuple[bytes, ...]] | None = None
+        self._places: dict[str, list[_Place]] = {}
+        """Where the result of a content is: in several files, if it was damaged and made again."""
+        self._read: tuple[Path, tuple[tuple[bytes, bytes], ...]] | None = None
         for path in files_of(folder):
             try:
                 contents = _table(path, "content").column("content").to_pylist()
             except ValueError as error:
                 self.problems.append(f"{path}: left out: {error}")
                 continue
-            self._places |= {name: _Place(path, row) for row, name in enumerate(contents)}
+            named = ((row, name) for row, name in enumerate(contents) if isinstance(name, str))
+            for row, name in named:
+                self._places.setdefault(name, []).append(_Place(path, row))
 
     def __len__(self) -> int:
         return len(self._places)
 
     def result(self, content: str) -> Crossing | None:
         """The result made from it; None if there is none, or what is there cannot be read."""
-        place = self._places.get(content)
-        if place is None:
-            return None
-        try:
-            return _crossing_of(self._rows(place.path)[place.row])
-        except _UNREADABLE as error:
-            self.problems.append(_line_of(place.path, place.row, error))
-            del self._places[content]
-            return None
+        for place in list(self._places.get(content, ())):
+            try:
+                header, result = self._rows(place.path)[place.row]
+                _header_of(header)  # without which nobody else can read the result
+                return _crossing_of(result)
+            except _UNREADABLE as error:
+                self.problems.append(_line_of(place.path, place.row, error))
+                self._places[content].remove(place)
+        self._places.pop(content, None)
+        return None
 
     def put(self, found: Iterable[Result], header: Header) -> Path | None:
         """A run's results as one file, on the disk when this returns; None if there are none."""
@@ -104,7 +108,8 @@ class Kept:
             return None
         path = self._folder / f"{content_of_all(one.content for one in ordered)}.parquet"
         write_atomically(path, _file_of(ordered, header))
-        self._places |= {one.content: _Place(path, row) for row, one in enumerate(ordered)}
+        self._read = None
+        self._places |= {one.content: [_Place(path, row)] for row, one in enumerate(ordered)}
         return path
 
     def crossings(self) -> Iterator[Crossing]:
@@ -114,10 +119,13 @@ class Kept:
             if crossing is not None:
                 yield crossing
 
-    def _rows(self, path: Path) -> tuple[bytes, ...]:
-        """The results of a file, which is kept: neighbours are asked for one after another."""
+    def _rows(self, path: Path) -> tuple[tuple[bytes, bytes], ...]:
+        """The heads and results of a file, which are kept: neighbours are asked for one after
+        another."""
         if self._read is None or self._read[0] != path:
-            self._read = path, tuple(_table(path, "result")["result"].to_pylist())
+            found = _table(path, "header", "result")
+            both = (found[name].to_pylist() for name in ("header", "result"))
+            self._read = path, tuple(zip(*both, strict=True))
         return self._read[1]
 
 

@@ -9,7 +9,9 @@ was made of. Who is killed between the two leaves rows twice, which are read onc
 """
 
 import hashlib
+import itertools
 import logging
+import math
 import struct
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -47,6 +49,8 @@ _PLAIN: Final = (
     *("search_hash", "version", "content"),
 )
 _OF_ELEMENTS: Final = tuple(f"ei_{name}_nm2" for name in _ELEMENT)
+_LATEST_S: Final = 2e11
+"""Times of crossings are between 1970 and the year 8300: these have a date."""
 
 
 class Kept(NamedTuple):
@@ -87,7 +91,7 @@ class Read(NamedTuple):
     crossings: tuple[Kept, ...]
     """In order of their entries, each once."""
     problems: tuple[str, ...]
-    """Files that cannot be read, a line each."""
+    """Files that cannot be read, or not whole, a line each."""
 
 
 class Added(NamedTuple):
@@ -111,6 +115,8 @@ def add_results(
         try:
             check_realm(crossing.realm)
             check_identifier(crossing.bridge)
+            _check_time(crossing.entry_time)
+            _check_time(crossing.exit_time)
         except ValueError as error:
             raise InputError(f"{crossing.crossing_id}: {error}") from None
         by_bridge[(crossing.realm, crossing.bridge)].append(crossing)
@@ -120,7 +126,7 @@ def add_results(
     added, bridges = 0, []
     for (realm, bridge), some in sorted(by_bridge.items()):
         where = partition(folder, realm, bridge)
-        there = {one.content for one in read_partition(where, ("content",)).crossings}
+        there = _contents(where)
         new = [kept_of(one, header, (temperatures or {}).get(one.crossing_id)) for one in some]
         new = [one for one in new if one.content not in there]
         if new:
@@ -160,34 +166,54 @@ def realm_of(folder: Path, bridge: str, realm: str | None) -> str:
 
 
 def read_partition(where: Path, columns: Iterable[str] = ()) -> Read:
-    """The crossings of one bridge, each by its newest result; `columns` beyond those of a table.
-
-    Asked for ("content",) alone every result counts, also older ones, and the rest is empty.
-    """
-    wanted = tuple(columns)
-    only_content = wanted == ("content",)
-    names = ["content"] if only_content else [*_PLAIN, *_OF_ELEMENTS, *wanted]
+    """The crossings of one bridge, each by its newest result; `columns` beyond those of a table."""
     rows: list[Kept] = []
     problems: list[str] = []
     for path in sorted(where.glob(FILES)):
-        try:
-            rows += _rows(path, names)
-        except (ValueError, TypeError, KeyError) as error:
-            problems.append(f"{path}: left out: {error}")
-    if only_content:
-        return Read(tuple(rows), tuple(problems))
+        some, wrong = _rows(path, [*_PLAIN, *_OF_ELEMENTS, *columns])
+        rows += some
+        problems += wrong
     newest: dict[str, Kept] = {}
     for row in rows:
         before = newest.get(row.crossing_id)
-        if before is None or (before.created_s, before.content) < (row.created_s, row.content):
+        if before is None or _rank(before) < _rank(row):
             newest[row.crossing_id] = row
     ordered = sorted(newest.values(), key=lambda one: (one.entry_s, one.crossing_id))
     return Read(tuple(ordered), tuple(problems))
 
 
-def _rows(path: Path, columns: list[str] | None = None) -> list[Kept]:
-    """The crossings of a file. ValueError, TypeError or KeyError: it is none of ours."""
-    return [_from_row(told) for told in decoded(path, KEY, EDITION, columns).to_pylist()]
+def _rank(row: Kept) -> tuple[float, bool, str]:
+    """The newer result counts; of the same one that was added twice, where a temperature is."""
+    return row.created_s, row.temperature_deg_c is not None, row.content
+
+
+def _contents(where: Path) -> set[str]:
+    """Of all results of a bridge that can be read, also older ones."""
+    return {row.content for path in sorted(where.glob(FILES)) for row in _rows(path)[0]}
+
+
+def _rows(path: Path, columns: list[str] | None = None) -> tuple[list[Kept], list[str]]:
+    """The crossings of a file; and a line if it, or some of its rows, cannot be read."""
+    try:
+        table = decoded(path, KEY, EDITION, columns)
+    except ValueError as error:
+        return [], [f"{path}: left out: {error}"]
+    rows: list[Kept] = []
+    wrong: list[str] = []
+    for number, told in enumerate(table.to_pylist(), start=1):
+        try:
+            rows.append(_checked(_from_row(told)))
+        except (ValueError, TypeError) as error:
+            wrong.append(f"row {number}: {error}")
+    if not wrong:
+        return rows, []
+    return rows, [f"{path}: {len(wrong)} of {table.num_rows} rows left out, first {wrong[0]}"]
+
+
+def wrong_of_file(path: Path) -> str | None:
+    """Why a file holds no crossing that can be read, in a line; None if it holds some."""
+    rows, problems = _rows(path, [*_PLAIN, *_OF_ELEMENTS])
+    return None if rows or not problems else problems[0]
 
 
 def write_batch(where: Path, rows: Iterable[Kept]) -> Path:
@@ -200,24 +226,31 @@ def write_batch(where: Path, rows: Iterable[Kept]) -> Path:
 
 
 def _write(where: Path, rows: Iterable[Kept]) -> Path:
+    """Write a file called by its rows. One of that name that does not hold them is damaged, and
+    stays: then the file gets a number."""
     ordered = sorted(rows, key=lambda one: (one.entry_s, one.crossing_id, one.content))
-    digest = hashlib.sha256("".join(one.content for one in ordered).encode()).hexdigest()[:20]
-    path = where / f"{digest}.parquet"
-    if not path.exists():
-        make_folder(where)
-        write_atomically(path, encoded(_table(ordered), KEY, EDITION))
+    contents = [one.content for one in ordered]
+    digest = hashlib.sha256("".join(contents).encode()).hexdigest()[:20]
+    for number in itertools.count(1):
+        path = where / f"{digest}{f'-{number}' if number > 1 else ''}.parquet"
+        if not path.exists():
+            make_folder(where)
+            write_atomically(path, encoded(_table(ordered), KEY, EDITION))
+            break
+        if [one.content for one in _rows(path)[0]] == contents:
+            break
     return path
 
 
 def _pack(where: Path, files: list[Path]) -> None:
-    """Put what is in several files into one; what cannot be read stays as it is."""
+    """Put what is in several files into one; one that cannot be read, or not whole, stays."""
     rows: dict[str, Kept] = {}
     read: list[Path] = []
     for path in files:
-        try:
-            some = _rows(path)
-        except (ValueError, TypeError, KeyError) as error:
-            _log.warning("%s: left out: %s", path, error)
+        some, problems = _rows(path)
+        for problem in problems:
+            _log.warning("%s", problem)
+        if problems:
             continue
         rows |= {one.content: one for one in some}
         read.append(path)
@@ -356,10 +389,53 @@ def _table(rows: list[Kept]) -> "pa.Table":
 def _from_row(told: dict[str, Any]) -> Kept:
     of_elements = [told.get(name) or () for name in _OF_ELEMENTS]
     plain: dict[str, Any] = {name: told.get(name) for name in _PLAIN}
-    plain["reasons"] = tuple(told.get("reasons") or ())
+    reasons = told.get("reasons") or []
+    if not isinstance(reasons, list):
+        raise TypeError(f"reasons are {reasons!r}, a list is expected")
+    plain["reasons"] = tuple(reasons)
     return Kept(
         **plain,
         elements=tuple(zip(*of_elements, strict=True)),
         likelihood=told.get("likelihood"),
         observation=told.get("observation"),
     )
+
+
+def _checked(kept: Kept) -> Kept:
+    """A row of which all that others rely on is there; ValueError or TypeError if it is not."""
+    for name in ("crossing_id", "vehicle", "method", "site_hash", "search_hash", "version"):
+        _check_text(name, getattr(kept, name))
+    _check_text("content", kept.content)
+    if kept.direction not in ("start_to_end", "end_to_start"):
+        raise ValueError(f"direction is {kept.direction!r}")
+    if kept.verdict not in ("good", "suspect", "rejected"):
+        raise ValueError(f"verdict is {kept.verdict!r}")
+    _check_time(kept.entry_s)
+    _check_time(kept.exit_s)
+    for name in ("speed_m_per_s", "created_s"):
+        _check_number(name, getattr(kept, name))
+    for name in ("chi2_per_dof", "temperature_deg_c"):
+        if getattr(kept, name) is not None:
+            _check_number(name, getattr(kept, name))
+    for element in kept.elements:
+        for value in element:
+            _check_number("EI", value)
+    for name in ("likelihood", "observation"):
+        if not isinstance(getattr(kept, name), bytes | None):
+            raise TypeError(f"{name} is no bytes")
+    return kept
+
+
+def _check_text(name: str, value: object) -> None:
+    if not isinstance(value, str) or not value:
+        raise TypeError(f"{name} is {value!r}, a text is expected")
+
+
+def _check_number(name: str, value: object) -> None:
+    if not isinstance(value, float | int) or not math.isfinite(value):
+        raise TypeError(f"{name} is {value!r}, a number is expected")
+
+
+def _check_time(value: object) -> None:
+    if not isinstance(value, float | int) or not 0.0 <= value <= _LATEST_S:
+        raise ValueError(f"{value!r} is no time of a crossing, seconds since 1970 are expected")

@@ -7,12 +7,13 @@ is killed between the two leaves rows twice, which readers take once.
 """
 
 import hashlib
+import itertools
 import json
 import logging
+import math
 from collections import defaultdict
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 from services.common.errors import FailureError, InputError
 from services.common.parquet_files import decoded, encoded
@@ -34,6 +35,9 @@ CATALOG: Final = "_catalog"
 """No realm is called that."""
 EDITION: Final = "1"
 _KEY = "driveby.catalog"
+_LATEST_NS = (1 << 63) - 1
+"""In the year 2262."""
+ValueT = TypeVar("ValueT")
 
 
 class Stored(NamedTuple):
@@ -80,7 +84,7 @@ def stored(folder: Folder) -> Stored:
 
 def add(folder: Folder, row: Row) -> bool:
     """Write a row as a file of its own; False if it is there already."""
-    return _put(folder, [row])
+    return _put(folder, [row])[1]
 
 
 def catalog_closed(folder: Path, recording: Path) -> None:
@@ -163,22 +167,35 @@ def _pack(folder: Folder, rows: dict[str, Row], before: Stored) -> None:
         days[row.day].append(row)
     kept = set()
     for day in sorted(days):
-        kept.add(_name(days[day]))
-        _put(folder, days[day])
+        kept.add(_put(folder, days[day])[0])
     for name in before.files:
         if name not in kept:
             remove(folder, name)
 
 
-def _put(folder: Folder, rows: Iterable[Row]) -> bool:
+def _put(folder: Folder, rows: list[Row]) -> tuple[str, bool]:
+    """Write rows as a file; return its name, and whether it is new.
+
+    A file of that name that cannot be read stays where it is: then the rows get another one.
+    """
     ordered = sorted(rows, key=lambda row: row.path)
-    return put(folder, _name(ordered), _file_of(ordered))
+    content = _file_of(ordered)
+    for number in itertools.count(1):
+        name = _name(ordered, number)
+        if put(folder, name, content):
+            return name, True
+        try:
+            _rows_of(read(folder, name))
+        except ValueError:  # InputError is one
+            continue
+        return name, False
+    raise AssertionError("numbers do not end")
 
 
-def _name(rows: list[Row]) -> str:
-    ordered = sorted(rows, key=lambda row: row.path)
+def _name(ordered: list[Row], number: int) -> str:
     digest = hashlib.sha256(repr([tuple(row) for row in ordered]).encode()).hexdigest()[:20]
-    return f"{CATALOG}/{ordered[0].day}/{digest}.parquet"
+    of_day = digest if number == 1 else f"{digest}-{number}"
+    return f"{CATALOG}/{ordered[0].day}/{of_day}.parquet"
 
 
 def _file_of(rows: list[Row]) -> bytes:
@@ -207,25 +224,40 @@ def _rows_of(content: bytes) -> list[Row]:
     """The rows of a file; ValueError if it is none of this edition."""
     try:
         return [_row(one) for one in decoded(content, _KEY, EDITION).to_pylist()]
-    except (KeyError, TypeError) as error:
+    except KeyError as error:
         raise ValueError(f"is no file of {_KEY} (lacks {error})") from None
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"is no file of {_KEY} ({error})") from None
 
 
 def _row(told: dict[str, Any]) -> Row:
+    """A row of a file; KeyError, TypeError or ValueError if it is none."""
     details = json.loads(told["details"])
     sides = [told[name] for name in Box._fields]
-    return Row(
-        told["path"],
-        told["size_bytes"],
-        told["modified_ns"],
-        told["content"],
-        tuple(details["realms"]),
-        tuple(details["vehicles"]),
-        told["first_ns"],
-        told["last_ns"],
-        details["messages"],
-        details["rates_hz"],
-        details["gaps"],
-        details["gap_s"],
-        None if sides[0] is None else Box(*sides),
+    row = Row(
+        _of(told, "path", str),
+        _of(told, "size_bytes", int),
+        _of(told, "modified_ns", int),
+        _of(told, "content", bytes),
+        tuple(_of(details, "realms", list)),
+        tuple(_of(details, "vehicles", list)),
+        _of(told, "first_ns", int),
+        _of(told, "last_ns", int),
+        _of(details, "messages", int),
+        _of(details, "rates_hz", dict),
+        _of(details, "gaps", int),
+        float(details["gap_s"]),
+        None if sides[0] is None else Box(*map(float, sides)),
     )
+    if not 0 <= row.first_ns <= row.last_ns <= _LATEST_NS:
+        raise ValueError(f"{row.path}: has the times {row.first_ns} and {row.last_ns} ns")
+    if row.box is not None and not all(map(math.isfinite, row.box)):
+        raise ValueError(f"{row.path}: has a box that is not finite")
+    return row
+
+
+def _of(told: dict[str, Any], name: str, kind: type[ValueT]) -> ValueT:
+    value = told[name]
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} is {value!r}")
+    return value

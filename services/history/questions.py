@@ -2,11 +2,20 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from services.common.errors import InputError
-from services.common.parquet_files import FILES, decoded
-from services.history.archive import CROSSINGS, EDITION, KEY, bridges_of
+from services.common.parquet_files import FILES
+from services.history.archive import (
+    CROSSINGS,
+    EDITION,
+    KEY,
+    bridges_of,
+    wrong_of_file,
+)
+
+if TYPE_CHECKING:
+    import duckdb
 
 
 class Answer(NamedTuple):
@@ -18,12 +27,17 @@ class Answer(NamedTuple):
     """Files that were left out, a line each."""
 
 
+_PARTITIONS: Final = "realm=*/bridge=*"
 _OVERVIEW = """
 SELECT realm, bridge, count(DISTINCT crossing_id) AS crossings,
        count(DISTINCT crossing_id) FILTER (verdict = 'good') AS good,
        count(DISTINCT vehicle) AS trucks,
        min(entry_s) AS first_s, max(entry_s) AS last_s
-FROM crossings GROUP BY realm, bridge ORDER BY realm, bridge
+FROM crossings WHERE entry_s BETWEEN 0 AND 2e11 GROUP BY realm, bridge ORDER BY realm, bridge
+"""
+_EDITIONS: Final = """
+SELECT DISTINCT min(decode(value)) FILTER (decode(key) = $2)
+FROM parquet_kv_metadata($1) GROUP BY file_name
 """
 
 
@@ -42,7 +56,7 @@ def ask(folder: Path, question: str) -> Answer:
     """
     if not bridges_of(folder):
         raise InputError(f"{folder}: is no history; driveby history add RESULTS makes one")
-    files = f"{folder / CROSSINGS}/*/*/{FILES}"
+    files = f"{folder / CROSSINGS}/{_PARTITIONS}/{FILES}"
     try:
         return _asked(question, files, ())
     except InputError:
@@ -61,6 +75,7 @@ def _asked(question: str, files: str | list[str], problems: tuple[str, ...]) -> 
             asked = connection.extract_statements(question)
             if [one.type for one in asked] != [duckdb.StatementType.SELECT]:
                 raise InputError("--sql: one question that begins with SELECT … is expected")
+            _check_editions(connection, files)
             crossings = connection.read_parquet(files, hive_partitioning=True, union_by_name=True)
             crossings.create_view("crossings")
             found = connection.sql(question)
@@ -69,14 +84,21 @@ def _asked(question: str, files: str | list[str], problems: tuple[str, ...]) -> 
             raise InputError(f"--sql: {' '.join(str(error).split())[:300]}") from None
 
 
+def _check_editions(connection: "duckdb.DuckDBPyConnection", files: str | list[str]) -> None:
+    """InputError if one of the files is of another edition: its columns may mean something else."""
+    found = connection.execute(_EDITIONS, [files, KEY]).fetchall()
+    if any(edition != EDITION for (edition,) in found):
+        raise InputError(f"a file is of another edition than {EDITION} of {KEY}")
+
+
 def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
     good, problems = [], []
-    for path in sorted((folder / CROSSINGS).glob(f"*/*/{FILES}")):
-        try:
-            decoded(path, KEY, EDITION, ["crossing_id"])
+    for path in sorted((folder / CROSSINGS).glob(f"{_PARTITIONS}/{FILES}")):
+        wrong = wrong_of_file(path)
+        if wrong is None:
             good.append(str(path))
-        except ValueError as error:
-            problems.append(f"{path}: left out: {error}")
+        else:
+            problems.append(wrong)
     return good, tuple(problems)
 
 

@@ -22,7 +22,7 @@ from schemas.topics import check_realm
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import confirm, stopped_by_signals
 from services.bus.session import open_session
-from services.common.errors import FailureError, InputError
+from services.common.errors import FailureError, InputError, one_line
 from services.drives.importing import vehicle_of
 from services.drives.ros2_messages import check_rosbags, unknown_hash
 from services.drives.ros2_truck import Accel, Ros2Truck
@@ -40,6 +40,8 @@ _AT_ONCE: Final = 50
 """Of a topic, before another one has its turn."""
 _PAUSE_S: Final = 0.005
 _TELL_EVERY_S: Final = 10.0
+_MOST_PUBLISHERS: Final = 1000
+"""Of which it is remembered what has come; beyond them it begins anew."""
 _MOST_REFUSED: Final = 100
 """Types and hashes that are told of; a stranger could make up as many as it likes."""
 
@@ -161,8 +163,8 @@ class _Hearing:
         self._truck = truck
         self._subscribers: dict[str, Any] = {}
         self._refused: set[str] = set()
-        self._latest: dict[str, tuple[bytes, int]] = {}
-        """By topic: who published last, and the number of that message."""
+        self._latest: dict[tuple[str, bytes], int] = {}
+        """By topic and publisher: the number of its last message."""
         self._heard: set[str] = set()
         self._silent: set[str] = set()
         for topic in truck.table.topics():
@@ -196,16 +198,17 @@ class _Hearing:
         of = next((one for one in self._truck.types(topic) if one.dds_name == name), None)
         if of is None:
             wanted = " or ".join(one.name for one in self._truck.types(topic))
-            self._refuse(f"{topic}: is of {name[:80]}, {wanted} is expected; refused")
+            self._refuse(f"{topic}: is of {one_line(name[:80])}, {wanted} is expected; refused")
             return []
         problem = unknown_hash(of, told_hash)
         if problem is not None:
-            self._refuse(f"{topic}: {problem}; refused")
+            self._refuse(f"{topic}: {one_line(problem)}; refused")
             return []
         self._heard.add(topic)
         if not self._is_next(topic, attachment.publisher, attachment.sequence):
             return []
-        return self._truck.take(topic, of, sample.payload.to_bytes(), attachment.sent_ns)
+        payload = sample.payload.to_bytes()
+        return self._truck.take(topic, of, payload, attachment.sent_ns, attachment.publisher)
 
     def tell_silence(self) -> None:
         """Name the topics of which nothing has come since it was asked last, once."""
@@ -223,15 +226,16 @@ class _Hearing:
     def _is_next(self, topic: str, publisher: bytes, sequence: int) -> bool:
         """Count what was lost on the way; False of what has come before."""
         complaints = self._truck.complaints
-        before = self._latest.get(topic)
-        if before is not None and before[0] == publisher:
-            if sequence <= before[1]:
-                complaints.add(topic, "messages that came again, left out")
-                return False
-            complaints.add(topic, "messages lost on the way", sequence - before[1] - 1)
-        elif before is not None:
-            complaints.add(topic, "times that another publisher went on")
-        self._latest[topic] = (publisher, sequence)
+        name = (topic, publisher)
+        before = self._latest.get(name)
+        if before is not None and sequence <= before:
+            complaints.add(topic, "messages that came again, left out")
+            return False
+        if before is not None:
+            complaints.add(topic, "messages lost on the way", sequence - before - 1)
+        elif len(self._latest) >= _MOST_PUBLISHERS:
+            self._latest.clear()
+        self._latest[name] = sequence
         return True
 
     def _refuse(self, line: str) -> None:

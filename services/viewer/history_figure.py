@@ -30,6 +30,8 @@ from services.viewer.drawing import (
 )
 
 _PANEL_IN, _TEMPERATURE_IN = 0.92, 0.75
+_MOST_CHARACTERS = 100
+"""Of what somebody noted: a line."""
 
 
 class Point(NamedTuple):
@@ -54,6 +56,8 @@ class Mark(NamedTuple):
     sentence: str
     acknowledged: str
     """By whom and when; empty while it stands."""
+    note: str = ""
+    """What they said of it."""
 
 
 class History(NamedTuple):
@@ -97,6 +101,7 @@ def history_of(past: Past) -> History:
             alarm.sentence(),
             "" if alarm.acknowledged is None else
             f"{alarm.acknowledged.by}, {_day(alarm.acknowledged.time)}",
+            "" if alarm.acknowledged is None else alarm.acknowledged.note,
         )
         for alarm in past.alarms
     )  # fmt: skip
@@ -143,12 +148,22 @@ def _heading(history: History) -> list[tuple[str, str]]:
     said = f"{many} {history.unit}{'s' if many != 1 else ''} with crossings; bars: 95 % intervals"
     lines = [(said + ", grey where no crossing was good", MUTED)]
     for mark in history.marks:
-        begin = "noted" if mark.acknowledged else "ALARM"
-        by = f" ({mark.acknowledged})" if mark.acknowledged else ""
-        lines.append((f"{begin}: {mark.sentence}{by}", _colour(mark)))
+        if not mark.acknowledged:
+            lines.append((f"ALARM: {mark.sentence}", _colour(mark)))
+            continue
+        lines.append((f"noted: {mark.sentence} ({_short(mark.acknowledged)})", INK))
+        if mark.note:
+            lines.append((f"“{_short(mark.note)}”", MUTED))
+    if any(not mark.acknowledged for mark in history.marks):
+        how = f"driveby alarm ack {history.bridge} --by NAME --note TEXT"
+        lines.append((f"Look at the bridge, then: {how}", MUTED))
     if not history.marks:
         lines.append(("no alarm: nothing has changed by more than chance", VERDICT_COLOURS["good"]))
     return lines
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _MOST_CHARACTERS else text[: _MOST_CHARACTERS - 1] + "…"
 
 
 def _colour(mark: Mark) -> str:
@@ -158,17 +173,16 @@ def _colour(mark: Mark) -> str:
 
 
 def _limits(history: History, elements: int) -> tuple[float, float]:
-    values = [
-        100.0 * value[n] / _usual(history, n)
-        for n in range(elements)
-        for point in history.points
-        if len(point.mean) > n
-        for value in (point.low, point.high)
-    ]
-    if not values:
-        return 80.0, 120.0
-    low, high = np.quantile(values, [0.01, 0.99])
-    return float(min(low, 90.0) - 4.0), float(max(high, 110.0) + 4.0)
+    """Of all panels: all estimates that are good, and all but the longest intervals."""
+    ends, middles = [], [90.0, 110.0]
+    for n in range(elements):
+        for point in (point for point in history.points if len(point.mean) > n):
+            usual = _usual(history, n)
+            ends += [100.0 * point.low[n] / usual, 100.0 * point.high[n] / usual]
+            if point.verdict == "good":
+                middles.append(100.0 * point.mean[n] / usual)
+    low, high = np.quantile(ends or middles, [0.01, 0.99])
+    return float(min(low, *middles) - 4.0), float(max(high, *middles) + 4.0)
 
 
 def _usual(history: History, n: int) -> float:
@@ -196,8 +210,9 @@ def _draw_element(axes: Axes, history: History, n: int, limits: tuple[float, flo
             since, raised = _dates([mark.since_s, mark.raised_s])
             axes.axvspan(since, raised, color=colour, alpha=0.13, linewidth=0.0)
             axes.axvline(raised, color=colour, linewidth=1.6)
+            said = "stiffer" if mark.is_stiffer else "weaker"
             axes.annotate(
-                "stiffer" if mark.is_stiffer else "weaker", (raised, limits[1]),
+                f"{said}, noted" if mark.acknowledged else said, (raised, limits[1]),
                 xytext=(4, -3), textcoords="offset points", va="top", fontsize=8.5,
                 color=colour, fontweight="bold",
             )  # fmt: skip
@@ -207,9 +222,10 @@ def _draw_element(axes: Axes, history: History, n: int, limits: tuple[float, flo
     axes.yaxis.tick_right()
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
-    axes.text(
-        0.004, 0.06, f"100 % is {usual / 1e9:.2f} GN·m²", transform=axes.transAxes,
-        fontsize=7.5, color=MUTED,
+    # Beside the panel, as points may be anywhere in it.
+    axes.annotate(
+        f"100 %:\n{usual / 1e9:#.3g} GN·m²", (0.0, 0.5), xycoords="axes fraction", xytext=(-6, -8),
+        textcoords="offset points", ha="right", va="top", fontsize=7, color=MUTED,
     )  # fmt: skip
     _over_time(axes)
 

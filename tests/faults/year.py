@@ -12,6 +12,8 @@ Crossings are drawn from the method's own statistics and not driven (tests/fleet
 """
 
 import argparse
+import contextlib
+import io
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -87,7 +89,7 @@ def year(out: Path, seed: int, weeks: int = WEEKS) -> int:
         monday_s = BEGIN_S + (week + 1) * WEEK_S
         write_atomically(found, results_json(results_of(crossings, monday_s)))
         words = ["history", "add", str(found), "--later", "--history", str(history)]
-        if cli.main([*words, "--temperature", str(station)]) != 0:
+        if not _done([*words, "--temperature", str(station)]):
             return 1
         for alarm in check(history, Settings(), monday_s).raised:
             print(f"{_day(monday_s)}  {alarm.bridge}: {alarm.sentence()}")
@@ -98,9 +100,19 @@ def year(out: Path, seed: int, weeks: int = WEEKS) -> int:
     print(f"{number} crossings of {BRIDGES} bridges by {TRUCKS} trucks in {weeks} weeks")
     for name in (WEAKENS, REPAIRED, "bridge-01"):
         words = ["history", name, "--history", str(history), "--period", "week"]
-        if cli.main([*words, "--figures", str(out / "figures")]) != 0:
+        if not _done([*words, "--figures", str(out / "figures")]):
             return 1
+        print(out / "figures" / f"{name}-history.png")
     return _judged(history)
+
+
+def _done(words: list[str]) -> bool:
+    """Run a command; what it says is told only if it fails."""
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        code = cli.main(words)
+    if code != 0:
+        print(said.getvalue(), end="")
+    return code == 0
 
 
 def _judged(history: Path) -> int:

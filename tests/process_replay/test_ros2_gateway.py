@@ -217,6 +217,7 @@ def test_what_is_not_known_is_refused_by_name_and_hash_and_nothing_ends_it(
     logger = start_logger(start, endpoint, tmp_path / "live.mcap")
     process = gateway()
     node, other = ros2.RosNode(ros.session), ros2.RosNode(ros.session, gid=bytes(16))
+    second = ros2.RosNode(ros.session, gid=bytes(reversed(range(16))))
     first_ns = 1_700_000_000_000_000_000
     stamps = [first_ns + number * 1_000_000 for number in range(2_400)]
     front = ros2.TOPICS["sprung_front"]
@@ -227,6 +228,8 @@ def test_what_is_not_known_is_refused_by_name_and_hash_and_nothing_ends_it(
         known = ros2.Ros(front, IMU, ros2.imu(stamps[0], 0.0), stamps[0])
         other.publish(known, type_hash="RIHS01_" + "0" * 64)
         other.publish(ros2.Ros(front, FIX, ros2.fix(stamps[0], 50.0, 8.0), stamps[0]))
+        nasty = FIX._replace(dds_name="x\x1b[2J\ny")
+        other.publish(ros2.Ros(front, nasty, b"", stamps[0]))
         where = f"0{front}/{IMU.dds_name}/{IMU.hash}"
         for payload, attachment in (
             (known.payload, None),
@@ -244,11 +247,16 @@ def test_what_is_not_known_is_refused_by_name_and_hash_and_nothing_ends_it(
         other.publish(known, sent_ns=stamps[0] + 3_600_000_000_000)
         for number, stamp_ns in enumerate(stamps):
             node.publish(ros2.Ros(front, IMU, ros2.imu(stamp_ns, number / 100), stamp_ns))
+            if number % 10 == 5:  # a second sensor of the same topic
+                between_ns = stamp_ns + 400_000
+                second.publish(ros2.Ros(front, IMU, ros2.imu(between_ns, 77.0), between_ns))
         heard(subscription, 2_400)
     log = ended(process)
     terminate(logger)
     assert f"{front}: {IMU.name} has the type hash RIHS01_{'0' * 64}, known is {IMU.hash}" in log
     assert f"{front}: is of {FIX.dds_name}, {IMU.name} is expected; refused" in log
+    assert f"{front}: is of x\\x1b[2J y, {IMU.name} is expected; refused\n" in log
+    assert "240 messages of a second sensor, left out" in log
     assert "4 messages left out (the first has no attachment" in log
     assert "1 stamps too far from when they were sent (the first by 3600.000 s)" in log
     assert "Traceback" not in log

@@ -17,8 +17,10 @@ from tests.unit.cli.watching import (
     NOW_NS,
     NOW_S,
     Listened,
+    a_fleet,
     a_morning,
     alarm,
+    bridge_state,
     drives,
     estimate,
     health,
@@ -222,6 +224,18 @@ def test_alarms_that_stand_come_first_on_the_page(site: Site) -> None:
         tell(watched, alarm(f"new-{number}"))
     assert "  and 7 more alarms, of which 2 stand" in drawn(watched)
     assert len(drawn(watched, 80, 24)) <= 26
+
+
+def test_a_bridge_with_an_alarm_is_among_those_that_are_shown(site: Site) -> None:
+    watched = a_fleet(site)
+    for number in range(6):
+        tell(watched, bridge_state(site, f"later-{number}"))
+    lines = drawn(watched)
+    (head,) = [n for n, line in enumerate(lines) if line.startswith("bridge ")]
+    shown = [
+        line.split()[0] for line in lines[head + 1 :] if line.startswith(("bridge-", "later-"))
+    ]
+    assert shown == ["bridge-07", "later-3", "later-4", "later-5"]
 
 
 def test_where_there_is_no_room_an_alarm_that_stands_is_kept(

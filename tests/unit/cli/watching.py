@@ -13,7 +13,7 @@ from schemas.site import Site
 from schemas.topics import Key
 from services.bus.listening import Heard
 from services.cli.watched import Watched
-from tests.unit.viewer.found import results_of, some_crossing
+from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
 NOW_NS = 1_790_000_600_000_000_000
 NOW_S = 5000.0
@@ -56,23 +56,38 @@ def drives(
     return said
 
 
-def state(crossing_id: str, which: pb.CrossingState, vehicle: str, entry: float) -> Heard:
+def state(
+    crossing_id: str,
+    which: pb.CrossingState,
+    vehicle: str,
+    entry: float,
+    bridge: str = "bridge-1",
+) -> Heard:
     entry_ns = 1_790_000_000_000_000_000 + round(entry * 1e9)
     message = pb.Crossing(
-        schema_version=1, crossing_id=crossing_id, vehicle=vehicle, bridge="bridge-1",
+        schema_version=1, crossing_id=crossing_id, vehicle=vehicle, bridge=bridge,
         direction=pb.START_TO_END, state=which, time_ns=entry_ns, entry_time_ns=entry_ns,
     )  # fmt: skip
-    return heard("bridge", "bridge-1", "crossing", message.SerializeToString())
+    return heard("bridge", bridge, "crossing", message.SerializeToString())
 
 
-def result(site: Site, name: str, vehicle: str = "truck-1", **changes: Any) -> Crossing:
+def result(
+    site: Site,
+    name: str,
+    vehicle: str = "truck-1",
+    *,
+    bridge: str = "bridge-1",
+    ratios: np.ndarray = RATIOS,
+    **changes: Any,
+) -> Crossing:
     """With priors, as method pre gives them."""
-    given = results_of(site, some_crossing(name, **changes)).crossings[0].model_dump()
+    found = results_of(site, some_crossing(name, **changes), ratios=ratios)
+    given = found.crossings[0].model_dump() | {"vehicle": vehicle, "bridge": bridge}
     nominal = site.bridges[0].nominal_flexural_rigidity_nm2[0]
     for one, value in (given["parameters"] or {}).items():
         if one.startswith("EI_"):
             value["prior"] = {"distribution": "log_normal", "location": nominal, "scale": 0.55}
-    return Crossing.model_validate({**given, "vehicle": vehicle})
+    return Crossing.model_validate(given)
 
 
 def estimate(crossing: Crossing) -> Heard:
@@ -80,28 +95,41 @@ def estimate(crossing: Crossing) -> Heard:
     return heard("bridge", crossing.bridge, "estimate", payload)
 
 
-def bridge_state(site: Site) -> Heard:
-    found = results_of(site, some_crossing("a"), used="a").bridges["bridge-1"]
-    used = ("a", "b", "c")
-    fused = found.model_copy(
-        update={
-            "verdict": "good",
-            "crossings_used": used,
-            "finding": "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, "
-            "interval 57 to 62 %. All others agree within 3 %.",
-        }
-    )
-    payload = bridge_to_protobuf("bridge-1", NOW_NS, fused).SerializeToString()
-    return heard("bridge", "bridge-1", "state", payload)
+WEAK_FINDING = (
+    "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, "
+    "interval 57 to 62 %. All others agree within 3 %."
+)
 
 
-def alarm(bridge: str = "bridge-1", *, by: str = "", raised: float = 1.7899e9) -> Heard:
-    """Element 4 has lost a tenth; acknowledged if it is said by whom."""
+def bridge_state(
+    site: Site,
+    bridge: str = "bridge-1",
+    finding: str = WEAK_FINDING,
+    *,
+    crossings: int = 3,
+    ratios: np.ndarray = RATIOS,
+) -> Heard:
+    found = results_of(site, some_crossing("a"), used="a", ratios=ratios).bridges["bridge-1"]
+    used = tuple(f"c-{n}" for n in range(crossings))
+    changes = {"verdict": "good", "crossings_used": used, "finding": finding}
+    message = bridge_to_protobuf(bridge, NOW_NS, found.model_copy(update=changes))
+    return heard("bridge", bridge, "state", message.SerializeToString())
+
+
+def alarm(
+    bridge: str = "bridge-1",
+    *,
+    by: str = "",
+    element: int = 4,
+    since: float = 1.7878e9,
+    raised: float = 1.7899e9,
+) -> Heard:
+    """An element has lost a tenth; acknowledged if it is said by whom."""
     note = Acknowledgement(by=by, time=raised + 1.0) if by else None
     found = Alarm(
-        alarm_id=f"a-{raised:.0f}", realm="live", bridge=bridge, element=4, direction="weaker",
-        since=1.7878e9, raised=raised, sum=11.0, threshold=9.3, ratio=0.9, ratio_q025=0.88,
-        ratio_q975=0.92, acknowledged=note,
+        alarm_id=f"a-{raised:.0f}", realm="live", bridge=bridge, element=element,
+        direction="weaker", since=since, raised=raised, sum=11.0, threshold=9.3, ratio=0.9,
+        ratio_q025=0.88, ratio_q975=0.92, acknowledged=note,
     )  # fmt: skip
     return heard("bridge", bridge, "alarm", encode_alarm(found, NOW_NS))
 
@@ -143,6 +171,42 @@ def a_morning(site: Site) -> Watched:
     tell(watched, state("d", pb.IDENTIFYING, "truck-1", 550.0))
     tell(watched, progress("worker", "d", "sampling", 0.45))
     tell(watched, state("e", pb.DETECTED, "truck-2", 596.0))
+    tell(watched, health("logger", rate_per_s=120.0, queue=3.0, lost=0.0, dropped=0.0))
+    tell(watched, health("worker", queue=14.0))
+    return watched
+
+
+def a_fleet(site: Site) -> Watched:
+    """Three trucks and four bridges: an alarm of one stands, that of another is acknowledged."""
+    watched = Watched()
+    drives(watched, "truck-1")
+    drives(watched, "truck-2", lag_s=0.4)
+    drives(watched, "truck-3", ago_s=300.0)
+    rng = np.random.default_rng(4)
+    quiet = "No element stands out: all agree within {} %."
+    for number, bridge in enumerate(("bridge-02", "bridge-03", "bridge-11", "bridge-07")):
+        ratios = 1.0 + 0.012 * rng.standard_normal(7)
+        is_weak = bridge == "bridge-07"
+        ratios[3] *= 0.8 if is_weak else 1.0
+        finding = quiet.format(2 + number)
+        if is_weak:
+            finding = (
+                "Element 4, 12.9 to 17.1 m: 20 % less stiff than the other elements, "
+                "interval 16 to 24 %. All others agree within 3 %."
+            )
+        of = {"bridge": bridge, "ratios": ratios}
+        who = f"truck-{number % 3 + 1}"
+        tell(watched, estimate(result(site, f"{bridge}-a", who, entry=90.0 * number, **of)))
+        crossings = 40 + 7 * number
+        tell(watched, bridge_state(site, bridge, finding, crossings=crossings, ratios=ratios))
+    rejected = {"verdict": "rejected", "reasons": ("channel_missing",), "entry": 330.0}
+    tell(watched, estimate(result(site, "c", "truck-3", bridge="bridge-03", **rejected)))
+    for which in (pb.DETECTED, pb.COMPLETE, pb.IDENTIFYING):
+        tell(watched, state("d", which, "truck-1", 550.0, "bridge-11"))
+    tell(watched, progress("worker", "d", "sampling", 0.45))
+    tell(watched, state("e", pb.DETECTED, "truck-2", 596.0, "bridge-07"))
+    tell(watched, alarm("bridge-03", by="the owner", element=2, since=1.7809e9, raised=1.783e9))
+    tell(watched, alarm("bridge-07"))
     tell(watched, health("logger", rate_per_s=120.0, queue=3.0, lost=0.0, dropped=0.0))
     tell(watched, health("worker", queue=14.0))
     return watched

@@ -91,3 +91,11 @@ def test_what_comes_twice_is_left_out_and_a_clock_that_went_back_is_followed() -
     found += positions.finish()
     assert complaints.count("/fix", "times that the clock went back") == 1
     assert len(found) == 60 + 60 - 20
+
+
+def test_velocities_that_come_twice_are_told() -> None:
+    complaints = Complaints()
+    positions = Positions("/fix", "/vel", complaints)
+    for _ in range(3):
+        positions.add_velocity(Velocity(FIRST_NS, 10.0))
+    assert complaints.count("/vel", PAST) == 2

@@ -1,12 +1,17 @@
 """`driveby import` of ROS 2: MCAP and SQLite, folders and single files, and what is wrong."""
 
+import os
+import re
 import shutil
+import sqlite3
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
+import zstandard
+from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer
 
 from schemas.site_file import site_toml
 from services.cli.main import main
@@ -231,3 +236,231 @@ def test_a_drive_that_gives_nothing_is_refused_with_what_was_wrong(
 def test_a_recording_of_ours_is_none_of_ros(complaint: Complaint, project: Path) -> None:
     line = complaint(project / "recordings" / "sample" / "crossing.mcap")
     assert "has no topic" in line or "cannot be read" in line
+
+
+def imported(source: Path, site: Path, output: Path) -> int:
+    return main(["import", str(source), "--site", str(site), "-o", str(output), "--force"])
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_compressed_recordings_are_read(
+    messages: list[ros2.Ros], site: Path, tmp_path: Path, mode: CompressionMode
+) -> None:
+    source = ros2.record(tmp_path / "bag", messages, StoragePlugin.SQLITE3, mode)
+    assert imported(source, site, tmp_path / "out.mcap") == 0
+    (run,) = signals_of_recording(tmp_path / "out.mcap")
+    assert all(series.time_ns.size == 3000 for series in run.channels.values())
+
+
+def test_a_message_that_unpacks_to_too_much_costs_only_itself(
+    messages: list[ros2.Ros], site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = ros2.record(tmp_path / "bag", messages, StoragePlugin.SQLITE3, CompressionMode.MESSAGE)
+    with sqlite3.connect(folder / "bag.db3") as rows:
+        bomb = zstandard.compress(bytes(1 << 28))
+        rows.execute("UPDATE messages SET data = ? WHERE id = 1", (bomb,))
+    assert len(bomb) < 20_000
+    assert imported(folder, site, tmp_path / "out.mcap") == 0
+    assert "1 messages left out (the first has 4097 bytes, at most 4096" in capsys.readouterr().err
+
+
+def a_chunk(compression: bytes, packed: bytes, size: int) -> bytes:
+    """An MCAP file with one chunk and no index, which says that `size` bytes come out of it."""
+    header = struct.pack("<I4sI0s", 4, b"ros2", 0, b"")
+    chunk = struct.pack("<QQQI", 0, 2**62, size, 0)
+    chunk += struct.pack(f"<I{len(compression)}sQ", len(compression), compression, len(packed))
+    records = ((1, header), (6, chunk + packed), (2, bytes(20)))
+    body = b"".join(struct.pack("<BQ", op, len(content)) + content for op, content in records)
+    return b"\x89MCAP0\r\n" + body + b"\x89MCAP0\r\n"
+
+
+@pytest.mark.parametrize("said", [1000, 1 << 40])
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_what_unpacks_to_too_much_is_refused(
+    tmp_path: Path, complaint: Complaint, compression: str, said: int
+) -> None:
+    """Whether it says that so much comes, or that little does."""
+    import lz4.frame
+
+    zeros = bytes(1 << 28)
+    packed = zstandard.compress(zeros) if compression == "zstd" else lz4.frame.compress(zeros)
+    path = tmp_path / "drive.mcap"
+    path.write_bytes(a_chunk(compression.encode(), packed, said))
+    line = complaint(path)
+    expected = "expected 1000 bytes, got 1001" if said == 1000 else f"a chunk of {said} bytes"
+    assert expected in line
+
+
+def test_a_file_that_would_fill_the_disk_is_not_unpacked(
+    messages: list[ros2.Ros], tmp_path: Path, complaint: Complaint, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = ros2.record(
+        tmp_path / "bag", messages[:100], StoragePlugin.SQLITE3, CompressionMode.FILE
+    )
+    (path,) = folder.glob("*.zstd")
+    path.write_bytes(zstandard.compress(bytes(1 << 22)))
+    free = shutil.disk_usage(tmp_path)._replace(free=1 << 20)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: free)
+    assert "unpacked it is more than half of what is free in" in complaint(folder)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE messages SET data = 1000000000000 WHERE id = 5",
+        "UPDATE messages SET data = 'text' WHERE id = 5",
+        "UPDATE messages SET timestamp = 'noon' WHERE id = 5",
+        "UPDATE messages SET timestamp = 1.5 WHERE id = 5",
+        "UPDATE topics SET name = x'00ff' WHERE id = 1",
+        "UPDATE topics SET type = 5.5 WHERE id = 1",
+        "UPDATE topics SET type_description_hash = 'RIHS01_x'",
+        "UPDATE message_definitions SET encoded_message_definition = x'ff'",
+        "UPDATE message_definitions SET encoding = 'ros9msg'",
+        "DROP TABLE schema; CREATE TABLE schema (schema_version); INSERT INTO schema VALUES ('x')",
+        "DELETE FROM topics",
+        "DROP TABLE messages",
+        "ALTER TABLE messages RENAME TO x; CREATE VIEW messages AS SELECT * FROM x",
+    ],
+)
+def test_rows_that_hold_something_else_are_refused_with_a_line(
+    messages: list[ros2.Ros], tmp_path: Path, complaint: Complaint, change: str
+) -> None:
+    folder = ros2.record(tmp_path / "bag", messages[:400], StoragePlugin.SQLITE3)
+    path = folder / "bag.db3"
+    with sqlite3.connect(path) as rows:
+        rows.executescript(change)
+    complaint(path)
+
+
+def test_how_many_messages_there_are_is_not_believed(
+    messages: list[ros2.Ros], site: Path, tmp_path: Path
+) -> None:
+    folder = ros2.record(tmp_path / "bag", messages, StoragePlugin.SQLITE3)
+    metadata = folder / "metadata.yaml"
+    lied, changed = re.subn(r"message_count: \d+", "message_count: 0", metadata.read_text())
+    assert changed >= 1 + len(ros2.TOPICS)
+    metadata.write_text(lied)
+    assert imported(folder, site, tmp_path / "out.mcap") == 0
+
+
+def test_topics_that_hold_nothing_beside_others_that_do(
+    tmp_path: Path, complaint: Complaint
+) -> None:
+    source = tmp_path / "bag"
+    with Writer(source, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        for name in ros2.TOPICS.values():
+            writer.add_connection(name, IMU.name, typestore=ros2.STORE)
+        writer.add_connection(ros2.FIX_TOPIC, FIX.name, typestore=ros2.STORE)
+        writer.add_connection(ros2.VELOCITY_TOPIC, ros2.TWIST.name, typestore=ros2.STORE)
+        camera = writer.add_connection("/camera", IMU.name, typestore=ros2.STORE)
+        writer.write(camera, FIRST_NS, ros2.imu(FIRST_NS, 0.0))
+    assert "gives no accelerations: no message of theirs is in it" in complaint(source)
+
+
+def test_a_good_hash_does_not_excuse_another_definition(
+    messages: list[ros2.Ros], tmp_path: Path, complaint: Complaint
+) -> None:
+    """The hash in metadata.yaml is right, the definition in the MCAP file is another one."""
+    source = tmp_path / "bag"
+    definition = "float64 x\n"
+    with Writer(source, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic in {message.topic: None for message in messages}:
+            of = next(message.type for message in messages if message.topic == topic)
+            if of != IMU:
+                writer.add_connection(topic, of.name, typestore=ros2.STORE)
+            else:
+                writer.add_connection(topic, of.name, msgdef=definition, rihs01=of.hash)
+    assert f"{FRONT}: {IMU.name} has the type hash RIHS01_" in complaint(source)
+
+
+def test_metadata_that_names_files_elsewhere_reads_none_of_them(
+    messages: list[ros2.Ros], tmp_path: Path, complaint: Complaint
+) -> None:
+    other = ros2.record(tmp_path / "other", messages, StoragePlugin.SQLITE3)
+    folder = ros2.record(tmp_path / "bag", messages[:100], StoragePlugin.SQLITE3)
+    metadata = folder / "metadata.yaml"
+    good = metadata.read_text()
+    assert good.count("bag.db3")
+    for elsewhere in (str(other / "other.db3"), "../other/other.db3", "..", "/", "."):
+        metadata.write_text(good.replace("bag.db3", elsewhere))
+        complaint(folder)
+
+
+def test_metadata_with_aliases_is_refused(
+    messages: list[ros2.Ros], site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ten of ten of ten …: its words would fill the memory when what is wrong with it is told."""
+    folder = ros2.record(tmp_path / "bag", messages[:100], StoragePlugin.MCAP)
+    metadata = folder / "metadata.yaml"
+    nested = ", ".join(f"&a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 10))
+    changed = metadata.read_text().replace("compression_mode: ''", "compression_mode: FILE")
+    line = f"compression_format: [&a0 [x, x], {nested}]"
+    changed, number = re.subn(r"compression_format: ''", line, changed)
+    assert number == 1
+    metadata.write_text(changed)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rosbags.rosbag2.Reader.open", lambda reader: pytest.fail("opened"))
+        assert imported(folder, site, tmp_path / "out.mcap") == 2
+    assert f"{metadata}: has aliases (*NAME)" in capsys.readouterr().err
+
+
+def test_a_pipe_in_the_folder_is_not_waited_for(
+    messages: list[ros2.Ros], site: Path, tmp_path: Path
+) -> None:
+    folder = ros2.record(tmp_path / "bag", messages[:100], StoragePlugin.SQLITE3)
+    (folder / "bag.db3").unlink()
+    os.mkfifo(folder / "bag.db3")
+    with pytest.MonkeyPatch.context() as patch:
+        # Opening it would wait for a writer for ever.
+        patch.setattr("rosbags.rosbag2.Reader.open", lambda reader: pytest.fail("opened"))
+        assert imported(folder, site, tmp_path / "out.mcap") == 2
+
+
+def test_a_name_under_which_another_file_would_be_opened_is_refused(
+    messages: list[ros2.Ros], tmp_path: Path, site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = ros2.record(tmp_path / "bag", messages, StoragePlugin.SQLITE3)
+    shutil.copy(folder / "bag.db3", tmp_path / "a")
+    (tmp_path / "a?b.db3").write_bytes(b"something else")
+    assert imported(tmp_path / "a?b.db3", site, tmp_path / "out.mcap") == 2
+    assert "as there is a ?, # or % in its path" in capsys.readouterr().err
+
+
+def test_messages_that_are_not_in_the_file_yet_are_told(
+    messages: list[ros2.Ros], tmp_path: Path, complaint: Complaint
+) -> None:
+    """As a recorder leaves it that was killed: what came last is in the log beside the file."""
+    folder = ros2.record(tmp_path / "bag", messages, StoragePlugin.SQLITE3)
+    path = folder / "bag.db3"
+    rows = sqlite3.connect(path)
+    rows.execute("PRAGMA journal_mode = WAL")
+    rows.execute("UPDATE messages SET timestamp = timestamp + 1")
+    rows.commit()
+    shutil.copytree(folder, tmp_path / "killed")
+    rows.close()
+    killed = tmp_path / "killed/bag.db3"
+    assert (tmp_path / "killed/bag.db3-wal").stat().st_size
+    assert "its last messages are in bag.db3-wal beside it" in complaint(killed)
+
+
+def test_names_that_a_terminal_would_obey_are_shown(
+    messages: list[ros2.Ros], tmp_path: Path, complaint: Complaint
+) -> None:
+    folder = ros2.record(tmp_path / "bag", messages[:100], StoragePlugin.SQLITE3)
+    path = folder / "bag.db3"
+    with sqlite3.connect(path) as rows:
+        rows.execute("UPDATE topics SET name = '/x' || char(27) || '[2J' || char(10) || '/y'")
+    line = complaint(path)
+    assert "it has /x\\x1b[2J /y" in line
+
+
+def test_what_is_imported_is_never_written_over(
+    messages: list[ros2.Ros], site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = ros2.record(tmp_path / "bag", messages, StoragePlugin.MCAP)
+    path = folder / "bag.mcap"
+    before = path.read_bytes()
+    for source in (path, folder):
+        assert imported(source, site, path) == 2
+        assert "is what is to be imported" in capsys.readouterr().err
+    assert path.read_bytes() == before

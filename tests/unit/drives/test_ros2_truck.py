@@ -76,6 +76,52 @@ def test_messages_of_another_frame_and_without_accelerometer_are_left_out() -> N
     assert of.complaints.count(FRONT, "messages that say they have no acceleration, left out") == 20
 
 
+def test_a_topic_is_one_sensor_s() -> None:
+    """Two of one topic, told apart by who publishes or by their frames: the first is heard."""
+    for publishers, frames in (((b"one", b"two"), ("a", "a")), ((b"", b""), ("a", "b"))):
+        of = truck()
+        found: list[Accel | GnssFix] = []
+        for number in range(3000):
+            at = FIRST_NS + number * 1_000_000
+            for which in (0, 1):
+                stamp_ns = at + which * 300_000
+                payload = ros2.imu(stamp_ns, float(which), frames[which])
+                found += of.take(FRONT, IMU, payload, stamp_ns, publishers[which])
+        found += of.finish()
+        batches = [one.channels["sprung_front"] for one in found if isinstance(one, Accel)]
+        assert {batch.rate_hz for batch in batches} == {1000.0}
+        samples = np.concatenate([batch.samples for batch in batches])
+        np.testing.assert_allclose(samples, np.zeros(3000), atol=4e-15)
+        assert of.complaints.count(FRONT, "messages of a second sensor, left out") == 3000
+
+
+def test_a_sensor_that_was_started_anew_goes_on() -> None:
+    of = truck()
+    found: list[Accel | GnssFix] = []
+    for publisher, frame, begin in ((b"one", "a", 0), (b"two", "a", 4000), (b"two", "b", 8000)):
+        for number in range(begin, begin + 2500):
+            stamp_ns = FIRST_NS + number * 1_000_000
+            found += of.take(FRONT, IMU, ros2.imu(stamp_ns, 1.0, frame), stamp_ns, publisher)
+    found += of.finish()
+    batches = [one.channels["sprung_front"] for one in found if isinstance(one, Accel)]
+    assert sum(batch.samples.size for batch in batches) == 7500
+    assert of.complaints.count(FRONT, "times that another sensor went on") == 2
+
+
+def test_a_clock_that_was_ahead_at_first_does_not_stop_the_truck_s_own() -> None:
+    """Set back by an hour, as by NTP: times on the truck's own clock still ascend."""
+    of = truck()
+    found: list[Accel | GnssFix] = []
+    for ahead_s, count in ((3600, 3000), (0, 5000)):
+        for number in range(count):
+            stamp_ns = FIRST_NS + ahead_s * 10**9 + number * 1_000_000
+            found += of.take(FRONT, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns)
+    found += of.finish()
+    times = [one.device_time_ns for one in found if isinstance(one, Accel)]
+    assert times == sorted(set(times))
+    assert len(times) == 30 + 40  # a second of the new time has shown that it is one
+
+
 def test_stamps_must_be_near_the_time_of_sending() -> None:
     of = truck()
     payload = ros2.imu(FIRST_NS, 0.0)

@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+import zstandard
 
 from schemas.results import Header
+from schemas.results import results as results_file
 from services.common.errors import InputError
 from services.common.parquet_files import Most, encoded
 from services.execution import kept as kept_module
@@ -73,6 +76,29 @@ def test_a_result_that_cannot_be_read_is_a_line_and_no_result(tmp_path: Path) ->
     assert kept.result(first.content) is None
     assert len(kept.problems) == 1
     assert f"{path}: row 1: left out" in kept.problems[0]
+
+
+@pytest.mark.parametrize("change", [{"header": None}, {"header": b"x"}, {"result": None}])
+def test_what_others_cannot_read_is_no_result_either(
+    tmp_path: Path, change: dict[str, object]
+) -> None:
+    """Else it would be known from before for ever, and never be in a history."""
+    first, second = results(2)
+    path = Kept(tmp_path).put([first, second], HEADER)
+    assert path is not None
+    told = pq.read_table(path).to_pylist()
+    told[1] |= change
+    path.write_bytes(encoded(pa.Table.from_pylist(told), kept_module.KEY, kept_module.EDITION))
+    kept, problems = Kept(tmp_path), list[str]()
+    assert kept.result(first.content) == first.crossing
+    assert kept.result(second.content) is None
+    assert len(kept.problems) == 1
+    assert f"{path}: row 2: left out: " in kept.problems[0]
+    found = [c for some in kept_results(tmp_path, problems.append) for c in some.crossings]
+    assert found == [first.crossing]
+    assert kept.problems[0] in problems
+    kept.put([second], HEADER)
+    assert Kept(tmp_path).result(second.content) == second.crossing
 
 
 def test_what_a_writer_that_was_killed_has_left_is_no_file(tmp_path: Path) -> None:
@@ -153,7 +179,12 @@ def test_what_says_that_it_is_huge_is_a_line(
     """A result of 2⁴⁰ bytes in twenty; more rows than there may be."""
     # The header of a frame: magic, what follows, the window, the size.
     frame = struct.pack("<IBBQ", 0xFD2FB528, 0b1100_0000, 0, 1 << 40)
-    content = foreign(content=["a"], result=pa.array([frame], pa.binary()))
+    head = zstandard.compress(results_file(HEADER, [], {}).model_dump_json().encode())
+    content = foreign(
+        content=["a"],
+        header=pa.array([head], pa.binary()),
+        result=pa.array([frame], pa.binary()),
+    )
     (tmp_path / "bomb.parquet").write_bytes(content)
     kept = Kept(tmp_path)
     assert kept.result("a") is None

@@ -3,7 +3,6 @@
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from schemas.alarms import Alarm, alarm_of, encode_alarm
@@ -15,7 +14,7 @@ from services.history import alarms
 from services.history.alarm_files import acknowledge, alarms_of, standing
 from services.history.alarms import Settings, check
 from services.history.archive import add_results
-from tests.fleet import WEEK_S, bridge_of, crossing_of, results_of, templates, trucks_of
+from tests.fleet import WEEK_S, losses_of
 
 BEGIN_S = datetime(2025, 1, 6, tzinfo=UTC).timestamp()  # a Monday
 WEEKS = 24
@@ -27,19 +26,8 @@ AFTER_S = BEGIN_S + WEEKS * WEEK_S
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One bridge that is sound, one that loses a fifth of element 4 in week 14."""
     folder = tmp_path_factory.mktemp("history")
-    rng = np.random.default_rng(2)
-    trucks, kinds, some = trucks_of(rng, 2), templates(), []
-    for name in ("bridge-1", "bridge-2"):
-        bridge = bridge_of(rng, name)
-        for week in range(WEEKS):
-            ei = bridge.ei_nm2.copy()
-            ei[3] *= 0.8 if week >= LOSES_AT and name == "bridge-2" else 1.0
-            for day in (1, 4):
-                entry_s = BEGIN_S + week * WEEK_S + day * 86_400.0
-                truck, kind = trucks[int(rng.integers(2))], kinds[int(rng.integers(3))]
-                some.append(crossing_of(rng, kind, truck, bridge, entry_s, ei))
-    temperatures = {one.crossing_id: 10.0 for one in some}
-    add_results(folder, results_of(some, AFTER_S), temperatures)
+    found = losses_of({"bridge-1": None, "bridge-2": LOSES_AT}, BEGIN_S, WEEKS)
+    add_results(folder, found, {one.crossing_id: 10.0 for one in found.crossings})
     return folder
 
 
@@ -158,10 +146,16 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     assert capsys.readouterr().out == "no alarms\n"
     assert cli.main(["alarm", "check", *there]) == 0
     said = capsys.readouterr().out
-    assert said.startswith("2 bridges looked at, 1 new alarms\nalarm 2025")
+    assert said.startswith("2 bridges looked at, 1 new alarm\nalarm 2025")
     assert "-4-weaker of bridge-2, raised 2025-" in said
+    how = "look at the bridge, then: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
+    assert said.endswith(how)
+    assert cli.main(["alarm", "list", *there]) == 0
+    assert capsys.readouterr().out.endswith(how)
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", "--note", "props", *there]) == 0
     assert "acknowledged by owner on" in capsys.readouterr().out
+    assert cli.main(["alarm", "list", *there]) == 0
+    assert how not in capsys.readouterr().out
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 2
     assert capsys.readouterr().err == f"driveby: {history}: no alarm of bridge-2 stands\n"
     assert cli.main(["alarm", "ack", "bridge-2", *there]) == 2
@@ -169,3 +163,92 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     assert cli.main(["alarm", "check", "bridge-2", *there]) == 2
     assert cli.main(["history", "bridge-2", "--figures", str(tmp_path / "f"), *there]) == 0
     assert "props; element 4 is" in capsys.readouterr().out
+
+
+def test_what_was_noted_while_nobody_told_is_told_at_the_start(history: Path) -> None:
+    """Who heard the alarm stand shows it until it hears that somebody took note of it."""
+    (alarm,) = check(history, Settings(), AFTER_S).standing
+    acknowledge(history, alarm, "owner", "", AFTER_S)
+    told: list[tuple[str, bool]] = []
+
+    def put(alarm: Alarm, payload: bytes) -> None:
+        told.append((alarm.bridge, alarm.acknowledged is not None))
+
+    month_s = 30 * 86_400.0
+    Teller(put).tell(history, round((AFTER_S + month_s - 60.0) * 1e9))
+    assert told == [("bridge-2", True)]
+    Teller(put).tell(history, round((AFTER_S + month_s + 60.0) * 1e9))
+    assert told == [("bridge-2", True)]
+
+
+def test_an_acknowledgement_that_is_damaged_can_be_given_again(
+    history: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (alarm,) = check(history, Settings(), AFTER_S).standing
+    damaged = history / f"alarms/realm=sim-fleet/bridge=bridge-2/{alarm.alarm_id}.ack.json"
+    damaged.write_text("{")
+    words = ["alarm", "ack", "bridge-2", "--by", "owner", "--history", str(history)]
+    assert cli.main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{damaged}: not an acknowledgement: " in line
+    assert line.endswith("; move that file away and acknowledge again")
+    damaged.rename(damaged.with_suffix(".damaged"))
+    assert cli.main(words) == 0
+    assert standing(history) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("said", "line"),
+    [
+        (["--by", "x" * 201], "--by: String should have at most 200 characters"),
+        (["--by", "owner", "--note", "x" * 1001], "--note: String should have at most 1000"),
+        (["--by", "\n"], "--by: String should have at least 1 character"),
+    ],
+)
+def test_what_is_too_long_to_be_said_gets_a_line(
+    history: Path, capsys: pytest.CaptureFixture[str], said: list[str], line: str
+) -> None:
+    check(history, Settings(), AFTER_S)
+    assert cli.main(["alarm", "ack", "bridge-2", *said, "--history", str(history)]) == 2
+    assert capsys.readouterr().err.startswith(f"driveby: {line}")
+    assert len(standing(history)[0]) == 1
+
+
+def test_a_note_is_one_line_and_nothing_that_a_terminal_obeys(
+    history: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    check(history, Settings(), AFTER_S)
+    words = ["alarm", "ack", "bridge-2", "--by", "an\nowner", "--note", "one\x1b[2J\ntwo"]
+    assert cli.main([*words, "--history", str(history)]) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "acknowledged by an owner on" in line
+    assert "one\\x1b[2J two; element 4" in line
+
+
+def test_an_alarm_in_another_place_than_its_own_gets_a_line(history: Path) -> None:
+    (alarm,) = check(history, Settings(), AFTER_S).standing
+    path = history / f"alarms/realm=sim-fleet/bridge=bridge-2/{alarm.alarm_id}.json"
+    copy = path.with_name("copy.json")
+    copy.write_bytes(path.read_bytes())
+    elsewhere = history / f"alarms/realm=live/bridge=bridge-2/{alarm.alarm_id}.json"
+    elsewhere.parent.mkdir(parents=True)
+    elsewhere.write_bytes(path.read_bytes())
+    found, problems = standing(history)
+    assert found == [alarm]
+    for wrong in (copy, elsewhere):
+        said = f"{wrong}: is alarm {alarm.alarm_id} of bridge-2 in realm sim-fleet, which"
+        assert any(line.startswith(said) for line in problems)
+
+
+def test_an_alarm_stands_though_its_crossings_are_gone(
+    history: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    check(history, Settings(), AFTER_S)
+    (history / "crossings").unlink()
+    there = ["--history", str(history)]
+    assert cli.main(["alarm", "list", *there]) == 0
+    assert "of bridge-2, raised" in capsys.readouterr().out
+    assert cli.main(["alarm", "check", "--all", *there]) == 0
+    assert "stands; element 4" in capsys.readouterr().out
+    assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 0
+    assert standing(history) == ([], [])

@@ -6,11 +6,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+import zstandard
 
 from schemas.results import Crossing, Results, results_json
 from services.cli import main as cli
 from services.common.errors import InputError
+from services.common.parquet_files import encoded
 from services.history import archive
 from services.history.archive import (
     add_results,
@@ -296,3 +300,127 @@ def test_what_a_killed_writer_left_is_no_damage(tmp_path: Path) -> None:
     read = read_partition(where(tmp_path))
     assert (len(read.crossings), read.problems) == (3, ())
     assert ask(tmp_path, "SELECT count(*) FROM crossings").rows == ((3,),)
+
+
+def rewritten(path: Path, row: int, change: dict[str, object]) -> None:
+    """Another value in a row; where it is of another kind, in all of the column."""
+    told = pq.read_table(path).to_pylist()
+    for name, value in change.items():
+        is_alike = value is None or type(value) is type(told[row][name])
+        for number, one in enumerate(told):
+            if number == row:
+                one[name] = value
+            elif not is_alike:
+                one[name] = type(value)()
+    path.write_bytes(encoded(pa.Table.from_pylist(told), archive.KEY, archive.EDITION))
+
+
+BAD_ROWS: list[dict[str, object]] = [
+    {"crossing_id": None},
+    {"crossing_id": 5},
+    {"vehicle": None},
+    {"direction": "sideways"},
+    {"entry_s": None},
+    {"entry_s": float("nan")},
+    {"entry_s": 1e300},
+    {"entry_s": -5.0},
+    {"entry_s": "noon"},
+    {"exit_s": float("inf")},
+    {"speed_m_per_s": None},
+    {"verdict": "splendid"},
+    {"reasons": "none"},
+    {"chi2_per_dof": float("nan")},
+    {"temperature_deg_c": "warm"},
+    {"temperature_deg_c": float("inf")},
+    {"created_s": None},
+    {"site_hash": None},
+    {"search_hash": None},
+    {"version": None},
+    {"content": None},
+    {"ei_mean_nm2": None},
+    {"ei_std_nm2": [1.0]},
+    {"ei_q025_nm2": [float("nan")] * 7},
+    {"ei_q975_nm2": "stiff"},
+    {"likelihood": b"no zstd"},
+    {"likelihood": "text"},
+    {"likelihood": zstandard.compress(b"{}")},
+    {"observation": b"nothing"},
+    {"observation": 5},
+]
+
+
+@pytest.mark.parametrize("change", BAD_ROWS, ids=str)
+def test_bad_rows_get_a_line_and_the_others_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict[str, object]
+) -> None:
+    some = crossings(4)
+    history, found = tmp_path / "history", tmp_path / "r.json"
+    found.write_text(results_json(some))
+    there = ["--history", str(history)]
+    assert cli.main(["history", "add", str(found), "--later", *there]) == 0
+    (path,) = files(history)
+    rewritten(path, 1, change)
+    before = path.read_bytes()
+    capsys.readouterr()
+    name = some.crossings[1].crossing_id
+    lines: list[str] = []
+    for words in (["history", "bridge-1"], ["history"], ["alarm", "check", "--all"]):
+        assert cli.main([*words, *there]) in (0, 2)
+        said = capsys.readouterr()
+        assert "internal error" not in said.err
+        lost = [one for one in (said.out + said.err).splitlines() if "left out" in one]
+        assert len(lost) <= 1
+        assert all(one.startswith((f"{path}: ", f"{name}: ")) for one in lost)
+        lines += lost
+    assert lines
+    assert cli.main(["history", "add", str(found), *there]) in (0, 3)
+    assert "internal error" not in capsys.readouterr().err
+    assert path.read_bytes() == before
+    # What can be read of the two files together is all that there was.
+    assert len(read_partition(where(history), ("likelihood", "observation")).crossings) == 4
+
+
+def test_what_is_lost_is_written_beside_the_damaged_file_that_has_its_name(tmp_path: Path) -> None:
+    """The same rows make the same name: else nothing would be written, and it was lost."""
+    some = crossings(3)
+    add_results(tmp_path, some)
+    (path,) = files(tmp_path)
+    torn = path.read_bytes()[:-100]
+    path.write_bytes(torn)
+    for count in (3, 0):
+        assert add_results(tmp_path, some) == (count, 3 - count, ("bridge-1",) if count else ())
+        read = read_partition(where(tmp_path))
+        assert len(read.crossings) == 3
+        assert len(read.problems) == 1
+    assert path.read_bytes() == torn
+    assert len(files(tmp_path)) == 2
+
+
+def test_questions_leave_out_another_edition_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    some = crossings(3)
+    add_results(tmp_path, some.model_copy(update={"crossings": some.crossings[:2]}))
+    with monkeypatch.context() as patch:
+        patch.setattr(archive, "EDITION", "2")
+        add_results(tmp_path, some.model_copy(update={"crossings": some.crossings[2:]}))
+    assert cli.main(["history", "--history", str(tmp_path)]) == 0
+    line, _, row = capsys.readouterr().out.splitlines()
+    assert "left out: is of edition 2 of driveby.history, this program knows 1" in line
+    assert row.split()[:3] == ["sim-fleet", "bridge-1", "2"]
+
+
+def test_a_time_that_is_none_is_not_added(tmp_path: Path) -> None:
+    some = crossings(2)
+    bad = some.crossings[1].model_copy(update={"entry_time": 1e18})
+    with pytest.raises(InputError, match=r"1e\+18 is no time of a crossing"):
+        add_results(tmp_path, some.model_copy(update={"crossings": (some.crossings[0], bad)}))
+    assert files(tmp_path) == []
+
+
+def test_adding_again_without_temperatures_takes_none_away(tmp_path: Path) -> None:
+    some = crossings(8)
+    add_results(tmp_path, some, {one.crossing_id: 7.0 for one in some.crossings})
+    add_results(tmp_path, some)
+    kept = read_partition(where(tmp_path)).crossings
+    assert [one.temperature_deg_c for one in kept] == [7.0] * 8

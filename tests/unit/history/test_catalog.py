@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from schemas.signals import AccelBatch, Channel, GnssFix, encode_accel, encode_gnss
@@ -15,6 +17,7 @@ from schemas.site_file import load_site
 from schemas.topics import Key
 from services.cli import main as cli
 from services.common.errors import InputError
+from services.common.parquet_files import encoded
 from services.common.stores import folder_at, put
 from services.drives.survey import survey
 from services.history import catalog
@@ -251,6 +254,55 @@ def test_files_that_are_no_rows_get_a_line_and_stay(fleet: Path) -> None:
     assert "torn.parquet: left out: is no file of driveby.catalog" in cut
     assert torn.exists()
     assert other.exists()
+
+
+def test_rows_of_a_damaged_file_are_written_again_beside_it(fleet: Path) -> None:
+    """They would have the same name; else all recordings were read anew each time."""
+    folder = folder_at(str(fleet))
+    truth = mend(folder).rows
+    (file,) = (fleet / CATALOG).rglob("*.parquet")
+    file.write_bytes(file.read_bytes()[:-40])
+    assert mend(folder).added == 3
+    (problem,) = mend(folder).problems
+    assert f"{file}: left out" in problem
+    assert mend(folder)[:2] == (truth, 0)
+    assert len(list((fleet / CATALOG).rglob("*.parquet"))) == 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"path": None},
+        {"first_ns": "noon"},
+        {"first_ns": -1},
+        {"first_ns": 2**62},
+        {"size_bytes": None},
+        {"content": None},
+        {"south_deg": float("nan")},
+        {"west_deg": None},
+        {"details": None},
+        {"details": "{"},
+        {"details": "[]"},
+        {"details": '{"realms": 5}'},
+    ],
+)
+def test_rows_that_hold_something_else_get_a_line_and_are_made_anew(
+    fleet: Path, change: dict[str, object], capsys: pytest.CaptureFixture[str], project: Path
+) -> None:
+    folder = folder_at(str(fleet))
+    truth = mend(folder).rows
+    (file,) = (fleet / CATALOG).rglob("*.parquet")
+    told = pq.read_table(file).to_pylist()
+    told[1] |= change
+    for row in told:
+        row |= {name: str(row[name]) for name in change if isinstance(told[1][name], str)}
+    file.write_bytes(encoded(pa.Table.from_pylist(told), catalog._KEY, catalog.EDITION))
+    site = str(project / "docs/site.example.toml")
+    assert cli.main(["catalog", str(fleet), "--site", site]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert sum(f"{file}: left out: " in line for line in said.out.splitlines()) == 1
+    assert stored(folder).rows == truth
 
 
 def test_a_recording_that_is_not_closed_is_named(fleet: Path) -> None:

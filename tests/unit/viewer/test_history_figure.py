@@ -1,0 +1,61 @@
+"""The picture of a bridge's past: what is in its panels, and what its head says."""
+
+import matplotlib
+import numpy as np
+
+from services.viewer.drawing import STYLE
+from services.viewer.history_figure import History, Mark, Point, draw_history
+
+WEEK_S = 7 * 86_400.0
+BEGIN_S = 1.7364e9
+
+
+def weeks(*ratios: float) -> tuple[Point, ...]:
+    """Of two elements; that of the second one is given, the other stays."""
+    return tuple(
+        Point(
+            BEGIN_S + number * WEEK_S,
+            (16e9, 16e9 * ratio),
+            (15.5e9, 15.5e9 * ratio),
+            (16.5e9, 16.5e9 * ratio),
+            "good",
+            None,
+        )
+        for number, ratio in enumerate(ratios)
+    )
+
+
+def mark(acknowledged: str = "", note: str = "") -> Mark:
+    since_s = BEGIN_S + 150 * WEEK_S
+    return Mark(2, False, since_s, since_s + 3 * WEEK_S, "element 2 is weaker", acknowledged, note)
+
+
+def drawn(history: History) -> matplotlib.figure.Figure:
+    with matplotlib.rc_context(STYLE):
+        return draw_history(history)
+
+
+def test_the_newest_estimate_is_in_its_panel_however_few_are_like_it() -> None:
+    """A loss of a third in the last of three years' weeks, which is less than one in a hundred."""
+    figure = drawn(History("bridge-1", "week", weeks(*[1.0] * 150, 0.66), ()))
+    _, second = figure.axes[:2]
+    (points,) = [line for line in second.lines if line.get_marker() == "o"]
+    low, high = second.get_ylim()
+    shown = np.asarray(points.get_ydata(), dtype=float)
+    assert shown.min() < 67.0
+    assert low < shown.min() < shown.max() < high
+
+
+def test_the_head_says_what_to_do_while_an_alarm_stands() -> None:
+    points = weeks(*[1.0] * 150, 0.9, 0.9, 0.9)
+    said = [text.get_text() for text in drawn(History("b-1", "week", points, (mark(),))).texts]
+    assert "ALARM: element 2 is weaker" in said
+    assert "Look at the bridge, then: driveby alarm ack b-1 --by NAME --note TEXT" in said
+    noted = mark("the owner, 2025-06-23", "props were put in")
+    said = [text.get_text() for text in drawn(History("b-1", "week", points, (noted,))).texts]
+    assert "noted: element 2 is weaker (the owner, 2025-06-23)" in said
+    assert "“props were put in”" in said
+    assert not any("driveby" in text for text in said)
+    long = mark("the owner, 2025-06-23", "x" * 500)
+    said = [text.get_text() for text in drawn(History("b-1", "week", points, (long,))).texts]
+    assert max(map(len, said)) < 110
