@@ -351,7 +351,7 @@ def checked(
         running = begin(*of(recordings, *on(held.cluster, into, "--json", str(path))), **env)
         in_the_middle(running, into)
         do(running)
-        held.file.unlink()
+        held.file.unlink(missing_ok=True)
         assert running.wait() == 0, running.said()
         assert results_of(path) == of_one_process
         assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
@@ -389,10 +389,33 @@ def test_a_worker_that_is_frozen_and_goes_on_leaves_what_was_its_own_to_others(
             os.kill(before[-1], signal.SIGSTOP)
             until(lambda: threads_of(one.cluster.address, None) == 1)
             os.kill(before[-1], signal.SIGCONT)
+            one.file.unlink()  # it ends when its batch has
             until(lambda: len(one.cluster.pids("worker 1")) > len(before))
 
         said = checked(one, freeze)
     assert "the scheduler at " not in said, said
+
+
+@pytest.mark.faults
+def test_who_comes_while_a_worker_is_frozen_asks_again(
+    begin: Callable[..., Running],
+    recordings: list[Path],
+    tmp_path: Path,
+    of_one_process: dict[str, Any],
+) -> None:
+    """All workers are asked what they are, until all answer, or the scheduler gives one up."""
+    into, path = tmp_path / "into", tmp_path / "found.json"
+    with holding(tmp_path, DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL="600s") as one:
+        (worker,) = one.cluster.pids("worker 1")
+        os.kill(worker, signal.SIGSTOP)
+        options = on(one.cluster, into, "--json", str(path))
+        running = begin(*of(recordings, *options), DRIVEBY_TEST_CALL_S="2")
+        told = "could not ask for its workers' versions"
+        until(lambda: told in running.said() or running.process.poll() is not None)
+        os.kill(worker, signal.SIGCONT)
+        assert running.wait() == 0, running.said()
+    assert told in running.said()
+    assert results_of(path) == of_one_process
 
 
 @pytest.mark.faults
