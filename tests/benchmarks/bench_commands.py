@@ -88,8 +88,8 @@ marks = [("", time.perf_counter(), peak_bytes())]
 def mark(what):
     marks.append((what, time.perf_counter(), peak_bytes()))
 
-import google.protobuf.message, mcap.records, numba, numpy, pydantic, scipy.linalg, scipy.special
-import zstandard
+import pre_core  # numba and NumPy, and what of NumPy is put off before SciPy comes
+import google.protobuf.message, mcap.records, pydantic, scipy.linalg, scipy.special, zstandard
 mark("libraries imported: numba, SciPy, NumPy, pydantic, protobuf")
 from schemas.settings import IdentificationSettings
 from services.execution.offline import identify_recordings, site_of

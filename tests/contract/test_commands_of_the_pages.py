@@ -143,7 +143,7 @@ NOT_RUN = {
     "python tests/numerics/table.py": LONG,
     "python docs/scripts/reproduction.py frequencies": LONG,
     "python -m pytest -m slow tests/unit/validation/test_validation.py": LONG,
-    "python -m tests.verdicts.both_ways --records build/both_ways.jsonl": LONG,
+    "python -m tests.verdicts.both_ways --worlds 8 --records build/both_ways.jsonl": LONG,
     "python -m tests.verdicts.measure": LONG,
     "python -m tests.verdicts.measure signals 300": LONG,
     "python -m tests.verdicts.measure sound 14": LONG,

@@ -1,6 +1,6 @@
 """Weighted draws and chains on the same crossings, side by side.
 
-    python -m tests.verdicts.both_ways --records build/both_ways.jsonl
+    python -m tests.verdicts.both_ways --worlds 8 --records build/both_ways.jsonl
 
 Crossings drawn from the priors, and of each effect that `driveby validate --method pre` has, but
 those on roads that differ: there draws come neither by weights nor by chains. Each is identified as
