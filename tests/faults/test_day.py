@@ -35,7 +35,9 @@ def test_killed_five_times_and_away_for_longer_than_a_history(tmp_path: Path) ->
     told = live(tmp_path, rounds=3, bridges=9, speed=8.0, kills=5, away_s=600.0, seed=2)
     assert told.problems == []
     assert told.crossings == told.results == 108
-    assert told.shown == told.to_show >= 84  # by which eight of the ten bridges it draws
+    # It draws the first eight of twelve bridges that a truck comes near: two of these nobody
+    # crosses, and two half as often as the others.
+    assert told.shown == told.to_show >= 60
 
 
 def test_the_day_sees_what_is_missing_twice_or_invented() -> None:
