@@ -28,6 +28,7 @@ Longer than other modules: filter, levels of noise and covariance are all made o
 above, which stand once.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -338,6 +339,17 @@ def _folded(rows: RowFilter, count: int) -> _Folded:
     return _Folded(below, above, power_below, power_above)
 
 
+def _folded_spectrum(
+    at: _Folded, truck: Truck, density: FloatArray, force: FloatArray, road: Mismatch | None
+) -> NDArray[np.complex128]:
+    """Spectra of the rows (f, 3, 3), with what folds on to them."""
+    both = np.concatenate([at.below, at.above])
+    power = np.concatenate([at.power_below, at.power_above])
+    whole = _spectrum(truck, density, force, road, both) * power
+    low, high = np.split(whole, 2, axis=2)
+    return np.moveaxis(low + high.conj(), 2, 0)
+
+
 def noise_power(
     rows: RowFilter,
     trucks: list[Truck],
@@ -352,16 +364,11 @@ def noise_power(
     of an endless record, folded at half the rate of the rows.
     """
     at = _folded(rows, _FEW_FREQUENCIES)
-    both = np.concatenate([at.below, at.above])
-    power = np.concatenate([at.power_below, at.power_above])
-
-    def folded(truck: int) -> NDArray[np.complex128]:
-        whole = _spectrum(trucks[truck], density[truck], force, road, both) * power
-        low, high = np.split(whole, 2, axis=2)
-        return np.moveaxis(low + high.conj(), 2, 0)
-
-    first = np.linalg.inv(folded(0))
-    traces = [np.einsum("fij,fji->", first, folded(1 + k)).real for k in which]
+    folded = partial(_folded_spectrum, at, force=force, road=road)
+    first = np.linalg.inv(folded(trucks[0], density[0]))
+    traces = [
+        np.einsum("fij,fji->", first, folded(trucks[1 + k], density[1 + k])).real for k in which
+    ]
     return np.asarray(traces) / _FEW_FREQUENCIES - RESIDUALS
 
 
@@ -408,9 +415,7 @@ def mismatch_power(
             out[number, 2] = of_front * turn * e[3, 0] + of_rear * e[3, 1]
         return out
 
-    low = _spectrum(trucks[0], density, force, road, at.below) * at.power_below
-    high = _spectrum(trucks[0], density, force, road, at.above) * at.power_above
-    weight = np.linalg.inv(np.moveaxis(low + high.conj(), 2, 0))[:, 0]
+    weight = np.linalg.inv(_folded_spectrum(at, trucks[0], density, force, road))[:, 0]
     both = crossed(at.below, at.power_below) + crossed(at.above, at.power_above).conj()
     return np.einsum("fl,wlf->w", weight, both).real / _MANY_FREQUENCIES
 
