@@ -105,6 +105,17 @@ SCALARS: Final = (
         may_be_absent=True,
         in_paper=False,
     ),
+    Unknown(
+        "torsion",
+        "1/N",
+        BRIDGE,
+        "torsional_flexibility_per_n",
+        0,
+        -1,
+        may_be_zero=True,
+        may_be_absent=True,
+        in_paper=False,
+    ),
 )
 """All but EI, in the order of theta."""
 ELEMENT: Final = Unknown("EI", "N·m²", BRIDGE, "flexural_rigidity_nm2", 0, 1)
@@ -133,6 +144,7 @@ ALPHA: Final = place("alpha")
 BETA: Final = place("beta")
 K_ROT: Final = place("k_rot_start")
 F: Final = place("f_start")
+TORSION: Final = place("torsion")
 FIRST_OF_BRIDGE: Final = RHO_A
 EI_1: Final = len(SCALARS)
 

@@ -87,6 +87,8 @@ class Derived(_Fields):
     """That a rotational spring is at the support at all; None from methods that know of none."""
     probability_giving: AtEnds | None = None
     """That the bearing gives under load at all."""
+    probability_torsion: Annotated[Finite, Field(ge=0, le=1)] | None = None
+    """That the deck twists under the truck at all."""
     springs_believed: Annotated[Finite, Field(ge=0, le=1)] | None = None
     """How much of what the body's motion says through the truck's springs was believed: 1 if they
     are as linear as the sensors can tell, near 0 where they rub."""

@@ -71,6 +71,8 @@ def crossing_to_protobuf(crossing: Crossing, header: Header) -> pb.Estimate:
             if ends is not None:
                 getattr(message.derived, name).start = ends.start
                 getattr(message.derived, name).end = ends.end
+        if crossing.derived.probability_torsion is not None:
+            message.derived.probability_torsion = crossing.derived.probability_torsion
         if crossing.derived.springs_believed is not None:
             message.derived.springs_believed = crossing.derived.springs_believed
         level, thirds = crossing.derived.ei_level, crossing.derived.ei_thirds
@@ -343,6 +345,7 @@ def _derived(message: pb.Derived) -> dict[str, object]:
         "max_deflection_m": _parameter(message.max_deflection_m),
         "probability_sprung": _ends(message, "probability_sprung"),
         "probability_giving": _ends(message, "probability_giving"),
+        "probability_torsion": _or_none(message, "probability_torsion"),
         "springs_believed": _or_none(message, "springs_believed"),
         "ei_level": _parameter(message.ei_level) if message.HasField("ei_level") else None,
         "ei_thirds": (

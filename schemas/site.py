@@ -7,21 +7,24 @@ is a relative standard deviation of a log-normal prior, unless its name carries 
 import math
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     Strict,
     StrictBool,
     StringConstraints,
+    model_serializer,
     model_validator,
 )
 
 from schemas.signals import MAX_RATE_HZ
 from schemas.site_errors import at
+from schemas.site_lane import Lane
 from schemas.site_ros2 import Ros2, check_ros2
 from schemas.topics import IDENTIFIER
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
@@ -74,6 +77,18 @@ Densities = Annotated[tuple[Density, Density, Density, Density], BeforeValidator
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    later_keys: ClassVar[tuple[str, ...]] = ()
+    """Keys that are written only where they are not at their defaults: a file without them keeps
+    the hash that it had before there were such keys."""
+
+    @model_serializer(mode="wrap")
+    def _without_later_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        fields = type(self).model_fields
+        for key in self.later_keys:
+            if key in values and getattr(self, key) == fields[key].default:
+                del values[key]
+        return values
 
 
 class _Spreadable(_Table):
@@ -165,7 +180,7 @@ class Vehicle(_Spreadable):
         return self
 
 
-class Bridge(_Spreadable):
+class Bridge(Lane, _Spreadable):
     """One or more spans. Its ends are where the bearings are; elements are numbered from its start.
 
     Over interior supports the bridge is continuous: their deflection is held and they turn freely.
@@ -174,6 +189,8 @@ class Bridge(_Spreadable):
     `flexural_rigidity_per_element_nm2` takes its place where elements are not alike. If both are
     given the values by element are the nominal ones and the single value is not used.
     """
+
+    later_keys: ClassVar[tuple[str, ...]] = tuple(Lane.model_fields)
 
     span_m: Annotated[Number, Field(gt=0, le=1000)]
     start_latitude_deg: Latitude
@@ -230,6 +247,11 @@ class Bridge(_Spreadable):
         if key in ("support_rotational_stiffness_nm_per_rad", "support_compliance_m_per_n"):
             return (0.0, 0.0)
         return super().nominal(key)
+
+    def uniform(self) -> tuple[float, float, float]:
+        """Return longest span in m, mean nominal EI in N·m² and mass per length in kg/m."""
+        mean = sum(self.nominal_flexural_rigidity_nm2) / self.elements
+        return max(self.lengths_of_spans_m), mean, self.mass_per_length_kg_per_m
 
     @property
     def lengths_m(self) -> tuple[float, ...]:

@@ -48,7 +48,7 @@ from pre_core.physics.bridge import FloatArray
 from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import Rows, minimised
 from pre_core.search.loop import Ending, Report, Solution
-from pre_core.unknowns import F
+from pre_core.unknowns import TORSION, F
 
 _COARSE = ((300.0, 4), (100.0, 4), (30.0, 4))
 """Temperatures and the steps at each on the way to the truck, the bridge taken as a whole."""
@@ -197,13 +197,14 @@ def _lower(problem: Problem, y: FloatArray, directions: FloatArray, *, is_free: 
     """How far back along each of the directions (f, d) nothing becomes negative that must not.
 
     What must not changes along one direction each. On the way (`is_free`) springs may push and
-    dampers drive, which leads through where they would be stuck at nothing; a bearing may not rise.
+    dampers drive, which leads through where they would be stuck at nothing; a bearing may not rise,
+    nor a deck twist against its load.
     """
     lower = np.full(directions.shape[1], -np.inf)
     held = layout(problem).half_normal
     if is_free:
         kept = np.flatnonzero(problem.priors.estimated)
-        held = np.flatnonzero(np.isin(kept, (F, F + 1)))
+        held = held[np.isin(kept[held], (F, F + 1, TORSION))]
     for place in held:
         for along in np.flatnonzero(directions[place]):
             lower[along] = -y[place] / directions[place, along]

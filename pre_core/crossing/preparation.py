@@ -37,7 +37,8 @@ from pre_core.physics.beam_basis import beam_basis, rebased
 from pre_core.physics.bridge import FloatArray
 from pre_core.physics.simulate import rear_position_m
 from pre_core.physics.surface import COMMON_LORRY, Footprint
-from pre_core.unknowns import FIRST_OF_BRIDGE
+from pre_core.physics.torsion import NO_TORSION, torsion_basis
+from pre_core.unknowns import FIRST_OF_BRIDGE, TORSION
 
 _KNOT_S = 0.4
 """Between knots of the trajectory: a driver changes the speed more slowly."""
@@ -85,10 +86,17 @@ class Inputs(NamedTuple):
     threads: int
     footprints: tuple[Footprint, Footprint] = COMMON_LORRY
     """Where the front and the rear axle stand on the road."""
+    torsional_wave_speed_m_per_s: float = 0.0
+    """Positive where the deck may twist."""
+    lane_factor: float = 1.0
+    """Square of this run's distance from the bridge's axis over that of the torsion's prior."""
 
 
 def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
-    """The problem and the coordinates of its nominal start."""
+    """Return the problem and the coordinates of its nominal start.
+
+    Raises ValueError if torsion is estimated and no speed of its waves is given.
+    """
     model = channel_signals(inputs.acceleration_m_per_s2, inputs.step_s, inputs.slowest_rate_hz)
     n = model.signals.shape[2]
     basis = beam_basis(
@@ -104,6 +112,16 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
     travel = front if inputs.direction > 0 else inputs.span_m - front
     wheelbase = inputs.priors.wheelbase_m
     first = int(np.searchsorted(travel - wheelbase, travel[0] + _MARGIN_M))
+    torsion = NO_TORSION
+    if inputs.priors.estimated[TORSION]:
+        if not inputs.torsional_wave_speed_m_per_s > 0.0:
+            raise ValueError("torsion is estimated, so its waves need a speed")
+        torsion = torsion_basis(
+            basis.lengths_m,
+            tuple(inputs.parts * node for node in inputs.interior_supports),
+            inputs.torsional_wave_speed_m_per_s,
+            inputs.lane_factor,
+        )
     crossing = Crossing(
         model.step_s,
         model.signals,
@@ -120,6 +138,7 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         step_table(),
         False,
         0,
+        torsion,
     )
     crossing = crossing._replace(swing_sample=swing_sample(crossing, front))
     row = row_filter(model.step_s)

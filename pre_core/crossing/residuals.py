@@ -32,6 +32,13 @@ from pre_core.kernels.lanes import LANES, kernel, summing
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 from pre_core.physics import modal_response
 from pre_core.physics.beam_basis import BeamBasis
+from pre_core.physics.torsion import (
+    GROUPS,
+    NO_TORSION,
+    TorsionBasis,
+    flexibility_remainder,
+    torsion_filters,
+)
 from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
 from pre_core.unknowns import (
     C_S1,
@@ -44,6 +51,7 @@ from pre_core.unknowns import (
     KAPPA,
     M_U1,
     RHO_A,
+    TORSION,
 )
 
 FloatArray = NDArray[np.float64]
@@ -90,6 +98,7 @@ class Crossing(NamedTuple):
     swing_sample: int
     """At which the bridge's swing is what `Points.swing` says; more than the reach of a step
     (`step_table`) before a wheel is on it."""
+    torsion: TorsionBasis = NO_TORSION
 
 
 class Points(NamedTuple):
@@ -142,7 +151,7 @@ class Work(NamedTuple):
 def workspace(crossing: Crossing, parameters: int, rows: RowFilter) -> Work:
     """Allocate for this crossing."""
     parts, _, m = crossing.basis.cubics.shape
-    groups = (m + LANES - 1) // LANES
+    groups = (m + LANES - 1) // LANES + GROUPS * crossing.torsion.ends_m.shape[0]
     n = crossing.signals.shape[2]
     return Work(
         np.zeros((m, m)),
@@ -359,6 +368,9 @@ def _bridge(crossing: Crossing, work: Work, theta: FloatArray) -> bool:
     ):
         work.modes_of[:] = np.nan
         return False
+    if not torsion_filters(crossing.torsion, theta, crossing.step_s, work.cubics, work.feedback):
+        work.modes_of[:] = np.nan
+        return False
     work.modes_of[:] = theta
     return True
 
@@ -525,6 +537,32 @@ def _deflect(crossing: Crossing, work: Work, points: Points, k: int) -> None:
                 y = work.lanes[w, i - begin]
                 work.road[w, i] += (y[0] + y[1]) + (y[2] + y[3])
         begin = stop
+    if crossing.torsion.ends_m.shape[0] > 0:
+        _twist_at_once(crossing, work, points, k, last)
+
+
+@kernel
+def _twist_at_once(crossing: Crossing, work: Work, points: Points, k: int, last: int) -> None:
+    """Add to `road` the twist that follows the load at once: what no marched mode has."""
+    torsion = crossing.torsion
+    flexibility = max(points.theta[k, TORSION], 0.0) * torsion.load_factor
+    if flexibility == 0.0:
+        return
+    back = crossing.direction * points.wheelbase_m[k]
+    for i in range(last):
+        e1, e2 = work.part[0, i], work.part[1, i]
+        if e1 < 0 and e2 < 0:
+            continue
+        x1 = points.position_m[k, i]
+        x2 = x1 - back
+        p1, p2 = work.place[0, i], work.place[1, i]
+        across = flexibility_remainder(torsion, e1, p1, x1, e2, p2, x2)
+        if e1 >= 0:
+            own = flexibility_remainder(torsion, e1, p1, x1, e1, p1, x1)
+            work.road[0, i] += flexibility * (own * work.load[0, i] + across * work.load[1, i])
+        if e2 >= 0:
+            own = flexibility_remainder(torsion, e2, p2, x2, e2, p2, x2)
+            work.road[1, i] += flexibility * (own * work.load[1, i] + across * work.load[0, i])
 
 
 @kernel

@@ -27,6 +27,10 @@ class Beam(NamedTuple):
     """How far the bearings at the ends give under load; 0 is rigid."""
     interior_supports: tuple[int, ...] = ()
     """Nodes, 1 to n - 1, whose deflection is held; they turn freely."""
+    torsional_flexibility_per_n: float = 0.0
+    """e²/(GJ) of wheels whose middle runs at the distance e beside the axis (torsion.py)."""
+    torsional_wave_speed_m_per_s: float = 0.0
+    """Positive where the deck twists."""
 
 
 class Modes(NamedTuple):

@@ -5,7 +5,20 @@ from numpy.typing import NDArray
 
 from pre_core.physics.bridge import Beam
 from pre_core.physics.vehicle import HalfCar
-from pre_core.unknowns import ALPHA, BETA, BRIDGE, D_1, EI_1, K_ROT, M_U1, RHO_A, TRUCK, F, table
+from pre_core.unknowns import (
+    ALPHA,
+    BETA,
+    BRIDGE,
+    D_1,
+    EI_1,
+    K_ROT,
+    M_U1,
+    RHO_A,
+    TORSION,
+    TRUCK,
+    F,
+    table,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -23,9 +36,15 @@ def from_models(car: HalfCar, beam: Beam) -> FloatArray:
 
 
 def beam_from(
-    theta: FloatArray, element_lengths_m: FloatArray, interior_supports: tuple[int, ...] = ()
+    theta: FloatArray,
+    element_lengths_m: FloatArray,
+    interior_supports: tuple[int, ...] = (),
+    wave_speed_m_per_s: float = 0.0,
 ) -> Beam:
-    """The bridge of theta (p,) over supports at its ends and at the nodes given."""
+    """Return the bridge of theta (p,) over supports at its ends and at the nodes given.
+
+    The torsional wave speed is not among the unknowns.
+    """
     rigidities = theta[EI_1:]
     return Beam(
         element_lengths_m,
@@ -36,6 +55,8 @@ def beam_from(
         (float(theta[K_ROT]), float(theta[K_ROT + 1])),
         (float(theta[F]), float(theta[F + 1])),
         interior_supports,
+        float(theta[TORSION]),
+        wave_speed_m_per_s,
     )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.physics import bridge as _bridge
 from pre_core.physics import vehicle as _vehicle
+from pre_core.physics.torsional_modes import torsional_modes, twist_at_once
 
 FloatArray = NDArray[np.float64]
 
@@ -45,7 +46,7 @@ class Simulation(NamedTuple):
     acceleration_m_per_s2: FloatArray  # (steps, 4)
     contact_force_n: FloatArray  # (steps, 2), up positive on the bridge: negative while loaded
     wheel_deflection_m: FloatArray  # (steps, 2): the bridge under each wheel
-    modal_displacement: FloatArray  # (steps, modes)
+    modal_displacement: FloatArray  # (steps, modes), in bending
     modal_velocity: FloatArray  # (steps, modes)
     friction_n: FloatArray  # (steps, 2) of the springs, positive where it resists lengthening
     modes: _bridge.Modes
@@ -99,6 +100,7 @@ def _march(
     eigenvalues: FloatArray,
     modal_damping: FloatArray,
     cubics: FloatArray,
+    at_once: FloatArray,
     element_lengths: FloatArray,
     element: NDArray[np.int64],
     place: FloatArray,
@@ -243,6 +245,9 @@ def _march(
                     qdd_new[k] = acceleration
                     q_new[k] = q_guess[k] + modal_quarter * acceleration
                     qd_new[k] = qd_guess[k] + modal_half * acceleration
+            if at_once.shape[0] > 0:
+                for w in range(2):
+                    y[w] += at_once[n, w, 0] * p[0] + at_once[n, w, 1] * p[1]
             # The truck on the road and the deflected bridge.
             for i in range(4):
                 force[i] = free[i]
@@ -359,7 +364,15 @@ def simulate(
     )
     effective = mass + 0.5 * step_s * damping + 0.25 * step_s**2 * stiffness
     steps = motion.position_m.size
-    count = basis.eigenvalues_per_s2.size
+    bending = basis.eigenvalues_per_s2.size
+    twist = torsional_modes(beam)
+    eigenvalues = np.concatenate([basis.eigenvalues_per_s2, twist.eigenvalues_per_s2])
+    damping_of_modes = np.concatenate([basis.damping_per_s, twist.damping_per_s])
+    cubics = np.concatenate([cubics, twist.cubics], axis=2)
+    count = eigenvalues.size
+    state = np.zeros((2, count))
+    if swing is not None:
+        state[:, :bending] = swing
     z, zd, zdd = (np.zeros((steps, 4)) for _ in range(3))
     contact, deflection, friction = (np.zeros((steps, 2)) for _ in range(3))
     static_load = np.array(_vehicle.static_axle_loads_n(car, gravity_m_per_s2))
@@ -381,16 +394,17 @@ def simulate(
         np.array(car.tyre_damping_ns_per_m),
         static_load,
         transfer,
-        basis.eigenvalues_per_s2,
-        basis.damping_per_s,
+        eigenvalues,
+        damping_of_modes,
         cubics,
+        twist_at_once(beam, wheels),
         beam.element_lengths_m,
         element,
         place,
         motion.speed_m_per_s,
         np.ascontiguousarray(road.height_m),
         np.ascontiguousarray(road.rate_m_per_s),
-        np.zeros((2, count)) if swing is None else np.ascontiguousarray(swing),
+        state,
         -1 if swing is None else int(is_on.argmax()) if swing_step is None else swing_step,
         tolerance,
         max_iterations,
@@ -404,7 +418,17 @@ def simulate(
         friction,
     )
     return Simulation(
-        z, zd, zdd, contact, deflection, q, qd, friction, basis, iterations > 0, max(iterations, 0)
+        z,
+        zd,
+        zdd,
+        contact,
+        deflection,
+        q[:, :bending],
+        qd[:, :bending],
+        friction,
+        basis,
+        iterations > 0,
+        max(iterations, 0),
     )
 
 

@@ -237,7 +237,7 @@ class Thirds(_message.Message):
     def __init__(self, left: _Optional[_Union[Parameter, _Mapping]] = ..., middle: _Optional[_Union[Parameter, _Mapping]] = ..., right: _Optional[_Union[Parameter, _Mapping]] = ...) -> None: ...
 
 class Derived(_message.Message):
-    __slots__ = ("f1_hz", "max_deflection_m", "probability_below_90_percent_of_baseline", "probability_sprung", "probability_giving", "springs_believed", "ei_level", "ei_thirds")
+    __slots__ = ("f1_hz", "max_deflection_m", "probability_below_90_percent_of_baseline", "probability_sprung", "probability_giving", "springs_believed", "ei_level", "ei_thirds", "probability_torsion")
     class ProbabilityBelow90PercentOfBaselineEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -253,6 +253,7 @@ class Derived(_message.Message):
     SPRINGS_BELIEVED_FIELD_NUMBER: _ClassVar[int]
     EI_LEVEL_FIELD_NUMBER: _ClassVar[int]
     EI_THIRDS_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_TORSION_FIELD_NUMBER: _ClassVar[int]
     f1_hz: Parameter
     max_deflection_m: Parameter
     probability_below_90_percent_of_baseline: _containers.ScalarMap[str, float]
@@ -261,7 +262,8 @@ class Derived(_message.Message):
     springs_believed: float
     ei_level: Parameter
     ei_thirds: Thirds
-    def __init__(self, f1_hz: _Optional[_Union[Parameter, _Mapping]] = ..., max_deflection_m: _Optional[_Union[Parameter, _Mapping]] = ..., probability_below_90_percent_of_baseline: _Optional[_Mapping[str, float]] = ..., probability_sprung: _Optional[_Union[AtEnds, _Mapping]] = ..., probability_giving: _Optional[_Union[AtEnds, _Mapping]] = ..., springs_believed: _Optional[float] = ..., ei_level: _Optional[_Union[Parameter, _Mapping]] = ..., ei_thirds: _Optional[_Union[Thirds, _Mapping]] = ...) -> None: ...
+    probability_torsion: float
+    def __init__(self, f1_hz: _Optional[_Union[Parameter, _Mapping]] = ..., max_deflection_m: _Optional[_Union[Parameter, _Mapping]] = ..., probability_below_90_percent_of_baseline: _Optional[_Mapping[str, float]] = ..., probability_sprung: _Optional[_Union[AtEnds, _Mapping]] = ..., probability_giving: _Optional[_Union[AtEnds, _Mapping]] = ..., springs_believed: _Optional[float] = ..., ei_level: _Optional[_Union[Parameter, _Mapping]] = ..., ei_thirds: _Optional[_Union[Thirds, _Mapping]] = ..., probability_torsion: _Optional[float] = ...) -> None: ...
 
 class Coordinate(_message.Message):
     __slots__ = ("name", "location", "scale", "is_log", "absence")

@@ -278,6 +278,8 @@ def _of_ends_and_springs(derived: Derived) -> Iterator[str]:
         yield f"a spring holds the end of the bridge: {at_ends(derived.probability_sprung)}"
     if derived.probability_giving is not None:
         yield f"a bearing gives under load: {at_ends(derived.probability_giving)}"
+    if derived.probability_torsion:
+        yield f"the deck twists under the truck: {100.0 * derived.probability_torsion:.0f} %"
     if derived.springs_believed is not None:
         yield f"the truck's springs are believed to {100.0 * derived.springs_believed:.0f} %"
 

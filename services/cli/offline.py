@@ -201,11 +201,32 @@ def _add_beyond(p: Any) -> None:
         metavar="EXPONENT",
         help="of the air in the springs: 1.38 is usual",
     )
+    p.add_argument(
+        "--lane-offset",
+        type=number("a distance in m", low=-20, high=20),
+        metavar="M",
+        help="distance of the lane's middle to the left of the bridge's axis, looking from start "
+        "to end; with --torsion the deck twists under it (default: 0)",
+    )
+    p.add_argument(
+        "--torsion",
+        type=numbers(
+            "a frequency ratio and a radius of gyration in m (RATIO:M)", (0.2, 100), (0.1, 30)
+        ),
+        metavar="RATIO:M",
+        help="first torsional over first bending frequency of the deck and its radius of "
+        "gyration, with --lane-offset (2:2.3 is usual; default: the deck does not twist)",
+    )
 
 
 def _simulate(options: argparse.Namespace) -> int:
     from services.simulation.drive import Beyond, Left, simulate_command
 
+    if (options.lane_offset is None) != (options.torsion is None):
+        given, missing = ("--torsion", "--lane-offset")
+        if options.torsion is None:
+            given, missing = missing, given
+        raise InputError(f"{given}: is of use with {missing} only, which is missing")
     stiffness = options.bearing_stiffness
     return simulate_command(
         site=options.site,
@@ -227,6 +248,7 @@ def _simulate(options: argparse.Namespace) -> int:
             options.bilinear,
             options.air_springs,
         ),
+        twist=None if options.torsion is None else (options.lane_offset, *options.torsion),
         surface=_on_surface(options),
         runs=options.runs,
         drive_seed=options.drive_seed,

@@ -105,6 +105,7 @@ def _warm_up_pre() -> None:
         ),
         2,
         1,
+        torsional_wave_speed_m_per_s=400.0,
     )
     problem, y = prepare(inputs)
     posterior.all_rows(problem, y[None, :])

@@ -27,6 +27,7 @@ from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge
+from services.common.geodesy import bridge_frame, to_chainage
 from services.identification.checks import Fit, reasons_after_fit
 from services.identification.crossing_data import (
     CrossingData,
@@ -58,6 +59,10 @@ _LARGEST_CHI2 = 25.0
 far an interval that is widened by so much can be trusted nobody has measured."""
 _EVEN = 0.5
 """Probability before the crossing that a support has no spring, or that a bearing is rigid."""
+_SURE_OF_LANE_M = 0.3
+"""A receiver whose slow error is larger says less of the lane than the site file."""
+_FARTHEST_ASIDE = 3.0
+"""Standard deviations beyond which receiver and site file speak of different axes."""
 _ROAD_DRAWS = 80
 """Standard deviations of a road from so many are right to 8 %, and each draw is an evaluation."""
 _DEFLECTION_DRAWS = 400
@@ -114,6 +119,8 @@ def inputs_of(
         _parts(bridge),
         settings.threads,
         footprints_of(vehicle),
+        bridge.torsional_wave_speed_m_per_s,
+        lane_factor(data),
     )
 
 
@@ -135,11 +142,12 @@ def _priors(data: CrossingData) -> posterior.Priors:
         of[row.part].scale_at_zero(row.key) if zero else of[row.part].spread(row.key)
         for row, zero in zip(rows, at_zero, strict=True)
     ]
+    spreads = np.array(spread)
     return posterior.Priors(
         nominal,
-        np.array(spread),
+        spreads,
         at_zero,
-        at_zero | (nominal > 0.0),
+        (at_zero & (spreads > 0.0)) | (nominal > 0.0),
         np.array([absence(bridge, row) for row in rows]),
         vehicle.wheelbase_m,
         vehicle.spread("wheelbase_m"),
@@ -155,7 +163,35 @@ def absence(bridge: Bridge, row: unknowns.Unknown) -> float:
         return 0.0
     if row.key == "support_rotational_stiffness_nm_per_rad":
         return {"free": 1.0, "sprung": 0.0}.get(bridge.bearings[row.which], _EVEN)
+    if row.key == "torsional_flexibility_per_n" and bridge.is_lane_off_axis:
+        return 0.0
     return _EVEN
+
+
+def lane_factor(data: CrossingData) -> float:
+    """Return the square of this run's distance from the axis over that of the torsion's prior.
+
+    Where the site file says how far the lane is off the axis, a receiver that is right to
+    decimetres and agrees with that shows the run's own distance; otherwise 1. Without such a
+    statement its distance from the line between the ends is no evidence: often that line was
+    measured along the lane.
+    """
+    bridge, spread_m = data.bridge, data.receiver.position_spread_m
+    if not bridge.is_lane_off_axis or bridge.lane_offset_m is None or spread_m > _SURE_OF_LANE_M:
+        return 1.0
+    on_bridge = (data.fixes.time_s >= data.stay.entry_s) & (data.fixes.time_s <= data.stay.exit_s)
+    if not on_bridge.any():
+        return 1.0
+    _, lateral_m = to_chainage(
+        bridge_frame(bridge),
+        data.fixes.latitude_deg[on_bridge],
+        data.fixes.longitude_deg[on_bridge],
+    )
+    measured_m = abs(float(np.median(lateral_m)))
+    aside_m = measured_m - abs(bridge.lane_offset_m)
+    if abs(aside_m) > _FARTHEST_ASIDE * np.hypot(bridge.lane_offset_m_spread, spread_m):
+        return 1.0
+    return float((measured_m / bridge.reference_lane_offset_m) ** 2)
 
 
 def identify_pre(
@@ -357,6 +393,7 @@ def _derived(
         max_deflection_m=_parameter("m", deflections, None),
         probability_sprung=_probability_of(theta, unknowns.K_ROT),
         probability_giving=_probability_of(theta, unknowns.F),
+        probability_torsion=float((theta[:, unknowns.TORSION] > 0.0).mean()),
         springs_believed=posterior.belief_in_springs(problem, flat.mean(axis=0)),
         ei_level=_parameter("1", _level(data.bridge, scaled, 0.0, 1.0), None),
         ei_thirds=results.Thirds(

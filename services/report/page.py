@@ -356,6 +356,9 @@ def _numbers(crossing: Crossing) -> Iterator[tuple[str, str, str]]:
                     f"{100.0 * ends.start:.0f} % at the start, {100.0 * ends.end:.0f} % at the end"
                 )
                 yield what, percent, "how likely that is, in place of bearings that do neither"
+        if derived.probability_torsion is not None:
+            percent = f"{100.0 * derived.probability_torsion:.0f} %"
+            yield "deck that twists", percent, "how likely it is that it does under this lane"
     road = crossing.road
     if road is not None and (road.iri_m_per_km is not None or road.iso_class is not None):
         yield "road", _one_road(crossing) or "", "International Roughness Index, ISO 8608 class"

@@ -40,6 +40,7 @@ from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
 from schemas.site_file import load_site, parse_site, site_toml
+from schemas.site_lane import flexibility_per_n, wave_speed_m_per_s
 from services.common.errors import FailureError, InputError
 from services.common.files import check_writable
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
@@ -90,6 +91,15 @@ class Left(NamedTuple):
     """Between its leaving and the first wheel's coming on."""
 
 
+class Twist(NamedTuple):
+    """A deck that twists under a truck whose middle runs beside the bridge's axis."""
+
+    flexibility_per_n: float
+    wave_speed_m_per_s: float
+    lane_offset_m: float
+    """To the left of the axis, looking from start to end."""
+
+
 class Beyond(NamedTuple):
     """What truck and bridge have that a site file does not tell."""
 
@@ -101,6 +111,8 @@ class Beyond(NamedTuple):
     friction_load_growth: float = 0.0
     bilinear_damping: float = 0.0
     air_spring_exponent: float = 0.0
+
+    twist: Twist | None = None
 
 
 NOTHING = Beyond()
@@ -137,6 +149,7 @@ def simulate_command(
     gps_noise: bool,
     rate: float | None,
     beyond: Beyond = NOTHING,
+    twist: tuple[float, float, float] | None = None,
     surface: OnSurface | None = None,
     runs: int = 1,
     drive_seed: int | None = None,
@@ -144,10 +157,15 @@ def simulate_command(
     force: bool = False,
     console: "Console",
 ) -> int:
-    """Write the recording of one simulated crossing, or of several over the same road."""
+    """Write the recording of one simulated crossing, or of several over the same road.
+
+    `twist` is lane offset in m, ratio of torsional to bending frequency and deck gyration in m.
+    """
     check_writable(output, force=force)
     known = paper_site() if site is None else load_site(site)
     ratios = ratios_of(known.bridges[0], scenario, ei)
+    if twist is not None:
+        beyond = beyond._replace(twist=twist_of(known.bridges[0], *twist))
     drives, paths = [], None if surface is None else wheel_paths_of(known.vehicles[0], surface)
     of_noise = seed if drive_seed is None else drive_seed
     with steps_bar("simulating", console) as progress:
@@ -275,6 +293,7 @@ def simulate_drive(
         antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
         left=beyond.left,
         paths=paths,
+        lane_offset_m=beyond.twist.lane_offset_m if beyond.twist else 0.0,
     )[:2]
     ratios = np.asarray(rigidity_ratios, dtype=np.float64)
     return Drive(run, roads.front, ratios, None if paths is None else roads.rear)
@@ -295,6 +314,7 @@ def measured_run(
     antenna_to_front_axle_m: float = 0.0,
     left: Left | None = None,
     paths: WheelPaths | None = None,
+    lane_offset_m: float = 0.0,
 ) -> tuple[Run, AxleRoads, Simulation]:
     """Drive `car` over `beam` along `motion` and measure it with one sensor per channel.
 
@@ -331,7 +351,8 @@ def measured_run(
     time_s = START_TIME_S + np.arange(channels[CHANNELS[0]].size) / rate
     antenna = motion.position_m[settling_steps:] - sign * antenna_to_front_axle_m
     speed = np.abs(motion.speed_m_per_s[settling_steps:])
-    gnss = _fixes(bridge, step_s, antenna, speed, receiver, gnss_rng, forward=sign > 0)
+    lateral = np.full_like(antenna, lane_offset_m)
+    gnss = _fixes(bridge, step_s, antenna, lateral, speed, receiver, gnss_rng, forward=sign > 0)
     return Run("simulation", time_s, rate, channels, gnss), roads, fine
 
 
@@ -380,6 +401,20 @@ def with_beyond(car: HalfCar, beam: Beam, beyond: Beyond) -> tuple[HalfCar, Beam
     ), beam._replace(
         support_rotational_stiffness_nm_per_rad=beyond.support_rotational_stiffness_nm_per_rad,
         support_compliance_m_per_n=beyond.support_compliance_m_per_n,
+        torsional_flexibility_per_n=beyond.twist.flexibility_per_n if beyond.twist else 0.0,
+        torsional_wave_speed_m_per_s=beyond.twist.wave_speed_m_per_s if beyond.twist else 0.0,
+    )
+
+
+def twist_of(
+    bridge: Bridge, lane_offset_m: float, frequency_ratio: float, gyration_m: float
+) -> Twist:
+    """Return the twist of the site's bridge, uniform and sound, under a lane beside its axis."""
+    span_m, rigidity_nm2, mass_kg_per_m = bridge.uniform()
+    return Twist(
+        flexibility_per_n(lane_offset_m, gyration_m, frequency_ratio, span_m, rigidity_nm2),
+        wave_speed_m_per_s(frequency_ratio, span_m, rigidity_nm2, mass_kg_per_m),
+        lane_offset_m,
     )
 
 
@@ -429,6 +464,7 @@ def _fixes(
     bridge: Bridge,
     step_s: float,
     antenna: Floats,
+    lateral: Floats,
     speed: Floats,
     receiver: Receiver,
     rng: np.random.Generator,
@@ -437,7 +473,7 @@ def _fixes(
 ) -> GnssTrack:
     """What the receiver reports of the drive of its antenna."""
     time_s = step_s * np.arange(antenna.size, dtype=np.float64)
-    fixes = measure_position(time_s, antenna, np.zeros_like(antenna), speed, receiver, rng)
+    fixes = measure_position(time_s, antenna, lateral, speed, receiver, rng)
     frame = bridge_frame(bridge)
     latitude, longitude = to_lat_lon(frame, fixes.chainage_m, fixes.lateral_m)
     return GnssTrack(

@@ -16,6 +16,8 @@ CAR = experiment.TRUCK._replace(pitch_inertia_ratio=1.3, tyre_damping_ns_per_m=(
 BEAM = experiment.beam(experiment.scenario_ratios(6))._replace(
     support_rotational_stiffness_nm_per_rad=(2e8, 1e8),
     support_compliance_m_per_n=(3e-10, 2e-10),
+    torsional_flexibility_per_n=4e-10,
+    torsional_wave_speed_m_per_s=380.0,
 )
 
 
@@ -41,7 +43,12 @@ def test_accelerations_stay_where_everything_follows_its_power_of_the_mass() -> 
     motion = constant_speed(-5.0, experiment.SPEED_M_PER_S, 700, STEP_S)
 
     def accelerations(of: unknowns.FloatArray, mass_kg: float) -> unknowns.FloatArray:
-        car, beam = car_from(of, mass_kg), beam_from(of, BEAM.element_lengths_m)
+        car = car_from(of, mass_kg)
+        beam = beam_from(
+            of,
+            BEAM.element_lengths_m,
+            wave_speed_m_per_s=BEAM.torsional_wave_speed_m_per_s,
+        )
         felt = under_wheels(road, motion, car.wheelbase_m, 1)
         return simulate(car, beam, motion, felt, STEP_S).acceleration_m_per_s2
 

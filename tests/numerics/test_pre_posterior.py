@@ -28,7 +28,7 @@ from pre_core.crossing.preparation import Inputs, prepare, with_noise_at
 from pre_core.paper import experiment
 from pre_core.physics.models import from_models
 from pre_core.physics.sensors import white_noise
-from pre_core.unknowns import C_S1, C_U1, D_1, EI_1, K_ROT, K_S1, K_U1, M_U1, F
+from pre_core.unknowns import C_S1, C_U1, D_1, EI_1, K_ROT, K_S1, K_U1, M_U1, TORSION, F
 from schemas.signals import CHANNELS
 from services.simulation.drive import beam_of, paper_site, truck_of
 
@@ -41,6 +41,7 @@ POSITION_NOISE_M, SPEED_NOISE_M_PER_S, OFFSET_SPREAD_M = 0.02, 0.03, 1.2
 SPRING_SPREAD = 4e8
 COMPLIANCE_SPREAD = 1e-9
 TYRE_DAMPING_SPREAD = 1000.0
+TORSION_SPREAD = 1e-9
 KNOT_S = 0.4
 DEGREE = 5
 JERK_M_PER_S3 = 1.0
@@ -94,6 +95,7 @@ def here(scenario_6: "Drive") -> Case:
     spread[K_ROT : K_ROT + 2] = SPRING_SPREAD
     spread[F : F + 2] = COMPLIANCE_SPREAD
     spread[C_U1 : C_U1 + 2] = TYRE_DAMPING_SPREAD
+    spread[TORSION] = TORSION_SPREAD
     at_zero = nominal == 0.0
     known = np.full(nominal.size, True)
     priors = Priors(
@@ -124,6 +126,7 @@ def here(scenario_6: "Drive") -> Case:
         priors,
         2,
         2,
+        torsional_wave_speed_m_per_s=400.0,
     )
     problem, y = prepare(inputs)
     where = layout(problem)

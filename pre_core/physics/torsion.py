@@ -1,0 +1,153 @@
+"""Uniform St. Venant torsion of the deck under wheels that run beside the bridge's axis.
+
+A deck of torsional rigidity GJ whose twist is held at every support turns by theta under the
+moment e P of a wheel pair at the lateral distance e of its middle from the axis, and the middle of
+that axle sinks by e theta. Of the two only g = e²/(GJ) matters to what the middle of an axle feels:
+
+    y(x) = g G(x, x') P,   G(x, x') = (min(x, x') - a) (b - max(x, x')) / (b - a)
+
+under a standing load P at x' in the same span from a to b. In motion theta is a sum of sines of
+each span, of which the j-th swings at j c/(2 (b - a)) where c is the torsional wave speed, the root
+of GJ over the rotational inertia of a metre of deck. The lowest `MODES` of each span are marched
+as modes (modal_response.py); the rest follows the load at once (`flexibility_remainder`).
+
+Torsion and bending are taken for independent, as they are for a deck that is symmetric about its
+axis, and the axis for the middle between the ends given in the site file.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.kernels.lanes import LANES, kernel
+from pre_core.physics.beam_basis import modal_damping
+from pre_core.physics.modal_response import COEFFICIENTS, mode_coefficients
+from pre_core.unknowns import TORSION
+
+FloatArray = NDArray[np.float64]
+
+GROUPS = 2
+"""Of lanes for each span."""
+MODES = GROUPS * LANES
+"""Modes of each span that swing."""
+
+
+class TorsionBasis(NamedTuple):
+    """What every evaluation shares of a deck with parts (parts,) in some spans; of none, if empty.
+
+    `cubics` (parts, 4, modes): unit sines of the part's span in powers of the place 0..1 in it.
+    """
+
+    cubics: FloatArray
+    span_of_part: NDArray[np.int64]  # (parts,)
+    ends_m: FloatArray  # (spans, 2) chainages
+    wave_speed_m_per_s: float
+    load_factor: float
+    """Of g, for a crossing whose distance from the axis is another than that of g: its square."""
+
+
+NO_TORSION: Final = TorsionBasis(
+    np.zeros((0, 4, MODES)), np.zeros(0, dtype=np.int64), np.zeros((0, 2)), 0.0, 1.0
+)
+"""Of a deck that does not twist."""
+
+
+def torsion_basis(
+    part_lengths_m: FloatArray,
+    supports: tuple[int, ...],
+    wave_speed_m_per_s: float,
+    load_factor: float = 1.0,
+) -> TorsionBasis:
+    """Return the basis of a deck of these parts (parts,), held at its ends and at some nodes."""
+    spans = span_ends_m(part_lengths_m, supports)
+    span_of_part = np.searchsorted(np.array(supports), np.arange(part_lengths_m.size), side="right")
+    edges = np.concatenate([[0.0], np.cumsum(part_lengths_m)])
+    cubics = np.zeros((part_lengths_m.size, 4, MODES))
+    for part, span in enumerate(span_of_part):
+        shapes = sine_cubics(edges[part : part + 2], spans[span], MODES)
+        cubics[part] = shapes
+    return TorsionBasis(
+        cubics, span_of_part.astype(np.int64), spans, wave_speed_m_per_s, load_factor
+    )
+
+
+def span_ends_m(part_lengths_m: FloatArray, supports: tuple[int, ...]) -> FloatArray:
+    """Return the chainages (spans, 2) between which the deck may twist."""
+    edges = np.concatenate([[0.0], np.cumsum(part_lengths_m)])
+    held = edges[[0, *supports, part_lengths_m.size]]
+    return np.stack([held[:-1], held[1:]], axis=1)
+
+
+def sine_cubics(part_m: FloatArray, span_m: FloatArray, modes: int) -> FloatArray:
+    """Return cubics (4, modes) in the place 0..1 of a part (2,) through a span's (2,) unit sines.
+
+    Value and slope are those of the sines at both ends of the part (Hermite).
+    """
+    length = part_m[1] - part_m[0]
+    wave = np.arange(1, modes + 1) * np.pi / (span_m[1] - span_m[0])
+    phase = wave[None, :] * (part_m[:, None] - span_m[0])
+    value, slope = np.sin(phase), np.cos(phase) * wave * length
+    rise = value[1] - value[0]
+    return np.stack(
+        [value[0], slope[0], 3.0 * rise - 2.0 * slope[0] - slope[1], slope.sum(axis=0) - 2.0 * rise]
+    )
+
+
+@kernel
+def torsion_filters(
+    basis: TorsionBasis,
+    theta: FloatArray,
+    step_s: float,
+    cubics: FloatArray,
+    feedback: FloatArray,
+) -> bool:
+    """Write the torsional modes of `theta` (p,) into the last groups of lanes, one for each span.
+
+    As `modal_response.modal_filters` writes those in bending: `cubics` (parts, groups, 4, 4) and
+    `feedback` (groups, 5, 4). Return False if not finite.
+    """
+    first = feedback.shape[0] - GROUPS * basis.ends_m.shape[0]
+    flexibility = max(theta[TORSION], 0.0) * basis.load_factor
+    one = np.empty(COEFFICIENTS)
+    for span in range(basis.ends_m.shape[0]):
+        length = basis.ends_m[span, 1] - basis.ends_m[span, 0]
+        # The modal mass is that of g = 1/(mass c²), for the coordinate e theta.
+        per_mass = 2.0 * flexibility * basis.wave_speed_m_per_s**2 / length
+        for j in range(MODES):
+            omega = (j + 1) * np.pi * basis.wave_speed_m_per_s / length
+            eigenvalue = omega * omega
+            total = mode_coefficients(eigenvalue, modal_damping(theta, eigenvalue), step_s, one)
+            if not total > 0.0:
+                return False
+            group, lane = first + span * GROUPS + j // LANES, j % LANES
+            feedback[group, :, lane] = one
+            size = np.sqrt(total * per_mass)
+            for part in range(cubics.shape[0]):
+                for power in range(4):
+                    inside = basis.span_of_part[part] == span
+                    value = size * basis.cubics[part, power, j] if inside else 0.0
+                    cubics[part, group, power, lane] = value
+    return True
+
+
+@kernel
+def flexibility_remainder(
+    basis: TorsionBasis, part: int, place: float, at_m: float, other: int, there: float, to_m: float
+) -> float:
+    """Return G(x, x') in m less the part of the modes that are marched, of two places.
+
+    A place is its part, the place 0..1 in that, and its chainage; parts of -1 are off the bridge.
+    """
+    if part < 0 or other < 0 or basis.span_of_part[part] != basis.span_of_part[other]:
+        return 0.0
+    span = basis.span_of_part[part]
+    begin, end = basis.ends_m[span, 0], basis.ends_m[span, 1]
+    length = end - begin
+    total = (min(at_m, to_m) - begin) * (end - max(at_m, to_m)) / length
+    here, far = basis.cubics[part], basis.cubics[other]
+    for j in range(MODES):
+        a = ((here[3, j] * place + here[2, j]) * place + here[1, j]) * place + here[0, j]
+        b = ((far[3, j] * there + far[2, j]) * there + far[1, j]) * there + far[0, j]
+        total -= 2.0 * length * a * b / ((j + 1) * np.pi) ** 2
+    return total
