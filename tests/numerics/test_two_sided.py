@@ -3,6 +3,8 @@
 The simulator shares nothing with `pre_core`, so that each can be held against the other.
 """
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -11,8 +13,9 @@ from scipy.special import k1
 from pre_core.physics import simulate as plane
 from pre_core.physics.bridge import refine, uniform_beam
 from pre_core.physics.surface import Footprint, spectra, surface_density
-from pre_core.physics.vehicle import HalfCar
+from pre_core.physics.vehicle import HalfCar, dahl_friction_n
 from services.simulation.two_sided import (
+    LONGEST_STEP_S,
     Axle,
     Body,
     Bogie,
@@ -118,35 +121,44 @@ def test_standing_truck_beside_the_axis_twists_the_deck() -> None:
 
     expected = [1.5 * (front * twist(x, 8.0) + rear * twist(x, 4.0)) for x in (8.0, 4.0)]
     np.testing.assert_allclose(-run.twist_rad[n], expected, rtol=0.01)
-    np.testing.assert_allclose(-run.twist_rad[n], expected, rtol=0.01)
     # Bending is what it is without torsion.
     np.testing.assert_allclose(run.deflection_m[n], crawled(DECK)[0].deflection_m[n], rtol=1e-4)
 
 
 def test_frequencies_of_a_uniform_beam() -> None:
     deck = Deck(30.0, (1.56e10,) * 7, 4400.0, 0.7, 0.005)
-    n = np.arange(1, 13)
+    n = np.arange(1, 9)
     exact = 0.5 * np.pi * (n / 30.0) ** 2 * np.sqrt(1.56e10 / 4400.0)
-    np.testing.assert_allclose(bending_frequencies_hz(deck, 12), exact, rtol=2e-5)
+    np.testing.assert_allclose(bending_frequencies_hz(deck, 8), exact, rtol=2e-5)
+
+
+def accelerations(truck: Truck, deck: Deck, step_s: float) -> Floats:
+    """Accelerations every 4 ms; axles, bridge ends and cells are met at whole steps."""
+    motion = even_motion(-8.0, 10.0, 2.4, step_s)
+    run = cross(truck, deck, wavy(truck), motion, lane_offset_m=1.2)
+    return run.acceleration[:: round(4e-3 / step_s)]
 
 
 def test_steps_are_of_fourth_order() -> None:
-    """Entry, exit and cells of the mesh are at whole steps, where the solution has kinks."""
-    deck = DECK._replace(torsion=Torsion(9.0, 2.0))
-    truck = LORRY._replace(
-        axles=tuple(axle._replace(tyre_damping_ns_per_m=800.0) for axle in LORRY.axles)
-    )
-
-    def accelerations(step_s: float) -> Floats:
-        motion = even_motion(-8.0, 10.0, 2.4, step_s)
-        run = cross(truck, deck, wavy(truck), motion, lane_offset_m=1.2)
-        return run.acceleration[:: round(4e-3 / step_s)]
-
-    exact = accelerations(2.5e-4)
+    exact = accelerations(LORRY, DECK, 2.5e-4)
     steps = np.array([4e-3, 2e-3, 1e-3])
-    errors = [float(np.abs(accelerations(step) - exact).max()) for step in steps]
+    errors = [float(np.abs(accelerations(LORRY, DECK, step) - exact).max()) for step in steps]
     order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert 3.6 < order < 4.6, errors
+
+
+def test_longest_steps_are_exact_where_kinks_cost_the_order() -> None:
+    """Damped tyres feel a jump at the ends, torsion has a kink under the wheel.
+
+    A sensor of 10 µg/√Hz at 500 Hz has noise of 1.6e-3 m/s².
+    """
+    twisting = DECK._replace(torsion=Torsion(9.0, 2.0))
+    damped = LORRY._replace(
+        axles=tuple(axle._replace(tyre_damping_ns_per_m=800.0) for axle in LORRY.axles)
+    )
+    exact = accelerations(damped, twisting, 1.25e-4)
+    used = accelerations(damped, twisting, LONGEST_STEP_S)
+    np.testing.assert_allclose(used, exact, atol=4e-5)
 
 
 def half_car(truck: Truck, kappa: float) -> HalfCar:
@@ -271,29 +283,35 @@ def test_equalised_bogie_shares_its_spring_force() -> None:
         springs.append(inertia - dynamic)
     assert np.abs(springs[0]).max() > 3000.0
     np.testing.assert_allclose(springs[0] / 0.55, springs[1] / 0.45, atol=1e-6)
-    independent = cross(
-        TANDEM._replace(bogies=()), DECK, rough, even_motion(-9.0, 10.0, 2.0, 5e-4)
-    )
+    independent = cross(TANDEM._replace(bogies=()), DECK, rough, even_motion(-9.0, 10.0, 2.0, 5e-4))
     assert np.abs(independent.acceleration - run.acceleration).max() > 0.1
 
 
-def test_friction_holds_up_to_its_level() -> None:
-    """Swept slowly to and fro, the spring's force differs by twice the friction between ways."""
-    stiff = LORRY._replace(
-        axles=tuple(axle._replace(friction_n=4000.0) for axle in LORRY.axles)
+def test_friction_of_the_springs_follows_dahls_law() -> None:
+    """What the springs hold beyond stiffness and damping is Dahl's friction of their stroke."""
+    rubbing = LORRY._replace(
+        axles=tuple(
+            axle._replace(friction_n=4000.0, friction_length_m=0.002) for axle in LORRY.axles
+        )
     )
-    x = np.arange(-40.0, 60.0, 0.05)
-    bump = np.tile(0.02 * np.sin(2.0 * np.pi * x / 20.0) * np.clip((x + 30.0) / 5.0, 0, 1), (4, 1))
-    run = cross(
-        stiff, DECK, Road(-40.0, 0.05, bump), even_motion(-39.0, 0.5, 70.0, 1e-3)
-    )
-    plain = cross(
-        LORRY, DECK, Road(-40.0, 0.05, bump), even_motion(-39.0, 0.5, 70.0, 1e-3)
-    )
-    # Quasi-static: the contact forces hardly change, but the springs do not follow.
-    front = 3
-    stroke = [run.coordinates @ (body_row(stiff, 0.0, 0.0) - axle_row(stiff, 0, 0.0)) for run in (run, plain)]
-    assert front and np.ptp(stroke[0]) < np.ptp(stroke[1])
+    run = cross(rubbing, DECK, wavy(rubbing), even_motion(-8.0, 10.0, 2.4, 2.5e-4))
+    tyres = tyres_of(rubbing)
+    for i, axle in enumerate(rubbing.axles):
+        dynamic = -run.contact_force_n[:, tyres.axle == i].sum(axis=1)
+        dynamic -= static_axle_loads_n(rubbing)[i]
+        held = axle.mass_kg * (run.acceleration @ axle_row(rubbing, i, 0.0)) - dynamic
+        # Positive where the spring is extended and pulls the axle up.
+        stroke = run.coordinates @ (
+            body_row(rubbing, axle.position_m, 0.0) - axle_row(rubbing, i, 0.0)
+        )
+        rate = np.gradient(stroke, run.time_s)
+        friction = held - axle.suspension_stiffness_n_per_m * stroke
+        friction -= axle.suspension_damping_ns_per_m * rate
+        exact = np.zeros_like(stroke)
+        for n in range(1, stroke.size):
+            exact[n] = dahl_friction_n(exact[n - 1], stroke[n] - stroke[n - 1], 4000.0, 0.002)
+        assert np.ptp(exact) > 6000.0
+        np.testing.assert_allclose(friction, exact, atol=60.0)
 
 
 def test_semitrailer_stands_on_its_kingpin() -> None:
@@ -351,9 +369,7 @@ def cross_spectra(heights: Floats, spacing_m: float) -> tuple[Floats, NDArray[np
 
 
 def in_bands(n: Floats, values: Floats, edges: Floats) -> Floats:
-    return np.array(
-        [values[(n >= low) & (n < high)].mean() for low, high in zip(edges, edges[1:], strict=False)]
-    )
+    return np.array([values[(n >= low) & (n < high)].mean() for low, high in pairwise(edges)])
 
 
 EDGES = np.array([0.06, 0.1, 0.16, 0.25, 0.4, 0.63, 1.0, 1.6, 2.5])
@@ -385,12 +401,10 @@ def test_surface_coherence_between_lines_is_that_of_an_isotropic_one() -> None:
 def test_difference_of_twin_and_single_tyres_is_that_of_the_formula() -> None:
     """The same surface by two programs, where all the information on the mismatch is."""
     single = [Strip(side * 0.95, 0.25, 0.2) for side in (1, -1)]
-    twin = [
-        Strip(side * 0.95 + apart, 0.22, 0.2) for side in (1, -1) for apart in (0.165, -0.165)
-    ]
-    heights = profiles([*single, *twin], 16, 0.05, 3000)
+    twin = [Strip(side * 0.95 + apart, 0.22, 0.2) for side in (1, -1) for apart in (0.165, -0.165)]
+    heights = profiles([*single, *twin], 12, 0.1, 1500)
     apart = heights[:, :2].mean(axis=1) - heights[:, 2:].mean(axis=1)
-    n, found = cross_spectra(apart[:, None], 0.05)
+    n, found = cross_spectra(apart[:, None], 0.1)
     front = Footprint(track_m=1.9)
     rear = Footprint(width_m=0.22, twin_distance_m=0.33, track_m=1.9)
     use = n > 0.02
