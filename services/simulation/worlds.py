@@ -22,8 +22,8 @@ What is drawn, uniformly unless said:
   1.3 to 3 times the first of bending and whose radius of gyration is 1.8 to 3 m, under single tyres
   on such a surface;
 - left-and-right: a truck that rolls, its load up to 6 cm off the middle, on the same tyres and
-  surface, with sensors left and right on both axles and in pairs on the body, averaged to the four
-  channels;
+  surface, with sensors left and right on both axles and in pairs on the body, whose gains differ,
+  averaged to the four channels;
 - everything: all of these but the last three, each end sprung and the bridge continuous every other
   time.
 """
@@ -184,7 +184,11 @@ def with_single_tyres(site: Site) -> Site:
 
 
 def _pairs(site: Site, drawn: Truth, car: HalfCar, errors: Floats) -> tuple[Sensor, ...]:
-    """Sensors left and right, with errors of their own: (3, 8) standard normals."""
+    """Sensors left and right, with gains and biases of their own: (3, 8) standard normals.
+
+    One logger takes both of a pair at the same time: they have the same delay. A difference would
+    let an axle's roll into their mean, as that of their gains does.
+    """
     sensor = site.sensor
     bias = float(np.sqrt(np.mean(drawn.channels.bias_m_per_s2**2)))
     places = [
@@ -202,7 +206,7 @@ def _pairs(site: Site, drawn: Truth, car: HalfCar, errors: Floats) -> tuple[Sens
             gain_error=float(
                 (1.0 + drawn.channels.common_gain) * (1.0 + sensor.gain_spread * errors[0, k]) - 1.0
             ),
-            delay_s=float(sensor.delay_spread_s * errors[1, k]),
+            delay_s=float(sensor.delay_spread_s * errors[1, k - k % 2]),
             bias_m_per_s2=float(bias * errors[2, k]),
         )
         for k, (on, position, axle, lateral) in enumerate(places)

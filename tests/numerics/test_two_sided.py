@@ -121,6 +121,9 @@ def test_standing_truck_beside_the_axis_twists_the_deck() -> None:
 
     expected = [1.5 * (front * twist(x, 8.0) + rear * twist(x, 4.0)) for x in (8.0, 4.0)]
     np.testing.assert_allclose(-run.twist_rad[n], expected, rtol=0.01)
+    # Both axles sink with the lane: w + e theta.
+    sunk = [run.coordinates[n] @ axle_row(LORRY, axle, 0.0) for axle in (0, 1)]
+    np.testing.assert_allclose(sunk, run.deflection_m[n] + 1.5 * run.twist_rad[n], rtol=5e-3)
     # Bending is what it is without torsion.
     np.testing.assert_allclose(run.deflection_m[n], crawled(DECK)[0].deflection_m[n], rtol=1e-4)
 
@@ -346,6 +349,23 @@ def test_load_beside_the_middle_leans_on_that_side() -> None:
     forces = -run.contact_force_n[-1]
     assert forces @ tyres.lateral_m == pytest.approx(14_500.0 * GRAVITY * 0.06)
     np.testing.assert_allclose(run.acceleration, 0.0, atol=1e-12)
+
+
+def test_one_side_higher_leans_the_body_by_its_springs_in_series() -> None:
+    """Tyres and springs of each axle in series, less what the leaning body's weight takes away."""
+    tyres = tyres_of(LORRY)
+    bank = Road(-60.0, 0.5, np.tile(0.01 * np.sign(tyres.lateral_m)[:, None], (1, 200)))
+    run = cross(LORRY, DECK, bank, even_motion(-50.0, 2.0, 12.0, 1e-3), settle_s=2.0)
+    body, total = LORRY.bodies[0], 0.0
+    for axle in LORRY.axles:
+        spring = axle.suspension_stiffness_n_per_m * axle.spring_track_m**2 / 4.0
+        spring += axle.anti_roll_nm_per_rad
+        tyre = axle.tyre_stiffness_n_per_m * axle.track_m**2 / 4.0
+        total += spring * tyre / (spring + tyre)
+    leaning = body.mass_kg * GRAVITY * body.roll_arm_m
+    expected = 0.02 / 1.9 * total / (total - leaning)
+    assert run.coordinates[-1, 2] == pytest.approx(expected, rel=1e-3)
+    np.testing.assert_allclose(run.coordinates[-1, :2], 0.0, atol=1e-9)
 
 
 def profiles(strips: list[Strip], seeds: int, spacing_m: float, count: int) -> Floats:

@@ -214,6 +214,10 @@ def test_torsion_and_sides_are_drawn_from_the_stated_ranges() -> None:
     for width in pairs:
         assert width is not None
         assert width.torsion is None
+        delays, gains = np.array([(s.delay_s, s.gain_error) for s in width.sensors]).T
+        np.testing.assert_array_equal(delays[::2], delays[1::2])
+        assert np.unique(gains).size == 8
+        assert np.unique(delays).size == 4
         assert sorted({(s.on, s.lateral_m) for s in width.sensors}) == [
             ("axle", -0.9),
             ("axle", 0.9),
