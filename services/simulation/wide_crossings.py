@@ -163,7 +163,7 @@ def drive_case(case: Case, number: int) -> Driven:
     response = cross(truck, case.deck, road, motion, lane_offset_m=lane, settle_s=_SETTLE_S)
     rng = np.random.default_rng(np.random.SeedSequence([case.seed, 0x51DE, number]))
     travel = sign * (response.position_m - (0.0 if how.forward else span))
-    begin = max(_RUN_UP_S, float(np.interp(-_BEFORE_M, travel, response.time_s)))
+    begin = float(np.interp(-_BEFORE_M, travel, response.time_s))
     end = float(np.interp(span + length + _BEHIND_M, travel, response.time_s))
     time_s = begin + np.arange(int((end - begin) * case.rate_hz)) / case.rate_hz
     start_s = START_TIME_S + number * BETWEEN_RUNS_S

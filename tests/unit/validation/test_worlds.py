@@ -247,8 +247,7 @@ def test_torsion_reaches_the_simulation_and_the_record(monkeypatch: pytest.Monke
     assert density[2] == pytest.approx(density[1] / np.sqrt(2.0))
 
 
-def test_a_truck_with_width_moves_as_the_half_car_in_the_middle() -> None:
-    """Tracks alike, no torsion, no roll: one drive by both simulators, on like roads."""
+def test_truck_with_width_has_loads_and_inertia_of_the_half_car() -> None:
     world = draw_world(SITE, "torsion", 4)
     width = world.truth.width
     assert width is not None
@@ -266,6 +265,9 @@ def test_a_truck_with_width_moves_as_the_half_car_in_the_middle() -> None:
     np.testing.assert_allclose(
         bending_frequencies_hz(deck, 3), natural_frequencies_hz(refine(beam, 10), 3), rtol=1e-5
     )
+    leaning = draw_world(SITE, "left-and-right", 4).truth.width
+    assert leaning is not None
+    assert truck_with_width(car, leaning).bodies[0].cg_left_m == leaning.load_left_m
     with pytest.raises(ValueError, match="one span of equal elements"):
         deck_with_width(draw_world(SITE, "spans", 1).truth.beam, width)
 
