@@ -39,6 +39,8 @@ EFFECTS: Final = (
     "air",
     "spans",
     "surface",
+    "torsion",
+    "left-and-right",
     "everything",
 )
 """As in `simulation.worlds`, which is not imported for a line of help."""

@@ -49,6 +49,8 @@ from services.simulation.drive import (
     measured_run,
     paper_site,
 )
+from services.simulation.drive_wide import LONGEST_STEP_S as LONGEST_WIDE_STEP_S
+from services.simulation.drive_wide import Width, measured_wide_run
 from services.simulation.wheel_paths import WheelPaths
 
 Floats = NDArray[np.float64]
@@ -117,6 +119,8 @@ class Truth(NamedTuple):
     """What was on the bridge before."""
     paths: WheelPaths | None = None
     """Where the wheels run on a road that is a surface; None: both axles feel one groove."""
+    width: Width | None = None
+    """What truck and bridge have beyond the plane; None: nothing."""
 
 
 class Drawn(NamedTuple):
@@ -263,10 +267,10 @@ def drive(
     The noise is that of the conditions, unless that of each channel is given.
     """
     vehicle, bridge, how = site.vehicles[0], site.bridges[0], truth.conditions
-    every = max(1, int(np.ceil(1.0 / (how.rate_hz * LONGEST_STEP_S))))
+    longest_s = LONGEST_STEP_S if truth.width is None else LONGEST_WIDE_STEP_S
+    every = max(1, int(np.ceil(1.0 / (how.rate_hz * longest_s))))
     step_s = 1.0 / (how.rate_hz * every)
     settling = round(SETTLE_S * how.rate_hz) * every
-    motion = _motion(truth, bridge, step_s, every)
     errors = truth.channels
     axles = how.noise_ug_per_rthz
     body = axles if how.body_noise_ug_per_rthz is None else how.body_noise_ug_per_rthz
@@ -289,6 +293,36 @@ def drive(
         speed_noise_m_per_s=site.receiver.speed_noise_m_per_s,
         latency_s=truth.latency_s,
     )
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 0x6E]))
+    if truth.width is not None:
+        half_s = 0.5 * step_s
+        halves = _motion(truth, bridge, half_s, 2 * every)
+        wide = measured_wide_run(
+            bridge,
+            truth.car,
+            truth.beam,
+            truth.width,
+            halves,
+            half_s,
+            settling,
+            (how.road_class, how.road_seed),
+            sensors,
+            receiver,
+            rng,
+            antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
+        )
+        of_channels = np.array(densities) / (np.sqrt(2.0) if truth.width.sensors else 1.0)
+        return Drawn(
+            truth,
+            wide.run,
+            declared(site, tuple(of_channels.tolist()), how.rate_hz),
+            Motion(*(values[::2] for values in halves)),
+            float(wide.run.accel_time_s[0]) - settling * step_s,
+            step_s,
+            wide.road,
+            wide.largest_deflection_m,
+        )
+    motion = _motion(truth, bridge, step_s, every)
     run, roads, happened = measured_run(
         bridge,
         truth.car,
@@ -299,7 +333,7 @@ def drive(
         (how.road_class, how.road_seed),
         sensors,
         receiver,
-        np.random.default_rng(np.random.SeedSequence([seed, 0x6E])),
+        rng,
         antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
         left=truth.left,
         paths=truth.paths,

@@ -352,7 +352,7 @@ def measured_run(
     antenna = motion.position_m[settling_steps:] - sign * antenna_to_front_axle_m
     speed = np.abs(motion.speed_m_per_s[settling_steps:])
     lateral = np.full_like(antenna, lane_offset_m)
-    gnss = _fixes(bridge, step_s, antenna, lateral, speed, receiver, gnss_rng, forward=sign > 0)
+    gnss = gnss_track(bridge, step_s, antenna, lateral, speed, receiver, gnss_rng, forward=sign > 0)
     return Run("simulation", time_s, rate, channels, gnss), roads, fine
 
 
@@ -460,7 +460,7 @@ def _altitude_m(bridge: Bridge, chainage_m: Floats) -> Floats:
     return np.interp(chainage_m, [0.0, bridge.span_m], [low, high])
 
 
-def _fixes(
+def gnss_track(
     bridge: Bridge,
     step_s: float,
     antenna: Floats,
@@ -471,7 +471,7 @@ def _fixes(
     *,
     forward: bool,
 ) -> GnssTrack:
-    """What the receiver reports of the drive of its antenna."""
+    """Return what the receiver reports of the drive of its antenna, (n,) positions by step."""
     time_s = step_s * np.arange(antenna.size, dtype=np.float64)
     fixes = measure_position(time_s, antenna, lateral, speed, receiver, rng)
     frame = bridge_frame(bridge)

@@ -18,7 +18,13 @@ What is drawn, uniformly unless said:
 - surface: the road is a random surface under single tyres in front and twin tyres behind, unless
   the site says which (`wheel_paths`); the rear axle runs 0 to 10 mm beside the front, the truck
   0.12 m from the line (standard deviation);
-- everything: all of these but the surface, each end sprung and the bridge continuous every other
+- torsion: a lane 0.5 to 2 m off the axis, either side, of a deck whose first torsional frequency is
+  1.3 to 3 times the first of bending and whose radius of gyration is 1.8 to 3 m, under single tyres
+  on such a surface;
+- left-and-right: a truck that rolls, its load up to 6 cm off the middle, on the same tyres and
+  surface, with sensors left and right on both axles and in pairs on the body, whose gains differ,
+  averaged to the four channels;
+- everything: all of these but the last three, each end sprung and the bridge continuous every other
   time.
 """
 
@@ -28,13 +34,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
-from pre_core.physics.bridge import Beam
+from pre_core.physics.bridge import Beam, natural_frequencies_hz
 from pre_core.physics.vehicle import HalfCar
 from schemas.site import Bridge, Site
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.simulation.drawn import Truth, draw_truth
 from services.simulation.drive import Beyond, Left, with_beyond
+from services.simulation.drive_wide import Width
+from services.simulation.two_sided import Torsion
 from services.simulation.wheel_paths import OnSurface, wheel_paths_of
+from services.simulation.wide_crossings import Sensor
 
 Floats = NDArray[np.float64]
 
@@ -53,12 +62,21 @@ SPANS = (2, 5)
 SPAN_M = (12.0, 25.0)
 REAR_OFFSET_M = (0.0, 0.01)
 WANDER_M = 0.12
+LANE_OFFSET_M = (0.5, 2.0)
+TORSIONAL_RATIO = (1.3, 3.0)
+GYRATION_M = (1.8, 3.0)
+LOAD_LEFT_M = (-0.06, 0.06)
+AXLE_SENSORS_M, BODY_SENSORS_M = 0.9, 0.4
+"""Distance of sensors left and right from the middle."""
 
 EVERYTHING = "everything"
 SURFACE = "surface"
-"""Not a part of everything, whose answers on such a road would say little of the rest."""
 AMONG_ALL = ("free", "sprung", "sinking", "swing", "tyres", "friction", "bilinear", "air", "spans")
-ALONE = (*AMONG_ALL, SURFACE)
+TORSION = "torsion"
+LEFT_AND_RIGHT = "left-and-right"
+ON_SURFACES = (SURFACE, TORSION, LEFT_AND_RIGHT)
+"""Not parts of everything, whose answers on such a road would say little of the rest."""
+ALONE = (*AMONG_ALL, *ON_SURFACES)
 EFFECTS = (*ALONE, EVERYTHING)
 
 
@@ -94,6 +112,10 @@ def draw_world(site: Site, effect: str, seed: int) -> World:
     bilinear, air = float(rng.uniform(*BILINEAR)), float(rng.uniform(*AIR_EXPONENT))
     spans = rng.uniform(*SPAN_M, int(rng.integers(SPANS[0], SPANS[1] + 1)))
     rear_offset = float(rng.uniform(*REAR_OFFSET_M))
+    side = 1.0 if rng.uniform() < 0.5 else -1.0
+    lane, ratio = side * float(rng.uniform(*LANE_OFFSET_M)), float(rng.uniform(*TORSIONAL_RATIO))
+    gyration, load_left = float(rng.uniform(*GYRATION_M)), float(rng.uniform(*LOAD_LEFT_M))
+    errors_of_pairs = rng.standard_normal((3, 8))
 
     alone = effect != EVERYTHING
 
@@ -102,6 +124,8 @@ def draw_world(site: Site, effect: str, seed: int) -> World:
 
     if effect == "spans" or (not alone and every_other[0]):
         site = site.model_copy(update={"bridges": (continuous(site.bridges[0], spans),)})
+    if effect in (TORSION, LEFT_AND_RIGHT):
+        site = with_single_tyres(site)
     drawn = draw_truth(site, seed)
     scale = site.bridges[0].support_rotational_stiffness_nm_per_rad_scale_at_zero
     sprung = [has("sprung") and (alone or bool(other)) for other in every_other[1:3]]
@@ -126,8 +150,67 @@ def draw_world(site: Site, effect: str, seed: int) -> World:
         vehicle = site.vehicles[0]
         unknown = vehicle.rear_axle_offset_m is None
         paths = wheel_paths_of(vehicle, OnSurface(None, rear_offset if unknown else None, WANDER_M))
-    truth = drawn._replace(car=car, beam=beam, conditions=conditions, left=beyond.left, paths=paths)
+    width = None
+    if has(TORSION) or has(LEFT_AND_RIGHT):
+        vehicle = site.vehicles[0]
+        unknown = vehicle.rear_axle_offset_m is None
+        width = Width(
+            wheel_paths_of(vehicle, OnSurface(None, rear_offset if unknown else None, WANDER_M))
+        )
+    if width is not None and has(TORSION):
+        nominal = np.mean(site.bridges[0].nominal_flexural_rigidity_nm2)
+        undamaged = beam._replace(
+            flexural_rigidity_nm2=np.full_like(beam.flexural_rigidity_nm2, nominal)
+        )
+        f_1 = float(natural_frequencies_hz(undamaged, 1)[0])
+        width = width._replace(lane_offset_m=lane, torsion=Torsion(ratio * f_1, gyration))
+    if width is not None and has(LEFT_AND_RIGHT):
+        width = width._replace(
+            load_left_m=load_left, sensors=_pairs(site, drawn, car, errors_of_pairs)
+        )
+    truth = drawn._replace(
+        car=car, beam=beam, conditions=conditions, left=beyond.left, paths=paths, width=width
+    )
     return World(truth, site, beyond)
+
+
+def with_single_tyres(site: Site) -> Site:
+    """Return the site whose truck has single tyres, unless it says which it has."""
+    vehicle = site.vehicles[0]
+    if vehicle.twin_tyre_distance_m is not None:
+        return site
+    single = vehicle.model_copy(update={"twin_tyre_distance_m": (0.0, 0.0)})
+    return site.model_copy(update={"vehicles": (single, *site.vehicles[1:])})
+
+
+def _pairs(site: Site, drawn: Truth, car: HalfCar, errors: Floats) -> tuple[Sensor, ...]:
+    """Sensors left and right, with gains and biases of their own: (3, 8) standard normals.
+
+    One logger takes both of a pair at the same time: they have the same delay. A difference would
+    let an axle's roll into their mean, as that of their gains does.
+    """
+    sensor = site.sensor
+    bias = float(np.sqrt(np.mean(drawn.channels.bias_m_per_s2**2)))
+    places = [
+        ("body", position, 0, side * BODY_SENSORS_M)
+        for position in (0.0, car.wheelbase_m)
+        for side in (1.0, -1.0)
+    ] + [("axle", 0.0, axle, side * AXLE_SENSORS_M) for axle in (1, 2) for side in (1.0, -1.0)]
+    return tuple(
+        Sensor(
+            f"{on}_{k}",
+            on,
+            position,
+            axle,
+            lateral,
+            gain_error=float(
+                (1.0 + drawn.channels.common_gain) * (1.0 + sensor.gain_spread * errors[0, k]) - 1.0
+            ),
+            delay_s=float(sensor.delay_spread_s * errors[1, k - k % 2]),
+            bias_m_per_s2=float(bias * errors[2, k]),
+        )
+        for k, (on, position, axle, lateral) in enumerate(places)
+    )
 
 
 def _plain(car: HalfCar, beam: Beam) -> tuple[HalfCar, Beam]:

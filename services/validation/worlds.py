@@ -21,6 +21,7 @@ from schemas.site_file import site_hash
 from services.common.errors import InputError
 from services.recordings.recording import program_version
 from services.simulation.drawn import drive, see
+from services.simulation.drive_wide import Width
 from services.simulation.worlds import SURFACE, draw_world
 from services.validation.bound import bound_at_truth
 from services.validation.calibration import Check, Record, in_processes, record
@@ -82,10 +83,24 @@ def one_world(site: Site, effect: str, seed: int, settings: IdentificationSettin
                 "rear": paths.rear._asdict(),
                 "wander_m": paths.wander_m,
             },
+            "width": None if world.truth.width is None else _width_of(world.truth.width),
             "friction_length_m": world.truth.car.friction_length_m,
             "interior_supports_m": world.site.bridges[0].interior_supports_m,
         },
         "derived": None if derived is None else derived.model_dump(mode="json"),
+    }
+
+
+def _width_of(width: Width) -> Record:
+    """What a crossing has beyond the plane, as JSON."""
+    return width._asdict() | {
+        "paths": {
+            "front": width.paths.front._asdict(),
+            "rear": width.paths.rear._asdict(),
+            "wander_m": width.paths.wander_m,
+        },
+        "torsion": None if width.torsion is None else width.torsion._asdict(),
+        "sensors": [sensor._asdict() for sensor in width.sensors],
     }
 
 

@@ -22,7 +22,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.common.files import make_folder
 from services.simulation.drawn import default_site
-from services.simulation.worlds import EFFECTS, SURFACE
+from services.simulation.worlds import EFFECTS, ON_SURFACES
 from services.validation.calibration import Record, one_crossing
 from services.validation.worlds import (
     HEADINGS,
@@ -43,7 +43,7 @@ def main() -> int:
     site = default_site()
     settings = IdentificationSettings(method="pre", threads=1)
     identity = identity_of(site, settings)
-    effects = [effect for effect in EFFECTS if effect != SURFACE]
+    effects = [effect for effect in EFFECTS if effect not in ON_SURFACES]
     wanted = [(DRAWN, seed) for seed in range(options.crossings)]
     wanted += [(effect, seed) for seed in range(options.worlds) for effect in effects]
     make_folder(options.records.parent)

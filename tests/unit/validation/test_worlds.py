@@ -7,14 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2 as STANDARD_GRAVITY
+from pre_core.physics.bridge import natural_frequencies_hz, refine
 from pre_core.physics.vehicle import static_axle_loads_n
 from schemas.settings import IdentificationSettings
+from schemas.signals import CHANNELS
 from services.cli import validation as command_line
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_chainage
 from services.simulation import drawn as drawn_crossings
 from services.simulation import worlds
 from services.simulation.drawn import default_site, draw_truth
+from services.simulation.drive_wide import deck_with_width, truck_with_width
+from services.simulation.two_sided import bending_frequencies_hz
+from services.simulation.two_sided import static_axle_loads_n as static_loads
 from services.simulation.wheel_paths import OnSurface, wheel_paths_of
 from services.simulation.worlds import ALONE, EFFECTS, EVERYTHING, World, draw_world
 from services.validation import worlds as validation
@@ -79,6 +85,8 @@ def test_an_effect_alone_changes_nothing_else(effect: str) -> None:
             "air": world.truth.car.air_spring_exponent > 0.0,
             "spans": bool(world.site.bridges[0].interior_supports_m),
             "surface": world.truth.paths is not None,
+            "torsion": world.truth.width is not None and world.truth.width.torsion is not None,
+            "left-and-right": world.truth.width is not None and bool(world.truth.width.sensors),
         }
         assert [name for name, there in others.items() if there] == [effect] * (effect != "free")
 
@@ -151,7 +159,7 @@ def test_on_a_surface_the_rear_axle_has_twin_tyres_and_runs_beside() -> None:
             SITE.vehicles[0], OnSurface("twin", paths.rear.offset_m, 0.12)
         )
     assert {w.truth.conditions.road_class for w in drawn("surface")} == {"A", "B"}
-    assert all(w.truth.paths is None for w in drawn(EVERYTHING))
+    assert all(w.truth.paths is None and w.truth.width is None for w in drawn(EVERYTHING))
 
 
 def test_on_a_surface_tyres_are_the_sites_where_it_tells() -> None:
@@ -182,6 +190,86 @@ def test_the_surface_is_driven_over_by_the_worlds_truck(monkeypatch: pytest.Monk
     assert lines[0]["world"]["wheel_paths"] is None
     assert lines[1]["world"]["wheel_paths"]["rear"] == paths.rear._asdict()
     assert json.loads(json.dumps(lines[1]["world"]))["wheel_paths"]["wander_m"] == 0.12
+
+
+def test_torsion_and_sides_are_drawn_from_the_stated_ranges() -> None:
+    widths = [w.truth.width for w in drawn("torsion")]
+    for world, width in zip(drawn("torsion"), widths, strict=True):
+        assert width is not None
+        assert width.torsion is not None
+        assert width.paths.rear.twin_distance_m == 0.0
+        assert world.site.vehicles[0].twin_tyre_distance_m == (0.0, 0.0)
+    lanes = [abs(width.lane_offset_m) for width in widths if width]
+    assert within(lanes, worlds.LANE_OFFSET_M)
+    assert {width.lane_offset_m > 0.0 for width in widths if width} == {True, False}
+    of_torsion = [width.torsion for width in widths if width and width.torsion]
+    # 3.286 Hz is the first frequency of the paper's undamaged bridge.
+    frequencies = np.array([t.frequency_hz for t in of_torsion])
+    masses = [w.truth.beam.mass_per_length_kg_per_m[0] for w in drawn("torsion")]
+    ratios = frequencies / (0.5 * np.pi / 30.0**2 * np.sqrt(1.56e10 / np.array(masses)))
+    assert within(ratios, worlds.TORSIONAL_RATIO)
+    assert within([t.gyration_m for t in of_torsion], worlds.GYRATION_M)
+    pairs = [w.truth.width for w in drawn("left-and-right")]
+    assert within([width.load_left_m for width in pairs if width], worlds.LOAD_LEFT_M)
+    for width in pairs:
+        assert width is not None
+        assert width.torsion is None
+        delays, gains = np.array([(s.delay_s, s.gain_error) for s in width.sensors]).T
+        np.testing.assert_array_equal(delays[::2], delays[1::2])
+        assert np.unique(gains).size == 8
+        assert np.unique(delays).size == 4
+        assert sorted({(s.on, s.lateral_m) for s in width.sensors}) == [
+            ("axle", -0.9),
+            ("axle", 0.9),
+            ("body", -0.4),
+            ("body", 0.4),
+        ]
+
+
+def test_torsion_reaches_the_simulation_and_the_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs: list[Any] = []
+
+    def keeping(found: list[Any], site: Any, settings: Any) -> list[Any]:
+        runs.append((found[0], site))
+        return []
+
+    monkeypatch.setattr(validation, "see", keeping)
+    lines = [validation.one_world(SITE, effect, 2, SETTINGS) for effect in worlds.ON_SURFACES]
+    told = [json.loads(json.dumps(line["world"]))["width"] for line in lines]
+    assert told[0] is None
+    assert told[1]["torsion"]["frequency_hz"] > 0.0
+    assert len(told[2]["sensors"]) == 8
+    for run, _ in runs:
+        assert tuple(sorted(run.channels)) == tuple(sorted(CHANNELS))
+        assert run.accel_time_s.size == run.channels[CHANNELS[0]].size
+    # The mean of two sensors has 1/sqrt(2) of the noise of one.
+    density = [site.sensor.noise_density_ug_per_rthz[0] for _, site in runs]
+    assert density[2] == pytest.approx(density[1] / np.sqrt(2.0))
+
+
+def test_truck_with_width_has_loads_and_inertia_of_the_half_car() -> None:
+    world = draw_world(SITE, "torsion", 4)
+    width = world.truth.width
+    assert width is not None
+    car, beam = world.truth.car, world.truth.beam
+    truck, deck = truck_with_width(car, width), deck_with_width(beam, width)
+    np.testing.assert_allclose(
+        static_loads(truck), static_axle_loads_n(car, STANDARD_GRAVITY), rtol=1e-9
+    )
+    assert truck.bodies[0].pitch_inertia_kg_m2 == pytest.approx(
+        car.pitch_inertia_ratio
+        * car.body_mass_kg
+        * car.front_axle_to_cg_m
+        * (car.wheelbase_m - car.front_axle_to_cg_m)
+    )
+    np.testing.assert_allclose(
+        bending_frequencies_hz(deck, 3), natural_frequencies_hz(refine(beam, 10), 3), rtol=1e-5
+    )
+    leaning = draw_world(SITE, "left-and-right", 4).truth.width
+    assert leaning is not None
+    assert truck_with_width(car, leaning).bodies[0].cg_left_m == leaning.load_left_m
+    with pytest.raises(ValueError, match="one span of equal elements"):
+        deck_with_width(draw_world(SITE, "spans", 1).truth.beam, width)
 
 
 def test_an_effect_that_is_none() -> None:

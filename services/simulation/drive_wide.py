@@ -1,0 +1,224 @@
+"""Drives of a half-car and a beam that are given width: the truth of `two_sided` behind a run.
+
+What a plane truck and bridge leave open (roll, tracks, torsion, the lane) is in `Width`. Sensors in
+the middle, or left and right, become the four channels that every method takes.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.physics.bridge import Beam
+from pre_core.physics.road import Profile
+from pre_core.physics.sensors import Accelerometer, Receiver, measure_acceleration
+from pre_core.physics.simulate import Motion as PlaneMotion
+from pre_core.physics.surface import Footprint
+from pre_core.physics.vehicle import HalfCar
+from schemas.signals import CHANNELS
+from schemas.site import Bridge
+from services.drives.runs import Run
+from services.simulation.drive import START_TIME_S, gnss_track
+from services.simulation.two_sided import (
+    Axle,
+    Body,
+    Deck,
+    Motion,
+    Road,
+    Torsion,
+    Truck,
+    cross,
+)
+from services.simulation.two_sided_surface import draw_waves
+from services.simulation.wheel_paths import WheelPaths
+from services.simulation.wide_crossings import Sensor, middle_channels, road_under, sensor_row
+
+Floats = NDArray[np.float64]
+
+LONGEST_STEP_S = 2e-4
+"""The accelerometers' filters take samples at this interval or less."""
+_ROLL_GYRATION_M = 0.85
+_SETTLE_S = 1.5
+"""The road rises to its heights during this time at the beginning of the run-up."""
+
+
+class Width(NamedTuple):
+    """What a truck and a bridge have beyond the plane through the truck's middle."""
+
+    paths: WheelPaths
+    lane_offset_m: float = 0.0
+    """Middle of the lane to the left of the bridge's axis, looking from start to end."""
+    torsion: Torsion | None = None
+    load_left_m: float = 0.0
+    """Distance of the body's centre of gravity to the left of the middle."""
+    sensors: tuple[Sensor, ...] = ()
+    """Where they are, gains, delays and biases; none: the four in the middle."""
+
+
+class WideDrive(NamedTuple):
+    """What the truck recorded, and what was behind it."""
+
+    run: Run
+    road: Profile
+    """Mean of what the front tyres feel."""
+    largest_deflection_m: float
+    """Of the bridge's axis under an axle."""
+
+
+def measured_wide_run(
+    bridge: Bridge,
+    car: HalfCar,
+    beam: Beam,
+    width: Width,
+    motion: PlaneMotion,
+    half_step_s: float,
+    settling_steps: int,
+    road: tuple[str, int],
+    sensors: Sequence[Accelerometer],
+    receiver: Receiver,
+    rng: np.random.Generator,
+    *,
+    antenna_to_front_axle_m: float = 0.0,
+) -> WideDrive:
+    """Drive a truck with width along `motion` (every half step) and measure it.
+
+    `sensors` are those of the four channels; where the truck has more, they have the first one's
+    rate, the density of the channel's kind, and errors of their own. The recording begins after
+    `settling_steps` whole steps.
+    """
+    accel_rng, gnss_rng, place_rng = rng.spawn(3)
+    truck, deck = truck_with_width(car, width), deck_with_width(beam, width)
+    forward = bool(motion.speed_m_per_s[0] >= 0.0)
+    lane = width.lane_offset_m + width.paths.wander_m * float(place_rng.standard_normal())
+    reach = car.wheelbase_m + 1.0
+    surface = road_under(
+        truck,
+        draw_waves(*road),
+        float(motion.position_m.min() - reach),
+        float(motion.position_m.max() + reach),
+        lane_offset_m=lane,
+        forward=forward,
+    )
+    count = motion.position_m.size - (motion.position_m.size + 1) % 2
+    step_s = 2.0 * half_step_s
+    response = cross(
+        truck,
+        deck,
+        surface,
+        Motion(step_s, *(values[:count] for values in motion)),
+        lane_offset_m=lane,
+        settle_s=_SETTLE_S,
+    )
+    recorded = response.acceleration[settling_steps:]
+    rate = sensors[0].rate_hz
+    read = {
+        place.channel: measure_acceleration(
+            recorded @ sensor_row(truck, place), 1.0 / step_s, sensor, accel_rng
+        )
+        for place, sensor in _places(car, width, sensors)
+    }
+    channels = middle_channels(read, width.sensors) if width.sensors else read
+    position = motion.position_m[:count:2][settling_steps:]
+    speed = np.abs(motion.speed_m_per_s[:count:2][settling_steps:])
+    gnss = gnss_track(
+        bridge,
+        step_s,
+        position - (1 if forward else -1) * antenna_to_front_axle_m,
+        np.full_like(position, lane),
+        speed,
+        receiver,
+        gnss_rng,
+        forward=forward,
+    )
+    samples = channels[CHANNELS[0]].size
+    time_s = START_TIME_S + np.arange(samples, dtype=np.float64) / rate
+    run = Run("simulation", time_s, rate, channels, gnss)
+    return WideDrive(run, _felt_in_front(surface, truck), -float(response.deflection_m.min()))
+
+
+def _places(
+    car: HalfCar, width: Width, sensors: Sequence[Accelerometer]
+) -> list[tuple[Sensor, Accelerometer]]:
+    """All sensors of the truck with what each makes of the motion."""
+    front, rear = sensors[:2], sensors[2:]
+    if not width.sensors:
+        middle = (
+            Sensor(CHANNELS[0], "body", 0.0),
+            Sensor(CHANNELS[1], "body", car.wheelbase_m),
+            Sensor(CHANNELS[2], "axle", axle=1),
+            Sensor(CHANNELS[3], "axle", axle=2),
+        )
+        return list(zip(middle, sensors, strict=True))
+    return [
+        (
+            place,
+            (front if place.on == "body" else rear)[0]._replace(
+                gain_error=place.gain_error,
+                delay_s=place.delay_s,
+                bias_m_per_s2=place.bias_m_per_s2,
+            ),
+        )
+        for place in width.sensors
+    ]
+
+
+def _felt_in_front(road: Road, truck: Truck) -> Profile:
+    front = 4 if truck.axles[0].twin_distance_m > 0.0 else 2
+    x = road.start_m + road.spacing_m * np.arange(road.height_m.shape[1], dtype=np.float64)
+    return Profile(x, road.height_m[:front].mean(axis=0))
+
+
+def truck_with_width(car: HalfCar, width: Width) -> Truck:
+    """Return the truck with two sides that moves as `car` does in its middle plane."""
+    body_kg, d_1 = car.body_mass_kg, car.front_axle_to_cg_m
+    pitch = car.pitch_inertia_ratio * body_kg * d_1 * (car.wheelbase_m - d_1)
+    body = Body(
+        body_kg,
+        d_1,
+        pitch,
+        body_kg * _ROLL_GYRATION_M**2,
+        cg_left_m=width.load_left_m,
+        cg_height_m=car.cg_height_m,
+    )
+    return Truck(
+        (body,),
+        tuple(
+            _axle(car, i, footprint)
+            for i, footprint in enumerate((width.paths.front, width.paths.rear))
+        ),
+    )
+
+
+def _axle(car: HalfCar, i: int, footprint: Footprint) -> Axle:
+    return Axle(
+        i * car.wheelbase_m,
+        car.unsprung_mass_kg[i],
+        car.suspension_stiffness_n_per_m[i],
+        car.suspension_damping_ns_per_m[i],
+        car.tyre_stiffness_n_per_m[i],
+        car.tyre_damping_ns_per_m[i],
+        footprint.track_m,
+        footprint.width_m,
+        footprint.twin_distance_m,
+        contact_length_m=footprint.length_m,
+        offset_m=footprint.offset_m,
+        friction_n=car.dry_friction_n[i],
+        friction_length_m=car.friction_length_m,
+    )
+
+
+def deck_with_width(beam: Beam, width: Width) -> Deck:
+    """Return the deck of a single span of equal elements; ValueError for any other beam."""
+    lengths = beam.element_lengths_m
+    if beam.interior_supports or np.ptp(lengths) > 1e-9 * lengths[0]:
+        raise ValueError("a deck with width has one span of equal elements")
+    return Deck(
+        float(lengths.sum()),
+        tuple(beam.flexural_rigidity_nm2.tolist()),
+        float(beam.mass_per_length_kg_per_m[0]),
+        beam.rayleigh_alpha_per_s,
+        beam.rayleigh_beta_s,
+        width.torsion,
+        beam.support_rotational_stiffness_nm_per_rad,
+    )

@@ -1,0 +1,373 @@
+"""Crossings of trucks and bridges with width: what sensors record, and folders of files.
+
+A case is one truck, bridge, road, set of sensors and the site file of its owner, with any number of
+runs. `two_sided` drives it, `wide_cases` draws some. Accelerometers have gain, delay, bias and
+white noise; a receiver has a slow error, which is constant during a run, and white ones.
+
+    case = draw_wide(3)
+    write_folder(Path("w3"), case)                       # as shared crossings: CSV, site, truth
+    found = see([drive_case(case, 0).run], site_of(case), IdentificationSettings())
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from pre_core.constants import MICRO_G_M_PER_S2
+from schemas.site import Bridge, Site
+from schemas.site_file import parse_site
+from services.common.geodesy import bridge_frame, to_lat_lon
+from services.drives.runs import GnssTrack, Run
+from services.simulation.two_sided import (
+    LONGEST_STEP_S,
+    Deck,
+    Response,
+    Road,
+    Truck,
+    axle_row,
+    body_row,
+    cross,
+    even_motion,
+    static_axle_loads_n,
+    tyres_of,
+)
+from services.simulation.two_sided_surface import Strip, Waves, draw_waves, heights_m
+
+Floats = NDArray[np.float64]
+
+START_TIME_S: Final = 1_796_300_000.0
+BETWEEN_RUNS_S: Final = 600.0
+_RUN_UP_S, _SETTLE_S = 5.0, 2.0
+_BEFORE_M, _BEHIND_M = 30.0, 25.0
+"""Road between the beginning of a recording and the first axle's entry; after the last exit."""
+_ROAD_SPACING_M = 0.02
+_FIX_RATE_HZ = 10.0
+_ALTITUDE_M, _ALTITUDE_NOISE_M = 20.0, 0.2
+
+PAIR_NAMES: Final = ("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear")
+
+
+class Sensor(NamedTuple):
+    """An accelerometer on a body, or on an axle."""
+
+    channel: str
+    on: str
+    """"body" or "axle"."""
+    position_m: float = 0.0
+    """Distance behind the first axle; of sensors on a body."""
+    axle: int = 0
+    """Number from 1; of sensors on axles."""
+    lateral_m: float = 0.0
+    """To the left of the middle."""
+    body: int = 0
+    noise_ug_per_rthz: float = 25.0
+    gain_error: float = 0.0
+    delay_s: float = 0.0
+    """A sample stamped t shows what was at t - delay."""
+    bias_m_per_s2: float = 0.0
+
+
+class SatelliteErrors(NamedTuple):
+    """Standard deviations of a receiver's errors."""
+
+    slow_m: float = 1.5
+    noise_m: float = 0.4
+    speed_m_per_s: float = 0.07
+
+
+USUAL_RECEIVER: Final = SatelliteErrors()
+RTK: Final = SatelliteErrors(0.02, 0.02, 0.02)
+
+
+class WideRun(NamedTuple):
+    """How one run is driven."""
+
+    speed_m_per_s: float
+    """Mean; it changes as a sine of `change_m_per_s` and `period_s`."""
+    forward: bool = True
+    beside_m: float = 0.0
+    """Distance of the truck to the left of its lane's middle, seen from start to end."""
+    change_m_per_s: float = 0.0
+    period_s: float = 10.0
+
+
+class Case(NamedTuple):
+    """One truck on one bridge, and what its owner declares."""
+
+    name: str
+    seed: int
+    """Of noise and receiver."""
+    truck: Truck
+    deck: Deck
+    undamaged_nm2: float
+    lane_offset_m: float
+    road_class: str
+    road_seed: int
+    is_one_road: bool
+    """All tyres feel the profile of one line."""
+    sensors: tuple[Sensor, ...]
+    runs: tuple[WideRun, ...]
+    declared: Mapping[str, Mapping[str, Any]]
+    """Tables and keys of the site file."""
+    rate_hz: float = 500.0
+    receiver: SatelliteErrors = USUAL_RECEIVER
+
+
+class Driven(NamedTuple):
+    """One run as it is recorded, with what is behind it."""
+
+    run: Run
+    response: Response
+    road: Road
+    entry_s: float
+    """When the first axle comes on, on the clock of the recording."""
+    exit_s: float
+    """When the last axle leaves."""
+
+
+def drive_case(case: Case, number: int) -> Driven:
+    """Drive and measure one of the case's runs."""
+    how = case.runs[number]
+    truck, span = case.truck, case.deck.span_m
+    length = max(axle.position_m for axle in truck.axles)
+    step_s = 1.0 / (case.rate_hz * np.ceil(1.0 / (case.rate_hz * LONGEST_STEP_S)))
+    slowest = how.speed_m_per_s - abs(how.change_m_per_s)
+    reach = (how.speed_m_per_s + abs(how.change_m_per_s)) * _RUN_UP_S + _BEFORE_M
+    duration = _RUN_UP_S + (_BEFORE_M + span + length + _BEHIND_M) / slowest
+    motion = even_motion(
+        -reach if how.forward else span + reach,
+        how.speed_m_per_s,
+        duration,
+        step_s,
+        forward=how.forward,
+        change_m_per_s=how.change_m_per_s,
+        period_s=how.period_s,
+    )
+    sign = 1.0 if how.forward else -1.0
+    lane = case.lane_offset_m + how.beside_m
+    low, high = motion.position_m.min(), motion.position_m.max()
+    road = road_under(
+        truck,
+        draw_waves(case.road_class, case.road_seed),
+        float(low - length - 1.0),
+        float(high + length + 1.0),
+        lane_offset_m=lane,
+        forward=how.forward,
+        is_one_road=case.is_one_road,
+    )
+    response = cross(truck, case.deck, road, motion, lane_offset_m=lane, settle_s=_SETTLE_S)
+    rng = np.random.default_rng(np.random.SeedSequence([case.seed, 0x51DE, number]))
+    travel = sign * (response.position_m - (0.0 if how.forward else span))
+    begin = float(np.interp(-_BEFORE_M, travel, response.time_s))
+    end = float(np.interp(span + length + _BEHIND_M, travel, response.time_s))
+    time_s = begin + np.arange(int((end - begin) * case.rate_hz)) / case.rate_hz
+    start_s = START_TIME_S + number * BETWEEN_RUNS_S
+    channels = {
+        sensor.channel: _measured(truck, response, sensor, time_s, case.rate_hz, rng)
+        for sensor in case.sensors
+    }
+    run = Run(
+        f"{case.name} {number}",
+        start_s + time_s - begin,
+        case.rate_hz,
+        channels,
+        _fixes(case, response, lane, time_s, start_s - begin, rng),
+    )
+    crossed = [float(np.interp(x, travel, response.time_s)) for x in (0.0, span + length)]
+    return Driven(run, response, road, *(start_s + at - begin for at in crossed))
+
+
+def road_under(
+    truck: Truck,
+    waves: Waves,
+    start_m: float,
+    stop_m: float,
+    *,
+    lane_offset_m: float = 0.0,
+    forward: bool = True,
+    is_one_road: bool = False,
+    spacing_m: float = _ROAD_SPACING_M,
+) -> Road:
+    """Return what each tyre of a truck feels whose middle runs beside the bridge's axis.
+
+    On one road every tyre feels the same line, averaged over the first axle's contact length.
+    """
+    count = round((stop_m - start_m) / spacing_m) + 1
+    sign = 1.0 if forward else -1.0
+    strips = []
+    tyres = tyres_of(truck)
+    for i, lateral in zip(tyres.axle, tyres.lateral_m, strict=True):
+        axle = truck.axles[i]
+        place = lane_offset_m + sign * float(lateral)
+        strips.append(Strip(place, axle.tyre_width_m, axle.contact_length_m))
+    if is_one_road:
+        strips = [Strip(0.0, 0.0, truck.axles[0].contact_length_m)] * len(strips)
+    felt = {s: heights_m(waves, s, start_m, spacing_m, count) for s in dict.fromkeys(strips)}
+    return Road(start_m, spacing_m, np.stack([felt[strip] for strip in strips]))
+
+
+def sensor_row(truck: Truck, sensor: Sensor) -> Floats:
+    """Return the row that takes the truck's accelerations to what a perfect sensor reads."""
+    if sensor.on == "body":
+        return body_row(truck, sensor.position_m, sensor.lateral_m, sensor.body)
+    return axle_row(truck, sensor.axle - 1, sensor.lateral_m)
+
+
+def _measured(
+    truck: Truck,
+    response: Response,
+    sensor: Sensor,
+    time_s: Floats,
+    rate_hz: float,
+    rng: np.random.Generator,
+) -> Floats:
+    true = response.acceleration @ sensor_row(truck, sensor)
+    read = CubicSpline(response.time_s, true)(time_s - sensor.delay_s)
+    noise = sensor.noise_ug_per_rthz * MICRO_G_M_PER_S2 * np.sqrt(rate_hz / 2.0)
+    return np.asarray(
+        (1.0 + sensor.gain_error) * read
+        + sensor.bias_m_per_s2
+        + noise * rng.standard_normal(time_s.size)
+    )
+
+
+def _fixes(
+    case: Case,
+    response: Response,
+    lane_m: float,
+    time_s: Floats,
+    clock_s: float,
+    rng: np.random.Generator,
+) -> GnssTrack:
+    at = np.arange(time_s[0], time_s[-1], 1.0 / _FIX_RATE_HZ)
+    errors = case.receiver
+    slow = errors.slow_m * rng.standard_normal(2)
+    white = errors.noise_m * rng.standard_normal((2, at.size))
+    along = np.interp(at, response.time_s, response.position_m) + slow[0] + white[0]
+    beside = lane_m + slow[1] + white[1]
+    speed = np.abs(
+        np.interp(at, response.time_s, np.gradient(response.position_m, response.time_s))
+    )
+    latitude, longitude = to_lat_lon(bridge_frame(site_of(case).bridges[0]), along, beside)
+    return GnssTrack(
+        clock_s + at,
+        latitude,
+        longitude,
+        _ALTITUDE_M + _ALTITUDE_NOISE_M * rng.standard_normal(at.size),
+        speed + errors.speed_m_per_s * rng.standard_normal(at.size),
+        None,
+    )
+
+
+def middle_channels(channels: Mapping[str, Floats], sensors: Sequence[Sensor]) -> dict[str, Floats]:
+    """Average sensors left and right of the same place into the four middle channels.
+
+    Body places and axles are front and rear in their order. ValueError where sensors of one place
+    have no mean in the middle.
+    """
+    found: dict[str, Floats] = {}
+    for on, names in (("body", PAIR_NAMES[:2]), ("axle", PAIR_NAMES[2:])):
+        of = [sensor for sensor in sensors if sensor.on == on]
+        places = sorted({(sensor.axle, sensor.position_m) for sensor in of})
+        for name, place in zip(names, places, strict=True):
+            there = [sensor for sensor in of if (sensor.axle, sensor.position_m) == place]
+            if abs(sum(sensor.lateral_m for sensor in there)) > 1e-9:
+                raise ValueError(f"{there[0].channel} and what is with it are not symmetric")
+            found[name] = np.mean([channels[sensor.channel] for sensor in there], axis=0)
+    return found
+
+
+def site_text(case: Case, *, with_width: bool = True) -> str:
+    """Return the owner's site file; `with_width` False leaves out what only width needs."""
+    lines = ["# All SI."]
+    for table in ("vehicle", "bridge", "sensor"):
+        lines.append(f"[{table}]")
+        lines += [
+            f"{key} = {json.dumps(value)}"
+            for key, value in case.declared[table].items()
+            if with_width or not _is_of_width(key, value)
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _is_of_width(key: str, value: object) -> bool:
+    torsion = ("lane_offset_m", "torsional_frequency_ratio", "deck_gyration_m")
+    return key in torsion or (key == "track_m" and isinstance(value, list))
+
+
+def site_of(case: Case) -> Site:
+    """Return the owner's site file as the program reads it."""
+    return parse_site(
+        site_text(case, with_width="lane_offset_m" in Bridge.model_fields), f"{case.name}.toml"
+    )
+
+
+def write_folder(folder: Path, case: Case) -> None:
+    """Write accel_NN.csv, gps_NN.csv, site.toml and truth.json of all runs to a new folder."""
+    folder.mkdir(parents=True)
+    runs = []
+    for number, how in enumerate(case.runs):
+        driven = drive_case(case, number)
+        run = driven.run
+        header = "time_s," + ",".join(run.channels)
+        rows = np.column_stack([run.accel_time_s, *run.channels.values()])
+        formats = ["%.6f"] + ["%.5f"] * len(run.channels)
+        np.savetxt(
+            folder / f"accel_{number:02d}.csv", rows, formats, ",", header=header, comments=""
+        )
+        gnss = run.gnss
+        np.savetxt(
+            folder / f"gps_{number:02d}.csv",
+            np.column_stack(
+                [
+                    gnss.time_s,
+                    gnss.latitude_deg,
+                    gnss.longitude_deg,
+                    gnss.altitude_m,
+                    gnss.speed_m_per_s,
+                ]
+            ),
+            ["%.3f", "%.8f", "%.8f", "%.2f", "%.3f"],
+            ",",
+            header="time_s,latitude_deg,longitude_deg,altitude_m,speed_mps",
+            comments="",
+        )
+        runs.append(
+            {
+                "speed_mps": how.speed_m_per_s,
+                "t0": float(run.accel_time_s[0]),
+                "entry": driven.entry_s,
+                "exit": driven.exit_s,
+                "direction": "start_to_end" if how.forward else "end_to_start",
+                "max_deflection_mm": -1e3 * float(driven.response.deflection_m.min()),
+            }
+        )
+    (folder / "site.toml").write_text(site_text(case), encoding="utf-8")
+    (folder / "truth.json").write_text(
+        json.dumps(truth_of(case) | {"runs": runs}, indent=1) + "\n", encoding="utf-8"
+    )
+
+
+def truth_of(case: Case) -> dict[str, Any]:
+    """Return what the simulator uses, for judging results only."""
+    truck, deck = case.truck, case.deck
+    return {
+        "EI": list(deck.flexural_rigidity_nm2),
+        "EI_ratio": [ei / case.undamaged_nm2 for ei in deck.flexural_rigidity_nm2],
+        "truck": {
+            "bodies": [body._asdict() for body in truck.bodies],
+            "axles": [axle._asdict() for axle in truck.axles],
+            "bogies": [bogie._asdict() for bogie in truck.bogies],
+            "kingpin": None if truck.kingpin is None else truck.kingpin._asdict(),
+            "axle_loads_n": static_axle_loads_n(truck).tolist(),
+        },
+        "torsion": None if deck.torsion is None else deck.torsion._asdict(),
+        "lane_offset_m": case.lane_offset_m,
+        "road": {"class": case.road_class, "seed": case.road_seed, "one_road": case.is_one_road},
+        "sensors": [sensor._asdict() for sensor in case.sensors],
+    }
