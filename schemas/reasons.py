@@ -19,6 +19,8 @@ class Reason(StrEnum):
     CHANNEL_STUCK = "channel_stuck"
     CHANNELS_ALIKE = "channels_alike"
     CHANNEL_BIASED = "channel_biased"
+    CHANNEL_SLIPPED = "channel_slipped"
+    GAIN_CHANGED = "gain_changed"
     SIGNAL_SPIKES = "signal_spikes"
     INCOMPLETE_CROSSING = "incomplete_crossing"
     # What is known beside its own signals.
@@ -56,6 +58,8 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.CHANNEL_STUCK: "A channel repeats one value.",
     Reason.CHANNELS_ALIKE: "Two channels show the same.",
     Reason.CHANNEL_BIASED: "A channel has an offset as large as a part of gravity.",
+    Reason.CHANNEL_SLIPPED: "The delay of a channel changes within the record.",
+    Reason.GAIN_CHANGED: "The gain of a channel changes within the record.",
     Reason.SIGNAL_SPIKES: "Single samples of a channel stand out of their neighbours.",
     Reason.INCOMPLETE_CROSSING: "The recording begins or ends while the truck is on the bridge.",
     Reason.VEHICLE_DIFFERS_FROM_SITE: (

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
+from pre_core.crossing import slip
 from pre_core.diagnostics import quality
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
@@ -66,6 +67,9 @@ _LARGEST_VEHICLE_Z = 4.0
 """No unknown of a truck is by chance so many standard deviations from its prior."""
 _LARGEST_POSITION_Z = 4.0
 """Nor is the receiver's slow error."""
+_LARGEST_STEP_Z = {slip.DELAY: 6.0, slip.GAIN: 7.0}
+"""Standard deviations of a step in a channel's delay or gain, for rows of the variance that they
+have. Sound: at most 3.5; one sample of 1 kHz lost: 6.8 to 38."""
 ALIKE_LOADS = 0.1
 """Axles whose loads differ by less than this share of their sum press the bridge alike: what the
 road does to both cannot be told from what the bridge does."""
@@ -98,6 +102,8 @@ class Fit(NamedTuple):
     """Whether the axles' roads were taken to differ, by what the rows off the bridge say."""
     off_bridge_m: float
     """How much road off the bridge there was to tell that from."""
+    step: slip.Step | None = None
+    """The most significant step in the delay or the gain of a channel."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
@@ -113,6 +119,22 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
     if fit.rigidity_spread.min() > _UNINFORMED and loads_are_alike(data.vehicle):
         reasons.append(Reason.AXLES_ALIKE)
     return reasons
+
+
+def steps_of_channels(fit: Fit) -> dict[Reason, str]:
+    """Return the reason, and the channel's name, where a channel's delay or gain changes.
+
+    The fit has spread the step over truck and bridge, so that no number of it can be used.
+    """
+    step = fit.step
+    if step is None:
+        return {}
+    if abs(step.z) < _LARGEST_STEP_Z[step.kind] * np.sqrt(max(fit.chi2_per_dof, 1.0)):
+        return {}
+    name = CHANNELS[step.channel]
+    if step.kind == slip.GAIN:
+        return {Reason.GAIN_CHANGED: f"{name}, by about {100.0 * step.size:+.2g} %"}
+    return {Reason.CHANNEL_SLIPPED: f"{name}, by about {1e3 * step.size:+.2g} ms"}
 
 
 def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:

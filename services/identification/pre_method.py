@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pre_core import unknowns
 from pre_core.constants import MICRO_G_M_PER_S2
-from pre_core.crossing import optimum, posterior
+from pre_core.crossing import optimum, posterior, slip
 from pre_core.crossing.compliances import LEANING_SPREAD, led_by_mismatch
 from pre_core.crossing.mismatch import as_two_numbers
 from pre_core.crossing.preparation import Inputs, off_bridge_m, rear_at_rows_m
@@ -27,7 +27,7 @@ from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge
-from services.identification.checks import Fit, reasons_after_fit
+from services.identification.checks import Fit, reasons_after_fit, steps_of_channels
 from services.identification.crossing_data import (
     CrossingData,
     Floats,
@@ -192,19 +192,22 @@ def identify_pre(
         "starts": float(found.starts),
         "position_shift_m": float(y[posterior.layout(problem).offset]),
     }
-    reasons = reasons_after_fit(data, _fit(data, found))
+    fit = _fit(data, found)
+    broken = steps_of_channels(fit)
+    reasons = [*broken, *reasons_after_fit(data, fit)]
     if found.ending is not Ending.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
     if found.noise_power > 1.0 and Reason.NOISE_ABOVE_DECLARED not in reasons:
         reasons.insert(0, Reason.NOISE_ABOVE_DECLARED)
     usable = _LARGEST_CHI2 if Reason.NOISE_ABOVE_DECLARED in reasons else _USABLE_CHI2
-    if found.chi2_per_dof > usable:
+    if broken or found.chi2_per_dof > usable:
         diagnostics["seconds"] = elapsed()
         return rejected(
             data,
             settings,
             passing,
             reasons,
+            broken,
             chi2_per_dof=found.chi2_per_dof,
             diagnostics=diagnostics,
         )
@@ -260,6 +263,7 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
         np.sqrt(np.diag(covariance)[where.elements]),
         bool(problem.mismatch.level_m3.any()),
         off_bridge_m(problem, y),
+        slip.largest_step(problem, found.state, covariance),
     )
 
 

@@ -42,6 +42,8 @@ _ADVICE = {
     Reason.CHANNELS_ALIKE: "Look at the wiring: one sensor seems to be recorded twice.",
     Reason.CHANNEL_BIASED: "Declare whether gravity is in the signals, or change the sensor.",
     Reason.SIGNAL_SPIKES: "Look at cables and plugs, and at what else is on the sensors' supply.",
+    Reason.CHANNEL_SLIPPED: "Look for samples that this sensor, its buffer or the import loses.",
+    Reason.GAIN_CHANGED: "Look for a loose sensor or plug.",
     Reason.NOT_FINITE: "Look at the recording: it has values that are no numbers.",
     Reason.GAP_ON_BRIDGE: "Recover the missing samples from the truck's spool, or drive again.",
     Reason.INCOMPLETE_CROSSING: "Record a few seconds before and after the bridge.",

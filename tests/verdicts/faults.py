@@ -347,6 +347,26 @@ def stuck(name: str, from_s: float = -np.inf) -> Fault:
     return Fault(channels=hold)
 
 
+def slipped(name: str, samples: int, at_s: float) -> Fault:
+    """A sensor loses samples at a time since the entry; the later ones move up."""
+
+    def lose(channels: Channels, time_s: Floats) -> Channels:
+        values, first = channels[name], int(np.argmax(time_s >= at_s))
+        kept = np.delete(values, slice(first, first + samples))
+        return channels | {name: np.concatenate([kept, np.repeat(kept[-1:], samples)])}
+
+    return Fault(channels=lose)
+
+
+def louder(name: str, factor: float, at_s: float) -> Fault:
+    """A sensor's gain changes by a factor at a time since the entry."""
+
+    def change(channels: Channels, time_s: Floats) -> Channels:
+        return channels | {name: channels[name] * np.where(time_s >= at_s, factor, 1.0)}
+
+    return Fault(channels=change)
+
+
 def alike(channels: Channels, _: Floats) -> Channels:
     """Four channels of one sensor."""
     return dict.fromkeys(channels, channels[U1])
