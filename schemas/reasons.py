@@ -39,6 +39,7 @@ class Reason(StrEnum):
     NOISE_ABOVE_DECLARED = "noise_above_declared"
     NOISE_BELOW_DECLARED = "noise_below_declared"
     IMPLAUSIBLE_VEHICLE = "implausible_vehicle"
+    IMPLAUSIBLE_BRIDGE = "implausible_bridge"
     POSITION_INCONSISTENT = "position_inconsistent"
     # How the search ended.
     NOT_CONVERGED = "not_converged"
@@ -86,6 +87,10 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "The accelerometers are much quieter than the site file says, which could hide a misfit."
     ),
     Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
+    Reason.IMPLAUSIBLE_BRIDGE: (
+        "An element is stiffer than its nominal value and than the others by more than any damage "
+        "of these explains."
+    ),
     Reason.POSITION_INCONSISTENT: "The position that fits disagrees with the receiver.",
     Reason.NOT_CONVERGED: "The search did not converge.",
     Reason.SAMPLER_DIAGNOSTICS: "The draws did not pass their own checks.",

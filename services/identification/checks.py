@@ -70,6 +70,11 @@ _LARGEST_POSITION_Z = 4.0
 _LARGEST_STEP_Z = {slip.DELAY: 6.0, slip.GAIN: 7.0}
 """Standard deviations of a step in a channel's delay or gain, for rows of the variance that they
 have. Sound: at most 3.5; one sample of 1 kHz lost: 6.8 to 38."""
+_STIFFER = 1.5
+"""Age and a nominal value raise an element's EI over nominal by less, and never over that of all
+others: wrong signals do."""
+_CLEARLY = 0.025
+"""Quantile of the draws that must be above it."""
 ALIKE_LOADS = 0.1
 """Axles whose loads differ by less than this share of their sum press the bridge alike: what the
 road does to both cannot be told from what the bridge does."""
@@ -135,6 +140,25 @@ def steps_of_channels(fit: Fit) -> dict[Reason, str]:
     if step.kind == slip.GAIN:
         return {Reason.GAIN_CHANGED: f"{name}, by about {100.0 * step.size:+.2g} %"}
     return {Reason.CHANNEL_SLIPPED: f"{name}, by about {1e3 * step.size:+.2g} ms"}
+
+
+def stiffer_elements(ratio: Floats) -> list[int]:
+    """Return the elements whose EI over nominal, draws (k, n), no damage explains.
+
+    Each is stiffer than nominal and than the median of the others by more than a factor, clearly.
+    Low values alone, however low, never make another element implausible.
+    """
+    count = ratio.shape[1]
+    if count < 2:
+        return []
+    clear = [
+        min(
+            np.quantile(ratio[:, e], _CLEARLY),
+            np.quantile(ratio[:, e] / np.median(np.delete(ratio, e, axis=1), axis=1), _CLEARLY),
+        )
+        for e in range(count)
+    ]
+    return [e for e in range(count) if clear[e] > _STIFFER]
 
 
 def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:

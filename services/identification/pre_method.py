@@ -24,10 +24,15 @@ from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
 from pre_core.search.loop import Ending, Report
 from schemas import results
-from schemas.reasons import Reason
+from schemas.reasons import Reason, texts
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge
-from services.identification.checks import Fit, reasons_after_fit, steps_of_channels
+from services.identification.checks import (
+    Fit,
+    reasons_after_fit,
+    steps_of_channels,
+    stiffer_elements,
+)
 from services.identification.crossing_data import (
     CrossingData,
     Floats,
@@ -200,7 +205,8 @@ def identify_pre(
     if found.noise_power > 1.0 and Reason.NOISE_ABOVE_DECLARED not in reasons:
         reasons.insert(0, Reason.NOISE_ABOVE_DECLARED)
     usable = _LARGEST_CHI2 if Reason.NOISE_ABOVE_DECLARED in reasons else _USABLE_CHI2
-    if broken or found.chi2_per_dof > usable:
+    # Elsewhere than at the optimum neither values nor widths mean anything.
+    if broken or found.ending is not Ending.CONVERGED or found.chi2_per_dof > usable:
         diagnostics["seconds"] = elapsed()
         return rejected(
             data,
@@ -224,13 +230,18 @@ def identify_pre(
         diagnostics["pareto_k"] = chain.pareto_k
     if chain.ending is not Ending.STEPS_DONE:
         reasons.append(Reason.SAMPLER_DIAGNOSTICS)
+    implausible = _implausible_elements(data.bridge, problem, chain)
+    if implausible:
+        reasons.append(Reason.IMPLAUSIBLE_BRIDGE)
     reasons += caveats(data, motion)
     values = _values(data, problem, chain, settings, keep)
     diagnostics["seconds"] = elapsed()
+    once = tuple(dict.fromkeys(reasons))
     return results.Crossing(
         **header(data, settings, passing),
-        verdict="suspect" if reasons else "good",
-        reasons=tuple(dict.fromkeys(reasons)),
+        verdict="suspect" if once else "good",
+        reasons=once,
+        reason_texts=tuple(texts(once, {Reason.IMPLAUSIBLE_BRIDGE: implausible})),
         chi2_per_dof=found.chi2_per_dof * found.noise_power,
         diagnostics=diagnostics,
         fusion_likelihood=stored(data, found),
@@ -265,6 +276,14 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
         off_bridge_m(problem, y),
         slip.largest_step(problem, found.state, covariance),
     )
+
+
+def _implausible_elements(bridge: Bridge, problem: posterior.Problem, chain: Sampled) -> str:
+    """Return the names of the elements that are stiffer than damage of the others explains."""
+    flat = chain.draws.reshape(-1, chain.draws.shape[2])
+    rigidity = posterior.values_of(problem, flat).theta[:, unknowns.EI_1 :]
+    found = stiffer_elements(rigidity / np.array(bridge.nominal_flexural_rigidity_nm2))
+    return ", ".join(f"EI_{e + 1}" for e in found)
 
 
 def _values(

@@ -62,6 +62,10 @@ _ADVICE = {
     ),
     Reason.NOISE_BELOW_DECLARED: "Declare the sensors' true noise, and identify again.",
     Reason.IMPLAUSIBLE_VEHICLE: "Measure the wheelbase; make sure that it was this truck.",
+    Reason.IMPLAUSIBLE_BRIDGE: (
+        "Look at sensors and receiver. Where the bridge is built stiffer there, declare it "
+        "(flexural_rigidity_per_element_nm2)."
+    ),
     Reason.POSITION_INCONSISTENT: "Check the coordinates of the bearings and the antenna's place.",
     Reason.APPROACH_TOO_SHORT: "Record from 40 m before the bridge to 25 m behind it.",
     Reason.AXLES_ALIKE: "Load one axle more than the other.",
