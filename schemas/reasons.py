@@ -17,6 +17,7 @@ class Reason(StrEnum):
     CHANNEL_SWAPPED = "channel_swapped"
     CHANNEL_INVERTED = "channel_inverted"
     CHANNEL_STUCK = "channel_stuck"
+    CHANNEL_BRIDGED = "channel_bridged"
     CHANNELS_ALIKE = "channels_alike"
     CHANNEL_BIASED = "channel_biased"
     CHANNEL_SLIPPED = "channel_slipped"
@@ -57,6 +58,7 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.CHANNEL_SWAPPED: "Two channels seem to be exchanged.",
     Reason.CHANNEL_INVERTED: "A channel seems to have the wrong sign.",
     Reason.CHANNEL_STUCK: "A channel repeats one value.",
+    Reason.CHANNEL_BRIDGED: "A channel has a straight line where no sensor measured.",
     Reason.CHANNELS_ALIKE: "Two channels show the same.",
     Reason.CHANNEL_BIASED: "A channel has an offset as large as a part of gravity.",
     Reason.CHANNEL_SLIPPED: "The delay of a channel changes within the record.",

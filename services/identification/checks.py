@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import slip
-from pre_core.diagnostics import quality
+from pre_core.diagnostics import frozen, quality
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
 from schemas.signals import CHANNELS
@@ -244,6 +244,27 @@ def reasons_before_fit(
     found = quality.pairing(acceleration, step_s, *body_constants(vehicle))
     named = {Reason.CHANNEL_INVERTED: _inverted, Reason.CHANNEL_SWAPPED: _exchanged}
     return {reason: named[reason](found) for reason in reasons}
+
+
+def unmeasured(acceleration: Floats, step_s: float) -> dict[Reason, str]:
+    """Return the reason, and the channels (4, n), of stretches that no sensor measured.
+
+    Anywhere in the record, for all of it is fitted.
+    """
+    of_each = {
+        Reason.CHANNEL_STUCK: frozen.longest_hold_s,
+        Reason.CHANNEL_BRIDGED: frozen.longest_line_s,
+    }
+    for reason, longest_s in of_each.items():
+        found = [longest_s(values, step_s) for values in acceleration]
+        names = [
+            f"{name} for {1e3 * seconds:.0f} ms"
+            for name, seconds in zip(CHANNELS, found, strict=True)
+            if seconds > 0.0
+        ]
+        if names:
+            return {reason: ", ".join(names)}
+    return {}
 
 
 def _broken(acceleration: Floats, step_s: float) -> dict[Reason, str]:

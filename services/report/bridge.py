@@ -39,6 +39,7 @@ _ADVICE = {
         "file), import the files and identify again; the drive need not be repeated."
     ),
     Reason.CHANNEL_STUCK: "Look at plugs and sensors: one of them does not measure.",
+    Reason.CHANNEL_BRIDGED: "Leave missing samples out, rather than bridge them before the import.",
     Reason.CHANNELS_ALIKE: "Look at the wiring: one sensor seems to be recorded twice.",
     Reason.CHANNEL_BIASED: "Declare whether gravity is in the signals, or change the sensor.",
     Reason.SIGNAL_SPIKES: "Look at cables and plugs, and at what else is on the sensors' supply.",

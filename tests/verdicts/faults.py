@@ -347,6 +347,24 @@ def stuck(name: str, from_s: float = -np.inf) -> Fault:
     return Fault(channels=hold)
 
 
+def frozen(name: str, from_s: float, seconds: float, *, bridged: bool = False) -> Fault:
+    """A sensor holds its value for a while; or a line bridges what it did not measure."""
+
+    def hold(channels: Channels, time_s: Floats) -> Channels:
+        values = channels[name].copy()
+        there = np.flatnonzero((time_s >= from_s) & (time_s < from_s + seconds))
+        first, last = values[there[[0, -1]]]
+        values[there] = np.linspace(first, last if bridged else first, there.size)
+        return channels | {name: values}
+
+    return Fault(channels=hold)
+
+
+def quantised(channels: Channels, step_m_per_s2: float) -> Channels:
+    """A converter with this step, in all channels."""
+    return {name: step_m_per_s2 * np.round(v / step_m_per_s2) for name, v in channels.items()}
+
+
 def slipped(name: str, samples: int, at_s: float) -> Fault:
     """A sensor loses samples at a time since the entry; the later ones move up."""
 
