@@ -42,6 +42,7 @@ class Reason(StrEnum):
     IMPLAUSIBLE_VEHICLE = "implausible_vehicle"
     IMPLAUSIBLE_BRIDGE = "implausible_bridge"
     POSITION_INCONSISTENT = "position_inconsistent"
+    SPEED_INCONSISTENT = "speed_inconsistent"
     # How the search ended.
     NOT_CONVERGED = "not_converged"
     SAMPLER_DIAGNOSTICS = "sampler_diagnostics"
@@ -94,6 +95,7 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "of these explains."
     ),
     Reason.POSITION_INCONSISTENT: "The position that fits disagrees with the receiver.",
+    Reason.SPEED_INCONSISTENT: "The receiver's speeds contradict its positions or the fit.",
     Reason.NOT_CONVERGED: "The search did not converge.",
     Reason.SAMPLER_DIAGNOSTICS: "The draws did not pass their own checks.",
     Reason.FAILED: "The identification failed.",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import slip
-from pre_core.diagnostics import frozen, quality
+from pre_core.diagnostics import frozen, quality, receiver
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
 from schemas.signals import CHANNELS
@@ -70,6 +70,16 @@ _LARGEST_POSITION_Z = 4.0
 _LARGEST_STEP_Z = {slip.DELAY: 6.0, slip.GAIN: 7.0}
 """Standard deviations of a step in a channel's delay or gain, for rows of the variance that they
 have. Sound: at most 3.5; one sample of 1 kHz lost: 6.8 to 38."""
+_LARGEST_SPEED_SCALE_Z = 5.0
+"""Standard deviations by which a receiver's speeds differ from what its positions make of them.
+Sound: at most 2."""
+_RECEIVER_ASIDE_S = 4.0
+"""Fixes are compared so far before and behind the bridge, as the fit uses them."""
+_SPEED_SCALE_SPREAD = 0.002
+"""Chainage is along the bridge's axis, and a road is not quite straight."""
+_LARGEST_SPEED_BIAS, _LARGEST_SPEED_BIAS_Z = 1.0, 5.0
+"""Mean difference of the receiver's speeds from the fit's, in their noise, and in standard
+deviations of the mean. Sound: at most 0.3 of ten fixes a second; speeds 3 % high: 1.3 to 3.7."""
 _STIFFER = 1.5
 """Age and a nominal value raise an element's EI over nominal by less, and never over that of all
 others: wrong signals do."""
@@ -107,6 +117,8 @@ class Fit(NamedTuple):
     """Whether the axles' roads were taken to differ, by what the rows off the bridge say."""
     off_bridge_m: float
     """How much road off the bridge there was to tell that from."""
+    speed_bias: float = 0.0
+    """Mean difference of the receiver's speeds from the fit's, in multiples of their noise."""
     step: slip.Step | None = None
     """The most significant step in the delay or the gain of a channel."""
 
@@ -121,9 +133,31 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
     if abs(fit.position_z) > _LARGEST_POSITION_Z:
         reasons.append(Reason.POSITION_INCONSISTENT)
+    if _speeds_differ(data, fit):
+        reasons.append(Reason.SPEED_INCONSISTENT)
     if fit.rigidity_spread.min() > _UNINFORMED and loads_are_alike(data.vehicle):
         reasons.append(Reason.AXLES_ALIKE)
     return reasons
+
+
+def _speeds_differ(data: CrossingData, fit: Fit) -> bool:
+    """Return whether the receiver's speeds contradict its positions or the fit."""
+    stay, time_s = data.stay, data.fixes.time_s
+    around = (time_s > stay.entry_s - _RECEIVER_ASIDE_S) & (
+        time_s < stay.exit_s + _RECEIVER_ASIDE_S
+    )
+    count = int(np.count_nonzero(around))
+    bias = abs(fit.speed_bias)
+    if bias > max(_LARGEST_SPEED_BIAS, _LARGEST_SPEED_BIAS_Z / np.sqrt(max(count, 1))):
+        return True
+    scale, spread = receiver.speed_scale(
+        time_s[around],
+        data.chainage_m[around],
+        np.abs(data.fixes.speed_m_per_s[around]),
+        noise_m=max(data.receiver.position_noise_m, 0.01),
+        spread_m=data.receiver.position_spread_m,
+    )
+    return abs(scale) > _LARGEST_SPEED_SCALE_Z * np.hypot(spread, _SPEED_SCALE_SPREAD)
 
 
 def steps_of_channels(fit: Fit) -> dict[Reason, str]:

@@ -274,8 +274,19 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
         np.sqrt(np.diag(covariance)[where.elements]),
         bool(problem.mismatch.level_m3.any()),
         off_bridge_m(problem, y),
+        _speed_bias(problem, y),
         slip.largest_step(problem, found.state, covariance),
     )
+
+
+def _speed_bias(problem: posterior.Problem, y: Floats) -> float:
+    """Return how far the receiver's speeds are above those of y, on average, in their noise."""
+    where, rows = posterior.layout(problem), problem.receiver_rows
+    left = problem.receiver_values - rows @ y[where.trajectory.start : where.offset + 1]
+    # The offset is in the rows of the positions and in its own, the last; speeds follow positions.
+    fixes = int(np.count_nonzero(rows[:, -1])) - 1
+    direction = problem.crossing.direction
+    return direction * float(np.mean(left[fixes : 2 * fixes]))
 
 
 def _implausible_elements(bridge: Bridge, problem: posterior.Problem, chain: Sampled) -> str:

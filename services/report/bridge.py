@@ -68,6 +68,7 @@ _ADVICE = {
         "(flexural_rigidity_per_element_nm2)."
     ),
     Reason.POSITION_INCONSISTENT: "Check the coordinates of the bearings and the antenna's place.",
+    Reason.SPEED_INCONSISTENT: "Look at the receiver, and at the unit of its speeds in the import.",
     Reason.APPROACH_TOO_SHORT: "Record from 40 m before the bridge to 25 m behind it.",
     Reason.AXLES_ALIKE: "Load one axle more than the other.",
     Reason.ACCELERATING_CG_UNKNOWN: "Keep the speed, or declare the height of the centre of mass.",

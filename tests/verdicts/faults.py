@@ -76,6 +76,8 @@ class Fault(NamedTuple):
     jitter_s: float = 0.0
     slow: str | None = None
     """A channel that is sampled at 100 Hz."""
+    speeds: float = 1.0
+    """The receiver's speeds over the true ones."""
     outage_s: tuple[float, float] | None = None
     """No fixes between these times since the entry."""
     site: Callable[[Site], Site] = lambda site: site
@@ -156,6 +158,7 @@ def crossing(truth: Truth, fault: Fault = NOTHING) -> Case:
         () if fault.outage_s is None else ((entry + fault.outage_s[0], entry + fault.outage_s[1]),)
     )
     gnss = _fixes(truth, clock, position, speed, outages, gnss_rng)
+    gnss = gnss._replace(speed_m_per_s=fault.speeds * gnss.speed_m_per_s)
     run = Run(
         "simulation",
         stamps[kept],
