@@ -52,16 +52,26 @@ class Step(NamedTuple):
 
 
 def largest_step(problem: Problem, state: State, covariance: FloatArray) -> Step:
-    """Return the most significant step at the optimum `state` with `covariance` (f, f) of y."""
+    """Return the most significant step at the optimum `state` with `covariance` (f, f) of y.
+
+    Of the delay alone where the axles' roads differ: which part of that is a channel's gain is not
+    known well enough.
+    """
     crossing = problem.crossing
     m = problem.noise.reciprocal.size
     white, jacobian = state.residual[:m], state.jacobian[:m]
-    slope = covariance @ (state.jacobian.T @ state.residual)
+    # Where roads differ the rows answer to noise that is in the signals too: what that makes of the
+    # fit's own columns on average (`noise_slope`) it makes of g as far as these explain it.
+    gradient = state.jacobian.T @ state.residual
+    gradient[: problem.noise_slope.size] += problem.noise_slope
+    slope = covariance @ gradient
     at = points(problem, state.y[None, :])
     n = crossing.signals.shape[2]
     worst = Step(DELAY, 0, 0.0, 0.0, 0.0)
     changed, rows = np.empty_like(crossing.signals), np.empty((1, m))
-    for kind, (count, aside) in enumerate(_MOMENTS):
+    kinds = (DELAY,) if problem.mismatch.level_m3.any() else (DELAY, GAIN)
+    for kind in kinds:
+        count, aside = _MOMENTS[kind]
         moments = (n * np.linspace(aside, 1.0 - aside, count + 2)[1:-1]).astype(np.int64)
         for channel in range(CHANNELS):
             columns = np.empty((count, m))
