@@ -17,8 +17,11 @@ class Reason(StrEnum):
     CHANNEL_SWAPPED = "channel_swapped"
     CHANNEL_INVERTED = "channel_inverted"
     CHANNEL_STUCK = "channel_stuck"
+    CHANNEL_BRIDGED = "channel_bridged"
     CHANNELS_ALIKE = "channels_alike"
     CHANNEL_BIASED = "channel_biased"
+    CHANNEL_SLIPPED = "channel_slipped"
+    GAIN_CHANGED = "gain_changed"
     SIGNAL_SPIKES = "signal_spikes"
     INCOMPLETE_CROSSING = "incomplete_crossing"
     # What is known beside its own signals.
@@ -37,7 +40,9 @@ class Reason(StrEnum):
     NOISE_ABOVE_DECLARED = "noise_above_declared"
     NOISE_BELOW_DECLARED = "noise_below_declared"
     IMPLAUSIBLE_VEHICLE = "implausible_vehicle"
+    IMPLAUSIBLE_BRIDGE = "implausible_bridge"
     POSITION_INCONSISTENT = "position_inconsistent"
+    SPEED_INCONSISTENT = "speed_inconsistent"
     # How the search ended.
     NOT_CONVERGED = "not_converged"
     SAMPLER_DIAGNOSTICS = "sampler_diagnostics"
@@ -54,8 +59,11 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.CHANNEL_SWAPPED: "Two channels seem to be exchanged.",
     Reason.CHANNEL_INVERTED: "A channel seems to have the wrong sign.",
     Reason.CHANNEL_STUCK: "A channel repeats one value.",
+    Reason.CHANNEL_BRIDGED: "A channel has a straight line where no sensor measured.",
     Reason.CHANNELS_ALIKE: "Two channels show the same.",
     Reason.CHANNEL_BIASED: "A channel has an offset as large as a part of gravity.",
+    Reason.CHANNEL_SLIPPED: "The delay of a channel changes within the record.",
+    Reason.GAIN_CHANGED: "The gain of a channel changes within the record.",
     Reason.SIGNAL_SPIKES: "Single samples of a channel stand out of their neighbours.",
     Reason.INCOMPLETE_CROSSING: "The recording begins or ends while the truck is on the bridge.",
     Reason.VEHICLE_DIFFERS_FROM_SITE: (
@@ -82,7 +90,12 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "The accelerometers are much quieter than the site file says, which could hide a misfit."
     ),
     Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
+    Reason.IMPLAUSIBLE_BRIDGE: (
+        "An element is stiffer than its nominal value and than the others by more than any damage "
+        "of these explains."
+    ),
     Reason.POSITION_INCONSISTENT: "The position that fits disagrees with the receiver.",
+    Reason.SPEED_INCONSISTENT: "The receiver's speeds contradict its positions or the fit.",
     Reason.NOT_CONVERGED: "The search did not converge.",
     Reason.SAMPLER_DIAGNOSTICS: "The draws did not pass their own checks.",
     Reason.FAILED: "The identification failed.",

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
-from pre_core.diagnostics import quality
+from pre_core.crossing import slip
+from pre_core.diagnostics import frozen, quality, receiver
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
 from schemas.signals import CHANNELS
@@ -66,6 +67,24 @@ _LARGEST_VEHICLE_Z = 4.0
 """No unknown of a truck is by chance so many standard deviations from its prior."""
 _LARGEST_POSITION_Z = 4.0
 """Nor is the receiver's slow error."""
+_LARGEST_STEP_Z = {slip.DELAY: 6.0, slip.GAIN: 7.0}
+"""Standard deviations of a step in a channel's delay or gain, for rows of the variance that they
+have. Sound: at most 3.5; one sample of 1 kHz lost: 6.8 to 38."""
+_LARGEST_SPEED_SCALE_Z = 5.0
+"""Standard deviations by which a receiver's speeds differ from what its positions make of them.
+Sound: at most 2."""
+_RECEIVER_ASIDE_S = 4.0
+"""Fixes are compared so far before and behind the bridge, as the fit uses them."""
+_SPEED_SCALE_SPREAD = 0.002
+"""Chainage is along the bridge's axis, and a road is not quite straight."""
+_LARGEST_SPEED_BIAS, _LARGEST_SPEED_BIAS_Z = 1.0, 5.0
+"""Mean difference of the receiver's speeds from the fit's, in their noise, and in standard
+deviations of the mean. Sound: at most 0.3 of ten fixes a second; speeds 3 % high: 1.3 to 3.7."""
+_STIFFER = 1.5
+"""Age and a nominal value raise an element's EI over nominal by less, and never over that of all
+others: wrong signals do."""
+_CLEARLY = 0.025
+"""Quantile of the draws that must be above it."""
 ALIKE_LOADS = 0.1
 """Axles whose loads differ by less than this share of their sum press the bridge alike: what the
 road does to both cannot be told from what the bridge does."""
@@ -98,6 +117,10 @@ class Fit(NamedTuple):
     """Whether the axles' roads were taken to differ, by what the rows off the bridge say."""
     off_bridge_m: float
     """How much road off the bridge there was to tell that from."""
+    speed_bias: float = 0.0
+    """Mean difference of the receiver's speeds from the fit's, in multiples of their noise."""
+    step: slip.Step | None = None
+    """The most significant step in the delay or the gain of a channel."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
@@ -110,9 +133,66 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
     if abs(fit.position_z) > _LARGEST_POSITION_Z:
         reasons.append(Reason.POSITION_INCONSISTENT)
+    if _speeds_differ(data, fit):
+        reasons.append(Reason.SPEED_INCONSISTENT)
     if fit.rigidity_spread.min() > _UNINFORMED and loads_are_alike(data.vehicle):
         reasons.append(Reason.AXLES_ALIKE)
     return reasons
+
+
+def _speeds_differ(data: CrossingData, fit: Fit) -> bool:
+    """Return whether the receiver's speeds contradict its positions or the fit."""
+    stay, time_s = data.stay, data.fixes.time_s
+    around = (time_s > stay.entry_s - _RECEIVER_ASIDE_S) & (
+        time_s < stay.exit_s + _RECEIVER_ASIDE_S
+    )
+    count = int(np.count_nonzero(around))
+    bias = abs(fit.speed_bias)
+    if bias > max(_LARGEST_SPEED_BIAS, _LARGEST_SPEED_BIAS_Z / np.sqrt(max(count, 1))):
+        return True
+    scale, spread = receiver.speed_scale(
+        time_s[around],
+        data.chainage_m[around],
+        np.abs(data.fixes.speed_m_per_s[around]),
+        noise_m=max(data.receiver.position_noise_m, 0.01),
+        spread_m=data.receiver.position_spread_m,
+    )
+    return abs(scale) > _LARGEST_SPEED_SCALE_Z * np.hypot(spread, _SPEED_SCALE_SPREAD)
+
+
+def steps_of_channels(fit: Fit) -> dict[Reason, str]:
+    """Return the reason, and the channel's name, where a channel's delay or gain changes.
+
+    The fit has spread the step over truck and bridge, so that no number of it can be used.
+    """
+    step = fit.step
+    if step is None:
+        return {}
+    if abs(step.z) < _LARGEST_STEP_Z[step.kind] * np.sqrt(max(fit.chi2_per_dof, 1.0)):
+        return {}
+    name = CHANNELS[step.channel]
+    if step.kind == slip.GAIN:
+        return {Reason.GAIN_CHANGED: f"{name}, by about {100.0 * step.size:+.2g} %"}
+    return {Reason.CHANNEL_SLIPPED: f"{name}, by about {1e3 * step.size:+.2g} ms"}
+
+
+def stiffer_elements(ratio: Floats) -> list[int]:
+    """Return the elements whose EI over nominal, draws (k, n), no damage explains.
+
+    Each is stiffer than nominal and than the median of the others by more than a factor, clearly.
+    Low values alone, however low, never make another element implausible.
+    """
+    count = ratio.shape[1]
+    if count < 2:
+        return []
+    clear = [
+        min(
+            np.quantile(ratio[:, e], _CLEARLY),
+            np.quantile(ratio[:, e] / np.median(np.delete(ratio, e, axis=1), axis=1), _CLEARLY),
+        )
+        for e in range(count)
+    ]
+    return [e for e in range(count) if clear[e] > _STIFFER]
 
 
 def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
@@ -198,6 +278,27 @@ def reasons_before_fit(
     found = quality.pairing(acceleration, step_s, *body_constants(vehicle))
     named = {Reason.CHANNEL_INVERTED: _inverted, Reason.CHANNEL_SWAPPED: _exchanged}
     return {reason: named[reason](found) for reason in reasons}
+
+
+def unmeasured(acceleration: Floats, step_s: float) -> dict[Reason, str]:
+    """Return the reason, and the channels (4, n), of stretches that no sensor measured.
+
+    Anywhere in the record, for all of it is fitted.
+    """
+    of_each = {
+        Reason.CHANNEL_STUCK: frozen.longest_hold_s,
+        Reason.CHANNEL_BRIDGED: frozen.longest_line_s,
+    }
+    for reason, longest_s in of_each.items():
+        found = [longest_s(values, step_s) for values in acceleration]
+        names = [
+            f"{name} for {1e3 * seconds:.0f} ms"
+            for name, seconds in zip(CHANNELS, found, strict=True)
+            if seconds > 0.0
+        ]
+        if names:
+            return {reason: ", ".join(names)}
+    return {}
 
 
 def _broken(acceleration: Floats, step_s: float) -> dict[Reason, str]:

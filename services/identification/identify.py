@@ -19,7 +19,7 @@ from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
-from services.identification.checks import reasons_before_fit
+from services.identification.checks import reasons_before_fit, unmeasured
 from services.identification.crossing_data import (
     LONGEST_SURE_OUTAGE_S,
     CrossingData,
@@ -87,13 +87,14 @@ def identify(
         if cut is None:
             return reject([Reason.GAP_ON_BRIDGE])
         near = _near(cut, passing, 1.0 / data.samples.rate_hz)
+        step_s = 1.0 / data.samples.rate_hz
         broken = reasons_before_fit(
             data.vehicle,
             cut.acceleration[:, near],
-            1.0 / data.samples.rate_hz,
+            step_s,
             Motion(*(values[near] for values in cut.motion)),
             data.stay.direction,
-        )
+        ) or unmeasured(cut.acceleration, step_s)
         if broken:
             return reject(broken, broken)
         if settings.method == "pre":

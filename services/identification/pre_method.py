@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pre_core import unknowns
 from pre_core.constants import MICRO_G_M_PER_S2
-from pre_core.crossing import optimum, posterior
+from pre_core.crossing import optimum, posterior, slip
 from pre_core.crossing.compliances import LEANING_SPREAD, led_by_mismatch
 from pre_core.crossing.mismatch import as_two_numbers
 from pre_core.crossing.preparation import Inputs, off_bridge_m, rear_at_rows_m
@@ -24,11 +24,16 @@ from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
 from pre_core.search.loop import Ending, Report
 from schemas import results
-from schemas.reasons import Reason
+from schemas.reasons import Reason, texts
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge
 from services.common.geodesy import bridge_frame, to_chainage
-from services.identification.checks import Fit, reasons_after_fit
+from services.identification.checks import (
+    Fit,
+    reasons_after_fit,
+    steps_of_channels,
+    stiffer_elements,
+)
 from services.identification.crossing_data import (
     CrossingData,
     Floats,
@@ -228,19 +233,23 @@ def identify_pre(
         "starts": float(found.starts),
         "position_shift_m": float(y[posterior.layout(problem).offset]),
     }
-    reasons = reasons_after_fit(data, _fit(data, found))
+    fit = _fit(data, found)
+    broken = steps_of_channels(fit)
+    reasons = [*broken, *reasons_after_fit(data, fit)]
     if found.ending is not Ending.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
     if found.noise_power > 1.0 and Reason.NOISE_ABOVE_DECLARED not in reasons:
         reasons.insert(0, Reason.NOISE_ABOVE_DECLARED)
     usable = _LARGEST_CHI2 if Reason.NOISE_ABOVE_DECLARED in reasons else _USABLE_CHI2
-    if found.chi2_per_dof > usable:
+    # Elsewhere than at the optimum neither values nor widths mean anything.
+    if broken or found.ending is not Ending.CONVERGED or found.chi2_per_dof > usable:
         diagnostics["seconds"] = elapsed()
         return rejected(
             data,
             settings,
             passing,
             reasons,
+            broken,
             chi2_per_dof=found.chi2_per_dof,
             diagnostics=diagnostics,
         )
@@ -257,13 +266,18 @@ def identify_pre(
         diagnostics["pareto_k"] = chain.pareto_k
     if chain.ending is not Ending.STEPS_DONE:
         reasons.append(Reason.SAMPLER_DIAGNOSTICS)
+    implausible = _implausible_elements(data.bridge, problem, chain)
+    if implausible:
+        reasons.append(Reason.IMPLAUSIBLE_BRIDGE)
     reasons += caveats(data, motion)
     values = _values(data, problem, chain, settings, keep)
     diagnostics["seconds"] = elapsed()
+    once = tuple(dict.fromkeys(reasons))
     return results.Crossing(
         **header(data, settings, passing),
-        verdict="suspect" if reasons else "good",
-        reasons=tuple(dict.fromkeys(reasons)),
+        verdict="suspect" if once else "good",
+        reasons=once,
+        reason_texts=tuple(texts(once, {Reason.IMPLAUSIBLE_BRIDGE: implausible})),
         chi2_per_dof=found.chi2_per_dof * found.noise_power,
         diagnostics=diagnostics,
         fusion_likelihood=stored(data, found),
@@ -296,7 +310,27 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
         np.sqrt(np.diag(covariance)[where.elements]),
         bool(problem.mismatch.level_m3.any()),
         off_bridge_m(problem, y),
+        _speed_bias(problem, y),
+        slip.largest_step(problem, found.state, covariance),
     )
+
+
+def _speed_bias(problem: posterior.Problem, y: Floats) -> float:
+    """Return how far the receiver's speeds are above those of y, on average, in their noise."""
+    where, rows = posterior.layout(problem), problem.receiver_rows
+    left = problem.receiver_values - rows @ y[where.trajectory.start : where.offset + 1]
+    # The offset is in the rows of the positions and in its own, the last; speeds follow positions.
+    fixes = int(np.count_nonzero(rows[:, -1])) - 1
+    direction = problem.crossing.direction
+    return direction * float(np.mean(left[fixes : 2 * fixes]))
+
+
+def _implausible_elements(bridge: Bridge, problem: posterior.Problem, chain: Sampled) -> str:
+    """Return the names of the elements that are stiffer than damage of the others explains."""
+    flat = chain.draws.reshape(-1, chain.draws.shape[2])
+    rigidity = posterior.values_of(problem, flat).theta[:, unknowns.EI_1 :]
+    found = stiffer_elements(rigidity / np.array(bridge.nominal_flexural_rigidity_nm2))
+    return ", ".join(f"EI_{e + 1}" for e in found)
 
 
 def _values(

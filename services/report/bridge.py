@@ -39,9 +39,12 @@ _ADVICE = {
         "file), import the files and identify again; the drive need not be repeated."
     ),
     Reason.CHANNEL_STUCK: "Look at plugs and sensors: one of them does not measure.",
+    Reason.CHANNEL_BRIDGED: "Leave missing samples out, rather than bridge them before the import.",
     Reason.CHANNELS_ALIKE: "Look at the wiring: one sensor seems to be recorded twice.",
     Reason.CHANNEL_BIASED: "Declare whether gravity is in the signals, or change the sensor.",
     Reason.SIGNAL_SPIKES: "Look at cables and plugs, and at what else is on the sensors' supply.",
+    Reason.CHANNEL_SLIPPED: "Look for samples that this sensor, its buffer or the import loses.",
+    Reason.GAIN_CHANGED: "Look for a loose sensor or plug.",
     Reason.NOT_FINITE: "Look at the recording: it has values that are no numbers.",
     Reason.GAP_ON_BRIDGE: "Recover the missing samples from the truck's spool, or drive again.",
     Reason.INCOMPLETE_CROSSING: "Record a few seconds before and after the bridge.",
@@ -60,7 +63,12 @@ _ADVICE = {
     ),
     Reason.NOISE_BELOW_DECLARED: "Declare the sensors' true noise, and identify again.",
     Reason.IMPLAUSIBLE_VEHICLE: "Measure the wheelbase; make sure that it was this truck.",
+    Reason.IMPLAUSIBLE_BRIDGE: (
+        "Look at sensors and receiver. Where the bridge is built stiffer there, declare it "
+        "(flexural_rigidity_per_element_nm2)."
+    ),
     Reason.POSITION_INCONSISTENT: "Check the coordinates of the bearings and the antenna's place.",
+    Reason.SPEED_INCONSISTENT: "Look at the receiver, and at the unit of its speeds in the import.",
     Reason.APPROACH_TOO_SHORT: "Record from 40 m before the bridge to 25 m behind it.",
     Reason.AXLES_ALIKE: "Load one axle more than the other.",
     Reason.ACCELERATING_CG_UNKNOWN: "Keep the speed, or declare the height of the centre of mass.",

@@ -380,13 +380,17 @@ def see(
     settings: IdentificationSettings,
     identify: Identify = identify,
 ) -> list[Seen]:
-    """Identify all crossings of the site's first truck through the engine, as from a recording."""
+    """Identify all crossings of the site's first truck through the engine, as from a recording.
+
+    A bridge that is drawn from the prior may have elements that no real one has: they are no reason
+    against the crossing.
+    """
     kept: dict[str, CrossingData] = {}
     draws: dict[str, dict[str, Floats]] = {}
 
     def keeping(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
         kept[data.crossing_id] = data
-        return identify(data, settings, **others)
+        return _of_any_bridge(identify(data, settings, **others))
 
     header = header_of(site, settings, 0.0)
     messages = run_to_messages(runs, site, REALM, site.vehicles[0].id)
@@ -406,6 +410,20 @@ def see(
         for result in found
         if result is not None
     ]
+
+
+def _of_any_bridge(result: Crossing) -> Crossing:
+    """Return the result without the reason that its bridge is implausible."""
+    kept = [k for k, code in enumerate(result.reasons) if code != Reason.IMPLAUSIBLE_BRIDGE]
+    if len(kept) == len(result.reasons):
+        return result
+    return result.model_copy(
+        update={
+            "verdict": result.verdict if kept else "good",
+            "reasons": tuple(result.reasons[k] for k in kept),
+            "reason_texts": tuple(result.reason_texts[k] for k in kept),
+        }
+    )
 
 
 def data_alone(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[Seen]:

@@ -76,6 +76,8 @@ class Fault(NamedTuple):
     jitter_s: float = 0.0
     slow: str | None = None
     """A channel that is sampled at 100 Hz."""
+    speeds: float = 1.0
+    """The receiver's speeds over the true ones."""
     outage_s: tuple[float, float] | None = None
     """No fixes between these times since the entry."""
     site: Callable[[Site], Site] = lambda site: site
@@ -156,6 +158,7 @@ def crossing(truth: Truth, fault: Fault = NOTHING) -> Case:
         () if fault.outage_s is None else ((entry + fault.outage_s[0], entry + fault.outage_s[1]),)
     )
     gnss = _fixes(truth, clock, position, speed, outages, gnss_rng)
+    gnss = gnss._replace(speed_m_per_s=fault.speeds * gnss.speed_m_per_s)
     run = Run(
         "simulation",
         stamps[kept],
@@ -345,6 +348,44 @@ def stuck(name: str, from_s: float = -np.inf) -> Fault:
         return channels | {name: values}
 
     return Fault(channels=hold)
+
+
+def frozen(name: str, from_s: float, seconds: float, *, bridged: bool = False) -> Fault:
+    """A sensor holds its value for a while; or a line bridges what it did not measure."""
+
+    def hold(channels: Channels, time_s: Floats) -> Channels:
+        values = channels[name].copy()
+        there = np.flatnonzero((time_s >= from_s) & (time_s < from_s + seconds))
+        first, last = values[there[[0, -1]]]
+        values[there] = np.linspace(first, last if bridged else first, there.size)
+        return channels | {name: values}
+
+    return Fault(channels=hold)
+
+
+def quantised(channels: Channels, step_m_per_s2: float) -> Channels:
+    """A converter with this step, in all channels."""
+    return {name: step_m_per_s2 * np.round(v / step_m_per_s2) for name, v in channels.items()}
+
+
+def slipped(name: str, samples: int, at_s: float) -> Fault:
+    """A sensor loses samples at a time since the entry; the later ones move up."""
+
+    def lose(channels: Channels, time_s: Floats) -> Channels:
+        values, first = channels[name], int(np.argmax(time_s >= at_s))
+        kept = np.delete(values, slice(first, first + samples))
+        return channels | {name: np.concatenate([kept, np.repeat(kept[-1:], samples)])}
+
+    return Fault(channels=lose)
+
+
+def louder(name: str, factor: float, at_s: float) -> Fault:
+    """A sensor's gain changes by a factor at a time since the entry."""
+
+    def change(channels: Channels, time_s: Floats) -> Channels:
+        return channels | {name: channels[name] * np.where(time_s >= at_s, factor, 1.0)}
+
+    return Fault(channels=change)
 
 
 def alike(channels: Channels, _: Floats) -> Channels:

@@ -8,7 +8,13 @@ from scipy.fft import dct
 
 from pre_core.diagnostics import quality
 from schemas.reasons import Reason
-from services.identification.checks import BODY_FRONT, ROAD, Fit, reasons_after_fit
+from services.identification.checks import (
+    BODY_FRONT,
+    ROAD,
+    Fit,
+    reasons_after_fit,
+    stiffer_elements,
+)
 from services.identification.crossing_data import CrossingData, Floats
 from tests.verdicts.steady import steady_crossing
 
@@ -185,3 +191,31 @@ def test_a_short_approach_is_named_where_the_roads_seem_to_differ() -> None:
     ):
         reasons = reasons_after_fit(data, fit(white, **changes))
         assert (Reason.APPROACH_TOO_SHORT in reasons) is named
+
+
+def ratios(means: list[float], spread: float = 0.05) -> Floats:
+    """Draws of EI over nominal, (2000, n)."""
+    rng = np.random.default_rng(0)
+    return np.array(means) * np.exp(spread * rng.standard_normal((2000, len(means))))
+
+
+@pytest.mark.parametrize(
+    ("means", "spread", "found"),
+    [
+        ([1.0, 0.4, 2.0, 1.0, 2.1, 1.0, 1.0], 0.05, [2, 4]),
+        ([1.0, 1.0, 1.0, 2.0], 0.05, [3]),
+        ([1.0, 2.0], 0.05, [1]),
+        # Wide draws show nothing.
+        ([1.0, 0.4, 2.0, 1.0, 2.1, 1.0, 1.0], 0.3, []),
+        # However low the others are, and wherever: damage is no reason.
+        ([0.1, 0.1, 1.0, 0.1, 0.1], 0.05, []),
+        ([0.3, 1.0, 0.3, 1.0, 0.3], 0.05, []),
+        # The whole bridge is stiffer than nominal.
+        ([1.9, 2.0, 1.9, 2.0], 0.05, []),
+        ([3.0], 0.05, []),
+    ],
+)
+def test_stiffer_elements_are_those_that_damage_cannot_make(
+    means: list[float], spread: float, found: list[int]
+) -> None:
+    assert stiffer_elements(ratios(means, spread)) == found

@@ -1,0 +1,119 @@
+"""Whether a channel's delay or gain changes within the record, by the rows that a fit leaves over.
+
+A sensor that loses samples publishes the later ones too early: its delay changes by a step. The
+search estimates one delay and one gain for the whole record, so that a step is spread over truck
+and bridge. Rows are linear in the signals, and a unit step of channel c at time t_0 adds to them
+
+    g = dr/d(delay of c), of the signals from t_0 on alone,
+
+with velocity and displacement integrated from the changed acceleration, as `channels` does it. The
+score test projects the white rows on the part of g that the unknowns of the fit do not explain:
+
+    z = (g'r - g'J S J'r) / sqrt(g'g - g'J S J'g),    S = (J'J)^-1,
+
+a standard normal where nothing changes, for every channel and every t_0.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.crossing.channels import A_1, A_2, A_3, A, V, Z
+from pre_core.crossing.layout import CHANNELS
+from pre_core.crossing.posterior import Problem, points
+from pre_core.crossing.residuals import evaluate_white
+from pre_core.search.levenberg_marquardt import State
+
+FloatArray = NDArray[np.float64]
+
+DELAY, GAIN = range(2)
+_MOMENTS = ((24, 0.0), (10, 0.15))
+"""Number of moments, evenly spaced, at which the delay and the gain of every channel may change,
+and the share of the record at either end that has none."""
+_STEP = 1e-4
+"""Step of the difference in s, and relative for the gain: the rows are linear in it."""
+_LEAST_SHARE = 1e-3
+"""A step near an end of the record changes next to no row: its share of the largest norm."""
+
+
+class Step(NamedTuple):
+    """The most significant step of one channel's delay or gain."""
+
+    kind: int
+    """`DELAY` or `GAIN`."""
+    channel: int
+    time_s: float
+    """Time since the first sample of the model's signals."""
+    size: float
+    """Time in s by which the later samples come early, or the relative change of the gain."""
+    z: float
+    """Size over its standard deviation, for rows of unit variance."""
+
+
+def largest_step(problem: Problem, state: State, covariance: FloatArray) -> Step:
+    """Return the most significant step at the optimum `state` with `covariance` (f, f) of y.
+
+    Of the delay alone where the axles' roads differ: which part of that is a channel's gain is not
+    known well enough.
+    """
+    crossing = problem.crossing
+    m = problem.noise.reciprocal.size
+    white, jacobian = state.residual[:m], state.jacobian[:m]
+    # Where roads differ the rows answer to noise that is in the signals too: what that makes of the
+    # fit's own columns on average (`noise_slope`) it makes of g as far as these explain it.
+    gradient = state.jacobian.T @ state.residual
+    gradient[: problem.noise_slope.size] += problem.noise_slope
+    slope = covariance @ gradient
+    at = points(problem, state.y[None, :])
+    n = crossing.signals.shape[2]
+    worst = Step(DELAY, 0, 0.0, 0.0, 0.0)
+    changed, rows = np.empty_like(crossing.signals), np.empty((1, m))
+    kinds = (DELAY,) if problem.mismatch.level_m3.any() else (DELAY, GAIN)
+    for kind in kinds:
+        count, aside = _MOMENTS[kind]
+        moments = (n * np.linspace(aside, 1.0 - aside, count + 2)[1:-1]).astype(np.int64)
+        for channel in range(CHANNELS):
+            columns = np.empty((count, m))
+            for k, moment in enumerate(moments.tolist()):
+                changed[:] = crossing.signals
+                changed[channel] += _STEP * unit_step(
+                    crossing.signals[channel], kind, moment, crossing.step_s
+                )
+                evaluate_white(
+                    crossing._replace(signals=changed),
+                    problem.rows,
+                    problem.noise,
+                    problem.works,
+                    at,
+                    rows,
+                )
+                columns[k] = (rows[0] - white) / _STEP
+            explained = columns @ jacobian
+            norm = np.sum(columns**2, axis=1)
+            left = norm - np.sum((explained @ covariance) * explained, axis=1)
+            score = columns @ white - explained @ slope
+            is_seen = left > _LEAST_SHARE * norm.max()
+            z = np.where(is_seen, score / np.sqrt(np.where(is_seen, left, 1.0)), 0.0)
+            k = int(np.argmax(np.abs(z)))
+            if abs(z[k]) > abs(worst.z):
+                size = float(score[k] / left[k])
+                time_s = float(moments[k]) * crossing.step_s
+                worst = Step(kind, channel, time_s, size, float(z[k]))
+    return worst
+
+
+def unit_step(signals: FloatArray, kind: int, moment: int, step_s: float) -> FloatArray:
+    """Return what a unit step at sample `moment` adds to the signals (6, n) of one channel."""
+    out = np.zeros_like(signals)
+    own, new = signals[:, moment:], out[:, moment:]
+    since_s = step_s * np.arange(own.shape[1])
+    if kind == DELAY:
+        new[V] = own[A] - own[A, 0]
+        new[Z] = own[V] - own[V, 0] - own[A, 0] * since_s
+        new[A], new[A_1], new[A_2] = own[A_1], own[A_2], own[A_3]
+    else:
+        new[V] = own[V] - own[V, 0]
+        new[Z] = own[Z] - own[Z, 0] - own[V, 0] * since_s
+        new[A:] = own[A:]
+    return out

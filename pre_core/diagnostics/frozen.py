@@ -1,0 +1,102 @@
+"""Stretches of a signal that no sensor measured: held at one value, or bridged by a straight line.
+
+Noise and motion change every sample and every difference of samples. Of a coarse converter
+neighbours are often alike: a stretch counts if it is longer than chance makes one in a thousand
+million records' samples, and a held one if the signal then jumps by more than the converter's
+steps, which a signal that a converter holds by itself cannot do.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+_SHORTEST_S, _LONG_S = 0.01, 0.04
+"""No shorter stretch counts; a longer one that is held counts however many neighbours are alike."""
+_FEWEST = 5
+"""Samples of the shortest stretch that counts."""
+_CHANCE = 1e-9
+"""Probability of a stretch at one place by chance: a record has some ten thousand samples."""
+_COARSE_SHARE = 0.02
+"""A signal with a larger share of equal neighbours is coarse."""
+_JUMP = 4.0
+"""Steps of the converter."""
+_LOW_STEPS = 0.05
+"""Quantile of the changes of a coarse signal that is one step."""
+_STRAIGHT = 1e-3
+"""Part of the median second difference below which there is none."""
+_ON_GRID = 1e-3
+"""Part of a step by which changes of a quantised signal miss whole numbers of steps."""
+_ROUNDING = 1e-9
+"""Part of the largest value below which differences are those of floating point."""
+_BLOCKS = 8
+"""Parts of a record: where the truck is calm, more neighbours are alike."""
+
+
+def longest_hold_s(values: FloatArray, step_s: float) -> float:
+    """Return the length of the longest stretch of (n,) that is held at one value; 0 if none is.
+
+    Both ends of the range are left out, where a sensor is saturated and not stuck.
+    """
+    change = np.diff(values)
+    is_equal = change == 0.0
+    begin, length = _runs(is_equal)
+    if begin.size == 0:
+        return 0.0
+    share = _largest_share(is_equal, begin, length)
+    fewest = max(_fewest(step_s), min(_by_chance(share) + 1, round(_LONG_S / step_s)))
+    is_end = (values[begin] == values.max()) | (values[begin] == values.min())
+    length = np.where(is_end, 0, length)
+    if share > _COARSE_SHARE:
+        after = np.minimum(begin + length, change.size - 1)
+        step = np.quantile(np.abs(change[~is_equal]), _LOW_STEPS)
+        length = np.where(np.abs(change[after]) > _JUMP * step, length, 0)
+    held = int(length.max()) + 1
+    return held * step_s if held >= fewest else 0.0
+
+
+def longest_line_s(values: FloatArray, step_s: float) -> float:
+    """Return the length of the longest stretch of (n,) that is a slanting line; 0 if none is."""
+    change = np.diff(values)
+    bend = np.abs(np.diff(change))
+    is_bent = bend > _ROUNDING * np.abs(values).max()
+    if not is_bent.any():
+        return 0.0
+    flat = max(_STRAIGHT * float(np.median(bend[is_bent])), float(bend[~is_bent].max(initial=0.0)))
+    is_straight = (bend <= flat) & (np.abs(change[1:]) > flat) & (np.abs(change[:-1]) > flat)
+    # A quantised signal may rise by one step at every sample; a line between two values does not.
+    step = float(np.quantile(np.abs(change[np.abs(change) > flat]), _LOW_STEPS))
+    off_grid = np.abs(change / step - np.round(change / step))
+    if float(np.median(off_grid)) < _ON_GRID:
+        is_straight &= off_grid[1:] > _ON_GRID
+    begin, length = _runs(is_straight)
+    if length.size == 0:
+        return 0.0
+    share = _largest_share(is_straight, begin, length)
+    line = int(length.max()) + 2
+    return line * step_s if line >= max(_fewest(step_s), _by_chance(share) + 2) else 0.0
+
+
+def _fewest(step_s: float) -> int:
+    return max(_FEWEST, round(_SHORTEST_S / step_s))
+
+
+def _runs(is_true: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where the runs of true flags (n,) begin, and their lengths."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_true, [False]]).astype(np.int8)))
+    return edges[::2], np.diff(edges)[::2]
+
+
+def _largest_share(
+    is_true: NDArray[np.bool_], begin: NDArray[np.int64], length: NDArray[np.int64]
+) -> float:
+    """Return the largest share of true flags (n,) in a part of them, without the longest run."""
+    worst = int(np.argmax(length))
+    others = is_true.astype(np.float64)
+    others[begin[worst] : begin[worst] + length[worst]] = 0.0
+    return max(float(part.mean()) for part in np.array_split(others, _BLOCKS))
+
+
+def _by_chance(share: float) -> int:
+    """Return the length that a run of flags, each true with a probability, has next to never."""
+    return int(np.ceil(np.log(_CHANCE) / np.log(min(max(share, 1e-9), 0.999))))

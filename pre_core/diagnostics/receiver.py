@@ -1,0 +1,36 @@
+"""Whether a receiver's speeds and its positions contradict each other."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+_FEWEST = 4
+_DRIFT_S = 300.0
+"""Correlation time of a receiver's slow error."""
+
+
+def speed_scale(
+    time_s: FloatArray,
+    position_m: FloatArray,
+    speed_m_per_s: FloatArray,
+    *,
+    noise_m: float,
+    spread_m: float,
+) -> tuple[float, float]:
+    """Return by which part the speeds are too high for the positions, and its standard deviation.
+
+    Positions (m,) are a + b times the integrated speeds, with white noise and a slow error of
+    exponential correlation. Nothing of fewer than four fixes, whose deviation is infinite.
+    """
+    if time_s.size < _FEWEST:
+        return 0.0, np.inf
+    mean = 0.5 * (speed_m_per_s[1:] + speed_m_per_s[:-1])
+    travelled = np.concatenate([[0.0], np.cumsum(mean * np.diff(time_s))])
+    apart = np.abs(time_s[:, None] - time_s[None, :])
+    covariance = spread_m**2 * np.exp(-apart / _DRIFT_S) + noise_m**2 * np.eye(time_s.size)
+    columns = np.stack([np.ones_like(travelled), travelled], axis=1)
+    weighted = np.linalg.solve(covariance, columns)
+    spread = np.linalg.inv(columns.T @ weighted)
+    slope = float((spread @ (weighted.T @ position_m))[1])
+    return 1.0 / abs(slope) - 1.0, float(np.sqrt(spread[1, 1]))
