@@ -32,7 +32,6 @@ from services.drives.ros2_complaints import (
     UNKNOWN_TYPE,
     UNPUBLISHED,
     UNREADABLE,
-    Complaints,
     Refusals,
 )
 from services.drives.ros2_messages import IMU, MAX_PAYLOAD_BYTES, check_rosbags, unknown_hash
@@ -48,10 +47,11 @@ CONNECT_TIMEOUT_S: Final = 10.0
 _WAITING: Final = 20_000
 """Messages of a topic: more than ten seconds of the fastest. Beyond it the oldest are dropped and
 counted; nobody at the ROS router is held up."""
-_WAITING_BYTES: Final = 16 << 20
-"""The same in bytes: `_WAITING` messages of the types that are read, which have some 330."""
+_WAITING_BYTES: Final = 24 << 20
+"""The same in bytes: `_WAITING` messages of a sensor have some 19 MB."""
 _OVERHEAD_BYTES: Final = 500
-"""Memory of a waiting message besides its payload and its key, an estimate above what was seen."""
+"""Memory of a waiting message besides its content: 263 by `sys.getsizeof`, and what an
+allocator adds."""
 _AT_ONCE: Final = 50
 """Of a topic, before another one has its turn."""
 _MOST_BYTES: Final = MAX_PAYLOAD_BYTES + 1024
@@ -110,7 +110,7 @@ def run(
         spooled = None if spool is None else Spool(spool, budget_bytes=spool_budget_bytes)
         gateway = Gateway(bus, realm, vehicle, spooled)
         stack.callback(gateway.close)
-        out = _Out(gateway, vehicle_toml(known, vehicle), truck.complaints)
+        out = _Out(gateway, vehicle_toml(known, vehicle), truck)
         telling = _Telling(gateway, truck)
         with _Hearing(ros_session, truck) as hearing:
             ready()
@@ -204,16 +204,17 @@ class _Telling:
 class _Out:
     """Publishes; what the truck is comes before all else that it says."""
 
-    def __init__(self, gateway: Gateway, toml: str, complaints: Complaints) -> None:
+    def __init__(self, gateway: Gateway, toml: str, truck: Ros2Truck) -> None:
         self.sent = 0
         self._gateway = gateway
         self._toml = toml
-        self._complaints = complaints
+        self._complaints = truck.complaints
+        self._gnss = truck.table.gnss
+        self._topics = {name: imu.topic for name, imu in truck.table.imu.by_channel().items()}
 
     def put(self, item: Accel | GnssFix) -> None:
         """Publish an item; one that no message can hold is counted."""
         times = {"device_time_ns": item.device_time_ns, "wall_time_ns": item.wall_time_ns}
-        topic = "positions" if isinstance(item, GnssFix) else next(iter(item.channels))
         try:
             if not self.sent:
                 self._gateway.info(self._toml, **times)
@@ -225,6 +226,10 @@ class _Out:
                 self._gateway.accel(item.channels, **times)
                 self.sent += 1
         except ValueError as error:  # times of a stranger's clock
+            if isinstance(item, GnssFix):
+                topic = self._gnss
+            else:
+                topic = self._topics[next(iter(item.channels))]
             self._complaints.add(topic, UNPUBLISHED, example=one_line(str(error))[:200])
 
 
@@ -268,7 +273,7 @@ class _Hearing:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def next(self, topic: str) -> _Heard | None:
-        """A message of a topic, if one has come."""
+        """Return the next message of a topic, or None if none waits."""
         return self._waiting[topic].get()
 
     def _receive(self, topic: str, sample: zenoh.Sample) -> None:
@@ -294,7 +299,7 @@ class _Hearing:
             self._counted_too_large[topic] = too_large
 
     def taken(self, topic: str, heard: _Heard) -> list[Accel | GnssFix]:
-        """What of a message can be published now."""
+        """Return what of a message can be published now."""
         complaints = self._truck.complaints
         try:
             name, told_hash = type_and_hash(heard.key)
