@@ -12,12 +12,15 @@ import pytest
 
 from schemas.events import EventKind, decode_event
 from services.recordings.recording import read_messages
+from tests.waiting import hesitation
 
 KILLS_ENV = "DRIVEBY_SOAK_KILLS"
 MINUTES_ENV = "DRIVEBY_SOAK_MINUTES"
 pytestmark = pytest.mark.process
 
 MakeFleet = Callable[..., Any]
+_SWITCHES = 10
+"""From thread to thread on a message's way, each of which a busy machine delays."""
 
 
 @pytest.mark.faults  # the next but one does the same, and more
@@ -163,21 +166,24 @@ def test_frozen_for_longer_than_its_time_outs(fleet: MakeFleet, what: str, secon
 @pytest.mark.parametrize("router", [False, pytest.param(True, marks=pytest.mark.faults)])
 def test_a_frozen_truck_delays_no_other(fleet: MakeFleet, router: bool) -> None:
     one = fleet(router=router)
-    one.start_logger()
-    if router:
-        one.start_router()
-    frozen, healthy = one.start_truck("truck-1"), one.start_truck("truck-2")
-    frozen.wait_for(20)
-    frozen.process.send_signal(signal.SIGSTOP)
-    healthy.wait_for(max(healthy.said.values(), default=0) + 60)
-    late = one.start_truck("truck-3")
-    late.wait_for(40)
-    frozen.process.send_signal(signal.SIGCONT)
-    one.finish()
+    with hesitation() as own_delay_s:
+        one.start_logger()
+        if router:
+            one.start_router()
+        frozen, healthy = one.start_truck("truck-1"), one.start_truck("truck-2")
+        frozen.wait_for(20)
+        frozen.process.send_signal(signal.SIGSTOP)
+        healthy.wait_for(max(healthy.said.values(), default=0) + 60)
+        late = one.start_truck("truck-3")
+        late.wait_for(40)
+        frozen.process.send_signal(signal.SIGCONT)
+        one.finish()
+        machine_s = _SWITCHES * own_delay_s()
     for vehicle in ("truck-2", "truck-3"):
         found_s = lags_s(one, vehicle)
-        assert sorted(found_s)[len(found_s) // 2] < 0.5
-        assert max(found_s) < 4.0, vehicle  # the first ones, while the logger meets the truck
+        assert sorted(found_s)[len(found_s) // 2] < max(0.5, machine_s)
+        # The first ones, while the logger meets the truck.
+        assert max(found_s) < max(4.0, machine_s), vehicle
 
 
 def lags_s(one: Any, vehicle: str = "truck-*") -> list[float]:
@@ -215,7 +221,9 @@ def test_a_frozen_subscriber_holds_up_the_logger_for_seconds_only(fleet: MakeFle
     for truck in trucks:
         truck.wait_for(500)
     viewer.send_signal(signal.SIGSTOP)
-    for truck in trucks:
-        truck.wait_for(max(truck.said.values()) + 12_000)
-    assert one.finish() == 0
-    assert max(lags_s(one)) < 5.0  # Zenoh's own patience made it 10
+    with hesitation() as own_delay_s:
+        for truck in trucks:
+            truck.wait_for(max(truck.said.values()) + 12_000)
+        assert one.finish() == 0
+        machine_s = _SWITCHES * own_delay_s()
+    assert max(lags_s(one)) < max(5.0, machine_s)  # Zenoh's own patience made it 10
