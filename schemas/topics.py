@@ -14,6 +14,7 @@ IDENTIFIER = r"[a-z0-9][a-z0-9_-]{0,62}"
 REALM = rf"live|(?:replay|sim|import)-{IDENTIFIER}"
 
 _IDENTIFIER = re.compile(IDENTIFIER)
+_MAX_IDENTIFIER_CHARACTERS = 63
 _REALM = re.compile(REALM)
 _NAME_BEGIN = re.compile(r"[a-z0-9][a-z0-9_-]*")
 MAX_KEY_CHARACTERS = 255
@@ -135,6 +136,11 @@ def check_identifier(text: str) -> str:
             "beginning with a letter or digit"
         )
     return text
+
+
+def gateway_service(vehicle: str) -> str:
+    """Return the name of the service under which a truck's gateway publishes events."""
+    return f"gateway-{check_identifier(vehicle)}"[:_MAX_IDENTIFIER_CHARACTERS]
 
 
 def check_realm(text: str) -> str:

@@ -134,7 +134,8 @@ def _in_folder(source: Source, folder: Folder, name: str) -> Recording:
 def _recordings(sources: Sequence[Source], site: Site, problems: list[str]) -> list[Recording]:
     """Recordings that are named; of folders those in which positions show a crossing.
 
-    A folder's catalogue is mended first: what it said that was not so is a problem, a line each.
+    A folder's catalogue is mended first: what it said that was not so is a problem, a line each. It
+    is kept there if the folder may be written.
     """
     found: list[Recording] = []
     for source in sources:
@@ -142,7 +143,7 @@ def _recordings(sources: Sequence[Source], site: Site, problems: list[str]) -> l
             found.append(recording_at(source))
             continue
         folder = folder_at(str(source))
-        mended = mend(folder)
+        mended = mend(folder, must_write=False)
         looked = crossings_of(folder, mended.rows.values(), site)
         problems += (*mended.problems, *looked.problems)
         with_crossings = {path for one in looked.crossings for path in one.recordings}

@@ -3,7 +3,8 @@
 They are processes of their own, started as `dask scheduler` and `dask worker` start them, and end
 with this one, however it ends (`services.common.leash`). One that dies is started again: a worker
 leaves when its scheduler does, so after a dead scheduler all are new. One that is frozen is ended,
-so it dies as well.
+so it dies as well. Exit code 0 is an end like any other: whatever Dask's configuration says
+(`_FIXED`), none of them ends by itself while this runs.
 
 Dask runs whatever it is sent. They listen on this machine only, unless they have credentials: then
 everybody who connects shows a certificate of the same authority.
@@ -19,9 +20,11 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from services.bus.playback import leave_at_once, stopped_by_signals
+from services.cluster.scheduler_process import CAUSE_FILE
 from services.common.errors import FailureError, InputError
 from services.common.extras import check_installed
 from services.execution.scheduler import Credentials, is_loopback, threads_of
@@ -118,10 +121,12 @@ def check_listens(wanted: Wanted) -> None:
 @contextmanager
 def _children(wanted: Wanted, folder: str) -> Iterator[list["_Child"]]:
     """The scheduler and the workers; they have ended when the block has."""
-    scheduler = _Child("scheduler", "distributed.cli.dask_scheduler", _of_scheduler(wanted))
+    causes = Path(folder)
+    own = "services.cluster.scheduler_process"
+    scheduler = _Child("scheduler", own, _of_scheduler(wanted), causes)
     arguments = _of_worker(wanted, folder)
     workers = [
-        _Child(f"worker {number}", "distributed.cli.dask_worker", arguments)
+        _Child(f"worker {number}", "distributed.cli.dask_worker", arguments, causes)
         for number in range(1, wanted.workers + 1)
     ]
     children = [scheduler, *workers]
@@ -168,8 +173,9 @@ def _tls_arguments(files: Credentials | None) -> list[str]:
 class _Child:
     """One process after the other, on a leash."""
 
-    def __init__(self, name: str, module: str, arguments: list[str]) -> None:
+    def __init__(self, name: str, module: str, arguments: list[str], causes: Path) -> None:
         self.name = name
+        self._cause_file = causes / f"{name.replace(' ', '-')}-ended"
         self._arguments = [module, *arguments]
         self._process: subprocess.Popen[bytes] | None = None
         self._watch: Watch | None = None
@@ -180,10 +186,11 @@ class _Child:
 
     def start(self) -> None:
         """Start it; what it says goes where this process's errors go."""
+        self._cause_file.unlink(missing_ok=True)
         self._process = subprocess.Popen(
             [sys.executable, "-m", "services.common.leash", *self._arguments],
             stdin=subprocess.PIPE,
-            env=_ENVIRONMENT | os.environ,
+            env=_ENVIRONMENT | os.environ | _FIXED | {CAUSE_FILE: str(self._cause_file)},
         )
         self._began_s, self._again_s = time.monotonic(), None
         self._watch = Watch(self._process.pid, Limits(math.inf, FROZEN_S), self._began_s)
@@ -203,7 +210,10 @@ class _Child:
         self.died_soon = self.died_soon + 1 if now_s < self._began_s + _SOON_S else 0
         pause_s = min(2.0**self.died_soon - 1.0, _LONGEST_PAUSE_S)
         self._again_s = now_s + pause_s
-        _log.warning("the %s has ended (exit code %d); it is started again", self.name, code)
+        cause = f": {self._cause_file.read_text()}" if self._cause_file.exists() else ""
+        _log.warning(
+            "the %s has ended (exit code %d%s); it is started again", self.name, code, cause
+        )
 
     def _end_if_frozen(self, now_s: float) -> None:
         """Kill it if it does nothing; it is started again when it has ended."""
@@ -240,3 +250,12 @@ _ENVIRONMENT: Final = {
     "PYTHONWARNINGS": "ignore:resource_tracker",  # it puts away what a worker that is ended leaves
 }
 """Of the children; what the user has set counts."""
+
+_FIXED: Final = {
+    "DASK_DISTRIBUTED__SCHEDULER__IDLE_TIMEOUT": "None",
+    "DASK_DISTRIBUTED__SCHEDULER__NO_WORKERS_TIMEOUT": "None",
+    "DASK_DISTRIBUTED__WORKER__LIFETIME__DURATION": "None",
+}
+"""Of the children, whatever files of Dask or the user say. By the first and the last they would end
+by themselves with exit code 0, by the second they would give up batches while workers start again.
+"""

@@ -1,6 +1,32 @@
 """What was not right with messages of ROS 2: counted, and told a line for each kind."""
 
 from collections import Counter
+from typing import Final, NamedTuple
+
+UNREADABLE: Final = "messages left out"
+TOO_LARGE: Final = "messages larger than any of a sensor, left out"
+UNKNOWN_TYPE: Final = "messages of another type, left out"
+FAR_STAMPS: Final = "stamps too far from when they were sent"
+OTHER_FRAME: Final = "messages of another frame, left out"
+SECOND_SENSOR: Final = "messages of a second sensor, left out"
+WRONG_RATE: Final = "messages at a wrong rate, left out"
+UNPUBLISHED: Final = "messages that cannot be published, left out"
+DROPPED: Final = "messages dropped, as too many waited"
+_REFUSED: Final = (
+    *(UNREADABLE, TOO_LARGE, UNKNOWN_TYPE, FAR_STAMPS, OTHER_FRAME, SECOND_SENSOR, WRONG_RATE),
+    UNPUBLISHED,
+)
+"""Kinds by which a publisher is refused that is no sensor of the truck, or is set up wrongly."""
+
+
+class Refusals(NamedTuple):
+    """Messages of a topic that were refused or dropped since the last report."""
+
+    topic: str
+    refused: int
+    dropped: int
+    text: str
+    """Its lines, with the numbers of this report."""
 
 
 class Complaints:
@@ -9,6 +35,7 @@ class Complaints:
     def __init__(self) -> None:
         self._counts: Counter[tuple[str, str]] = Counter()
         self._told: Counter[tuple[str, str]] = Counter()
+        self._reported: Counter[tuple[str, str]] = Counter()
         self._examples: dict[tuple[str, str], str] = {}
 
     def add(self, topic: str, kind: str, number: int = 1, example: str = "") -> None:
@@ -27,8 +54,29 @@ class Complaints:
         lines = []
         for name, number in sorted(self._counts.items()):
             if number > self._told[name]:
-                topic, kind = name
-                example = self._examples.get(name, "")
-                lines.append(f"{topic}: {number} {kind}{example and f' ({example})'}")
+                lines.append(self._line(*name, number))
         self._told = self._counts.copy()
         return lines
+
+    def refusals(self) -> list[Refusals]:
+        """Return what was refused or dropped since `reported`, one for each topic."""
+        found = []
+        for topic in sorted({topic for topic, _ in self._counts}):
+            new = {
+                kind: number
+                for kind in (*_REFUSED, DROPPED)
+                if (number := self._counts[topic, kind] - self._reported[topic, kind]) > 0
+            }
+            if new:
+                dropped = new.get(DROPPED, 0)
+                text = "; ".join(self._line(topic, kind, number) for kind, number in new.items())
+                found.append(Refusals(topic, sum(new.values()) - dropped, dropped, text))
+        return found
+
+    def reported(self, topic: str) -> None:
+        """Note that all refusals of a topic so far have been reported."""
+        self._reported |= Counter({name: n for name, n in self._counts.items() if name[0] == topic})
+
+    def _line(self, topic: str, kind: str, number: int) -> str:
+        example = self._examples.get((topic, kind), "")
+        return f"{topic}: {number} {kind}{example and f' ({example})'}"

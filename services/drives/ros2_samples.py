@@ -31,6 +31,16 @@ _LONG_GAP_S: Final = 1.0
 """After a longer one the line begins anew, as it does when stamps are in the past for so long."""
 
 
+class RateError(InputError):
+    """The stamps of a topic give another rate than the site file declares."""
+
+    def __init__(self, topic: str, samples: int, line: str) -> None:
+        super().__init__(line)
+        self.topic = topic
+        self.samples = samples
+        """Number of samples that were measured, and are left out."""
+
+
 class Piece(NamedTuple):
     """Samples without a gap; the time is of the first."""
 
@@ -64,7 +74,8 @@ class EvenSamples:
     def add(self, stamp_ns: int, value: float) -> list[Piece]:
         """Take a sample in m/s²; return what is complete, which is nothing for most samples.
 
-        InputError once the rate is known and is not the one that the site file declares.
+        RateError once the rate is known and is not the one that the site file declares; what has
+        come is forgotten then.
         """
         if self._rate_hz:
             return self._place(stamp_ns, value)
@@ -84,12 +95,19 @@ class EvenSamples:
         return self._begin()
 
     def finish(self) -> list[Piece]:
-        """What is left when no more samples come; InputError as `add`."""
+        """Return what is left when no more samples come; RateError as `add`."""
         if not self._rate_hz and len(self._early) >= _FEWEST:
             return self._begin() + self._flush()
         self._complaints.add(self._topic, "samples, too few to tell their rate", len(self._early))
         self._early.clear()
         return self._flush()
+
+    def restart(self) -> list[Piece]:
+        """Measure the rate again, as another sensor goes on; RateError as `add`, of the first."""
+        try:
+            return self.finish()
+        finally:
+            self._rate_hz, self._behind = 0.0, 0
 
     def _most_early(self) -> float:
         return 2 * _MEASURED_S * self._declared_hz + _FEWEST
@@ -100,9 +118,13 @@ class EvenSamples:
         relative_s = np.array([stamp_ns - first_ns for stamp_ns, _ in self._early]) / NS_PER_S
         rate_hz = sampling_rate_hz(relative_s)
         if not abs(rate_hz / self._declared_hz - 1) <= LARGEST_RATE_ERROR or rate_hz > MAX_RATE_HZ:
-            raise InputError(
+            samples = len(self._early)
+            self._early.clear()
+            raise RateError(
+                self._topic,
+                samples,
                 f"{self._topic}: its stamps give a rate of {rate_hz:.4g} Hz, but sensor.rate_hz of "
-                f"{self._site_name} is {self._declared_hz:g} Hz, one of them must be mended"
+                f"{self._site_name} is {self._declared_hz:g} Hz, one of them must be mended",
             )
         self._rate_hz = rate_hz
         offset_s = float(np.mean(relative_s - grid_index(relative_s) / rate_hz))

@@ -4,14 +4,23 @@ Times are those of `header.stamp`: when something was measured. When it was sent
 thing: the two must be within `largest_delay_s` of each other, or the stamp is not believed.
 """
 
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Final, NamedTuple, NoReturn
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from schemas.signals import CHANNELS, NS_PER_S, Channel, GnssFix
 from schemas.site import Site
 from schemas.site_ros2 import Ros2, RosImu
 from services.common.errors import InputError
-from services.drives.ros2_complaints import Complaints
+from services.drives.ros2_complaints import (
+    FAR_STAMPS,
+    OTHER_FRAME,
+    SECOND_SENSOR,
+    UNREADABLE,
+    WRONG_RATE,
+    Complaints,
+)
 from services.drives.ros2_messages import (
     FIX,
     IMU,
@@ -23,7 +32,7 @@ from services.drives.ros2_messages import (
     decode,
 )
 from services.drives.ros2_positions import FixWithSpeed, Positions
-from services.drives.ros2_samples import EvenSamples, Piece
+from services.drives.ros2_samples import EvenSamples, Piece, RateError
 
 _LEAST_SPEED_NOISE_M_PER_S: Final = 0.5
 """Of speeds that are slopes of positions: their errors are those of the positions once more, and
@@ -33,6 +42,10 @@ _BEFORE_FIRST_NS: Final = 100 * NS_PER_S
 """The truck's own clock shows so much at its first message: others may be stamped before it."""
 _HANDOVER_S: Final = 1.0
 """After so long without a message of a topic's sensor another one may speak there."""
+_REFUSED_S: Final = 10.0
+"""A sensor with a wrong rate is left out for so long, by its stamps, and then measured again."""
+_MOST_REFUSED: Final = 1000
+"""Sensors of a topic with a wrong rate that are remembered; beyond them the oldest is forgotten."""
 
 
 class Accel(NamedTuple):
@@ -54,8 +67,19 @@ class _Source(NamedTuple):
 class Ros2Truck:
     """Takes messages of a truck's topics in the order in which each topic's came."""
 
-    def __init__(self, site: Site, site_name: str, vehicle: str) -> None:
-        """InputError: the site has no `[ros2]` of that truck, or one that cannot be right."""
+    def __init__(
+        self,
+        site: Site,
+        site_name: str,
+        vehicle: str,
+        wrong_rate: Callable[[RateError], None] | None = None,
+    ) -> None:
+        """InputError: the site has no `[ros2]` of that truck, or one that cannot be right.
+
+        `wrong_rate` is called where the rate of a sensor is not the one that the site file
+        declares. Without it `take` and `finish` raise that RateError.
+        """
+        self._wrong_rate = _raise if wrong_rate is None else wrong_rate
         self.table = ros2_of(site, site_name, vehicle)
         self.complaints = Complaints()
         self._imus = {imu.topic: imu for imu in self.table.imu.by_channel().values()}
@@ -68,6 +92,8 @@ class Ros2Truck:
         }
         self._positions = Positions(self.table.gnss, self.table.velocity, self.complaints)
         self._sources: dict[str, _Source] = {}
+        self._refused: dict[str, dict[tuple[bytes, str], int]] = {}
+        """By topic: sensors with a wrong rate, each with the stamp at which that was found."""
         self._zero_ns: int | None = None
         self._latest_device_ns = 0
 
@@ -83,66 +109,105 @@ class Ros2Truck:
         """Take a message; return what can be published now. Identities are for others to set.
 
         `publisher` is who sent it, where that is known. What is wrong with a message is counted in
-        `complaints`. InputError: the rate of a channel is not the one that the site file declares.
+        `complaints`.
         """
         try:
             message = decode(of, payload)
         except ValueError as error:
-            self.complaints.add(topic, "messages left out", example=f"the first {error}")
+            self.complaints.add(topic, UNREADABLE, example=f"the first {error}")
             return []
         if abs(message.stamp_ns - sent_ns) > self.table.largest_delay_s * NS_PER_S:
             apart = f"the first by {(sent_ns - message.stamp_ns) / NS_PER_S:.3f} s"
-            self.complaints.add(topic, "stamps too far from when they were sent", example=apart)
+            self.complaints.add(topic, FAR_STAMPS, example=apart)
             return []
-        if not self._is_of_its_sensor(topic, message, publisher):
+        frame = message.frame if isinstance(message, Imu) else ""
+        source = _Source(publisher, frame, message.stamp_ns)
+        if not self._is_of_its_sensor(topic, source):
             return []
+        left = self._handed_over(topic, source)
         if self._zero_ns is None:
             self._zero_ns = message.stamp_ns - _BEFORE_FIRST_NS
         match message:
             case Imu():
-                return self._accelerations(topic, message)
+                return left + self._accelerations(topic, message)
             case Fix():
                 return self._fix(message)
             case Velocity():
                 return self._fixes(self._positions.add_velocity(message))
 
     def finish(self) -> list[Accel | GnssFix]:
-        """What is left when no more messages come; InputError as `take`."""
+        """Return what is left when no more messages come; RateError as `take`."""
         found: list[Accel | GnssFix] = []
         for topic, samples in self._samples.items():
-            found += self._batches(topic, samples.finish())
+            found += self._batches(topic, self._at_right_rate(samples.finish))
         return found + self._fixes(self._positions.finish())
 
-    def _is_of_its_sensor(
-        self, topic: str, message: Imu | Fix | Velocity, publisher: bytes
-    ) -> bool:
+    def _is_of_its_sensor(self, topic: str, source: _Source) -> bool:
         """Whether a message is of the sensor that has the topic; what others say is counted.
 
         Samples of two are no signal. So a topic is the first one's, by publisher and frame, until
-        it has been silent for a while: a node that was started anew is another publisher.
+        it has been silent for a while, as a node that was started again is another publisher, or
+        until its rate is known and is not the declared one.
         """
-        frame = message.frame if isinstance(message, Imu) else ""
+        publisher, frame, stamp_ns = source
         imu = self._imus.get(topic)
         if imu is not None and imu.frame is not None and frame != imu.frame:
             other = f"the first {frame[:60]!r}, not {imu.frame!r}"
-            self.complaints.add(topic, "messages of another frame, left out", example=other)
+            self.complaints.add(topic, OTHER_FRAME, example=other)
             return False
-        now, before = _Source(publisher, frame, message.stamp_ns), self._sources.get(topic)
-        if before is not None and (publisher, frame) != (before.publisher, before.frame):
-            if abs(now.stamp_ns - before.stamp_ns) <= _HANDOVER_S * NS_PER_S:
-                other = f"the first of frame {frame[:60]!r}" if frame != before.frame else ""
-                self.complaints.add(topic, "messages of a second sensor, left out", example=other)
-                return False
-            self.complaints.add(topic, "times that another sensor went on")
-        self._sources[topic] = now
+        before = self._sources.get(topic)
+        if (
+            before is not None
+            and source[:2] != before[:2]
+            and abs(stamp_ns - before.stamp_ns) <= _HANDOVER_S * NS_PER_S
+        ):
+            other = f"the first of frame {frame[:60]!r}" if frame != before.frame else ""
+            self.complaints.add(topic, SECOND_SENSOR, example=other)
+            return False
+        refused_ns = self._refused.get(topic, {}).get((publisher, frame))
+        if refused_ns is not None and abs(stamp_ns - refused_ns) <= _REFUSED_S * NS_PER_S:
+            self.complaints.add(topic, WRONG_RATE)
+            return False
         return True
+
+    def _handed_over(self, topic: str, source: _Source) -> list[Accel | GnssFix]:
+        """Note whose a topic is; return what is left of another sensor that had it before.
+
+        The rate of each sensor is measured, or samples of a stranger would be put on the grid of
+        the truck's own.
+        """
+        left: list[Accel | GnssFix] = []
+        before = self._sources.get(topic)
+        if before is not None and source[:2] != before[:2]:
+            self.complaints.add(topic, "times that another sensor went on")
+            if topic in self._samples:
+                left = self._batches(topic, self._at_right_rate(self._samples[topic].restart))
+        self._sources[topic] = source
+        return left
+
+    def _at_right_rate(self, pieces_of: Callable[[], list[Piece]]) -> list[Piece]:
+        """Return the pieces; none, and the topic is free again, if the sensor's rate is wrong."""
+        try:
+            return pieces_of()
+        except RateError as error:
+            source = self._sources.pop(error.topic, None)
+            if source is not None:
+                refused = self._refused.setdefault(error.topic, {})
+                refused[source.publisher, source.frame] = source.stamp_ns
+                if len(refused) > _MOST_REFUSED:
+                    del refused[next(iter(refused))]
+            reason = str(error).removeprefix(f"{error.topic}: ")
+            self.complaints.add(error.topic, WRONG_RATE, error.samples, example=reason)
+            self._wrong_rate(error)
+            return []
 
     def _accelerations(self, topic: str, message: Imu) -> list[Accel | GnssFix]:
         if message.acceleration_m_per_s2 is None:
             self.complaints.add(topic, "messages that say they have no acceleration, left out")
             return []
         up = _up(self._imus[topic], message.acceleration_m_per_s2)
-        return self._batches(topic, self._samples[topic].add(message.stamp_ns, up))
+        add = partial(self._samples[topic].add, message.stamp_ns, up)
+        return self._batches(topic, self._at_right_rate(add))
 
     def _batches(self, topic: str, pieces: list[Piece]) -> list[Accel | GnssFix]:
         name = self._channels[topic]
@@ -216,6 +281,10 @@ def ros2_of(site: Site, site_name: str, vehicle: str) -> Ros2:
             "of positions then"
         )
     return table
+
+
+def _raise(error: RateError) -> NoReturn:
+    raise error
 
 
 def _up(imu: RosImu, measured: dict[str, float]) -> float:

@@ -107,12 +107,15 @@ def catalog_above(recording: Path) -> Path | None:
     return next((folder for folder in above if (folder / CATALOG).is_dir()), None)
 
 
-def mend(folder: Folder, *, verify: bool = False) -> Mended:
+def mend(folder: Folder, *, verify: bool = False, must_write: bool = True) -> Mended:
     """Bring the catalogue to what is in the folder, and pack it.
 
     Rows that are missing are made; rows of recordings that are gone, or whose content is another,
     are named and dropped, and made anew where there is a file. A file with the size and time of its
     row is taken to be that file, unless `verify`: then its content is read and compared.
+
+    Raise FailureError or InputError if the catalogue cannot be written. Without `must_write` that
+    is a warning, for a caller who only needs the rows and may only read the folder.
     """
     before = stored(folder)
     problems = list(before.problems)
@@ -136,7 +139,16 @@ def mend(folder: Folder, *, verify: bool = False) -> Mended:
                 rows[path] = old
         except InputError as error:
             problems.append(str(error))
-    _pack(folder, rows, before)
+    try:
+        _pack(folder, rows, before)
+    except (FailureError, InputError) as error:
+        if must_write:
+            raise
+        _log.warning(
+            "%s: cannot write its catalogue; the next identification reads these recordings again "
+            "(%s)",
+            *(folder.name, error),
+        )
     return Mended(rows, added, tuple(problems))
 
 

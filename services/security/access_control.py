@@ -14,7 +14,7 @@ subject, what it publishes and what it reads, give all rules. To each key belong
 from collections.abc import Iterable
 from typing import Any
 
-from schemas.topics import PREFIX, TOPICS
+from schemas.topics import PREFIX, TOPICS, gateway_service
 from services.bus.credentials import Subject
 
 _SAYS = ("put", "reply", "declare_queryable", "liveliness_token")
@@ -31,7 +31,8 @@ _SERVICE_STREAMS = {
 def access_control(subjects: Iterable[Subject]) -> dict[str, Any]:
     """Return the value of Zenoh's key `access_control` that lets these in, and nobody else.
 
-    A truck publishes its own keys and reads `durable`, for that tells it what it may forget. A
+    A truck publishes its own keys and events of its gateway, which is a service of a name of its
+    own, and reads `durable`, for that tells it what it may forget. A
     logger publishes about itself and reads everything; a worker publishes results and alarms and
     reads trucks, those and its own health; a viewer reads results and alarms. A replay publishes in
     realms of replays only.
@@ -59,7 +60,11 @@ def published_by(subject: Subject) -> list[str]:
     role, name = subject
     match role:
         case "truck":
-            return [*_keys("vehicle", name), f"{PREFIX}/*/vehicle/{name}/*/spool"]
+            return [
+                *_keys("vehicle", name),
+                f"{PREFIX}/*/vehicle/{name}/*/spool",
+                *_keys("service", gateway_service(name), ("event",)),
+            ]
         case "logger":
             return _keys("service", name, _SERVICE_STREAMS[role])
         case "worker":

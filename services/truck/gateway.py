@@ -26,11 +26,12 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 from zenoh import handlers
 
+from schemas.events import Event, encode_event
 from schemas.signals import (
     AccelBatch,
     Channel,
@@ -51,7 +52,7 @@ from schemas.spool import (
     spool_key,
     spool_selector,
 )
-from schemas.topics import Key, check_identifier, check_realm, key, topic
+from schemas.topics import Key, check_identifier, check_realm, gateway_service, key, topic
 from schemas.vehicle_info import own_part
 from services.bus.delivery import Delivery
 from services.bus.publisher import Publisher
@@ -160,6 +161,19 @@ class Gateway:
         self.put("gnss", encode_gnss(own), identity)
         self.put("location", encode_location(own), self._identity("location"))
 
+    def event(self, event: Event) -> bool:
+        """Publish an event about this truck; False if the bus does not take it now.
+
+        It is neither spooled nor waited for.
+        """
+        if not self.is_online:
+            return False
+        put = _Put("service", gateway_service(self.vehicle), "event", encode_event(event), None)
+        if self._spool is not None:
+            return self._spool.publish(put, wait=False)
+        self.publisher.put(*put)
+        return True
+
     def put(
         self, stream: str, payload: bytes, identity: Identity, *, patient: bool = False
     ) -> None:
@@ -177,7 +191,8 @@ class Gateway:
             spooled = self._append(self._spool.spool, stream, payload, identity)
             # What is on no disk can only be published, however long that takes.
             wait = self.is_online and (patient or not spooled)
-            if not self._spool.publish(stream, payload, identity, wait=wait):
+            put = _Put("vehicle", self.vehicle, stream, payload, identity)
+            if not self._spool.publish(put, wait=wait):
                 self.deferred += 1
         self._next[stream] = identity.sequence + 1
         self.delivery.sent(Key(self.publisher.realm, "vehicle", self.vehicle, stream), identity)
@@ -239,6 +254,16 @@ class Gateway:
             return False
 
 
+class _Put(NamedTuple):
+    """What `Publisher.put` takes."""
+
+    owner: str
+    identifier: str
+    stream: str
+    payload: bytes
+    identity: Identity | None
+
+
 class _SpoolService:
     """Three threads: one publishes, one syncs and frees, one answers queries."""
 
@@ -246,9 +271,7 @@ class _SpoolService:
         self.spool = spool
         self._gateway = gateway
         self._realm = gateway.publisher.realm
-        self._outbox: queue.Queue[tuple[str, bytes, Identity] | None] = queue.Queue(
-            _OUTBOX_MESSAGES
-        )
+        self._outbox: queue.Queue[_Put | None] = queue.Queue(_OUTBOX_MESSAGES)
         self._closing = threading.Event()
         self._queryable: zenoh.Queryable[Any] | None = None
         self._threads: list[threading.Thread] = []
@@ -269,10 +292,10 @@ class _SpoolService:
         self._threads.append(thread)
         thread.start()
 
-    def publish(self, stream: str, payload: bytes, identity: Identity, *, wait: bool) -> bool:
+    def publish(self, put: _Put, *, wait: bool) -> bool:
         """Hand over a message for publication; False if the bus is behind."""
         try:
-            self._outbox.put((stream, payload, identity), block=wait)
+            self._outbox.put(put, block=wait)
             return True
         except queue.Full:
             return False
@@ -297,10 +320,9 @@ class _SpoolService:
 
     def _publish_all(self) -> None:
         publisher, vehicle = self._gateway.publisher, self._gateway.vehicle
-        while (item := self._outbox.get()) is not None and not self._closing.is_set():
-            stream, payload, identity = item
+        while (put := self._outbox.get()) is not None and not self._closing.is_set():
             try:
-                publisher.put("vehicle", vehicle, stream, payload, identity)
+                publisher.put(*put)
             except zenoh.ZError as error:  # it stays in the spool
                 _log.debug("%s: %s", vehicle, error)
 

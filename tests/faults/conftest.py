@@ -26,7 +26,9 @@ Numbers = dict[tuple[str, str, int], set[int]]
 class Truck:
     """A process that drives, and what it said it has handed over."""
 
-    def __init__(self, fleet: "Fleet", vehicle: str, rate: float, env: dict[str, str]) -> None:
+    def __init__(
+        self, fleet: "Fleet", vehicle: str, rate: float, endpoint: str, env: dict[str, str]
+    ) -> None:
         self._fleet = fleet
         self.vehicle = vehicle
         self.said: dict[int, int] = {}
@@ -37,7 +39,7 @@ class Truck:
         spool = fleet.folder / "spool" / vehicle
         self.process = fleet.python(
             "truck_process.py",
-            fleet.truck_endpoint,
+            endpoint,
             "live",
             vehicle,
             str(spool),
@@ -115,9 +117,9 @@ class Fleet:
         self._processes.append(process)
         return process
 
-    def start_logger(self) -> None:
+    def start_logger(self, **env: str) -> None:
         self.logger = self.python(
-            "logger_process.py", self.logger_endpoint, str(self.folder / "recordings"), env={}
+            "logger_process.py", self.logger_endpoint, str(self.folder / "recordings"), env=env
         )
         assert self.logger.stdout is not None
         assert self.logger.stdout.readline() == "ready\n", self.logs()
@@ -129,8 +131,14 @@ class Fleet:
         assert self.router.stdout is not None
         assert self.router.stdout.readline() == "ready\n", self.logs()
 
-    def start_truck(self, vehicle: str = "truck-1", rate: float = 20.0, **env: str) -> Truck:
-        truck = Truck(self, vehicle, rate, env)
+    def start_truck(
+        self,
+        vehicle: str = "truck-1",
+        rate: float = 20.0,
+        endpoint: str | None = None,
+        **env: str,
+    ) -> Truck:
+        truck = Truck(self, vehicle, rate, endpoint or self.truck_endpoint, env)
         self.trucks.append(truck)
         return truck
 
@@ -143,6 +151,11 @@ class Fleet:
         assert self.logger is not None
         self.logger.send_signal(signal.SIGTERM)
         assert self.logger.wait(timeout=LONGEST_S) == 0, self.logs()
+
+    def said_by_logger(self) -> str:
+        return "".join(
+            path.read_text() for path in sorted(self.folder.glob("logger_process-*.log"))
+        )
 
     def logs(self) -> str:
         return "\n".join(path.read_text()[-3000:] for path in sorted(self.folder.glob("*.log")))

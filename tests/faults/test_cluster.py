@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from distributed import Client
 
 from services.cli import main as cli
 from services.common.errors import FailureError
@@ -176,7 +177,17 @@ def test_a_drive_gives_what_it_gives_in_one_process(
     assert found[1:] == found[:1] * 2
 
 
-@pytest.mark.parametrize("whom", ["worker 1", "scheduler"])
+@pytest.mark.parametrize(
+    ("whom", "by", "cause"),
+    [
+        ("worker 1", signal.SIGKILL, "exit code -9"),
+        ("scheduler", signal.SIGKILL, "exit code -9"),
+        pytest.param(
+            *("scheduler", signal.SIGTERM, "exit code 0: SIGTERM from outside"),
+            marks=pytest.mark.faults,
+        ),
+    ],
+)
 def test_who_is_killed_costs_nothing(
     two: RunningCluster,
     held: Held,
@@ -185,20 +196,53 @@ def test_who_is_killed_costs_nothing(
     tmp_path: Path,
     of_one_process: dict[str, Any],
     whom: str,
+    by: int,
+    cause: str,
 ) -> None:
     into, path = tmp_path / "into", tmp_path / "found.json"
     held.file.touch()
     running = begin(*of(recordings, *on(two, into, "--json", str(path))))
     in_the_middle(running, into)
     before = two.pids(whom)
-    os.kill(before[-1], signal.SIGKILL)
+    os.kill(before[-1], by)
     until(lambda: len(two.pids(whom)) > len(before))
+    assert f"the {whom} has ended ({cause}); it is started again" in two.command.said()
     held.file.unlink()
     assert running.wait() == 0, running.said()
     assert results_of(path) == of_one_process
     assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
     is_told = "the scheduler at " in running.said()
     assert is_told == (whom == "scheduler"), running.said()
+
+
+@pytest.mark.faults
+def test_idle_scheduler_lives_on_whatever_dask_is_configured_to(
+    tmp_path: Path, begin: Callable[..., Running], recordings: list[Path]
+) -> None:
+    """Time-outs of Dask's configuration, and a client that shuts its cluster down."""
+    env = {
+        "DASK_DISTRIBUTED__SCHEDULER__IDLE_TIMEOUT": "500ms",
+        "DASK_DISTRIBUTED__SCHEDULER__NO_WORKERS_TIMEOUT": "500ms",
+        "DASK_DISTRIBUTED__WORKER__LIFETIME__DURATION": "500ms",
+    }
+    with cluster(tmp_path, env=env) as two:
+        with Client(two.address, set_as_default=False) as client:
+            with pytest.raises(PermissionError, match="ends with that command only"):
+                client.sync(client.scheduler.terminate)  # as Client.shutdown does
+            until(lambda: client.run_on_scheduler(idle_s) > 2.0)
+        running = begin(*of(recordings[:1], *on(two, tmp_path / "into")))
+        assert running.wait() == 0, running.said()
+        assert "is gone" not in running.said()
+        assert "has ended" not in two.command.said()
+        assert len(two.pids("scheduler")) == 1
+
+
+def idle_s(dask_scheduler: Any) -> float:
+    """For how long a scheduler has had nothing to do; run in its process."""
+    import time
+
+    since: float | None = dask_scheduler.idle_since
+    return 0.0 if since is None else time.time() - since
 
 
 def test_a_client_that_is_killed_goes_on(

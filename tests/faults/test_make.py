@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.parent import PARENT_ENV
-from tests.waiting import LONGEST_S
+from tests.waiting import LONGEST_S, until
 
 
 def arguments_of(project: Path, target: str) -> list[str]:
@@ -78,11 +78,14 @@ def test_what_interrupts_the_tests_ends_their_processes(
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, preexec_fn=hear_ctrl_c,
     )  # fmt: skip
     try:
-        deadline = time.monotonic() + 120.0
-        while sum("truck_process.py" in program for _, program in session_of(tests.pid)) < 3:
-            assert tests.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        until(
+            lambda: (
+                tests.poll() is not None
+                or sum("truck_process.py" in program for _, program in session_of(tests.pid)) >= 3
+            ),
+            "three trucks",
+        )
+        assert tests.poll() is None
         if how == "Ctrl-C":  # pressed again, because it takes long
             os.killpg(tests.pid, signal.SIGINT)
             time.sleep(0.2)
@@ -90,9 +93,7 @@ def test_what_interrupts_the_tests_ends_their_processes(
         else:
             tests.kill()
         tests.wait(timeout=LONGEST_S)
-        while left := list(session_of(tests.pid)):
-            assert time.monotonic() < deadline, left
-            time.sleep(0.05)
+        until(lambda: not list(session_of(tests.pid)), "the end of all processes")
     finally:
         for process, _ in session_of(tests.pid):
             os.kill(process, signal.SIGKILL)

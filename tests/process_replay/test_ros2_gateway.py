@@ -16,22 +16,28 @@ import pytest
 import zenoh
 from rosbags.rosbag2 import StoragePlugin
 
+from schemas.events import decode_event
 from schemas.signals import decode_accel, decode_gnss, decode_info
-from schemas.site_file import site_toml
+from schemas.site_file import load_site, site_toml
 from schemas.topics import selector
 from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.cli.main import main
+from services.drives.ros2_complaints import DROPPED, TOO_LARGE
 from services.drives.ros2_messages import FIX, IMU
+from services.drives.ros2_truck import Ros2Truck
 from services.drives.signals import Signals, signals_of_recording
 from services.recordings.recording import read_messages
 from services.simulation.drive import paper_site
+from services.truck import ros2 as gateway_of_ros2
 from tests import ros2
 from tests.endpoints import free_endpoint
 from tests.process_replay.starting import End, Process, Start, start_logger
 from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process
+
+FIRST_NS = 1_700_000_000_000_000_000
 
 
 class Ros(NamedTuple):
@@ -257,7 +263,9 @@ def test_what_is_not_known_is_refused_by_name_and_hash_and_nothing_ends_it(
     assert f"{front}: is of {FIX.dds_name}, {IMU.name} is expected; refused" in log
     assert f"{front}: is of x\\x1b[2J y, {IMU.name} is expected; refused\n" in log
     assert "240 messages of a second sensor, left out" in log
-    assert "4 messages left out (the first has no attachment" in log
+    assert "3 messages left out (the first has no attachment" in log
+    assert "1 messages larger than any of a sensor, left out" in log
+    assert f"{front}: 3 messages of another type, left out (the first {IMU.name} has the" in log
     assert "1 stamps too far from when they were sent (the first by 3600.000 s)" in log
     assert "Traceback" not in log
     samples = one_run(tmp_path / "live.mcap").channels["sprung_front"]
@@ -309,21 +317,94 @@ def test_a_domain_is_its_own_and_humble_has_no_hash(
     terminate(logger)
 
 
-def test_a_rate_that_is_not_the_declared_one_ends_it_with_a_line(
-    gateway: Callable[..., Process], start: Start, ros: Ros, endpoint: str, tmp_path: Path
+def test_stranger_with_a_wrong_rate_costs_the_truck_nothing(
+    start: Start,
+    terminate: End,
+    gateway: Callable[..., Process],
+    ros: Ros,
+    endpoint: str,
+    tmp_path: Path,
 ) -> None:
-    start_logger(start, endpoint, tmp_path / "live.mcap")
-    process = gateway()
-    node = ros2.RosNode(ros.session)
-    topic = ros2.TOPICS["unsprung_rear"]
-    for number in range(900):
-        stamp_ns = 1_700_000_000_000_000_000 + number * 2_500_000
-        node.publish(ros2.Ros(topic, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns))
-    _, log = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 2
-    line = log.splitlines()[-1]
-    assert f"{topic}: its stamps give a rate of 400 Hz, but sensor.rate_hz of" in line
-    assert "is 1000 Hz" in line
+    """It speaks first on a topic of the truck, and goes on beside the truck's own sensor."""
+    live = tmp_path / "live.mcap"
+    logger = start_logger(start, endpoint, live)
+    process = gateway("--spool", str(tmp_path / "spool"))
+    own, stranger = ros2.RosNode(ros.session), ros2.RosNode(ros.session, gid=bytes(16))
+    front, rear = ros2.TOPICS["sprung_front"], ros2.TOPICS["sprung_rear"]
+    first_ns = 1_700_000_000_000_000_000
+    stamps = [first_ns + number * 1_000_000 for number in range(2_400)]
+    with (
+        open_session(connect=endpoint, timeout_s=LONGEST_S) as session,
+        Subscription(session, selector("sim-ros", "vehicle", "accel")) as subscription,
+    ):
+        for number in range(900):  # its rate is known after two seconds of its stamps
+            stamp_ns = first_ns + number * 2_500_000
+            stranger.publish(ros2.Ros(front, IMU, ros2.imu(stamp_ns, 77.0), stamp_ns))
+        for number, stamp_ns in enumerate(stamps):
+            for topic in (front, rear):
+                own.publish(ros2.Ros(topic, IMU, ros2.imu(stamp_ns, number / 100), stamp_ns))
+            if number % 10 == 5:
+                between_ns = stamp_ns + 400_000
+                stranger.publish(ros2.Ros(front, IMU, ros2.imu(between_ns, 77.0), between_ns))
+        heard(subscription, 2 * 2_400)
+    log = ended(process)
+    terminate(logger)
+    line = (
+        "messages at a wrong rate, left out (its stamps give a rate of 400 Hz, but sensor.rate_hz"
+    )
+    assert f"{front}: 900 {line}" in log
+    assert f"{front}: 240 messages of a second sensor, left out" in log
+    assert "Traceback" not in log
+    for name in ("sprung_front", "sprung_rear"):
+        samples = one_run(live).channels[name]
+        np.testing.assert_array_equal(samples.time_ns, stamps)
+        measured = samples.acceleration_m_per_s2
+        np.testing.assert_allclose(measured, np.arange(2_400) / 100, atol=4e-15)
+    events = [
+        decode_event(found.payload)
+        for found in read_messages(live)
+        if found.key[1:] == ("service", "gateway-truck-1", "event")
+    ]
+    assert {(event.kind, event.vehicle, event.stream) for event in events} == {
+        ("refused", "truck-1", "accel")
+    }
+    assert sum(event.messages for event in events) == 900 + 240
+    assert f"{front}: 900 {line}" in " ".join(event.text for event in events)
+
+
+def test_flood_fills_no_memory_and_costs_other_topics_nothing(
+    ros: Ros, ros_site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody takes what waits meanwhile. What was dropped or never kept is counted."""
+    monkeypatch.setattr(gateway_of_ros2, "_WAITING_BYTES", 1 << 20)
+    truck = Ros2Truck(load_site(ros_site), str(ros_site), "truck-1")
+    front, rear = ros2.TOPICS["sprung_front"], ros2.TOPICS["sprung_rear"]
+    where = f"0{front}/{IMU.dds_name}/{IMU.hash}"
+    with (
+        open_session(connect=ros.endpoint, timeout_s=LONGEST_S) as session,
+        gateway_of_ros2._Hearing(session, truck) as hearing,
+    ):
+        node = ros2.RosNode(ros.session)
+        node.publish(ros2.Ros(front, IMU, ros2.imu(FIRST_NS, 0.0), FIRST_NS))
+        for size, number in ((10_000_000, 30), (4_000, 1_000)):
+            payload = bytes(size)
+            for _ in range(number):
+                ros.session.put(where, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+        for number in range(100):
+            stamp_ns = FIRST_NS + number * 1_000_000
+            node.publish(ros2.Ros(rear, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns))
+        until(lambda: len(hearing._waiting[rear]) == 100, "what the other topic's sensor said")
+        kept = 0
+        while (heard := hearing.next(front)) is not None:
+            kept += 1
+            assert len(heard.payload) == 4_000
+        hearing.count_drops()
+    dropped = truck.complaints.count(front, DROPPED)
+    assert truck.complaints.count(front, TOO_LARGE) == 30
+    assert kept * 4_000 < 1 << 20
+    assert kept + dropped == 1_001
+    (refusals,) = truck.complaints.refusals()
+    assert (refusals.refused, refusals.dropped) == (30, dropped)
 
 
 def test_without_a_router_of_ros_it_says_so(ros_site: Path, endpoint: str) -> None:

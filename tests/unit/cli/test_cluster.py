@@ -1,6 +1,7 @@
 """`driveby cluster`, `identify --scheduler` and `--into`: what is refused, and what is told."""
 
 import importlib.util
+import os
 import socket
 import tempfile
 from pathlib import Path
@@ -9,14 +10,14 @@ import pytest
 
 from services.cli import main as cli
 from services.cli.parsing import EXIT_SOMETHING_LOST
-from services.common.stores import folder_at, put
+from services.common.stores import files_below, folder_at, put
 from services.execution import cluster
 from services.execution.kept import BRIDGES
 from services.history.catalog import CATALOG, mend
 from services.security.certs import certs_command
 from tests.drives import EXACT, drives
 from tests.faults.clusters import results_of
-from tests.object_store import object_store
+from tests.object_store import object_store, read_only, use_keys
 
 QUICK = ("--method", "least-squares")
 
@@ -203,3 +204,52 @@ def test_recordings_in_an_object_store_give_what_they_give_here(
     whole, alone, from_there, one_from_there = map(results_of, found)
     assert from_there == whole
     assert one_from_there == alone
+
+
+def test_bucket_that_may_only_be_read_is_identified(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server that checks keys against a policy which allows GetObject and ListBucket only."""
+    paths = drives(tmp_path / "recordings", 2)
+    found = [tmp_path / f"{n}.json" for n in range(3)]
+    here = ("identify", *paths, *QUICK, "--into", tmp_path / "here", "--json", found[0])
+    assert said(capsys, *here) == (0, "")
+    with object_store(monkeypatch) as address:
+        fleet = f"{address}/fleet"
+        for path in paths:
+            put(folder_at(fleet), f"day/{path.name}", path.read_bytes())
+        with read_only(monkeypatch):
+            there = ("identify", fleet, *QUICK, "--into", tmp_path / "there", "--json", found[1])
+            code, err = said(capsys, *there)
+            assert (code, err.count("\n")) == (0, 1), err
+            assert f"{fleet}: cannot write its catalogue" in err
+            single = f"{fleet}/day/{paths[0].name}"
+            assert said(capsys, "identify", single, *QUICK, "--json", found[2]) == (0, "")
+            code, err = said(capsys, "catalog", fleet)  # whose work is to write it
+            assert (code, err.count("\n")) == (1, 1)
+            assert "could not be written: Access Denied" in err
+            names = [entry.name for entry in files_below(folder_at(fleet), "")]
+    assert names == [f"day/{path.name}" for path in sorted(paths)]
+    whole, from_there, one = map(results_of, found)
+    assert from_there == whole
+    assert one["crossings"] == whole["crossings"][:1]
+
+
+def test_wrong_keys_of_a_store_are_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path,) = drives(tmp_path / "recordings", 1)
+    with object_store(monkeypatch) as address:
+        fleet = f"{address}/fleet"
+        put(folder_at(fleet), path.name, path.read_bytes())
+        with read_only(monkeypatch):
+            key = os.environ["AWS_ACCESS_KEY_ID"]
+            for key_id, why in ((key, "signature"), ("AKIAXXXXXXXXXXXXXXXX", "does not exist")):
+                use_keys(monkeypatch, key_id, "not the secret")
+                for source in (fleet, f"{fleet}/{path.name}"):
+                    for options in ((), ("--into", tmp_path / "into")):
+                        code, err = said(capsys, "identify", source, *QUICK, *options)
+                        assert (code, err.count("\n")) == (2, 1), err
+                        assert err.startswith(f"driveby: {source}: cannot be read: "), err
+                        assert why in err
+    assert list((tmp_path / "into").iterdir()) == []

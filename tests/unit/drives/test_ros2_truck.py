@@ -10,7 +10,9 @@ from schemas.signals import GnssFix, encode_gnss
 from schemas.site import Site
 from schemas.site_file import parse_site, site_toml
 from services.common.errors import InputError
+from services.drives.ros2_complaints import WRONG_RATE
 from services.drives.ros2_messages import FIX, IMU, TWIST
+from services.drives.ros2_samples import RateError
 from services.drives.ros2_truck import Accel, Ros2Truck
 from services.simulation.drive import paper_site
 from tests import ros2
@@ -27,8 +29,13 @@ def site(text: str = ros2.ROS2, *, speed_noise: float = 0.07) -> Site:
     return parse_site(declared + text, "site.toml")
 
 
-def truck(text: str = ros2.ROS2, *, speed_noise: float = 0.07) -> Ros2Truck:
-    return Ros2Truck(site(text, speed_noise=speed_noise), "site.toml", "truck-1")
+def truck(
+    text: str = ros2.ROS2,
+    *,
+    speed_noise: float = 0.07,
+    wrong_rate: Callable[[RateError], None] | None = None,
+) -> Ros2Truck:
+    return Ros2Truck(site(text, speed_noise=speed_noise), "site.toml", "truck-1", wrong_rate)
 
 
 def accelerations(of: Ros2Truck, make: Callable[[int], bytes], count: int = 20) -> np.ndarray:  # type: ignore[type-arg]
@@ -106,6 +113,74 @@ def test_a_sensor_that_was_started_anew_goes_on() -> None:
     batches = [one.channels["sprung_front"] for one in found if isinstance(one, Accel)]
     assert sum(batch.samples.size for batch in batches) == 7500
     assert of.complaints.count(FRONT, "times that another sensor went on") == 2
+
+
+def drive(
+    of: Ros2Truck, publisher: bytes, begin_s: float, count: int, rate_hz: float
+) -> list[float]:
+    """Publish `count` samples, whose value is their rate; return the values published."""
+    found: list[Accel | GnssFix] = []
+    for number in range(count):
+        stamp_ns = FIRST_NS + round((begin_s + number / rate_hz) * 1e9)
+        found += of.take(FRONT, IMU, ros2.imu(stamp_ns, rate_hz), stamp_ns, publisher)
+    return values(found)
+
+
+def values(found: list[Accel | GnssFix]) -> list[float]:
+    batches = [one.channels["sprung_front"].samples for one in found if isinstance(one, Accel)]
+    return [round(value) for batch in batches for value in batch.tolist()]
+
+
+def test_wrong_rate_ends_a_truck_only_where_nobody_takes_it() -> None:
+    with pytest.raises(
+        RateError, match=r"a rate of 400 Hz, but sensor.rate_hz of site.toml is 1000"
+    ):
+        drive(truck(), b"one", 0.0, 900, 400.0)
+    errors: list[RateError] = []
+    of = truck(wrong_rate=errors.append)
+    assert drive(of, b"one", 0.0, 900, 400.0) == []
+    assert [error.samples for error in errors] == [801]  # of two seconds
+    assert of.complaints.count(FRONT, WRONG_RATE) == 900
+    (refusals,) = of.complaints.refusals()
+    assert (refusals.topic, refusals.refused, refusals.dropped) == (FRONT, 900, 0)
+    assert "900 messages at a wrong rate, left out (its stamps give a rate of 400" in refusals.text
+    of.complaints.reported(FRONT)
+    assert of.complaints.refusals() == []
+
+
+def test_topic_of_a_stranger_with_a_wrong_rate_is_free_again() -> None:
+    of = truck(wrong_rate=lambda error: None)
+    assert drive(of, b"stranger", 0.0, 900, 400.0) == []
+    assert drive(of, b"one", 2.5, 3000, 1000.0) == [1000] * 3000
+
+
+def test_stranger_is_not_put_on_the_grid_of_a_silent_sensor() -> None:
+    """Its rate is measured, as that of every sensor that takes a topic over."""
+    of = truck(wrong_rate=lambda error: None)
+    assert drive(of, b"one", 0.0, 3000, 1000.0) == [1000] * 3000
+    assert drive(of, b"stranger", 5.0, 900, 400.0) == []
+    assert drive(of, b"one", 8.0, 2500, 1000.0) == [1000] * 2500
+
+
+def test_sensor_with_a_wrong_rate_is_measured_again() -> None:
+    """It was set right meanwhile, without being another publisher."""
+    of = truck(wrong_rate=lambda error: None)
+    assert drive(of, b"one", 0.0, 900, 400.0) == []
+    assert drive(of, b"one", 5.0, 3000, 1000.0) == []
+    assert drive(of, b"one", 20.0, 3000, 1000.0) == [1000] * 3000
+
+
+def test_end_of_a_drive_is_not_lost_by_a_wrong_rate() -> None:
+    of = truck(wrong_rate=lambda error: None)
+    rear = ros2.TOPICS["sprung_rear"]
+    for number in range(50):
+        stamp_ns = FIRST_NS + number * 2_500_000
+        of.take(FRONT, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns)
+        stamp_ns = FIRST_NS + number * 1_000_000
+        of.take(rear, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns)
+    left = of.finish()
+    assert [tuple(one.channels) for one in left if isinstance(one, Accel)] == [("sprung_rear",)]
+    assert of.complaints.count(FRONT, WRONG_RATE) == 50
 
 
 def test_a_clock_that_was_ahead_at_first_does_not_stop_the_truck_s_own() -> None:

@@ -1,9 +1,9 @@
-"""Who may hear and say alarms of bridges."""
+"""Who may hear and say alarms of bridges and events of gateways."""
 
 import pytest
 import zenoh
 
-from schemas.topics import key
+from schemas.topics import gateway_service, key
 from services.bus.credentials import Subject
 from services.security.access_control import published_by, read_by
 
@@ -28,3 +28,10 @@ def test_alarms_are_heard_by_who_looks_and_said_by_who_judges(
 ) -> None:
     subject = Subject(role, "x")
     assert (meets(read_by(subject)), meets(published_by(subject))) == (hears, says)
+
+
+def test_truck_publishes_events_of_its_own_gateway_only() -> None:
+    said = published_by(Subject("truck", "truck-1"))
+    events = [expression for expression in said if expression.endswith("/event")]
+    assert events == [key("live", "service", "gateway-truck-1", "event").replace("live", "*")]
+    assert gateway_service("x" * 63) == f"gateway-{'x' * 55}"
