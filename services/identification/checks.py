@@ -157,7 +157,7 @@ def _speeds_differ(data: CrossingData, fit: Fit) -> bool:
         noise_m=max(data.receiver.position_noise_m, 0.01),
         spread_m=data.receiver.position_spread_m,
     )
-    return abs(scale) > _LARGEST_SPEED_SCALE_Z * np.hypot(spread, _SPEED_SCALE_SPREAD)
+    return bool(abs(scale) > _LARGEST_SPEED_SCALE_Z * np.hypot(spread, _SPEED_SCALE_SPREAD))
 
 
 def steps_of_channels(fit: Fit) -> dict[Reason, str]:

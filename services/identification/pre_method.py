@@ -27,7 +27,6 @@ from schemas import results
 from schemas.reasons import Reason, texts
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge
-from services.common.geodesy import bridge_frame, to_chainage
 from services.identification.checks import (
     Fit,
     reasons_after_fit,
@@ -48,6 +47,7 @@ from services.identification.crossing_data import (
 )
 from services.identification.footprints import footprints_of
 from services.identification.fusing import stored
+from services.identification.lane import lane_factor
 
 _FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN = 14, 8
 """At least so many in all, and in each of several spans on average, whatever the number of
@@ -64,10 +64,6 @@ _LARGEST_CHI2 = 25.0
 far an interval that is widened by so much can be trusted nobody has measured."""
 _EVEN = 0.5
 """Probability before the crossing that a support has no spring, or that a bearing is rigid."""
-_SURE_OF_LANE_M = 0.3
-"""A receiver whose slow error is larger says less of the lane than the site file."""
-_FARTHEST_ASIDE = 3.0
-"""Standard deviations beyond which receiver and site file speak of different axes."""
 _ROAD_DRAWS = 80
 """Standard deviations of a road from so many are right to 8 %, and each draw is an evaluation."""
 _DEFLECTION_DRAWS = 400
@@ -171,32 +167,6 @@ def absence(bridge: Bridge, row: unknowns.Unknown) -> float:
     if row.key == "torsional_flexibility_per_n" and bridge.is_lane_off_axis:
         return 0.0
     return _EVEN
-
-
-def lane_factor(data: CrossingData) -> float:
-    """Return the square of this run's distance from the axis over that of the torsion's prior.
-
-    Where the site file says how far the lane is off the axis, a receiver that is right to
-    decimetres and agrees with that shows the run's own distance; otherwise 1. Without such a
-    statement its distance from the line between the ends is no evidence: often that line was
-    measured along the lane.
-    """
-    bridge, spread_m = data.bridge, data.receiver.position_spread_m
-    if not bridge.is_lane_off_axis or bridge.lane_offset_m is None or spread_m > _SURE_OF_LANE_M:
-        return 1.0
-    on_bridge = (data.fixes.time_s >= data.stay.entry_s) & (data.fixes.time_s <= data.stay.exit_s)
-    if not on_bridge.any():
-        return 1.0
-    _, lateral_m = to_chainage(
-        bridge_frame(bridge),
-        data.fixes.latitude_deg[on_bridge],
-        data.fixes.longitude_deg[on_bridge],
-    )
-    measured_m = abs(float(np.median(lateral_m)))
-    aside_m = measured_m - abs(bridge.lane_offset_m)
-    if abs(aside_m) > _FARTHEST_ASIDE * np.hypot(bridge.lane_offset_m_spread, spread_m):
-        return 1.0
-    return float((measured_m / bridge.reference_lane_offset_m) ** 2)
 
 
 def identify_pre(
