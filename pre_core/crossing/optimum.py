@@ -92,6 +92,9 @@ _REFINED_M = (0.3, 0.15)
 _BESIDE_M, _BESIDE = 0.1, 6
 """Where the roads differ so many places to either side of an optimum are looked at: a bearing that
 gives makes minima 0.2 m apart, and what the walk knows of the truck tells not which is right."""
+_PLAINLY_SPRUNG = 0.5
+"""Scales of their prior from which on springs at the ends, bearings that give and torsion are
+tried without."""
 _MOST_MOVES = 4
 """From an optimum to one beside it."""
 _PATIENCE = 1.5  # strides beyond the best place
@@ -437,6 +440,8 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
             break
     if best is None:
         return _nowhere(problem, y, evaluations, len(tried), rubs=rubs)
+    best, used = _with_free_ends(best, way)
+    evaluations += used
     return best._replace(
         evaluations=evaluations,
         starts=len(tried),
@@ -451,6 +456,25 @@ def _moved(problem: Problem, y: FloatArray, place: _Place) -> FloatArray:
     moved[layout(problem).trajectory] += place.shift_m
     moved[place.places] += place.bridge
     return moved
+
+
+def _with_free_ends(found: Optimum, way: Way) -> tuple[Optimum, int]:
+    """Return the better of an optimum with springs at the ends and one without, and evaluations.
+
+    A bridge that is held at both ends and has less than half its stiffness bends nearly as one on
+    free bearings, with a truck that is wrong by a third of its prior: a search that is led there
+    stays there.
+    """
+    where, y = layout(found.problem), found.state.y
+    ends = np.intersect1d(where.half_normal, where.bridge)
+    if not np.any(y[ends] > _PLAINLY_SPRUNG):
+        return found, 0
+    start = y.copy()
+    start[where.bridge] = 0.0
+    other, used = _freed(found.problem, start, way)
+    if isinstance(other, Optimum) and other.chi2_per_dof < found.chi2_per_dof:
+        found = other
+    return found, used
 
 
 def _settled(found: Optimum, way: Way) -> tuple[Optimum, int]:
