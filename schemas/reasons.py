@@ -40,6 +40,7 @@ class Reason(StrEnum):
     NOISE_ABOVE_DECLARED = "noise_above_declared"
     NOISE_BELOW_DECLARED = "noise_below_declared"
     IMPLAUSIBLE_VEHICLE = "implausible_vehicle"
+    COMMON_DISTURBANCE = "common_disturbance"
     IMPLAUSIBLE_BRIDGE = "implausible_bridge"
     POSITION_INCONSISTENT = "position_inconsistent"
     SPEED_INCONSISTENT = "speed_inconsistent"
@@ -90,6 +91,9 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "The accelerometers are much quieter than the site file says, which could hide a misfit."
     ),
     Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
+    Reason.COMMON_DISTURBANCE: (
+        "All sensors measure something in common that is no vertical motion, as tilted ones do."
+    ),
     Reason.IMPLAUSIBLE_BRIDGE: (
         "An element is stiffer than its nominal value and than the others by more than any damage "
         "of these explains."

@@ -27,7 +27,29 @@ _ROAD_BAND_HZ = (1.0, 8.0)
 """Where both axles feel the road alike."""
 
 
+_OFF_GRID = 0.01
+"""Part of a step by which values may miss a grid."""
+_FINE = 0.2
+"""Part of a bin below which a converter's step does not show in it."""
+_FEWEST_LEVELS = 12
+"""A signal of fewer levels does not show how its density falls."""
+_ROUNDING = 1e-9
+"""Part of the largest value below which differences are those of floating point."""
+
+
 # Signals.
+
+
+def converter_step(values: FloatArray) -> float:
+    """Return the step between the values of a signal (n,) if all lie on a grid, else zero."""
+    distinct = np.unique(values)
+    apart = np.diff(distinct)
+    apart = apart[apart > _ROUNDING * np.abs(values).max(initial=0.0)]
+    if apart.size < 2:
+        return 0.0
+    step = float(apart.min())
+    off_grid = np.abs(apart / step - np.round(apart / step))
+    return step if float(off_grid.max()) < _OFF_GRID else 0.0
 
 
 def longest_hold(values: FloatArray) -> int:
@@ -79,25 +101,35 @@ def pile_up(values: FloatArray, bins: int = 100) -> Rail:
     The density of a signal that is not cut off falls towards its ends: a smooth peak spends most of
     its time at its top, yet in the uppermost hundredth only 2.4 times as long as in the next. A
     signal that is cut off spends in the last bin all the time that it should have been beyond.
-    Both ends are looked at; the worse one is returned.
+    Both ends are looked at; the worse one is returned. Bins are no narrower than the steps of a
+    converter, of which some would hold two values and some none.
     """
     centred = values - np.median(values)
+    step = converter_step(values)
     worst = Rail(0.0, 0, 0.0)
     for sign in (1.0, -1.0):
         side = sign * centred
         top = float(side.max())
         if not top > 0.0:
             continue
-        place = np.floor(side * (bins / top)).astype(np.int64).clip(-1, bins - 1)
-        counts = np.bincount(place[place >= 0], minlength=bins).astype(np.float64)
+        if step * bins > _FINE * top:
+            width = step * np.ceil(top / (bins * step))
+            count = int(top / width + 0.5) + 1
+            if count < _FEWEST_LEVELS:
+                continue
+            place = np.floor(side / width + 0.5).astype(np.int64).clip(-1, count - 1)
+        else:
+            count = bins
+            place = np.floor(side * (bins / top)).astype(np.int64).clip(-1, bins - 1)
+        counts = np.bincount(place[place >= 0], minlength=count).astype(np.float64)
         # What a filter after the clipping lets through lies a little beyond the rail.
-        for k in range(bins - 1, int(0.8 * bins), -1):
+        for k in range(count - 1, int(0.8 * count), -1):
             inside = counts[k - 6 : k - 1].mean()
             ratio = counts[k] / max(inside, 1.0)
             if ratio > worst.ratio:
                 there = place >= k
                 visits = int(np.count_nonzero(there[1:] & ~there[:-1])) + int(there[0])
-                worst = Rail(float(ratio), visits, sign * top * (k + 0.5) / bins)
+                worst = Rail(float(ratio), visits, sign * top * (k + 0.5) / count)
     return worst
 
 

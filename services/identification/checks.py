@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
+from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing import slip
 from pre_core.diagnostics import frozen, quality, receiver
 from pre_core.physics.simulate import Motion
@@ -80,6 +80,12 @@ _SPEED_SCALE_SPREAD = 0.002
 _LARGEST_SPEED_BIAS, _LARGEST_SPEED_BIAS_Z = 1.0, 5.0
 """Mean difference of the receiver's speeds from the fit's, in their noise, and in standard
 deviations of the mean. Sound: at most 0.3 of ten fixes a second; speeds 3 % high: 1.3 to 3.7."""
+_COMMON = 0.7
+"""Coherence of both body equations' residuals, where these are more than the sensors' noise.
+Springs that rub, dampers that are not linear: -0.13 to 0.28; tilted sensors on a truck that shakes
+above 2 Hz: 0.95 to 0.97."""
+_COARSE = 1.4
+"""Noise of a converter's step over the declared one, from which on it is named."""
 _STIFFER = 1.5
 """Age and a nominal value raise an element's EI over nominal by less, and never over that of all
 others: wrong signals do."""
@@ -119,6 +125,8 @@ class Fit(NamedTuple):
     """How much road off the bridge there was to tell that from."""
     speed_bias: float = 0.0
     """Mean difference of the receiver's speeds from the fit's, in multiples of their noise."""
+    coherence: float = 0.0
+    """That of the body equations' residuals, where springs are doubted for them."""
     step: slip.Step | None = None
     """The most significant step in the delay or the gain of a channel."""
 
@@ -135,9 +143,27 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
         reasons.append(Reason.POSITION_INCONSISTENT)
     if _speeds_differ(data, fit):
         reasons.append(Reason.SPEED_INCONSISTENT)
+    if fit.coherence > _COMMON:
+        reasons.append(Reason.COMMON_DISTURBANCE)
     if fit.rigidity_spread.min() > _UNINFORMED and loads_are_alike(data.vehicle):
         reasons.append(Reason.AXLES_ALIKE)
     return reasons
+
+
+def coarse_converters(
+    density_ug_per_rthz: tuple[float, ...], acceleration: Floats, step_s: float
+) -> str:
+    """Return the channels (4, n) whose converter alone is plainly noisier than declared, or "".
+
+    Rounding to a step adds noise of the step over the root of twelve.
+    """
+    names = []
+    for name, density, values in zip(CHANNELS, density_ug_per_rthz, acceleration, strict=True):
+        step = quality.converter_step(values)
+        declared = density * MICRO_G_M_PER_S2 * np.sqrt(0.5 / step_s)
+        if step / np.sqrt(12.0) > _COARSE * declared:
+            names.append(f"{name} in steps of {step:.2g} m/s²")
+    return ", ".join(names)
 
 
 def _speeds_differ(data: CrossingData, fit: Fit) -> bool:

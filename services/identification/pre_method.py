@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pre_core import unknowns
 from pre_core.constants import MICRO_G_M_PER_S2
-from pre_core.crossing import optimum, posterior, slip
+from pre_core.crossing import optimum, posterior, shaking, slip, speeds
 from pre_core.crossing.compliances import LEANING_SPREAD, led_by_mismatch
 from pre_core.crossing.mismatch import as_two_numbers
 from pre_core.crossing.preparation import Inputs, off_bridge_m, rear_at_rows_m
@@ -29,6 +29,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Bridge
 from services.identification.checks import (
     Fit,
+    coarse_converters,
     reasons_after_fit,
     steps_of_channels,
     stiffer_elements,
@@ -181,7 +182,8 @@ def identify_pre(
     keep: Keep,
 ) -> results.Crossing:
     """The posterior of one crossing as a result; a fit that explains nothing is rejected."""
-    found = optimum.find_optimum(inputs_of(data, settings, acceleration, start_s), report)
+    inputs = inputs_of(data, settings, acceleration, start_s)
+    found = optimum.find_optimum(inputs, report)
     if found.noise_power > optimum.HOPELESS_NOISE:
         return rejected(
             data,
@@ -208,7 +210,9 @@ def identify_pre(
     reasons = [*broken, *reasons_after_fit(data, fit)]
     if found.ending is not Ending.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
-    if found.noise_power > 1.0 and Reason.NOISE_ABOVE_DECLARED not in reasons:
+    coarse = coarse_converters(data.sensor.noise_density_ug_per_rthz, acceleration, inputs.step_s)
+    about = {**broken, Reason.NOISE_ABOVE_DECLARED: coarse}
+    if (coarse or found.noise_power > 1.0) and Reason.NOISE_ABOVE_DECLARED not in reasons:
         reasons.insert(0, Reason.NOISE_ABOVE_DECLARED)
     usable = _LARGEST_CHI2 if Reason.NOISE_ABOVE_DECLARED in reasons else _USABLE_CHI2
     # Elsewhere than at the optimum neither values nor widths mean anything.
@@ -219,7 +223,7 @@ def identify_pre(
             settings,
             passing,
             reasons,
-            broken,
+            about,
             chi2_per_dof=found.chi2_per_dof,
             diagnostics=diagnostics,
         )
@@ -247,7 +251,7 @@ def identify_pre(
         **header(data, settings, passing),
         verdict="suspect" if once else "good",
         reasons=once,
-        reason_texts=tuple(texts(once, {Reason.IMPLAUSIBLE_BRIDGE: implausible})),
+        reason_texts=tuple(texts(once, about | {Reason.IMPLAUSIBLE_BRIDGE: implausible})),
         chi2_per_dof=found.chi2_per_dof * found.noise_power,
         diagnostics=diagnostics,
         fusion_likelihood=stored(data, found),
@@ -280,19 +284,10 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
         np.sqrt(np.diag(covariance)[where.elements]),
         bool(problem.mismatch.level_m3.any()),
         off_bridge_m(problem, y),
-        _speed_bias(problem, y),
+        speeds.speed_bias(problem, y),
+        shaking.coherence(problem, y) if problem.force.any() else 0.0,
         slip.largest_step(problem, found.state, covariance),
     )
-
-
-def _speed_bias(problem: posterior.Problem, y: Floats) -> float:
-    """Return how far the receiver's speeds are above those of y, on average, in their noise."""
-    where, rows = posterior.layout(problem), problem.receiver_rows
-    left = problem.receiver_values - rows @ y[where.trajectory.start : where.offset + 1]
-    # The offset is in the rows of the positions and in its own, the last; speeds follow positions.
-    fixes = int(np.count_nonzero(rows[:, -1])) - 1
-    direction = problem.crossing.direction
-    return direction * float(np.mean(left[fixes : 2 * fixes]))
 
 
 def _implausible_elements(bridge: Bridge, problem: posterior.Problem, chain: Sampled) -> str:

@@ -63,6 +63,7 @@ _ADVICE = {
     ),
     Reason.NOISE_BELOW_DECLARED: "Declare the sensors' true noise, and identify again.",
     Reason.IMPLAUSIBLE_VEHICLE: "Measure the wheelbase; make sure that it was this truck.",
+    Reason.COMMON_DISTURBANCE: "Mount the sensors upright; look at their common supply.",
     Reason.IMPLAUSIBLE_BRIDGE: (
         "Look at sensors and receiver. Where the bridge is built stiffer there, declare it "
         "(flexural_rigidity_per_element_nm2)."

@@ -390,7 +390,7 @@ def see(
 
     def keeping(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
         kept[data.crossing_id] = data
-        return _of_any_bridge(identify(data, settings, **others))
+        return of_any_bridge(identify(data, settings, **others))
 
     header = header_of(site, settings, 0.0)
     messages = run_to_messages(runs, site, REALM, site.vehicles[0].id)
@@ -412,7 +412,7 @@ def see(
     ]
 
 
-def _of_any_bridge(result: Crossing) -> Crossing:
+def of_any_bridge(result: Crossing) -> Crossing:
     """Return the result without the reason that its bridge is implausible."""
     kept = [k for k, code in enumerate(result.reasons) if code != Reason.IMPLAUSIBLE_BRIDGE]
     if len(kept) == len(result.reasons):

@@ -388,6 +388,23 @@ def louder(name: str, factor: float, at_s: float) -> Fault:
     return Fault(channels=change)
 
 
+def tilted(
+    degrees: float, shaking_m_per_s2: float, band_hz: tuple[float, float], seed: int = 0
+) -> Fault:
+    """All sensors lean, and the truck shakes along or across the road within a band."""
+
+    def lean(channels: Channels, time_s: Floats) -> Channels:
+        frequency = np.fft.rfftfreq(time_s.size, time_s[1] - time_s[0])
+        spectrum = np.fft.rfft(np.random.default_rng(seed).standard_normal(time_s.size))
+        spectrum[(frequency < band_hz[0]) | (frequency > band_hz[1])] = 0.0
+        shaking = np.fft.irfft(spectrum, time_s.size)
+        shaking *= shaking_m_per_s2 / shaking.std()
+        angle = np.radians(degrees)
+        return {k: np.cos(angle) * v + np.sin(angle) * shaking for k, v in channels.items()}
+
+    return Fault(channels=lean)
+
+
 def alike(channels: Channels, _: Floats) -> Channels:
     """Four channels of one sensor."""
     return dict.fromkeys(channels, channels[U1])

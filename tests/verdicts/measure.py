@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 
+from services.simulation.drawn import of_any_bridge
 from tests.verdicts import faults
 from tests.verdicts.test_faults import TABLE
 from tests.verdicts.test_signals import reasons
@@ -40,7 +41,7 @@ def sound(count: int) -> None:
     for seed in range(count):
         fault = faults.Fault(site=faults.believed_nearly(seed))
         case = faults.crossing(faults.drawn(seed), fault)
-        result = faults.identified(case)
+        result = of_any_bridge(faults.identified(case))
         worst = ""
         if result.parameters is not None:
             worst = f", worst EI {np.abs(faults.z_scores(case, result)).max():.1f} std"

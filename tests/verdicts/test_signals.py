@@ -128,6 +128,30 @@ def test_nothing_is_said_of_sound_channels(seed: int) -> None:
     assert reasons(seed) == []
 
 
+@pytest.mark.parametrize("step_m_per_s2", [0.06, 0.077, 0.15])
+@pytest.mark.parametrize("seed", [None, 1, 2, 3])
+def test_quantised_channel_is_not_saturated(seed: int | None, step_m_per_s2: float) -> None:
+    """16 bits over ±200 g, 12 bits over ±16 g, and twice that."""
+    coarse = Fault(channels=lambda channels, _: faults.quantised(channels, step_m_per_s2))
+    assert reasons(seed, coarse) == []
+
+
+@pytest.mark.parametrize("name", [U1, U2])
+def test_quantised_channel_that_is_saturated_is_named(name: str) -> None:
+    def both(channels: faults.Channels, time_s: faults.Floats) -> faults.Channels:
+        return faults.quantised(faults.saturated(name).channels(channels, time_s), 9.6e-3)
+
+    assert accused(None, Fault(channels=both)) == {Reason.SENSOR_SATURATED: name}
+
+
+def test_converter_step_is_that_of_the_grid() -> None:
+    rng = np.random.default_rng(0)
+    fine = rng.standard_normal(10_000)
+    assert quality.converter_step(fine) == 0.0
+    assert quality.converter_step(0.077 * np.round(fine / 0.077)) == pytest.approx(0.077)
+    assert quality.converter_step(np.zeros(10)) == 0.0
+
+
 @pytest.mark.parametrize("range_g", [2.0, 8.0])
 def test_a_coarse_converter_is_not_broken(range_g: float) -> None:
     """12 bits: the body's channels hold one value for up to 30 samples."""
@@ -227,3 +251,14 @@ def test_least_squares_in_a_box_are_scipys(seed: int) -> None:
     theirs = lsq_linear(matrix, right, (low, high), method="bvls")
     np.testing.assert_allclose(x, theirs.x, atol=1e-9)
     assert least == pytest.approx(2.0 * theirs.cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("step_m_per_s2", [0.06, pytest.param(0.077, marks=pytest.mark.slow)])
+def test_coarse_converter_is_noise_above_the_declared(step_m_per_s2: float) -> None:
+    """Not saturated: 16 bits over ±200 g, whose steps are noise three times the declared."""
+    coarse = Fault(channels=lambda channels, _: faults.quantised(channels, step_m_per_s2))
+    result = faults.identified(faults.crossing(Truth(), coarse))
+    assert result.verdict != "good"
+    assert Reason.NOISE_ABOVE_DECLARED in result.reasons
+    sentence = result.reason_texts[result.reasons.index(Reason.NOISE_ABOVE_DECLARED)]
+    assert f"{U1} in steps of {step_m_per_s2:.2g} m/s²" in sentence
