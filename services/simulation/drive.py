@@ -30,12 +30,7 @@ from pre_core.physics.sensors import (
     measure_acceleration,
     measure_position,
 )
-from pre_core.physics.simulate import (
-    Motion,
-    Simulation,
-    constant_acceleration,
-    simulate,
-)
+from pre_core.physics.simulate import Motion, Simulation, constant_acceleration, simulate
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
@@ -45,6 +40,7 @@ from services.common.files import check_writable
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.common.progress import steps_bar
 from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.identification.placed import middle_site
 from services.recordings.writer import write_recording
 from services.simulation.wheel_paths import (
     AxleRoads,
@@ -146,7 +142,7 @@ def simulate_command(
 ) -> int:
     """Write the recording of one simulated crossing, or of several over the same road."""
     check_writable(output, force=force)
-    known = paper_site() if site is None else load_site(site)
+    known = paper_site() if site is None else middle_site(load_site(site))
     ratios = ratios_of(known.bridges[0], scenario, ei)
     drives, paths = [], None if surface is None else wheel_paths_of(known.vehicles[0], surface)
     of_noise = seed if drive_seed is None else drive_seed
