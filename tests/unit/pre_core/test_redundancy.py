@@ -46,6 +46,16 @@ def test_gains_and_delays_within_their_spreads_are_expected() -> None:
         assert found.power < found.expected
 
 
+def test_delays_alone_are_expected_by_their_spread() -> None:
+    rng = np.random.default_rng(4)
+    for seed in range(20):
+        signals = corners(seed)
+        late = 0.004 * rng.standard_normal((4, 1))
+        signals = signals - late * np.gradient(signals, STEP_S, axis=1)
+        found = leftover(PARITY, signals, STEP_S, 1e-4, 0.004, 2.5)
+        assert found.power < found.expected
+
+
 @pytest.mark.parametrize("channel", range(4))
 @pytest.mark.parametrize("gain", [0.8, 0.9, 1.1, 1.3])
 def test_wrong_gain_is_the_channels_own(channel: int, gain: float) -> None:
