@@ -19,11 +19,13 @@ from schemas.site_sensors import PlacedSensor
 from services.cli import main as cli
 from services.drives.runs import Run, run_to_messages
 from services.drives.signals import signals_of_recording
+from services.drives.survey import survey
 from services.recordings.recording import read_messages
 from services.recordings.writer import write_recording
 from services.report.bridge import bridge_reports
 from services.report.page import page
 from services.viewer.layout import acceleration_plots
+from services.viewer.recording_page import recording_page
 from tests.unit.inspection.test_inspection import findings, sound
 from tests.unit.viewer.found import results_of, some_crossing
 
@@ -186,6 +188,12 @@ def test_report_lists_the_sensors() -> None:
         update={"vehicles": (site.vehicles[0].model_copy(update={"sensors": ()}),)}
     )
     assert "Sensors" not in page(bridge_reports([(Path("a.json"), results, plain)], None))
+
+
+def test_page_of_a_recording_lists_the_sensors(tmp_path: Path) -> None:
+    text = recording_page(survey(recorded(tmp_path)))
+    assert "8 accelerometers at" in text
+    assert "  - unsprung_front_right: axle 1, 0.4 m to the right, 35.4 µg/√Hz" in text
 
 
 def test_viewer_draws_all_named_channels() -> None:
