@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pre_core.physics.simulate import Motion
+from schemas.errors import InputError
 from schemas.reasons import Reason
 from schemas.results import Crossing, load_results
 from schemas.settings import IdentificationSettings
@@ -342,6 +343,24 @@ def test_errors_of_single_sensors_make_no_good_answer_wrong(two_sided: TwoSided,
     print(result.verdict, np.median([one.std / one.mean for one in stds]), result.chi2_per_dof)
     if result.verdict == "good":
         assert np.abs(in_stds(result, two_sided.truth)).max() < 4.0
+
+
+def test_left_half_of_the_sensors_is_refused(shared: Path, tmp_path: Path) -> None:
+    folder = shared / "crossings" / "d10_left_and_right_8_runs"
+    head, *tables = (folder / "site.toml").read_text().split("[[vehicle.sensors]]")
+    last, bridge = tables[-1].split("\n[bridge]")
+    left = [one for one in (*tables[:-1], last) if "lateral_m = -" not in one]
+    site = tmp_path / "left.toml"
+    site.write_text(
+        "[[vehicle.sensors]]".join([head, *left]) + "\n[bridge]" + bridge, encoding="utf-8"
+    )
+    with pytest.raises(InputError) as caught:
+        load_site(site)
+    assert str(caught.value) == (
+        f'{site}: vehicle.sensors[2] ("unsprung_front_left") shows axle 1 on the left only, which '
+        "hides its roll (roll_not_seen): put a second sensor on the other side, or this one in the "
+        "middle"
+    )
 
 
 @pytest.mark.slow
