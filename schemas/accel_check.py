@@ -1,10 +1,10 @@
 """Checks an AccelBatch without taking it apart: most of what a logger of many trucks computes.
 
 No I/O. Encoded as protobuf's own encoders do, a batch is a header of five numbers and then, channel
-by channel, some bytes that are the same in every batch (tags, lengths, position, rate) and the
-samples. Read in that order nothing is left over, so what fits this form means here what it means to
-protobuf. What does not fit, or is not right, goes through `decode_accel`, which knows every form
-and says what is wrong.
+by channel, some bytes that are the same in every batch (tags, lengths, position, rate), the samples
+and, of a channel without a position, its name. Read in that order nothing is left over, so what
+fits this form means here what it means to protobuf. What does not fit, or is not right, goes
+through `decode_accel`, which knows every form and says what is wrong.
 """
 
 import re
@@ -19,22 +19,26 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import (
     ACCEL_NAMES,
     MAX_ACCELERATION_M_PER_S2,
+    MAX_CHANNELS,
     Stamp,
     check_channel,
     check_header,
     decode_accel,
     stamp,
 )
+from schemas.topics import check_identifier
 
 _VARINT = rb"[\x80-\xff]{0,9}[\x00-\x7f]"
 _HEADER = re.compile(rb"\x08\x01" + b"".join(rb"\x%02x" % tag + _VARINT for tag in b"\x10\x18 ("))
 """Version 1, boot_id, sequence, device and wall time. One that is 0 is left out: not this form."""
 _BEFORE = re.compile(
-    rb"\x32(%b)\x08([\x00-\x7f])\x11(.{8})\x1a(%b)" % (_VARINT, _VARINT), re.DOTALL
+    rb"\x32(%b)(\x08[\x00-\x7f])?\x11(.{8})\x1a(%b)" % (_VARINT, _VARINT), re.DOTALL
 )
 """Tag and length of a channel, its position, its rate, tag and length of its samples."""
 _SHORT, _LONG = 15, 17
 """Bytes before the samples of a channel, with lengths of one byte and of two."""
+_POSITION, _NAME = b"\x08", b"\x22"
+"""Tags; a position takes two bytes, which a channel with a name lacks."""
 _RATE = struct.Struct("<d")
 _FLOAT64 = np.dtype("<f8")
 
@@ -43,8 +47,11 @@ class _Channel(NamedTuple):
     """What the bytes before the samples of a channel say."""
 
     name: str
+    """Of its position; empty where its name stands behind the samples."""
     number: int
     """Samples; 0: these bytes do not have the form, or are not right."""
+    behind: int = 0
+    """Bytes behind the samples, of tag, length and name."""
 
 
 _NOTHING = _Channel("", 0)
@@ -64,14 +71,20 @@ def _stamp_if_usual(payload: bytes) -> Stamp | None:
     names = set()
     samples = []
     while at < end:
-        first = at + (_SHORT if payload[at + 1 : at + 2] < b"\x80" else _LONG)
-        name, number = _channel(payload[at:first])
-        at = first + 8 * number
-        if not number or name in names or at > end:
+        is_short = payload[at + 1 : at + 2] < b"\x80"
+        first = at + (_SHORT if is_short else _LONG)
+        if not payload.startswith(_POSITION, at + (2 if is_short else 3)):
+            first -= 2
+        name, number, behind = _channel(payload[at:first])
+        last = first + 8 * number
+        at = last + behind
+        if behind:
+            name = _name(payload[last:at])
+        if not number or not name or name in names or at > end:
             return None
         names.add(name)
-        samples.append(payload[first:at])
-    if not samples:
+        samples.append(payload[first:last])
+    if not samples or len(names) > MAX_CHANNELS:
         return None
     every = np.frombuffer(b"".join(samples), _FLOAT64)
     # numpy's product would give up the interpreter's lock, which other threads wait for.
@@ -92,16 +105,29 @@ def _channel(before: bytes) -> _Channel:
     if found is None:
         return _NOTHING
     channel_bytes, samples_bytes = _number(found[1]), _number(found[4])
-    name = ACCEL_NAMES.get(found[2][0])
+    position = found[2] or b""
+    name = ACCEL_NAMES.get(position[1]) if position else ""
     number, rest = divmod(samples_bytes, 8)
-    if name is None or rest or channel_bytes != 12 + len(found[4]) + samples_bytes:
+    behind = channel_bytes - (len(position) + 10 + len(found[4]) + samples_bytes)
+    if name is None or rest or behind < 0 or bool(behind) == bool(name):
         return _NOTHING
     try:
         (rate_hz,) = _RATE.unpack(found[3])
-        check_channel(name, rate_hz, number)
+        check_channel(name or "unnamed", rate_hz, number)
     except ValueError:
         return _NOTHING
-    return _Channel(name, number)
+    return _Channel(name, number, behind)
+
+
+@lru_cache(maxsize=10_000)
+def _name(behind: bytes) -> str:
+    """Read the name behind the samples of a channel; empty if it is none of the usual form."""
+    if len(behind) < 3 or behind[:1] != _NAME or behind[1] != len(behind) - 2:
+        return ""
+    try:
+        return check_identifier(behind[2:].decode())
+    except ValueError:
+        return ""
 
 
 def _number(varint: bytes) -> int:

@@ -149,7 +149,7 @@ def pair_hash(site: Site, pair: Pair, settings: IdentificationSettings) -> str:
     content = {
         "method_edition": METHOD_EDITION,
         "settings": settings.model_dump(mode="json", exclude=set(_NOT_OF_A_CERTIFICATE)),
-        "vehicle": site.vehicle(pair.vehicle).model_dump(mode="json"),
+        "vehicle": site.vehicle(pair.vehicle).shortest(),
         "bridge": site.bridge(pair.bridge).model_dump(mode="json", exclude=set(_NOT_OF_A_BRIDGE)),
         "sensor": site.sensor.model_dump(mode="json"),
         "receiver": site.receiver.model_dump(mode="json"),

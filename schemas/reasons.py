@@ -23,6 +23,8 @@ class Reason(StrEnum):
     CHANNEL_SLIPPED = "channel_slipped"
     GAIN_CHANGED = "gain_changed"
     SIGNAL_SPIKES = "signal_spikes"
+    ROLL_NOT_SEEN = "roll_not_seen"
+    SENSORS_DISAGREE = "sensors_disagree"
     INCOMPLETE_CROSSING = "incomplete_crossing"
     # What is known beside its own signals.
     VEHICLE_DIFFERS_FROM_SITE = "vehicle_differs_from_site"
@@ -66,6 +68,14 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.CHANNEL_SLIPPED: "The delay of a channel changes within the record.",
     Reason.GAIN_CHANGED: "The gain of a channel changes within the record.",
     Reason.SIGNAL_SPIKES: "Single samples of a channel stand out of their neighbours.",
+    Reason.ROLL_NOT_SEEN: (
+        "A part of the truck is measured on one side only, so its roll cannot be told from its "
+        "heave."
+    ),
+    Reason.SENSORS_DISAGREE: (
+        "Accelerometers of one part of the truck do not agree: a gain or a delay is wrong, or one "
+        "is loose."
+    ),
     Reason.INCOMPLETE_CROSSING: "The recording begins or ends while the truck is on the bridge.",
     Reason.VEHICLE_DIFFERS_FROM_SITE: (
         "What the truck says of itself is not what the site file says of it."

@@ -7,7 +7,7 @@ ValueError what `decode_*` would refuse.
 
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -21,6 +21,8 @@ from schemas.topics import check_identifier
 SCHEMA_VERSION = 1
 CHANNELS = ("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear")
 
+MAX_CHANNELS = 32
+"""Accelerometers of one truck: more is no truck."""
 MAX_RATE_HZ = 50_000.0
 MAX_BATCH_S = 1.0
 """A batch is 50-100 ms; ten times that still bounds the memory that one message can ask for."""
@@ -42,8 +44,8 @@ _POSITIONS = {
 }
 ACCEL_NAMES: dict[int, str] = {position: name for name, position in _POSITIONS.items()}
 """Name of a channel by its position in the protobuf message."""
-_CHANNEL_BYTES = 2 + 9 + 1
-"""What a channel takes beside its samples: position, rate, and the tag of the samples."""
+_POSITION_BYTES, _RATE_BYTES, _TAG_BYTES = 2, 9, 1
+"""Encoded size of a position, of a rate, and of the tag of samples or of a name."""
 _FLOAT64 = np.dtype("<f8")
 _IDENTITY = struct.Struct("!QQ")
 
@@ -114,12 +116,14 @@ def encode_accel(batch: AccelBatch) -> bytes:
     """Return the AccelBatch message."""
     _check_accel(batch)
     message = pb.AccelBatch(schema_version=SCHEMA_VERSION, **_header(batch))
-    for name in CHANNELS:
-        if name in batch.channels:
-            rate_hz, samples = batch.channels[name]
-            message.channels.add(
-                position=_POSITIONS[name], rate_hz=rate_hz, acceleration_m_per_s2=samples.tolist()
-            )
+    for name in in_order(batch.channels):
+        rate_hz, samples = batch.channels[name]
+        message.channels.add(
+            position=_POSITIONS.get(name, pb.SENSOR_POSITION_UNSPECIFIED),
+            name="" if name in _POSITIONS else name,
+            rate_hz=rate_hz,
+            acceleration_m_per_s2=samples.tolist(),
+        )
     return message.SerializeToString(deterministic=True)
 
 
@@ -127,11 +131,11 @@ def decode_accel(payload: bytes) -> AccelBatch:
     """Return the batch in an AccelBatch message; ValueError if it is malformed or impossible."""
     message = pb.AccelBatch()
     _parse(message, payload)
+    if len(message.channels) > MAX_CHANNELS:
+        raise ValueError(f"{len(message.channels)} channels; at most {MAX_CHANNELS}")
     channels: dict[str, Channel] = {}
     for channel in message.channels:
-        name = ACCEL_NAMES.get(channel.position)
-        if name is None:
-            raise ValueError(f"channel at unknown position {int(channel.position)}")
+        name = _name(channel)
         if name in channels:
             raise ValueError(f"channel {name} is there twice")
         channels[name] = Channel(channel.rate_hz, _samples(channel))
@@ -317,11 +321,29 @@ def _parse(message: pb.AccelBatch | pb.GnssFix | pb.VehicleInfo, payload: bytes)
     check_version(message.schema_version)
 
 
+def _name(channel: pb.AccelChannel) -> str:
+    """Return the name of a channel: of its position, or its own where it has none of the four."""
+    if channel.position == pb.SENSOR_POSITION_UNSPECIFIED and channel.name:
+        return channel.name
+    name = ACCEL_NAMES.get(channel.position)
+    if name is None:
+        raise ValueError(f"channel at unknown position {int(channel.position)}")
+    if channel.name not in ("", name):
+        raise ValueError(f"channel {name} has another name, {channel.name[:63]!r}, too")
+    return name
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return names of channels in the order of every table: the four first, others by alphabet."""
+    there = set(names)
+    return [name for name in CHANNELS if name in there] + sorted(there - set(CHANNELS))
+
+
 def _samples(channel: pb.AccelChannel) -> npt.NDArray[np.float64]:
     """Return the samples of a channel, which may not be written to.
 
-    Encoded again they stand together at the end, and bytes are read four times as fast as one
-    number after the other. The length says whether something else, of an unknown field, stands
+    Encoded again they stand together, before the name if there is one, and bytes are read four
+    times as fast as one number after the other. The length shows whether an unknown field stands
     behind them.
     """
     values = channel.acceleration_m_per_s2
@@ -329,8 +351,11 @@ def _samples(channel: pb.AccelChannel) -> npt.NDArray[np.float64]:
     encoded = channel.SerializeToString()
     size = 8 * number
     varint_bytes = (size.bit_length() + 6) // 7
-    if number and len(encoded) == _CHANNEL_BYTES + varint_bytes + size:
-        return np.frombuffer(encoded, _FLOAT64, number, len(encoded) - size)
+    name = len(channel.name.encode())  # at most 127, or the lengths do not agree
+    behind = _TAG_BYTES + 1 + name if name else 0
+    before = (_POSITION_BYTES if channel.position else 0) + _RATE_BYTES + _TAG_BYTES + varint_bytes
+    if number and len(encoded) == before + size + behind:
+        return np.frombuffer(encoded, _FLOAT64, number, before)
     return np.array(values[:], np.float64)
 
 
@@ -357,8 +382,7 @@ def check_header(message: AccelBatch | GnssFix | VehicleInfo | pb.AccelBatch) ->
 
 def check_channel(name: str, rate_hz: float, samples: int) -> None:
     """ValueError if a channel cannot have so many samples at that rate."""
-    if name not in _POSITIONS:
-        raise ValueError(f"no channel {name!r}; there are {', '.join(CHANNELS)}")
+    check_identifier(name)
     if not 0.0 < rate_hz <= MAX_RATE_HZ:
         raise ValueError(f"{name}: rate {rate_hz} Hz is not between 0 and {MAX_RATE_HZ:.0f}")
     if not samples:
@@ -372,6 +396,8 @@ def _check_accel(batch: AccelBatch) -> None:
     check_header(batch)
     if not batch.channels:
         raise ValueError("no channel")
+    if len(batch.channels) > MAX_CHANNELS:
+        raise ValueError(f"{len(batch.channels)} channels; at most {MAX_CHANNELS}")
     for name, (rate_hz, samples) in batch.channels.items():
         if samples.ndim != 1:
             raise ValueError(f"{name}: samples of shape {samples.shape}; (n,) is expected")

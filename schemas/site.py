@@ -7,26 +7,23 @@ is a relative standard deviation of a log-normal prior, unless its name carries 
 import math
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from pydantic import (
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
-    SerializerFunctionWrapHandler,
     Strict,
     StrictBool,
     StringConstraints,
-    model_serializer,
     model_validator,
 )
 
-from schemas.signals import MAX_RATE_HZ
 from schemas.site_errors import at
 from schemas.site_lane import Lane
+from schemas.site_numbers import Density, NotNegative, Number, Positive, Rate, Spread, Table
 from schemas.site_ros2 import Ros2, check_ros2
-from schemas.topics import IDENTIFIER
+from schemas.site_vehicle import Spreadable
+from schemas.site_vehicle import Vehicle as Vehicle
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
 
 MAX_ELEMENTS: Final = 30
@@ -39,19 +36,11 @@ slip of the pen. Ends read off a hand-held receiver are metres off, so less is n
 _SMALLEST_SLIP: Final = 1e-3
 """Lengths of elements are rounded: they may miss the span by this share of it."""
 
-_TYRE_DAMPING_NS_PER_M: Final = 1000.0
 _BEARING_COMPLIANCE_M_PER_N: Final = 1e-9
 
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0, le=1e15)]
-NotNegative = Annotated[Number, Field(ge=0, le=1e15)]
-PositivePair = tuple[Positive, Positive]
-NotNegativePair = tuple[NotNegative, NotNegative]
-Spread = Annotated[Number, Field(ge=0, le=3)]
 Latitude = Annotated[Number, Field(ge=-89, le=89)]
 Altitude = Annotated[Number, Field(ge=-500, le=9000)]
 Longitude = Annotated[Number, Field(ge=-180, le=180)]
-Identifier = Annotated[str, StringConstraints(pattern=f"^{IDENTIFIER}$")]
 Text = Annotated[str, StringConstraints(min_length=1, max_length=1000)]
 Sign = Annotated[Literal[1, -1], BeforeValidator(lambda v: int(v) if v in (1.0, -1.0) else v)]
 
@@ -69,118 +58,11 @@ def _both_ends(value: object) -> object:
     return [value] * 2 if value in ("unknown", "free", "sprung") else value
 
 
-Rate = Annotated[Number, Field(ge=1, le=MAX_RATE_HZ)]
-Density = Annotated[Number, Field(ge=0, le=1e6)]
 Rates = Annotated[tuple[Rate, Rate, Rate, Rate], BeforeValidator(_four)]
 Densities = Annotated[tuple[Density, Density, Density, Density], BeforeValidator(_four)]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-    later_keys: ClassVar[tuple[str, ...]] = ()
-    """Keys that are written only where they are not at their defaults: a file without them keeps
-    the hash that it had before there were such keys."""
-
-    @model_serializer(mode="wrap")
-    def _without_later_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        fields = type(self).model_fields
-        for key in self.later_keys:
-            if key in values and getattr(self, key) == fields[key].default:
-                del values[key]
-        return values
-
-
-class _Spreadable(_Table):
-    id: Identifier
-
-    def spread(self, key: str) -> float:
-        """Return the relative standard deviation of the prior of `key`."""
-        value: float = getattr(self, f"{key}_spread")
-        return value
-
-    def nominal(self, key: str) -> tuple[float, ...]:
-        """Return what is known of a quantity before, one value or several."""
-        value: float | tuple[float, ...] = getattr(self, key)
-        return value if isinstance(value, tuple) else (value,)
-
-    def scale_at_zero(self, key: str) -> float:
-        """Return the scale of the half-normal prior of a quantity that is nominally zero."""
-        value: float = getattr(self, f"{key}_scale_at_zero")
-        return value
-
-
-class Vehicle(_Spreadable):
-    """A truck with two axles. Nominal values are those of a data sheet."""
-
-    total_mass_kg: Annotated[Number, Field(gt=0, le=1e6)]
-    wheelbase_m: Annotated[Number, Field(gt=0, le=30)]
-    front_axle_to_cg_m: Annotated[Number, Field(gt=0, le=30)]
-    suspension_damping_ns_per_m: NotNegativePair
-    suspension_stiffness_n_per_m: PositivePair
-    unsprung_mass_kg: PositivePair
-    tyre_stiffness_n_per_m: PositivePair
-    gps_antenna_to_front_axle_m: Annotated[Number, Field(ge=-50, le=50)]
-    """How far the antenna is behind the front axle, positive to the rear."""
-    cg_height_m: Annotated[Number, Field(gt=0, le=5)] | None = None
-    pitch_inertia_ratio: Annotated[Number, Field(gt=0, le=10)] = 1.0
-    """κ: the pitch inertia is κ·m_s·d_1·d_2."""
-    tyre_damping_ns_per_m: NotNegativePair = (0.0, 0.0)
-    """Zero: not known (see `scale_at_zero`)."""
-    tyre_width_m: PositivePair | None = None
-    """Widths of the tread; with the next four, by how much the road differs from axle to axle."""
-    tyre_contact_length_m: PositivePair | None = None
-    twin_tyre_distance_m: NotNegativePair | None = None
-    """Between the middles of twin tyres; 0 for single ones."""
-    track_m: Annotated[Number, Field(gt=0, le=5)] | None = None
-    """Between the middles of the wheels of both sides."""
-    rear_axle_offset_m: Annotated[Number, Field(ge=-1, le=1)] | None = None
-    """How far the rear axle runs to the left of the front axle."""
-
-    total_mass_kg_spread: Spread = 0.01
-    wheelbase_m_spread: Spread = 0.002
-    front_axle_to_cg_m_spread: Spread = 0.15
-    suspension_damping_ns_per_m_spread: Spread = 0.15
-    suspension_stiffness_n_per_m_spread: Spread = 0.15
-    unsprung_mass_kg_spread: Spread = 0.15
-    tyre_stiffness_n_per_m_spread: Spread = 0.15
-    cg_height_m_spread: Spread = 0.15
-    pitch_inertia_ratio_spread: Spread = 0.15
-    tyre_damping_ns_per_m_spread: Spread = 0.15
-
-    @property
-    def tyre_damping_ns_per_m_scale_at_zero(self) -> float:
-        """Scale of the half-normal prior of the damping of a tyre of which nothing is known."""
-        return _TYRE_DAMPING_NS_PER_M
-
-    @property
-    def sprung_mass_kg(self) -> float:
-        """Mass of the body: what is not axles and wheels."""
-        return self.total_mass_kg - sum(self.unsprung_mass_kg)
-
-    @property
-    def cg_to_rear_axle_m(self) -> float:
-        """Distance d_2 of the body's centre of gravity from the rear axle."""
-        return self.wheelbase_m - self.front_axle_to_cg_m
-
-    @model_validator(mode="after")
-    def _fits_together(self) -> "Vehicle":
-        if self.front_axle_to_cg_m >= self.wheelbase_m:
-            raise at(
-                "front_axle_to_cg_m",
-                f"is {self.front_axle_to_cg_m}, it must be a length less than wheelbase_m, "
-                f"{self.wheelbase_m} m",
-            )
-        if self.sprung_mass_kg <= 0:
-            raise at(
-                "unsprung_mass_kg",
-                f"adds up to {sum(self.unsprung_mass_kg)}, it must be a mass less than "
-                f"total_mass_kg, {self.total_mass_kg} kg",
-            )
-        return self
-
-
-class Bridge(Lane, _Spreadable):
+class Bridge(Lane, Spreadable):
     """One or more spans. Its ends are where the bearings are; elements are numbered from its start.
 
     Over interior supports the bridge is continuous: their deflection is held and they turn freely.
@@ -390,12 +272,15 @@ def _shared(count: int, lengths: Sequence[float]) -> list[int]:
     return shares
 
 
-class Sensor(_Table):
-    """The accelerometers, in the order sprung front, sprung rear, unsprung front, unsprung rear."""
+class Sensor(Table):
+    """The accelerometers, in the order sprung front, sprung rear, unsprung front, unsprung rear.
+
+    Of trucks with `sensors` their own densities, and rates where given, take the place of these.
+    """
 
     rate_hz: Rates
-    noise_density_ug_per_rthz: Densities
-    """One-sided; 0 for a simulation without noise."""
+    noise_density_ug_per_rthz: Densities = (0.0, 0.0, 0.0, 0.0)
+    """One-sided; 0 for a simulation without noise. Only trucks with `sensors` may leave it out."""
     gravity_included: StrictBool = False
     up: tuple[Sign, Sign, Sign, Sign] = (1, 1, 1, 1)
     gain_spread: Spread = 0.01
@@ -404,7 +289,7 @@ class Sensor(_Table):
     common_gain_spread: Spread = 0.01
 
 
-class Receiver(_Table):
+class Receiver(Table):
     """The satellite receiver."""
 
     position_spread_m: NotNegative = 1.5
@@ -415,7 +300,7 @@ class Receiver(_Table):
     latency_spread_s: Annotated[Number, Field(ge=0, le=10)] = 0.1
 
 
-class Site(_Table):
+class Site(Table):
     """Everything in a site file."""
 
     vehicles: Annotated[tuple[Vehicle, ...], Field(alias="vehicle", min_length=1)]
@@ -435,7 +320,7 @@ class Site(_Table):
 
     @model_validator(mode="after")
     def _identifiers_are_unique(self) -> "Site":
-        lists: dict[str, tuple[_Spreadable, ...]] = {
+        lists: dict[str, tuple[Spreadable, ...]] = {
             "vehicle": self.vehicles,
             "bridge": self.bridges,
         }
@@ -445,7 +330,29 @@ class Site(_Table):
                 if table.id in seen:
                     raise at(f"{name}.{index}.id", f'is "{table.id}" again, ids must be unique')
                 seen.add(table.id)
-        check_ros2(self.ros2, {vehicle.id for vehicle in self.vehicles})
+        check_ros2(self.ros2, {vehicle.id: vehicle.channels for vehicle in self.vehicles})
+        return self
+
+    @model_validator(mode="after")
+    def _sensors_are_described(self) -> "Site":
+        """Raise where [sensor] and the sensors of a vehicle leave something open."""
+        sensor = self.sensor
+        by_place = [vehicle for vehicle in self.vehicles if vehicle.sensors]
+        if len(by_place) < len(self.vehicles):
+            if "noise_density_ug_per_rthz" not in sensor.model_fields_set:
+                raise at(
+                    "sensor.noise_density_ug_per_rthz",
+                    "is missing, it must be a noise density in µg/√Hz",
+                )
+        elif sensor.up != (1, 1, 1, 1):
+            raise at("sensor.up", "is of the four channels, the vehicle's sensors must point up")
+        for number, vehicle in enumerate(self.vehicles):
+            for place, one in enumerate(vehicle.sensors):
+                if one.rate_hz is None and len(set(sensor.rate_hz)) > 1:
+                    raise at(
+                        f"vehicle.{number}.sensors.{place}.rate_hz",
+                        "is missing, it must be a rate in Hz: sensor.rate_hz has several",
+                    )
         return self
 
 

@@ -129,7 +129,7 @@ def _expected(problem: Any, key: str, tables: Tables) -> str:
         return _quantity(key, f"{words} {context[name]:g}")
     if kind == "finite_number":
         return ", ".join(part for part in (_quantity(key), "a finite number") if part)
-    if key == "id":
+    if key in ("id", "channel"):
         return (
             'an identifier of a-z, 0-9, "_" and "-", at most 63, beginning with a letter or digit'
         )
@@ -153,11 +153,26 @@ def _expected(problem: Any, key: str, tables: Tables) -> str:
 _CHOICES: Final = {
     "bearings": '"unknown", "free" or "sprung"',
     "axis": '"x", "y" or "z", with "-" before it if that axis points down',
+    "tyres": '"single", "twin" or "wide"',
+    "on": '"body" or "axle"',
     "road_class": 'an ISO 8608 class, "A" to "E"',
 }
 
 
+_TABLE_LISTS: Final = {
+    "axles": "two or more [[vehicle.axles]], of a bogie the numbers of its axles",
+    "bogies": "tables [[vehicle.bogies]]",
+    "sensors": "at most 32 [[vehicle.sensors]]",
+}
+
+
 def _list_expected(key: str, tables: Tables) -> str:
+    if key in ("axles", "bogies", "sensors"):
+        return _TABLE_LISTS[key]
+    if key == "shares":
+        return "a list with one number for each axle of the bogie"
+    if key == "track_m":
+        return "a length in m or a pair [front, rear]"
     if key in ("vehicle", "bridge", "ros2"):
         return f"a table [{key}] or several [[{key}]]"
     if key in ("flexural_rigidity_per_element_nm2", "element_lengths_m"):

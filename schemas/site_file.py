@@ -9,8 +9,10 @@ from pydantic import BaseModel, ValidationError
 
 from schemas.errors import InputError
 from schemas.site import MAX_ELEMENTS, MAX_TABLES, Bridge, Receiver, Sensor, Site, Vehicle
+from schemas.site_axles import Axle, Bogie
 from schemas.site_errors import Tables, all_lines, first_line
 from schemas.site_ros2 import Ros2
+from schemas.site_sensors import PlacedSensor
 from schemas.toml_text import parse_toml, read_toml_text
 
 _MOST_FIELDS: Final = 100
@@ -21,6 +23,9 @@ _TABLES: Final[Tables] = {
     "sensor": Sensor,
     "receiver": Receiver,
     "ros2": Ros2,
+    "vehicle.axles": Axle,
+    "vehicle.bogies": Bogie,
+    "vehicle.sensors": PlacedSensor,
 }
 _LISTS: Final = ("vehicle", "bridge", "ros2")
 """Tables of which there may be several."""
@@ -90,7 +95,8 @@ def site_hash(site: Site) -> str:
 
     But for `[ros2]`, which says by which way messages come and nothing of what is in them.
     """
-    values = site.model_dump(by_alias=True, exclude={"ros2"})
+    values = site.model_dump(by_alias=True, exclude={"ros2", "vehicles"})
+    values["vehicle"] = [vehicle.shortest() for vehicle in site.vehicles]
     canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -117,7 +123,10 @@ def vehicle_toml(site: Site, vehicle_id: str) -> str:
 
 
 def _toml(tables: list[tuple[str, BaseModel]]) -> str:
-    return "".join(_table_text(heading, table.model_dump()) for heading, table in tables)
+    return "".join(
+        _table_text(heading, one.shortest() if isinstance(one, Vehicle) else one.model_dump())
+        for heading, one in tables
+    )
 
 
 def toml_of(tables: dict[str, dict[str, Any]]) -> str:
@@ -137,5 +146,7 @@ def _value_text(value: Any) -> str:
     if isinstance(value, dict):
         pairs = (f"{key} = {_value_text(one)}" for key, one in value.items() if one is not None)
         return f"{{ {', '.join(pairs)} }}"
+    if isinstance(value, list | tuple) and any(isinstance(one, dict) for one in value):
+        return f"[{', '.join(_value_text(one) for one in value)}]"
     # JSON's numbers, strings, booleans and lists are TOML's; DEL alone must be escaped.
     return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")

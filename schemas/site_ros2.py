@@ -1,5 +1,6 @@
 """`[ros2]` of a site file: which topics of a ROS 2 truck are which of its channels."""
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, StrictBool, StringConstraints
@@ -33,6 +34,10 @@ class RosImu(_Table):
 class RosImus(_Table):
     """The accelerometers of a truck by the channel that each is."""
 
+    # Channels that [[vehicle.sensors]] names stand beside the four.
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, RosImu]
+
     sprung_front: RosImu | None = None
     sprung_rear: RosImu | None = None
     unsprung_front: RosImu | None = None
@@ -41,6 +46,7 @@ class RosImus(_Table):
     def by_channel(self) -> dict[str, RosImu]:
         """Those that there are."""
         named = {name: getattr(self, name) for name in type(self).model_fields}
+        named |= self.__pydantic_extra__
         return {name: imu for name, imu in named.items() if imu is not None}
 
 
@@ -66,8 +72,11 @@ class Ros2(_Table):
         return [imu.topic for imu in self.imu.by_channel().values()] + others
 
 
-def check_ros2(tables: tuple[Ros2, ...], vehicles: set[str]) -> None:
-    """Raise if a truck is unknown or there twice, or a topic is two things at once."""
+def check_ros2(tables: tuple[Ros2, ...], vehicles: Mapping[str, tuple[str, ...]]) -> None:
+    """Raise if a truck or a channel is unknown, or a truck or a topic is there twice.
+
+    `vehicles` are the names of the channels of each.
+    """
     seen: set[str] = set()
     for index, table in enumerate(tables):
         where = f"ros2.{index}"
@@ -80,6 +89,14 @@ def check_ros2(tables: tuple[Ros2, ...], vehicles: set[str]) -> None:
         topics = table.topics()
         if not table.imu.by_channel():
             raise at(f"{where}.imu", "names no channel, at least one accelerometer is expected")
+        channels = vehicles[table.vehicle]
+        for name in table.imu.by_channel():
+            if name not in channels:
+                raise at(
+                    f"{where}.imu.{name}",
+                    f"is not a known field, it must be a channel of {table.vehicle}: "
+                    f"{', '.join(channels)}",
+                )
         for topic in topics:
             if topics.count(topic) > 1:
                 raise at(where, f'has the topic "{topic}" twice, each is one thing only')

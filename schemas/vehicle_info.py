@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 from schemas.errors import InputError
 from schemas.signals import MAX_SITE_BYTES
 from schemas.site import Vehicle
+from schemas.site_axles import in_pairs
 from schemas.site_file import toml_of
 from schemas.toml_text import parse_toml
 
@@ -68,6 +69,10 @@ def differences(info_toml: str, known: Vehicle) -> list[Difference]:
     except InputError:
         return []
     said = next((one for one in _vehicles(table) if one.get("id") == known.id), {})
+    try:
+        said = in_pairs(said)
+    except ValueError:
+        return []
     found = []
     for name in _COMPARED:
         mine = _numbers(getattr(known, name))

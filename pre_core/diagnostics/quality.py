@@ -216,6 +216,30 @@ def pairing(
     )
 
 
+def unexplained(
+    acceleration_m_per_s2: FloatArray,
+    step_s: float,
+    stiffness_per_mass: FloatArray,
+    damping_per_mass: FloatArray,
+) -> float:
+    """Return the part of the body's motion that the channels (4, n) as recorded leave open.
+
+    It is `Pairing.recorded` without the search for another order.
+    """
+    spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
+    return max(
+        _unexplained(
+            spectrum[w],
+            spectrum[2 + w],
+            spectrum[1 - w],
+            omega,
+            float(stiffness_per_mass[w]),
+            float(damping_per_mass[w]),
+        )
+        for w in range(2)
+    )
+
+
 def _moved(order: tuple[int, ...]) -> int:
     return sum(channel != place for place, channel in enumerate(order))
 

@@ -57,14 +57,16 @@ SUSPECT: Verdict
 REJECTED: Verdict
 
 class AccelChannel(_message.Message):
-    __slots__ = ("position", "rate_hz", "acceleration_m_per_s2")
+    __slots__ = ("position", "rate_hz", "acceleration_m_per_s2", "name")
     POSITION_FIELD_NUMBER: _ClassVar[int]
     RATE_HZ_FIELD_NUMBER: _ClassVar[int]
     ACCELERATION_M_PER_S2_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
     position: SensorPosition
     rate_hz: float
     acceleration_m_per_s2: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, position: _Optional[_Union[SensorPosition, str]] = ..., rate_hz: _Optional[float] = ..., acceleration_m_per_s2: _Optional[_Iterable[float]] = ...) -> None: ...
+    name: str
+    def __init__(self, position: _Optional[_Union[SensorPosition, str]] = ..., rate_hz: _Optional[float] = ..., acceleration_m_per_s2: _Optional[_Iterable[float]] = ..., name: _Optional[str] = ...) -> None: ...
 
 class AccelBatch(_message.Message):
     __slots__ = ("schema_version", "boot_id", "sequence", "device_time_ns", "wall_time_ns", "channels")

@@ -165,7 +165,10 @@ def check_certificates(certificates: Path | None) -> None:
 
 def warn_of_no_noise(site: Site, method: str) -> None:
     """Say so where a method cannot believe in sensors without noise."""
-    if method == "pre" and not any(site.sensor.noise_density_ug_per_rthz):
+    from services.identification.placed import middle_sensor
+
+    noise = (middle_sensor(site.sensor, one).noise_density_ug_per_rthz for one in site.vehicles)
+    if method == "pre" and not any(map(any, noise)):
         _log.warning(
             "the site says that the sensors have no noise, which method pre cannot believe; "
             "simulations without noise are for --method least-squares"

@@ -95,6 +95,7 @@ def _survey(options: argparse.Namespace) -> int:
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
     from services.common.progress import progress_bar
+    from services.identification.placed import middle_site, sensor_rows, sensors_in_words
     from services.planning.alternatives import with_noise, with_tyres
     from services.planning.crossings import Road
     from services.planning.survey import Asked, survey
@@ -105,7 +106,8 @@ def _survey(options: argparse.Namespace) -> int:
     for path in (figure, options.json):
         if path is not None:
             check_writable(path)
-    site = load_site(options.site)
+    given = load_site(options.site)
+    site = middle_site(given)
     if options.tyres is not None:
         site = with_tyres(site, options.tyres)
     if options.noise is not None:
@@ -124,13 +126,17 @@ def _survey(options: argparse.Namespace) -> int:
             lambda done, jobs: bar.update(task, completed=done, total=jobs),
         )
     if options.json is not None:
-        content = json.dumps(as_json(found), indent=1, ensure_ascii=False)
+        rows = sensor_rows(given.sensor, given.vehicles[0])
+        sensors = {"sensors": [row._asdict() for row in rows]} if rows else {}
+        content = json.dumps(as_json(found) | sensors, indent=1, ensure_ascii=False)
         write_atomically(options.json, content + "\n")
     if figure is not None:
         from services.planning.figure import survey_figure
 
         survey_figure(figure, found)
     print("\n".join(lines_of(found)))
+    for line in sensors_in_words(given.sensor, given.vehicles[0]):
+        print(f"sensor {line}")
     return 0
 
 

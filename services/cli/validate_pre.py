@@ -8,6 +8,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
 from services.common.files import check_writable, make_folder, write_atomically
 from services.common.progress import progress_bar
+from services.identification.placed import middle_site
 from services.simulation.drawn import default_site
 from services.validation.calibration import Check, by_condition, ranks_of, scores
 from services.validation.uncertainty import (
@@ -56,7 +57,7 @@ def validate_pre_command(
     if figures is not None:
         make_folder(figures)
         check_writable(figures / _FIGURE)
-    known = default_site() if site is None else load_site(site)
+    known = default_site() if site is None else middle_site(load_site(site))
     with progress_bar(console) as bar:
         task = bar.add_task("crossings", total=None)
         outcome = run_parts(

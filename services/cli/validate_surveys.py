@@ -8,6 +8,7 @@ from schemas.site_file import load_site
 from services.cli.survey_forecasts import forecasts_of
 from services.common.files import make_folder
 from services.common.progress import progress_bar, steps_bar
+from services.identification.placed import middle_site
 from services.simulation.drawn import default_site
 from services.validation import detection
 from services.validation.surveys import HEADINGS, fused_surveys, rows, run_surveys, survey_checks
@@ -34,7 +35,7 @@ def validate_surveys_command(
     """
     read_records(records)
     make_folder(records.parent)
-    known = default_site() if site is None else load_site(site)
+    known = default_site() if site is None else middle_site(load_site(site))
     with progress_bar(console) as bar:
         task = bar.add_task("crossings", total=None)
         found = run_surveys(

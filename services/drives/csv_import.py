@@ -4,6 +4,7 @@ Every error names the file, the line and the field. The whole file is parsed at 
 fails, or the numbers are not acceptable, is it read line by line to find out where.
 """
 
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -16,8 +17,10 @@ from schemas.signals import (
     EARLIEST_WALL_TIME_NS,
     LATEST_WALL_TIME_NS,
     MAX_ACCELERATION_M_PER_S2,
+    MAX_CHANNELS,
     MAX_RATE_HZ,
 )
+from schemas.topics import IDENTIFIER
 from services.common.errors import InputError
 from services.common.files import read_text
 from services.common.progress import Steps, unwatched_steps
@@ -25,6 +28,7 @@ from services.drives.runs import GnssTrack, Run, sampling_rate_hz
 
 Floats = NDArray[np.float64]
 
+_CHANNEL: Final = re.compile(IDENTIFIER)
 GPS_COLUMNS: Final = ("time_s", "latitude_deg", "longitude_deg", "altitude_m", "speed_mps")
 
 
@@ -44,14 +48,19 @@ _LIMITS: Final[dict[str, _Limits]] = {
     "longitude_deg": _Limits(-180, 180, "a longitude in degrees"),
     "altitude_m": _Limits(-1000, 20_000, "an altitude in m"),
     "speed_mps": _Limits(-200, 200, "a speed in m/s"),
-    **dict.fromkeys(CHANNELS, _ACCELERATION),
 }
+"""Columns that are not of an accelerometer."""
 
 
-def read_folder(folder: Path, progress: Steps = unwatched_steps) -> list[Run]:
+def read_folder(
+    folder: Path,
+    progress: Steps = unwatched_steps,
+    channels: tuple[str, ...] | None = CHANNELS,
+) -> list[Run]:
     """Read every pair of files in a folder, in order of time; InputError if there is none.
 
-    `progress` is told of each pair.
+    `channels` are the columns that there may be, None any names of channels. `progress` is told of
+    each pair.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, one with accel_NN.csv and gps_NN.csv expected")
@@ -67,7 +76,7 @@ def read_folder(folder: Path, progress: Steps = unwatched_steps) -> list[Run]:
     runs: list[Run] = []
     for number in sorted(accel):
         progress(len(runs), len(accel))
-        runs.append(read_pair(accel[number], folder / f"gps_{number}"))
+        runs.append(read_pair(accel[number], folder / f"gps_{number}", channels))
     runs.sort(key=lambda run: float(run.accel_time_s[0]))
     for before, after in pairwise(runs):
         if after.accel_time_s[0] <= before.accel_time_s[-1]:
@@ -78,9 +87,9 @@ def read_folder(folder: Path, progress: Steps = unwatched_steps) -> list[Run]:
     return runs
 
 
-def read_pair(accel: Path, gps: Path) -> Run:
+def read_pair(accel: Path, gps: Path, channels: tuple[str, ...] | None = CHANNELS) -> Run:
     """Read one run. Times in s since 1970 UTC; accelerations in m/s² as they are in the file."""
-    columns = _read_accel(accel)
+    columns = _read_accel(accel, channels)
     track = _read_gps(gps, accel)
     time_s = columns.pop("time_s")
     if track.time_s[-1] < time_s[0] or time_s[-1] < track.time_s[0]:
@@ -96,10 +105,15 @@ def read_pair(accel: Path, gps: Path) -> Run:
     return Run(str(accel), time_s, rate_hz, columns, track)
 
 
-def _read_accel(path: Path) -> dict[str, Floats]:
+def _read_accel(path: Path, channels: tuple[str, ...] | None) -> dict[str, Floats]:
     header, lines = _lines(path)
-    wanted = f"the columns time_s and {', '.join(CHANNELS)}"
-    _check_header(path, header, ("time_s",), CHANNELS, wanted)
+    if channels is None:
+        wanted = f"the columns time_s and at most {MAX_CHANNELS} channels"
+        named = [name for name in header if _CHANNEL.fullmatch(name) and name not in GPS_COLUMNS]
+        channels = tuple(named[:MAX_CHANNELS])
+    else:
+        wanted = f"the columns time_s and {', '.join(channels)}"
+    _check_header(path, header, ("time_s",), channels, wanted)
     if len(header) < 2:
         raise InputError(f"{path}: line 1: no accelerations, {wanted} expected")
     return _columns(path, header, lines)
@@ -143,8 +157,8 @@ def _columns(path: Path, header: list[str], lines: list[str]) -> dict[str, Float
         )
     except ValueError as error:
         raise _complaint(path, header, lines) from error
-    low = np.array([_LIMITS[name].low for name in header])
-    high = np.array([_LIMITS[name].high for name in header])
+    limits = [_LIMITS.get(name, _ACCELERATION) for name in header]
+    low, high = (np.array([one[side] for one in limits]) for side in (0, 1))
     if (
         table.shape[0] < 2
         or table.shape[1] != len(header)
@@ -169,7 +183,7 @@ def _complaint(path: Path, header: list[str], lines: list[str]) -> InputError:
             return InputError(f"{where}: has {len(fields)} fields, {len(header)} expected")
         for name, field in zip(header, fields, strict=True):
             value = _number(field)
-            low, high, what = _LIMITS[name]
+            low, high, what = _LIMITS.get(name, _ACCELERATION)
             if value is None or not low <= value <= high:
                 shown = field.strip()[:40] or "empty"
                 return InputError(

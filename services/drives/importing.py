@@ -15,6 +15,7 @@ from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_import import read_folder, read_pair
 from services.drives.ros2_recording import is_ros2, messages_of_ros2
 from services.drives.runs import Run, normalised, run_to_messages
+from services.identification.placed import middle_sensor, rates_hz
 from services.recordings.recording import Message
 from services.recordings.writer import write_recording
 
@@ -46,7 +47,7 @@ def import_command(
     realm = _realm(sources, name)
     if len(sources) == 1 and is_ros2(sources[0]):
         return _import_ros2(sources[0], text, parsed, str(site), output, realm, vehicle_id, force)
-    runs = normalised_runs(sources, parsed, str(site), reading)
+    runs = normalised_runs(sources, parsed, str(site), vehicle_id, reading)
     messages = write_recording(
         output,
         _watched(run_to_messages(runs, parsed, realm, vehicle_id), runs, writing),
@@ -94,7 +95,7 @@ def messages_of_folder(
 ) -> Iterator[Message]:
     """The same of a site that was read already; errors call it `site_name`."""
     vehicle_id = vehicle_of(site, site_name, vehicle)
-    runs = normalised_runs([folder], site, site_name)
+    runs = normalised_runs([folder], site, site_name, vehicle_id)
     return run_to_messages(runs, site, _realm([folder], None), vehicle_id)
 
 
@@ -114,32 +115,38 @@ def _watched(messages: Iterable[Message], runs: list[Run], writing: Steps) -> It
 
 
 def normalised_runs(
-    sources: list[Path], site: Site | None, site_name: str, reading: Steps = unwatched_steps
+    sources: list[Path],
+    site: Site | None,
+    site_name: str,
+    vehicle_id: str,
+    reading: Steps = unwatched_steps,
 ) -> list[Run]:
     """The runs of a folder or of a pair of CSV files, upward and without gravity.
 
     Without a site nobody knows how a CSV file was measured: then it is as in the file.
     """
+    vehicle = None if site is None else site.vehicle(vehicle_id)
+    channels = None if vehicle is None else vehicle.channels
     if len(sources) == 1 and sources[0].suffix == ".csv":
         raise InputError(f"{sources[0]}: the positions are missing, give accel.csv and gps.csv")
     if len(sources) == 1 and is_comma2k19(sources[0]):
         return [read_comma2k19(sources[0])]  # knows its axes and its rate itself
     if len(sources) == 1:
-        runs = read_folder(sources[0], reading)
+        runs = read_folder(sources[0], reading, channels)
     elif len(sources) == 2:
-        runs = [read_pair(*sources)]
+        runs = [read_pair(sources[0], sources[1], channels)]
     else:
         raise InputError(f"{len(sources)} files given, a folder or accel.csv gps.csv expected")
-    if site is None:
+    if site is None or vehicle is None:
         return runs
+    declared = tuple(rates_hz(site.sensor, vehicle).values())
     for run in runs:
-        _check_rate(run, site, site_name)
-    return [normalised(run, site.sensor) for run in runs]
+        _check_rate(run, declared, site_name)
+    return [normalised(run, middle_sensor(site.sensor, vehicle)) for run in runs]
 
 
-def _check_rate(run: Run, site: Site, site_name: str) -> None:
+def _check_rate(run: Run, declared: tuple[float, ...], site_name: str) -> None:
     """Times in the wrong unit and the wrong site file show in the rate."""
-    declared = site.sensor.rate_hz
     if not any(abs(run.rate_hz / rate - 1) <= _LARGEST_RATE_ERROR for rate in declared):
         raise InputError(
             f"{run.source}: time_s gives a rate of {run.rate_hz:g} Hz, but sensor.rate_hz of "

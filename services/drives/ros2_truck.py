@@ -9,7 +9,7 @@ from functools import partial
 from typing import Final, NamedTuple, NoReturn
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
-from schemas.signals import CHANNELS, NS_PER_S, Channel, GnssFix
+from schemas.signals import NS_PER_S, Channel, GnssFix
 from schemas.site import Site
 from schemas.site_ros2 import Ros2, RosImu
 from services.common.errors import InputError
@@ -33,6 +33,7 @@ from services.drives.ros2_messages import (
 )
 from services.drives.ros2_positions import FixWithSpeed, Positions
 from services.drives.ros2_samples import EvenSamples, Piece, RateError
+from services.identification.placed import rates_hz
 
 _LEAST_SPEED_NOISE_M_PER_S: Final = 0.5
 """Of speeds that are slopes of positions: their errors are those of the positions once more, and
@@ -84,10 +85,9 @@ class Ros2Truck:
         self.complaints = Complaints()
         self._imus = {imu.topic: imu for imu in self.table.imu.by_channel().values()}
         self._channels = {imu.topic: name for name, imu in self.table.imu.by_channel().items()}
+        declared_hz = rates_hz(site.sensor, site.vehicle(vehicle))
         self._samples = {
-            topic: EvenSamples(
-                topic, site.sensor.rate_hz[CHANNELS.index(name)], site_name, self.complaints
-            )
+            topic: EvenSamples(topic, declared_hz[name], site_name, self.complaints)
             for topic, name in self._channels.items()
         }
         self._positions = Positions(self.table.gnss, self.table.velocity, self.complaints)

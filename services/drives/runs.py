@@ -74,12 +74,14 @@ def sampling_rate_hz(time_s: Floats) -> float:
 def normalised(run: Run, sensor: Sensor) -> Run:
     """Return the run with accelerations upward and without gravity, as `sensor` says they are not.
 
-    An accelerometer at rest whose axis points up reads +g.
+    Channels beside the four point up. An accelerometer at rest whose axis points up reads +g.
     """
     gravity = STANDARD_GRAVITY_M_PER_S2 if sensor.gravity_included else 0.0
-    sign = dict(zip(CHANNELS, sensor.up, strict=True))
+    signs = dict(zip(CHANNELS, sensor.up, strict=True))
     return run._replace(
-        channels={name: sign[name] * values - gravity for name, values in run.channels.items()}
+        channels={
+            name: signs.get(name, 1) * values - gravity for name, values in run.channels.items()
+        }
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.signals import CHANNELS, AccelBatch, Channel, GnssFix, decode_accel, decode_gnss
+from schemas.signals import AccelBatch, Channel, GnssFix, decode_accel, decode_gnss, in_order
 from schemas.site import Site
 from services.common.extras import check_installed
 from services.common.progress import Offset, unwatched
@@ -53,7 +53,7 @@ class Signals(NamedTuple):
     run: int
     """Number of the run in its file, from 0, by time."""
     channels: dict[str, Series]
-    """By name, as in `driveby.CHANNELS`; a channel that the truck lacks is absent."""
+    """By name, those of `driveby.CHANNELS` first; a channel that the truck lacks is absent."""
     fixes: Track
 
     def accelerations(self) -> "pd.DataFrame":
@@ -116,7 +116,7 @@ def signals_of_folder(
 
     Without a site file nobody knows how they were measured: then they are as in the files.
     """
-    runs = normalised_runs([folder], site, site_name)
+    runs = normalised_runs([folder], site, site_name, vehicle)
     return _numbered([signals_of_run(run, vehicle) for run in runs])
 
 
@@ -140,13 +140,12 @@ def signals_of_run(run: Run, vehicle: str) -> Signals:
 def series_of_batches(batches: Sequence[AccelBatch]) -> dict[str, Series]:
     """Join batches, in their order, into one series for each channel that there is."""
     series = {}
-    for name in CHANNELS:
+    for name in in_order(name for batch in batches for name in batch.channels):
         parts = [(b.wall_time_ns, b.channels[name]) for b in batches if name in b.channels]
-        if parts:
-            series[name] = Series(
-                np.concatenate(list(_times_ns(parts))),
-                np.concatenate([c.samples for _, c in parts]),
-            )
+        series[name] = Series(
+            np.concatenate(list(_times_ns(parts))),
+            np.concatenate([c.samples for _, c in parts]),
+        )
     return series
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.signals import CHANNELS
+from schemas.signals import CHANNELS, in_order
 from schemas.site import Site
 from schemas.site_file import site_toml
 from services.drives.signals import Series, Signals
@@ -43,7 +43,7 @@ def tables_of_runs(runs: Sequence[Signals]) -> list[Table]:
     accelerations: dict[str, NDArray[np.generic]] = {
         "time_ns": np.concatenate([one["time_ns"] for one in accel] or [np.empty(0, np.int64)])
     }
-    for name in CHANNELS:
+    for name in in_order({*CHANNELS, *(name for run in runs for name in run.channels)}):
         parts = [one.get(name, np.full(one["time_ns"].size, np.nan)) for one in accel]
         accelerations[name] = np.concatenate(parts or [empty])
     fixes = {"time_ns": np.concatenate([run.fixes.time_ns for run in runs])}

@@ -1,12 +1,12 @@
 """Whether an answer can be trusted: from signals, site and fit to the reasons against it.
 
-`reasons_before_fit` looks at the four accelerations alone, by the physics that any truck obeys;
+`reasons_before_fit` looks at the accelerations alone, by the physics that any truck obeys;
 `reasons_after_fit` at what the fit leaves over. What is measured is in
 `pre_core.diagnostics.quality`; here are the thresholds, each with what it was measured to be on
 sound crossings and on broken ones (docs/verdicts.md).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import combinations
 from typing import NamedTuple
 
@@ -18,8 +18,8 @@ from pre_core.crossing import slip
 from pre_core.diagnostics import frozen, quality, receiver
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
-from schemas.signals import CHANNELS
 from schemas.site import Vehicle
+from services.identification import placed
 from services.identification.crossing_data import CrossingData, Floats
 
 # Before the fit. Sound: 300 drawn crossings, none accused (docs/verdicts.md).
@@ -151,19 +151,22 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
 
 
 def coarse_converters(
-    density_ug_per_rthz: tuple[float, ...], acceleration: Floats, step_s: float
+    names: tuple[str, ...],
+    density_ug_per_rthz: tuple[float, ...],
+    acceleration: Floats,
+    step_s: float,
 ) -> str:
     """Return the channels (4, n) whose converter alone is plainly noisier than declared, or "".
 
     Rounding to a step adds noise of the step over the root of twelve.
     """
-    names = []
-    for name, density, values in zip(CHANNELS, density_ug_per_rthz, acceleration, strict=True):
+    found = []
+    for name, density, values in zip(names, density_ug_per_rthz, acceleration, strict=True):
         step = quality.converter_step(values)
         declared = density * MICRO_G_M_PER_S2 * np.sqrt(0.5 / step_s)
         if step / np.sqrt(12.0) > _COARSE * declared:
-            names.append(f"{name} in steps of {step:.2g} m/s²")
-    return ", ".join(names)
+            found.append(f"{name} in steps of {step:.2g} m/s²")
+    return ", ".join(found)
 
 
 def _speeds_differ(data: CrossingData, fit: Fit) -> bool:
@@ -186,7 +189,7 @@ def _speeds_differ(data: CrossingData, fit: Fit) -> bool:
     return bool(abs(scale) > _LARGEST_SPEED_SCALE_Z * np.hypot(spread, _SPEED_SCALE_SPREAD))
 
 
-def steps_of_channels(fit: Fit) -> dict[Reason, str]:
+def steps_of_channels(names: tuple[str, ...], fit: Fit) -> dict[Reason, str]:
     """Return the reason, and the channel's name, where a channel's delay or gain changes.
 
     The fit has spread the step over truck and bridge, so that no number of it can be used.
@@ -196,7 +199,7 @@ def steps_of_channels(fit: Fit) -> dict[Reason, str]:
         return {}
     if abs(step.z) < _LARGEST_STEP_Z[step.kind] * np.sqrt(max(fit.chi2_per_dof, 1.0)):
         return {}
-    name = CHANNELS[step.channel]
+    name = names[step.channel]
     if step.kind == slip.GAIN:
         return {Reason.GAIN_CHANGED: f"{name}, by about {100.0 * step.size:+.2g} %"}
     return {Reason.CHANNEL_SLIPPED: f"{name}, by about {1e3 * step.size:+.2g} ms"}
@@ -289,25 +292,39 @@ def loads_are_alike(vehicle: Vehicle) -> bool:
 
 
 def reasons_before_fit(
-    vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion, direction: int
-) -> dict[Reason, str]:
-    """What the accelerations (4, n) alone say against the crossing, and of which channels.
+    vehicle: Vehicle,
+    acceleration: Floats,
+    step_s: float,
+    motion: Motion,
+    direction: int,
+    spreads: placed.Spreads = placed.USUAL_SPREADS,
+) -> Mapping[Reason, str]:
+    """What the accelerations (m, n) alone say against the crossing, and of which channels.
 
-    All of it forbids a fit. `motion` is where the front axle was at every sample.
+    They are those of the vehicle's channels in their order. All of it forbids a fit. `motion` is
+    where the front axle was at every sample.
     """
-    broken = _broken(acceleration, step_s)
+    broken = _broken(vehicle.channels, acceleration, step_s)
     if broken:
         return broken
-    reasons = order_and_signs(vehicle, acceleration, step_s, motion, direction)
+    disagreeing = placed.disagreement(vehicle, acceleration, step_s, spreads)
+    if disagreeing:
+        return disagreeing
+    readings = placed.middle_of(vehicle, acceleration)
+    one = of_one_sensor(vehicle, acceleration, readings, step_s)
+    if one:
+        return one
+    reasons = order_and_signs(vehicle, readings, step_s, motion, direction)
     if not reasons:
         return {}
-    found = quality.pairing(acceleration, step_s, *body_constants(vehicle))
+    found = quality.pairing(readings, step_s, *body_constants(vehicle))
     named = {Reason.CHANNEL_INVERTED: _inverted, Reason.CHANNEL_SWAPPED: _exchanged}
-    return {reason: named[reason](found) for reason in reasons}
+    names = placed.middle_names(vehicle)
+    return {reason: named[reason](found, names) for reason in reasons}
 
 
-def unmeasured(acceleration: Floats, step_s: float) -> dict[Reason, str]:
-    """Return the reason, and the channels (4, n), of stretches that no sensor measured.
+def unmeasured(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> dict[Reason, str]:
+    """Return the reason, and the channels (m, n), of stretches that no sensor measured.
 
     Anywhere in the record, for all of it is fitted.
     """
@@ -319,7 +336,7 @@ def unmeasured(acceleration: Floats, step_s: float) -> dict[Reason, str]:
         found = [longest_s(values, step_s) for values in acceleration]
         names = [
             f"{name} for {1e3 * seconds:.0f} ms"
-            for name, seconds in zip(CHANNELS, found, strict=True)
+            for name, seconds in zip(channels, found, strict=True)
             if seconds > 0.0
         ]
         if names:
@@ -327,11 +344,40 @@ def unmeasured(acceleration: Floats, step_s: float) -> dict[Reason, str]:
     return {}
 
 
-def _broken(acceleration: Floats, step_s: float) -> dict[Reason, str]:
+def of_one_sensor(
+    vehicle: Vehicle, acceleration: Floats, readings: Floats, step_s: float
+) -> dict[Reason, str]:
+    """Whether one sensor turned round, or two exchanged, explain a body that does not follow.
+
+    Where several sensors make a middle reading: one inverted among them makes it a roll.
+    """
+    if not vehicle.sensors:
+        return {}
+    constants = body_constants(vehicle)
+    recorded = quality.unexplained(readings, step_s, *constants)
+    if recorded <= UNEXPLAINED:
+        return {}
+    best, found = _BETTER * recorded, dict[Reason, str]()
+    names = vehicle.channels
+    pairs = combinations(range(len(names)), 2)
+    for order in [*((k,) for k in range(len(names))), *pairs]:
+        other = acceleration.copy()
+        if len(order) == 1:
+            other[order[0]] *= -1.0
+        else:
+            other[list(order)] = acceleration[list(order[::-1])]
+        left = quality.unexplained(placed.middle_of(vehicle, other), step_s, *constants)
+        if left < best:
+            reason = Reason.CHANNEL_INVERTED if len(order) == 1 else Reason.CHANNEL_SWAPPED
+            best, found = left, {reason: " and ".join(names[k] for k in order)}
+    return found
+
+
+def _broken(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> dict[Reason, str]:
     """The most plain of what is wrong with single channels: it makes the others show as well."""
 
     def those(is_wrong: Callable[[Floats], bool]) -> str:
-        each = zip(CHANNELS, acceleration, strict=True)
+        each = zip(channels, acceleration, strict=True)
         return ", ".join(name for name, values in each if is_wrong(values))
 
     of_each: list[tuple[Reason, Callable[[Floats], bool]]] = [
@@ -343,7 +389,7 @@ def _broken(acceleration: Floats, step_s: float) -> dict[Reason, str]:
     if stuck:
         return {Reason.CHANNEL_STUCK: stuck}
     if quality.smallest_difference(acceleration) < ALIKE:
-        return {Reason.CHANNELS_ALIKE: _alike(acceleration)}
+        return {Reason.CHANNELS_ALIKE: _alike(channels, acceleration)}
     for reason, is_wrong in of_each:
         names = those(is_wrong)
         if names:
@@ -351,26 +397,25 @@ def _broken(acceleration: Floats, step_s: float) -> dict[Reason, str]:
     return {}
 
 
-def _alike(acceleration: Floats) -> str:
-    """Names of channels (4, n) that show the same."""
-    pairs = combinations(range(len(CHANNELS)), 2)
+def _alike(channels: tuple[str, ...], acceleration: Floats) -> str:
+    """Names of channels (m, n) that show the same."""
+    pairs = combinations(range(len(channels)), 2)
     return ", ".join(
-        f"{CHANNELS[i]} and {CHANNELS[k]}"
+        f"{channels[i]} and {channels[k]}"
         for i, k in pairs
         if quality.smallest_difference(acceleration[[i, k]]) < ALIKE
     )
 
 
-def _inverted(found: quality.Pairing) -> str:
+def _inverted(found: quality.Pairing, names: tuple[str, ...]) -> str:
     """Names of channels of which one is inverted."""
-    pairs = zip(("front", "rear"), found.upright, strict=True)
-    ends = [end for end, upright in pairs if upright > UNEXPLAINED]
+    ends = [end for end, upright in enumerate(found.upright) if upright > UNEXPLAINED]
     if not ends:
         return "both of one axle"
-    return " and ".join(f"sprung_{end} or unsprung_{end}" for end in ends)
+    return " and ".join(f"{names[end]} or {names[2 + end]}" for end in ends)
 
 
-def _exchanged(found: quality.Pairing) -> str:
+def _exchanged(found: quality.Pairing, names: tuple[str, ...]) -> str:
     """Names of channels that are exchanged; with "or" where the body's equations know no better.
 
     To them front and rear are alike: if both pairs change places as well, they hold as before. So
@@ -383,7 +428,7 @@ def _exchanged(found: quality.Pairing) -> str:
     moved = [[k for k in range(4) if way[k] != k] for way in ways]
     fewest = min(map(len, moved))
     return ", or ".join(
-        " and ".join(CHANNELS[k] for k in one) for one in sorted(moved) if len(one) == fewest
+        " and ".join(names[k] for k in one) for one in sorted(moved) if len(one) == fewest
     )
 
 

@@ -58,6 +58,7 @@ from services.identification.outputs import (
     crossing_output,
     state_output,
 )
+from services.identification.placed import middle_sensor
 from services.identification.remembered import (
     BridgeCrossings,
     Found,
@@ -219,7 +220,7 @@ class Engine:
         return data._replace(
             vehicle=self._vehicles[data.vehicle.id],
             bridge=self._bridges.bridge(number),
-            sensor=self._site.sensor,
+            sensor=middle_sensor(self._site.sensor, self._vehicles[data.vehicle.id]),
             receiver=self._site.receiver,
             chainage_m=chainage,
         )
@@ -711,12 +712,12 @@ class Engine:
             realm,
             truck.vehicle,
             bridge,
-            self._site.sensor,
+            middle_sensor(self._site.sensor, truck.vehicle),
             self._site.receiver,
             stay,
             fixes,
             chainage,
-            truck.boot.samples(*self._window(truck, bridge, stay)),
+            truck.boot.samples(*self._window(truck, bridge, stay), truck.vehicle.channels),
             wall_offset_s,
             self._against(realm, truck, bridge, stay, crossing_id),
         )

@@ -12,7 +12,7 @@ def footprints_of(
         "width_m": vehicle.tyre_width_m,
         "length_m": vehicle.tyre_contact_length_m,
         "twin_distance_m": vehicle.twin_tyre_distance_m,
-        "track_m": None if vehicle.track_m is None else (vehicle.track_m, vehicle.track_m),
+        "track_m": vehicle.track_m,
     }
     axles = []
     for axle, common in enumerate(usual):

@@ -18,7 +18,6 @@ from pre_core.search.loop import Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
-from schemas.signals import CHANNELS
 from services.identification.checks import reasons_before_fit, unmeasured
 from services.identification.crossing_data import (
     LONGEST_SURE_OUTAGE_S,
@@ -31,6 +30,7 @@ from services.identification.crossing_data import (
     window,
 )
 from services.identification.paper_method import identify_paper
+from services.identification.placed import Spreads, hidden, middle_of
 from services.identification.pre_method import Keep as Keep
 from services.identification.pre_method import identify_pre
 from services.identification.stays import STANDING_M_PER_S, Passage
@@ -81,7 +81,8 @@ def identify(
     reject = partial(rejected, data, settings, passing)
     reasons = _unusable(data, settings.method, trajectory, entry_s, exit_s)
     if reasons or trajectory is None or data.samples is None:
-        return reject(reasons or [Reason.FAILED], {Reason.CHANNEL_MISSING: _missing(data)})
+        about = {Reason.CHANNEL_MISSING: _missing(data), Reason.ROLL_NOT_SEEN: _hidden(data)}
+        return reject(reasons or [Reason.FAILED], about)
     try:
         cut = _cut(data, trajectory, data.samples, passing)
         if cut is None:
@@ -94,9 +95,11 @@ def identify(
             step_s,
             Motion(*(values[near] for values in cut.motion)),
             data.stay.direction,
-        ) or unmeasured(cut.acceleration, step_s)
+            Spreads(data.sensor.gain_spread, data.sensor.delay_spread_s),
+        ) or unmeasured(data.vehicle.channels, cut.acceleration, step_s)
         if broken:
             return reject(broken, broken)
+        cut = cut._replace(acceleration=middle_of(data.vehicle, cut.acceleration))
         if settings.method == "pre":
             return identify_pre(
                 data, settings, passing, *cut, report, lambda: stopwatch() - began, keep
@@ -118,7 +121,8 @@ def identify(
 class _Cut(NamedTuple):
     """The samples of a crossing and where the truck was at them."""
 
-    acceleration: Floats  # (4, n)
+    acceleration: Floats
+    """(m, n) of all channels of the vehicle, in its order; (4, n) once they are reduced."""
     start_s: float
     motion: Motion
 
@@ -134,7 +138,7 @@ def _cut(
     motion = motion_at(trajectory, time_s[part], data.stay.direction)
     driving = _driving(time_s[part], motion, passing)
     return _Cut(
-        np.stack([samples.channels[name][part][driving] for name in CHANNELS]),
+        np.stack([samples.channels[name][part][driving] for name in data.vehicle.channels]),
         float(time_s[part][driving][0]),
         Motion(*(values[driving] for values in motion)),
     )
@@ -221,6 +225,8 @@ def _unusable(
             pass
     if _missing(data):
         reasons.append(Reason.CHANNEL_MISSING)
+    if _hidden(data):
+        reasons.append(Reason.ROLL_NOT_SEEN)
     if data.stay.passage is not Passage.THROUGH:
         return reasons
     outage_s = longest_outage_s(data.fixes.time_s, entry_s, exit_s)
@@ -239,7 +245,12 @@ def _unusable(
 def _missing(data: CrossingData) -> str:
     """Names of the channels that the truck lacks."""
     there = data.samples.channels if data.samples is not None else {}
-    return ", ".join(name for name in CHANNELS if name not in there)
+    return ", ".join(name for name in data.vehicle.channels if name not in there)
+
+
+def _hidden(data: CrossingData) -> str:
+    """Names of the sensors that there are of parts that are measured on one side only."""
+    return hidden(data.vehicle, () if data.samples is None else data.samples.channels)
 
 
 def _size(samples: Samples) -> int:

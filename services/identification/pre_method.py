@@ -49,6 +49,7 @@ from services.identification.crossing_data import (
 from services.identification.footprints import footprints_of
 from services.identification.fusing import stored
 from services.identification.lane import lane_factor
+from services.identification.placed import middle_names
 
 _FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN = 14, 8
 """At least so many in all, and in each of several spans on average, whatever the number of
@@ -206,11 +207,12 @@ def identify_pre(
         "position_shift_m": float(y[posterior.layout(problem).offset]),
     }
     fit = _fit(data, found)
-    broken = steps_of_channels(fit)
+    broken = steps_of_channels(middle_names(data.vehicle), fit)
     reasons = [*broken, *reasons_after_fit(data, fit)]
     if found.ending is not Ending.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
-    coarse = coarse_converters(data.sensor.noise_density_ug_per_rthz, acceleration, inputs.step_s)
+    names, densities = middle_names(data.vehicle), data.sensor.noise_density_ug_per_rthz
+    coarse = coarse_converters(names, densities, acceleration, inputs.step_s)
     about = {**broken, Reason.NOISE_ABOVE_DECLARED: coarse}
     if (coarse or found.noise_power > 1.0) and Reason.NOISE_ABOVE_DECLARED not in reasons:
         reasons.insert(0, Reason.NOISE_ABOVE_DECLARED)

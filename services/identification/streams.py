@@ -7,7 +7,7 @@ they came nor on what came later.
 """
 
 from bisect import insort
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.signals import CHANNELS, MAX_BATCH_S, NS_PER_S, AccelBatch, GnssFix
+from schemas.signals import MAX_BATCH_S, MAX_CHANNELS, NS_PER_S, AccelBatch, GnssFix, in_order
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +27,8 @@ _CLOCK_ERROR = 1e-3
 """How far the declared rate may be off before it says that other samples are missing."""
 _WALL_CLOCK_S = 10.0
 """The wall clock is read off the fixes of this long before a moment."""
+_MOST_NAMES = 10 * MAX_CHANNELS
+"""Names of channels that are remembered of a boot."""
 _JITTER = 8.0
 """Times of batches that are off by this many times the usual are off for another reason."""
 
@@ -90,7 +92,9 @@ class Boot:
         self._first_accel = min(self._first_accel, (batch.sequence, batch.device_time_ns))
         if batch.device_time_ns >= self._forgotten_ns:
             self._batches.setdefault(batch.sequence, batch)
-            self._channels.update(batch.channels)
+            # A truck that names other channels in every batch must not fill the memory.
+            if len(self._channels) <= _MOST_NAMES:
+                self._channels.update(batch.channels)
 
     def add_fix(self, fix: GnssFix) -> bool:
         """Take a fix in; one that is here already is ignored. `settle` makes it known.
@@ -216,11 +220,14 @@ class Boot:
             self._columns = np.ascontiguousarray(columns)
         return Fixes(*self._columns)
 
-    def samples(self, start_s: float, stop_s: float) -> Samples | None:
+    def samples(
+        self, start_s: float, stop_s: float, names: Collection[str] | None = None
+    ) -> Samples | None:
         """Samples from `start` to `stop`, on the grid of the fastest channel.
 
-        A slower channel is interpolated band-limited. A channel that this truck has but that
-        has no sample in this stretch is NaN throughout. None: the truck has no channel at all.
+        Of the channels that have come only `names`, if given, are looked at. A slower channel is
+        interpolated band-limited. A channel that this truck has but that has no sample in this
+        stretch is NaN throughout. None: the truck has no channel at all.
         """
         sequences = [
             sequence
@@ -228,23 +235,23 @@ class Boot:
             if start_s - MAX_BATCH_S < _seconds(batch.device_time_ns) <= stop_s
         ]
         chosen = [self._batches[sequence] for sequence in sorted(sequences)]
+        known = in_order(self._channels if names is None else self._channels & set(names))
         grids = {
             name: grid
-            for name in CHANNELS
+            for name in known
             if (grid := _grid(name, chosen, start_s, stop_s)) is not None
         }
         if not grids:
-            if not self._channels:
+            if not known:
                 return None
-            return Samples(start_s, 1.0, {name: np.empty(0) for name in sorted(self._channels)})
+            return Samples(start_s, 1.0, {name: np.empty(0) for name in sorted(known)})
         fastest = max(grids.values(), key=lambda grid: grid.rate_hz)
         time = fastest.start_s + np.arange(fastest.values.size) / fastest.rate_hz
         channels = {
             name: _resampled(grids[name], time)
             if name in grids
             else np.full(fastest.values.size, np.nan)
-            for name in CHANNELS
-            if name in self._channels
+            for name in known
         }
         slowest_hz = min(grid.rate_hz for grid in grids.values())
         return Samples(fastest.start_s, fastest.rate_hz, channels, slowest_hz)

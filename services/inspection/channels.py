@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from pre_core.diagnostics import quality
 from pre_core.physics.simulate import Motion
-from schemas.reasons import Reason
-from schemas.signals import CHANNELS
+from schemas.reasons import REASON_TEXTS, Reason
 from schemas.site import Sensor, Vehicle
-from services.identification import checks
+from services.identification import checks, placed
+from services.identification.placed import rates_hz
 from services.inspection.finding import Finding, State, judged
 from services.inspection.recorded import Recorded
 
@@ -28,22 +28,31 @@ _LARGEST_FACTOR: Final = 2.5
 """Of k/m from what the site file says: a data sheet's 15 % of both is far within."""
 
 
-def present(run: Recorded) -> Finding:
-    """Whether all four are there."""
-    known = () if run.samples is None else tuple(run.samples.channels)
-    missing = [name for name in CHANNELS if name not in known]
-    return judged(
+def present(run: Recorded, vehicle: Vehicle) -> Iterator[Finding]:
+    """Whether all of the vehicle's are there, and others that the site file does not name."""
+    recorded = () if run.samples is None else tuple(run.samples.channels)
+    missing = [name for name in vehicle.channels if name not in recorded]
+    unknown = [name for name in recorded if name not in vehicle.channels]
+    if unknown:
+        yield Finding(
+            "channels_unknown",
+            State.WRONG,
+            f"{', '.join(unknown)} recorded, not in the site file",
+            "name every accelerometer in [[vehicle.sensors]]: one that is not named is not used",
+        )
+    there = len(vehicle.channels) - len(missing)
+    yield judged(
         "channels_present",
-        f"{len(known)} of {len(CHANNELS)} accelerometers recorded"
+        f"{there} of {len(vehicle.channels)} accelerometers recorded"
         + (f", {', '.join(missing)} missing" if missing else ""),
         "look at plugs and logger: a crossing without one of them is rejected",
         is_wrong=bool(missing),
     )
 
 
-def rates(run: Recorded, sensor: Sensor) -> Iterator[Finding]:
+def rates(run: Recorded, sensor: Sensor, vehicle: Vehicle) -> Iterator[Finding]:
     """Sampling rates against the site file, and what is missing."""
-    for name, declared in zip(CHANNELS, sensor.rate_hz, strict=True):
+    for name, declared in rates_hz(sensor, vehicle).items():
         if name not in run.rates_hz:
             continue
         rate = run.rates_hz[name]
@@ -132,8 +141,25 @@ def _is_saturated(values: Floats) -> bool:
     return checks.is_saturated(values) and any(checks.is_saturated(half) for half in halves)
 
 
+def agreement(vehicle: Vehicle, sensor: Sensor, acceleration: Floats, step_s: float) -> Finding:
+    """Whether the sensors (m, n) of each part agree; only for a truck that names its own."""
+    spreads = placed.Spreads(sensor.gain_spread, sensor.delay_spread_s)
+    found = placed.disagreement(vehicle, acceleration, step_s, spreads)
+    if not found:
+        readings = placed.middle_of(vehicle, acceleration)
+        found = checks.of_one_sensor(vehicle, acceleration, readings, step_s)
+    for reason, names in found.items():
+        return Finding(
+            str(reason),
+            State.WRONG,
+            f"{REASON_TEXTS[reason].removesuffix('.')}: {names}",
+            "look at mounts, cables and the channels' order, and have the sensor calibrated",
+        )
+    return Finding("sensors_agree", State.OK, "sensors of one part do not contradict one another")
+
+
 def in_place(vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion) -> Finding:
-    """Order and signs of the four channels (4, n) of a drive, by the equations of the body."""
+    """Order and signs of the middle readings (4, n) of a drive, by the equations of the body."""
     reasons = checks.order_and_signs(vehicle, acceleration, step_s, motion, 1)
     found = quality.pairing(acceleration, step_s, *checks.body_constants(vehicle))
     explained = 1.0 - found.recorded
@@ -142,13 +168,16 @@ def in_place(vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Moti
         follows = followed(vehicle, acceleration, step_s, motion.position_m)
         if follows.alike > follows.opposite:
             reasons = []
+    names = placed.middle_names(vehicle)
     if Reason.CHANNEL_SWAPPED in reasons:
-        return Finding("channel_swapped", State.WRONG, _swapped(found), "exchange them, or say so")
+        return Finding(
+            "channel_swapped", State.WRONG, _swapped(found, names), "exchange them, or say so"
+        )
     if Reason.CHANNEL_INVERTED in reasons:
         return Finding(
             "channel_inverted",
             State.WRONG,
-            _inverted(found),
+            _inverted(found, names),
             "turn it, or say so by `up` in [sensor]",
         )
     return judged(
@@ -184,26 +213,22 @@ def followed(
     return Followed(float(tried[best]), float(alike[best]), -float(alike.min()))
 
 
-def _swapped(found: quality.Pairing) -> str:
+def _swapped(found: quality.Pairing, names: tuple[str, ...]) -> str:
     if found.recorded <= checks.UNEXPLAINED:
         return "the rear axle meets the road first: front and rear are exchanged"
     pairs = [
-        f"{CHANNELS[k]} looks like {CHANNELS[found.best_order.index(k)]}"
+        f"{names[k]} looks like {names[found.best_order.index(k)]}"
         for k in range(4)
         if found.best_order[k] != k
     ]
     return f"{found.recorded:.0%} of the body's motion unexplained: {', '.join(pairs)}"
 
 
-def _inverted(found: quality.Pairing) -> str:
-    ends = [
-        end
-        for end, upright in zip(("front", "rear"), found.upright, strict=True)
-        if upright > checks.UNEXPLAINED
-    ]
+def _inverted(found: quality.Pairing, names: tuple[str, ...]) -> str:
+    ends = [end for end, upright in enumerate(found.upright) if upright > checks.UNEXPLAINED]
     if not ends:
         return "both channels of one axle are inverted: the axles move against each other"
-    return f"sprung_{ends[0]} or unsprung_{ends[0]} is inverted"
+    return f"{names[ends[0]]} or {names[2 + ends[0]]} is inverted"
 
 
 def wheelbase(

@@ -8,13 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.physics.simulate import Motion
-from schemas.signals import CHANNELS
 from schemas.site import Site, Vehicle
 from schemas.site_file import load_site, parse_site
 from services.common.errors import InputError
 from services.common.progress import Offset, unwatched
+from services.identification.placed import densities_ug_per_rthz, middle_of
 from services.identification.streams import Samples
-from services.inspection.channels import alive, gaps, in_place, masses, present, rates, wheelbase
+from services.inspection.channels import (
+    agreement,
+    alive,
+    gaps,
+    in_place,
+    masses,
+    present,
+    rates,
+    wheelbase,
+)
 from services.inspection.finding import Finding, State
 from services.inspection.noise import Still, noise_of
 from services.inspection.place import place_of
@@ -101,9 +110,10 @@ def of_run(run: Recorded, site: Site) -> Iterator[Finding]:
         )
         return
     vehicle = known[run.vehicle]
-    yield present(run)
+    yield from present(run, vehicle)
+    run = run.of_channels(vehicle.channels)
     if run.samples is not None and run.samples.channels:
-        yield from rates(run, site.sensor)
+        yield from rates(run, site.sensor, vehicle)
         yield gaps(run)
         yield from _of_signals(run, site, vehicle, run.samples)
     yield from receiver_of(run, site.receiver)
@@ -119,7 +129,7 @@ def of_run(run: Recorded, site: Site) -> Iterator[Finding]:
 
 def _of_signals(run: Recorded, site: Site, vehicle: Vehicle, samples: Samples) -> Iterator[Finding]:
     stood, drove = _standstill(run, samples), _drive(run, samples)
-    names = tuple(name for name in CHANNELS if name in samples.channels)
+    names = tuple(name for name in vehicle.channels if name in samples.channels)
     part = np.stack([samples.channels[name][drove or stood or slice(0, None)] for name in names])
     part = part[:, np.isfinite(part).all(axis=0)]
     broken: set[str] = set()
@@ -130,7 +140,7 @@ def _of_signals(run: Recorded, site: Site, vehicle: Vehicle, samples: Samples) -
             elif _is_wrong(finding):
                 broken |= {name for name in names if finding.text.startswith(f"{name}:")}
             yield finding
-    declared = dict(zip(CHANNELS, site.sensor.noise_density_ug_per_rthz, strict=True))
+    declared = densities_ug_per_rthz(site.sensor, vehicle)
     for name in names:
         if name in broken:
             continue
@@ -139,8 +149,13 @@ def _of_signals(run: Recorded, site: Site, vehicle: Vehicle, samples: Samples) -
         is_slow = run.rates_hz.get(name, samples.rate_hz) < _SLOW * samples.rate_hz
         still = Still(quiet, samples.rate_hz, stood is not None)
         yield noise_of(name, None if is_slow else still, declared[name])
-    if len(names) < len(CHANNELS) or broken:
+    if len(names) < len(vehicle.channels) or broken:
         return
+    if vehicle.sensors and drove is not None:
+        agreed = agreement(vehicle, site.sensor, part, 1.0 / samples.rate_hz)
+        yield agreed
+        if _is_wrong(agreed):
+            return
     if drove is None:
         yield Finding(
             "channels_in_place",
@@ -149,7 +164,7 @@ def _of_signals(run: Recorded, site: Site, vehicle: Vehicle, samples: Samples) -
             "check again with ten seconds of driving",
         )
     else:
-        yield from _of_motion(run, vehicle, samples, drove, part)
+        yield from _of_motion(run, vehicle, samples, drove, middle_of(vehicle, part))
 
 
 def _is_wrong(finding: Finding) -> bool:

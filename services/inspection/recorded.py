@@ -1,6 +1,6 @@
 """Runs of trucks as a check looks at them: from recordings, and from folders of CSV files."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -16,6 +16,7 @@ from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_import import read_folder
 from services.drives.importing import vehicle_of
 from services.drives.runs import normalised, run_to_messages
+from services.identification.placed import middle_sensor
 from services.identification.streams import Boot, Fixes, Samples, boot_of
 from services.recordings.recording import Message, read_messages
 
@@ -54,6 +55,13 @@ class Recorded(NamedTuple):
     is_cut: bool
     """Whether the run has more accelerations than were looked at."""
 
+    def of_channels(self, names: Collection[str]) -> "Recorded":
+        """The run without channels other than these."""
+        if self.samples is None:
+            return self
+        there = {name: v for name, v in self.samples.channels.items() if name in names}
+        return self._replace(samples=self.samples._replace(channels=there))
+
 
 def recorded_runs(
     path: Path, site: Site, site_name: str, progress: Offset = unwatched
@@ -87,11 +95,14 @@ def recorded_runs(
 
 def _of_folder(folder: Path, site: Site, site_name: str) -> Iterator[Message]:
     """As `driveby import` would read it, but that rates are judged by the check."""
+    vehicle_id = vehicle_of(site, site_name, None)
     if is_comma2k19(folder):
         runs = [read_comma2k19(folder)]
     else:
-        runs = [normalised(run, site.sensor) for run in read_folder(folder)]
-    return run_to_messages(runs, site, _REALM, vehicle_of(site, site_name, None))
+        vehicle = site.vehicle(vehicle_id)
+        sensor = middle_sensor(site.sensor, vehicle)
+        runs = [normalised(run, sensor) for run in read_folder(folder, channels=vehicle.channels)]
+    return run_to_messages(runs, site, _REALM, vehicle_id)
 
 
 def _recorded(

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from typing import Final
 
-from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
 from services.identification.checks import ALIKE_LOADS, axle_loads_kg
 from services.identification.identify import SLOWEST_M_PER_S
+from services.identification.placed import densities_ug_per_rthz, rates_hz, sensors_in_words
 from services.inspection.finding import Finding, State, judged
 
 SLOWEST_RATE_HZ: Final = 100.0
@@ -21,8 +21,9 @@ _WHEELBASE_M: Final = (1.5, 12.0)
 def findings_of_site(site: Site, vehicle: Vehicle) -> Iterator[Finding]:
     """Loads, masses, tyres, sampling, and the bridges' places."""
     yield from findings_of_truck(vehicle)
-    yield sampling(site.sensor.rate_hz)
-    yield noise_declared(site)
+    yield from sensors_of(site, vehicle)
+    yield sampling(tuple(rates_hz(site.sensor, vehicle).values()))
+    yield noise_declared(site, vehicle)
     for bridge in site.bridges:
         yield from findings_of_bridge(bridge)
 
@@ -100,10 +101,17 @@ def sampling(rates_hz: tuple[float, ...]) -> Finding:
     )
 
 
-def noise_declared(site: Site) -> Finding:
+def sensors_of(site: Site, vehicle: Vehicle) -> Iterator[Finding]:
+    """The sensors of a truck that names its own, with their places."""
+    for line in sensors_in_words(site.sensor, vehicle):
+        yield Finding("sensor", State.OK, line)
+
+
+def noise_declared(site: Site, vehicle: Vehicle) -> Finding:
     """Whether a noise is declared at all."""
-    densities = site.sensor.noise_density_ug_per_rthz
-    silent = [name for name, density in zip(CHANNELS, densities, strict=True) if density == 0.0]
+    declared = densities_ug_per_rthz(site.sensor, vehicle)
+    densities = declared.values()
+    silent = [name for name, density in declared.items() if density == 0.0]
     return judged(
         "noise_declared",
         f"noise declared {' '.join(f'{density:g}' for density in densities)} µg/√Hz"

@@ -26,8 +26,12 @@ gps_antenna_to_front_axle_m = nan     # how far behind the front axle, negative 
 # twin_tyre_distance_m = [0.0, 0.33]  # middle to middle of twin tyres, 0 for single ones
 # tyre_width_m = [0.25, 0.22]         # of the tread
 # tyre_contact_length_m = [0.2, 0.2]
-# track_m = 2.0                       # between the wheels of both sides
+# track_m = 2.0                       # between the wheels of both sides, a pair where they differ:
+                                      # single tyres help where tracks are alike to a centimetre
 # rear_axle_offset_m = 0.005          # how far the rear axle runs to the left of the front one
+# Accelerometers by name and place, where they are not four in the middle: as [[vehicle.sensors]]
+# with channel, on, axle or position_m, lateral_m, noise_density_ug_per_rthz, rate_hz.
+# sensors = []
 # total_mass_kg_spread = 0.01
 # wheelbase_m_spread = 0.002
 # front_axle_to_cg_m_spread = 0.15

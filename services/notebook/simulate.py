@@ -12,6 +12,7 @@ from services.common.errors import InputError
 from services.drives.runs import run_to_messages
 from services.drives.signals import Signals, signals_of_run
 from services.execution.blas import one_blas_thread
+from services.identification.placed import middle_site
 from services.notebook.read import Name, given_site
 from services.recordings.recording import Message
 from services.simulation.drive import (
@@ -103,7 +104,7 @@ def simulate(
     ):
         if not low <= value <= high:
             raise InputError(f"{what} is {value:g}, it must be from {low:g} to {high:g}")
-    known = paper_site() if site is None else given_site(site)
+    known = paper_site() if site is None else middle_site(given_site(site))
     with one_blas_thread():
         drive = simulate_drive(
             known,

@@ -106,7 +106,11 @@ def warnings(found: Survey) -> Iterator[str]:
     """What makes a survey with this truck and these sensors blind, or its forecast doubtful."""
     site = found.planned.plan.site
     vehicle = site.vehicles[0]
-    of_site = [*findings_of_truck(vehicle), sampling(site.sensor.rate_hz), noise_declared(site)]
+    of_site = [
+        *findings_of_truck(vehicle),
+        sampling(site.sensor.rate_hz),
+        noise_declared(site, vehicle),
+    ]
     # The bridge's speed is judged below, with that of the command line.
     of_bridge = (f for f in findings_of_bridge(site.bridges[0]) if f.name != "survey_speed")
     for finding in (*of_site, *of_bridge):

@@ -18,6 +18,7 @@ from services.history.archive import bridges_of
 from services.history.past import Past, past_of
 from services.history.periods import Unit
 from services.identification.comparison import Estimate, compare
+from services.identification.placed import sensors_in_words
 from services.viewer.baseline import named_baseline, stored_baseline
 from services.viewer.bridge_view import BridgeView, told, view_of_bridge
 
@@ -41,6 +42,12 @@ _ADVICE = {
     Reason.CHANNEL_STUCK: "Look at plugs and sensors: one of them does not measure.",
     Reason.CHANNEL_BRIDGED: "Leave missing samples out, rather than bridge them before the import.",
     Reason.CHANNELS_ALIKE: "Look at the wiring: one sensor seems to be recorded twice.",
+    Reason.ROLL_NOT_SEEN: (
+        "Put a second sensor on the other side of the part, or this one in the middle."
+    ),
+    Reason.SENSORS_DISAGREE: (
+        "Look at the mounts and the cables of these sensors, and have their gains calibrated."
+    ),
     Reason.CHANNEL_BIASED: "Declare whether gravity is in the signals, or change the sensor.",
     Reason.SIGNAL_SPIKES: "Look at cables and plugs, and at what else is on the sensors' supply.",
     Reason.CHANNEL_SLIPPED: "Look for samples that this sensor, its buffer or the import loses.",
@@ -107,6 +114,8 @@ class BridgeReport(NamedTuple):
     quality: str
     past: Past | None = None
     """What a history holds of it, if one was given."""
+    sensors: tuple[str, ...] = ()
+    """A line for each sensor of the trucks that name their own."""
 
 
 def bridge_reports(
@@ -192,6 +201,18 @@ def _report(
         baseline_name,
         _finding(view, crossings, stored),
         _quality(view, crossings),
+        sensors=_sensors(site, crossings),
+    )
+
+
+def _sensors(site: Site, crossings: Sequence[Crossing]) -> tuple[str, ...]:
+    """Sensors of the trucks that crossed, by their places; nothing of four in the middle."""
+    drove = {crossing.vehicle for crossing in crossings}
+    return tuple(
+        f"{vehicle.id} {line}"
+        for vehicle in site.vehicles
+        if vehicle.id in drove
+        for line in sensors_in_words(site.sensor, vehicle)
     )
 
 

@@ -160,6 +160,7 @@ def _facts(report: BridgeReport) -> Html:
         ("Quality", report.quality),
         *([] if report.view.estimate is None else [("Compared with", compared)]),
         ("Road", _road(crossings)),
+        *([("Sensors", "; ".join(report.sensors))] if report.sensors else []),
         *([] if report.past is None else [("Over time", past_in_short(report.past))]),
         ("Source", f"{', '.join(report.sources)}; {', '.join(report.programs)}"),
     ]

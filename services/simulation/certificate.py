@@ -41,6 +41,7 @@ from schemas.results import Crossing
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site, Vehicle
 from services.common.errors import FailureError
+from services.identification.placed import middle_sensor, middle_site
 from services.recordings.recording import program_version
 from services.simulation.drawn import Truth, draw_truth, drive, see
 from services.simulation.drive import beam_of
@@ -191,24 +192,28 @@ def tried_in_processes(trial: Trial, pool: ProcessPoolExecutor, processes: int) 
 
 
 def alone_on(site: Site, pair: Pair) -> Site:
-    """The site with this vehicle and this bridge only; KeyError if it has no such pair."""
+    """The site with this vehicle and this bridge only; KeyError if it has no such pair.
+
+    Sensors of the vehicle are reduced to its middle readings: that is what is simulated.
+    """
     chosen = {
         "vehicles": (site.vehicle(pair.vehicle),),
         "bridges": (site.bridge(pair.bridge),),
     }
-    return site.model_copy(update=chosen)
+    return middle_site(site.model_copy(update=chosen))
 
 
 def conditions_of(vehicle: Vehicle, bridge: Bridge, site: Site) -> Conditions:
     """What the site file says of road, speed and sensors, or what is usual."""
+    sensor = middle_sensor(site.sensor, vehicle)
     twin = vehicle.twin_tyre_distance_m is not None and vehicle.twin_tyre_distance_m[1] > 0.0
     return Conditions(
         speed_m_per_s=bridge.survey_speed_m_per_s or _SPEED_M_PER_S,
         road_class=bridge.road_class or _ROAD_CLASS,
         road="surface" if twin or vehicle.rear_axle_offset_m else "groove",
         # A simulated truck has one rate: the poorest of its sensors'.
-        rate_hz=min(site.sensor.rate_hz),
-        noise_density_ug_per_rthz=site.sensor.noise_density_ug_per_rthz,
+        rate_hz=min(sensor.rate_hz),
+        noise_density_ug_per_rthz=sensor.noise_density_ug_per_rthz,
     )
 
 

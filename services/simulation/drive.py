@@ -30,12 +30,7 @@ from pre_core.physics.sensors import (
     measure_acceleration,
     measure_position,
 )
-from pre_core.physics.simulate import (
-    Motion,
-    Simulation,
-    constant_acceleration,
-    simulate,
-)
+from pre_core.physics.simulate import Motion, Simulation, constant_acceleration, simulate
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
@@ -46,6 +41,7 @@ from services.common.files import check_writable
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.common.progress import steps_bar
 from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.identification.placed import middle_site
 from services.recordings.writer import write_recording
 from services.simulation.wheel_paths import (
     AxleRoads,
@@ -162,7 +158,7 @@ def simulate_command(
     `twist` is lane offset in m, ratio of torsional to bending frequency and deck gyration in m.
     """
     check_writable(output, force=force)
-    known = paper_site() if site is None else load_site(site)
+    known = paper_site() if site is None else middle_site(load_site(site))
     ratios = ratios_of(known.bridges[0], scenario, ei)
     if twist is not None:
         beyond = beyond._replace(twist=twist_of(known.bridges[0], *twist))

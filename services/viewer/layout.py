@@ -245,15 +245,28 @@ def acceleration_plots(
 
     All of it, or with `window_s` what lies so shortly before the moment that is looked at.
     """
-    return [
-        _plot(origin, f"{vehicle} {name} accelerations (m/s²)".strip(), part, window_s)
-        for part, name in (("sprung", "Body"), ("unsprung", "Axle"))
-        if f"{part}_front" in channels or f"{part}_rear" in channels
-    ]
+    plots = []
+    for part, name in (("sprung", "Body"), ("unsprung", "Axle"), ("", "Other")):
+        own = sorted(one for one in channels if _part(one) == part)
+        if own:
+            four = [f"{part}_front", f"{part}_rear"] if part else []
+            entities = [*four, *(one for one in own if one not in four), ENDS]
+            title = f"{vehicle} {name} accelerations (m/s²)".strip()
+            plots.append(_plot(origin, title, entities, window_s))
+    return plots
+
+
+def _part(channel: str) -> str:
+    """By the beginning of its name what a channel is plotted with: the site file is not at hand."""
+    part = channel.partition("_")[0]
+    return part if part in ("sprung", "unsprung") else ""
 
 
 def _plot(
-    origin: str, name: str, only: str | None = None, window_s: float | None = None
+    origin: str,
+    name: str,
+    only: Sequence[str] | None = None,
+    window_s: float | None = None,
 ) -> rrb.View:
     """A plot of all of a series, not only of what lies before the time cursor, or of a window."""
     start = end = rrb.TimeRangeBoundary.infinite()
@@ -263,11 +276,7 @@ def _plot(
         end = rrb.TimeRangeBoundary.cursor_relative(seconds=0.0)
         timelines = [TIME]
     shown = [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline in timelines]
-    contents = (
-        "$origin/**"
-        if only is None
-        else [f"$origin/{only}_front", f"$origin/{only}_rear", f"$origin/{ENDS}"]
-    )
+    contents = "$origin/**" if only is None else [f"$origin/{one}" for one in only]
     return rrb.TimeSeriesView(
         origin=origin,
         contents=contents,

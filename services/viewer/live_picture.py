@@ -58,8 +58,8 @@ from services.viewer.live_parts import (
 from services.viewer.rerun_crossing import log_rigidity
 from services.viewer.rerun_file import acceleration_series
 from services.viewer.rerun_parts import (
-    CHANNEL_COLOURS,
     MUTED,
+    channel_colour,
     columns_of,
     log_line,
     rgb,
@@ -208,7 +208,7 @@ class LivePicture:
         for channel in batch.channels.keys() - truck.channels:
             truck.channels.add(channel)
             entity = f"vehicle/{vehicle}/acceleration/{channel}"
-            log_line(self._recording, entity, channel.replace("_", " "), CHANNEL_COLOURS[channel])
+            log_line(self._recording, entity, channel.replace("_", " "), channel_colour(channel))
             self._layout_is_old = True
         truck.batches.append(batch)
 

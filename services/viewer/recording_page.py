@@ -6,8 +6,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 
 from schemas.results import Crossing
+from schemas.site import Site
 from services.drives.survey import Survey, Truck
 from services.identification.bridges import Passing
+from services.identification.placed import sensors_in_words
 from services.identification.stays import MERGE_S, Passage
 from services.viewer.crossing_view import PassingView
 
@@ -43,7 +45,9 @@ def recording_page(found: Survey) -> str:
     seconds = (found.last_ns - found.first_ns) * _S
     lines = [f"# {found.path.name}", ""]
     lines += [f"{_moment(found.first_ns)} UTC, {_length(seconds)}{_state(found)}.", ""]
-    lines += [f"- {_truck(truck)}" for truck in found.trucks]
+    for truck in found.trucks:
+        lines.append(f"- {_truck(truck)}")
+        lines += [f"  - {line}" for line in _sensors(truck, found.site)]
     if found.site is None:
         lines.append(f"- {found.site_error or 'No site file in it: its bridges are not known.'}")
     else:
@@ -85,6 +89,14 @@ def _truck(truck: Truck) -> str:
     missing = sum(stream.missing for stream in truck.streams.values())
     lost = f", **{missing} messages missing**" if missing else ""
     return f"Truck **{truck.vehicle}** ({truck.realm}): {channels}{lost}"
+
+
+def _sensors(truck: Truck, site: Site | None) -> list[str]:
+    """Places of the sensors, of a truck that names its own."""
+    if site is None:
+        return []
+    known = (vehicle for vehicle in site.vehicles if vehicle.id == truck.vehicle)
+    return [line for vehicle in known for line in sensors_in_words(site.sensor, vehicle)]
 
 
 def _state(found: Survey) -> str:

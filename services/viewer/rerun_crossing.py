@@ -29,12 +29,12 @@ from services.viewer.layout import ENDS, LEARNED_ROW, crossing_root, is_doubtful
 from services.viewer.learned import Learned, learned_of
 from services.viewer.rerun_parts import (
     BASELINE,
-    CHANNEL_COLOURS,
     MUTED,
     WEAK,
     IntArray,
     Stream,
     chainage_column,
+    channel_colour,
     columns_of,
     log_labels,
     log_line,
@@ -119,7 +119,7 @@ def log_acceleration(recording: Stream, root: str, crossing: OnBridge, channels:
     for channel, (time_ns, samples) in channels.items():
         inside = (time_ns >= first_ns) & (time_ns <= last_ns)
         entity = f"{root}/acceleration/{channel}"
-        log_line(recording, entity, channel.replace("_", " "), CHANNEL_COLOURS[channel])
+        log_line(recording, entity, channel.replace("_", " "), channel_colour(channel))
         send_scalars(
             recording,
             entity,

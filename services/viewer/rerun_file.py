@@ -32,8 +32,8 @@ from services.viewer.rerun_crossing import (
     log_position,
 )
 from services.viewer.rerun_parts import (
-    CHANNEL_COLOURS,
     IntArray,
+    channel_colour,
     log_line,
     log_markdown,
     send_scalars,
@@ -161,7 +161,7 @@ def _log_accelerations(
             entity = f"vehicle/{vehicle}/acceleration/{channel}"
             if channel not in named:
                 named.add(channel)
-                log_line(recording, entity, channel.replace("_", " "), CHANNEL_COLOURS[channel])
+                log_line(recording, entity, channel.replace("_", " "), channel_colour(channel))
             known = piece[0].channels.get(channel) if first else None
             sent = 0 if known is None else known.samples.size
             send_scalars(recording, entity, samples[sent:], time_ns=time_ns[sent:])

@@ -36,12 +36,20 @@ CHANNEL_COLOURS = {
     "unsprung_front": VEHICLE_COLOURS["front"],
     "unsprung_rear": VEHICLE_COLOURS["rear"],
 }
+_OTHER_CHANNELS = ("#0072B2", "#CC79A7", "#999999", "#44AA99", "#882255", "#DDCC77")
 MUTED = "#9AA5B1"
 WEAK, BASELINE = "#E69F00", "#009E73"
 UNKNOWN = "#CC79A7"
 """Of a bridge of which nothing is known: none of the colours that say something."""
 _RATIO_COLOURS = ((0.5, (213, 94, 0)), (0.75, (240, 228, 66)), (1.0, (86, 180, 233)))
 RATIO_LEGEND = "blue 1, yellow 0.75, orange 0.5 of nominal"
+
+
+def channel_colour(channel: str) -> str:
+    """Return the colour of a channel: one of its own for the four, else one by its name."""
+    if channel in CHANNEL_COLOURS:
+        return CHANNEL_COLOURS[channel]
+    return _OTHER_CHANNELS[sum(channel.encode()) % len(_OTHER_CHANNELS)]
 
 
 def rgb(colour: str) -> Rgb:

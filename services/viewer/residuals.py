@@ -17,7 +17,6 @@ from pre_core.crossing.preparation import Inputs
 from pre_core.diagnostics import quality
 from schemas.results import Crossing, Header
 from schemas.settings import IdentificationSettings
-from schemas.signals import CHANNELS
 from schemas.site import Site
 from services.common.progress import Steps, unwatched_steps
 from services.execution.blas import one_blas_thread
@@ -25,6 +24,7 @@ from services.execution.dispatch import feed_all
 from services.execution.here import Here
 from services.identification.crossing_data import CrossingData, nominal_parameters
 from services.identification.engine import Engine
+from services.identification.placed import middle_of
 from services.identification.pre_method import inputs_of
 from services.recordings.recording import Message
 from services.viewer.crossing_view import FloatArray, ResidualCells
@@ -111,9 +111,10 @@ def _cells(data: CrossingData, result: Crossing) -> ResidualCells | None:
 def _inputs(data: CrossingData) -> Inputs | None:
     """The unbroken samples around the crossing, as method `pre` takes them."""
     samples = data.samples
-    if samples is None or any(name not in samples.channels for name in CHANNELS):
+    channels = data.vehicle.channels
+    if samples is None or any(name not in samples.channels for name in channels):
         return None
-    acceleration = np.stack([samples.channels[name] for name in CHANNELS])
+    acceleration = middle_of(data.vehicle, np.stack([samples.channels[name] for name in channels]))
     holes = np.flatnonzero(~np.isfinite(acceleration).all(axis=0))
     middle_s = 0.5 * (data.stay.entry_s + data.stay.exit_s)
     middle = round((middle_s - samples.start_s) * samples.rate_hz)

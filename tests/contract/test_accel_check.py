@@ -16,14 +16,19 @@ TIME_NS = 1_700_000_000_000_000_000
 LIMIT = signals.MAX_ACCELERATION_M_PER_S2
 
 
-def encoded(*channels: tuple[int, float, list[float]], **header: int) -> bytes:
+def encoded(
+    *channels: tuple[int, float, list[float]], names: tuple[str, ...] = (), **header: int
+) -> bytes:
     known = {"schema_version": 1, "boot_id": TIME_NS, "sequence": 5, "device_time_ns": 7}
     message = pb.AccelBatch(**{**known, "wall_time_ns": TIME_NS, **header})
-    for position, rate_hz, samples in channels:
+    for (position, rate_hz, samples), name in zip(
+        channels, names or ("",) * len(channels), strict=True
+    ):
         message.channels.add(
             position=position,  # type: ignore[arg-type]  # also of no known channel
             rate_hz=rate_hz,
             acceleration_m_per_s2=samples,
+            name=name,
         )
     return message.SerializeToString()
 
@@ -41,12 +46,14 @@ def assert_same(payload: bytes) -> None:
 
 BATCH = encoded(*[(position, 1000.0, [0.5] * 50) for position in (1, 2, 3, 4)])
 SHORT = encoded((1, 200.0, [0.5] * 10), (3, 200.0, [0.5] * 12))
+NAMED = encoded((1, 200.0, [0.5] * 10), (0, 200.0, [0.5] * 12), names=("", "axle_1_left"))
+NAMED_LONG = encoded((0, 1000.0, [0.5] * 50), (0, 200.0, [0.5] * 2), names=("a" * 63, "b"))
 
 
 @st.composite
 def edited(draw: st.DrawFn) -> bytes:
     """Return a batch in which bytes have been changed, put in, taken out or repeated."""
-    payload = draw(st.sampled_from([BATCH, SHORT]))
+    payload = draw(st.sampled_from([BATCH, SHORT, NAMED, NAMED_LONG]))
     for _ in range(draw(st.integers(1, 3))):
         # What stands between the samples is what matters, and most of it is at the beginning.
         first = draw(st.integers(0, min(len(payload), 80)) | st.integers(0, len(payload)))
@@ -60,6 +67,15 @@ def edited(draw: st.DrawFn) -> bytes:
 @example(BATCH)
 @example(SHORT)
 @example(BATCH + SHORT)
+@example(NAMED)
+@example(NAMED + BATCH)
+@example(NAMED.replace(b"axle_1_left", b"unsprung_fr"))
+@example(NAMED.replace(b"axle_1_left", b"Axle_1_left"))
+@example(NAMED.replace(b"axle_1_left", b"axle_1_l\xfft"))
+@example(NAMED.replace(b"\x22\x0baxle", b"\x22\x0aaxle"))
+@example(NAMED.replace(b"\x22\x0baxle", b"\x2a\x0baxle"))
+@example(NAMED[:-1])
+@example(NAMED_LONG)
 @example(BATCH + b"\x10\x01")
 @example(BATCH + b"\x3a\x01\x00")
 @example(BATCH.replace(b"\x32", b"\x3a", 1))
@@ -96,6 +112,37 @@ rates = st.sampled_from([1000.0, 20.0, 50_000.0, 50_001.0, 0.0, -1.0, math.nan])
 @example([(1, 20.0, (0.5, 50))])
 def test_any_channels(channels: list[tuple[int, float, tuple[float, int]]]) -> None:
     assert_same(encoded(*[(place, rate, [v] * n) for place, rate, (v, n) in channels]))
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 2),
+            st.sampled_from(
+                ["", "a", "sprung_front", "sprung_rear", "Front", "ü", "a" * 63, "a" * 64]
+            ),
+        ),
+        max_size=4,
+    )
+)
+@example([(1, "sprung_front")])
+@example([(0, "sprung_front"), (1, "")])
+def test_any_names(channels: list[tuple[int, str]]) -> None:
+    names = tuple(name for _, name in channels)
+    assert_same(encoded(*[(place, 200.0, [0.5] * 10) for place, _ in channels], names=names))
+
+
+@pytest.mark.parametrize("number", [signals.MAX_CHANNELS, signals.MAX_CHANNELS + 1])
+def test_channels_are_bounded(number: int) -> None:
+    names = tuple(f"a{k}" for k in range(number))
+    payload = encoded(*[(0, 200.0, [0.5])] * number, names=names)
+    assert_same(payload)
+    assert (accel_check._stamp_if_usual(payload) is None) == (number > signals.MAX_CHANNELS)
+
+
+@pytest.mark.parametrize("payload", [BATCH, SHORT, NAMED, NAMED_LONG])
+def test_named_channels_are_of_the_usual_form(payload: bytes) -> None:
+    assert accel_check._stamp_if_usual(payload) is not None
 
 
 @pytest.mark.parametrize("boot_id", [0, 1, 2**64 - 1])

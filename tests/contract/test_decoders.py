@@ -1,6 +1,7 @@
 """Decoders take any bytes: a message or a ValueError of one line, never anything else."""
 
 import math
+import struct
 from collections.abc import Callable
 from typing import Any
 
@@ -69,7 +70,7 @@ def test_valid_bytes_with_one_changed_or_cut_off(stream: str, data: st.DataObjec
 @given(
     headers,
     st.dictionaries(
-        st.sampled_from(signals.CHANNELS),
+        st.sampled_from([*signals.CHANNELS, "axle_1_left", "a" * 63]),
         st.tuples(
             st.floats(100.0, signals.MAX_RATE_HZ), st.lists(finite, min_size=1, max_size=100)
         ),
@@ -89,6 +90,38 @@ def test_accel_round_trip(
     for name, channel in batch.channels.items():
         assert again.channels[name].rate_hz == channel.rate_hz
         np.testing.assert_array_equal(again.channels[name].samples, channel.samples)
+
+
+def test_the_four_channels_travel_as_before_names() -> None:
+    """Bytes of a batch that the first version wrote: a position, a rate, one sample."""
+    channel = b"\x08\x03\x11" + struct.pack("<d", 200.0) + b"\x1a\x08" + struct.pack("<d", 0.5)
+    old = b"\x08\x01\x10\x01\x18\x02\x20\x03\x28" + _varint(TIME_NS) + b"\x32\x15" + channel
+    batch = signals.decode_accel(old)
+    assert batch.channels["unsprung_front"].samples.tolist() == [0.5]
+    assert signals.encode_accel(batch) == old
+
+
+def test_a_channel_has_one_name() -> None:
+    message = pb.AccelBatch.FromString(VALID["accel"])
+    message.channels[0].name = "axle_1_left"
+    with pytest.raises(ValueError, match="sprung_front has another name, 'axle_1_left'"):
+        signals.decode_accel(message.SerializeToString())
+
+
+def test_a_batch_of_too_many_channels_is_refused() -> None:
+    channel = signals.Channel(200.0, np.array([0.5]))
+    names = [f"a{k}" for k in range(signals.MAX_CHANNELS + 1)]
+    batch = signals.AccelBatch(1, 2, 3, TIME_NS, dict.fromkeys(names, channel))
+    with pytest.raises(ValueError, match="33 channels; at most 32"):
+        signals.encode_accel(batch)
+
+
+def _varint(number: int) -> bytes:
+    parts = []
+    while number >= 0x80:
+        parts.append(number & 0x7F | 0x80)
+        number >>= 7
+    return bytes([*parts, number])
 
 
 @given(

@@ -19,7 +19,7 @@ def told(seed: int | None, fault: Fault, step_m_per_s2: float = 0.0) -> dict[Rea
         channels = faults.quantised(channels, step_m_per_s2)
     channels = fault.channels(channels, case.run.accel_time_s - case.entry_s)
     acceleration = np.stack([channels[name] for name in CHANNELS])
-    return unmeasured(acceleration, 1.0 / truth.rate_hz)
+    return unmeasured(CHANNELS, acceleration, 1.0 / truth.rate_hz)
 
 
 @pytest.mark.parametrize("seconds", [0.05, 0.2])

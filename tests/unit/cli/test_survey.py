@@ -8,6 +8,8 @@ import matplotlib
 import numpy as np
 import pytest
 
+from schemas.site import Site
+from schemas.site_file import site_toml
 from services.cli import main as cli
 from services.cli.survey import lines_of
 from services.planning import survey as planning
@@ -120,6 +122,38 @@ def test_what_makes_a_survey_blind_is_warned_of() -> None:
     assert [line for line in slow if "below 3 m/s a crossing is rejected" in line]
     short = list(warnings(made_up(9, {})._replace(compared_m=8.0)))
     assert [line for line in short if "8 m of road beside the bridge" in line]
+
+
+def test_sensors_are_named_and_their_middle_is_planned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planned: list[Site] = []
+
+    def kept(site: Site, *_: object) -> Survey:
+        planned.append(site)
+        return made_up(9, {})
+
+    monkeypatch.setattr(planning, "survey", kept)
+    site, found = tmp_path / "site.toml", tmp_path / "plan.json"
+    text = site_toml(paper_site())
+    places = (("body", 0.0), ("body", 4.4), ("axle", 1), ("axle", 2))
+    for number, (on, place) in enumerate(places):
+        for side, lateral in (("left", 0.5), ("right", -0.5)):
+            where = f"axle = {place}" if on == "axle" else f"position_m = {place}"
+            text = text.replace(
+                "[bridge]",
+                f'[[vehicle.sensors]]\nchannel = "s{number}_{side}"\non = "{on}"\n{where}\n'
+                f"lateral_m = {lateral}\nnoise_density_ug_per_rthz = 10.0\n[bridge]",
+                1,
+            )
+    site.write_text(text)
+    assert cli.main(["survey", "--site", str(site), "--json", str(found)]) == 0
+    out = capsys.readouterr().out
+    assert "sensor s2_left: axle 1, 0.5 m to the left, 10 µg/√Hz" in out
+    sensors = json.loads(found.read_text(encoding="utf-8"))["sensors"]
+    assert [one["channel"] for one in sensors][:2] == ["s0_left", "s0_right"]
+    assert planned[0].vehicles[0].sensors == ()
+    assert planned[0].sensor.noise_density_ug_per_rthz == pytest.approx((10.0 / 2**0.5,) * 4)
 
 
 def test_every_word_of_the_picture_can_be_read() -> None:

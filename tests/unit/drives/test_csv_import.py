@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from schemas.signals import CHANNELS
+from schemas.site_file import load_site
 from services.common.errors import InputError
 from services.drives.csv_import import read_folder, read_pair
 from services.drives.runs import Run
@@ -68,7 +69,7 @@ def test_a_folder_is_read_exactly() -> None:
 def test_the_independent_crossings_are_read(shared: Path) -> None:
     runs = {
         folder.name: read_folder(folder)
-        for folder in (shared / "crossings").iterdir()
+        for folder in (shared / "crossings").glob("d[1-9]_*")
         if folder.is_dir()
     }
     assert {name: len(found) for name, found in runs.items()} == {
@@ -90,6 +91,54 @@ def test_the_independent_crossings_are_read(shared: Path) -> None:
             assert run.gnss.speed_m_per_s.mean() == pytest.approx(10.0, abs=within)
     starts = [run.accel_time_s[0] for run in runs["d3_edge_damage_4_runs"]]
     assert starts == sorted(starts)
+
+
+def test_columns_are_the_channels_that_the_site_names(shared: Path) -> None:
+    folder = shared / "crossings" / "d10_left_and_right_8_runs"
+    channels = load_site(folder / "site.toml").vehicles[0].channels
+    runs = read_folder(folder, channels=channels)
+    assert len(runs) == 8
+    assert all(set(run.channels) == set(channels) for run in runs)
+    with pytest.raises(InputError, match='line 1: unknown column "sprung_front_right", the colu'):
+        read_folder(folder)
+
+
+def named_columns(folder: Path, header: str) -> tuple[Path, Path]:
+    lines = ACCEL.splitlines()
+    (folder / "accel_00.csv").write_text("\n".join([header, *lines[1:]]) + "\n")
+    (folder / "gps_00.csv").write_text(GPS)
+    return folder / "accel_00.csv", folder / "gps_00.csv"
+
+
+def test_columns_are_named_in_any_order(tmp_path: Path) -> None:
+    files = named_columns(tmp_path, "time_s,axle_1_left,f,r,axle_1_right")
+    run = read_pair(*files, ("f", "r", "axle_1_left", "axle_1_right", "absent"))
+    assert tuple(run.channels) == ("axle_1_left", "f", "r", "axle_1_right")
+    with pytest.raises(InputError) as caught:
+        read_pair(*files, ("f", "r", "axle_1_left"))
+    assert str(caught.value) == (
+        f'{files[0]}: line 1: unknown column "axle_1_right", the columns time_s and f, r, '
+        "axle_1_left expected"
+    )
+
+
+def test_without_a_site_any_name_of_a_channel_will_do(tmp_path: Path) -> None:
+    files = named_columns(tmp_path, "time_s,a,b,c,sprung_front")
+    assert tuple(read_pair(*files, None).channels) == ("a", "b", "c", "sprung_front")
+    for bad in ("Front", "latitude_deg"):
+        files = named_columns(tmp_path, f"time_s,a,b,c,{bad}")
+        with pytest.raises(InputError, match=f'unknown column "{bad}"'):
+            read_pair(*files, None)
+
+
+def test_a_named_channel_has_limits(tmp_path: Path) -> None:
+    files = named_columns(tmp_path, "time_s,a,b,c,d")
+    text = files[0].read_text().splitlines()
+    fields = text[5].split(",")
+    text[5] = ",".join([*fields[:2], "1e5", *fields[3:]])
+    files[0].write_text("\n".join(text))
+    with pytest.raises(InputError, match="line 6: b is 1e5, it must be an acceleration in m/s²"):
+        read_pair(*files, ("a", "b", "c", "d"))
 
 
 def test_columns_may_be_missing_and_in_any_order(tmp_path: Path) -> None:

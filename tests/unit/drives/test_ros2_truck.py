@@ -48,6 +48,36 @@ def accelerations(of: Ros2Truck, make: Callable[[int], bytes], count: int = 20) 
     return np.concatenate(batches) if batches else np.empty(0)
 
 
+def test_topics_become_the_channels_that_the_vehicle_names() -> None:
+    sensors = "".join(
+        f'[[vehicle.sensors]]\nchannel = "{name}"\nnoise_density_ug_per_rthz = 25\n{where}\n'
+        for name, where in (
+            ("f", 'on = "body"\nposition_m = 0.0'),
+            ("r", 'on = "body"\nposition_m = 4.4'),
+            ("a", 'on = "axle"\naxle = 1\nrate_hz = 500.0'),
+            ("b", 'on = "axle"\naxle = 2'),
+        )
+    )
+    declared = site_toml(paper_site()).replace("[bridge]", f"{sensors}[bridge]")
+    text = f"""
+[ros2]
+vehicle = "truck-1"
+gnss = "/gps/fix"
+velocity = "/gps/vel"
+[ros2.imu]
+a = {{ topic = "{FRONT}" }}
+"""
+    one = Ros2Truck(parse_site(declared + text, "site.toml"), "site.toml", "truck-1")
+    found: list[Accel | GnssFix] = []
+    for number in range(20):
+        stamp_ns = FIRST_NS + number * 2_000_000
+        found += one.take(FRONT, IMU, ros2.imu(stamp_ns, 1.5), stamp_ns)
+    found += one.finish()
+    batches = [batch for batch in found if isinstance(batch, Accel)]
+    assert {name for batch in batches for name in batch.channels} == {"a"}
+    assert sum(batch.channels["a"].samples.size for batch in batches) == 20
+
+
 @pytest.mark.parametrize(
     ("extra", "gravity", "expected"),
     [

@@ -91,6 +91,31 @@ def test_batches_in_any_order_and_twice_are_one_signal() -> None:
     np.testing.assert_allclose(relative_times(found), np.arange(2000) / 1000.0, rtol=0, atol=1e-9)
 
 
+def test_named_channels_come_behind_the_four_and_only_those_asked_for() -> None:
+    """A channel that nobody asked for must not make the grid of the others."""
+    rates = {"unsprung_front": 1000.0, "b": 500.0, "a": 1000.0, "cabin": 2000.0}
+
+    def one(k: int) -> dict[str, tuple[float, Floats]]:
+        return {name: (rate, np.full(round(0.05 * rate), 1.0 * k)) for name, rate in rates.items()}
+
+    boot = boot_with([batch(k, 0.05 * k, one(k)) for k in range(40)])
+    every = boot.samples(START_NS / NS, START_NS / NS + 2.0)
+    assert every is not None
+    assert (list(every.channels), every.rate_hz) == (["unsprung_front", "a", "b", "cabin"], 2000.0)
+    some = boot.samples(START_NS / NS, START_NS / NS + 2.0, ("a", "b", "absent"))
+    assert some is not None
+    assert (list(some.channels), some.rate_hz, some.slowest_rate_hz) == (["a", "b"], 1000.0, 500.0)
+    assert boot.samples(START_NS / NS, START_NS / NS + 2.0, ("absent",)) is None
+
+
+def test_names_of_channels_do_not_fill_the_memory() -> None:
+    boot = Boot()
+    for k in range(1000):
+        names = {f"c{k}_{n}": (1000.0, np.zeros(1)) for n in range(32)}
+        boot.add_accel(batch(k, 0.05 * k, names))
+    assert len(boot._channels) < 400
+
+
 def test_a_part_has_exactly_the_samples_between_its_ends() -> None:
     boot = boot_with(batches_of(np.arange(2000.0)))
     found = samples(boot, 0.4, 0.9)

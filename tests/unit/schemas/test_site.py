@@ -322,6 +322,9 @@ def test_a_missing_or_unreadable_file(tmp_path: Path) -> None:
 
 def test_the_sites_of_the_independent_crossings_are_read(shared_sites: list[Path]) -> None:
     for path in shared_sites:
+        # Three axles are refused (test_site_axles); a deck that twists has keys of its own.
+        if path.parent.name.startswith("d12_"):
+            continue
         bridge = load_site(path).bridges[0]
         # Coordinates are given to 1e-8 degrees, 1.1 mm: each end is off by up to 0.8 mm.
         assert math.isclose(bridge.ends_distance_m, bridge.span_m, rel_tol=0, abs_tol=1.6e-3)

@@ -186,11 +186,11 @@ def test_tyres_are_the_sites_the_askers_or_common_ones() -> None:
         tyre_width_m=(0.3, 0.2),
         tyre_contact_length_m=(0.15, 0.18),
         twin_tyre_distance_m=(0.0, 0.31),
-        track_m=2.0,
+        track_m=(2.0, 1.8),
         rear_axle_offset_m=-0.02,
     ).vehicles[0]
     assert wheel_paths_of(known, OnSurface(wander_m=0.1)) == WheelPaths(
-        Footprint(0.3, 0.0, 0.15, 2.0), Footprint(0.2, 0.31, 0.18, 2.0, -0.02), 0.1
+        Footprint(0.3, 0.0, 0.15, 2.0), Footprint(0.2, 0.31, 0.18, 1.8, -0.02), 0.1
     )
     singles = a_site(twin_tyre_distance_m=(0.0, 0.0)).vehicles[0]
     assert wheel_paths_of(singles).rear == SINGLE._replace(offset_m=0.005)

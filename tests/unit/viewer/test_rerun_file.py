@@ -206,6 +206,18 @@ def test_every_sample_of_every_channel_is_there_at_its_time(drive):
         assert (times_ns(batch) == START_NS + np.arange(40 * BATCH) * 1_000_000).all()
 
 
+def test_named_channels_are_drawn(tmp_path: Path, site: Site) -> None:
+    names = ("sprung_front", "axle_1_left", "axle_1_right")
+    path = tmp_path / "named.rrd"
+    vehicles = {"truck-1": VehicleSignals(accel(channels=names), gnss())}
+    write_views(path, vehicles=vehicles, crossings=[crossing()], site=site)
+    chunks = RrdReader(path).stream().to_chunks()
+    view = view_of_crossing(crossing(), site.bridges[0])
+    for channel in names:
+        assert rows(chunks, f"vehicle/truck-1/acceleration/{channel}").num_rows == 40 * BATCH
+        assert rows(chunks, f"{crossing_root(view)}/acceleration/{channel}").num_rows > 0
+
+
 def test_track_has_every_fix(drive):
     chunks, _ = drive
     position = rows(chunks, "map/position/truck-1")
