@@ -52,11 +52,7 @@ class Step(NamedTuple):
 
 
 def largest_step(problem: Problem, state: State, covariance: FloatArray) -> Step:
-    """Return the most significant step at the optimum `state` with `covariance` (f, f) of y.
-
-    Of the delay alone where the axles' roads differ: which part of that is a channel's gain is not
-    known well enough.
-    """
+    """Return the most significant step at the optimum `state` with `covariance` (f, f) of y."""
     crossing = problem.crossing
     m = problem.noise.reciprocal.size
     white, jacobian = state.residual[:m], state.jacobian[:m]
@@ -69,9 +65,7 @@ def largest_step(problem: Problem, state: State, covariance: FloatArray) -> Step
     n = crossing.signals.shape[2]
     worst = Step(DELAY, 0, 0.0, 0.0, 0.0)
     changed, rows = np.empty_like(crossing.signals), np.empty((1, m))
-    kinds = (DELAY,) if problem.mismatch.level_m3.any() else (DELAY, GAIN)
-    for kind in kinds:
-        count, aside = _MOMENTS[kind]
+    for kind, (count, aside) in enumerate(_MOMENTS):
         moments = (n * np.linspace(aside, 1.0 - aside, count + 2)[1:-1]).astype(np.int64)
         for channel in range(CHANNELS):
             columns = np.empty((count, m))
