@@ -22,6 +22,7 @@ from pydantic import (
 
 from schemas.signals import MAX_RATE_HZ
 from schemas.site_errors import at
+from schemas.site_physics import check_bridge, check_receiver, check_sensor, check_vehicle
 from schemas.site_ros2 import Ros2, check_ros2
 from schemas.topics import IDENTIFIER
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
@@ -162,6 +163,7 @@ class Vehicle(_Spreadable):
                 f"adds up to {sum(self.unsprung_mass_kg)}, it must be a mass less than "
                 f"total_mass_kg, {self.total_mass_kg} kg",
             )
+        check_vehicle(self)
         return self
 
 
@@ -330,6 +332,7 @@ class Bridge(_Spreadable):
                 f"is {self.span_m:g} but the ends are {distance:.1f} m apart, "
                 "the span and the coordinates of the bearings must agree",
             )
+        check_bridge(self)
         return self
 
     def _supports_fit(self) -> None:
@@ -381,6 +384,8 @@ class Sensor(_Table):
     delay_spread_s: Annotated[Number, Field(ge=0, le=1)] = 0.0005
     common_gain_spread: Spread = 0.01
 
+    _is_possible = model_validator(mode="after")(check_sensor)
+
 
 class Receiver(_Table):
     """The satellite receiver."""
@@ -391,6 +396,8 @@ class Receiver(_Table):
     speed_noise_m_per_s: NotNegative = 0.07
     latency_s: Annotated[Number, Field(ge=-10, le=10)] = 0.0
     latency_spread_s: Annotated[Number, Field(ge=0, le=10)] = 0.1
+
+    _is_possible = model_validator(mode="after")(check_receiver)
 
 
 class Site(_Table):
