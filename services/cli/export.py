@@ -42,7 +42,12 @@ def add_export(commands: Any) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from services.common.files import check_folder_writable, check_site_kept, write_atomically
+    from services.common.files import (
+        check_folder_writable,
+        check_site_kept,
+        make_folder,
+        write_atomically,
+    )
     from services.common.progress import reading_bar, steps_bar
     from services.drives.signals import signals_of_recording
     from services.drives.survey import survey
@@ -80,7 +85,7 @@ def _export(options: argparse.Namespace) -> int:
         tables += [table for n, run in enumerate(runs) for table in tables_of_run(run, n)]
     if results is not None:
         tables += tables_of_results(results, site)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     _check_no_others(folder, {f"{table.name}.csv" for table in tables if form == "csv" and runs})
     with steps_bar(f"writing into {folder}") as progress:
         for number, table in enumerate(tables):

@@ -95,6 +95,15 @@ def check_writable(path: Path, *, force: bool = False, kinds: tuple[Kind, ...] =
         check_kind(path, kinds)
 
 
+def is_unicode(name: str) -> bool:
+    """Return whether a name is UTF-8 on the disk; libraries cannot store or write another one."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def name_error(path: Path, error: OSError) -> InputError:
     """Return the error that says why a name cannot be used, with the name cut to fit a line."""
     if error.errno == errno.ENAMETOOLONG:
@@ -194,10 +203,11 @@ def _check_replaceable(path: Path, *, force: bool) -> None:
 def check_folder_writable(folder: Path) -> None:
     """Raise InputError if nothing can be put into a folder, or into the first parent there is."""
     there = folder
-    while not there.exists() and there != there.parent:
+    while not os.path.lexists(there) and there != there.parent:
         there = there.parent
     if not there.is_dir():
-        raise InputError(f"{folder}: cannot be made, {there} is a file")
+        what = "a file" if there.exists() else "a link to nothing"
+        raise InputError(f"{folder}: cannot be made, {there} is {what}")
     if not os.access(there, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: no permission to write in the folder {there}")
 
