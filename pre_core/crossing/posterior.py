@@ -412,5 +412,5 @@ def largest_deflections_m(problem: Problem, y: FloatArray) -> FloatArray:
     ]
     largest = np.concatenate(found)
     if np.isnan(largest).any():
-        raise np.linalg.LinAlgError("the bridge of this point has no modes")
+        raise FloatingPointError("the bridge of this point has no modes")
     return largest

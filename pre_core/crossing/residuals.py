@@ -737,7 +737,7 @@ def roads_and_deflections(
     """
     deflection = _deflections(crossing, work, points, k)
     if np.isnan(deflection[0, 0]):
-        raise np.linalg.LinAlgError("the bridge of this point has no modes")
+        raise FloatingPointError("the bridge of this point has no modes")
     gain = points.common_gain[k]
     return -gain * work.road, gain * deflection
 

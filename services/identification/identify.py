@@ -123,13 +123,13 @@ def identify(
 def is_not_finite(error: Exception) -> bool:
     """Return whether an error says that numbers of a fit or a result are beyond what floats hold.
 
-    Values at the edge of what a site file may say lead there: overflows, matrices that have no
-    inverse, and fields of a result that only take finite numbers.
+    Values at the edge of what a site file may say lead there: overflows, bridges without modes,
+    and fields of a result that only take finite numbers.
     """
     if isinstance(error, ValidationError):
         problems = error.errors(include_url=False, include_context=False, include_input=False)
         return all(problem["type"] == "finite_number" for problem in problems)
-    return isinstance(error, ArithmeticError | np.linalg.LinAlgError)
+    return isinstance(error, ArithmeticError)
 
 
 class _Cut(NamedTuple):
