@@ -733,7 +733,7 @@ def roads_and_deflections(
 ) -> tuple[FloatArray, FloatArray]:
     """Road heights (2, n) in m under both wheels at every sample, the bridge's deflections (2, n).
 
-    Raises ValueError for an impossible point.
+    Raises FloatingPointError for an impossible point.
     """
     deflection = _deflections(crossing, work, points, k)
     if np.isnan(deflection[0, 0]):
