@@ -21,6 +21,7 @@ from pydantic import (
 from schemas.site_errors import at
 from schemas.site_lane import Lane
 from schemas.site_numbers import Density, NotNegative, Number, Positive, Rate, Spread, Table
+from schemas.site_physics import check_bridge, check_receiver, check_sensor
 from schemas.site_ros2 import Ros2, check_ros2
 from schemas.site_vehicle import Spreadable
 from schemas.site_vehicle import Vehicle as Vehicle
@@ -234,6 +235,7 @@ class Bridge(Lane, Spreadable):
                 f"is {self.span_m:g} but the ends are {distance:.1f} m apart, "
                 "the span and the coordinates of the bearings must agree",
             )
+        check_bridge(self)
         return self
 
     def _supports_fit(self) -> None:
@@ -288,6 +290,8 @@ class Sensor(Table):
     delay_spread_s: Annotated[Number, Field(ge=0, le=1)] = 0.0005
     common_gain_spread: Spread = 0.01
 
+    _is_possible = model_validator(mode="after")(check_sensor)
+
 
 class Receiver(Table):
     """The satellite receiver."""
@@ -298,6 +302,8 @@ class Receiver(Table):
     speed_noise_m_per_s: NotNegative = 0.07
     latency_s: Annotated[Number, Field(ge=-10, le=10)] = 0.0
     latency_spread_s: Annotated[Number, Field(ge=0, le=10)] = 0.1
+
+    _is_possible = model_validator(mode="after")(check_receiver)
 
 
 class Site(Table):

@@ -31,9 +31,9 @@ _LISTS: Final = ("vehicle", "bridge", "ros2")
 """Tables of which there may be several."""
 
 
-def load_site(path: Path) -> Site:
+def load_site(path: str | Path) -> Site:
     """Read a site file; raise InputError with one line if it cannot be read or is wrong."""
-    return parse_site(read_site_text(path), str(path))
+    return parse_site(read_site_text(Path(path)), str(path))
 
 
 def read_site_text(path: Path) -> str:

@@ -17,6 +17,7 @@ from schemas.site_numbers import (
     Table,
     Track,
 )
+from schemas.site_physics import check_vehicle
 from schemas.site_sensors import MOST_SENSORS, PlacedSensor, check_sensors
 
 _TYRE_DAMPING_NS_PER_M: Final = 1000.0
@@ -141,4 +142,5 @@ class Vehicle(Spreadable):
             )
         if self.sensors:
             check_sensors(self.sensors, self.wheelbase_m)
+        check_vehicle(self)
         return self

@@ -33,6 +33,9 @@ _SCAN: Final = re.compile(
     rf"|{_PART}(?:[ \t]*+\.[ \t]*+{_PART})?+"
     r"|(?P<open>[\[{])|(?P<close>[\]}])|(?P<key>=)|(?P<end>[\"'])"
 )
+_DECIMAL_COMMA: Final = re.compile(
+    r"[ \t]*[A-Za-z0-9_-]+[ \t]*=[ \t]*([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)[ \t]*(?:#.*)?"
+)
 _DOT: Final = re.compile(rf"{_PART}(?P<dot>[ \t]*+\.)?+")
 
 
@@ -119,6 +122,13 @@ def _syntax(message: str, text: str) -> str:
     match = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|(end of document))\)", message)
     if match is None:
         return f"is not TOML: {message}"
+    row = int(match[2]) if match[2] else 0
+    comma = _DECIMAL_COMMA.fullmatch(text.split("\n")[row - 1]) if row else None
+    if comma is not None:
+        return (
+            f"line {row}: is not TOML: {comma[1]},{comma[2]} has a decimal comma, "
+            f"TOML has a point: {comma[1]}.{comma[2]}"
+        )
     if match[4]:
         return f"line {len(text.splitlines())}: is not TOML: {match[1]} before the end of the file"
     return f"line {match[2]}, column {match[3]}: is not TOML: {match[1]}"

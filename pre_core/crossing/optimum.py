@@ -111,6 +111,11 @@ _HOPELESS_CHI2 = (1000.0, 25.0)
 """Above the first after one place is freed, above the second after more, no other place is tried.
 Of 70 drawn sound crossings the first place was the right one in all; another one never brought a
 chi2 of this size down to something usable."""
+_MOST_EVALUATIONS = 100_000
+"""Of a whole search. The sample takes 2,000, a site file with two supports too many 65,000: beyond
+this a search has lost its way, and none of its numbers can be trusted."""
+_MOST_STRIDES = 60
+"""To either side on the walk along the road, however little is known of the offset."""
 _BEND = 0.8
 """A little less than what would make the coordinate linear in 1/EI: see `bends`."""
 
@@ -305,7 +310,7 @@ def _walk(problem: Problem, y: FloatArray, way: Way) -> tuple[list[_Place], int]
         return min(seen, key=lambda place: place.objective)
 
     look(0.0, nothing)
-    reach = _STRIDE_M + _REACH / problem.receiver_rows[-1, -1]
+    reach = min(_STRIDE_M + _REACH / problem.receiver_rows[-1, -1], _MOST_STRIDES * _STRIDE_M)
     for sign in (1.0, -1.0):
         shift = sign * _STRIDE_M
         while abs(shift) <= reach:
@@ -337,16 +342,20 @@ def _beside(found: Optimum, way: Way) -> tuple[_Place | None, int]:
 
 
 def find_optimum(inputs: Inputs, report: Report = lambda stage, fraction: None) -> Optimum:
-    """The optimum of the posterior. Its `ending` is NOT_FINITE if no place gave finite rows."""
+    """The optimum of the posterior. Its `ending` is NOT_FINITE if no place gave finite rows.
+
+    It is STEPS_EXHAUSTED if the search took more than `_MOST_EVALUATIONS` and found no fit.
+    """
     problem, y = prepare(inputs)
-    found = [_from_places(problem, y, _SIMPLEST, report)]
+    found = [_from_places(problem, y, _SIMPLEST, report, _MOST_EVALUATIONS)]
     if not _is_final(found[0]):
         found += _further(problem, y, found[0], report)
-    return min(
-        found, key=lambda one: (one.noise_power <= HOPELESS_NOISE, one.chi2_per_dof)
-    )._replace(
-        evaluations=sum(one.evaluations for one in found), starts=sum(one.starts for one in found)
-    )
+    best = min(found, key=lambda one: (one.noise_power <= HOPELESS_NOISE, one.chi2_per_dof))
+    evaluations = sum(one.evaluations for one in found)
+    is_lost = evaluations > _MOST_EVALUATIONS and not _is_final(best)
+    if is_lost and best.ending is not Ending.NOT_FINITE:
+        best = best._replace(ending=Ending.STEPS_EXHAUSTED)
+    return best._replace(evaluations=evaluations, starts=sum(one.starts for one in found))
 
 
 def _further(problem: Problem, y: FloatArray, first: Optimum, report: Report) -> list[Optimum]:
@@ -364,7 +373,10 @@ def _further(problem: Problem, y: FloatArray, first: Optimum, report: Report) ->
         # Springs that rub look like roads that differ until they are doubted.
         if rubs if way.believes else (way == doubting and differs and not rubs):
             continue
-        found.append(_from_places(problem, y, way, report))
+        left = _MOST_EVALUATIONS - sum(one.evaluations for one in (first, *found))
+        if left <= 0:
+            break
+        found.append(_from_places(problem, y, way, report, left))
         rubs = found[-1].rubs
         if _is_final(found[-1]):
             break
@@ -384,10 +396,11 @@ def _is_accepted(problem: Problem, chi2: float) -> bool:
     return chi2 < 1.0 + excess + _ACCEPTED_Z * float(np.sqrt(2.0 / judged))
 
 
-def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> Optimum:
+def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report, most: int) -> Optimum:
     """The best optimum of those that are reached from the likeliest places along the road.
 
-    None, as if no place gave finite rows, as soon as a place shows that the way is wrong.
+    None, as if no place gave finite rows, as soon as a place shows that the way is wrong. After
+    `most` evaluations no other place is tried.
     """
     force = linear_springs() if way.believes else None
     whole = _whole_bridge(problem, way)
@@ -427,7 +440,7 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
         found, used = _freed(problem, _moved(problem, y, place), way)
         evaluations += used
         if isinstance(found, Optimum) and found.problem.mismatch.level_m3.any():
-            found, used = _settled(found, way)
+            found, used = _settled(found, way, most - evaluations)
             evaluations += used
         if not isinstance(found, Optimum):
             rubs = found is _Wrong.RUBS
@@ -437,6 +450,8 @@ def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report) -> O
         if _is_accepted(best.problem, best.chi2_per_dof) or len(tried) == way.most_places:
             break
         if best.chi2_per_dof > _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]:
+            break
+        if evaluations > most:
             break
     if best is None:
         return _nowhere(problem, y, evaluations, len(tried), rubs=rubs)
@@ -477,10 +492,12 @@ def _with_free_ends(found: Optimum, way: Way) -> tuple[Optimum, int]:
     return found, used
 
 
-def _settled(found: Optimum, way: Way) -> tuple[Optimum, int]:
+def _settled(found: Optimum, way: Way, most: int) -> tuple[Optimum, int]:
     """The best of an optimum and those beside it on a road that differs, and the evaluations."""
     evaluations = 0
     for _ in range(_MOST_MOVES):
+        if evaluations > most:
+            break
         place, used = _beside(found, way)
         evaluations += used
         if place is None:

@@ -404,7 +404,7 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
 def largest_deflections_m(problem: Problem, y: FloatArray) -> FloatArray:
     """Largest deflection under a wheel (k,), positive downwards, of the points y (k, size).
 
-    Raises ValueError for an impossible point.
+    Raises FloatingPointError for an impossible point.
     """
     found = [
         largest_deflections(problem.crossing, problem.works, points(problem, y[n : n + _AT_ONCE]))
@@ -412,5 +412,5 @@ def largest_deflections_m(problem: Problem, y: FloatArray) -> FloatArray:
     ]
     largest = np.concatenate(found)
     if np.isnan(largest).any():
-        raise ValueError("the bridge of this point has no modes")
+        raise FloatingPointError("the bridge of this point has no modes")
     return largest

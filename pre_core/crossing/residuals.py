@@ -771,11 +771,11 @@ def roads_and_deflections(
 ) -> tuple[FloatArray, FloatArray]:
     """Road heights (2, n) in m under both wheels at every sample, the bridge's deflections (2, n).
 
-    Raises ValueError for an impossible point.
+    Raises FloatingPointError for an impossible point.
     """
     deflection = _deflections(crossing, work, points, k)
     if np.isnan(deflection[0, 0]):
-        raise ValueError("the bridge of this point has no modes")
+        raise FloatingPointError("the bridge of this point has no modes")
     gain = points.common_gain[k]
     return -gain * work.road, gain * deflection
 

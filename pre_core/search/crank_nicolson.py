@@ -114,8 +114,10 @@ def _accepted(state: State, proposal: State, uniform: FloatArray) -> tuple[State
 
 
 def split_r_hat(draws: FloatArray) -> FloatArray:
-    """Split R-hat (f,) of draws (n, c, f)."""
+    """Split R-hat (f,) of draws (n, c, f): infinite for fewer than four draws a chain."""
     half = draws.shape[0] // 2
+    if half < 2:
+        return np.full(draws.shape[2], np.inf)
     parts = np.concatenate([draws[:half], draws[half : 2 * half]], axis=1)
     within = parts.var(axis=0, ddof=1).mean(axis=0)
     between = half * parts.mean(axis=0).var(axis=0, ddof=1)

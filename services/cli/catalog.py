@@ -5,7 +5,8 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from services.cli.parsing import add_file, add_site, command
+from services.cli.parsing import add_output_file, add_site, command
+from services.common.kinds import CATALOG_CSV, CROSSINGS_CSV
 
 if TYPE_CHECKING:
     from services.history.catalog_row import Row
@@ -32,7 +33,8 @@ def add_catalog(commands: Any) -> None:
         help="read every recording and compare it with its row, also where size and time agree",
     )
     add_site(p, "list crossings of its bridges, from positions alone")
-    add_file(p, "--csv", "OUT.csv", "write all crossings (with --site) or recordings here")
+    text = "write all crossings (with --site) or recordings here"
+    add_output_file(p, "--csv", "OUT.csv", text, CATALOG_CSV, CROSSINGS_CSV)
 
 
 def _catalog(options: argparse.Namespace) -> int:

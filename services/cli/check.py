@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from services.cli.parsing import command
+from services.cli.parsing import OutputFile, command
 
 if TYPE_CHECKING:
     from services.inspection.inspect import Report
@@ -31,7 +31,7 @@ def add_check(commands: Any) -> None:
     )
     p.add_argument(
         "--template",
-        type=Path,
+        type=OutputFile(()),
         metavar="NEW.toml",
         help="write a site file to start from, with what each key means, and check nothing",
     )

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from services.cli.parsing import add_site, command
+from services.cli.parsing import add_output_folder, add_site, command
 from services.common.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def add_export(commands: Any) -> None:
         metavar="REC.mcap|RESULTS.json|DIR",
         help="recordings, folders with recordings below, and at most one results file",
     )
-    p.add_argument("--to", type=Path, required=True, metavar="DIR", help="folder for the files")
+    add_output_folder(p, "--to", "folder for the files", required=True)
     p.add_argument(
         "--format", choices=("csv", "parquet"), default="csv", help="of the tables (default: csv)"
     )
@@ -42,7 +42,12 @@ def add_export(commands: Any) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from services.common.files import check_folder_writable, write_atomically
+    from services.common.files import (
+        check_folder_writable,
+        check_site_kept,
+        make_folder,
+        write_atomically,
+    )
     from services.common.progress import reading_bar, steps_bar
     from services.drives.signals import signals_of_recording
     from services.drives.survey import survey
@@ -71,6 +76,8 @@ def _export(options: argparse.Namespace) -> int:
             passings = [
                 p for path in recordings for p in survey(path, site, progress=next_file()).passings
             ]
+    if form == "csv" and runs and site is not None:
+        check_site_kept(folder / "site.toml", as_measured(site))
     tables: list[Table] = []
     if form == "parquet":
         tables += tables_of_runs(runs) if runs else []
@@ -78,7 +85,7 @@ def _export(options: argparse.Namespace) -> int:
         tables += [table for n, run in enumerate(runs) for table in tables_of_run(run, n)]
     if results is not None:
         tables += tables_of_results(results, site)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     _check_no_others(folder, {f"{table.name}.csv" for table in tables if form == "csv" and runs})
     with steps_bar(f"writing into {folder}") as progress:
         for number, table in enumerate(tables):

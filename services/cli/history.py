@@ -8,8 +8,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from services.cli.parsing import EXIT_SOMETHING_LOST, a_console, add_file, command
+from services.cli.parsing import (
+    EXIT_SOMETHING_LOST,
+    a_console,
+    add_file,
+    add_output_file,
+    add_output_folder,
+    command,
+)
 from services.common.errors import InputError, one_line
+from services.common.kinds import HISTORY_CSV, HISTORY_JSON, RERUN
 
 if TYPE_CHECKING:
     from schemas.alarms import Alarm
@@ -51,10 +59,11 @@ def add_history(commands: Any) -> None:
         action="store_true",
         help="with add: fuse nothing now; who looks at a bridge first waits for it then",
     )
-    add_file(p, "--csv", "OUT.csv", "write a row for each period and element here")
-    add_file(p, "--json", "OUT.json", "write periods and alarms here")
-    add_file(p, "--figures", "DIR", "draw the bridge over time here, as PNG and SVG")
-    add_file(p, "--rrd", "OUT.rrd", "write EI over time for Rerun here")
+    text = "write a row for each period and element here"
+    add_output_file(p, "--csv", "OUT.csv", text, HISTORY_CSV)
+    add_output_file(p, "--json", "OUT.json", "write periods and alarms here", HISTORY_JSON)
+    add_output_folder(p, "--figures", "draw the bridge over time here, as PNG and SVG")
+    add_output_file(p, "--rrd", "OUT.rrd", "write EI over time for Rerun here", RERUN)
     p.add_argument("--view", action="store_true", help="look at EI over time in the Rerun viewer")
     p.add_argument("--web", action="store_true", help="look at it in the browser")
     p.add_argument("--sql", metavar="SELECT …", help="ask about the table crossings (DuckDB)")

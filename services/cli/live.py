@@ -8,11 +8,12 @@ from services.cli.parsing import (
     a_console,
     add_certificates,
     add_endpoint,
-    add_file,
     add_folder,
     add_id,
     add_method,
     add_noise,
+    add_output_file,
+    add_output_folder,
     add_realm,
     add_site,
     add_speed,
@@ -33,7 +34,7 @@ def add_demo(commands: Any) -> None:
         "a truck crosses a bridge: simulated, recorded, identified, drawn",
         "driveby demo --speed 4",
     )
-    p.add_argument("--out", type=Path, metavar="DIR", help="new folder for what it leaves behind")
+    add_output_folder(p, "--out", "new folder for what it leaves behind")
     add_speed(p, 4.0)
     text = "accelerometers' noise density in µg/√Hz; 0: all exact, least squares (default: 25)"
     add_noise(p, text, 25.0)
@@ -70,7 +71,7 @@ def add_logger(commands: Any) -> None:
         help="listen to other machines without --tls: whoever reaches the address is believed",
     )
     add_folder(p, "folder of the recordings")
-    add_file(p, "--file", "REC.mcap", "put everything into this one new file")
+    add_output_file(p, "--file", "REC.mcap", "put everything into this one new file")
     p.add_argument(
         "--realm",
         action="append",
@@ -148,7 +149,8 @@ def add_worker(commands: Any) -> None:
     add_realm(p)
     add_site(p, "trucks and bridges", required=True)
     add_folder(p, "folder of the results")
-    add_file(p, "--file", "RESULTS.mcap", "put the results into this one new file (and .json)")
+    text = "put the results into this one new file (and .json)"
+    add_output_file(p, "--file", "RESULTS.mcap", text)
     add_method(p)
     p.add_argument(
         "--processes",

@@ -7,13 +7,16 @@ compilers and viewers.
 """
 
 import argparse
+import errno
 import gc
+import io
 import json
 import logging
 import os
 import sys
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final, NoReturn
 
 from services.cli.access import add_certs
@@ -42,7 +45,7 @@ from services.cli.offline import (
     add_recover,
     add_simulate,
 )
-from services.cli.parsing import Handler, Parser, add_common
+from services.cli.parsing import Files, Handler, Parser, add_common, files_of
 from services.cli.replay import add_replay
 from services.cli.report import add_report
 from services.cli.survey import add_survey
@@ -50,8 +53,12 @@ from services.cli.validation import add_validate
 from services.cli.view import add_view
 from services.cli.watch import add_watch
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
+from services.common.files import check_kind, is_unicode, name_error
+from services.common.outputs import declared
 
 _OBJECTS_BETWEEN_LOOKS: Final = 20_000
+_COUNTS_AT_EXIT: Final = ("_duckdb", "duckdb")
+"""Modules made with nanobind, whose types are in circles that a last collection takes apart."""
 _COMMANDS: Final = (
     add_survey,
     add_check,
@@ -83,6 +90,10 @@ _COMMANDS: Final = (
 
 EXIT_FAILED: Final = 1
 EXIT_BAD_INPUT: Final = 2
+_BAD_NAMES: Final = frozenset(
+    (errno.ENAMETOOLONG, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.ELOOP)
+)
+"""Errors of the system that the user mends by another name."""
 EXIT_BROKEN_PIPE: Final = 141
 """What a shell reports of SIGPIPE, as `EXIT_INTERRUPTED` is of SIGINT."""
 
@@ -104,8 +115,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # A service has nothing else to show for itself than what it says.
     _log(options.log_format, verbose=options.verbose or options.handler in (*SERVICES, *CLUSTERS))
     handler: Handler = options.handler
+    # A name need not be Unicode, and a line that says it must not fail.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
-        code = handler(options)
+        files = files_of(options)
+        _check_names(files)
+        with declared(files.inputs, files.outputs):
+            for path, kinds in files.outputs.items():
+                check_kind(path, kinds)
+            code = handler(options)
         sys.stdout.flush()
     except InputError as error:
         return _say(str(error), EXIT_BAD_INPUT)
@@ -120,19 +140,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if options.debug:
             traceback.print_exc()
+        if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":
+            return _say(f"{error.object[:200]}: is no name in UTF-8; rename it", EXIT_BAD_INPUT)
+        if isinstance(error, OSError) and error.filename is not None:
+            code = EXIT_BAD_INPUT if error.errno in _BAD_NAMES else EXIT_FAILED
+            return _say(str(name_error(Path(os.fsdecode(error.filename)), error)), code)
         what = " ".join(f"{type(error).__name__}: {error}".split())[:300]
         hint = "" if options.debug else "; run with --debug for the traceback"
         return _say(f"internal error, please report: {what}{hint}", EXIT_FAILED)
     return code
 
 
+def _check_names(files: Files) -> None:
+    """InputError if a name cannot be one of this file system, or relative names mean nothing."""
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise InputError("the working directory is gone, change to one that exists") from error
+    for path in (*files.outputs, *files.folders):
+        if not is_unicode(str(path)):  # libraries that write cannot take such a name
+            raise InputError(f"{path}: the name is not UTF-8; give another name to write")
+    for path in (*files.inputs, *files.outputs, *files.folders):
+        try:
+            path.lstat()
+        except OSError as error:
+            if error.errno == errno.ENAMETOOLONG:
+                raise name_error(path, error) from error
+
+
 def program() -> int:
     """`main` of a process of its own, which ends with it.
 
-    What is left is not looked through for circles once more, at the end of Python: 0.15 s.
+    What is left is not looked through for circles once more, at the end of Python: 0.15 s. Not so
+    where a library counts what it finds alive at the very end, and prints a line for each object.
     """
     code = main()
-    gc.freeze()
+    if not any(name in sys.modules for name in _COUNTS_AT_EXIT):
+        gc.freeze()
     return code
 
 

@@ -7,6 +7,7 @@ from typing import Any
 from services.cli.cluster import add_scheduler, check_scheduler, execution_of
 from services.cli.parsing import (
     CERTIFICATES,
+    OutputFile,
     a_console,
     add_certificates,
     add_file,
@@ -14,6 +15,8 @@ from services.cli.parsing import (
     add_method,
     add_noise,
     add_output,
+    add_output_file,
+    add_output_folder,
     add_seed,
     add_site,
     command,
@@ -25,6 +28,7 @@ from services.cli.parsing import (
     whole,
 )
 from services.common.errors import InputError
+from services.common.kinds import ARRAYS, MCAP, NETCDF, RERUN, RESULTS
 
 
 def _ratios(text: str) -> tuple[float, ...]:
@@ -328,10 +332,11 @@ def add_identify(commands: Any) -> None:
     )
     add_site(p, "(default: the site stored in the recording)")
     add_method(p)
-    add_file(p, "--json", "OUT.json", "write the results here")
-    add_file(p, "--rrd", "OUT.rrd", "write a Rerun recording here")
-    add_file(p, "--draws", "OUT.npz|OUT.nc", "write the draws of method pre here, for ArviZ")
-    add_file(p, "--figures", "DIR", "draw every crossing and bridge here, as PNG and SVG")
+    add_output_file(p, "--json", "OUT.json", "write the results here", RESULTS)
+    add_output_file(p, "--rrd", "OUT.rrd", "write a Rerun recording here", RERUN)
+    text = "write the draws of method pre here, for ArviZ"
+    add_output_file(p, "--draws", "OUT.npz|OUT.nc", text, ARRAYS, NETCDF)
+    add_output_folder(p, "--figures", "draw every crossing and bridge here, as PNG and SVG")
     _add_fusing(p)
     add_certificates(
         p, f"certificates that results name where there are such (default: {CERTIFICATES})"
@@ -372,7 +377,8 @@ def add_fuse(commands: Any) -> None:
         "driveby fuse monday.json tuesday.json --json week.json",
     )
     p.add_argument("results", type=Path, nargs="+", metavar="RESULTS.json", help="results")
-    add_file(p, "--json", "OUT.json", "write all crossings and the fused estimates here")
+    text = "write all crossings and the fused estimates here"
+    add_output_file(p, "--json", "OUT.json", text, RESULTS)
     _add_fusing(p)
 
 
@@ -438,7 +444,7 @@ def add_recover(commands: Any) -> None:
     p.add_argument(
         "-o",
         "--output",
-        type=Path,
+        type=OutputFile((MCAP,)),
         metavar="OUT.mcap",
         help="(default: REC.recovered.mcap beside it)",
     )

@@ -5,11 +5,13 @@ Nothing heavy is imported here: `driveby --help` does not wait for compilers and
 
 import argparse
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
 
 from services.common.endpoints import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
 from services.common.errors import InputError
+from services.common.kinds import MCAP, Kind
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -44,7 +46,7 @@ def command(
         epilog=f"example: {example}",
         allow_abbrev=False,
     )
-    parser.set_defaults(handler=handler)
+    parser.set_defaults(handler=handler, parser=parser)
     add_common(parser, suppressed=True)
     return parser
 
@@ -74,8 +76,53 @@ def source(text: str) -> Path | str:
     return text if "://" in text else Path(text)
 
 
+@dataclass(frozen=True)
+class OutputFile:
+    """The type of an argument that names a file to write, and the kinds that it may replace.
+
+    Every other path is an input, or a folder to write to (`folder_here`).
+    """
+
+    kinds: tuple[Kind, ...]
+    """None: the command has a rule of its own, as that the file must be new."""
+
+    def __call__(self, text: str) -> Path:
+        """Return the path."""
+        return Path(text)
+
+
+class Files(NamedTuple):
+    """The paths among the arguments of a command."""
+
+    inputs: list[Path]
+    """Files and folders to read."""
+    outputs: dict[Path, tuple[Kind, ...]]
+    """Files to write, and the kinds that each may replace."""
+    folders: list[Path]
+    """Folders to write to."""
+
+
+def files_of(options: argparse.Namespace) -> Files:
+    """Return the paths that were given to a command, by what the command does with them."""
+    files = Files([], {}, [])
+    for action in options.parser._actions:
+        value = getattr(options, action.dest, None)
+        for path in value if isinstance(value, list) else [value]:
+            if not isinstance(path, Path):
+                continue
+            if isinstance(action.type, OutputFile):
+                if path in files.outputs:
+                    raise InputError(f"{path}: is given for two outputs; give each a name")
+                files.outputs[path] = action.type.kinds
+            elif action.type is folder_here:
+                files.folders.append(path)
+            else:
+                files.inputs.append(path)
+    return files
+
+
 def folder_here(text: str) -> Path:
-    """A folder of this machine; an address of a store would else become a folder called s3:."""
+    """A folder of this machine to write to; an address would else become a folder called s3:."""
     if "://" in text:
         raise argparse.ArgumentTypeError(f"is {text!r}, a folder of this machine is expected")
     return Path(text)
@@ -89,7 +136,12 @@ def add_site(p: Any, text: str, *, required: bool = False) -> None:
 def add_output(p: argparse.ArgumentParser) -> None:
     """`-o`: the recording to write, which is replaced with `--force` only."""
     p.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="REC.mcap", help="recording to write"
+        "-o",
+        "--output",
+        type=OutputFile((MCAP,)),
+        required=True,
+        metavar="REC.mcap",
+        help="recording to write",
     )
     add_force(p)
 
@@ -104,8 +156,18 @@ def add_force(p: argparse.ArgumentParser) -> None:
 
 
 def add_file(p: Any, option: str, metavar: str, text: str) -> None:
-    """An option that names a file."""
+    """An option that names a file to read."""
     p.add_argument(option, type=Path, metavar=metavar, help=text)
+
+
+def add_output_file(p: Any, option: str, metavar: str, text: str, *kinds: Kind) -> None:
+    """An option that names a file to write, which replaces a file of these kinds only."""
+    p.add_argument(option, type=OutputFile(kinds), metavar=metavar, help=text)
+
+
+def add_output_folder(p: Any, option: str, text: str, *, required: bool = False) -> None:
+    """An option that names a folder to write to."""
+    p.add_argument(option, type=folder_here, required=required, metavar="DIR", help=text)
 
 
 def add_folder(p: argparse.ArgumentParser, text: str) -> None:

@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from services.cli.parsing import add_file, add_site, command
+from services.cli.parsing import OutputFile, add_file, add_site, command
+from services.common.kinds import HTML, PDF
 
 
 def add_report(commands: Any) -> None:
@@ -22,7 +23,7 @@ def add_report(commands: Any) -> None:
     p.add_argument(
         "-o",
         "--output",
-        type=Path,
+        type=OutputFile((HTML,)),
         default=Path("report.html"),
         metavar="OUT.html",
         help="(default: report.html)",
@@ -54,7 +55,7 @@ def _report(options: argparse.Namespace) -> int:
     pdf = output.with_suffix(".pdf")
     check_writable(output)
     if options.pdf:
-        check_writable(pdf)
+        check_writable(pdf, kinds=(PDF,))
         browser = find_browser()
     files = []
     for path in options.results:

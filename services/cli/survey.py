@@ -7,7 +7,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from services.cli.parsing import a_console, add_file, add_site, command, number, whole
+from services.cli.parsing import a_console, add_output_file, add_site, command, number, whole
+from services.common.kinds import PNG, SURVEY_JSON, SVG
 
 if TYPE_CHECKING:
     from services.planning.survey import Expected, Outlook, Survey
@@ -86,8 +87,9 @@ def add_survey(commands: Any) -> None:
         help="standard deviation of the truck's place across the lane from run to run; runs beside "
         "each other tell more (default: 0.12)",
     )
-    add_file(p, "--figure", "OUT.png|OUT.svg", "draw probabilities over the number of crossings")
-    add_file(p, "--json", "OUT.json", "write everything here")
+    text = "draw probabilities over the number of crossings"
+    add_output_file(p, "--figure", "OUT.png|OUT.svg", text, PNG, SVG)
+    add_output_file(p, "--json", "OUT.json", "write everything here", SURVEY_JSON)
 
 
 def _survey(options: argparse.Namespace) -> int:

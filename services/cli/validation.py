@@ -8,10 +8,12 @@ from typing import Any, Final
 from services.cli.parsing import (
     CERTIFICATES,
     SCENARIOS,
+    OutputFile,
     a_console,
     add_certificates,
-    add_file,
     add_noise,
+    add_output_file,
+    add_output_folder,
     add_seed,
     add_site,
     command,
@@ -20,6 +22,7 @@ from services.cli.parsing import (
     whole,
 )
 from services.common.errors import InputError
+from services.common.kinds import AIMS_JSON, RECORDS, VALIDATION_JSON, VALIDATION_PAGE
 
 
 def _scenarios(text: str) -> tuple[int, ...]:
@@ -119,8 +122,9 @@ def add_validate(commands: Any) -> None:
         "truck and bridge (default: those of the paper); without --method: makes a certificate "
         "for every pair of them (exit code 1 if one fails)",
     )
-    add_file(p, "--json", "OUT.json", "write the table here")
-    p.add_argument("--figures", type=Path, metavar="DIR", help="write figures to this folder")
+    text = "write the table here"
+    add_output_file(p, "--json", "OUT.json", text, VALIDATION_JSON, AIMS_JSON)
+    add_output_folder(p, "--figures", "write figures to this folder")
     p.add_argument("--particles", type=whole("particles", 1), default=500, help="(default: 500)")
     p.add_argument("--steps", type=whole("steps", 1), default=600, help="(default: 600)")
     add_seed(p)
@@ -162,7 +166,7 @@ def add_validate(commands: Any) -> None:
     )
     p.add_argument(
         "--records",
-        type=Path,
+        type=OutputFile((RECORDS,)),
         default=Path("build/worlds.jsonl"),
         metavar="FILE.jsonl",
         help="what --worlds or --surveys has run is kept here and not run again "
@@ -190,7 +194,7 @@ def add_validate(commands: Any) -> None:
         help="folders of crossings with a truth.json (default: ../shared/crossings)",
     )
     p.add_argument("--processes", type=whole("processes", 1, 256), default=2, help="(default: 2)")
-    add_file(p, "--page", "PAGE.md", "write what was found as a page")
+    add_output_file(p, "--page", "PAGE.md", "write what was found as a page", VALIDATION_PAGE)
 
 
 def _validate_site(options: argparse.Namespace) -> int:

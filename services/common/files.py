@@ -1,9 +1,11 @@
 """Files that are whole or absent: written beside the target, synced, renamed.
 
-Other files replace what was there. A recording is replaced only if somebody says so, and never
-while it is being written: who writes it would go on into a file without a name.
+An output replaces a file of its own kind only, never a site file, and never a file that the command
+reads (`services.common.outputs`). A recording is replaced only with `force`, and never while it is
+being written: its writer would continue into a file without a name.
 """
 
+import errno
 import fcntl
 import os
 import secrets
@@ -13,8 +15,22 @@ from pathlib import Path
 from typing import BinaryIO
 
 from services.common.errors import FailureError, InputError
+from services.common.kinds import (
+    EMPTY,
+    HEAD_BYTES,
+    OTHER,
+    RECORDING,
+    SITE,
+    TEXT,
+    Kind,
+    described,
+    family_of,
+)
+from services.common.outputs import check_no_input
 
 _RECORDING_SUFFIX = ".mcap"
+_LONGEST_NAME = 255
+"""Bytes of a name on the file systems of Linux and macOS."""
 _RECORDING_MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -24,7 +40,9 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     Raises InputError if nothing can be written there, FailureError if writing fails.
     """
     with replaced_atomically(path) as temporary:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        # The name of a file may stand in a text and need not be Unicode.
+        encoded = content.encode(errors="backslashreplace") if isinstance(content, str) else content
+        temporary.write_bytes(encoded)
 
 
 @contextmanager
@@ -32,16 +50,17 @@ def replaced_atomically(path: Path, *, force: bool = False) -> Iterator[Path]:
     """Give a temporary path beside `path` to write to; rename it when the block ends well.
 
     The temporary name keeps the suffix, because writers choose the format by it. If the block
-    raises, or there is a recording (see `check_writable`), the temporary file is removed and `path`
-    stays as it was.
+    raises, or `path` must not be replaced (see `check_writable`), the temporary file is removed and
+    `path` stays as it was.
     """
     check_writable(path, force=force)
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    temporary = _temporary(path)
     try:
         try:
             yield temporary
             _sync(temporary)
             check_writable(path, force=force)  # it took a while to get here
+            _check_like(path, temporary)
             temporary.replace(path)
             _sync(path.parent)
         except OSError as error:
@@ -50,23 +69,105 @@ def replaced_atomically(path: Path, *, force: bool = False) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def check_writable(path: Path, *, force: bool = False) -> None:
+def check_writable(path: Path, *, force: bool = False, kinds: tuple[Kind, ...] = ()) -> None:
     """Raise InputError if a file cannot be put at `path`. For use before hours of work.
 
-    Nor may it be where there is a recording: that is replaced with `force` only, and never while
-    somebody writes it.
+    A file that is there must be of one of the `kinds`, where some are given; it must not be read by
+    the same command. A recording is replaced with `force` only, and never while it is being
+    written.
     """
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, give the name of a file to write")
-    if path.exists() and not path.is_file():
-        # Renaming a file onto a device or a pipe would replace it.
-        raise InputError(f"{path}: is no ordinary file, give the name of a file to write")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist, make it first")
+    try:
+        if path.is_dir():
+            raise InputError(f"{path}: is a folder, give the name of a file to write")
+        if path.exists() and not path.is_file():
+            # Renaming a file onto a device or a pipe would replace it.
+            raise InputError(f"{path}: is no ordinary file, give the name of a file to write")
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: the folder {path.parent} does not exist, make it first")
+        is_there = path.exists()
+    except OSError as error:
+        raise name_error(path, error) from error
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise InputError(f"{path}: no permission to write in the folder {path.parent}")
-    if path.exists():
+    check_no_input(path)
+    if is_there:
         _check_replaceable(path, force=force)
+        check_kind(path, kinds)
+
+
+def is_unicode(name: str) -> bool:
+    """Return whether a name is UTF-8 on the disk; libraries cannot store or write another one."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def name_error(path: Path, error: OSError) -> InputError:
+    """Return the error that says why a name cannot be used, with the name cut to fit a line."""
+    if error.errno == errno.ENAMETOOLONG:
+        return InputError(
+            f"{str(path)[:60]}...: the name is too long, file systems take {_LONGEST_NAME} bytes"
+        )
+    return InputError(f"{path}: cannot be used: {_reason(error)}")
+
+
+def _temporary(path: Path) -> Path:
+    """Return a free name beside `path` with its suffix, no longer than file systems take."""
+    token = secrets.token_hex(4)
+    name = f".{path.stem}.{token}.part{path.suffix}"
+    if len(os.fsencode(name)) > _LONGEST_NAME:
+        name = f".{token}.part{path.suffix}"
+    return path.with_name(name)
+
+
+def _head(path: Path) -> bytes:
+    """Return the first bytes of a file; none if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(HEAD_BYTES)
+    except OSError:
+        return b""
+
+
+def check_kind(path: Path, kinds: tuple[Kind, ...]) -> None:
+    """Raise InputError if a file at `path` is of none of the kinds that may be replaced.
+
+    Recordings have a rule of their own (`check_writable`).
+    """
+    head = _head(path) if kinds and path.is_file() else b""
+    if head and family_of(head) != RECORDING and not any(kind.matches(head) for kind in kinds):
+        names = " or ".join(dict.fromkeys(kind.name for kind in kinds))
+        raise InputError(
+            f"{path}: is {described(head)}, and only {names} is replaced here; give another name"
+        )
+
+
+def check_site_kept(path: Path, text: str) -> None:
+    """Raise InputError if there is a site file at `path` that says anything else than `text`."""
+    if family_of(_head(path)) == SITE and path.read_bytes() != text.encode():
+        raise InputError(f"{path}: is a site file, and none is replaced; give another name")
+
+
+def _check_like(path: Path, temporary: Path) -> None:
+    """Raise InputError if `path` holds another kind of file than the one that would replace it.
+
+    A file that is damaged is not recognised and may be replaced; a site file may not, unless by the
+    same text.
+    """
+    if not path.exists():
+        return
+    there, new = _head(path), _head(temporary)
+    family = family_of(there)
+    if family == SITE:
+        if path.read_bytes() != temporary.read_bytes():
+            raise InputError(f"{path}: is a site file, and none is replaced; give another name")
+    elif family not in (EMPTY, OTHER, TEXT, family_of(new)):
+        raise InputError(
+            f"{path}: is {described(there)}, and would be replaced by "
+            f"{described(new) or 'an empty file'}; give another name"
+        )
 
 
 def is_held(file: BinaryIO) -> bool:
@@ -102,10 +203,11 @@ def _check_replaceable(path: Path, *, force: bool) -> None:
 def check_folder_writable(folder: Path) -> None:
     """Raise InputError if nothing can be put into a folder, or into the first parent there is."""
     there = folder
-    while not there.exists() and there != there.parent:
+    while not os.path.lexists(there) and there != there.parent:
         there = there.parent
     if not there.is_dir():
-        raise InputError(f"{folder}: cannot be made, {there} is a file")
+        what = "a file" if there.exists() else "a link to nothing"
+        raise InputError(f"{folder}: cannot be made, {there} is {what}")
     if not os.access(there, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: no permission to write in the folder {there}")
 
@@ -147,8 +249,8 @@ def decode_text(path: Path, content: bytes) -> str:
 
 def read_bytes(path: Path) -> bytes:
     """Return the bytes of a file; raise InputError if it is missing or unreadable."""
-    check_ordinary(path)
     try:
+        check_ordinary(path)
         return path.read_bytes()
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from schemas.signals import CHANNELS, in_order
 from schemas.site import Site
 from schemas.site_file import site_toml
-from services.drives.signals import Series, Signals
+from services.drives.signals import Series, Signals, Track
 from services.export.tables import Table
 
 _FIXES = ("latitude_deg", "longitude_deg", "altitude_m", "speed_m_per_s", "heading_deg")
@@ -20,7 +20,7 @@ _FIXES = ("latitude_deg", "longitude_deg", "altitude_m", "speed_m_per_s", "headi
 
 def tables_of_run(run: Signals, number: int) -> list[Table]:
     """Accelerations and fixes of one run, as `accel_NN` and `gps_NN`."""
-    fixes = run.fixes
+    fixes = _by_time(run.fixes)
     return [
         Table(f"accel_{number:02d}", _accelerations(run.channels)),
         Table(
@@ -46,9 +46,10 @@ def tables_of_runs(runs: Sequence[Signals]) -> list[Table]:
     for name in in_order({*CHANNELS, *(name for run in runs for name in run.channels)}):
         parts = [one.get(name, np.full(one["time_ns"].size, np.nan)) for one in accel]
         accelerations[name] = np.concatenate(parts or [empty])
-    fixes = {"time_ns": np.concatenate([run.fixes.time_ns for run in runs])}
+    tracks = [_by_time(run.fixes) for run in runs]
+    fixes = {"time_ns": np.concatenate([track.time_ns for track in tracks])}
     for name in _FIXES:
-        fixes[name] = np.concatenate([getattr(run.fixes, name) for run in runs])
+        fixes[name] = np.concatenate([getattr(track, name) for track in tracks])
     return [
         Table(
             "accelerations", _whose(runs, [one["time_ns"].size for one in accel]) | accelerations
@@ -61,6 +62,12 @@ def as_measured(site: Site) -> str:
     """The site file to go with exported CSV files, which are upward and without gravity."""
     sensor = site.sensor.model_copy(update={"gravity_included": False, "up": (1, 1, 1, 1)})
     return site_toml(site.model_copy(update={"sensor": sensor}))
+
+
+def _by_time(track: Track) -> Track:
+    """Return fixes in the order of time, in which they are but for a clock that was set back."""
+    order = np.argsort(track.time_ns, kind="stable")
+    return Track(track.time_ns[order], *(values[order] for values in track[1:]))
 
 
 def _whose(runs: Sequence[Signals], sizes: Sequence[int]) -> dict[str, NDArray[np.generic]]:
@@ -77,7 +84,9 @@ def _accelerations(channels: dict[str, Series]) -> dict[str, NDArray[np.generic]
         return {"time_ns": np.empty(0, np.int64)}
     times = [series.time_ns for series in channels.values()]
     every = times[0]
-    if any(not np.array_equal(every, other) for other in times[1:]):
+    # A truck's clock may be set back within a boot: then its batches are not in order of time.
+    is_rising = bool(np.all(np.diff(every) > 0))
+    if not is_rising or any(not np.array_equal(every, other) for other in times[1:]):
         every = np.unique(np.concatenate(times))
     columns: dict[str, NDArray[np.generic]] = {"time_ns": every}
     for name, (time_ns, values) in channels.items():

@@ -6,6 +6,7 @@ from pathlib import Path
 from schemas.results import BridgeResult, load_results
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
+from services.common.outputs import add_input
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +41,7 @@ def baselines_of(
 
 def stored_state(path: Path, bridge: Bridge) -> BridgeResult:
     """The state of a bridge in a results file; InputError if there is none with its elements."""
+    add_input(path)
     state = load_results(path).bridges.get(bridge.id)
     if state is None or len(state.elements) != bridge.elements:
         raise InputError(

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
 from services.common.errors import FailureError, InputError
+from services.common.files import is_unicode
 from services.common.parquet_files import decoded, encoded
 from services.common.stores import (
     Entry,
@@ -126,6 +127,9 @@ def mend(folder: Folder, *, verify: bool = False, must_write: bool = True) -> Me
     problems += [f"{folder.name}/{path}: is gone; its row is dropped" for path in sorted(gone)]
     for path, entry in recordings.items():
         old = before.rows.get(path)
+        if not is_unicode(path):
+            problems.append(f"{folder.name}/{path}: the name is not UTF-8; rename it")
+            continue
         try:
             if old is not None and (wrong := _wrong(folder, entry, old, verify=verify)):
                 problems.append(f"{folder.name}/{path}: {wrong}; its row is made anew")

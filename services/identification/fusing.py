@@ -133,6 +133,8 @@ def _stretches(off: of_crossing.OffBridge | None) -> tuple[fusion.Stretch, ...]:
     )
 
 
+# The likelihoods of crossings overflow far from their optima, where they are infinitely unlikely.
+@np.errstate(all="ignore")
 def fused(
     sources: Sequence[Source],
     report: Report = lambda stage, fraction: None,

@@ -10,6 +10,7 @@ from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from pydantic import ValidationError
 
 from pre_core.crossing.splines import value_at
 from pre_core.crossing.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
@@ -64,6 +65,8 @@ _LONGEST_OUTAGE_S = 8.0
 """So long without a fix the trajectory may be found from the axles' signals, by method `pre`."""
 
 
+# A search tries values beyond what floats hold, and sees by itself that an objective is not finite.
+@np.errstate(all="ignore")
 def identify(
     data: CrossingData,
     settings: IdentificationSettings,
@@ -113,9 +116,24 @@ def identify(
             report,
             lambda: stopwatch() - began,
         )
-    except Exception:  # whatever the data are, the answer is a verdict
+    except Exception as error:  # whatever the data are, the answer is a verdict
+        if is_not_finite(error):
+            _log.info("%s: %s: %s", data.crossing_id, type(error).__name__, error)
+            return reject([Reason.NOT_FINITE])
         _log.exception("identification of %s failed", data.crossing_id)
         return reject([Reason.FAILED])
+
+
+def is_not_finite(error: Exception) -> bool:
+    """Return whether an error says that numbers of a fit or a result are beyond what floats hold.
+
+    Values at the edge of what a site file may say lead there: overflows, bridges without modes,
+    and fields of a result that only take finite numbers.
+    """
+    if isinstance(error, ValidationError):
+        problems = error.errors(include_url=False, include_context=False, include_input=False)
+        return all(problem["type"] == "finite_number" for problem in problems)
+    return isinstance(error, ArithmeticError)
 
 
 class _Cut(NamedTuple):

@@ -58,6 +58,9 @@ span's deflection on n elements than it should: 1 % on three, 0.05 % on eight. F
 elements each: chi2 1.16 and an EI 3.3 standard deviations off; on nine: 0.96 and 1.9."""
 _SMALLEST_NOISE_UG = 0.1
 """A declared noise of zero cannot whiten anything; below this, model error dominates."""
+_SMALLEST_SPREAD = 1e-6
+"""Of a prior, relative: what a site file says is known exactly is a coordinate all the same."""
+_SMALLEST_DELAY_S = 1e-9
 _USABLE_CHI2 = 2.0
 """Intervals that are widened by the square root of this are wide; a model that fits worse is wrong,
 unless it is only the noise that is larger than declared."""
@@ -148,15 +151,15 @@ def _priors(data: CrossingData) -> posterior.Priors:
     spreads = np.array(spread)
     return posterior.Priors(
         nominal,
-        spreads,
+        np.where(at_zero, spreads, np.maximum(spreads, _SMALLEST_SPREAD)),
         at_zero,
         (at_zero & (spreads > 0.0)) | (nominal > 0.0),
         np.array([absence(bridge, row) for row in rows]),
         vehicle.wheelbase_m,
-        vehicle.spread("wheelbase_m"),
-        data.sensor.gain_spread,
-        data.sensor.common_gain_spread,
-        data.sensor.delay_spread_s,
+        max(vehicle.spread("wheelbase_m"), _SMALLEST_SPREAD),
+        max(data.sensor.gain_spread, _SMALLEST_SPREAD),
+        max(data.sensor.common_gain_spread, _SMALLEST_SPREAD),
+        max(data.sensor.delay_spread_s, _SMALLEST_DELAY_S),
     )
 
 

@@ -115,6 +115,8 @@ def run(
     _check_service(service_id)
     check_speaks_for(tls, "logger", service_id)
     check_folder_writable(file.parent if file is not None else folder)
+    if file is not None and file.exists():
+        raise InputError(f"{file}: exists, and recordings are never overwritten; give another name")
     _check_room(file.parent if file is not None else folder, limits.min_free_bytes)
     own = OwnEvents(service_id, time.time_ns())
     with (

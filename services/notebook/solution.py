@@ -11,7 +11,8 @@ from schemas.results import Crossing, Parameter, Results, Verdict, results_json
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
 from services.common.extras import check_installed
-from services.common.files import write_atomically
+from services.common.files import check_writable, write_atomically
+from services.common.kinds import RESULTS
 from services.history.draws import (
     Draws,
     DrawsOfCrossing,
@@ -115,6 +116,7 @@ class Identification(NamedTuple):
 
     def to_json(self, path: str | Path) -> None:
         """Write results.json, as `driveby identify --json` does."""
+        check_writable(Path(path), kinds=(RESULTS,))
         write_atomically(Path(path), results_json(self.results))
 
 

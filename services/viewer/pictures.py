@@ -5,6 +5,7 @@ from pathlib import Path
 
 from schemas.results import Results
 from schemas.site import Site
+from services.common.files import make_folder
 from services.common.progress import Steps, unwatched_steps
 from services.viewer.bridge_figure import bridge_figure
 from services.viewer.bridge_view import views_of_bridges
@@ -22,7 +23,7 @@ def write_pictures(
     The folder is made if it is not there, files of these names are replaced. `progress` is told of
     each picture.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     bridges = views_of_bridges(results, site)
     steps = len(FORMS) * (len(results.crossings) + len(bridges))
     written: list[Path] = []

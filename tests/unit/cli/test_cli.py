@@ -171,11 +171,11 @@ def test_positions_of_another_day_give_one_line_and_leave_nothing(
     path.write_text(path.read_text().replace("\n1790", "\n1791"))
     before = listing(drive.parent)
     output = drive.parent / "out.mcap"
-    output.write_text("kept")
+    output.write_bytes(b"\x89MCAP0\r\nkept")
     arguments = ("import", drive, "--site", drive / "site.toml", "-o", output)
     line = refused(capsys, *arguments, "--force")
     assert line.startswith(f"{path}: time_s goes from 1791000000.000 to ")
-    assert listing(drive.parent) == {**before, "out.mcap": b"kept"}
+    assert listing(drive.parent) == {**before, "out.mcap": b"\x89MCAP0\r\nkept"}
 
 
 def test_missing_files_and_places_are_named(

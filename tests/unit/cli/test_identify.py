@@ -312,7 +312,7 @@ def test_a_failing_writer_leaves_the_files_of_yesterday(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out.rrd"
-    out.write_text("of yesterday")
+    out.write_text("RRF2 of yesterday")
 
     def fail(path: Path, **_: object) -> None:
         path.write_bytes(b"half")
@@ -321,7 +321,7 @@ def test_a_failing_writer_leaves_the_files_of_yesterday(
     monkeypatch.setattr("services.viewer.view.write_rrd", fail)
     arguments = ["identify", str(recording), "--method", "least-squares", "--rrd", str(out)]
     assert cli.main(arguments) == 1
-    assert out.read_text() == "of yesterday"
+    assert out.read_text() == "RRF2 of yesterday"
     assert [path.name for path in tmp_path.iterdir()] == ["out.rrd"]
 
 

@@ -478,3 +478,10 @@ def test_what_is_not_installed_is_named(
         call(exact, simulation.signals)
     line = f'needs {module}, which is not installed: pip install "driveby[notebook]"'
     assert line in str(caught.value)
+
+
+def test_a_text_is_a_path(csv_example: Path) -> None:
+    path = csv_example / "site.toml"
+    assert driveby.load_site(str(path)) == driveby.load_site(path)
+    with pytest.raises(driveby.InputError, match=r"none\.toml: no such file"):
+        driveby.load_site("none.toml")

@@ -460,7 +460,7 @@ def test_what_is_imported_is_never_written_over(
     folder = ros2.record(tmp_path / "bag", messages, StoragePlugin.MCAP)
     path = folder / "bag.mcap"
     before = path.read_bytes()
-    for source in (path, folder):
+    for source, said in ((path, "is read by this command"), (folder, "is what is to be imported")):
         assert imported(source, site, path) == 2
-        assert "is what is to be imported" in capsys.readouterr().err
+        assert said in capsys.readouterr().err
     assert path.read_bytes() == before

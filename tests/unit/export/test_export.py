@@ -14,6 +14,7 @@ from schemas.site_file import load_site
 from services.cli import main as cli
 from services.common.geodesy import bridge_frame, to_chainage
 from services.drives.signals import signals_of_recording
+from services.recordings.recording import read_messages, read_site
 from services.recordings.writer import write_recording
 from tests.unit.drives.recorded import drive
 
@@ -244,3 +245,25 @@ def test_what_cannot_be_exported_is_one_line(
         assert err.count("\n") == 1
     assert not (tmp_path / "t").exists()
     assert load_results(results).crossings
+
+
+def test_a_recording_whose_sequences_run_backwards_is_exported_by_time(
+    sample: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A clock that is set back gives such batches; rows are in the order of time all the same."""
+    messages = list(read_messages(sample))
+    last = max(message.sequence for message in messages)
+    backwards = tmp_path / "backwards.mcap"
+    write_recording(
+        backwards,
+        [message._replace(sequence=last - message.sequence) for message in messages],
+        site_toml=read_site(sample),
+        reason="test",
+    )
+    out: list[dict[str, str]] = []
+    for path in (sample, backwards):
+        folder = tmp_path / path.stem
+        assert cli.main(["export", str(path), "--to", str(folder)]) == 0
+        capsys.readouterr()
+        out.append({one.name: one.read_text() for one in folder.glob("*.csv")})
+    assert out[0] == out[1]

@@ -178,3 +178,22 @@ def test_only_one_place_parses_toml() -> None:
         if "tomllib.load" in path.read_text()
     }
     assert users == {"schemas/toml_text.py"}
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("span_m = 22,0", "22,0 has a decimal comma, TOML has a point: 22.0"),
+        ("  span_m=-1,5e3  # m", "-1,5e3 has a decimal comma, TOML has a point: -1.5e3"),
+    ],
+)
+def test_a_decimal_comma_is_named(line: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_toml(f"[bridge]\nid = 'b'\n{line}\nelements = 5\n", "site.toml")
+    assert str(caught.value) == f"site.toml: line 3: is not TOML: {said}"
+
+
+def test_a_comma_between_values_is_no_decimal_comma() -> None:
+    with pytest.raises(InputError, match="line 1, column"):
+        parse_toml("pair = 1,2, 3\n", "site.toml")
+    assert parse_toml("pair = [1,2]\n", "site.toml") == {"pair": [1, 2]}

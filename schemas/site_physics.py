@@ -1,0 +1,192 @@
+"""Physical bounds of a site file: values that no truck, bridge or sensor can have are refused.
+
+The bounds are generous, for a model in a laboratory is a bridge too: what is unlikely is left to
+`driveby check`. Most hold for ratios of quantities, as natural frequencies and damping ratios, and
+are given in the message as a range of the key that is out of it.
+"""
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from schemas.site_errors import at
+
+if TYPE_CHECKING:
+    from schemas.site import Bridge, Receiver, Sensor
+    from schemas.site_vehicle import Vehicle
+
+_G_M_PER_S2: Final = 9.80665
+_SMALLEST_MASS_KG: Final = 0.1
+_MASS_PER_LENGTH_KG_PER_M: Final = (0.01, 1e6)
+_SMALLEST_AXLE: Final = 1e-3
+"""Mass of an axle over the truck's; and the least share of it that is sprung."""
+_SMALLEST_LOAD: Final = 0.01
+"""Share of the weight that each axle carries at least."""
+_SPRING_HZ: Final = (0.1, 300.0)
+"""Of the body on the springs of an axle: at 0.1 Hz it sags by 25 m under its own weight."""
+_TYRE_HZ: Final = (0.1, 1000.0)
+"""Of the body on the tyres at least, of the axle on them at most."""
+_MOST_DAMPING: Final = 20.0
+"""Damping ratio of a spring with its damper, and of a tyre."""
+_WAVE_SPEED_M_PER_S: Final = 6000.0
+"""Of the materials of bridges at most: 5100 in steel, 4000 in concrete."""
+_GYRATION: Final = 0.25
+"""Radius of gyration of the cross-section over the span: a truss half as deep as it is long."""
+_SAG: Final = 0.1
+"""Deflection under the own weight over the span: of real bridges 1/100 and less."""
+_SHORTEST_PART: Final = 1e-3
+"""Length of an element over the span, and of a span over the bridge."""
+_SUPPORT_SPRING: Final = (1e-6, 1e6)
+"""Over EI / span."""
+_SMALLEST_COMPLIANCE_M_PER_N: Final = 1e-15
+_SLOWEST_RATE_HZ: Final = 10.0
+_LARGEST_POSITION_M: Final = 100.0
+_LARGEST_SPEED_M_PER_S: Final = 10.0
+_TYRE_M: Final = (1e-3, 2.0)
+
+
+def check_vehicle(vehicle: "Vehicle") -> None:
+    """Raise the error of the first key whose value no truck can have."""
+    total = vehicle.total_mass_kg
+    _check("total_mass_kg", total, (_SMALLEST_MASS_KG, 1e6), "a mass", "kg")
+    wheelbase = vehicle.wheelbase_m
+    _check("wheelbase_m", wheelbase, (0.05, 30.0), "a length", "m")
+    _check(
+        "front_axle_to_cg_m",
+        vehicle.front_axle_to_cg_m,
+        (_SMALLEST_LOAD * wheelbase, (1.0 - _SMALLEST_LOAD) * wheelbase),
+        "a length",
+        "m",
+        "each axle carries a part of the truck",
+    )
+    _check("pitch_inertia_ratio", vehicle.pitch_inertia_ratio, (0.01, 10.0), "a number")
+    for k, mass in enumerate(vehicle.unsprung_mass_kg):
+        limits = (_SMALLEST_AXLE * total, (1.0 - _SMALLEST_AXLE) * total)
+        _check(f"unsprung_mass_kg.{k}", mass, limits, "a mass", "kg", f"the truck has {total:g} kg")
+    if vehicle.sprung_mass_kg < _SMALLEST_AXLE * total:
+        raise at(
+            "unsprung_mass_kg",
+            f"adds up to {sum(vehicle.unsprung_mass_kg):g}, it must be a mass of at most "
+            f"{(1.0 - _SMALLEST_AXLE) * total:g} kg: a part of the truck is on springs",
+        )
+    loads = (vehicle.cg_to_rear_axle_m / wheelbase, vehicle.front_axle_to_cg_m / wheelbase)
+    for k in range(2):
+        _check_axle(vehicle, k, vehicle.sprung_mass_kg * loads[k])
+    for key in ("tyre_width_m", "tyre_contact_length_m"):
+        for k, value in enumerate(getattr(vehicle, key) or ()):
+            _check(f"{key}.{k}", value, _TYRE_M, "a length", "m")
+    for k, value in enumerate(vehicle.twin_tyre_distance_m or ()):
+        _check(f"twin_tyre_distance_m.{k}", value, (0.0, _TYRE_M[1]), "a length", "m")
+    for k, value in enumerate(vehicle.track_m or ()):
+        _check(f"track_m.{k}", value, (0.02, 5.0), "a length", "m")
+
+
+def _check_axle(vehicle: "Vehicle", k: int, body_kg: float) -> None:
+    """Raise if springs, tyres or dampers of an axle that carries `body_kg` cannot be."""
+    axle_kg = vehicle.unsprung_mass_kg[k]
+    spring, tyre = vehicle.suspension_stiffness_n_per_m[k], vehicle.tyre_stiffness_n_per_m[k]
+    low, high = (_stiffness(body_kg, hz) for hz in _SPRING_HZ)
+    because = f"{body_kg:.3g} kg swing on it at {_SPRING_HZ[0]:g} to {_SPRING_HZ[1]:g} Hz"
+    key = f"suspension_stiffness_n_per_m.{k}"
+    _check(key, spring, (low, high), "a stiffness", "N/m", because)
+    low, high = _stiffness(body_kg, _TYRE_HZ[0]), _stiffness(axle_kg, _TYRE_HZ[1])
+    because = f"an axle of {axle_kg:.3g} kg swings on it at {_TYRE_HZ[1]:g} Hz at most"
+    _check(f"tyre_stiffness_n_per_m.{k}", tyre, (low, high), "a stiffness", "N/m", because)
+    because = f"the damping ratio is {_MOST_DAMPING:g} then"
+    for key, damping, stiffness, mass in (
+        ("suspension_damping_ns_per_m", vehicle.suspension_damping_ns_per_m[k], spring, body_kg),
+        ("tyre_damping_ns_per_m", vehicle.tyre_damping_ns_per_m[k], tyre, axle_kg),
+    ):
+        most = 2.0 * _MOST_DAMPING * math.sqrt(stiffness * mass)
+        _check(f"{key}.{k}", damping, (0.0, most), "a damping", "N·s/m", because)
+
+
+def check_bridge(bridge: "Bridge") -> None:
+    """Raise the error of the first key whose value no bridge can have."""
+    _check("span_m", bridge.span_m, (0.1, 1000.0), "a length", "m")
+    mass = bridge.mass_per_length_kg_per_m
+    key = "mass_per_length_kg_per_m"
+    _check(key, mass, _MASS_PER_LENGTH_KG_PER_M, "a mass per length", "kg/m")
+    shortest = _SHORTEST_PART * bridge.span_m
+    for k, length in enumerate(bridge.element_lengths_m or ()):
+        _check(f"element_lengths_m.{k}", length, (shortest, bridge.span_m), "a length", "m")
+    for k, support in enumerate(bridge.interior_supports_m):
+        before = (0.0, *bridge.interior_supports_m)[k]
+        limits = (before + shortest, bridge.span_m - shortest)
+        _check(f"interior_supports_m.{k}", support, limits, "a chainage", "m")
+    span = max(bridge.lengths_of_spans_m)
+    limits = _rigidities(span, mass)
+    low_hz, high_hz = (_first_hz(span, mass, rigidity) for rigidity in limits)
+    because = f"{span:g} m of {mass:g} kg/m swing at {low_hz:.2g} to {high_hz:.3g} Hz"
+    single = "flexural_rigidity_nm2"
+    if bridge.flexural_rigidity_nm2 is not None:
+        value = bridge.flexural_rigidity_nm2
+        _check(single, value, limits, "a flexural rigidity", "N·m²", because)
+    for k, value in enumerate(bridge.flexural_rigidity_per_element_nm2 or ()):
+        key = f"flexural_rigidity_per_element_nm2.{k}"
+        _check(key, value, limits, "a flexural rigidity", "N·m²", because)
+    nominal = bridge.nominal_flexural_rigidity_nm2
+    mean = math.exp(math.fsum(map(math.log, nominal)) / len(nominal))
+    first_hz = _first_hz(span, mass, mean)
+    omega = 2.0 * math.pi * first_hz
+    because = f"beyond it the first mode, {first_hz:.2g} Hz, does not swing"
+    for key, value, most, noun, unit in (
+        ("rayleigh_alpha_per_s", bridge.rayleigh_alpha_per_s, 2.0 * omega, "a coefficient", "1/s"),
+        ("rayleigh_beta_s", bridge.rayleigh_beta_s, 2.0 / omega, "a time", "s"),
+    ):
+        _check(key, value, (0.0, most), noun, unit, because)
+    if bridge.support_rotational_stiffness_spread_nm_per_rad is not None:
+        key = "support_rotational_stiffness_spread_nm_per_rad"
+        low, high = (share * mean / span for share in _SUPPORT_SPRING)
+        _check(key, getattr(bridge, key), (low, high), "a rotational stiffness", "N·m/rad")
+    key = "support_compliance_spread_m_per_n"
+    _check(key, getattr(bridge, key), (_SMALLEST_COMPLIANCE_M_PER_N, 1e-6), "a compliance", "m/N")
+
+
+def check_sensor(sensor: "Sensor") -> "Sensor":
+    """Return the sensor; raise if a rate is none of an accelerometer."""
+    for rate in sensor.rate_hz:
+        if rate < _SLOWEST_RATE_HZ:
+            raise at(
+                "rate_hz",
+                f"is {rate:g}, it must be a rate of at least {_SLOWEST_RATE_HZ:g} Hz (Hz, not kHz)",
+            )
+    return sensor
+
+
+def check_receiver(receiver: "Receiver") -> "Receiver":
+    """Return the receiver; raise if its errors are larger than a bridge is long."""
+    for key in ("position_spread_m", "position_noise_m"):
+        _check(key, getattr(receiver, key), (0.0, _LARGEST_POSITION_M), "a length", "m")
+    key = "speed_noise_m_per_s"
+    _check(key, receiver.speed_noise_m_per_s, (0.0, _LARGEST_SPEED_M_PER_S), "a speed", "m/s")
+    return receiver
+
+
+def _stiffness(mass_kg: float, frequency_hz: float) -> float:
+    return mass_kg * (2.0 * math.pi * frequency_hz) ** 2
+
+
+def _first_hz(span_m: float, mass_kg_per_m: float, rigidity_nm2: float) -> float:
+    """Return the first natural frequency of a beam on two supports."""
+    return math.pi / (2.0 * span_m**2) * math.sqrt(rigidity_nm2 / mass_kg_per_m)
+
+
+def _rigidities(span_m: float, mass_kg_per_m: float) -> tuple[float, float]:
+    """Return EI at which a beam sags by a tenth of its span, and that of the stiffest section."""
+    least = 5.0 * mass_kg_per_m * _G_M_PER_S2 * span_m**3 / (384.0 * _SAG)
+    return least, mass_kg_per_m * (_WAVE_SPEED_M_PER_S * _GYRATION * span_m) ** 2
+
+
+def _check(
+    path: str,
+    value: float,
+    limits: tuple[float, float],
+    noun: str,
+    unit: str = "",
+    because: str = "",
+) -> None:
+    low, high = limits
+    if low <= value <= high:
+        return
+    reach = f"from {low:.4g} to {high:.4g} {unit}".rstrip()
+    raise at(path, f"is {value:g}, it must be {noun} {reach}" + (f": {because}" if because else ""))

@@ -1,0 +1,64 @@
+"""A search ends: the walk along the road has a reach, and the whole has a budget."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pre_core.crossing import optimum
+from pre_core.search.loop import Ending
+
+
+def found(chi2: float, evaluations: int, ending: Ending = Ending.CONVERGED) -> Any:
+    """A stand-in for an optimum, as the choice among them sees it."""
+    unknown: Any = SimpleNamespace(y=np.zeros(1))
+    return optimum.Optimum(unknown, unknown, ending, chi2, evaluations, 1)
+
+
+def test_the_walk_has_a_reach_however_little_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The further away, the better it fits: only the reach ends this walk."""
+    seen: list[float] = []
+
+    def look(shift: float, start: Any) -> Any:
+        seen.append(shift)
+        assert len(seen) < 1000
+        return optimum._Place(-abs(shift), shift, start, np.zeros(0, np.int64)), 1
+
+    bridge = SimpleNamespace(bridge=np.arange(3))
+    monkeypatch.setattr(optimum, "_looking", lambda problem, y, way: look)
+    monkeypatch.setattr(optimum, "layout", lambda problem: bridge)
+    problem: Any = SimpleNamespace(receiver_rows=np.array([[1e-9]]))
+    _, evaluations = optimum._walk(problem, np.zeros(4), optimum._SIMPLEST)
+    assert max(map(abs, seen)) < 40.0
+    assert evaluations < 200
+
+
+@pytest.mark.parametrize("each", [30_000, 60_000, 200_000])
+def test_a_search_that_finds_no_fit_ends_within_its_budget(
+    each: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    budgets: list[int] = []
+
+    def from_places(problem: Any, y: Any, way: Any, report: Any, most: int) -> Any:
+        budgets.append(most)
+        return found(5.0, each)
+
+    monkeypatch.setattr(optimum, "_from_places", from_places)
+    monkeypatch.setattr(optimum, "prepare", lambda inputs: (None, None))
+    monkeypatch.setattr(optimum, "levels_at", lambda problem, y: np.zeros(1))
+    monkeypatch.setattr(optimum, "_is_accepted", lambda problem, chi2: chi2 < 1.5)
+    inputs: Any = None
+    best = optimum.find_optimum(inputs)
+    assert min(budgets) > 0
+    assert best.evaluations == each * len(budgets)
+    assert best.evaluations < optimum._MOST_EVALUATIONS + each
+    assert best.ending is Ending.STEPS_EXHAUSTED
+
+
+def test_a_fit_that_took_long_is_a_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(optimum, "_from_places", lambda *_: found(1.0, 300_000))
+    monkeypatch.setattr(optimum, "prepare", lambda inputs: (None, None))
+    monkeypatch.setattr(optimum, "_is_accepted", lambda problem, chi2: chi2 < 1.5)
+    inputs: Any = None
+    assert optimum.find_optimum(inputs).ending is Ending.CONVERGED
