@@ -41,7 +41,8 @@ class Alarm(_Fields):
     raised: Finite
     """End of the period that raised it."""
     sum: Finite
-    """Of the CUSUM, in standard deviations."""
+    """Statistic of the chart that raised it, in standard deviations: √(2 ln R), of earlier versions
+    a CUSUM. Compare it with the threshold of the same alarm only."""
     threshold: Finite
     ratio: Finite
     """EI of the element now over before, with its 95 % interval."""

@@ -1,39 +1,54 @@
-"""A bridge's baseline: ln EI at a reference temperature, its slope, and what observations share.
+"""A bridge's baseline: ln EI at a reference temperature, its usual movements, and shared errors.
 
 Every period has an observation y of ln EI with own covariance R and loadings K on unit normals z
 that other periods have too (trucks, tracks, the bridge's other unknowns):
 
-    y = mu + beta (T - T_0) + K z + own + change,    change ~ N(0, q^2 ((1 - rho) I + rho 1 1')).
+    y = mu + beta (T - T_0) + wander + K z + own + change,
+    change ~ N(0, q^2 C),    wander: Ornstein-Uhlenbeck of standard deviation s, memory tau,
 
-mu, beta and z are one normal state; what a period tells is added as in Kalman's filter without
-motion. Its innovation is the observation less its prediction from all before, with the covariance S
-of both: innovations of a bridge that does not change are independent of each other, whatever
-periods share, for what they share is in the prediction.
+with C = (1 - rho) I + rho 1 1'. A period of unknown temperature has instead of beta (T - T_0) an
+annual wave of unknown amplitude and phase in each element, half an annual one and an offset common
+to all, and the weather's deviation from it as noise.
+
+mu, beta, wander, season and z are one normal state, followed by a Kalman filter. q, s and tau are
+unknown: the filter runs for each of `scales_compared()` at once, and each run's weight is its prior
+times the density of what was observed. Innovations of a bridge that does not change are
+independent of each other, whatever periods share, for what they share is in the prediction.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.fusion.between import BETWEEN_SCALE
-from pre_core.monitoring.observation import Observation
+from pre_core.monitoring.observation import Observation, Shared
 
 FloatArray = NDArray[np.float64]
 
 REFERENCE_DEG_C = 10.0
 LEVEL_SPREAD = 1.0
-"""Of ln EI before any crossing: next to nothing is known."""
+"""Prior standard deviation of ln EI: next to nothing is known."""
 SLOPE_SPREAD, SLOPE_SPREAD_OWN = 4e-3, 1e-3
-"""Of d ln EI/dT in 1/K, common to all elements and of each beside that: concrete and asphalt lose
+"""Prior of d ln EI/dT in 1/K, common to all elements and own of each: concrete and asphalt lose
 some tenths of a per cent a kelvin."""
-UNKNOWN_DEG_C = 8.0
-"""Standard deviation of the temperature of a period of which it is not known."""
-CHANGES = (0.0, 0.005, 0.01, 0.02, 0.03, 0.04)
-"""Values of q that are compared."""
+SEASON_K, HALF_SEASON_K, OFFSET_K, WEATHER_K = 11.0, 3.0, 8.0, 4.0
+"""Temperature in K, as standard deviation, where it is unknown: each part of the annual wave, of
+the wave of half a year, of the annual mean, and of a period's weather."""
+DAYS_PER_YEAR = 365.25
+CHANGES = (0.0, 0.005, 0.015, 0.04)
+"""Values of q that are compared; half-normal prior of scale 4 %, as between crossings."""
+WANDERS = (0.0, 0.006, 0.012, 0.02)
+"""Values of s that are compared: larger ones would explain a slow loss."""
+WANDER_SCALE = 0.012
+"""Scale of the half-normal prior of s."""
+MEMORIES_DAYS = (56.0, 280.0)
+"""Values of tau that are compared, equally likely."""
 COMMON_CHANGE = 0.5
 """rho."""
+_NEGLIGIBLE = 0.01
+"""Share of an observation's own variance below which a direction of shared error counts as own."""
 
 
 class Period(NamedTuple):
@@ -41,143 +56,265 @@ class Period(NamedTuple):
 
     observation: Observation
     temperature_deg_c: float | None
+    time_days: float
+    """Middle of the period."""
+
+
+class Scales(NamedTuple):
+    """Sizes of the usual movements that are compared, (m,) each."""
+
+    change: FloatArray
+    """q."""
+    wander: FloatArray
+    """s."""
+    memory_days: FloatArray
+    """tau."""
+    log_prior: FloatArray
 
 
 class State(NamedTuple):
-    """What is known: a normal of mu (n), beta (n) and the shared unknowns."""
+    """What is known, by each of m scales: a normal of all unknowns (size,)."""
 
-    mean: FloatArray
-    covariance: FloatArray
+    mean: FloatArray  # (m, size)
+    covariance: FloatArray  # (m, size, size)
+    log_weight: FloatArray
+    """(m,) logarithm of the posterior weight, normalised."""
     places: Mapping[str, slice]
-    """Of what is shared, by name."""
+    """Place of each unknown: level, wander, slope, season, change, and the names of what is
+    shared."""
+    scales: Scales
+    time_days: float
 
 
 class Innovation(NamedTuple):
-    """What a period tells beyond what was predicted of it."""
+    """The difference between what a period says and its prediction, by each scale."""
 
-    value: FloatArray  # (n,)
-    covariance: FloatArray  # (n, n) of it
-    predicted: FloatArray  # (n,) ln EI
-
-
-def begin(first: Observation) -> State:
-    """Nothing known but where the first observation is, roughly."""
-    n = first.value.size
-    covariance = np.zeros((2 * n, 2 * n))
-    covariance[:n, :n] = LEVEL_SPREAD**2 * np.eye(n)
-    covariance[n:, n:] = SLOPE_SPREAD**2 + SLOPE_SPREAD_OWN**2 * np.eye(n)
-    return State(np.concatenate([first.value, np.zeros(n)]), covariance, {})
+    value: FloatArray  # (m, n)
+    covariance: FloatArray  # (m, n, n) of it
+    across: FloatArray  # (n, size): how the observation depends on the state
+    gain: FloatArray  # (m, size, n): covariance of state and innovation
 
 
-def innovation(state: State, period: Period, change: float) -> tuple[State, Innovation]:
-    """The innovation of a period, and the state that knows of it; `change` is q."""
-    state = _with_places(state, period.observation)
-    across, noise = _rows(state, period, change)
-    predicted = across @ state.mean
-    gain = state.covariance @ across.T
-    covariance = across @ gain + noise
-    value = period.observation.value - predicted
-    factor = np.linalg.cholesky(covariance)
-    told = np.linalg.solve(factor, np.column_stack([value, gain.T]))
-    mean = state.mean + told[:, 1:].T @ told[:, 0]
-    after = State(mean, state.covariance - told[:, 1:].T @ told[:, 1:], state.places)
-    return after, Innovation(value, covariance, predicted)
+def scales_compared() -> Scales:
+    """Return the grid of q, s and tau with its prior."""
+    wanders = [(0.0, MEMORIES_DAYS[0], 1.0)]
+    wanders += [(s, tau, 1.0 / len(MEMORIES_DAYS)) for s in WANDERS[1:] for tau in MEMORIES_DAYS]
+    widths_q = dict(zip(CHANGES, np.gradient(np.array(CHANGES)), strict=True))
+    widths_s = dict(zip(WANDERS, np.gradient(np.array(WANDERS)), strict=True))
+    rows = np.array(
+        [
+            (q, s, tau, np.log(share * widths_q[q] * widths_s[s])
+             - 0.5 * (q / BETWEEN_SCALE) ** 2 - 0.5 * (s / WANDER_SCALE) ** 2)
+            for q in CHANGES
+            for s, tau, share in wanders
+        ]
+    )  # fmt: skip
+    log_prior = rows[:, 3] - log_sum(rows[:, 3])
+    return Scales(rows[:, 0], rows[:, 1], rows[:, 2], log_prior)
 
 
-def log_evidence(of: Innovation) -> float:
-    """Logarithm of the density of what was observed, but for a constant."""
-    factor = np.linalg.cholesky(of.covariance)
-    apart = np.linalg.solve(factor, of.value)
-    return float(-0.5 * apart @ apart - np.log(np.diag(factor)).sum())
-
-
-def usual_change(periods: Sequence[Period]) -> float:
-    """q by how periods differ in which the bridge is taken not to change: root of its mean square.
-
-    Over `CHANGES`, with a half-normal prior of scale 4 %, as between crossings.
-    """
-    log = np.array([-0.5 * (q / BETWEEN_SCALE) ** 2 for q in CHANGES])
-    for number, q in enumerate(CHANGES):
-        state = begin(periods[0].observation)
-        for period in periods:
-            state, found = innovation(state, period, q)
-            log[number] += log_evidence(found)
-    weight = np.exp(log - log.max()) * np.gradient(np.array(CHANGES))
-    return float(np.sqrt(weight @ np.square(CHANGES) / weight.sum()))
-
-
-def changed_since(
-    state: State, periods: Sequence[Period], change: float, spread: float
-) -> tuple[State, FloatArray, FloatArray]:
-    """By how much ln EI (n,) is another in some periods than before, and its covariance.
-
-    `state` knows of all before. And the state with what is now as its level, for what comes after.
-    """
-    n = periods[0].observation.value.size
-    size = state.mean.size
-    covariance = np.zeros((size + n, size + n))
-    covariance[:size, :size] = state.covariance
-    covariance[size:, size:] = spread**2 * np.eye(n)
-    places = {**state.places, _CHANGE: slice(size, size + n)}
-    now = State(np.concatenate([state.mean, np.zeros(n)]), covariance, places)
+def begin(periods: Sequence[Period], scales: Scales) -> State:
+    """Return the state before the first of some periods; they say what unknowns there are."""
+    n, m = periods[0].observation.value.size, scales.change.size
+    blocks: dict[str, FloatArray] = {"level": LEVEL_SPREAD**2 * np.eye(n), "wander": _alike(n)}
+    if any(period.temperature_deg_c is not None for period in periods):
+        blocks["slope"] = _of_slope(n)
+    if any(period.temperature_deg_c is None for period in periods):
+        season = np.zeros((2 * n + 3, 2 * n + 3))
+        season[:n, :n] = season[n : 2 * n, n : 2 * n] = SEASON_K**2 * _of_slope(n)
+        others_k = np.array([HALF_SEASON_K, HALF_SEASON_K, OFFSET_K])
+        season[2 * n :, 2 * n :] = np.diag((SLOPE_SPREAD * others_k) ** 2)
+        blocks["season"] = season
     for period in periods:
-        now, _ = innovation(now, period, change)
-    at = now.places[_CHANGE]
-    return _moved(now), now.mean[at], now.covariance[at, at]
+        for one in period.observation.shared:
+            blocks.setdefault(one.name, np.eye(one.loading.shape[1]))
+    places, size = {}, 0
+    for name, block in blocks.items():
+        places[name] = slice(size, size + len(block))
+        size += len(block)
+    covariance = np.zeros((m, size, size))
+    for name, block in blocks.items():
+        factor = scales.wander**2 if name == "wander" else np.ones(m)
+        covariance[:, places[name], places[name]] = factor[:, None, None] * block
+    mean = np.zeros((m, size))
+    mean[:, :n] = periods[0].observation.value
+    return State(mean, covariance, scales.log_prior, places, scales, periods[0].time_days)
+
+
+def moved_on(state: State, time_days: float) -> tuple[State, FloatArray]:
+    """Return the state at a later time, and the share of the wander that is left by then, (m,)."""
+    passed = max(0.0, time_days - state.time_days)
+    kept = np.exp(-passed / state.scales.memory_days)
+    at = state.places["wander"]
+    mean, covariance = state.mean.copy(), state.covariance.copy()
+    mean[:, at] *= kept[:, None]
+    covariance[:, at, :] *= kept[:, None, None]
+    covariance[:, :, at] *= kept[:, None, None]
+    anew = state.scales.wander**2 * (1.0 - kept**2)
+    covariance[:, at, at] += anew[:, None, None] * _alike(at.stop - at.start)
+    return state._replace(mean=mean, covariance=covariance, time_days=time_days), kept
+
+
+def innovation(state: State, period: Period) -> Innovation:
+    """Return the innovation of a period at the time of the state."""
+    across, noise = _rows(state, period)
+    n = len(across)
+    gain = state.covariance @ across.T
+    own = state.scales.change[:, None, None] ** 2 * _alike(n)
+    covariance = across @ gain + noise + own
+    value = period.observation.value - state.mean @ across.T
+    return Innovation(value, covariance, across, gain)
+
+
+def learned(state: State, told: Innovation) -> tuple[State, FloatArray]:
+    """Return the state that knows of an innovation, and Kalman's gain (m, size, n)."""
+    weight = np.asarray(
+        np.linalg.solve(told.covariance, told.gain.transpose(0, 2, 1)).transpose(0, 2, 1)
+    )
+    mean = state.mean + (weight @ told.value[:, :, None])[:, :, 0]
+    covariance = state.covariance - weight @ told.gain.transpose(0, 2, 1)
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    log = state.log_weight + log_density(told)
+    return state._replace(mean=mean, covariance=covariance, log_weight=log - log_sum(log)), weight
+
+
+def log_density(told: Innovation) -> FloatArray:
+    """Return the logarithm of the density of an innovation by each scale, but for a constant."""
+    apart = np.linalg.solve(told.covariance, told.value[:, :, None])[:, :, 0]
+    return np.asarray(
+        -0.5 * np.sum(apart * told.value, axis=1) - 0.5 * np.linalg.slogdet(told.covariance)[1]
+    )
+
+
+def of_scales(state: State, kept: NDArray[np.bool_]) -> State:
+    """Return the state with some of its scales (m,) only."""
+    log = state.log_weight[kept]
+    return state._replace(
+        mean=state.mean[kept],
+        covariance=state.covariance[kept],
+        log_weight=log - log_sum(log),
+        scales=Scales(*(one[kept] for one in state.scales)),
+    )
+
+
+def standardised(state: State, told: Innovation) -> FloatArray:
+    """Return the innovation (n,) by all scales together over its standard deviation."""
+    weight = np.exp(state.log_weight)
+    mean = weight @ told.value
+    spread = np.diagonal(told.covariance, axis1=1, axis2=2) + (told.value - mean) ** 2
+    return np.asarray(mean / np.sqrt(weight @ spread))
+
+
+def with_change(state: State, spread: float) -> State:
+    """Return the state with a change of ln EI from now on, a prior standard deviation of it."""
+    m, size = state.mean.shape
+    n = state.places["level"].stop
+    covariance = np.zeros((m, size + n, size + n))
+    covariance[:, :size, :size] = state.covariance
+    covariance[:, size:, size:] = spread**2 * np.eye(n)
+    mean = np.concatenate([state.mean, np.zeros((m, n))], axis=1)
+    places = {**state.places, _CHANGE: slice(size, size + n)}
+    return state._replace(mean=mean, covariance=covariance, places=places)
+
+
+def change_of(state: State) -> tuple[FloatArray, FloatArray]:
+    """Return mean (n,) and covariance (n, n) of the change of `with_change`."""
+    at = state.places[_CHANGE]
+    weight = np.exp(state.log_weight)
+    means = state.mean[:, at]
+    mean = weight @ means
+    between = np.einsum("m,mi,mj->ij", weight, means - mean, means - mean)
+    return mean, np.einsum("m,mij->ij", weight, state.covariance[:, at, at]) + between
+
+
+def change_taken(state: State) -> State:
+    """Return the state with level + change for the level, and without the change."""
+    at = state.places[_CHANGE]
+    n = at.stop - at.start
+    move = np.eye(state.mean.shape[1])
+    move[:n, at] = np.eye(n)
+    kept = np.delete(move, np.arange(at.start, at.stop), axis=0)
+    places = {name: where for name, where in state.places.items() if name != _CHANGE}
+    covariance = kept @ state.covariance @ kept.T
+    return state._replace(mean=state.mean @ kept.T, covariance=covariance, places=places)
 
 
 _CHANGE = "change"
 
 
-def _moved(state: State) -> State:
-    """The state with mu + change for mu, and without the change."""
-    at = state.places[_CHANGE]
-    n = at.stop - at.start
-    move = np.eye(state.mean.size)
-    move[:n, at] = np.eye(n)
-    kept = np.delete(move, np.arange(at.start, at.stop), axis=0)
-    places = {
-        name: slice(where.start - n, where.stop - n) if where.start > at.start else where
-        for name, where in state.places.items()
-        if name != _CHANGE
-    }
-    return State(kept @ state.mean, _symmetric(kept @ state.covariance @ kept.T), places)
+def compressed(periods: Sequence[Period]) -> list[Period]:
+    """Return periods whose shared errors have as few unknowns as matter.
+
+    Of each name the directions are kept that carry more than a hundredth of an observation's own
+    variance in any period; the rest is added to the own covariance.
+    """
+    stacked: dict[str, list[FloatArray]] = {}
+    for period in periods:
+        # Whitened by what is the observation's own.
+        root = np.linalg.inv(np.linalg.cholesky(period.observation.own))
+        for one in period.observation.shared:
+            stacked.setdefault(one.name, []).append(root @ one.loading)
+    kept = {name: _directions(some) for name, some in stacked.items()}
+    return [_with_directions(period, kept) for period in periods]
 
 
-def _with_places(state: State, observation: Observation) -> State:
-    """The state with unit normals for what it has not yet met."""
-    new = [one for one in observation.shared if one.name not in state.places]
-    if not new:
-        return state
-    places = dict(state.places)
-    size = state.mean.size
-    for one in new:
-        r = one.loading.shape[1]
-        places[one.name] = slice(size, size + r)
-        size += r
-    covariance = np.eye(size)
-    before = state.mean.size
-    covariance[:before, :before] = state.covariance
-    return State(np.concatenate([state.mean, np.zeros(size - before)]), covariance, places)
+def _directions(whitened: Iterable[FloatArray]) -> FloatArray:
+    """Return an orthonormal basis (r, p) of what matters in loadings (n, r)."""
+    some = list(whitened)
+    basis = np.linalg.svd(np.concatenate(some), full_matrices=False)[2].T
+    size = np.array([np.sum((one @ basis) ** 2, axis=0) for one in some])  # (periods, p)
+    behind = size[:, ::-1].cumsum(axis=1)[:, ::-1].max(axis=0)
+    return np.asarray(basis[:, behind > _NEGLIGIBLE])
 
 
-def _rows(state: State, period: Period, change: float) -> tuple[FloatArray, FloatArray]:
-    """How an observation goes with the state (n, size), and its own covariance (n, n)."""
+def _with_directions(period: Period, kept: Mapping[str, FloatArray]) -> Period:
+    of = period.observation
+    own, shared = of.own, []
+    for name, loading in of.shared:
+        moved = loading @ kept[name]
+        rest = loading - moved @ kept[name].T
+        own = own + rest @ rest.T
+        if moved.shape[1]:
+            shared.append(Shared(name, moved))
+    return period._replace(observation=Observation(of.value, own, tuple(shared)))
+
+
+def _rows(state: State, period: Period) -> tuple[FloatArray, FloatArray]:
+    """How an observation depends on the state (n, size), and its noise (n, n) beside q."""
     of = period.observation
     n = of.value.size
-    across = np.zeros((n, state.mean.size))
-    across[:, :n] = np.eye(n)
-    noise = of.own + change**2 * ((1.0 - COMMON_CHANGE) * np.eye(n) + COMMON_CHANGE)
-    if period.temperature_deg_c is None:
-        noise = noise + (SLOPE_SPREAD * UNKNOWN_DEG_C) ** 2
+    across = np.zeros((n, state.mean.shape[1]))
+    noise = of.own
+    for name in ("level", "wander", _CHANGE):
+        if name in state.places:
+            across[:, state.places[name]] = np.eye(n)
+    if period.temperature_deg_c is not None:
+        warmer = period.temperature_deg_c - REFERENCE_DEG_C
+        across[:, state.places["slope"]] = warmer * np.eye(n)
     else:
-        across[:, n : 2 * n] = (period.temperature_deg_c - REFERENCE_DEG_C) * np.eye(n)
+        phase = 2.0 * np.pi * period.time_days / DAYS_PER_YEAR
+        at = state.places["season"].start
+        across[:, at : at + n] = np.cos(phase) * np.eye(n)
+        across[:, at + n : at + 2 * n] = np.sin(phase) * np.eye(n)
+        across[:, at + 2 * n : at + 2 * n + 3] = np.cos(2.0 * phase), np.sin(2.0 * phase), 1.0
+        noise = noise + (SLOPE_SPREAD * WEATHER_K) ** 2
     for name, loading in of.shared:
         across[:, state.places[name]] = loading
-    if _CHANGE in state.places:
-        across[:, state.places[_CHANGE]] = np.eye(n)
     return across, noise
 
 
-def _symmetric(covariance: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (covariance + covariance.T))
+def _of_slope(n: int) -> FloatArray:
+    return SLOPE_SPREAD**2 + SLOPE_SPREAD_OWN**2 * np.eye(n)
+
+
+def _alike(n: int) -> FloatArray:
+    """C."""
+    return (1.0 - COMMON_CHANGE) * np.eye(n) + COMMON_CHANGE
+
+
+def log_sum(log: FloatArray) -> FloatArray:
+    """Return the logarithm of the sum of exponentials over the first axis."""
+    top = log.max(axis=0)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):  # of what is nothing everywhere
+        return np.asarray(top + np.log(np.exp(log - top).sum(axis=0)))

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from services.history.alarms import Checked, Settings
 
 _WHAT = ("check", "list", "ack", "serve")
+_MOST_LINES = 20
+"""Of bridges that are not watched."""
 _HOW = (
     "see it: driveby history BRIDGE --period week --figures DIR; look at the bridge, then: "
     "driveby alarm ack BRIDGE --by NAME --note TEXT"
@@ -52,6 +54,14 @@ def add_alarm(commands: Any) -> None:
         metavar="PERIODS",
         help="of which a bridge's baseline is made before it is watched (default: 8)",
     )
+    p.add_argument(
+        "--at-least",
+        type=number("a change in per cent", low=0.0, high=50.0),
+        default=5.0,
+        metavar="PERCENT",
+        help="smallest change of EI of interest; an alarm is raised when a change is larger with "
+        "97.5 %% probability (default: 5)",
+    )
     p.add_argument("--all", action="store_true", help="look at all bridges again")
     p.add_argument("--processes", type=whole("a number", 1, 256), default=1, help="(default: 1)")
     p.add_argument(
@@ -80,6 +90,7 @@ def _alarm(options: argparse.Namespace) -> int:
     print(f"{checked.bridges} {many} looked at, {len(checked.raised)} new {alarms}")
     for alarm in checked.standing:
         print(alarm_line(alarm))
+    _print_watches(options.history)
     if checked.standing:
         print(_HOW)
     return 0
@@ -88,7 +99,9 @@ def _alarm(options: argparse.Namespace) -> int:
 def _settings(options: argparse.Namespace) -> "Settings":
     from services.history.alarms import Settings
 
-    return Settings(options.period, options.false_alarms, options.learning)
+    return Settings(
+        options.period, options.false_alarms, options.learning, options.at_least / 100.0
+    )
 
 
 def _checked(options: argparse.Namespace) -> "Checked":
@@ -120,11 +133,29 @@ def _list(folder: Path) -> int:
             print(line)
         number += len(alarms)
         standing += sum(alarm.acknowledged is None for alarm in alarms)
-    if standing:
-        print(_HOW)
     if not number:
         print("no alarms")
+    _print_watches(folder)
+    if standing:
+        print(_HOW)
     return 0
+
+
+def _print_watches(folder: Path) -> None:
+    """Print how many bridges are watched, and why the others are not."""
+    from services.history.alarms import watches
+
+    found, problems = watches(folder, time.time())
+    for problem in problems:
+        print(problem)
+    if not found:
+        return
+    others = {name: one for name, one in found.items() if one.state not in ("watched", "alarm")}
+    print(f"{len(found) - len(others)} of {len(found)} bridges watched")
+    for realm, bridge in list(others)[:_MOST_LINES]:
+        print(f"{bridge} in realm {realm}: {others[(realm, bridge)].sentence}")
+    if len(others) > _MOST_LINES:
+        print(f"and {len(others) - _MOST_LINES} more that are not watched")
 
 
 def _acknowledge(options: argparse.Namespace) -> int:

@@ -207,7 +207,9 @@ def _drawn(options: argparse.Namespace, past: "Past") -> Iterator[Path]:
 
 
 def _lines(past: "Past") -> Iterator[str]:
-    bridge, realm, unit, periods, alarms = past
+    from services.history.past import statements
+
+    bridge, realm, unit, periods, alarms = past[:5]
     number = sum(one.crossings for one in periods)
     yield (
         f"{bridge} in realm {realm}: {number} crossings in {len(periods)} "
@@ -230,6 +232,8 @@ def _lines(past: "Past") -> Iterator[str]:
         yield f"{head}  {one.state.verdict:<8} {cells}"
     for alarm in alarms:
         yield alarm_line(alarm)
+    for said in statements(past):
+        yield said.text
 
 
 def alarm_line(alarm: "Alarm") -> str:
@@ -259,7 +263,7 @@ def _csv(periods: "Sequence[FusedPeriod]") -> Iterator[str]:
 
 
 def _json(past: "Past") -> str:
-    bridge, realm, unit, periods, alarms = past
+    bridge, realm, unit, periods, alarms, watch, comparison = past
     told = {
         "bridge": bridge,
         "realm": realm,
@@ -277,6 +281,21 @@ def _json(past: "Past") -> str:
             for one in periods
         ],
         "alarms": [alarm.model_dump(mode="json") for alarm in alarms],
+        "watch": {
+            "state": watch.state,
+            "text": watch.sentence,
+            "record": None if watch.record is None else watch.record.model_dump(mode="json"),
+        },
+        "comparison": None
+        if comparison is None
+        else {
+            "first_begin_time": comparison.first_s,
+            "last_begin_time": comparison.last_s,
+            "elements": {
+                f"EI_{one.element}": {"ratio": one.ratio, "q025": one.low, "q975": one.high}
+                for one in comparison.changes
+            },
+        },
     }
     return json.dumps(told, indent=1) + "\n"
 

@@ -34,6 +34,9 @@ _LATE_S: Final = 150.0
 _MOST_ALARMS: Final = 4
 """Lines of them at the head of a page, fewer on a low one."""
 _MOST_BRIDGES: Final = 4
+_NO_ALARM: Final = (
+    "No alarm was received; it is not known here whether driveby alarm serve watches any bridge."
+)
 _VERDICTS: Final = {"good": "green", "suspect": "yellow", "rejected": "red"}
 
 
@@ -63,6 +66,7 @@ def page(
     trucks, rows = _sorted_trucks(watched, now_s), watched.rows()
     alarms = _alarms(watched.alarms.values(), max(1, min(_MOST_ALARMS, height // 10)))
     taken = 11 + len(watched.services) + 3 * min(len(watched.bridges), _MOST_BRIDGES) + len(alarms)
+    taken += bool(watched.bridges) and not alarms
     room = max(8 - len(alarms), height - taken)
     most_trucks = max(2, min(len(trucks), room // 3))
     parts: list[RenderableType] = [_headline(watched, where, now_ns), *alarms]
@@ -79,6 +83,8 @@ def page(
         parts.append(_crossings(shown, is_wide=is_wide))
         if len(rows) > len(shown):
             parts.append(Text(f"  and {len(rows) - len(shown)} earlier", style="dim"))
+    if watched.bridges and not alarms:
+        parts.append(Text(_NO_ALARM, style="dim", no_wrap=True, overflow="ellipsis"))
     if watched.bridges:
         standing = {name for name, one in watched.alarms.items() if one.acknowledged is None}
         parts.append(_bridges(watched.bridges, standing))

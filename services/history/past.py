@@ -1,14 +1,27 @@
-"""A bridge's past: its periods, fused when somebody looks or ahead of it, and its alarms."""
+"""A bridge's past: its periods, fused when somebody looks or ahead of it, its alarms, and whether
+it is watched; of a bridge that is not, what its first and its last period say of a change."""
 
+import contextlib
+import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from schemas.alarms import Alarm
 from services.history.alarm_files import alarms_of
-from services.history.archive import partition, read_partition
-from services.history.periods import FusedPeriod, Unit, begin_of, fused_periods
+from services.history.archive import Kept, partition, read_partition, unpacked_observation
+from services.history.periods import (
+    FusedPeriod,
+    Unit,
+    begin_of,
+    by_period,
+    fused_periods,
+    period_name,
+)
+from services.history.watch_files import Watch, watch_of
 
 
 class Driven(NamedTuple):
@@ -19,6 +32,30 @@ class Driven(NamedTuple):
     entry_s: float
 
 
+class ElementChange(NamedTuple):
+    """EI of an element in the last period over EI in the first, with its 95 % interval."""
+
+    element: int
+    """Number from 1."""
+    ratio: float
+    low: float
+    high: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the interval leaves out that nothing has changed."""
+        return not self.low <= 1.0 <= self.high
+
+
+class Comparison(NamedTuple):
+    """The first and the last period with good crossings, compared."""
+
+    first_s: float
+    """Beginning in s since 1970 UTC, as `last_s`."""
+    last_s: float
+    changes: tuple[ElementChange, ...]
+
+
 class Past(NamedTuple):
     """What a history holds of a bridge in one realm."""
 
@@ -27,16 +64,127 @@ class Past(NamedTuple):
     unit: Unit
     periods: tuple[FusedPeriod, ...]
     alarms: tuple[Alarm, ...]
+    watch: Watch
+    comparison: Comparison | None = None
+    """Of a bridge that is not watched, where there are two periods."""
 
 
-def past_of(folder: Path, realm: str, bridge: str, unit: Unit, say: Callable[[str], None]) -> Past:
-    """Read a bridge of a history and fuse its periods; `say` is told what cannot be read."""
-    read = read_partition(partition(folder, realm, bridge), ("likelihood",))
+class Statement(NamedTuple):
+    """A sentence about whether a bridge has changed."""
+
+    text: str
+    is_reassuring: bool
+
+
+def past_of(
+    folder: Path,
+    realm: str,
+    bridge: str,
+    unit: Unit,
+    say: Callable[[str], None],
+    now_s: float | None = None,
+) -> Past:
+    """Read a bridge of a history and fuse its periods; `say` is told what cannot be read.
+
+    Whether the bridge is watched is judged at `now_s`, which is now by default.
+    """
+    read = read_partition(partition(folder, realm, bridge), ("likelihood", "observation"))
     alarms, problems = alarms_of(folder, realm, bridge)
-    for problem in (*read.problems, *problems):
+    now_s = time.time() if now_s is None else now_s
+    watch, damaged = watch_of(folder, realm, bridge, read.crossings, alarms, now_s)
+    for problem in (*read.problems, *problems, *damaged):
         say(problem)
     periods = fused_periods(folder, realm, bridge, read.crossings, unit, say)
-    return Past(bridge, realm, unit, tuple(periods), tuple(alarms))
+    comparison = None
+    if watch.state not in ("watched", "alarm"):
+        comparison = _compared(read.crossings, unit)
+    return Past(bridge, realm, unit, tuple(periods), tuple(alarms), watch, comparison)
+
+
+def statements(past: Past) -> Iterator[Statement]:
+    """Yield what there is to say where no alarm says it."""
+    watch = past.watch
+    if any(alarm.acknowledged is None for alarm in past.alarms):
+        return
+    yield Statement(watch.sentence, watch.found_nothing)
+    if watch.found_nothing:
+        return
+    if past.comparison is None:
+        yield Statement(
+            f"A change cannot be seen yet: fewer than two {past.unit}s have good crossings that "
+            "can be compared.",
+            is_reassuring=False,
+        )
+        return
+    yield Statement(_comparison_sentence(past.comparison, past.unit), is_reassuring=False)
+
+
+def _comparison_sentence(found: Comparison, unit: Unit) -> str:
+    first, last = period_name(found.first_s, unit), period_name(found.last_s, unit)
+    size = sorted(found.changes, key=_deviations, reverse=True)
+    clear = [one for one in size if one.is_clear]
+    rest = "Temperature and season are not taken out."
+    if not clear:
+        most = size[0]
+        return (
+            f"From {first} to {last} no element changed by more than its 95 % interval; most is "
+            f"element {most.element}, {_percent(most.ratio)} ({_percent(most.low)} to "
+            f"{_percent(most.high)}). {rest}"
+        )
+    told = ", ".join(
+        f"element {one.element} {_percent(one.ratio)} (95 % interval {_percent(one.low)} to "
+        f"{_percent(one.high)})"
+        for one in clear[:_MOST_ELEMENTS]
+    )
+    more = len(clear) - _MOST_ELEMENTS
+    others = f" and {more} more" if more > 0 else ""
+    return f"EI from {first} to {last}: {told}{others}. {rest}"
+
+
+_MOST_ELEMENTS = 3
+
+
+def _deviations(one: ElementChange) -> float:
+    """The change in units of its own uncertainty."""
+    return float(abs(np.log(one.ratio)) / np.log(one.high / one.low))
+
+
+def _percent(ratio: float) -> str:
+    return f"{100.0 * (ratio - 1.0):+.0f} %".replace("-", "−")
+
+
+def _compared(crossings: Iterable[Kept], unit: Unit) -> Comparison | None:
+    """Compare the first and the last period that have good crossings of the same elements."""
+    periods = []
+    for begin_s, some in by_period(crossings, unit):
+        content = [one.observation for one in some if one.verdict == "good" and one.observation]
+        observations = []
+        for packed in content:
+            with contextlib.suppress(ValueError, EOFError, OSError):
+                observations.append(unpacked_observation(packed))
+        if observations:
+            periods.append((begin_s, observations))
+    if len(periods) < 2:
+        return None
+    # Kernels are slow to import, and mostly there is nothing to compare.
+    from pre_core.monitoring.baseline import Period
+    from pre_core.monitoring.observation import fused
+    from pre_core.monitoring.watch import difference
+
+    n = periods[-1][1][-1].value.size
+    alike = [(begin_s, [o for o in some if o.value.size == n]) for begin_s, some in periods]
+    alike = [(begin_s, some) for begin_s, some in alike if some]
+    if len(alike) < 2:
+        return None
+    first, last = (
+        Period(fused(some, n), None, begin / 86_400.0) for begin, some in (alike[0], alike[-1])
+    )
+    found = difference(first, last)
+    changes = tuple(
+        ElementChange(number, float(ratio), float(low), float(high))
+        for number, (ratio, low, high) in enumerate(zip(*found, strict=True), start=1)
+    )
+    return Comparison(alike[0][0], alike[-1][0], changes)
 
 
 def fuse_ahead(

@@ -56,6 +56,11 @@ def end_of(begin_s: float, unit: Unit) -> float:
     return later.replace(day=1).timestamp() if unit == "month" else later.timestamp()
 
 
+def period_name(begin_s: float, unit: Unit) -> str:
+    """Return how a period is called: its month, or the day on which it begins."""
+    return f"{datetime.fromtimestamp(begin_s, UTC):{'%Y-%m' if unit == 'month' else '%Y-%m-%d'}}"
+
+
 def by_period(crossings: Iterable[Kept], unit: Unit) -> list[tuple[float, list[Kept]]]:
     """Crossings, in order of their entries, by the beginnings of their periods."""
     grouped = groupby(crossings, key=lambda one: begin_of(one.entry_s, unit))

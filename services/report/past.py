@@ -6,8 +6,7 @@ from datetime import UTC, datetime
 import matplotlib
 import numpy as np
 
-from schemas.alarms import Alarm
-from services.history.past import Past
+from services.history.past import Past, statements
 from services.report.html import Html, inlined_svg, table, tag
 from services.viewer.drawing import STYLE, figure_bytes
 from services.viewer.history_figure import History, draw_history, history_of
@@ -16,14 +15,17 @@ _HOW = (
     "Each bar is what all crossings of a {unit} say together, in per cent of the element's own "
     "median over time, with its 95 % interval. A wave that all elements share comes from the "
     "seasons: temperature changes stiffness. An alarm means that an element has changed by more "
-    "than chance and than what crossings share."
+    "than chance, season, usual slow movement and shared errors, and clearly by more than the "
+    "smallest change of interest."
 )
 
 
 def past_in_short(past: Past) -> str:
     """How much there is, and whether an alarm stands, for the first page."""
     standing = sum(alarm.acknowledged is None for alarm in past.alarms)
-    alarms = {0: "no alarm stands", 1: "an alarm stands"}.get(standing, f"{standing} alarms stand")
+    alarms = {1: "an alarm stands"}.get(standing, f"{standing} alarms stand")
+    if not standing:
+        alarms = "no alarm stands" if past.watch.found_nothing else "not watched for changes"
     return f"{_how_much(past)}; {alarms} (see the bridge over time)"
 
 
@@ -40,7 +42,7 @@ def past_section(past: Past, prefix: str) -> Html:
         "section",
         tag("h2", "The bridge over time"),
         tag("p", said),
-        *_alarms(past.alarms),
+        *_alarms(past),
         tag("figure", inlined_svg(svg, prefix, f"EI of each element over time. {said}")),
         _elements(drawn),
         tag("p", _HOW.format(unit=past.unit), class_="note"),
@@ -54,19 +56,19 @@ def _how_much(past: Past) -> str:
     return f"{number} crossings in {len(past.periods)} {many}"
 
 
-def _alarms(alarms: tuple[Alarm, ...]) -> Iterator[Html]:
-    if not alarms:
-        yield tag("p", "No alarm: nothing has changed by more than chance.")
-        return
+def _alarms(past: Past) -> Iterator[Html]:
     lines = []
-    for alarm in alarms:
+    for alarm in past.alarms:
         note = alarm.acknowledged
         state = "It stands: nobody has taken note of it."
         if note is not None:
             about = f": {note.note}" if note.note else "."
             state = f"{note.by} took note of it on {_day(note.time)}{about}"
         lines.append(tag("li", f"Alarm of {_day(alarm.raised)}: {alarm.sentence()}. {state}"))
-    yield tag("ul", *lines)
+    if lines:
+        yield tag("ul", *lines)
+    for said in statements(past):
+        yield tag("p", said.text, class_="reassuring" if said.is_reassuring else "not-watched")
 
 
 def _elements(drawn: History) -> Html:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
-from services.history.past import Past
+from services.history.past import Past, Statement, statements
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import (
     BAR_EDGE,
@@ -32,6 +33,8 @@ from services.viewer.drawing import (
 _PANEL_IN, _TEMPERATURE_IN = 0.92, 0.75
 _MOST_CHARACTERS = 100
 """Of what somebody noted: a line."""
+_LINE_CHARACTERS = 105
+"""Of a sentence, before it is continued on the next line."""
 
 
 class Point(NamedTuple):
@@ -67,6 +70,8 @@ class History(NamedTuple):
     unit: str
     points: tuple[Point, ...]
     marks: tuple[Mark, ...]
+    statements: tuple[Statement, ...]
+    """What there is to say where no alarm stands."""
 
 
 def history_figure(path: Path, past: Past) -> None:
@@ -105,7 +110,7 @@ def history_of(past: Past) -> History:
         )
         for alarm in past.alarms
     )  # fmt: skip
-    return History(past.bridge, past.unit, tuple(points), marks)
+    return History(past.bridge, past.unit, tuple(points), marks, tuple(statements(past)))
 
 
 def draw_history(history: History) -> Figure:
@@ -157,8 +162,9 @@ def _heading(history: History) -> list[tuple[str, str]]:
     if any(not mark.acknowledged for mark in history.marks):
         how = f"driveby alarm ack {history.bridge} --by NAME --note TEXT"
         lines.append((f"Look at the bridge, then: {how}", MUTED))
-    if not history.marks:
-        lines.append(("no alarm: nothing has changed by more than chance", VERDICT_COLOURS["good"]))
+    for one in history.statements:
+        colour = VERDICT_COLOURS["good"] if one.is_reassuring else INK
+        lines += [(line, colour) for line in textwrap.wrap(one.text, _LINE_CHARACTERS)]
     return lines
 
 

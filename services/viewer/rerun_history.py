@@ -92,8 +92,8 @@ def _said(history: History) -> str:
         state = f"noted by {mark.acknowledged}" if mark.acknowledged else "stands"
         lines.append(f"- Alarm of {datetime.fromtimestamp(mark.raised_s, UTC):%Y-%m-%d}, {state}: "
                      f"{mark.sentence}")  # fmt: skip
-    if not history.marks:
-        lines.append("No alarm: nothing has changed by more than chance.")
+    for said in history.statements:
+        lines += ["", said.text]
     return "\n".join(lines) + "\n"
 
 

@@ -39,7 +39,7 @@ NOT_RUN = {
     'pip install "driveby[s3]"': NETWORK,
     "pytest tests/unit/history/test_catalog.py": ITSELF,
     "python -m tests.benchmarks.fleet --out /tmp/fleet": LONG,
-    "python -m tests.benchmarks.alarms --figure docs/images/alarm-delay.png": LONG,
+    "python -m tests.benchmarks.alarms": LONG,
     "python -m tests.faults.year --out build/year": LONG,
     "make year": LONG,
     "pytest tests/numerics/test_monitoring.py": ITSELF,

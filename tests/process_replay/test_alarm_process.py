@@ -214,7 +214,8 @@ def test_from_the_history_to_those_who_watch(
     """Processes and a router as they are: it is raised, seen, acknowledged, and seen no more."""
     history, realm = tmp_path / "history", ["--endpoint", endpoint, "--realm", "sim-fleet"]
     begin_s = datetime(2025, 1, 6, tzinfo=UTC).timestamp()
-    add_results(history, losses_of({"bridge-1": 14, "bridge-2": None}, begin_s, 24))
+    lost = losses_of({"bridge-1": 14, "bridge-2": None}, begin_s, 24)
+    add_results(history, lost, {one.crossing_id: 10.0 for one in lost.crossings})
     start_logger(start, endpoint, tmp_path / "live.mcap")
     site = ["--site", str(project / "docs/site.example.toml")]
     serve = ["alarm", "serve", "--history", str(history), "--endpoint", endpoint]

@@ -255,3 +255,14 @@ def test_bad_options_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     err = capsys.readouterr().err
     assert err.count("\n") == 2
     assert "realm 'monday' must be live" in err
+
+
+def test_absent_alarms_are_no_reassurance_on_the_page(site: Site) -> None:
+    """The page cannot know whether bridges are watched, and says so until an alarm comes."""
+    said = "No alarm was received; it is not known here whether driveby alarm serve watches"
+    watched = Watched()
+    assert not any(one.startswith(said) for one in drawn(watched))
+    tell(watched, bridge_state(site))
+    assert line(drawn(watched), said).endswith("any bridge.")
+    tell(watched, alarm())
+    assert not any(one.startswith(said) for one in drawn(watched))

@@ -1,5 +1,7 @@
 """Alarms of a history: raised, kept over restarts, told, acknowledged by somebody only."""
 
+import json
+import os
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,8 +14,9 @@ from services.cli.alarm_service import Teller
 from services.common.errors import InputError
 from services.history import alarms
 from services.history.alarm_files import acknowledge, alarms_of, standing
-from services.history.alarms import Settings, check
+from services.history.alarms import Settings, check, watches
 from services.history.archive import add_results
+from services.history.watch_files import Watch, record_path
 from tests.fleet import WEEK_S, losses_of
 
 BEGIN_S = datetime(2025, 1, 6, tzinfo=UTC).timestamp()  # a Monday
@@ -88,6 +91,130 @@ def test_after_it_is_acknowledged_what_is_then_is_the_baseline(history: Path) ->
         acknowledge(history, alarm, "somebody else", "", AFTER_S)
 
 
+def watch_now(history: Path, bridge: str = "bridge-1", now_s: float = AFTER_S) -> Watch:
+    found, problems = watches(history, now_s)
+    assert problems == []
+    return found[("sim-fleet", bridge)]
+
+
+def test_only_a_watch_that_judged_says_that_nothing_has_changed(history: Path) -> None:
+    assert watch_now(history).state == "never_checked"
+    check(history, Settings(learning=40), AFTER_S)
+    training = watch_now(history)
+    assert (training.state, training.found_nothing) == ("training", False)
+    assert training.sentence == ("Not watched yet: 24 of 40 training weeks, up to 2025-06-23.")
+    check(history, Settings(), AFTER_S)
+    assert watch_now(history).found_nothing
+    assert watch_now(history).sentence == (
+        "No alarm: 16 weeks judged, 2025-03-03 to 2025-06-23; none shows a change that is clearly "
+        "larger than 5 %."
+    )
+    assert watch_now(history, "bridge-2").state == "alarm"
+    (alarm,) = standing(history)[0]
+    acknowledge(history, alarm, "owner", "", AFTER_S)
+    assert watch_now(history, "bridge-2").state == "acknowledged"
+    where = record_path(history, "sim-fleet", "bridge-1")
+    where.write_text("{")
+    found, problems = watches(history, AFTER_S)
+    assert found[("sim-fleet", "bridge-1")].state == "never_checked"
+    assert problems[0].startswith(f"{where}: not a record of a check: ")
+    # A record that is lost or damaged beyond reading is made again.
+    where.unlink()
+    assert check(history, Settings(), AFTER_S).bridges >= 1
+    assert watch_now(history).found_nothing
+
+
+def test_crossings_that_came_after_the_check_are_not_vouched_for(tmp_path: Path) -> None:
+    found = losses_of({"bridge-1": None}, BEGIN_S, WEEKS)
+    warm = {one.crossing_id: 10.0 for one in found.crossings}
+    first = found.model_copy(update={"crossings": found.crossings[:-4]})
+    add_results(tmp_path, first, warm)
+    check(tmp_path, Settings(), AFTER_S - 2 * WEEK_S)
+    assert watch_now(tmp_path, now_s=AFTER_S - 2 * WEEK_S).found_nothing
+    # Two weeks later nothing has come: nothing is missing either.
+    assert watch_now(tmp_path).found_nothing
+    add_results(tmp_path, found, warm)
+    later = watch_now(tmp_path)
+    assert (later.state, later.sentence) == (
+        "out_of_date",
+        "Not watched since 2025-06-09: crossings were added after driveby alarm check was run.",
+    )
+    check(tmp_path, Settings(), AFTER_S)
+    assert watch_now(tmp_path).found_nothing
+
+
+def test_an_unchanged_bridge_is_not_read_to_say_that_it_is_watched(
+    history: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    check(history, Settings(), AFTER_S)
+    record = record_path(history, "sim-fleet", "bridge-1")
+    added_s = (history / "crossings/realm=sim-fleet/bridge=bridge-1").stat().st_mtime
+    monkeypatch.setattr(alarms, "read_partition", lambda where: 1 / 0)
+    for bridge in ("bridge-1", "bridge-2"):
+        path = record_path(history, "sim-fleet", bridge)
+        os.utime(path, (added_s + 120.0, added_s + 120.0))
+    assert watch_now(history).found_nothing
+    # A week that was not over at the check, and is now, has crossings that nobody judged.
+    unfinished = record.read_text().replace(
+        f'"newest": {load_newest(record)}', f'"newest": {AFTER_S + 3600.0}'
+    )
+    record.write_text(unfinished)
+    os.utime(record, (added_s + 120.0, added_s + 120.0))
+    assert watch_now(history).found_nothing
+    assert watch_now(history, now_s=AFTER_S + WEEK_S).state == "out_of_date"
+
+
+def load_newest(record: Path) -> float:
+    return float(json.loads(record.read_text())["newest"])
+
+
+def test_a_year_passes_before_an_unknown_season_is_judged(tmp_path: Path) -> None:
+    add_results(tmp_path, losses_of({"bridge-1": None}, BEGIN_S, 20))
+    check(tmp_path, Settings(), BEGIN_S + 20 * WEEK_S)
+    found = watch_now(tmp_path, now_s=BEGIN_S + 20 * WEEK_S)
+    assert (found.state, found.sentence) == (
+        "season",
+        (
+            "Not watched yet: temperatures are unknown, so the season is learned for a year, until "
+            "2026-01-05."
+        ),
+    )
+
+
+def test_alarms_of_earlier_versions_are_read_and_their_acknowledgement_counts(
+    history: Path,
+) -> None:
+    """One that a CUSUM raised in the week in which the loss began, and that somebody noted: the
+    baseline is what the bridge was then, and nothing is raised again."""
+    since_s = BEGIN_S + LOSES_AT * WEEK_S
+    where = history / "alarms/realm=sim-fleet/bridge=bridge-2"
+    where.mkdir(parents=True)
+    (where / "20250421-4-weaker.json").write_text(
+        '{"edition": 1, "alarm_id": "20250421-4-weaker", "realm": "sim-fleet", '
+        '"bridge": "bridge-2", "element": 4, "direction": "weaker", '
+        f'"since": {since_s}, "raised": {since_s + WEEK_S}, "sum": 9.6, "threshold": 9.3, '
+        '"ratio": 0.8, "ratio_q025": 0.77, "ratio_q975": 0.83, "acknowledged": null}'
+    )
+    noted = f'{{"edition": 1, "by": "owner", "time": {since_s + WEEK_S + 60.0}, "note": ""}}'
+    (where / "20250421-4-weaker.ack.json").write_text(noted)
+    (history / "alarms/checked.json").write_text('{"sim-fleet/bridge-1": [1, "week", 2, 0.01, 8]}')
+    found = check(history, Settings(), AFTER_S)
+    assert (found.bridges, found.raised, found.standing, found.problems) == (2, (), (), ())
+    assert watch_now(history, "bridge-2").found_nothing
+
+
+def test_the_smallest_change_of_interest_is_an_option(
+    history: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["alarm", "check", "--history", str(history)]
+    assert cli.main([*words, "--at-least", "30"]) == 0
+    assert "0 new alarms" in capsys.readouterr().out
+    assert cli.main([*words, "--at-least", "5"]) == 0
+    assert "1 new alarm\n" in capsys.readouterr().out
+    assert cli.main([*words, "--at-least", "60"]) == 2
+    assert "a change in per cent from 0 to 50" in capsys.readouterr().err
+
+
 def test_damaged_files_of_alarms_get_a_line_and_what_stands_stands(history: Path) -> None:
     (alarm,) = check(history, Settings(), AFTER_S).standing
     where = history / "alarms/realm=sim-fleet/bridge=bridge-2"
@@ -143,13 +270,20 @@ def test_each_alarm_is_told_when_it_is_raised_when_it_is_noted_and_after_a_resta
 def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     there = ["--history", str(history)]
     assert cli.main(["alarm", "list", *there]) == 0
-    assert capsys.readouterr().out == "no alarms\n"
+    never = "driveby alarm check has not been run on this bridge."
+    assert capsys.readouterr().out.splitlines() == [
+        "no alarms",
+        "0 of 2 bridges watched",
+        f"bridge-1 in realm sim-fleet: Not watched: {never}",
+        f"bridge-2 in realm sim-fleet: Not watched: {never}",
+    ]
     assert cli.main(["alarm", "check", *there]) == 0
     said = capsys.readouterr().out
     assert said.startswith("2 bridges looked at, 1 new alarm\nalarm 2025")
     assert "-4-weaker of bridge-2, raised 2025-" in said
     how = "look at the bridge, then: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
     assert said.endswith(how)
+    assert "\n2 of 2 bridges watched\n" in said
     assert cli.main(["alarm", "list", *there]) == 0
     assert capsys.readouterr().out.endswith(how)
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", "--note", "props", *there]) == 0

@@ -1,18 +1,23 @@
 """A bridge's past: fused when crossings are added, on a page of a report, and in the viewer."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from schemas.alarms import Acknowledgement, Alarm
-from schemas.results import Results, results_json
+from schemas.results import ElementState, Results, results_json
 from services.cli import main as cli
 from services.history.archive import add_results
-from services.history.past import Past, past_of
+from services.history.past import Past, past_of, statements
+from services.identification.bridge_state import Counted, count_in, state_of, usable
 from services.report.past import past_in_short, past_section
+from services.viewer.history_figure import history_of
 from services.viewer.rerun_history import write_history
+from tests.fleet import bridge_of, crossing_of, results_of, templates, trucks_of
 from tests.unit.history.test_archive import BEGIN_S, crossings
 from tests.unit.report.test_report import Seen
 from tests.viewer_screen import open_tab, opened, picture, pixels
@@ -97,7 +102,10 @@ def test_the_page_of_a_report_tells_months_elements_and_alarms(past: Past) -> No
     found = Seen(past_section(past, "h-"))
     assert "The bridge over time" in found.text
     assert "34 crossings in 2 months, 2026-03-01 to 2026-05-01." in found.text
-    assert "No alarm: nothing has changed by more than chance." in found.text
+    assert "No alarm" not in found.text
+    never = "Not watched: driveby alarm check has not been run on this bridge."
+    assert never in found.text
+    assert "From 2026-03 to 2026-04 no element changed by more than its 95 % interval" in found.text
     assert "Median of all months (GN·m²) Newest month (GN·m²)" in found.text
     assert found.tags.count("tr") == 1 + 7
     newest, before = (
@@ -109,8 +117,80 @@ def test_the_page_of_a_report_tells_months_elements_and_alarms(past: Past) -> No
     assert f"{newest.mean / usual:.3f} 5 " in found.text
     assert found.tags.count("figure") == 1
     assert past_in_short(past) == (
-        "34 crossings in 2 months; no alarm stands (see the bridge over time)"
+        "34 crossings in 2 months; not watched for changes (see the bridge over time)"
     )
+
+
+@pytest.fixture(scope="module")
+def lost(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Results]:
+    """Two months, element 4 a fifth weaker in the second."""
+    folder = tmp_path_factory.mktemp("history")
+    rng = np.random.default_rng(3)
+    (truck,), bridge, some = trucks_of(rng, 1), bridge_of(rng, "bridge-1"), []
+    for day in range(59):
+        ei = bridge.ei_nm2.copy()
+        ei[3] *= 0.8 if day >= 31 else 1.0
+        entry_s = BEGIN_S - DAY_S + day * DAY_S  # from 1 March on
+        some.append(crossing_of(rng, templates()[day % 3], truck, bridge, entry_s, ei))
+    found = results_of(some, BEGIN_S + 100 * DAY_S)
+    add_results(folder, found)
+    return folder, found
+
+
+def test_two_months_that_differ_are_told_where_nothing_was_judged(
+    lost: tuple[Path, Results], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As `identify --baseline` says it of the same data; in every form, and nowhere in green."""
+    folder, found = lost
+    past = past_of(folder, "sim-fleet", "bridge-1", "month", print)
+    assert past.comparison is not None
+    of_it = past.comparison.changes[3]
+    assert of_it.low < 0.8 < of_it.high < 0.9
+    assert [one.element for one in past.comparison.changes if one.is_clear] == [4]
+    months = [part(found, 0, 31), part(found, 31, 59)]
+    before, after = (fused_state(some) for some in months)
+    theirs = after["EI_4"].mean / before["EI_4"].mean
+    assert of_it.ratio == pytest.approx(theirs, abs=0.02)
+    never, told = statements(past)
+    assert not never.is_reassuring
+    assert not told.is_reassuring
+    assert told.text.startswith("EI from 2026-03 to 2026-04: element 4 −")
+    assert told.text.endswith("Temperature and season are not taken out.")
+    assert cli.main(["history", "bridge-1", "--history", str(folder), "--json",
+                     str(tmp_path / "h.json"), "--figures", str(tmp_path)]) == 0  # fmt: skip
+    said = capsys.readouterr().out
+    assert never.text in said
+    assert told.text in said
+    kept = json.loads((tmp_path / "h.json").read_text())
+    assert kept["watch"]["state"] == "never_checked"
+    assert kept["comparison"]["elements"]["EI_4"]["q975"] == pytest.approx(of_it.high)
+    page, drawn = Seen(past_section(past, "h-")).text, history_of(past)
+    for form in (page, (tmp_path / "bridge-1-history.svg").read_text()):
+        assert "more than chance" not in form.replace("more than chance, season", "")
+        assert "No alarm" not in form
+    assert told.text in page
+    assert drawn.statements == (never, told)
+
+
+def fused_state(some: Results) -> dict[str, ElementState]:
+    kept = [usable(one) for one in some.crossings]
+    state = state_of(count_in(Counted(), [one for one in kept if one is not None]), "bridge-1")
+    assert state is not None
+    return dict(state.elements)
+
+
+def test_one_month_is_nothing_to_compare_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_results(tmp_path, crossings(5))
+    assert cli.main(["history", "bridge-1", "--history", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "Not watched: driveby alarm check has not been run on this bridge.",
+        (
+            "A change cannot be seen yet: fewer than two months have good crossings that can be "
+            "compared."
+        ),
+    ]
 
 
 def test_an_alarm_stands_until_somebody_has_taken_note_of_it(past: Past) -> None:
@@ -124,7 +204,7 @@ def test_an_alarm_stands_until_somebody_has_taken_note_of_it(past: Past) -> None
     found = Seen(past_section(noted, "h-"))
     assert f"{said} <b>Anna</b> took note of it on 2026-03-11: frozen" in found.text
     assert "b" not in found.tags  # what somebody wrote is text
-    assert "; no alarm stands (see" in past_in_short(noted)
+    assert "; not watched for changes (see" in past_in_short(noted)
     both = past._replace(alarms=(alarm(), alarm()))
     assert "; 2 alarms stand (see" in past_in_short(both)
 
@@ -142,7 +222,7 @@ def test_the_command_puts_the_page_behind_the_first(
     words += ["--site", str(project / "docs/site.example.toml")]
     assert cli.main([*words, "--history", str(tmp_path / "history")]) == 0
     text = Seen(output.read_text()).text
-    assert "Over time 3 crossings in 1 month; no alarm stands" in text
+    assert "Over time 3 crossings in 1 month; not watched for changes" in text
     places = [text.index(word) for word in ("What this does not mean", "The bridge over time",
                                             "Evidence, crossing by crossing")]  # fmt: skip
     assert places == sorted(places)

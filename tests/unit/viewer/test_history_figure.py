@@ -3,6 +3,8 @@
 import matplotlib
 import numpy as np
 
+from services.history.past import Statement
+from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import STYLE
 from services.viewer.history_figure import History, Mark, Point, draw_history
 
@@ -37,7 +39,7 @@ def drawn(history: History) -> matplotlib.figure.Figure:
 
 def test_the_newest_estimate_is_in_its_panel_however_few_are_like_it() -> None:
     """A loss of a third in the last of three years' weeks, which is less than one in a hundred."""
-    figure = drawn(History("bridge-1", "week", weeks(*[1.0] * 150, 0.66), ()))
+    figure = drawn(History("bridge-1", "week", weeks(*[1.0] * 150, 0.66), (), ()))
     _, second = figure.axes[:2]
     (points,) = [line for line in second.lines if line.get_marker() == "o"]
     low, high = second.get_ylim()
@@ -48,14 +50,29 @@ def test_the_newest_estimate_is_in_its_panel_however_few_are_like_it() -> None:
 
 def test_the_head_says_what_to_do_while_an_alarm_stands() -> None:
     points = weeks(*[1.0] * 150, 0.9, 0.9, 0.9)
-    said = [text.get_text() for text in drawn(History("b-1", "week", points, (mark(),))).texts]
+    said = [text.get_text() for text in drawn(History("b-1", "week", points, (mark(),), ())).texts]
     assert "ALARM: element 2 is weaker" in said
     assert "Look at the bridge, then: driveby alarm ack b-1 --by NAME --note TEXT" in said
     noted = mark("the owner, 2025-06-23", "props were put in")
-    said = [text.get_text() for text in drawn(History("b-1", "week", points, (noted,))).texts]
+    said = [text.get_text() for text in drawn(History("b-1", "week", points, (noted,), ())).texts]
     assert "noted: element 2 is weaker (the owner, 2025-06-23)" in said
     assert "“props were put in”" in said
     assert not any("driveby" in text for text in said)
     long = mark("the owner, 2025-06-23", "x" * 500)
-    said = [text.get_text() for text in drawn(History("b-1", "week", points, (long,))).texts]
+    said = [text.get_text() for text in drawn(History("b-1", "week", points, (long,), ())).texts]
     assert max(map(len, said)) < 110
+
+
+def test_the_head_is_green_only_where_a_watch_found_nothing() -> None:
+    points = weeks(1.0, 0.8)
+    for is_reassuring in (True, False):
+        long = " ".join(["not watched"] * 20)
+        said = (Statement(long, is_reassuring),)
+        texts = drawn(History("b-1", "week", points, (), said)).texts
+        about = [text for text in texts if "not watched" in text.get_text()]
+        assert len(about) == 3
+        assert " ".join(text.get_text() for text in about) == long
+        green = VERDICT_COLOURS["good"]
+        assert {text.get_color() == green for text in about} == {is_reassuring}
+    texts = drawn(History("b-1", "week", points, (), ())).texts
+    assert not any(text.get_color() == VERDICT_COLOURS["good"] for text in texts)

@@ -1,0 +1,184 @@
+"""The chart: has one element stepped, at any of the past periods, by more than a smallest change?
+
+A step delta of ln EI in period k adds G(t, k) delta to every later innovation of the Kalman filter
+(A. S. Willsky and H. L. Jones, IEEE Trans. Automatic Control 21 (1976)), with G known:
+
+    G = I - H F,    F <- Phi F + W G,
+
+H the rows of the observation, Phi the motion of the state, W Kalman's gain. So no filter has to be
+run for a change: sums of G' S^-1 G and G' S^-1 e say all about it. With delta ~ N(0, s^2) of one
+element j the ratio of the densities with and without it is L_jk, the scales of the usual movements
+integrated out in both. The Shiryaev-Roberts statistic
+
+    R_t = sum over k of the mean over j of L_jk(t)
+
+has the mean t where nothing changes: R_t - t is a martingale, so the mean time to a false alarm at
+R > A is at least A (M. Pollak, Annals of Statistics 13 (1985)), whatever is uncertain of the
+baseline, as long as its priors are true.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from pre_core.monitoring.baseline import LEVEL_SPREAD, Innovation, State, log_sum
+
+FloatArray = NDArray[np.float64]
+
+STEP_SPREAD = 0.15
+"""s: prior standard deviation of a step of one element's ln EI."""
+LARGEST = 4.0
+"""An innovation counts as so many standard deviations at most."""
+FEWEST = 3
+"""Periods that a change must have lasted to raise an alarm."""
+_ALL_KEPT = 8
+"""Beginnings so many periods back are all kept; of older ones two in each doubling of the lag."""
+
+
+class Chart(NamedTuple):
+    """Possible beginnings of a change (c) and what innovations since say of each."""
+
+    begins: tuple[int, ...]
+    """Numbers of periods."""
+    response: FloatArray  # (m, size, c, n): F
+    information: FloatArray  # (m, c, n, n): sum of G' S^-1 G
+    score: FloatArray  # (m, c, n): sum of G' S^-1 e
+
+
+class Verdict(NamedTuple):
+    """What a chart says after a period."""
+
+    log_ratio: float
+    """ln R."""
+    element: int
+    """Element, from 0, that most likely changed."""
+    begin: int
+    """Number of the period in which that most likely began."""
+    is_stiffer: bool
+    probability: float
+    """Of a change larger than the smallest one of interest, if there was a change."""
+
+
+def nothing(state: State) -> Chart:
+    """Return a chart that begins."""
+    m, size = state.mean.shape
+    n = state.places["level"].stop
+    return Chart((), np.zeros((m, size, 0, n)), np.zeros((m, 0, n, n)), np.zeros((m, 0, n)))
+
+
+def by_scales(chart: Chart, kept: NDArray[np.bool_]) -> Chart:
+    """Return the chart with some of its scales (m,) only."""
+    return Chart(chart.begins, chart.response[kept], chart.information[kept], chart.score[kept])
+
+
+def still(
+    chart: Chart, kept: FloatArray, wander: slice, weight: FloatArray, told: Innovation
+) -> Chart:
+    """Return the chart after a period that is learned but not judged; arguments as of `moved`."""
+    return chart._replace(response=_responded(chart, kept, wander, weight, told)[0])
+
+
+def moved(
+    chart: Chart,
+    number: int,
+    kept: FloatArray,
+    wander: slice,
+    weight: FloatArray | None,
+    told: Innovation,
+    inflation: float,
+) -> Chart:
+    """Return the chart after a period.
+
+    `number` is the period's, `kept` (m,) the share of the wander left since the previous one,
+    `weight` (m, size, n) Kalman's gain (None where nothing was learned), `inflation` what the
+    innovation's covariance is multiplied by.
+    """
+    m, size, _, n = chart.response.shape
+    chart = Chart(
+        (*chart.begins, number),
+        np.concatenate([chart.response, np.zeros((m, size, 1, n))], axis=2),
+        np.concatenate([chart.information, np.zeros((m, 1, n, n))], axis=1),
+        np.concatenate([chart.score, np.zeros((m, 1, n))], axis=1),
+    )
+    c = len(chart.begins)
+    response, shown = _responded(chart, kept, wander, weight, told)
+    flat = shown.reshape(m, n, c * n)
+    covariance = inflation * told.covariance
+    solved = np.linalg.solve(covariance, np.concatenate([flat, told.value[:, :, None]], axis=2))
+    by_begin = solved[:, :, :-1].reshape(m, n, c, n)
+    information = chart.information + np.matmul(
+        shown.transpose(0, 2, 3, 1), by_begin.transpose(0, 2, 1, 3)
+    )
+    score = chart.score + (flat.transpose(0, 2, 1) @ solved[:, :, -1:]).reshape(m, c, n)
+    stay = [at for at, begin in enumerate(chart.begins) if _is_kept(begin, number - begin)]
+    return Chart(
+        tuple(chart.begins[at] for at in stay),
+        response[:, :, stay],
+        information[:, stay],
+        score[:, stay],
+    )
+
+
+def _responded(
+    chart: Chart,
+    kept: FloatArray,
+    wander: slice,
+    weight: FloatArray | None,
+    told: Innovation,
+) -> tuple[FloatArray, FloatArray]:
+    """F after a period, and G (m, n, c, n)."""
+    m, size, c, n = chart.response.shape
+    before = chart.response.copy()
+    before[:, wander] *= kept[:, None, None, None]
+    shown = -(told.across @ before.reshape(m, size, c * n)).reshape(m, n, c, n)
+    shown += np.eye(n)[:, None, :]
+    if weight is not None:
+        before += (weight @ shown.reshape(m, n, c * n)).reshape(m, size, c, n)
+    return before, shown
+
+
+def _is_kept(begin: int, lag: int) -> bool:
+    if lag < _ALL_KEPT:
+        return True
+    return begin % (2 ** int(np.log2(lag / 2.0))) == 0
+
+
+def log_ratio(chart: Chart, state: State, number: int) -> tuple[float, FloatArray]:
+    """Return ln R after a period, and ln L (c, n), minus infinity where it is too early to say."""
+    n = state.places["level"].stop
+    if not chart.begins:
+        return -np.inf, np.zeros((0, n))
+    of_it = np.diagonal(chart.information, axis1=2, axis2=3)
+    by_scale = 0.5 * chart.score**2 / (of_it + STEP_SPREAD**-2)
+    by_scale = by_scale - 0.5 * np.log1p(STEP_SPREAD**2 * of_it)
+    log = log_sum(by_scale + state.log_weight[:, None, None])
+    log[[number - begin + 1 < FEWEST for begin in chart.begins]] = -np.inf
+    return float(log_sum(log.ravel()) - np.log(n)), log
+
+
+def judged(chart: Chart, state: State, number: int, smallest: tuple[float, float]) -> Verdict:
+    """Return what the chart says; a change is of interest outside of `smallest` (of ln EI).
+
+    The probability is that of the element's own change, all elements free to have changed, and
+    averaged over elements and beginnings by how likely each is.
+    """
+    total, log = log_ratio(chart, state, number)
+    n = chart.score.shape[2]
+    precision = chart.information + LEVEL_SPREAD**-2 * np.eye(n)
+    covariance = np.linalg.inv(precision)
+    mean = (covariance @ chart.score[..., None])[..., 0]
+    by_scale = 0.5 * np.sum(chart.score * mean, axis=2) - 0.5 * np.linalg.slogdet(precision)[1]
+    by_scale = by_scale + state.log_weight[:, None]
+    weight = np.exp(by_scale - log_sum(by_scale))[..., None]
+    spread = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+    low, high = smallest
+    larger = np.sum(weight * (ndtr((low - mean) / spread) + ndtr((mean - high) / spread)), axis=0)
+    share = np.exp(log - log_sum(log.ravel()))
+    element = int(share.sum(axis=0).argmax())
+    at = int(share[:, element].argmax())
+    is_stiffer = bool(np.sum(weight[:, at, 0] * mean[:, at, element]) > 0.0)
+    return Verdict(
+        total, element, chart.begins[at], is_stiffer, float(min(1.0, np.sum(share * larger)))
+    )

@@ -1,0 +1,191 @@
+"""What `alarm check` has judged of each bridge, as a file: an absent alarm means something by it.
+
+`alarms/checks/realm=R/bridge=B.json` is replaced at every check of the bridge. It may be deleted:
+then the bridge counts as not watched, and the next check looks at it again.
+"""
+
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Final, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from schemas.alarms import Alarm
+from schemas.json_file import load_json
+from services.common.errors import InputError
+from services.common.files import make_folder, write_atomically
+from services.history.alarm_files import ALARMS
+from services.history.archive import Kept
+from services.history.periods import Unit, begin_of
+
+_CHECKS: Final = "checks"
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class WatchRecord(BaseModel):
+    """What a check judged of a bridge; times in s since 1970 UTC."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+    edition: Literal[1] = 1
+    checked: Finite
+    period: Unit
+    until: Finite
+    """End of what was checked: beginning of the period that was not over."""
+    crossings: Count
+    """All crossings before `until`, whatever their verdicts."""
+    newest: Finite | None = None
+    """Entry of the newest crossing, before `until` or behind it."""
+    periods: Count
+    """Periods with good crossings that can be compared."""
+    judged: Count
+    """Periods that were compared with the baseline."""
+    training: Count
+    """Periods that are wanted before any is judged."""
+    at_least: Finite
+    """Smallest change of interest."""
+    judged_from: Finite | None = None
+    """Beginning of the first judged period."""
+    judged_to: Finite | None = None
+    """End of the last one."""
+    year_ends: Finite | None = None
+    """End of the year in which the season is learned, where a temperature is missing before it."""
+    problem: str = ""
+    """Why the bridge could not be watched."""
+
+
+State = Literal[
+    "never_checked", "out_of_date", "failed", "no_crossings", "training", "season", "acknowledged",
+    "alarm", "watched",
+]  # fmt: skip
+
+
+class Watch(NamedTuple):
+    """Whether a bridge is watched."""
+
+    state: State
+    record: WatchRecord | None
+    sentence: str
+
+    @property
+    def found_nothing(self) -> bool:
+        """Whether periods were judged, up to now, and none raised an alarm."""
+        return self.state == "watched"
+
+
+def write_record(folder: Path, realm: str, bridge: str, record: WatchRecord) -> None:
+    """Write down what was judged of a bridge."""
+    path = record_path(folder, realm, bridge)
+    make_folder(path.parent)
+    write_atomically(path, record.model_dump_json(indent=1) + "\n")
+
+
+def record_path(folder: Path, realm: str, bridge: str) -> Path:
+    """Return where the record of a bridge is."""
+    return folder / ALARMS / _CHECKS / f"realm={realm}" / f"bridge={bridge}.json"
+
+
+def record_of(folder: Path, realm: str, bridge: str) -> WatchRecord | None:
+    """Return the record of a bridge; None where there is none.
+
+    InputError if the file is damaged.
+    """
+    path = record_path(folder, realm, bridge)
+    return load_json(WatchRecord, path, "a record of a check") if path.exists() else None
+
+
+def watch_of(
+    folder: Path,
+    realm: str,
+    bridge: str,
+    crossings: Iterable[Kept] | None,
+    alarms: Iterable[Alarm],
+    now_s: float,
+) -> tuple[Watch, list[str]]:
+    """Return whether a bridge is watched, and a line where its record cannot be read.
+
+    Without its crossings (None) nothing was added since the check.
+    """
+    try:
+        record = record_of(folder, realm, bridge)
+    except InputError as error:
+        return _never("its record of the last check is damaged; run driveby alarm check"), [
+            str(error)
+        ]
+    if record is None:
+        return _never("driveby alarm check has not been run on this bridge"), []
+    entries_s = None if crossings is None else [one.entry_s for one in crossings]
+    state = _state(record, entries_s, tuple(alarms), now_s)
+    return Watch(state, record, _sentence(state, record)), []
+
+
+def _never(why: str) -> Watch:
+    return Watch("never_checked", None, f"Not watched: {why}.")
+
+
+def _state(
+    record: WatchRecord, entries_s: list[float] | None, alarms: tuple[Alarm, ...], now_s: float
+) -> State:
+    if any(alarm.acknowledged is None for alarm in alarms):
+        return "alarm"
+    over_s = begin_of(now_s, record.period)
+    checked, newest_s = record.crossings, record.newest
+    if entries_s is not None:
+        checked = sum(entry_s < record.until for entry_s in entries_s)
+        newest_s = max((entry_s for entry_s in entries_s if entry_s < over_s), default=None)
+    is_newer = newest_s is not None and record.until <= newest_s < over_s
+    if checked != record.crossings or is_newer:
+        return "out_of_date"
+    if record.problem:
+        return "failed"
+    if not record.periods:
+        return "no_crossings"
+    if record.judged_to is None:
+        return "season" if record.year_ends is not None else "training"
+    noted_s = max((a.acknowledged.time for a in alarms if a.acknowledged is not None), default=0.0)
+    return "acknowledged" if record.judged_to <= noted_s else "watched"
+
+
+def _sentence(state: State, record: WatchRecord) -> str:
+    unit = record.period
+    match state:
+        case "alarm":
+            return "An alarm stands: nothing else is judged until it is acknowledged."
+        case "out_of_date":
+            return (
+                f"Not watched since {day_of(record.checked)}: crossings were added after "
+                "driveby alarm check was run."
+            )
+        case "failed":
+            return f"Not watched: {record.problem}."
+        case "no_crossings":
+            return f"Not watched: no {unit} has good crossings that can be compared."
+        case "training":
+            return (
+                f"Not watched yet: {record.periods} of {record.training} training {unit}s, "
+                f"up to {day_of(record.until)}."
+            )
+        case "season":
+            return (
+                "Not watched yet: temperatures are unknown, so the season is learned for a year, "
+                f"until {day_of(record.year_ends)}."
+            )
+        case "acknowledged":
+            return f"No {unit} has been judged since the last alarm was acknowledged."
+        case _:
+            return (
+                f"No alarm: {record.judged} {_of(unit, record.judged)} judged, "
+                f"{day_of(record.judged_from)} to {day_of(record.judged_to)}; none shows a change "
+                f"that is clearly larger than {100.0 * record.at_least:g} %."
+            )
+
+
+def _of(unit: Unit, number: int) -> str:
+    return unit if number == 1 else f"{unit}s"
+
+
+def day_of(time_s: float | None) -> str:
+    """Return the day (UTC) of a time; nothing of none."""
+    return "" if time_s is None else f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"
