@@ -42,6 +42,8 @@ class Reason(StrEnum):
     NOISE_ABOVE_DECLARED = "noise_above_declared"
     NOISE_BELOW_DECLARED = "noise_below_declared"
     IMPLAUSIBLE_VEHICLE = "implausible_vehicle"
+    MORE_AXLES_THAN_DECLARED = "more_axles_than_declared"
+    MISMATCH_IMPLAUSIBLE = "mismatch_implausible"
     COMMON_DISTURBANCE = "common_disturbance"
     IMPLAUSIBLE_BRIDGE = "implausible_bridge"
     POSITION_INCONSISTENT = "position_inconsistent"
@@ -101,6 +103,13 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "The accelerometers are much quieter than the site file says, which could hide a misfit."
     ),
     Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
+    Reason.MORE_AXLES_THAN_DECLARED: (
+        "The body above the rear axle follows a force that no declared axle has, as that of a "
+        "further axle or of a trailer."
+    ),
+    Reason.MISMATCH_IMPLAUSIBLE: (
+        "The axles feel roads that differ by far more than the declared tyres and tracks can cause."
+    ),
     Reason.COMMON_DISTURBANCE: (
         "All sensors measure something in common that is no vertical motion, as tilted ones do."
     ),

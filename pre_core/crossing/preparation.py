@@ -287,18 +287,33 @@ def levels_at(problem: Problem, y: FloatArray) -> FloatArray:
 
     Nothing where these are too few, or explained as well without (`MISMATCHED`).
     """
+    level, gain, _ = _levels_off_bridge(problem, y)
+    return level if gain > MISMATCHED else np.zeros_like(level)
+
+
+def mismatch_excess(problem: Problem, y: FloatArray) -> float:
+    """Return the power of the mismatch off the bridge over what the declared axles would have.
+
+    Of waves of ten metres, on a surface as rough as the road at y; 0 where nothing is told.
+    """
+    level, _, expected = _levels_off_bridge(problem, y)
+    return float(level.sum() / expected.sum()) if expected.sum() > 0.0 else 0.0
+
+
+def _levels_off_bridge(problem: Problem, y: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+    """Return what `mismatch_levels` does, of the stretches before and behind the bridge."""
     some = [one for one in off_bridge(problem, y) if one.stop - one.start >= _FEWEST_ROWS]
     if not some:
-        return np.zeros_like(problem.mismatch.level_m3)
+        nothing = np.zeros_like(problem.mismatch.level_m3)
+        return nothing, 0.0, nothing
     differ, felt = filtered_rows(problem, y)[0], filtered_rear_road(problem, y)
-    level, gain = mismatch_levels(
+    return mismatch_levels(
         problem.rows,
         *truck_at(problem, y),
         problem.mismatch,
         [differ[one] for one in some],
         [felt[one] for one in some],
     )
-    return level if gain > MISMATCHED else np.zeros_like(level)
 
 
 def in_spreads(priors: Priors, theta: FloatArray) -> FloatArray:

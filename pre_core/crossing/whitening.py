@@ -427,8 +427,11 @@ def mismatch_levels(
     road: Mismatch,
     stretches: list[FloatArray],
     roads: list[FloatArray],
-) -> tuple[FloatArray, float]:
-    """Levels (s,) in m³ that stretches of the mismatch's rows show, and their gain over nothing.
+) -> tuple[FloatArray, float, FloatArray]:
+    """Return levels (s,) in m³ that stretches of the mismatch's rows show, and what they gain.
+
+    The gain is that of their likelihood over nothing; the third are the levels (s,) that the
+    declared axles have on a surface as rough as the road.
 
     Each stretch (m,) is of consecutive filtered rows to which no bridge adds anything; `roads` are
     rows of what one axle felt there, taken for the front one, by which an axle's offset is not
@@ -445,14 +448,15 @@ def mismatch_levels(
     whole = [_mismatch.segment(one, of_sensors, of_shapes[-1:]) for one in roads]
     metres = rows.every * rows.step_s * road.speed_m_per_s
     surface = _mismatch.surface_level(shapes, whole, [metres * one.size for one in roads])
-    usual = np.array([np.inf, surface * shapes.expected_m[1]])
+    expected = surface * shapes.expected_m
+    usual = np.array([np.inf, expected[1]])
     parts = [_mismatch.segment(one, of_sensors, of_shapes[:-1]) for one in stretches]
     level, gain = _mismatch.levels(parts, usual)
-    if level[0] >= _ALIKE * surface * shapes.expected_m[0]:
-        return level, gain
+    if level[0] >= _ALIKE * expected[0]:
+        return level, gain, expected
     alike = [part._replace(shapes=part.shapes[1:]) for part in parts]
     level, gain = _mismatch.levels(alike, usual[1:])
-    return np.concatenate([[0.0], level]), gain
+    return np.concatenate([[0.0], level]), gain, expected
 
 
 def force_noise(

@@ -1,51 +1,23 @@
-"""Whether an answer can be trusted: from signals, site and fit to the reasons against it.
+"""Whether the answer of a fit can be trusted: the reasons against it.
 
-`reasons_before_fit` looks at the accelerations alone, by the physics that any truck obeys;
-`reasons_after_fit` at what the fit leaves over. What is measured is in
-`pre_core.diagnostics.quality`; here are the thresholds, each with what it was measured to be on
-sound crossings and on broken ones (docs/verdicts.md).
+What is measured is in `pre_core.diagnostics`; here are the thresholds, each with what it was
+measured to be on sound crossings and on broken ones (docs/verdicts.md). What signals alone say is
+in `signal_checks`.
 """
 
-from collections.abc import Callable, Mapping
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
+from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import slip
-from pre_core.diagnostics import frozen, quality, receiver
-from pre_core.physics.simulate import Motion
+from pre_core.diagnostics import quality, receiver
 from schemas.reasons import Reason
 from schemas.site import Vehicle
-from services.identification import placed
 from services.identification.crossing_data import CrossingData, Floats
+from services.identification.signal_checks import body_constants
 
-# Before the fit. Sound: 300 drawn crossings, none accused (docs/verdicts.md).
-LONGEST_HOLD_S = 0.2
-"""Noise and motion change every sample; a coarse converter (12 bits) holds one for 0.03 s."""
-ALIKE = 1e-3
-"""Two channels that differ by less than this part of what they show are one."""
-_PILE_UP = 8.0
-_PILE_VISITS = 3
-"""Sound: at most 5.8 over three visits; a range of half of what is needed: 12 to 67."""
-_REPEATS = 4
-"""An extreme that comes exactly so often is the end of a range: noise repeats none."""
-SPIKE_HEIGHT = 20.0
-"""Over the typical distance from the neighbours. Sound: at most 7."""
-LARGEST_MEAN_M_PER_S2 = 0.3 * STANDARD_GRAVITY_M_PER_S2
-"""No truck falls for seconds: a mean of this size is gravity or a broken sensor."""
-UNEXPLAINED = 0.3
-_BETTER = 0.5
-"""Part of the body's motion that the body equations leave over. Sound: at most 0.10; two channels
-exchanged or one inverted: at least 0.36, and then at most 0.10 once they are put right."""
-_LEAD = 0.6
-"""Correlation of what both axles feel at one place. Sound: 0.71 to 0.99 (with the axles exchanged:
--0.72 to 0.49)."""
-
-
-# After the fit.
 _BANDS_HZ = np.array([0.0, 6.0, 12.0, 30.0, np.inf])
 """What bridge, body and wheels do lies mostly in the first three; the rest is noise."""
 _FALSE_ALARM_Z = 4.5
@@ -65,6 +37,7 @@ _SMALLEST_CHI2 = 0.6
 """A smaller one means that the noise is far below the declared, and intervals are too wide."""
 _LARGEST_VEHICLE_Z = 4.0
 """No unknown of a truck is by chance so many standard deviations from its prior."""
+_MOST_NAMED = 3
 _LARGEST_POSITION_Z = 4.0
 """Nor is the receiver's slow error."""
 _LARGEST_STEP_Z = {slip.DELAY: 6.0, slip.GAIN: 7.0}
@@ -91,6 +64,14 @@ _STIFFER = 1.5
 others: wrong signals do."""
 _CLEARLY = 0.025
 """Quantile of the draws that must be above it."""
+_UNDECLARED, _PLAINLY_UNDECLARED = 0.12, 0.3
+_REAR_OVER_FRONT = 2.5
+"""Part of the rear body's motion that its equation leaves over, and over the front's. Sixteen
+semitrailers and tandems declared with two axles: 0.15 to 1.3, 1.9 to 190 times the front's; sound
+trucks 0.05 at most, with springs that rub 0.21: below the second figure the first is a cause to
+name where something else is wrong, and no reason by itself."""
+_MISMATCH_EXCESS = 30.0
+"""In power: tyres twice as wide, or tracks that differ by 20 cm where they are declared alike."""
 ALIKE_LOADS = 0.1
 """Axles whose loads differ by less than this share of their sum press the bridge alike: what the
 road does to both cannot be told from what the bridge does."""
@@ -129,6 +110,8 @@ class Fit(NamedTuple):
     """That of the body equations' residuals, where springs are doubted for them."""
     step: slip.Step | None = None
     """The most significant step in the delay or the gain of a channel."""
+    mismatch_excess: float = 0.0
+    """Power of the mismatch off the bridge over what the declared axles would have."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
@@ -139,6 +122,8 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
         reasons.append(Reason.APPROACH_TOO_SHORT)
     if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > _LARGEST_VEHICLE_Z:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
+    if fit.mismatch_excess > _MISMATCH_EXCESS:
+        reasons.append(Reason.MISMATCH_IMPLAUSIBLE)
     if abs(fit.position_z) > _LARGEST_POSITION_Z:
         reasons.append(Reason.POSITION_INCONSISTENT)
     if _speeds_differ(data, fit):
@@ -291,188 +276,30 @@ def loads_are_alike(vehicle: Vehicle) -> bool:
     return abs(front - rear) < ALIKE_LOADS * (front + rear)
 
 
-def reasons_before_fit(
-    vehicle: Vehicle,
-    acceleration: Floats,
-    step_s: float,
-    motion: Motion,
-    direction: int,
-    spreads: placed.Spreads = placed.USUAL_SPREADS,
-) -> Mapping[Reason, str]:
-    """What the accelerations (m, n) alone say against the crossing, and of which channels.
-
-    They are those of the vehicle's channels in their order. All of it forbids a fit. `motion` is
-    where the front axle was at every sample.
-    """
-    broken = _broken(vehicle.channels, acceleration, step_s)
-    if broken:
-        return broken
-    disagreeing = placed.disagreement(vehicle, acceleration, step_s, spreads)
-    if disagreeing:
-        return disagreeing
-    readings = placed.middle_of(vehicle, acceleration)
-    one = of_one_sensor(vehicle, acceleration, readings, step_s)
-    if one:
-        return one
-    reasons = order_and_signs(vehicle, readings, step_s, motion, direction)
-    if not reasons:
-        return {}
-    found = quality.pairing(readings, step_s, *body_constants(vehicle))
-    named = {Reason.CHANNEL_INVERTED: _inverted, Reason.CHANNEL_SWAPPED: _exchanged}
-    names = placed.middle_names(vehicle)
-    return {reason: named[reason](found, names) for reason in reasons}
-
-
-def unmeasured(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> dict[Reason, str]:
-    """Return the reason, and the channels (m, n), of stretches that no sensor measured.
-
-    Anywhere in the record, for all of it is fitted.
-    """
-    of_each = {
-        Reason.CHANNEL_STUCK: frozen.longest_hold_s,
-        Reason.CHANNEL_BRIDGED: frozen.longest_line_s,
-    }
-    for reason, longest_s in of_each.items():
-        found = [longest_s(values, step_s) for values in acceleration]
-        names = [
-            f"{name} for {1e3 * seconds:.0f} ms"
-            for name, seconds in zip(channels, found, strict=True)
-            if seconds > 0.0
-        ]
-        if names:
-            return {reason: ", ".join(names)}
-    return {}
-
-
-def of_one_sensor(
-    vehicle: Vehicle, acceleration: Floats, readings: Floats, step_s: float
+def undeclared_axles(
+    vehicle: Vehicle, acceleration: Floats, step_s: float, *, is_doubted: bool
 ) -> dict[Reason, str]:
-    """Whether one sensor turned round, or two exchanged, explain a body that does not follow.
+    """Return the reason why the rear of the body follows a force that no declared axle has.
 
-    Where several sensors make a middle reading: one inverted among them makes it a roll.
+    By the body equations of the middle readings (4, n). Where `is_doubted` for other reasons, less
+    is enough.
     """
-    if not vehicle.sensors:
-        return {}
-    constants = body_constants(vehicle)
-    recorded = quality.unexplained(readings, step_s, *constants)
-    if recorded <= UNEXPLAINED:
-        return {}
-    best, found = _BETTER * recorded, dict[Reason, str]()
-    names = vehicle.channels
-    pairs = combinations(range(len(names)), 2)
-    for order in [*((k,) for k in range(len(names))), *pairs]:
-        other = acceleration.copy()
-        if len(order) == 1:
-            other[order[0]] *= -1.0
-        else:
-            other[list(order)] = acceleration[list(order[::-1])]
-        left = quality.unexplained(placed.middle_of(vehicle, other), step_s, *constants)
-        if left < best:
-            reason = Reason.CHANNEL_INVERTED if len(order) == 1 else Reason.CHANNEL_SWAPPED
-            best, found = left, {reason: " and ".join(names[k] for k in order)}
-    return found
-
-
-def _broken(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> dict[Reason, str]:
-    """The most plain of what is wrong with single channels: it makes the others show as well."""
-
-    def those(is_wrong: Callable[[Floats], bool]) -> str:
-        each = zip(channels, acceleration, strict=True)
-        return ", ".join(name for name, values in each if is_wrong(values))
-
-    of_each: list[tuple[Reason, Callable[[Floats], bool]]] = [
-        (Reason.CHANNEL_BIASED, lambda values: abs(values.mean()) > LARGEST_MEAN_M_PER_S2),
-        (Reason.SENSOR_SATURATED, is_saturated),
-        (Reason.SIGNAL_SPIKES, lambda values: quality.spikes(values, SPIKE_HEIGHT) > 0),
-    ]
-    stuck = those(lambda values: quality.longest_hold(values) * step_s > LONGEST_HOLD_S)
-    if stuck:
-        return {Reason.CHANNEL_STUCK: stuck}
-    if quality.smallest_difference(acceleration) < ALIKE:
-        return {Reason.CHANNELS_ALIKE: _alike(channels, acceleration)}
-    for reason, is_wrong in of_each:
-        names = those(is_wrong)
-        if names:
-            return {reason: names}
-    return {}
-
-
-def _alike(channels: tuple[str, ...], acceleration: Floats) -> str:
-    """Names of channels (m, n) that show the same."""
-    pairs = combinations(range(len(channels)), 2)
-    return ", ".join(
-        f"{channels[i]} and {channels[k]}"
-        for i, k in pairs
-        if quality.smallest_difference(acceleration[[i, k]]) < ALIKE
-    )
-
-
-def _inverted(found: quality.Pairing, names: tuple[str, ...]) -> str:
-    """Names of channels of which one is inverted."""
-    ends = [end for end, upright in enumerate(found.upright) if upright > UNEXPLAINED]
-    if not ends:
-        return "both of one axle"
-    return " and ".join(f"{names[end]} or {names[2 + end]}" for end in ends)
-
-
-def _exchanged(found: quality.Pairing, names: tuple[str, ...]) -> str:
-    """Names of channels that are exchanged; with "or" where the body's equations know no better.
-
-    To them front and rear are alike: if both pairs change places as well, they hold as before. So
-    of both ways the one that moves fewer channels is told.
-    """
-    if found.recorded <= UNEXPLAINED:
-        return "front and rear, of body and axle alike"
-    order = found.best_order
-    ways = [order, (order[1], order[0], order[3], order[2])]
-    moved = [[k for k in range(4) if way[k] != k] for way in ways]
-    fewest = min(map(len, moved))
-    return ", or ".join(
-        " and ".join(names[k] for k in one) for one in sorted(moved) if len(one) == fewest
-    )
-
-
-def is_saturated(values: Floats) -> bool:
-    """Whether a signal (n,) stays where a sensor's range ends."""
-    rail = quality.pile_up(values)
-    piled_up = rail.ratio > _PILE_UP and rail.visits >= _PILE_VISITS
-    return piled_up or quality.repeated_extremes(values) >= _REPEATS
-
-
-def body_constants(vehicle: Vehicle) -> tuple[Floats, Floats]:
-    """Springs and dampers over the masses that they carry, front and rear: (2,) each, nominally."""
-    d_1, wheelbase = vehicle.front_axle_to_cg_m, vehicle.wheelbase_m
-    body = vehicle.sprung_mass_kg * np.array([wheelbase - d_1, d_1]) / wheelbase
-    return (
-        np.array(vehicle.suspension_stiffness_n_per_m) / body,
-        np.array(vehicle.suspension_damping_ns_per_m) / body,
-    )
-
-
-def order_and_signs(
-    vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion, direction: int
-) -> list[Reason]:
-    """Whether channels (4, n) are exchanged or inverted; `motion` is the front axle's."""
     found = quality.pairing(acceleration, step_s, *body_constants(vehicle))
-    if found.recorded > UNEXPLAINED:
-        turned = [
-            reversed_ < _BETTER * upright
-            for upright, reversed_ in zip(found.upright, found.reversed_, strict=True)
-            if upright > UNEXPLAINED
-        ]
-        if all(turned) and min(found.reversed_) < found.best:
-            return [Reason.CHANNEL_INVERTED]
-        if found.best < _BETTER * found.recorded:
-            return [Reason.CHANNEL_SWAPPED]
-        return []  # something else is wrong, which the fit will show
-    travelled = direction * (motion.position_m - motion.position_m[0])
-    if np.any(np.diff(travelled) <= 0.0):
-        return []
-    right, exchanged = quality.lead(
-        acceleration[2], acceleration[3], step_s, travelled, vehicle.wheelbase_m
-    )
-    if right < -_LEAD:
-        return [Reason.CHANNEL_INVERTED]
-    if exchanged > _LEAD > 2.0 * right:
-        return [Reason.CHANNEL_SWAPPED]
-    return []
+    front, rear = found.upright
+    least = _UNDECLARED if is_doubted else _PLAINLY_UNDECLARED
+    if rear < max(least, _REAR_OVER_FRONT * front):
+        return {}
+    return {
+        Reason.MORE_AXLES_THAN_DECLARED: f"{100.0 * rear:.0f} % of its motion are unexplained, "
+        f"{100.0 * front:.0f} % at the front"
+    }
+
+
+def odd_parameters(fit: Fit) -> str:
+    """Return the truck's parameters that are implausibly far from the site file, farthest first."""
+    far = {name: z for name, z in fit.prior_z.items() if abs(z) > _LARGEST_VEHICLE_Z}
+    named = sorted(far, key=lambda name: -abs(far[name]))[:_MOST_NAMED]
+    if not named:
+        return ""
+    values = ", ".join(f"{name} {far[name]:+.1f}" for name in named)
+    return f"{values} standard deviations"

@@ -19,7 +19,6 @@ from pre_core.search.loop import Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
-from services.identification.checks import reasons_before_fit, unmeasured
 from services.identification.crossing_data import (
     LONGEST_SURE_OUTAGE_S,
     CrossingData,
@@ -34,6 +33,7 @@ from services.identification.paper_method import identify_paper
 from services.identification.placed import Spreads, hidden, middle_of
 from services.identification.pre_method import Keep as Keep
 from services.identification.pre_method import identify_pre
+from services.identification.signal_checks import reasons_before_fit, unmeasured
 from services.identification.stays import STANDING_M_PER_S, Passage
 from services.identification.streams import Samples
 

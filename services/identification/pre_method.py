@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 
 from pre_core import unknowns
 from pre_core.constants import MICRO_G_M_PER_S2
-from pre_core.crossing import optimum, posterior, shaking, slip, speeds
-from pre_core.crossing.compliances import LEANING_SPREAD, led_by_mismatch
+from pre_core.crossing import optimum, posterior
 from pre_core.crossing.mismatch import as_two_numbers
-from pre_core.crossing.preparation import Inputs, off_bridge_m, rear_at_rows_m
+from pre_core.crossing.preparation import Inputs
 from pre_core.crossing.sampling import Sampled, sample
-from pre_core.crossing.whitening import RESIDUALS
 from pre_core.physics.beam_basis import first_frequencies_hz
 from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
@@ -27,13 +25,7 @@ from schemas import results
 from schemas.reasons import Reason, texts
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge
-from services.identification.checks import (
-    Fit,
-    coarse_converters,
-    reasons_after_fit,
-    steps_of_channels,
-    stiffer_elements,
-)
+from services.identification.checks import stiffer_elements, undeclared_axles
 from services.identification.crossing_data import (
     CrossingData,
     Floats,
@@ -46,10 +38,10 @@ from services.identification.crossing_data import (
     rejected,
     road_result,
 )
+from services.identification.fit_reasons import reasons_of_fit
 from services.identification.footprints import footprints_of
 from services.identification.fusing import stored
 from services.identification.lane import lane_factor
-from services.identification.placed import middle_names
 
 _FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN = 14, 8
 """At least so many in all, and in each of several spans on average, whatever the number of
@@ -202,26 +194,19 @@ def identify_pre(
             },
         )
     if found.ending is Ending.NOT_FINITE:
-        return rejected(data, settings, passing, [Reason.NOT_FINITE])
+        named = undeclared_axles(data.vehicle, acceleration, inputs.step_s, is_doubted=True)
+        return rejected(data, settings, passing, [Reason.NOT_FINITE, *named], named)
     problem, y = found.problem, found.state.y
     diagnostics = {
         "iterations": float(found.evaluations),
         "starts": float(found.starts),
         "position_shift_m": float(y[posterior.layout(problem).offset]),
     }
-    fit = _fit(data, found)
-    broken = steps_of_channels(middle_names(data.vehicle), fit)
-    reasons = [*broken, *reasons_after_fit(data, fit)]
-    if found.ending is not Ending.CONVERGED:
-        reasons.append(Reason.NOT_CONVERGED)
-    names, densities = middle_names(data.vehicle), data.sensor.noise_density_ug_per_rthz
-    coarse = coarse_converters(names, densities, acceleration, inputs.step_s)
-    about = {**broken, Reason.NOISE_ABOVE_DECLARED: coarse}
-    if (coarse or found.noise_power > 1.0) and Reason.NOISE_ABOVE_DECLARED not in reasons:
-        reasons.insert(0, Reason.NOISE_ABOVE_DECLARED)
+    against = reasons_of_fit(data, found, acceleration, inputs.step_s)
+    reasons, about = list(against.reasons), against.about
     usable = _LARGEST_CHI2 if Reason.NOISE_ABOVE_DECLARED in reasons else _USABLE_CHI2
     # Elsewhere than at the optimum neither values nor widths mean anything.
-    if broken or found.ending is not Ending.CONVERGED or found.chi2_per_dof > usable:
+    if against.forbids or found.ending is not Ending.CONVERGED or found.chi2_per_dof > usable:
         diagnostics["seconds"] = elapsed()
         return rejected(
             data,
@@ -256,42 +241,11 @@ def identify_pre(
         **header(data, settings, passing),
         verdict="suspect" if once else "good",
         reasons=once,
-        reason_texts=tuple(texts(once, about | {Reason.IMPLAUSIBLE_BRIDGE: implausible})),
+        reason_texts=tuple(texts(once, {**about, Reason.IMPLAUSIBLE_BRIDGE: implausible})),
         chi2_per_dof=found.chi2_per_dof * found.noise_power,
         diagnostics=diagnostics,
         fusion_likelihood=stored(data, found),
         **values,
-    )
-
-
-def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
-    """What the checks after the fit look at."""
-    problem, y = found.problem, found.state.y
-    where, rows = posterior.layout(problem), problem.rows
-    white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
-    rows_of = unknowns.table(data.bridge.elements)
-    estimated = [rows_of[i] for i in np.flatnonzero(problem.priors.estimated)]
-    # Where the axles' roads differ that leads the truck as far as it is known.
-    led = np.hypot(1.0, LEANING_SPREAD * led_by_mismatch(found))
-    prior_z = {
-        row.name: float(y[k] / led[k])
-        for k, row in enumerate(estimated)
-        if row.part == unknowns.TRUCK
-    }
-    _, covariance = optimum.normal_approximation(found)
-    return Fit(
-        white,
-        rows.every * rows.step_s,
-        rear_at_rows_m(problem, y),
-        found.chi2_per_dof,
-        prior_z | {"wheelbase": float(y[where.wheelbase])},
-        float(problem.receiver_rows[-1, -1] * y[where.offset]),
-        np.sqrt(np.diag(covariance)[where.elements]),
-        bool(problem.mismatch.level_m3.any()),
-        off_bridge_m(problem, y),
-        speeds.speed_bias(problem, y),
-        shaking.coherence(problem, y) if problem.force.any() else 0.0,
-        slip.largest_step(problem, found.state, covariance),
     )
 
 

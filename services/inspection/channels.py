@@ -10,7 +10,7 @@ from pre_core.diagnostics import quality
 from pre_core.physics.simulate import Motion
 from schemas.reasons import REASON_TEXTS, Reason
 from schemas.site import Sensor, Vehicle
-from services.identification import checks, placed
+from services.identification import placed, signal_checks
 from services.identification.placed import rates_hz
 from services.inspection.finding import Finding, State, judged
 from services.inspection.recorded import Recorded
@@ -89,14 +89,14 @@ def alive(names: tuple[str, ...], acceleration: Floats, step_s: float) -> Iterat
     for name, values in zip(names, acceleration, strict=True):
         held_s = quality.longest_hold(values) * step_s
         mean = float(values.mean())
-        if held_s > checks.LONGEST_HOLD_S:
+        if held_s > signal_checks.LONGEST_HOLD_S:
             yield Finding(
                 "channel_stuck",
                 State.WRONG,
                 f"{name}: one value for {held_s:.2f} s",
                 "it is dead: look at plug and supply",
             )
-        elif abs(mean) > checks.LARGEST_MEAN_M_PER_S2:
+        elif abs(mean) > signal_checks.LARGEST_MEAN_M_PER_S2:
             yield Finding(
                 "channel_biased",
                 State.WRONG,
@@ -110,7 +110,7 @@ def alive(names: tuple[str, ...], acceleration: Floats, step_s: float) -> Iterat
                 f"{name}: values pile up at an end, {np.abs(values).max():.1f} m/s²",
                 "set a larger range",
             )
-        elif (spikes := quality.spikes(values, checks.SPIKE_HEIGHT)) > 0:
+        elif (spikes := quality.spikes(values, signal_checks.SPIKE_HEIGHT)) > 0:
             yield Finding(
                 "signal_spikes",
                 State.WRONG,
@@ -123,7 +123,7 @@ def alive(names: tuple[str, ...], acceleration: Floats, step_s: float) -> Iterat
                 State.OK,
                 f"{name}: alive, mean {mean:+.3f}, largest {np.abs(values).max():.2f} m/s²",
             )
-    if len(names) > 1 and quality.smallest_difference(acceleration) < checks.ALIKE:
+    if len(names) > 1 and quality.smallest_difference(acceleration) < signal_checks.ALIKE:
         yield Finding(
             "channels_alike",
             State.WRONG,
@@ -138,7 +138,9 @@ def _is_saturated(values: Floats) -> bool:
     Many stretches are looked at: chance made one of a hundred sound ones look so as a whole.
     """
     halves = np.array_split(values, 2)
-    return checks.is_saturated(values) and any(checks.is_saturated(half) for half in halves)
+    return signal_checks.is_saturated(values) and any(
+        signal_checks.is_saturated(half) for half in halves
+    )
 
 
 def agreement(vehicle: Vehicle, sensor: Sensor, acceleration: Floats, step_s: float) -> Finding:
@@ -147,7 +149,7 @@ def agreement(vehicle: Vehicle, sensor: Sensor, acceleration: Floats, step_s: fl
     found = placed.disagreement(vehicle, acceleration, step_s, spreads)
     if not found:
         readings = placed.middle_of(vehicle, acceleration)
-        found = checks.of_one_sensor(vehicle, acceleration, readings, step_s)
+        found = signal_checks.of_one_sensor(vehicle, acceleration, readings, step_s)
     for reason, names in found.items():
         return Finding(
             str(reason),
@@ -160,10 +162,10 @@ def agreement(vehicle: Vehicle, sensor: Sensor, acceleration: Floats, step_s: fl
 
 def in_place(vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion) -> Finding:
     """Order and signs of the middle readings (4, n) of a drive, by the equations of the body."""
-    reasons = checks.order_and_signs(vehicle, acceleration, step_s, motion, 1)
-    found = quality.pairing(acceleration, step_s, *checks.body_constants(vehicle))
+    reasons = signal_checks.order_and_signs(vehicle, acceleration, step_s, motion, 1)
+    found = quality.pairing(acceleration, step_s, *signal_checks.body_constants(vehicle))
     explained = 1.0 - found.recorded
-    if Reason.CHANNEL_INVERTED in reasons and found.recorded <= checks.UNEXPLAINED:
+    if Reason.CHANNEL_INVERTED in reasons and found.recorded <= signal_checks.UNEXPLAINED:
         # Axles that move against each other at one distance move alike at another.
         follows = followed(vehicle, acceleration, step_s, motion.position_m)
         if follows.alike > follows.opposite:
@@ -184,7 +186,7 @@ def in_place(vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Moti
         "channels_in_place",
         f"the axles' motion explains {explained:.0%} of the body's",
         "springs, masses or sensors are not those of the site file",
-        is_wrong=found.recorded > checks.UNEXPLAINED,
+        is_wrong=found.recorded > signal_checks.UNEXPLAINED,
     )
 
 
@@ -214,7 +216,7 @@ def followed(
 
 
 def _swapped(found: quality.Pairing, names: tuple[str, ...]) -> str:
-    if found.recorded <= checks.UNEXPLAINED:
+    if found.recorded <= signal_checks.UNEXPLAINED:
         return "the rear axle meets the road first: front and rear are exchanged"
     pairs = [
         f"{names[k]} looks like {names[found.best_order.index(k)]}"
@@ -225,7 +227,7 @@ def _swapped(found: quality.Pairing, names: tuple[str, ...]) -> str:
 
 
 def _inverted(found: quality.Pairing, names: tuple[str, ...]) -> str:
-    ends = [end for end, upright in enumerate(found.upright) if upright > checks.UNEXPLAINED]
+    ends = [end for end, upright in enumerate(found.upright) if upright > signal_checks.UNEXPLAINED]
     if not ends:
         return "both channels of one axle are inverted: the axles move against each other"
     return f"{names[ends[0]]} or {names[2 + ends[0]]} is inverted"
@@ -256,7 +258,7 @@ def wheelbase(
 
 def masses(vehicle: Vehicle, acceleration: Floats, step_s: float) -> Iterator[Finding]:
     """Springs over the masses that they carry, by the body's motion, against the site file."""
-    declared, damping = checks.body_constants(vehicle)
+    declared, damping = signal_checks.body_constants(vehicle)
     found = quality.stiffness_per_mass(acceleration, step_s, declared, damping)
     for end, measured, known in zip(("front", "rear"), found, declared.tolist(), strict=True):
         text = (

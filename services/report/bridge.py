@@ -69,7 +69,17 @@ _ADVICE = {
         "Measure the sensors' noise at standstill, declare it, and identify again."
     ),
     Reason.NOISE_BELOW_DECLARED: "Declare the sensors' true noise, and identify again.",
-    Reason.IMPLAUSIBLE_VEHICLE: "Measure the wheelbase; make sure that it was this truck.",
+    Reason.IMPLAUSIBLE_VEHICLE: (
+        "Make sure that it was this truck without a trailer, with its sensors in the middle of "
+        "axles and frame; measure the wheelbase."
+    ),
+    Reason.MORE_AXLES_THAN_DECLARED: (
+        "Drive without a trailer, or with a truck of two axles; look at the rear body sensor."
+    ),
+    Reason.MISMATCH_IMPLAUSIBLE: (
+        "Measure tyres and tracks of both axles and declare them; make sure that the sensors are "
+        "in the middle."
+    ),
     Reason.COMMON_DISTURBANCE: "Mount the sensors upright; look at their common supply.",
     Reason.IMPLAUSIBLE_BRIDGE: (
         "Look at sensors and receiver. Where the bridge is built stiffer there, declare it "

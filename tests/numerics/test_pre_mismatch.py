@@ -132,7 +132,7 @@ def test_levels_of_drawn_surfaces() -> None:
     found = []
     for seed in range(12):
         drive = driven(seed, 900)  # 27 m
-        level, gain = mismatch_levels(
+        level, gain, _ = mismatch_levels(
             rows, truck(), QUIET, of_level(0.0), [filtered(drive.difference)],
             [filtered(drive.front)],
         )  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 from schemas.reasons import Reason
 from schemas.signals import CHANNELS
 from services.identification import identify
-from services.identification.checks import unmeasured
+from services.identification.signal_checks import unmeasured
 from tests.verdicts import faults
 from tests.verdicts.faults import Fault, Truth
 from tests.verdicts.test_signals import sound

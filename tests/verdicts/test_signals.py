@@ -15,7 +15,7 @@ from pre_core.diagnostics import quality
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason, texts
 from schemas.signals import CHANNELS
-from services.identification.checks import reasons_before_fit
+from services.identification.signal_checks import reasons_before_fit
 from tests.verdicts import faults
 from tests.verdicts.faults import Case, Fault, Truth
 

@@ -21,7 +21,6 @@ from services.cli import main as cli
 from services.common.geodesy import bridge_frame, to_chainage
 from services.drives.csv_import import read_folder
 from services.drives.runs import Run
-from services.identification.checks import reasons_before_fit
 from services.identification.placed import (
     densities_ug_per_rthz,
     hidden,
@@ -32,6 +31,7 @@ from services.identification.placed import (
     rates_hz,
     sensors_in_words,
 )
+from services.identification.signal_checks import reasons_before_fit
 from services.simulation.drawn import see
 from services.simulation.drive import paper_site
 from tests.unit.identification.test_engine import drive, legs, rejected
