@@ -397,6 +397,16 @@ def _is_accepted(problem: Problem, chi2: float) -> bool:
 
 
 def _from_places(problem: Problem, y: FloatArray, way: Way, report: Report, most: int) -> Optimum:
+    """Return the best optimum of a way; none, as at numbers beyond all bounds, if it runs away."""
+    try:
+        return _from_likeliest_places(problem, y, way, report, most)
+    except (FloatingPointError, np.linalg.LinAlgError):
+        return _nowhere(problem, y, 0, 0)
+
+
+def _from_likeliest_places(
+    problem: Problem, y: FloatArray, way: Way, report: Report, most: int
+) -> Optimum:
     """The best optimum of those that are reached from the likeliest places along the road.
 
     None, as if no place gave finite rows, as soon as a place shows that the way is wrong. After

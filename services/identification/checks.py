@@ -70,6 +70,8 @@ _REAR_OVER_FRONT = 2.5
 semitrailers and tandems declared with two axles: 0.15 to 1.3, 1.9 to 190 times the front's; sound
 trucks 0.05 at most, with springs that rub 0.21: below the second figure the first is a cause to
 name where something else is wrong, and no reason by itself."""
+_LED_AWAY = 40.0
+"""Sound: at most 3; trailers and searches that ran away: 540 to 13,000."""
 _MISMATCH_EXCESS = 30.0
 """In power: tyres twice as wide, or tracks that differ by 20 cm where they are declared alike."""
 ALIKE_LOADS = 0.1
@@ -112,6 +114,9 @@ class Fit(NamedTuple):
     """The most significant step in the delay or the gain of a channel."""
     mismatch_excess: float = 0.0
     """Power of the mismatch off the bridge over what the declared axles would have."""
+    led_by_mismatch: float = 0.0
+    """Largest correction of a truck's unknown for the mismatch, in multiples of its prior's
+    spread."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
@@ -122,7 +127,7 @@ def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
         reasons.append(Reason.APPROACH_TOO_SHORT)
     if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > _LARGEST_VEHICLE_Z:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
-    if fit.mismatch_excess > _MISMATCH_EXCESS:
+    if fit.mismatch_excess > _MISMATCH_EXCESS or is_led_away(fit):
         reasons.append(Reason.MISMATCH_IMPLAUSIBLE)
     if abs(fit.position_z) > _LARGEST_POSITION_Z:
         reasons.append(Reason.POSITION_INCONSISTENT)
@@ -274,6 +279,11 @@ def loads_are_alike(vehicle: Vehicle) -> bool:
     """Whether both axles press the bridge alike."""
     front, rear = axle_loads_kg(vehicle)
     return abs(front - rear) < ALIKE_LOADS * (front + rear)
+
+
+def is_led_away(fit: Fit) -> bool:
+    """Return whether the correction for the mismatch is beyond any truck: no number can be used."""
+    return fit.led_by_mismatch > _LED_AWAY
 
 
 def undeclared_axles(

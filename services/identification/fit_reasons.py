@@ -18,6 +18,7 @@ from schemas.reasons import Reason
 from services.identification.checks import (
     Fit,
     coarse_converters,
+    is_led_away,
     odd_parameters,
     reasons_after_fit,
     steps_of_channels,
@@ -59,7 +60,7 @@ def reasons_of_fit(
         Reason.NOISE_ABOVE_DECLARED: coarse,
         Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
     }
-    return Against((*axles, *reasons), about, bool(slipped))
+    return Against((*axles, *reasons), about, bool(slipped) or is_led_away(fit))
 
 
 def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
@@ -70,7 +71,8 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
     rows_of = unknowns.table(data.bridge.elements)
     estimated = [rows_of[i] for i in np.flatnonzero(problem.priors.estimated)]
     # Where the axles' roads differ that leads the truck as far as it is known.
-    led = np.hypot(1.0, LEANING_SPREAD * led_by_mismatch(found))
+    moved = led_by_mismatch(found)
+    led = np.hypot(1.0, LEANING_SPREAD * moved)
     prior_z = {
         row.name: float(y[k] / led[k])
         for k, row in enumerate(estimated)
@@ -91,4 +93,5 @@ def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
         shaking.coherence(problem, y) if problem.force.any() else 0.0,
         slip.largest_step(problem, found.state, covariance),
         mismatch_excess(problem, y) if problem.mismatch.level_m3.any() else 0.0,
+        float(np.abs(moved).max()),
     )

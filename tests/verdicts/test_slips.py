@@ -12,7 +12,7 @@ from pre_core.crossing import slip
 from pre_core.crossing.channels import A_1, A, V, Z
 from schemas.reasons import Reason
 from schemas.signals import CHANNELS
-from services.identification import checks, pre_method
+from services.identification import checks, fit_reasons
 from services.identification.checks import Fit
 from tests.verdicts import faults
 from tests.verdicts.faults import Fault, Truth
@@ -69,12 +69,12 @@ def test_sound_channels_show_no_step(rate_hz: float, monkeypatch: pytest.MonkeyP
     """Below the threshold by a factor of 1.5 and more."""
     seen: list[Fit] = []
 
-    def kept(fit: Fit) -> dict[Reason, str]:
+    def kept(names: tuple[str, ...], fit: Fit) -> dict[Reason, str]:
         seen.append(fit)
-        return real(fit)
+        return real(names, fit)
 
     real = checks.steps_of_channels
-    monkeypatch.setattr(pre_method, "steps_of_channels", kept)
+    monkeypatch.setattr(fit_reasons, "steps_of_channels", kept)
     truth = Truth(rate_hz=rate_hz, seed=int(rate_hz))
     fault = Fault(site=faults.believed_nearly(int(rate_hz)))
     result = faults.identified(faults.crossing(truth, fault))
