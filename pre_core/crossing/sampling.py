@@ -5,11 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 
 from pre_core.crossing import compliances, optimum, posterior
-from pre_core.search import approximation, crank_nicolson, importance
+from pre_core.physics.torsion import NO_TORSION
+from pre_core.search import approximation, crank_nicolson, importance, levenberg_marquardt
 from pre_core.search.loop import Ending, Report, run
-from pre_core.unknowns import element_count, table
+from pre_core.unknowns import TORSION, element_count, table
 
 FloatArray = NDArray[np.float64]
 
@@ -30,6 +32,9 @@ _FEWEST_BATCHES, _MOST_BATCHES = 4, 10
 _TAME_BATCHES = 6
 """Weights whose tail is still too heavy by then are given up: the fit of few scatters."""
 _LARGEST_PARETO_K = 0.7
+_IMPROBABLE = 0.02
+"""Odds below which torsion is left out of the draws: it changes no interval, and a chain that has
+to find it now and then takes longer to agree."""
 _WORTH = 1.0 / 3.0
 """Weighted draws are enough if they are worth this share of those that are asked for. It is more
 than is asked of chains: what weights are worth is an estimate from the weights themselves."""
@@ -65,11 +70,56 @@ def sample(
 ) -> Sampled:
     """Draw from the posterior about its optimum, of noise `inflation` times what was declared.
 
-    At least `draws` in all chains together; STEPS_EXHAUSTED if they do not agree.
+    At least `draws` in all chains together; STEPS_EXHAUSTED if they do not agree. Torsion that is
+    improbable is left out: zero in all draws.
     """
-    problem = found.problem
-    if problem.mismatch.level_m3.any():
+    if found.problem.mismatch.level_m3.any():
         return _sampled_on_two_roads(found, draws, seed, inflation)
+    place = _improbable_torsion(found, inflation)
+    if place is None:
+        return _sampled_on_one_road(found, draws, seed, inflation, report)
+    stiff = _sampled_on_one_road(without_torsion(found, place), draws, seed, inflation, report)
+    return stiff._replace(draws=np.insert(stiff.draws, place, 0.0, axis=2))
+
+
+def _improbable_torsion(found: optimum.Optimum, inflation: float) -> int | None:
+    """Return the place in y of torsion that is hardly there, by the normal about the optimum."""
+    problem = found.problem
+    where = posterior.layout(problem)
+    kept = np.flatnonzero(problem.priors.estimated)
+    places = np.intersect1d(np.flatnonzero(kept == TORSION), where.half_normal)
+    if places.size == 0:
+        return None
+    place = int(places[0])
+    centre, covariance = optimum.normal_approximation(found)
+    scale = inflation * np.sqrt(covariance[place, place])
+    at = float(centre[place] / scale)
+    # Mass above zero over the density at zero, as in `compliances`.
+    log_above = np.log(scale * np.sqrt(2.0 * np.pi)) + log_ndtr(at) + 0.5 * at * at
+    log_odds = float(posterior.log_odds_of_absence(problem, inflation)[place])
+    return place if log_above - log_odds < np.log(_IMPROBABLE) else None
+
+
+def without_torsion(found: optimum.Optimum, place: int) -> optimum.Optimum:
+    """Return the optimum of the deck that does not twist, whose unknown was at `place` in y."""
+    problem = found.problem
+    priors = problem.priors
+    estimated = priors.estimated.copy()
+    estimated[TORSION] = False
+    stiff = problem._replace(
+        priors=priors._replace(estimated=estimated),
+        crossing=problem.crossing._replace(torsion=NO_TORSION),
+        noise_slope=np.delete(problem.noise_slope, place),
+    )
+    y = np.delete(found.state.y, place)
+    state = levenberg_marquardt.begin(lambda at: posterior.all_rows(stiff, at), y)
+    return found._replace(problem=stiff, state=state)
+
+
+def _sampled_on_one_road(
+    found: optimum.Optimum, draws: int, seed: int, inflation: float, report: Report
+) -> Sampled:
+    problem = found.problem
     mixed = _approximation(found, inflation, seed)
 
     def target(points: FloatArray) -> FloatArray:

@@ -67,10 +67,16 @@ rayleigh_beta_s = nan                 # half as much or more is thought possible
 # road_class = "A"                    # ISO 8608, for planning
 # survey_speed_m_per_s = 10.0         # for planning; below 3 m/s nothing is told
 # baseline = "first-survey.json"      # results to compare with, beside this file
+# lane_offset_m = 1.6                 # middle of the lane left of the axis, from start to end
+# torsional_frequency_ratio = 2.0     # first frequency in torsion over that in bending
+# deck_gyration_m = 2.3               # radius of gyration of the cross-section
 # flexural_rigidity_nm2_spread = 0.55
 # mass_per_length_kg_per_m_spread = 0.1
 # rayleigh_alpha_per_s_spread = 0.5
 # rayleigh_beta_s_spread = 0.5
+# lane_offset_m_spread = 0.3          # in m
+# torsional_frequency_ratio_spread = 0.3
+# deck_gyration_m_spread = 0.2
 
 [sensor]                              # four: body above front and rear axle, both axles
 rate_hz = nan                         # one number or four values; 100 at least

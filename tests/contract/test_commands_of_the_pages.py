@@ -42,6 +42,7 @@ NOT_RUN = {
     "python -m tests.benchmarks.alarms": LONG,
     "python -m tests.faults.year --out build/year": LONG,
     "make year": LONG,
+    'pytest tests/faults/test_cluster.py -m "faults or not faults" -k "idle or killed"': LONG,
     "pytest tests/numerics/test_monitoring.py": ITSELF,
     "driveby alarm ack BRIDGE --by NAME --note TEXT": (
         "needs an alarm; tests/unit/history/test_alarms.py has one"

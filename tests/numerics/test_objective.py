@@ -45,6 +45,7 @@ from pre_core.unknowns import (
     K_U1,
     KAPPA,
     RHO_A,
+    TORSION,
     F,
     paper_subset,
 )
@@ -326,16 +327,16 @@ def test_objective_equals_the_plain_implementation(name: str) -> None:
 def test_the_plain_implementation_notices_each_parameter() -> None:
     """A negative control of the comparison above: every parameter moves J by far more than 1e-9.
 
-    But those that the paper's model has not: damping of the tyres, and bearings that give.
+    But those that the paper's model has not: damping of the tyres, bearings that give, torsion.
     """
     case = make_case("kappa springs")
     window = window_of(case)
     work = workspace(window)
     base = perturbed(case.truth, 1, seed=5)[0]
     before = objective(window, work, base)
-    unheard = [C_U1, C_U1 + 1, F, F + 1]
+    unheard = [C_U1, C_U1 + 1, F, F + 1, TORSION]
     changed = base.copy()
-    changed[unheard] = 1e3, 1e3, 1e-9, 1e-9
+    changed[unheard] = 1e3, 1e3, 1e-9, 1e-9, 1e-9
     assert objective(window, work, changed) == before
     for i in np.setdiff1d(np.arange(base.size), unheard):
         changed = base.copy()
@@ -479,7 +480,7 @@ def test_not_finite_is_infinite(paper_case: tuple[Case, Window]) -> None:
 def test_paper_subset_leaves_out_what_the_paper_has_not() -> None:
     vector = from_models(experiment.TRUCK, experiment.beam(np.ones(7)))
     left_out = sorted(set(range(vector.size)) - set(paper_subset(7).tolist()))
-    assert left_out == [C_U1, C_U1 + 1, KAPPA, K_ROT, K_ROT + 1, F, F + 1]
+    assert left_out == [C_U1, C_U1 + 1, KAPPA, K_ROT, K_ROT + 1, F, F + 1, TORSION]
     assert paper_subset(7).size == 19
 
 

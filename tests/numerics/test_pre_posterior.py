@@ -160,7 +160,7 @@ def test_places_of_all_unknowns(here: Case) -> None:
         range(where.trajectory.start, where.trajectory.stop),
         [where.offset],
     ]
-    assert [len(group) for group in groups[:7]] == [26, 1, 3, 1, 4, 12, 6]
+    assert [len(group) for group in groups[:7]] == [27, 1, 3, 1, 4, 12, 6]
     assert [i for group in groups for i in group] == list(range(where.size))
 
 
@@ -328,16 +328,16 @@ def test_curvature_against_differences_of_the_sum_of_squares(here: Case) -> None
 
     The data are moved so that they fit exactly: what Gauss-Newton leaves out is zero then, and both
     must agree in every direction. Along the column of its covariance that belongs to an unknown,
-    one standard deviation costs exactly one. Bearings give and tyres have damping: below zero there
-    is nothing.
+    one standard deviation costs exactly one. Bearings give, the deck twists and tyres have damping:
+    below zero there is nothing.
     """
     y = here.y.copy()
-    y[[F, F + 1, C_U1, C_U1 + 1]] = 0.5, 0.3, 0.5, 0.5
+    y[[F, F + 1, C_U1, C_U1 + 1, TORSION]] = 0.5, 0.3, 0.5, 0.5, 0.5
     here = here._replace(y=y)
     where = layout(here.problem)
     spread = covariance(precision_root(jacobian_of(here, 1e-4)))
     np.testing.assert_allclose(spread, spread.T, rtol=1e-6, atol=1e-12)
-    at_zero = [K_ROT, K_ROT + 1, F, F + 1, C_U1, C_U1 + 1]
+    at_zero = [K_ROT, K_ROT + 1, F, F + 1, C_U1, C_U1 + 1, TORSION]
     rigidities = [EI_1, EI_1 + 1, EI_1 + 3]
     fitted = all_rows(here.problem, here.y[None])[0]
     size = 0.1

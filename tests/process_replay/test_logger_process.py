@@ -168,7 +168,7 @@ def test_an_existing_file_is_left_alone(
 ) -> None:
     file = tmp_path / "live.mcap"
     file.write_bytes(b"precious")
-    with pytest.raises(pytest.fail.Exception, match="exists, and a recording is never overwritten"):
+    with pytest.raises(pytest.fail.Exception, match="exists, and recordings are never overwritten"):
         start_logger(start, endpoint, file)
     assert file.read_bytes() == b"precious"
 

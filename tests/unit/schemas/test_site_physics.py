@@ -30,7 +30,7 @@ RECEIVER = f"{TEXT}\n[receiver]\n"
         ("front_axle_to_cg_m", "1e-9", "vehicle.front_axle_to_cg_m is 1e-09, it must be a length"),
         ("wheelbase_m", "4.0\npitch_inertia_ratio = 1e-9", "vehicle.pitch_inertia_ratio is 1e-09"),
         ("wheelbase_m", "4.0\ntyre_width_m = [1e15, 0.3]", "vehicle.tyre_width_m[0] is 1e+15, it"),
-        ("wheelbase_m", "4.0\ntrack_m = 1e-6", "vehicle.track_m is 1e-06, it must be a length fr"),
+        ("wheelbase_m", "4.0\ntrack_m = 1e-6", "vehicle.track_m[0] is 1e-06, it must be a length "),
         (
             "rate_hz",
             "1.0",

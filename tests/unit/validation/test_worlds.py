@@ -57,7 +57,7 @@ def test_the_command_line_knows_all_effects() -> None:
 
 def test_without_an_effect_the_world_is_the_methods() -> None:
     for world in drawn("free")[:20]:
-        assert world.beyond == (((0.0, 0.0), (0.0, 0.0), None) + (0.0,) * 4)
+        assert world.beyond == (((0.0, 0.0), (0.0, 0.0), None) + (0.0,) * 4 + (None,))
         assert world.truth.beam.support_rotational_stiffness_nm_per_rad == (0.0, 0.0)
         assert world.truth.car.tyre_damping_ns_per_m == (0.0, 0.0)
         assert world.site == SITE
