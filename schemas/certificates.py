@@ -17,7 +17,7 @@ from schemas.results import Finite
 from schemas.settings import NOT_OF_THE_RESULT, IdentificationSettings
 from schemas.site import Site
 
-METHOD_EDITION: Final = 2
+METHOD_EDITION: Final = 3
 """Of what method `pre` answers. To be raised with every change after which it may answer a crossing
 otherwise: certificates of before are void then. Not the program's version, which says nothing of
 the method: most versions leave it as it was, and it changes between two versions."""
