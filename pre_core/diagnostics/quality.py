@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.diagnostics.converter import converter_step
+
 FloatArray = NDArray[np.float64]
 
 _BODY_BAND_HZ = (0.7, 10.0)
@@ -27,29 +29,13 @@ _ROAD_BAND_HZ = (1.0, 8.0)
 """Where both axles feel the road alike."""
 
 
-_OFF_GRID = 0.01
-"""Part of a step by which values may miss a grid."""
 _FINE = 0.2
 """Part of a bin below which a converter's step does not show in it."""
 _FEWEST_LEVELS = 12
 """A signal of fewer levels does not show how its density falls."""
-_ROUNDING = 1e-9
-"""Part of the largest value below which differences are those of floating point."""
 
 
 # Signals.
-
-
-def converter_step(values: FloatArray) -> float:
-    """Return the step between the values of a signal (n,) if all lie on a grid, else zero."""
-    distinct = np.unique(values)
-    apart = np.diff(distinct)
-    apart = apart[apart > _ROUNDING * np.abs(values).max(initial=0.0)]
-    if apart.size < 2:
-        return 0.0
-    step = float(apart.min())
-    off_grid = np.abs(apart / step - np.round(apart / step))
-    return step if float(off_grid.max()) < _OFF_GRID else 0.0
 
 
 def longest_hold(values: FloatArray) -> int:

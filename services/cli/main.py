@@ -43,11 +43,11 @@ from services.cli.offline import (
     add_identify,
     add_import,
     add_recover,
-    add_simulate,
 )
 from services.cli.parsing import Files, Handler, Parser, add_common, files_of
 from services.cli.replay import add_replay
 from services.cli.report import add_report
+from services.cli.simulate import add_simulate
 from services.cli.survey import add_survey
 from services.cli.validation import add_validate
 from services.cli.view import add_view

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import slip
 from pre_core.diagnostics import quality, receiver
+from pre_core.diagnostics.converter import converter_step
 from schemas.reasons import Reason
 from schemas.site import Vehicle
 from services.identification.crossing_data import CrossingData, Floats
@@ -152,7 +153,7 @@ def coarse_converters(
     """
     found = []
     for name, density, values in zip(names, density_ug_per_rthz, acceleration, strict=True):
-        step = quality.converter_step(values)
+        step = converter_step(values)
         declared = density * MICRO_G_M_PER_S2 * np.sqrt(0.5 / step_s)
         if step / np.sqrt(12.0) > _COARSE * declared:
             found.append(f"{name} in steps of {step:.2g} m/s²")

@@ -19,7 +19,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site, Vehicle
 from services.common.errors import FailureError, InputError
 from services.identification.footprints import footprints_of
-from services.simulation.drawn import data_alone, inputs_of_seen
+from services.simulation.data_alone import data_alone, inputs_of_seen
 from services.simulation.drive import simulate_drive
 from services.simulation.wheel_paths import REAR_OFFSET_M
 

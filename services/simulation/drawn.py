@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core import unknowns
-from pre_core.crossing.preparation import Inputs
 from pre_core.physics.bridge import Beam, natural_frequencies_hz
 from pre_core.physics.models import from_models
 from pre_core.physics.road import Profile
@@ -29,20 +28,18 @@ from pre_core.physics.vehicle import HalfCar
 from schemas.reasons import Reason
 from schemas.results import Crossing
 from schemas.settings import IdentificationSettings
-from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
 from services.drives.runs import Run, run_to_messages
 from services.execution.dispatch import feed_all
 from services.execution.here import Here
 from services.execution.offline import header_of
-from services.identification.crossing_data import CrossingData, Passing, rejected
+from services.identification.crossing_data import CrossingData
 from services.identification.engine import Engine
 from services.identification.identify import Identify, identify
-from services.identification.pre_method import absence, inputs_of
+from services.identification.pre_method import absence
 from services.simulation.drive import (
     LONGEST_STEP_S,
     SETTLE_S,
-    SLOW_ERROR_S,
     Left,
     beam_of,
     declared,
@@ -51,6 +48,7 @@ from services.simulation.drive import (
 )
 from services.simulation.drive_wide import LONGEST_STEP_S as LONGEST_WIDE_STEP_S
 from services.simulation.drive_wide import Width, measured_wide_run
+from services.simulation.positions import SLOW_ERROR_S
 from services.simulation.wheel_paths import WheelPaths
 
 Floats = NDArray[np.float64]
@@ -424,27 +422,6 @@ def of_any_bridge(result: Crossing) -> Crossing:
             "reason_texts": tuple(result.reason_texts[k] for k in kept),
         }
     )
-
-
-def data_alone(runs: list[Run], site: Site, settings: IdentificationSettings) -> list[Seen]:
-    """What the engine would give to a method of every crossing; nothing is identified.
-
-    The results are rejections without a reason that means anything.
-    """
-
-    def nothing(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
-        passing = Passing(data.stay.entry_s, data.stay.exit_s, 0.0)
-        return rejected(data, settings, passing, [Reason.FAILED])
-
-    return see(runs, site, settings, nothing)
-
-
-def inputs_of_seen(seen: Seen) -> Inputs:
-    """A crossing as method `pre` takes it: all samples that the engine gave."""
-    samples = seen.data.samples
-    assert samples is not None  # noqa: S101 - a recording without any has no crossings
-    acceleration = np.stack([samples.channels[name] for name in CHANNELS])
-    return inputs_of(seen.data, seen.settings, acceleration, samples.start_s)
 
 
 def _flat(draws: dict[str, Floats] | None) -> dict[str, Floats] | None:

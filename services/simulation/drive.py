@@ -28,7 +28,6 @@ from pre_core.physics.sensors import (
     Accelerometer,
     Receiver,
     measure_acceleration,
-    measure_position,
 )
 from pre_core.physics.simulate import Motion, Simulation, constant_acceleration, simulate
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
@@ -38,11 +37,12 @@ from schemas.site_file import load_site, parse_site, site_toml
 from schemas.site_lane import flexibility_per_n, wave_speed_m_per_s
 from services.common.errors import FailureError, InputError
 from services.common.files import check_writable
-from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.common.progress import steps_bar
-from services.drives.runs import GnssTrack, Run, run_to_messages
+from services.drives.runs import Run, run_to_messages
 from services.identification.placed import middle_site
 from services.recordings.writer import write_recording
+from services.simulation.positions import START_TIME_S as START_TIME_S
+from services.simulation.positions import gnss_track, receiver_of
 from services.simulation.wheel_paths import (
     AxleRoads,
     OnSurface,
@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-START_TIME_S = 1_767_225_600.0
-"""2026-01-01 00:00 UTC: simulated drives begin then, so that the same call gives the same file."""
 _PARTS = 10
 _MODES = 40
 """For each span."""
@@ -68,11 +66,6 @@ SETTLE_S = 3.0
 _BEFORE_S, _AFTER_S = 3.0, 2.5
 _ROAD_SPACING_M = 0.01
 _CONTACT_PATCH_M = 0.2
-_FIX_RATE_HZ = 10.0
-SLOW_ERROR_S = 300.0
-"""A receiver's slow error is forgotten within minutes: a crossing sees it as almost constant."""
-_ALTITUDE_M = 25.0
-"""Of a bridge whose altitude the site file does not tell."""
 BETWEEN_RUNS_S = 600.0
 """From the beginning of a run to that of the next."""
 
@@ -284,7 +277,7 @@ def simulate_drive(
         settle,
         (road_class, seed),
         (sensor,) * len(CHANNELS),
-        _receiver(site, perfect=not receiver_errors),
+        receiver_of(site, perfect=not receiver_errors),
         np.random.default_rng(seed if drive_seed is None else drive_seed),
         antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
         left=beyond.left,
@@ -432,51 +425,3 @@ def ratios_of(bridge: Bridge, scenario: int | None, ei: Sequence[float] | None) 
 
 def _freedoms(beam: Beam) -> int:
     return int(node_dofs(beam.element_lengths_m.size, held_nodes(beam)).max()) + 1
-
-
-def _receiver(site: Site, *, perfect: bool) -> Receiver:
-    """The receiver of the site file, or one without error."""
-    if perfect:
-        return Receiver(_FIX_RATE_HZ)
-    declared_errors = site.receiver
-    return Receiver(
-        _FIX_RATE_HZ,
-        position_noise_m=declared_errors.position_noise_m,
-        position_spread_m=declared_errors.position_spread_m,
-        correlation_s=SLOW_ERROR_S,
-        speed_noise_m_per_s=declared_errors.speed_noise_m_per_s,
-        latency_s=declared_errors.latency_s,
-    )
-
-
-def _altitude_m(bridge: Bridge, chainage_m: Floats) -> Floats:
-    """Of the road: level but for the bridge, if the altitudes of its ends are known."""
-    ends = [a for a in (bridge.start_altitude_m, bridge.end_altitude_m) if a is not None]
-    low, high = (ends[0], ends[-1]) if ends else (_ALTITUDE_M, _ALTITUDE_M)
-    return np.interp(chainage_m, [0.0, bridge.span_m], [low, high])
-
-
-def gnss_track(
-    bridge: Bridge,
-    step_s: float,
-    antenna: Floats,
-    lateral: Floats,
-    speed: Floats,
-    receiver: Receiver,
-    rng: np.random.Generator,
-    *,
-    forward: bool,
-) -> GnssTrack:
-    """Return what the receiver reports of the drive of its antenna, (n,) positions by step."""
-    time_s = step_s * np.arange(antenna.size, dtype=np.float64)
-    fixes = measure_position(time_s, antenna, lateral, speed, receiver, rng)
-    frame = bridge_frame(bridge)
-    latitude, longitude = to_lat_lon(frame, fixes.chainage_m, fixes.lateral_m)
-    return GnssTrack(
-        START_TIME_S + fixes.time_s,
-        latitude,
-        longitude,
-        _altitude_m(bridge, fixes.chainage_m),
-        fixes.speed_m_per_s,
-        np.full(latitude.size, heading_deg(frame, start_to_end=forward)),
-    )

@@ -19,7 +19,7 @@ from pre_core.physics.vehicle import HalfCar
 from schemas.signals import CHANNELS
 from schemas.site import Bridge
 from services.drives.runs import Run
-from services.simulation.drive import START_TIME_S, gnss_track
+from services.simulation.positions import START_TIME_S, gnss_track
 from services.simulation.two_sided import (
     Axle,
     Body,

@@ -28,7 +28,8 @@ from pre_core.diagnostics.calibration import without_negative
 from pre_core.physics.vehicle import total_mass_kg
 from pre_core.survey.plan import Spreads, known_before, spreads, together, track_of
 from pre_core.survey.plan import Truth as AtTruth
-from services.simulation.drawn import Drawn, Seen, Truth, inputs_of_seen, true_values
+from services.simulation.data_alone import inputs_of_seen
+from services.simulation.drawn import Drawn, Seen, Truth, true_values
 
 Floats = NDArray[np.float64]
 

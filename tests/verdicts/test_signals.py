@@ -12,6 +12,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from pre_core.diagnostics import quality
+from pre_core.diagnostics.converter import converter_step
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason, texts
 from schemas.signals import CHANNELS
@@ -147,9 +148,9 @@ def test_quantised_channel_that_is_saturated_is_named(name: str) -> None:
 def test_converter_step_is_that_of_the_grid() -> None:
     rng = np.random.default_rng(0)
     fine = rng.standard_normal(10_000)
-    assert quality.converter_step(fine) == 0.0
-    assert quality.converter_step(0.077 * np.round(fine / 0.077)) == pytest.approx(0.077)
-    assert quality.converter_step(np.zeros(10)) == 0.0
+    assert converter_step(fine) == 0.0
+    assert converter_step(0.077 * np.round(fine / 0.077)) == pytest.approx(0.077)
+    assert converter_step(np.zeros(10)) == 0.0
 
 
 @pytest.mark.parametrize("range_g", [2.0, 8.0])

@@ -1,0 +1,23 @@
+"""The step of the converter that a signal came through."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+_OFF_GRID = 0.01
+"""Part of a step by which values may miss a grid."""
+_ROUNDING = 1e-9
+"""Part of the largest value below which differences are those of floating point."""
+
+
+def converter_step(values: FloatArray) -> float:
+    """Return the step between the values of a signal (n,) if all lie on a grid, else zero."""
+    distinct = np.unique(values)
+    apart = np.diff(distinct)
+    apart = apart[apart > _ROUNDING * np.abs(values).max(initial=0.0)]
+    if apart.size < 2:
+        return 0.0
+    step = float(apart.min())
+    off_grid = np.abs(apart / step - np.round(apart / step))
+    return step if float(off_grid.max()) < _OFF_GRID else 0.0

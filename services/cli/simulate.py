@@ -1,0 +1,249 @@
+"""`driveby simulate`: crossings of a known truth, with more physics where it is asked for."""
+
+import argparse
+from typing import Any
+
+from services.cli.parsing import (
+    a_console,
+    add_noise,
+    add_output,
+    add_seed,
+    add_site,
+    command,
+    number,
+    numbers,
+    scenario,
+    whole,
+)
+from services.common.errors import InputError
+
+
+def _ratios(text: str) -> tuple[float, ...]:
+    ratio = number("ratios", low=1e-3, high=1e3)
+    return tuple(ratio(part) for part in text.split(","))
+
+
+def _speed_range(text: str) -> tuple[float, float]:
+    speed = number("a speed in m/s (or START:END)", low=0.1, high=60)
+    start, _, end = text.partition(":")
+    return speed(start), speed(end if ":" in text else start)
+
+
+def add_simulate(commands: Any) -> None:
+    """`driveby simulate`: write the recording of a simulated crossing."""
+    p = command(
+        commands,
+        "simulate",
+        _simulate,
+        "write the recording of a simulated crossing",
+        "driveby simulate --scenario 6 --noise 25 -o run.mcap",
+    )
+    damage = p.add_mutually_exclusive_group(required=True)
+    damage.add_argument(
+        "--scenario", type=scenario, metavar="N", help="damage scenario of the paper, 1 to 12"
+    )
+    damage.add_argument(
+        "--ei",
+        type=_ratios,
+        metavar="1,1,.4,…",
+        help="flexural rigidity of each element as a ratio to the sound value",
+    )
+    add_site(p, "truck and bridge (default: those of the paper)")
+    p.add_argument(
+        "--road", choices=tuple("ABCDE"), default="A", help="ISO 8608 class (default: A)"
+    )
+    add_seed(p)
+    add_noise(p, "accelerometers' noise density in µg/√Hz (default: 0)")
+    p.add_argument(
+        "--speed",
+        type=_speed_range,
+        default=(10.0, 10.0),
+        metavar="M_PER_S",
+        help="a speed, or START:END for a change along the way (default: 10)",
+    )
+    p.add_argument(
+        "--direction",
+        choices=("start_to_end", "end_to_start"),
+        default="start_to_end",
+        help="(default: start_to_end)",
+    )
+    receiver = p.add_mutually_exclusive_group()
+    receiver.add_argument(
+        "--gps-noise", dest="gps_noise", action="store_true", help="errors of a real receiver"
+    )
+    receiver.add_argument(
+        "--perfect-gps",
+        dest="gps_noise",
+        action="store_false",
+        help="exact positions and speeds (default)",
+    )
+    p.set_defaults(gps_noise=False)
+    p.add_argument(
+        "--rate",
+        type=number("a rate in Hz", low=50, high=50_000),
+        metavar="HZ",
+        help="sampling rate (default: the site's, or 1000)",
+    )
+    _add_surface(p.add_argument_group("several runs, and a road that is a surface"))
+    _add_beyond(p.add_argument_group("beyond what a site file tells (default: nothing)"))
+    add_output(p)
+
+
+def _add_surface(p: Any) -> None:
+    p.add_argument(
+        "--runs",
+        type=whole("a number of runs", 1, 100),
+        default=1,
+        help="over the same road, ten minutes apart, in one recording (default: 1)",
+    )
+    p.add_argument(
+        "--drive-seed",
+        type=whole("a seed", 0),
+        metavar="SEED",
+        help="of noise and of the place across the lane (default: --seed, which is the road's)",
+    )
+    p.add_argument(
+        "--road-surface",
+        action="store_true",
+        help="the road is rough across too, so that the axles feel different roads "
+        "(default: one groove under both)",
+    )
+    p.add_argument(
+        "--tyres",
+        choices=("single", "twin"),
+        help="of the rear axle, on a surface (default: the site's, or twin)",
+    )
+    p.add_argument(
+        "--rear-offset",
+        type=number("an offset in m", low=-1, high=1),
+        metavar="M",
+        help="the rear axle runs so far beside the front, on a surface "
+        "(default: the site's, or 0.005)",
+    )
+    p.add_argument(
+        "--wander",
+        type=number("a standard deviation in m", low=0, high=2),
+        metavar="M",
+        help="of the truck's place across the lane from run to run, on a surface (default: 0)",
+    )
+
+
+def _on_surface(options: argparse.Namespace) -> Any:
+    from services.simulation.wheel_paths import OnSurface
+
+    if options.road_surface:
+        return OnSurface(options.tyres, options.rear_offset, options.wander or 0.0)
+    for name in ("tyres", "rear_offset", "wander"):
+        if getattr(options, name) is not None:
+            raise InputError(f"--{name.replace('_', '-')}: only a --road-surface has it")
+    return None
+
+
+def _add_beyond(p: Any) -> None:
+    p.add_argument(
+        "--support-springs",
+        type=numbers("rotational stiffnesses in N·m/rad (START:END)", (0, 1e13), (0, 1e13)),
+        default=(0.0, 0.0),
+        metavar="START:END",
+        help="the ends turn against springs of so many N·m/rad",
+    )
+    p.add_argument(
+        "--bearing-stiffness",
+        type=numbers("vertical stiffnesses in N/m (START:END)", (1e7, 1e15), (1e7, 1e15)),
+        metavar="START:END",
+        help="the ends sink on bearings of so many N/m",
+    )
+    p.add_argument(
+        "--left",
+        type=numbers(
+            "a weight in N, a speed in m/s and seconds before (N:M_PER_S:S)",
+            (0, 1e7),
+            (0.5, 60),
+            (0, 1000),
+        ),
+        metavar="N:M_PER_S:S",
+        help="a lorry of this weight and speed left so long before the truck comes on",
+    )
+    p.add_argument(
+        "--friction",
+        type=number("a share of the springs' load", low=0, high=0.5),
+        default=0.0,
+        metavar="SHARE",
+        help="dry friction of the springs over their static load",
+    )
+    p.add_argument(
+        "--friction-growth",
+        type=number("a growth with the load", low=0, high=1),
+        default=0.0,
+        metavar="SHARE",
+        help="of the friction with the load: 1 is proportional",
+    )
+    p.add_argument(
+        "--bilinear",
+        type=number("a share", low=0, high=0.9),
+        default=0.0,
+        metavar="SHARE",
+        help="dampers act so much more in rebound, and less in compression",
+    )
+    p.add_argument(
+        "--air-springs",
+        type=number("a polytropic exponent", low=1, high=2),
+        default=0.0,
+        metavar="EXPONENT",
+        help="of the air in the springs: 1.38 is usual",
+    )
+    p.add_argument(
+        "--lane-offset",
+        type=number("a distance in m", low=-20, high=20),
+        metavar="M",
+        help="distance of the lane's middle to the left of the bridge's axis, looking from start "
+        "to end; with --torsion the deck twists under it (default: 0)",
+    )
+    p.add_argument(
+        "--torsion",
+        type=numbers(
+            "a frequency ratio and a radius of gyration in m (RATIO:M)", (0.2, 100), (0.1, 30)
+        ),
+        metavar="RATIO:M",
+        help="first torsional over first bending frequency of the deck and its radius of "
+        "gyration, with --lane-offset (2:2.3 is usual; default: the deck does not twist)",
+    )
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    from services.simulation.drive import Beyond, Left, simulate_command
+
+    if (options.lane_offset is None) != (options.torsion is None):
+        given, missing = ("--torsion", "--lane-offset")
+        if options.torsion is None:
+            given, missing = missing, given
+        raise InputError(f"{given}: is of use with {missing} only, which is missing")
+    stiffness = options.bearing_stiffness
+    return simulate_command(
+        site=options.site,
+        scenario=options.scenario,
+        ei=options.ei,
+        road=options.road,
+        seed=options.seed,
+        noise=options.noise,
+        speed=options.speed,
+        direction=options.direction,
+        gps_noise=options.gps_noise,
+        rate=options.rate,
+        beyond=Beyond(
+            options.support_springs,
+            (1.0 / stiffness[0], 1.0 / stiffness[1]) if stiffness else (0.0, 0.0),
+            Left(*options.left) if options.left else None,
+            options.friction,
+            options.friction_growth,
+            options.bilinear,
+            options.air_springs,
+        ),
+        twist=None if options.torsion is None else (options.lane_offset, *options.torsion),
+        surface=_on_surface(options),
+        runs=options.runs,
+        drive_seed=options.drive_seed,
+        output=options.output,
+        force=options.force,
+        console=a_console(),
+    )
