@@ -10,6 +10,7 @@ from scipy.interpolate import BSpline
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import channels
 from pre_core.crossing.channels import channel_signals
+from pre_core.crossing.optimum import Optimum
 from pre_core.crossing.posterior import (
     Fixes,
     Priors,
@@ -25,9 +26,12 @@ from pre_core.crossing.posterior import (
     trajectory_basis,
 )
 from pre_core.crossing.preparation import Inputs, prepare, with_noise_at
+from pre_core.crossing.sampling import without_torsion
 from pre_core.paper import experiment
 from pre_core.physics.models import from_models
 from pre_core.physics.sensors import white_noise
+from pre_core.search import levenberg_marquardt
+from pre_core.search.loop import Ending
 from pre_core.unknowns import C_S1, C_U1, D_1, EI_1, K_ROT, K_S1, K_U1, M_U1, TORSION, F
 from schemas.signals import CHANNELS
 from services.simulation.drive import beam_of, paper_site, truck_of
@@ -429,3 +433,18 @@ def test_noise_does_not_pull_at_the_truck(here: Case) -> None:
     expected = here.y[: where.trajectory.start].copy()
     expected[: problem.noise_slope.size] -= problem.noise_slope
     np.testing.assert_allclose(moved, expected, atol=1e-12)
+
+
+def test_posterior_without_torsion_is_that_at_zero(here: Case) -> None:
+    """The same rows but for the prior of the unknown that is left out, to the last bit."""
+    place = layout(here.problem).theta.start + TORSION
+    y = here.y.copy()
+    y[TORSION] = 0.0
+    problem = with_noise_at(here.problem, y)
+    state = levenberg_marquardt.begin(lambda at: all_rows(problem, at), y)
+    found = Optimum(problem, state, Ending.CONVERGED, 1.0, 0, 1)
+    stiff = without_torsion(found, place)
+    data = problem.noise.reciprocal.size + problem.receiver_values.size
+    expected = np.delete(state.residual, data + place)
+    np.testing.assert_array_equal(stiff.state.residual, expected)
+    assert stiff.problem.crossing.torsion.ends_m.size == 0

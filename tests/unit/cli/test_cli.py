@@ -488,3 +488,16 @@ def test_a_logger_records_the_realms_it_is_told_to(
     monkeypatch.setattr("services.logger.run", lambda **arguments: told.update(arguments) or 0)
     assert cli.main(["logger", *given]) == 0
     assert told["realms"] == realms
+
+
+@pytest.mark.parametrize(
+    ("given", "missing"),
+    [(["--torsion", "2:2.3"], "--lane-offset"), (["--lane-offset", "1.5"], "--torsion")],
+)
+def test_half_a_twisting_deck_is_refused(
+    given: list[str], missing: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.mcap"
+    assert cli.main(["simulate", "--scenario", "6", *given, "-o", str(out)]) == 2
+    assert f"is of use with {missing} only, which is missing" in capsys.readouterr().err
+    assert not out.exists()

@@ -1,0 +1,34 @@
+"""Trailers and tandems declared with two axles, by the rear body equation alone."""
+
+import numpy as np
+import pytest
+
+from schemas.reasons import Reason
+from schemas.signals import CHANNELS
+from services.identification.checks import undeclared_axles
+from services.simulation.wide_cases import draw_wide, more_axles
+from services.simulation.wide_crossings import Case, drive_case, site_of
+
+
+def named(case: Case, *, is_doubted: bool) -> dict[Reason, str]:
+    run = drive_case(case, 0).run
+    signals = np.stack([run.channels[name] for name in CHANNELS])
+    vehicle = site_of(case).vehicles[0]
+    return undeclared_axles(vehicle, signals, 1.0 / run.rate_hz, is_doubted=is_doubted)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 9])
+def test_force_of_an_undeclared_axle_is_named(number: int) -> None:
+    found = named(more_axles(number), is_doubted=False)
+    assert "% of its motion are unexplained" in found[Reason.MORE_AXLES_THAN_DECLARED]
+
+
+@pytest.mark.parametrize("number", [5, 15])
+def test_weaker_sign_counts_where_something_else_is_wrong(number: int) -> None:
+    assert not named(more_axles(number), is_doubted=False)
+    assert named(more_axles(number), is_doubted=True)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_truck_with_its_declared_axles_is_not_accused(seed: int) -> None:
+    assert not named(draw_wide(seed), is_doubted=True)
