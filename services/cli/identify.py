@@ -282,7 +282,8 @@ def _of_ends_and_springs(derived: Derived) -> Iterator[str]:
     if derived.probability_giving is not None:
         yield f"a bearing gives under load: {at_ends(derived.probability_giving)}"
     if derived.probability_torsion:
-        yield f"the deck twists under the truck: {100.0 * derived.probability_torsion:.0f} %"
+        likely = f"{100.0 * derived.probability_torsion:.0f} %"
+        yield f"probability that the deck twists under the truck: {likely}"
     if derived.springs_believed is not None:
         yield f"the truck's springs are believed to {100.0 * derived.springs_believed:.0f} %"
 

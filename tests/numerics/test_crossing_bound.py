@@ -6,10 +6,10 @@ import pytest
 from pre_core.crossing import posterior
 from pre_core.survey.plan import Truth
 from schemas.settings import IdentificationSettings
+from services.simulation.data_alone import data_alone
 from services.simulation.drawn import (
     Drawn,
     Seen,
-    data_alone,
     default_site,
     draw_truth,
     drive,

@@ -14,7 +14,7 @@ from pre_core.crossing import optimum
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
-from services.identification import pre_method
+from services.identification import fit_reasons, pre_method
 from tests.verdicts import faults
 from tests.verdicts.faults import Case, Fault, Truth
 
@@ -187,7 +187,7 @@ def test_how_large_chi2_may_be_depends_on_the_pattern_up_to_25(
 
     real = optimum.find_optimum
     monkeypatch.setattr(optimum, "find_optimum", found)
-    monkeypatch.setattr(pre_method, "reasons_after_fit", lambda *_: [pattern])
+    monkeypatch.setattr(fit_reasons, "reasons_after_fit", lambda *_: [pattern])
     settings = IdentificationSettings(method="pre", seed=0, draws=300)
     result = faults.identified(faults.crossing(LOUD), settings)
     assert result.verdict == verdict

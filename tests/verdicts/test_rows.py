@@ -106,6 +106,13 @@ def test_a_truck_that_is_not_the_one_of_the_site_file() -> None:
     assert reasons_after_fit(crossing(), odd) == [Reason.IMPLAUSIBLE_VEHICLE]
 
 
+@pytest.mark.parametrize("field", ["mismatch_excess", "led_by_mismatch"])
+def test_mismatch_that_no_declared_tyre_causes_is_named(field: str) -> None:
+    assert reasons_after_fit(crossing(), fit(normals(), **{field: 20.0})) == []
+    odd = fit(normals(), **{field: 60.0})
+    assert reasons_after_fit(crossing(), odd) == [Reason.MISMATCH_IMPLAUSIBLE]
+
+
 def test_a_position_that_the_receiver_denies() -> None:
     assert reasons_after_fit(crossing(), fit(normals(), position_z=-5.0)) == [
         Reason.POSITION_INCONSISTENT

@@ -12,7 +12,8 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.identification.bridges import Bridges, Look
 from services.identification.stays import Passage, Stay
 from services.identification.streams import Fixes
-from services.simulation.drive import _altitude_m, paper_site
+from services.simulation.drive import paper_site
+from services.simulation.positions import _altitude_m
 
 Floats = NDArray[np.float64]
 ONE = paper_site().bridges[0]
