@@ -104,8 +104,8 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     ),
     Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
     Reason.MORE_AXLES_THAN_DECLARED: (
-        "The body above the rear axle follows a force that no declared axle has, as that of a "
-        "further axle or of a trailer."
+        "The rear of the truck moves as if a further axle or a trailer, which the site file does "
+        "not declare, pushed it."
     ),
     Reason.MISMATCH_IMPLAUSIBLE: (
         "The axles feel roads that differ by far more than the declared tyres and tracks can cause."

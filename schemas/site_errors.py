@@ -33,6 +33,7 @@ _QUANTITIES: Final = (
     ("_m_per_s", "a speed", "m/s"),
     ("_per_s", "a coefficient", "1/s"),
     ("_nm2", "a flexural rigidity", "N·m²"),
+    ("_offset_m_spread", "a standard deviation", "m"),
     ("_spread", "a relative standard deviation", ""),
     ("_kg", "a mass", "kg"),
     ("_hz", "a rate", "Hz"),

@@ -61,3 +61,9 @@ def test_impossible_lanes_are_refused_by_name(key: str, value: float) -> None:
     text = site_toml(SITE).replace("[bridge]\n", f"[bridge]\n{key} = {value}\n")
     with pytest.raises(InputError, match=f"bridge.{key}"):
         parse_site(text, "site.toml")
+
+
+def test_spread_of_the_lane_is_named_as_a_length() -> None:
+    text = site_toml(SITE).replace("[bridge]\n", "[bridge]\nlane_offset_m_spread = -1.0\n")
+    with pytest.raises(InputError, match=r"lane_offset_m_spread is -1.* m\b"):
+        parse_site(text, "site.toml")
