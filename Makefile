@@ -39,7 +39,7 @@ up: ## the demo's services as containers (Docker Engine 26.0, Compose 2.26; not 
 # One worker computes while the other waits for processes (tests/conftest.py); more would only wait.
 BESIDE := -n 2 --dist loadgroup
 
-test: $(STAMP) ## the default tests (some 7 minutes on 2 cores)
+test: $(STAMP) ## the default tests (some 17 minutes on 2 busy cores)
 	$(BIN)/python -m pytest $(BESIDE)
 
 test-all: $(STAMP) ## the default tests and the slow ones
