@@ -202,18 +202,15 @@ def pairing(
     )
 
 
-def unexplained(
+def unexplained_by_axle(
     acceleration_m_per_s2: FloatArray,
     step_s: float,
     stiffness_per_mass: FloatArray,
     damping_per_mass: FloatArray,
-) -> float:
-    """Return the part of the body's motion that the channels (4, n) as recorded leave open.
-
-    It is `Pairing.recorded` without the search for another order.
-    """
+) -> tuple[float, float]:
+    """Return `Pairing.upright` of channels (4, n), without the search for another order."""
     spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
-    return max(
+    front, rear = (
         _unexplained(
             spectrum[w],
             spectrum[2 + w],
@@ -224,6 +221,7 @@ def unexplained(
         )
         for w in range(2)
     )
+    return front, rear
 
 
 def _moved(order: tuple[int, ...]) -> int:

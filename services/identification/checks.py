@@ -295,8 +295,7 @@ def undeclared_axles(
     By the body equations of the middle readings (4, n). Where `is_doubted` for other reasons, less
     is enough.
     """
-    found = quality.pairing(acceleration, step_s, *body_constants(vehicle))
-    front, rear = found.upright
+    front, rear = quality.unexplained_by_axle(acceleration, step_s, *body_constants(vehicle))
     least = _UNDECLARED if is_doubted else _PLAINLY_UNDECLARED
     if rear < max(least, _REAR_OVER_FRONT * front):
         return {}

@@ -105,7 +105,7 @@ def of_one_sensor(
     if not vehicle.sensors:
         return {}
     constants = body_constants(vehicle)
-    recorded = quality.unexplained(readings, step_s, *constants)
+    recorded = max(quality.unexplained_by_axle(readings, step_s, *constants))
     if recorded <= UNEXPLAINED:
         return {}
     best, found = _BETTER * recorded, dict[Reason, str]()
@@ -117,7 +117,8 @@ def of_one_sensor(
             other[order[0]] *= -1.0
         else:
             other[list(order)] = acceleration[list(order[::-1])]
-        left = quality.unexplained(placed.middle_of(vehicle, other), step_s, *constants)
+        there = placed.middle_of(vehicle, other)
+        left = max(quality.unexplained_by_axle(there, step_s, *constants))
         if left < best:
             reason = Reason.CHANNEL_INVERTED if len(order) == 1 else Reason.CHANNEL_SWAPPED
             best, found = left, {reason: " and ".join(names[k] for k in order)}
