@@ -1,0 +1,395 @@
+"""The limits of the code's size, and what is beyond them today.
+
+A list below may only shrink. A test fails when something not listed is beyond its limit, when
+something listed has grown, and when it is within the limit, so that its line has to go. What is
+renamed or moved keeps its number, or a smaller one.
+"""
+
+import ast
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("driveby", "pre_core", "schemas", "services")
+MODULE_LINES = 450
+CLASS_LINES = 250
+FUNCTION_LINES = 60
+"""From `def` to the end, with the docstring and without decorators."""
+ARGUMENTS = 7
+"""Without `self` and `cls`."""
+OFTEN = frozenset({"State", "Info", "Problem"})
+"""Class names that each search has for itself."""
+
+LONG_MODULES = {
+    "pre_core.crossing.optimum": 738,
+    "pre_core.crossing.residuals": 803,
+    "pre_core.crossing.whitening": 622,
+    "pre_core.paper.residual": 579,
+    "services.identification.engine": 763,
+    "services.logger.writer": 511,
+    "services.simulation.two_sided": 861,
+    "services.viewer.rerun_crossing": 490,
+    "services.worker.__init__": 618,
+}
+
+LONG_CLASSES = {
+    "services.execution.cluster:Cluster": 273,
+    "services.identification.engine:Engine": 661,
+    "services.logger.intake:Intake": 293,
+    "services.logger.writer:FileWriter": 395,
+    "services.truck.spool:Spool": 260,
+    "services.viewer.live_picture:LivePicture": 315,
+    "services.worker.catching_up:CatchingUp": 314,
+}
+
+LONG_FUNCTIONS = {
+    "pre_core.crossing.optimum:_from_likeliest_places": 69,
+    "pre_core.crossing.preparation:prepare": 77,
+    "pre_core.crossing.residuals:_deflect": 75,
+    "pre_core.monitoring.watch:watch": 71,
+    "pre_core.paper.residual:build_window": 87,
+    "pre_core.paper.residual:march_particles": 64,
+    "pre_core.paper.residual:objective": 68,
+    "pre_core.physics.simulate:_march": 232,
+    "pre_core.physics.simulate:simulate": 115,
+    "schemas.results_on_the_wire:crossing_to_protobuf": 81,
+    "services.cli.export:_export": 67,
+    "services.cli.identify:identify_command": 70,
+    "services.cli.info:as_json": 63,
+    "services.cli.simulate:_add_beyond": 69,
+    "services.cli.survey:add_survey": 63,
+    "services.cli.validate_pre:validate_pre_command": 69,
+    "services.cli.validation:add_validate": 95,
+    "services.history.recorded:look": 69,
+    "services.identification.bridge_state:state_of": 69,
+    "services.identification.engine:Engine._advance": 67,
+    "services.identification.pre_method:identify_pre": 81,
+    "services.logger.__init__:_record": 61,
+    "services.replay.__init__:run": 70,
+    "services.simulation.drawn:draw_truth": 78,
+    "services.simulation.drawn:drive": 93,
+    "services.simulation.drive_wide:measured_wide_run": 69,
+    "services.simulation.two_sided:_derivative": 78,
+    "services.simulation.two_sided:_march": 146,
+    "services.simulation.two_sided:_system": 70,
+    "services.simulation.two_sided:cross": 61,
+    "services.simulation.wide_cases:draw_wide": 78,
+    "services.simulation.worlds:draw_world": 83,
+    "services.truck.__init__:run": 76,
+    "services.validation.paper:run_scenario": 71,
+    "services.worker.__init__:_serve": 104,
+    "services.worker.__init__:run": 150,
+}
+
+MANY_ARGUMENTS = {
+    "pre_core.crossing.compliances:_gibbs": 9,
+    "pre_core.crossing.compliances:of_normal": 9,
+    "pre_core.crossing.residuals:_evaluate": 9,
+    "pre_core.crossing.whitening:mismatch_power": 9,
+    "pre_core.paper.residual:_march_stretch": 9,
+    "pre_core.paper.residual:build_window": 15,
+    "pre_core.physics.beam_basis:_one_mode_two_wheels": 9,
+    "pre_core.physics.beam_basis:advance": 11,
+    "pre_core.physics.beam_basis:modal_filters": 8,
+    "pre_core.physics.beam_basis:modal_filters_one": 8,
+    "pre_core.physics.modal_response:_group_with_ends": 13,
+    "pre_core.physics.modal_response:advance": 8,
+    "pre_core.physics.modal_response:advance_with_ends": 10,
+    "pre_core.physics.modal_response:modal_filters": 9,
+    "pre_core.physics.newmark:_march": 9,
+    "pre_core.physics.simulate:_march": 37,
+    "pre_core.physics.simulate:simulate": 11,
+    "services.cli.identify:identify_command": 13,
+    "services.cli.identify_archive:archive_command": 12,
+    "services.cli.validate_paper:validate_command": 9,
+    "services.cli.validate_pre:validate_pre_command": 13,
+    "services.drives.importing:_import_ros2": 8,
+    "services.drives.importing:import_command": 8,
+    "services.execution.offline:identify_drives": 8,
+    "services.history.recorded:take": 8,
+    "services.identification.engine:Engine.__init__": 8,
+    "services.identification.outputs:crossing_output": 8,
+    "services.identification.pre_method:identify_pre": 9,
+    "services.identification.stays:find_stays": 8,
+    "services.logger.__init__:run": 11,
+    "services.notebook.simulate:simulate": 10,
+    "services.recordings.writer:RecordingWriter.__init__": 9,
+    "services.replay.__init__:run": 14,
+    "services.security.certs:certs_command": 8,
+    "services.simulation.drive:measured_run": 14,
+    "services.simulation.drive:simulate_command": 18,
+    "services.simulation.drive:simulate_drive": 12,
+    "services.simulation.drive_wide:measured_wide_run": 12,
+    "services.simulation.positions:gnss_track": 8,
+    "services.simulation.two_sided:_derivative": 23,
+    "services.simulation.two_sided:_march": 19,
+    "services.simulation.two_sided_surface:_heights": 9,
+    "services.simulation.wide_crossings:road_under": 8,
+    "services.truck.__init__:run": 11,
+    "services.truck.ros2:run": 9,
+    "services.validation.paper:run_scenario": 8,
+    "services.viewer.live:live_command": 8,
+    "services.viewer.rerun_file:write_rrd": 8,
+    "services.viewer.view:write_views": 9,
+    "services.worker.__init__:run": 15,
+    "services.worker.catching_up:CatchingUp.__init__": 9,
+}
+
+ROOMS_WITH_CODE = {
+    "pre_core": 7,
+    "services.cluster": 37,
+    "services.logger": 62,
+    "services.replay": 31,
+    "services.truck": 37,
+    "services.worker": 71,
+}
+
+SHARED_NAMES = {
+    "Asked": 2,
+    "Comparison": 2,
+    "Complaints": 2,
+    "Crossing": 2,
+    "Drive": 2,
+    "Driven": 2,
+    "Elements": 2,
+    "Errors": 2,
+    "Finding": 2,
+    "Fixes": 3,
+    "Found": 2,
+    "Fused": 3,
+    "Gone": 2,
+    "Heard": 3,
+    "Kept": 2,
+    "Kind": 2,
+    "Known": 3,
+    "Layout": 2,
+    "Limits": 2,
+    "Looked": 2,
+    "Motion": 2,
+    "Passage": 2,
+    "Passing": 3,
+    "Refusals": 2,
+    "Response": 2,
+    "Road": 2,
+    "Row": 2,
+    "Run": 2,
+    "Seen": 2,
+    "Service": 2,
+    "Shared": 2,
+    "Simulation": 2,
+    "Solution": 2,
+    "Source": 2,
+    "Spreads": 2,
+    "Stream": 3,
+    "Survey": 2,
+    "Track": 3,
+    "Truck": 4,
+    "Truth": 2,
+    "Wanted": 2,
+    "Watch": 2,
+    "Watched": 2,
+    "Window": 3,
+    "Work": 2,
+    "_File": 2,
+    "_Heard": 2,
+    "_Place": 3,
+    "_Read": 2,
+    "_Record": 2,
+    "_Source": 2,
+    "_Truck": 2,
+}
+
+LISTS = {
+    "lines of a module": LONG_MODULES,
+    "lines of a class": LONG_CLASSES,
+    "lines of a function": LONG_FUNCTIONS,
+    "arguments": MANY_ARGUMENTS,
+    "statements in a room's __init__": ROOMS_WITH_CODE,
+    "classes of one name": SHARED_NAMES,
+}
+
+
+class Module(NamedTuple):
+    """A module of ours: its dotted name, its text, and the same taken apart."""
+
+    name: str
+    text: str
+    tree: ast.Module
+
+
+def module_of(name: str, text: str) -> Module:
+    return Module(name, text, ast.parse(text))
+
+
+@pytest.fixture(scope="module")
+def modules() -> list[Module]:
+    """All modules but the generated ones."""
+    found = []
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            if not path.stem.endswith("_pb2"):
+                name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+                found.append(module_of(name, path.read_text()))
+    assert len(found) > 200, "or it looks in the wrong place"
+    return found
+
+
+def definitions(node: ast.AST, of: str = "") -> Iterator[tuple[str, ast.AST]]:
+    """Yield all classes and functions, also those within others, with their qualified names."""
+    for child in ast.iter_child_nodes(node):
+        is_one = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
+        name = f"{of}{child.name}" if is_one else of
+        if is_one:
+            yield name, child
+        yield from definitions(child, f"{name}." if is_one else of)
+
+
+def lines_of(node: ast.AST) -> int:
+    assert isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
+    assert node.end_lineno is not None
+    return node.end_lineno - node.lineno + 1
+
+
+def arguments_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    by_position = [*function.args.posonlyargs, *function.args.args]
+    is_method = bool(by_position) and by_position[0].arg in ("self", "cls")
+    return len(by_position) + len(function.args.kwonlyargs) - is_method
+
+
+def statements_of(tree: ast.Module) -> int:
+    """Count the statements of a module other than docstrings."""
+    return sum(
+        not (isinstance(one, ast.Expr) and isinstance(one.value, ast.Constant)) for one in tree.body
+    )
+
+
+def measured(modules: list[Module]) -> dict[str, dict[str, int]]:
+    """Return everything that is beyond a limit, by limit and name."""
+    found: dict[str, dict[str, int]] = {limit: {} for limit in LISTS}
+    classes: dict[str, int] = defaultdict(int)
+
+    def note(limit: str, name: str, number: int, most: int) -> None:
+        if number > most:
+            found[limit][name] = number
+
+    for module, text, tree in modules:
+        note("lines of a module", module, text.count("\n"), MODULE_LINES)
+        if module.endswith(".__init__") and module.split(".")[0] in ("services", "pre_core"):
+            room = module.removesuffix(".__init__")
+            note("statements in a room's __init__", room, statements_of(tree), 0)
+        for name, node in definitions(tree):
+            where = f"{module}:{name}"
+            if isinstance(node, ast.ClassDef):
+                note("lines of a class", where, lines_of(node), CLASS_LINES)
+                classes[node.name] += module.split(".")[0] in ("services", "pre_core")
+            elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                note("lines of a function", where, lines_of(node), FUNCTION_LINES)
+                note("arguments", where, arguments_of(node), ARGUMENTS)
+    for name, number in classes.items():
+        if name not in OFTEN:
+            note("classes of one name", name, number, 1)
+    return found
+
+
+def beyond(found: Mapping[str, int], listed: Mapping[str, int]) -> list[str]:
+    """Compare what is beyond a limit with the list of what may be."""
+    return [
+        *(f"{name}: is {found[name]}, beyond the limit" for name in sorted(found.keys() - listed)),
+        *(
+            f"{name}: has grown from {listed[name]} to {found[name]}"
+            for name in sorted(found.keys() & listed)
+            if found[name] > listed[name]
+        ),
+        *(
+            f"{name}: is within the limit, remove its line"
+            for name in sorted(listed.keys() - found)
+        ),
+    ]
+
+
+@pytest.mark.parametrize("limit", LISTS)
+def test_nothing_new_is_beyond_a_limit(limit: str, modules: list[Module]) -> None:
+    assert beyond(measured(modules)[limit], LISTS[limit]) == []
+
+
+def test_a_list_may_only_shrink() -> None:
+    listed = {"a": 70, "b": 80, "c": 90}
+    assert beyond({"a": 70, "b": 79, "c": 90}, listed) == []
+    assert beyond({"a": 71, "b": 80, "d": 61}, listed) == [
+        "d: is 61, beyond the limit",
+        "a: has grown from 70 to 71",
+        "c: is within the limit, remove its line",
+    ]
+
+
+def test_everything_beyond_a_limit_is_found() -> None:
+    long = "".join(f"        a = {n}\n" for n in range(60))
+    lines = "".join(f"    b{n} = {n}\n" for n in range(250 - 62))
+    code = f'"""Doc."""\n\n\nclass A:\n    def f(self, a, b, c, d, *, e, f, g, h):\n{long}{lines}'
+    found = measured(
+        [
+            module_of("services.room.one", code + "\n" * 300),
+            module_of("services.room.__init__", "from a import b\n"),
+            module_of("pre_core.__init__", '"""Doc."""\n'),
+            module_of("pre_core.two", "class A:\n    class State: ...\n\n\nclass State: ...\n"),
+            module_of("schemas.three", "class A: ...\n"),
+        ]
+    )
+    assert found == {
+        "lines of a module": {"services.room.one": 553},
+        "lines of a class": {},
+        "lines of a function": {"services.room.one:A.f": 61},
+        "arguments": {"services.room.one:A.f": 8},
+        "statements in a room's __init__": {"services.room": 1},
+        "classes of one name": {"A": 2},
+    }
+    longer = measured([module_of("services.room.one", f"{code}    c = 1\n    d = 2\n")])
+    assert longer["lines of a class"] == {"services.room.one:A": 252}
+
+
+def test_a_long_module_says_why_it_is_one(modules: list[Module]) -> None:
+    for name, _, tree in modules:
+        if name in LONG_MODULES:
+            head = (ast.get_docstring(tree) or "").replace("\n", " ")
+            assert "Longer than other modules" in head, name
+
+
+HEAVY = ("numba", "zenoh", "rerun", "matplotlib", "scipy", "pydantic", "numpy", "pandas", "xarray")
+
+
+def printed(code: str) -> str:
+    """Run code in a process of its own; return the last line it prints."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()[-1]
+
+
+def test_help_does_not_import_the_heavy_libraries() -> None:
+    code = (
+        "import sys\nfrom services.cli.main import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        f"print('LOADED', sorted(set({HEAVY!r}) & sys.modules.keys()))"
+    )
+    assert printed(code) == "LOADED []"
+
+
+PUT_OFF = {"pre_core": ["numpy.ctypeslib", "numpy.f2py", "numpy.testing"]}
+"""Modules of others in whose place importing a package puts something else; may only shrink."""
+
+
+@pytest.mark.parametrize("package", ["driveby", "pre_core"])
+def test_importing_a_package_leaves_the_process_alone(package: str) -> None:
+    code = (
+        "import gc, os, sys\nimport numpy\n"
+        "def now(): return dict(os.environ), gc.get_threshold(), gc.isenabled()\n"
+        f"before = now()\nimport {package}\nafter = now()\n"
+        "kinds = {name: type(module).__name__ for name, module in sys.modules.items()}\n"
+        "lazy = sorted(n for n in kinds if n.startswith('numpy') and 'Lazy' in kinds[n])\n"
+        "print(before == after, lazy)"
+    )
+    assert printed(code) == f"True {PUT_OFF.get(package, [])}"
