@@ -19,6 +19,7 @@ from services.common.errors import FailureError, InputError
 from services.drives import importing
 from services.recordings.recording import Message, read_info, read_site
 from services.recordings.writer import RecordingWriter, write_recording
+from tests.builders.commands import run
 
 EXAMPLE = Path(__file__).parents[2] / "data" / "csv_example"
 COMMANDS = (
@@ -39,12 +40,6 @@ def _logging_as_before() -> Iterator[None]:
     handlers, level = root.handlers[:], root.level
     yield
     root.handlers[:], root.level = handlers, level
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:

@@ -5,14 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from services.cli import main as cli
 from services.recordings.writer import write_recording
+from tests.builders.commands import run
 from tests.unit.drives.recorded import START_NS, drive
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    code = cli.main(["info", *map(str, arguments)])
-    return (code, *capsys.readouterr())
 
 
 @pytest.fixture
@@ -31,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_sample_is_told_in_full(capsys: pytest.CaptureFixture[str], project: Path) -> None:
-    code, out, err = run(capsys, project / "recordings/sample/crossing.mcap")
+    code, out, err = run(capsys, "info", project / "recordings/sample/crossing.mcap")
     assert (code, err) == (0, "")
     assert "319 kB, whole" in out
     assert "2026-01-01 00:00:00.0 to 00:00:08.9 UTC, 8.9 s" in out
@@ -45,7 +40,7 @@ def test_the_sample_is_told_in_full(capsys: pytest.CaptureFixture[str], project:
 def test_a_folder_is_a_line_a_file_and_a_sum(
     capsys: pytest.CaptureFixture[str], folder: Path
 ) -> None:
-    code, out, err = run(capsys, folder)
+    code, out, err = run(capsys, "info", folder)
     assert (code, err) == (0, "")
     heading, first, second, none, total = out.splitlines()
     assert heading.split() == [
@@ -61,7 +56,7 @@ def test_a_folder_is_a_line_a_file_and_a_sum(
 
 
 def test_json_tells_everything(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
-    code, out, _ = run(capsys, folder, "--json")
+    code, out, _ = run(capsys, "info", folder, "--json")
     assert code == 0
     by_name = {Path(one["path"]).name: one for one in json.loads(out)["recordings"]}
     assert by_name["none.mcap"]["error"].startswith("is not an MCAP file")
@@ -80,13 +75,13 @@ def test_crossings_by_another_site_file(
     capsys: pytest.CaptureFixture[str], project: Path, csv_example: Path
 ) -> None:
     sample = project / "recordings/sample/crossing.mcap"
-    code, out, _ = run(capsys, sample, "--json")
+    code, out, _ = run(capsys, "info", sample, "--json")
     (found,) = json.loads(out)["recordings"]
     assert code == 0
     assert found["crossings"][0]["direction"] == "start_to_end"
     assert found["crossings"][0]["passage"] == "through"
     assert found["site"]["bridges"][0]["span_m"] == 30.0
-    code, out, _ = run(capsys, sample, "--json", "--site", csv_example / "site.toml")
+    code, out, _ = run(capsys, "info", sample, "--json", "--site", csv_example / "site.toml")
     assert (code, json.loads(out)["recordings"][0]["crossings"]) == (0, [])
 
 
@@ -99,7 +94,7 @@ def test_what_is_named_and_cannot_be_read_is_bad_input(
         (folder / "missing.mcap", "no such file"),
         (tmp_path / "empty", "holds no recording (.mcap)"),
     ):
-        code, out, err = run(capsys, path)
+        code, out, err = run(capsys, "info", path)
         assert (code, out) == (2, "")
         assert words in err
         assert err.count("\n") == 1

@@ -16,12 +16,8 @@ from services.common.geodesy import bridge_frame, to_chainage
 from services.drives.signals import signals_of_recording
 from services.recordings.recording import read_messages, read_site
 from services.recordings.writer import write_recording
+from tests.builders.commands import run
 from tests.unit.drives.recorded import drive
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    code = cli.main([str(argument) for argument in arguments])
-    return (code, *capsys.readouterr())
 
 
 def rows(path: Path) -> list[dict[str, str]]:

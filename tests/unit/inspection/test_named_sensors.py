@@ -16,7 +16,6 @@ from schemas.signals import decode_accel
 from schemas.site import Site
 from schemas.site_file import site_toml
 from schemas.site_sensors import PlacedSensor
-from services.cli import main as cli
 from services.drives.runs import Run, run_to_messages
 from services.drives.signals import signals_of_recording
 from services.drives.survey import survey
@@ -26,6 +25,7 @@ from services.report.bridge import bridge_reports
 from services.report.page import page
 from services.viewer.layout import acceleration_plots
 from services.viewer.recording_page import recording_page
+from tests.builders import commands
 from tests.unit.inspection.test_inspection import findings, sound
 from tests.unit.viewer.found import results_of, some_crossing
 
@@ -75,11 +75,6 @@ def recorded(folder: Path) -> Path:
     return path
 
 
-def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    code = cli.main([str(argument) for argument in arguments])
-    return (code, *capsys.readouterr())
-
-
 def test_sound_sensors_are_in_order(tmp_path: Path) -> None:
     run, site = two_sided()
     found = findings(tmp_path, run, site)
@@ -115,16 +110,18 @@ def test_named_channels_are_recorded_and_exported(
         np.testing.assert_array_equal(signals.channels[name].acceleration_m_per_s2, values)
     batch = next(m for m in read_messages(path) if m.key.stream == "accel")
     assert len(decode_accel(batch.payload).channels) == 8
-    code, out, err = said(capsys, "info", path, "--json")
+    code, out, err = commands.run(capsys, "info", path, "--json")
     assert (code, err) == (0, "")
     (truck,) = json.loads(out)["recordings"][0]["trucks"]
     assert set(truck["channel_rates_hz"]) == set(run.channels)
     folder = tmp_path / "tables"
-    assert said(capsys, "export", path, "--to", folder)[0] == 0
+    assert commands.run(capsys, "export", path, "--to", folder)[0] == 0
     with (folder / "accel_00.csv").open(newline="") as file:
         assert next(csv.reader(file)) == ["time_s", *sorted(run.channels)]
     again = tmp_path / "again.mcap"
-    code, _, err = said(capsys, "import", folder, "--site", folder / "site.toml", "-o", again)
+    code, _, err = commands.run(
+        capsys, "import", folder, "--site", folder / "site.toml", "-o", again
+    )
     assert (code, err) == (0, "")
     (back,) = signals_of_recording(again)
     for name, series in signals.channels.items():
@@ -137,14 +134,14 @@ def test_check_lists_sensors_and_finds_a_column_that_is_missing(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     folder = tmp_path / "tables"
-    assert said(capsys, "export", recorded(tmp_path), "--to", folder)[0] == 0
-    code, out, _ = said(capsys, "check", folder / "site.toml")
+    assert commands.run(capsys, "export", recorded(tmp_path), "--to", folder)[0] == 0
+    code, out, _ = commands.run(capsys, "check", folder / "site.toml")
     assert "unsprung_front_right: axle 1, 0.4 m to the right, 35.4 µg/√Hz" in out
     table = (folder / "accel_00.csv").read_text().splitlines()
     (folder / "accel_00.csv").write_text(
         "\n".join(line.rpartition(",")[0] for line in table) + "\n"
     )
-    code, out, _ = said(capsys, "check", folder, "--json")
+    code, out, _ = commands.run(capsys, "check", folder, "--json")
     assert code == 1
     texts = [one["text"] for report in json.loads(out)["reports"] for one in report["findings"]]
     assert "7 of 8 accelerometers recorded, unsprung_rear_right missing" in texts
@@ -154,7 +151,7 @@ def test_sensors_of_one_side_are_one_line(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     folder = tmp_path / "tables"
-    assert said(capsys, "export", recorded(tmp_path), "--to", folder)[0] == 0
+    assert commands.run(capsys, "export", recorded(tmp_path), "--to", folder)[0] == 0
     _, site = two_sided()
     vehicle = site.vehicles[0]
     left = tuple(one for one in vehicle.sensors if one.lateral_m > 0.0)
@@ -167,12 +164,14 @@ def test_sensors_of_one_side_are_one_line(
         'vehicle.sensors[2] ("unsprung_front_left") shows axle 1 on the left only, which hides '
         "its roll (roll_not_seen): put a second sensor on the other side, or this one in the middle"
     )
-    code, _, err = said(capsys, "import", folder, "--site", one_sided, "-o", tmp_path / "x.mcap")
+    code, _, err = commands.run(
+        capsys, "import", folder, "--site", one_sided, "-o", tmp_path / "x.mcap"
+    )
     assert code == 2
     assert err.endswith(f"{one_sided}: {line}\n")
     assert err.count("\n") == 1
     assert not (tmp_path / "x.mcap").exists()
-    code, out, err = said(capsys, "check", one_sided)
+    code, out, err = commands.run(capsys, "check", one_sided)
     assert code == 2
     assert line in out + err
 

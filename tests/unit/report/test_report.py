@@ -13,13 +13,13 @@ from schemas.reasons import Reason
 from schemas.results import Results, results_json
 from schemas.site import Site
 from schemas.site_file import load_site, site_toml
-from services.cli import main as cli
 from services.common.errors import FailureError
 from services.report import pdf
 from services.report.bridge import _ADVICE, bridge_reports
 from services.report.html import Html, inlined_svg, joined, tag
 from services.report.page import page
 from services.report.place import ends_of, start_of
+from tests.builders.commands import run
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
 
@@ -235,11 +235,6 @@ def test_text_is_escaped_unless_it_is_html() -> None:
     assert 'aria-label="&quot;x&quot;"' in inlined
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    code = cli.main(["report", *map(str, arguments)])
-    return (code, *capsys.readouterr())
-
-
 @pytest.fixture
 def written(tmp_path: Path, site: Site) -> tuple[Path, Path]:
     """A results file and its site file."""
@@ -254,12 +249,12 @@ def test_the_command_writes_the_page_and_says_the_finding(
 ) -> None:
     found, site = written
     out = tmp_path / "r.html"
-    code, said, err = run(capsys, found, "--site", site, "-o", out)
+    code, said, err = run(capsys, "report", found, "--site", site, "-o", out)
     assert (code, err) == (0, "")
     assert said.startswith("bridge-1: One element is clearly less stiff. Element 4, 12.9 to 17.1 m")
     assert "Element 4" in Seen(out.read_text()).text
     first = out.read_bytes()
-    assert run(capsys, found, "--site", site, "-o", out)[0] == 0
+    assert run(capsys, "report", found, "--site", site, "-o", out)[0] == 0
     assert out.read_bytes() == first  # the same results give the same report
 
 
@@ -271,11 +266,11 @@ def test_the_baseline_of_the_site_file_lies_beside_it(
     toml = site.read_text().replace("[bridge]\n", '[bridge]\nbaseline = "then.json"\n')
     (tmp_path / "sites" / "site.toml").write_text(toml)
     options = (found, "--site", tmp_path / "sites" / "site.toml", "-o", tmp_path / "r.html")
-    code, out, err = run(capsys, *options)
+    code, out, err = run(capsys, "report", *options)
     assert (code, out) == (2, "")
     assert "then.json: no such file" in err
     (tmp_path / "sites" / "then.json").write_bytes(found.read_bytes())
-    assert run(capsys, *options)[0] == 0
+    assert run(capsys, "report", *options)[0] == 0
     assert "unchanged within 1 %" in (tmp_path / "r.html").read_text()
 
 
@@ -321,7 +316,7 @@ def test_what_cannot_be_reported_is_one_line_and_leaves_nothing(
         ((changed("e", {"bridge": "b-9"}), *with_site), "has results of b-9, which"),
     ):
         out = () if "-o" in arguments else ("-o", tmp_path / "r.html")
-        code, said, err = run(capsys, *arguments, *out)
+        code, said, err = run(capsys, "report", *arguments, *out)
         assert (code, said) == (2, ""), words
         assert words in err.splitlines()[-1]
         assert not (tmp_path / "r.html").exists()
@@ -335,7 +330,9 @@ def test_without_a_browser_pdf_says_what_to_do_and_writes_nothing(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     found, site = written
-    code, out, err = run(capsys, found, "--site", site, "-o", tmp_path / "r.html", "--pdf")
+    code, out, err = run(
+        capsys, "report", found, "--site", site, "-o", tmp_path / "r.html", "--pdf"
+    )
     assert (code, out) == (1, "")
     assert "--pdf needs Chromium, Chrome or Edge, none is installed" in err
     assert not (tmp_path / "r.html").exists()
@@ -349,7 +346,7 @@ def test_a_browser_that_prints_nothing_is_a_failure_with_the_page_left(
 ) -> None:
     monkeypatch.setattr(pdf, "find_browser", lambda: "true")
     found, site = written
-    code, _, err = run(capsys, found, "--site", site, "-o", tmp_path / "r.html", "--pdf")
+    code, _, err = run(capsys, "report", found, "--site", site, "-o", tmp_path / "r.html", "--pdf")
     assert code == 1
     assert "true ended with 0 and printed nothing; the report is in" in err
     assert (tmp_path / "r.html").exists()
@@ -366,7 +363,7 @@ def test_on_paper_a_bridge_of_one_crossing_has_two_pages(
     except Exception as error:
         pytest.skip(str(error))
     found, site = written
-    code, out, _ = run(capsys, found, "--site", site, "-o", tmp_path / "r.html", "--pdf")
+    code, out, _ = run(capsys, "report", found, "--site", site, "-o", tmp_path / "r.html", "--pdf")
     assert code == 0
     assert out.splitlines()[-1] == str(tmp_path / "r.pdf")
     printed = (tmp_path / "r.pdf").read_bytes()
