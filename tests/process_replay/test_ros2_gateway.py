@@ -4,7 +4,6 @@ No ROS 2 runs here: messages are encoded by rosbags, keys and attachments as in 
 """
 
 import json
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -31,6 +30,7 @@ from services.recordings.recording import read_messages
 from services.simulation.drive import paper_site
 from services.truck import ros2 as gateway_of_ros2
 from tests import ros2
+from tests.builders.processes import stop
 from tests.endpoints import free_endpoint
 from tests.process_replay.starting import End, Process, Start, start_logger
 from tests.waiting import LONGEST_S, until
@@ -111,13 +111,6 @@ def gateway(ros: Ros, endpoint: str, ros_site: Path) -> Iterator[Callable[..., P
         process.communicate()
 
 
-def ended(process: Process) -> str:
-    process.send_signal(signal.SIGTERM)
-    _, log = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 0, log
-    return log
-
-
 def heard(subscription: Subscription, samples: int) -> None:
     """Wait until so many samples of accelerometers have come."""
     found = 0
@@ -178,7 +171,7 @@ def test_a_crossing_gives_the_same_as_directly_and_as_from_a_file(
         for message in messages:
             node.publish(message)
         heard(subscription, samples - 4 * 100)  # the last batch of each is not full
-    log = ended(process)
+    log = stop(process)
     assert "WARNING" not in log
     terminate(logger)
 
@@ -257,7 +250,7 @@ def test_what_is_not_known_is_refused_by_name_and_hash_and_nothing_ends_it(
                 between_ns = stamp_ns + 400_000
                 second.publish(ros2.Ros(front, IMU, ros2.imu(between_ns, 77.0), between_ns))
         heard(subscription, 2_400)
-    log = ended(process)
+    log = stop(process)
     terminate(logger)
     assert f"{front}: {IMU.name} has the type hash RIHS01_{'0' * 64}, known is {IMU.hash}" in log
     assert f"{front}: is of {FIX.dds_name}, {IMU.name} is expected; refused" in log
@@ -313,7 +306,7 @@ def test_a_domain_is_its_own_and_humble_has_no_hash(
 
         until(three, "three fixes")
     assert speeds == [5.0, 5.0, 5.0]
-    assert "left out" not in ended(process)
+    assert "left out" not in stop(process)
     terminate(logger)
 
 
@@ -347,7 +340,7 @@ def test_stranger_with_a_wrong_rate_costs_the_truck_nothing(
                 between_ns = stamp_ns + 400_000
                 stranger.publish(ros2.Ros(front, IMU, ros2.imu(between_ns, 77.0), between_ns))
         heard(subscription, 2 * 2_400)
-    log = ended(process)
+    log = stop(process)
     terminate(logger)
     line = (
         "messages at a wrong rate, left out (its stamps give a rate of 400 Hz, but sensor.rate_hz"

@@ -1,7 +1,6 @@
 """A worker that was away finds in the logger's recordings what its trucks do not send any more."""
 
 import signal
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from services.bus.session import open_session
 from services.bus.subscription import Received, Subscription
 from services.recordings.recording import read_messages
 from services.simulation.drive import Drive, paper_site, write_drive
+from tests.builders.processes import stop
 from tests.process_replay.starting import Process, Start, start_logger
 from tests.waiting import LONGEST_S, until
 
@@ -76,13 +76,6 @@ def begin(start: Start, endpoint: str, site: Path, folder: Path) -> Callable[[],
         )
 
     return one
-
-
-def stop(process: subprocess.Popen[str]) -> str:
-    process.terminate()
-    _, log = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 0, log
-    return log
 
 
 def test_trucks_that_came_and_left_while_the_worker_was_away(

@@ -1,6 +1,5 @@
 """The worker in realm live: real crossings wait for a certificate, and get their result with it."""
 
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from services.bus.subscription import Received, Subscription
 from services.cli.health import health_command
 from services.history.certificates import save
 from services.recordings.recording import read_messages, read_site
+from tests.builders.processes import stop
 from tests.process_replay.starting import Process, Start, start_logger
 from tests.unit.schemas.test_certificates import certificate
 from tests.waiting import LONGEST_S, until
@@ -104,13 +104,6 @@ class Heard:
             for one in self._received.values()
             if one.key().stream == "estimate"
         ]
-
-
-def stop(process: subprocess.Popen[str]) -> str:
-    process.terminate()
-    _, log = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 0, log
-    return log
 
 
 WAITS = [pb.DETECTED, pb.COMPLETE, pb.WAITING_NOT_VALIDATED]

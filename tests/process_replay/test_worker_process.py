@@ -25,6 +25,7 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, run_to_messages
 from services.recordings.recording import Message, read_info, read_messages, read_site
 from services.simulation.drive import Drive, paper_site
+from tests.builders.processes import stop
 from tests.receiving import several
 from tests.waiting import LONGEST_S
 
@@ -373,14 +374,6 @@ def until_whole(subscription: Subscription, told: list[Received]) -> list[Receiv
     while len(once(told)) < len(WHOLE) and time.monotonic() < deadline:
         told += after(subscription, 0.2)
     return told + after(subscription, 1.5)
-
-
-def stop(process: subprocess.Popen[str]) -> str:
-    """As an operator would, who is patient; return the log."""
-    process.terminate()
-    _, log = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 0, log
-    return log
 
 
 def kill(process: subprocess.Popen[str]) -> None:
