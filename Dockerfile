@@ -1,31 +1,75 @@
-# One image for every service: the command line says which one runs. See compose.yaml.
+# Two images. `service`, the default, runs every command; `truck` is the small one of a truck's
+# computer: publisher and spool, `driveby truck` and `driveby health`. See compose.yaml.
 #
 # The base image is named by its tag: no registry was within reach when this was written, so its
-# digest is not known here. Who wants the same image every time gives it:
+# digest is not known here. For the same image every time give it:
 #     docker compose build --build-arg BASE=python:3.11-slim-bookworm@sha256:...
+#
+# Behind a mirror of PyPI: `PIP_CONFIG_FILE` and `PIP_CERT`, the variables of pip itself, name files
+# that compose.yaml hands to the build as secrets. They are in no layer.
 ARG BASE=python:3.11-slim-bookworm
-FROM ${BASE}
-ENV PYTHONUNBUFFERED=1 OPENBLAS_NUM_THREADS=1 NUMBA_CACHE_DIR=/tmp/kernels
-WORKDIR /app
-# `runtime`, or `cluster` for what a Dask cluster needs, too.
-ARG REQUIREMENTS=runtime
-COPY requirements/runtime.txt requirements/cluster.txt requirements/build.txt requirements/
-RUN pip install --no-cache-dir --require-hashes -r requirements/${REQUIREMENTS}.txt -r requirements/build.txt
-COPY LICENSE README.md pyproject.toml setup.py entrypoint.sh ./
+
+FROM ${BASE} AS tools
+RUN apt-get update && apt-get install --yes --no-install-recommends binutils
+COPY --chmod=0755 docs/scripts/slim_environment.sh /slim_environment
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+WORKDIR /build
+RUN python -m venv --without-pip /opt/driveby
+
+FROM tools AS wheel
+COPY requirements/build.txt requirements/
+RUN --mount=type=secret,id=pip,target=/etc/pip.conf --mount=type=secret,id=authorities \
+    if [ -s /run/secrets/authorities ]; then export PIP_CERT=/run/secrets/authorities; fi \
+    && pip --python /opt/driveby/bin/python install --require-hashes -r requirements/build.txt
+COPY LICENSE README.md pyproject.toml setup.py ./
 COPY driveby driveby
 COPY pre_core pre_core
 COPY schemas schemas
 COPY services services
-# No index: what builds is what was installed above, by hash. The sources go, so that the kernels are
-# compiled for the modules that will run.
-RUN pip install --no-cache-dir --no-deps --no-build-isolation --no-index . \
-    && rm -rf build driveby driveby.egg-info pre_core schemas services setup.py \
-    && useradd --uid 10001 --create-home driveby \
-    && mkdir recordings certs \
-    && chown driveby recordings certs
-# Compiled for the processor that builds; on one of another kind a service compiles once more before
-# it connects. The root file system is read-only and numba wants to write beside what it reads, so
-# entrypoint.sh copies these 8 MB to memory.
-RUN NUMBA_CACHE_DIR=/app/kernels python -m driveby.services.execution.warm_up --strict
-USER driveby
+# No index: what builds is what was installed above, by hash.
+RUN pip --python /opt/driveby/bin/python wheel --no-deps --no-build-isolation --no-index -w /wheels .
+
+FROM tools AS truck-environment
+COPY requirements/truck.txt requirements/
+RUN --mount=type=secret,id=pip,target=/etc/pip.conf --mount=type=secret,id=authorities \
+    if [ -s /run/secrets/authorities ]; then export PIP_CERT=/run/secrets/authorities; fi \
+    && pip --python /opt/driveby/bin/python install --require-hashes -r requirements/truck.txt
+RUN /slim_environment /opt/driveby
+COPY --from=wheel /wheels /wheels
+RUN pip --python /opt/driveby/bin/python install --no-deps --no-index /wheels/*.whl
+
+FROM tools AS service-environment
+# `runtime`, or `cluster` for what a Dask cluster needs, too.
+ARG REQUIREMENTS=runtime
+COPY requirements/runtime.txt requirements/cluster.txt requirements/
+RUN --mount=type=secret,id=pip,target=/etc/pip.conf --mount=type=secret,id=authorities \
+    if [ -s /run/secrets/authorities ]; then export PIP_CERT=/run/secrets/authorities; fi \
+    && pip --python /opt/driveby/bin/python install --no-compile --require-hashes -r requirements/${REQUIREMENTS}.txt
+RUN /slim_environment /opt/driveby
+COPY --from=wheel /wheels /wheels
+RUN pip --python /opt/driveby/bin/python install --no-deps --no-index /wheels/*.whl
+
+FROM ${BASE} AS common
+ENV PATH=/opt/driveby/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
+ENV PYTHONUNBUFFERED=1 OPENBLAS_NUM_THREADS=1 NUMBA_CACHE_DIR=/tmp/kernels
+WORKDIR /app
+COPY entrypoint.sh ./
+RUN useradd --uid 10001 --create-home driveby \
+    && mkdir recordings certs spool \
+    && chown driveby recordings certs spool
 ENTRYPOINT ["/app/entrypoint.sh"]
+
+FROM common AS truck
+COPY --from=truck-environment /opt/driveby /opt/driveby
+USER driveby
+
+FROM common AS service
+COPY --from=service-environment /opt/driveby /opt/driveby
+# Python writes compiled what is imported here, and nothing when it runs: its files are read-only.
+RUN python -c "import driveby.services.logger, driveby.services.viewer.rerun_file" \
+    && python -c "import driveby.services.worker, driveby.services.simulation.drive" \
+    && driveby health --help >/dev/null
+# The root file system is read-only and numba wants to write beside what it reads, so entrypoint.sh
+# copies these 8 MB to memory.
+RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh python -m driveby.services.execution.warm_up --strict
+USER driveby

@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo up test test-all faults soak day year mutants validate lint docs bench lock clean
+.PHONY: help install demo up down test test-all faults soak day year mutants validate lint docs bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -29,12 +29,15 @@ $(STAMP): $(PACKAGES) $(wildcard pre_core/*.py pre_core/*/*.py)
 demo: $(STAMP) ## a truck crosses a bridge: simulated, recorded, identified, drawn
 	$(BIN)/driveby demo
 
-up: ## the demo's services as containers (Docker Engine 26.0, Compose 2.26; not yet run)
+up: ## the demo's services as containers (Docker Engine 26.0, Compose 2.26)
 	@$(PYTHON) docs/scripts/container_versions.py
 	docker compose build
-	docker volume inspect driveby_certs >/dev/null 2>&1 || docker compose run --rm certs
+	docker volume inspect $${COMPOSE_PROJECT_NAME:-driveby}_certs >/dev/null 2>&1 || docker compose run --rm certs
 	docker compose up --detach --wait worker
 	docker compose up --detach truck
+
+down: ## end the containers; recordings, results, spools and certificates stay in their volumes
+	docker compose --profile setup --profile cluster down --remove-orphans
 
 # One worker computes while the other waits for processes (tests/conftest.py); more would only wait.
 BESIDE := -n 2 --dist loadgroup
@@ -84,8 +87,11 @@ docs: $(STAMP) ## the pages as a site, in build/site
 bench: $(STAMP) ## time everything, with its peers, into docs/benchmarks.md (12 minutes)
 	$(BIN)/python -m tests.benchmarks.report
 
+OF_A_TRUCK := cryptography eclipse-zenoh foxglove-schemas-protobuf mcap numpy protobuf pydantic zstandard
+
 lock: ## write the pinned requirements anew (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate pyproject.toml -o requirements/runtime.txt
+	printf '%s\n' $(OF_A_TRUCK) | uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c requirements/runtime.txt - -o requirements/truck.txt
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --extra dev pyproject.toml -o requirements/dev.txt
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --extra cluster pyproject.toml -o requirements/cluster.txt
 	sed -n '/^docs = \[/,/^]/s/^ *"\(.*\)",.*/\1/p' pyproject.toml | uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c requirements/dev.txt - -o requirements/docs.txt

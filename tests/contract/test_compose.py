@@ -126,7 +126,7 @@ def test_dask_takes_the_others_and_they_ask_for_certificates(name: str, tmp_path
     if which == "worker":
         assert options["scheduler"] == "tls://scheduler:8786"
         assert options["nanny"] is False
-        assert '[ "$1" = dask ] && exec "$@"' in (ROOT / "entrypoint.sh").read_text()
+        assert 'case $1 in dask | python) exec "$@"' in (ROOT / "entrypoint.sh").read_text()
 
 
 def test_the_client_of_the_cluster_finds_its_scheduler() -> None:
@@ -141,24 +141,25 @@ def test_only_loopback_is_published() -> None:
 
 
 def test_the_image_is_built_of_what_is_pinned_by_hash() -> None:
-    installs = [line for line in DOCKERFILE.splitlines() if "pip install" in line]
-    assert len(installs) == 2
-    assert "--require-hashes" in installs[0]
-    assert "-r requirements/build.txt" in installs[0]
-    assert "--no-index" in installs[1]
-    assert "--no-build-isolation" in installs[1]
+    steps = re.findall(r"^(?:RUN|    &&).* (pip .*(?:\\\n.*)*)$", DOCKERFILE, re.MULTILINE)
+    assert len(steps) == 6
+    for step in steps:
+        assert ("--require-hashes" in step) != ("--no-index" in step)
+        assert ("--no-build-isolation" in step) == (" wheel " in step)
+    assert "-r requirements/build.txt" in DOCKERFILE
     build = (ROOT / "requirements" / "build.txt").read_text()
     assert re.match(r"setuptools==[\d.]+ \\\n    --hash=sha256:", build)
     copies = [line.split()[1:-1] for line in DOCKERFILE.splitlines() if line.startswith("COPY")]
     copied = {source for sources in copies for source in sources}
+    copied = {source for source in copied if not source.startswith(("-", "/"))}
     assert {"setup.py", "driveby", "entrypoint.sh"} <= copied
     allowed = set(re.findall(r"^!(\S+)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE))
     assert copied <= allowed
 
 
 def test_the_image_compiles_its_kernels_where_the_entrypoint_looks() -> None:
-    step = "RUN NUMBA_CACHE_DIR=/app/kernels python -m driveby.services.execution.warm_up --strict"
-    assert step in DOCKERFILE
+    step = "python -m driveby.services.execution.warm_up --strict"
+    assert f"RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh {step}" in DOCKERFILE
     entrypoint = (ROOT / "entrypoint.sh").read_text()
     assert "${KERNELS:-/app/kernels}" in entrypoint
     cache = re.search(r"NUMBA_CACHE_DIR=(/tmp/\S+)", DOCKERFILE)
@@ -168,6 +169,57 @@ def test_the_image_compiles_its_kernels_where_the_entrypoint_looks() -> None:
         for service in SERVICES.values()
     )
     assert os.access(ROOT / "entrypoint.sh", os.X_OK)
+
+
+def pinned(name: str) -> set[str]:
+    text = (ROOT / "requirements" / f"{name}.txt").read_text()
+    return set(re.findall(r"^[a-z].*?(?= \\$)", text, re.MULTILINE))
+
+
+def test_the_truck_has_the_versions_of_the_others_and_nothing_that_draws() -> None:
+    assert pinned("truck") < pinned("runtime")
+    names = {line.split("==")[0] for line in pinned("truck")}
+    assert names.isdisjoint({"rerun-sdk", "duckdb", "matplotlib", "pyarrow", "scipy", "numba"})
+
+
+def test_trucks_meet_the_router_only() -> None:
+    on = {name: set(service["networks"]) for name, service in SERVICES.items()}
+    assert {name for name in on if on["truck"] & on[name]} == {"truck", "router"}
+    assert [n for n, network in COMPOSE["networks"].items() if not (network or {}).get("internal")]
+    assert {name for name in on if "outside" in on[name]} == {"router"}
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_logs_are_bounded(name: str) -> None:
+    assert SERVICES[name]["logging"]["options"] == {"max-size": "10m", "max-file": "3"}
+
+
+def test_ours_are_never_fetched_from_a_registry() -> None:
+    ours = {name: s for name, s in SERVICES.items() if s["image"].startswith("driveby")}
+    assert set(SERVICES) - set(ours) == {"router"}
+    assert all(service["pull_policy"] == "never" for service in ours.values())
+    built = {ours[name]["image"] for name in ours if "build" in ours[name]}
+    assert built == {service["image"] for service in ours.values()}
+
+
+@pytest.mark.parametrize("features", ["avx2 fma bmi2", "avx2 fma", "asimd"])
+def test_kernels_are_for_a_kind_of_processor_where_it_is_one(features: str, tmp_path: Path) -> None:
+    """`grep` in place of the processor's own features."""
+    program = tmp_path / "grep"
+    program.write_text(f'#!/bin/sh\ncase " {features} " in *" $2 "*) exit 0 ;; esac\nexit 1\n')
+    program.chmod(0o755)
+    done = subprocess.run(
+        [ROOT / "entrypoint.sh", "python", "-c", "import os; print(os.getenv('NUMBA_CPU_NAME'))"],
+        env={
+            "PATH": f"{tmp_path}:{Path(sys.executable).parent}:/usr/bin:/bin",
+            "NUMBA_CACHE_DIR": str(tmp_path / "kernels"),
+            "KERNELS": str(tmp_path / "none"),
+        },
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == ("x86-64-v3" if "bmi2" in features else "None")
 
 
 def a_docker(folder: Path, engine: str, compose: str, code: int = 0) -> Path:

@@ -1,0 +1,22 @@
+#!/bin/sh
+# Takes out of a Python environment what no container of ours uses: the Rerun viewer's program (the
+# library that writes its files stays), Arrow's parts for remote services, other packages' tests,
+# sources of compiled modules, headers, debugging symbols of extension modules.
+#
+#     slim_environment.sh FOLDER
+set -e
+cd "$1"/lib/python3*/site-packages
+rm -rf rerun_cli numba/cuda/tests ./*.dist-info/sboms \
+    pyarrow/include pyarrow/src pyarrow/*flight* pyarrow/*s3* pyarrow/*_cpp_tests*
+find . -type d -name tests -prune -exec rm -rf {} +
+find . -type f \( -name '*.c' -o -name '*.cpp' -o -name '*.h' -o -name '*.pyx' -o -name '*.pxd' \
+    -o -name '*.pyi' -o -name '*.a' \) -delete
+# A wheel has no links: the same library is in it under up to three names.
+for library in pyarrow/*.so.*.*; do
+    [ -f "$library" ] || continue
+    for other in "${library%%.so.*}".so*; do
+        [ "$other" = "$library" ] || { cmp -s "$library" "$other" && ln -f "$library" "$other"; }
+    done
+done
+# The libraries in *.libs were made by a tool whose files strip would break.
+find . -name '*.so*' -type f -size +2M -not -path './*.libs/*' -exec strip --strip-unneeded {} +

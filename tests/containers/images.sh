@@ -1,0 +1,55 @@
+#!/bin/sh
+# Makes the two images that Dockerfile and compose.yaml take from a registry, where none is within
+# reach: the base image from Debian's packages, the router's from crates.io. Tags are read from the
+# files. Images that are there already stay.
+#
+#     sh tests/containers/images.sh [FOLDER]
+#
+# Needs root, debootstrap, cargo and a docker engine; FOLDER keeps the compiled router (default:
+# build/containers). DEBIAN is the mirror, by default the one of this machine's apt.
+set -eu
+cd "$(dirname "$0")/../.."
+folder=$(mkdir -p "${1:-build/containers}" && cd "${1:-build/containers}" && pwd)
+base=$(sed -n 's/^ARG BASE=//p' Dockerfile)
+router=$(sed -n 's/^ *image: \(eclipse\/zenoh:.*\)/\1/p' compose.yaml)
+suite=${base##*-}
+sources=$(cat /etc/apt/sources.list /etc/apt/sources.list.d/*.sources 2>/dev/null || true)
+mirror=${DEBIAN:-$(echo "$sources" | sed -nE 's/^(URIs:|deb) *([^ ]+).*/\2/p' | head -n 1)}
+
+there() { docker image inspect "$1" >/dev/null 2>&1; }
+
+# What the official image leaves out, this one does, too: documentation, translations, lists of
+# packages, compiled Python. `python` is Debian's own interpreter.
+make_base() {
+    root=$(mktemp -d "$folder/root.XXXXXX")
+    trap 'rm -rf "$root"' EXIT
+    debootstrap --variant=minbase --include=python3,python3-pip,ca-certificates \
+        "$suite" "$root" "$mirror" >"$folder/debootstrap.log"
+    chroot "$root" python3 -c 'import sys; assert sys.argv[1].startswith(f"{sys.version_info[0]}.{sys.version_info[1]}-")' "${base#*:}"
+    find "$root/usr" -name __pycache__ -type d -prune -exec rm -rf {} +
+    rm -rf "$root"/var/lib/apt/lists/* "$root"/var/cache/* "$root"/usr/share/doc \
+        "$root"/usr/share/man "$root"/usr/share/info "$root"/usr/share/locale \
+        "$root"/usr/lib/python3*/EXTERNALLY-MANAGED
+    mkdir -p "$root/var/cache/apt/archives/partial" "$root/var/lib/apt/lists/partial"
+    ln -s /usr/bin/python3 "$root/usr/local/bin/python"
+    tar -C "$root" -c . | docker import -c 'CMD ["python3"]' - "$base" >/dev/null
+}
+
+# As the official image: /zenohd behind /entrypoint.sh, with `nc` for the health check.
+make_router() {
+    version=${router##*:}
+    CARGO_BUILD_JOBS=${CARGO_BUILD_JOBS:-2} cargo install zenohd --version "$version" --locked \
+        --quiet --root "$folder"
+    docker build --quiet --tag "$router" --file - "$folder/bin" >/dev/null <<END
+FROM $base
+RUN apt-get update && apt-get install --yes --no-install-recommends netcat-openbsd && rm -rf /var/lib/apt/lists/*
+COPY zenohd /zenohd
+RUN printf '#!/bin/sh\nexec /zenohd \$*\n' >/entrypoint.sh && chmod +x /entrypoint.sh
+ENV RUST_LOG=info
+ENTRYPOINT ["/entrypoint.sh"]
+END
+}
+
+there "$base" || make_base
+there "$router" || make_router
+docker image ls --format '{{.Repository}}:{{.Tag}} {{.Size}}' | grep -F -e "$base" -e "$router"
