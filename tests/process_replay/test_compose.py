@@ -145,7 +145,11 @@ def stop(process: subprocess.Popen[str], grace_s: float) -> int:
 def host(tmp_path: Path) -> Host:
     """An image: its kernels compiled from nothing, as the Dockerfile does."""
     made = Host(tmp_path)
-    step = re.search(r"^RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh (python .*)$", dockerfile(), re.MULTILINE)
+    step = re.search(
+        r"^RUN NUMBA_CACHE_DIR=/app/kernels /app/entrypoint.sh (python .*)$",
+        dockerfile(),
+        re.MULTILINE,
+    )
     assert step is not None
     environment = {**os.environ, **IMAGE_ENV, "NUMBA_CACHE_DIR": str(made.kernels)}
     # In the wheel, and so in the image, what is `services` here lies inside `driveby` (setup.py).
