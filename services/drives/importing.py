@@ -13,6 +13,7 @@ from services.common.naming import checked_identifier, identifier_from
 from services.common.progress import Steps, unwatched_steps
 from services.drives.comma2k19 import is_comma2k19, read_comma2k19
 from services.drives.csv_import import read_folder, read_pair
+from services.drives.plausible import check_plausible
 from services.drives.ros2_recording import is_ros2, messages_of_ros2
 from services.drives.runs import Run, normalised, run_to_messages
 from services.identification.placed import middle_sensor, rates_hz
@@ -142,6 +143,7 @@ def normalised_runs(
     declared = tuple(rates_hz(site.sensor, vehicle).values())
     for run in runs:
         _check_rate(run, declared, site_name)
+        check_plausible(run, site)
     return [normalised(run, middle_sensor(site.sensor, vehicle)) for run in runs]
 
 
