@@ -28,7 +28,7 @@ def add_alarm(commands: Any) -> None:
         commands,
         "alarm",
         _alarm,
-        "look for bridges that have changed, list and acknowledge alarms, tell them on the bus",
+        "detect changed bridges; list, acknowledge and publish alarms",
         "driveby alarm check --history history",
     )
     p.add_argument("what", choices=_WHAT, help="check | list | ack BRIDGE | serve")
@@ -45,14 +45,14 @@ def add_alarm(commands: Any) -> None:
         type=number("false alarms of a bridge in a year", low=1e-6, high=10.0),
         default=0.01,
         metavar="N",
-        help="that one bridge may have in a year (default: 0.01)",
+        help="tolerated false alarms per bridge and year (default: 0.01)",
     )
     p.add_argument(
         "--learning",
         type=whole("a number of periods", 2, 1000),
         default=8,
         metavar="PERIODS",
-        help="of which a bridge's baseline is made before it is watched (default: 8)",
+        help="number of training periods before monitoring starts (default: 8)",
     )
     p.add_argument(
         "--at-least",

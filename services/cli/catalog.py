@@ -23,7 +23,7 @@ def add_catalog(commands: Any) -> None:
         commands,
         "catalog",
         _catalog,
-        "build or mend the catalogue of a folder of recordings, and find crossings in it",
+        "build or repair the catalogue of a folder of recordings and find crossings in it",
         "driveby catalog recordings --site site.toml",
     )
     p.add_argument("folder", metavar="DIR|s3://…", help="folder with recordings below")

@@ -18,7 +18,7 @@ def add_check(commands: Any) -> None:
         commands,
         "check",
         _check,
-        "say what is wrong with site file, sensors, receiver and place before a survey",
+        "check site file, sensors, receiver and bridge coordinates before a survey",
         "driveby check site.toml standstill.mcap trial.mcap",
     )
     p.add_argument(

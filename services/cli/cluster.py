@@ -80,7 +80,7 @@ def add_scheduler(p: Any) -> None:
         "--patience",
         type=whole("seconds", 1, 86_400),
         metavar="S",
-        help="so long a scheduler that is gone, or workers, are waited for (default: 300)",
+        help="seconds to wait for a lost scheduler or for workers (default: 300)",
     )
     p.add_argument(
         "--tls", type=Path, metavar="FOLDER", help="credentials of a client of a cluster"

@@ -35,7 +35,7 @@ def add_history(commands: Any) -> None:
         commands,
         "history",
         _history,
-        "keep results over years, and show EI of each element of a bridge over time",
+        "store results over years and show EI of each element over time",
         "driveby history add drive.json --history history && "
         "driveby history bridge-1 --history history",
     )
@@ -57,7 +57,7 @@ def add_history(commands: Any) -> None:
     p.add_argument(
         "--later",
         action="store_true",
-        help="with add: fuse nothing now; who looks at a bridge first waits for it then",
+        help="with add: postpone fusion until the bridge is first shown",
     )
     text = "write a row for each period and element here"
     add_output_file(p, "--csv", "OUT.csv", text, HISTORY_CSV)

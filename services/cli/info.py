@@ -26,7 +26,7 @@ def add_info(commands: Any) -> None:
         commands,
         "info",
         _info,
-        "say what is in recordings: trucks, times, rates, gaps, crossings",
+        "summarise recordings: trucks, times, rates, gaps, crossings",
         "driveby info recordings/sample/crossing.mcap",
     )
     p.add_argument(

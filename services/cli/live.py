@@ -26,12 +26,12 @@ from services.common.endpoints import DEFAULT_ENDPOINT, default_endpoint
 
 
 def add_demo(commands: Any) -> None:
-    """`driveby demo`: a truck crosses a bridge: simulated, recorded, identified, drawn."""
+    """`driveby demo`: simulate, publish, record, identify and draw one crossing."""
     p = command(
         commands,
         "demo",
         _demo,
-        "a truck crosses a bridge: simulated, recorded, identified, drawn",
+        "simulate, publish, record, identify and draw one crossing",
         "driveby demo --speed 4",
     )
     add_output_folder(p, "--out", "new folder for what it leaves behind")
@@ -55,12 +55,12 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def add_logger(commands: Any) -> None:
-    """`driveby logger`: record all that travels; hosts the router that the others connect to."""
+    """`driveby logger`: record all messages of a realm and host the bus router."""
     p = command(
         commands,
         "logger",
         _logger,
-        "record all that travels; hosts the router that the others connect to",
+        "record all messages of a realm and host the bus router",
         f"driveby logger --listen {DEFAULT_ENDPOINT} --folder recordings --site site.toml",
     )
     p.add_argument("--listen", help=f"where to listen (default: {DEFAULT_ENDPOINT})")
@@ -94,14 +94,14 @@ def add_logger(commands: Any) -> None:
         type=number("a size in MB", low=0.1, high=1e6),
         default=1000.0,
         metavar="MB",
-        help="or when it is so large (default: 1000)",
+        help="start a new file at this size in MB (default: 1000)",
     )
     room.add_argument(
         "--min-free",
         type=number("a size in MB", low=0, high=1e9),
         default=500.0,
         metavar="MB",
-        help="room the disk must have; at an eighth of it recording ends (default: 500)",
+        help="minimum free disk space in MB; recording stops at one eighth of it (default: 500)",
     )
     room.add_argument(
         "--budget",
@@ -176,7 +176,7 @@ def add_worker(commands: Any) -> None:
     first.add_argument(
         "--no-certificates",
         action="store_true",
-        help="identify at once in realm live, too: for those who know what they do",
+        help="identify in realm live without site validation",
     )
     add_certificates(p, "where certificates are kept (default: certificates in --folder)")
     p.add_argument(
@@ -285,7 +285,7 @@ def add_gateway(commands: Any) -> None:
         commands,
         "gateway",
         _gateway,
-        "publish what a truck with ROS 2 says, as a truck of ours",
+        "publish the data of a ROS 2 truck on the bus",
         "driveby gateway ros2 --ros tcp/127.0.0.1:7447 --endpoint tcp/office:7447 --site site.toml",
     )
     p.add_argument("what", choices=("ros2",), help="ros2: with rmw_zenoh, see docs/ros2.md")
@@ -319,12 +319,12 @@ def _gateway(options: argparse.Namespace) -> int:
 
 
 def add_health(commands: Any) -> None:
-    """`driveby health`: ask a logger or a worker over the bus whether it does its work."""
+    """`driveby health`: query the health of a logger or worker over the bus."""
     p = command(
         commands,
         "health",
         _health,
-        "ask a logger or a worker over the bus whether it does its work",
+        "query the health of a logger or worker over the bus",
         "driveby health logger",
     )
     p.add_argument("service", metavar="ID", help="its --id, as logger or worker")

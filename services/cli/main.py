@@ -183,17 +183,18 @@ def program() -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="driveby",
-        description="Find how stiff every part of a bridge is from a truck that drives over it.",
+        description="Estimate the stiffness of every bridge element "
+        "from a truck that crosses the bridge.",
         epilog="example: driveby simulate --scenario 6 --noise 25 -o run.mcap "
         "&& driveby identify run.mcap",
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     parser.add_argument(
         "--print-completion",
         action=_Completion,
         choices=SHELLS,
-        help="print a script that completes commands and options in this shell, and leave",
+        help="print a completion script for this shell and exit",
     )
     add_common(parser, suppressed=False)
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)

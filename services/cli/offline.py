@@ -26,12 +26,12 @@ from services.common.kinds import ARRAYS, MCAP, NETCDF, RERUN, RESULTS
 
 
 def add_import(commands: Any) -> None:
-    """`driveby import`: turn files of a drive into a recording."""
+    """`driveby import`: convert CSV files or ROS 2 recordings of a drive to a recording."""
     p = command(
         commands,
         "import",
         _import,
-        "turn files of a drive into a recording",
+        "convert CSV files or ROS 2 recordings of a drive to a recording",
         "driveby import crossings/d1 --site crossings/d1/site.toml -o d1.mcap",
     )
     p.add_argument(
@@ -78,12 +78,12 @@ def _import(options: argparse.Namespace) -> int:
 
 
 def add_identify(commands: Any) -> None:
-    """`driveby identify`: find the flexural rigidity of each element from recordings."""
+    """`driveby identify`: estimate the flexural rigidity of each element from recordings."""
     p = command(
         commands,
         "identify",
         _identify,
-        "find the flexural rigidity of each element from recordings",
+        "estimate the flexural rigidity of each element from recordings",
         "driveby identify run.mcap --json result.json --rrd result.rrd",
     )
     p.add_argument(
@@ -136,7 +136,7 @@ def add_fuse(commands: Any) -> None:
         commands,
         "fuse",
         _fuse,
-        "make one estimate of each bridge from the results of many crossings",
+        "fuse the results of many crossings into one estimate of each bridge",
         "driveby fuse monday.json tuesday.json --json week.json",
     )
     p.add_argument("results", type=Path, nargs="+", metavar="RESULTS.json", help="results")
@@ -195,12 +195,12 @@ def _identify(options: argparse.Namespace) -> int:
 
 
 def add_recover(commands: Any) -> None:
-    """`driveby recover`: rewrite a recording that is damaged or was cut off."""
+    """`driveby recover`: rewrite a damaged or truncated recording."""
     p = command(
         commands,
         "recover",
         _recover,
-        "rewrite a recording that is damaged or was cut off",
+        "rewrite a damaged or truncated recording",
         "driveby recover run.mcap -o whole.mcap",
     )
     p.add_argument("recording", type=Path, metavar="REC.mcap", help="recording, stays as it is")

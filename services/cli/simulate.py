@@ -100,13 +100,13 @@ def _add_surface(p: Any) -> None:
         "--drive-seed",
         type=whole("a seed", 0),
         metavar="SEED",
-        help="of noise and of the place across the lane (default: --seed, which is the road's)",
+        help="seed of noise and lateral position (default: --seed, which also seeds the road)",
     )
     p.add_argument(
         "--road-surface",
         action="store_true",
-        help="the road is rough across too, so that the axles feel different roads "
-        "(default: one groove under both)",
+        help="simulate a 2-D road surface, so that the axles follow different profiles "
+        "(default: one profile for both)",
     )
     p.add_argument(
         "--tyres",
@@ -162,7 +162,8 @@ def _add_beyond(p: Any) -> None:
             (0, 1000),
         ),
         metavar="N:M_PER_S:S",
-        help="a lorry of this weight and speed left so long before the truck comes on",
+        help="weight and speed of a vehicle that left the bridge, and seconds between its exit "
+        "and the truck's entry",
     )
     p.add_argument(
         "--friction",
@@ -183,7 +184,7 @@ def _add_beyond(p: Any) -> None:
         type=number("a share", low=0, high=0.9),
         default=0.0,
         metavar="SHARE",
-        help="dampers act so much more in rebound, and less in compression",
+        help="damper asymmetry: stronger in rebound, weaker in compression by this share",
     )
     p.add_argument(
         "--air-springs",

@@ -33,7 +33,7 @@ def add_survey(commands: Any) -> None:
         commands,
         "survey",
         _survey,
-        "say, before anyone drives, how well each element will be known and what helps most",
+        "plan a survey: expected accuracy, detection probability, most useful change",
         "driveby survey --site site.toml --loss 0.2 --crossings 12 --figure plan.png",
     )
     add_site(
@@ -46,7 +46,7 @@ def add_survey(commands: Any) -> None:
         type=number("a share of EI", low=0.01, high=0.95, hint="20 % is 0.2"),
         default=0.2,
         metavar="SHARE",
-        help="of its rigidity that an element has lost and that is to be seen (default: 0.2)",
+        help="stiffness loss to detect, as a share of EI (default: 0.2)",
     )
     p.add_argument(
         "--crossings",

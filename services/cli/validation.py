@@ -101,12 +101,12 @@ def _some_of(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
 
 
 def add_validate(commands: Any) -> None:
-    """`driveby validate`: identify simulated crossings and compare with the truth and the paper."""
+    """`driveby validate`: compare simulated crossings with the truth and the paper."""
     p = command(
         commands,
         "validate",
         _validate,
-        "identify simulated crossings and compare with the truth and the paper",
+        "identify simulated crossings and compare them with the truth and the paper",
         "driveby validate --scenarios 1,6,12 --noise 25 --json validation.json",
     )
     p.add_argument(
@@ -155,7 +155,7 @@ def add_validate(commands: Any) -> None:
         "--worlds",
         type=whole("a number of crossings", 0),
         default=0,
-        help="with more physics than the method has, for each effect (default: 0)",
+        help="number of crossings for each out-of-model effect (default: 0)",
     )
     p.add_argument(
         "--effects",

@@ -8,12 +8,12 @@ from services.common.endpoints import LOOPBACK, default_endpoint
 
 
 def add_view(commands: Any) -> None:
-    """`driveby view`: look at a recording or a result."""
+    """`driveby view`: open a recording, a result or the live bus in the Rerun viewer."""
     p = command(
         commands,
         "view",
         _view,
-        "look at a recording or a result",
+        "open a recording, a result or the live bus in the Rerun viewer",
         "driveby view run.mcap --web",
     )
     p.add_argument(
@@ -29,7 +29,7 @@ def add_view(commands: Any) -> None:
     live.add_argument(
         "--serve",
         action="store_true",
-        help="open nothing; viewers that connect get all that there was",
+        help="serve only; viewers that connect later receive the buffered history",
     )
     live.add_argument(
         "--listen",

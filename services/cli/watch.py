@@ -28,7 +28,7 @@ def add_watch(commands: Any) -> None:
         commands,
         "watch",
         _watch,
-        "trucks, crossings and results as they come, in the terminal",
+        "show trucks, crossings and results in the terminal as they arrive",
         "driveby watch --realm sim-demo",
     )
     add_endpoint(p)
