@@ -92,7 +92,6 @@ NOT_RUN = {
     "make mutants MUTANTS=30 SEED=1": LONG,
     "make up": "needs a container engine; tests/contract/test_compose.py reads its files",
     "make down": "needs a container engine",
-    "sh tests/containers/images.sh": "needs a container engine, and root",
     "make docs": "needs a network the first time; tests/contract/test_site.py builds the site",
     'pip install ".[notebook]"': NETWORK,
     'pip install "driveby[notebook]"': NETWORK,

@@ -1,13 +1,13 @@
 """The repository's pages: links lead somewhere, every command named is there."""
 
 import re
+import runpy
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from schemas.site_file import load_site
-from services.cli import main as cli
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(
@@ -33,17 +33,15 @@ def test_links_lead_somewhere(page: Path):
             assert anchor in {slug(heading) for heading in headings}, f"no heading for {target}"
 
 
-def commands(text: str) -> set[str]:
-    return set(re.findall(r"`driveby ([a-z]+)`", text))
+def test_commands_page_is_that_of_the_parser():
+    script = runpy.run_path(str(ROOT / "docs/scripts/commands_page.py"))
+    page, made = script["PAGE"].read_text(), script["page"]()
+    assert page == made, "docs/commands.md is old: run python docs/scripts/commands_page.py"
+    assert len(re.findall(r"^\| `driveby [a-z]+` \|", page, re.MULTILINE)) >= 25
 
 
-def test_readme_lists_exactly_the_commands_that_there_are(capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit):
-        cli.main(["--help"])
-    overview = capsys.readouterr().out.split("COMMAND", 2)[-1]
-    offered = set(re.findall(r"^    ([a-z]+)\b", overview, re.MULTILINE))
-    assert offered, overview
-    assert commands((ROOT / "README.md").read_text()) == offered
+def test_readme_is_read_in_two_minutes():
+    assert len((ROOT / "README.md").read_text().split()) <= 900
 
 
 def test_example_site_file_is_accepted():
