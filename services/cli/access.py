@@ -20,16 +20,23 @@ def add_certs(commands: Any) -> None:
         "folder",
         type=Path,
         metavar="FOLDER",
-        help="made by the first run, with an authority, router, logger, worker, viewer and replay",
+        help="folder of credentials; the first run makes an authority, router, logger, worker, "
+        "viewer and replay",
     )
     p.add_argument(
         "--cluster",
         action="store_true",
-        help="make an authority for a Dask cluster instead, with scheduler, cluster-worker, client",
+        help="make an authority for a Dask cluster, with scheduler, cluster-worker and client",
     )
-    p.add_argument("--trucks", type=names, default=(), metavar="ID,…", help="add these trucks")
     p.add_argument(
-        "--add", type=names, default=(), metavar="ROLE/NAME,…", help="add e.g. viewer/anna"
+        "--trucks", type=names, default=(), metavar="ID,…", help="names of trucks to add"
+    )
+    p.add_argument(
+        "--add",
+        type=names,
+        default=(),
+        metavar="ROLE/NAME,…",
+        help="roles to add, e.g. viewer/anna",
     )
     p.add_argument(
         "--host",
@@ -46,10 +53,14 @@ def add_certs(commands: Any) -> None:
         help="how long the new certificates are valid (default: 365)",
     )
     p.add_argument(
-        "--renew", type=names, default=(), metavar="NAME,…", help="new key and certificate"
+        "--renew",
+        type=names,
+        default=(),
+        metavar="NAME,…",
+        help="names that get a new key and certificate",
     )
     p.add_argument(
-        "--revoke", type=names, default=(), metavar="NAME,…", help="these may no longer take part"
+        "--revoke", type=names, default=(), metavar="NAME,…", help="names to exclude from now on"
     )
 
 

@@ -32,13 +32,18 @@ def add_alarm(commands: Any) -> None:
         "driveby alarm check --history history",
     )
     p.add_argument("what", choices=_WHAT, help="check | list | ack BRIDGE | serve")
-    p.add_argument("bridge", nargs="?", help="of which the alarm is acknowledged")
+    p.add_argument("bridge", nargs="?", help="bridge whose alarm is acknowledged")
     add_history_folder(p)
-    p.add_argument("--realm", help="of a bridge that is in several")
-    p.add_argument("--by", metavar="NAME", help="with ack: who takes note of it")
-    p.add_argument("--note", default="", metavar="TEXT", help="with ack: what was found or done")
+    p.add_argument("--realm", help="realm of the bridge, where it is in several")
+    p.add_argument("--by", metavar="NAME", help="with ack: name of the person who acknowledges")
     p.add_argument(
-        "--period", choices=("day", "week", "month"), default="week", help="(default: week)"
+        "--note", default="", metavar="TEXT", help="with ack: finding or action, as a note"
+    )
+    p.add_argument(
+        "--period",
+        choices=("day", "week", "month"),
+        default="week",
+        help="period of fusion (default: week)",
     )
     p.add_argument(
         "--false-alarms",
@@ -62,14 +67,19 @@ def add_alarm(commands: Any) -> None:
         help="smallest change of EI of interest; an alarm is raised when a change is larger with "
         "97.5 %% probability (default: 5)",
     )
-    p.add_argument("--all", action="store_true", help="look at all bridges again")
-    p.add_argument("--processes", type=whole("a number", 1, 256), default=1, help="(default: 1)")
+    p.add_argument("--all", action="store_true", help="check all bridges again")
+    p.add_argument(
+        "--processes",
+        type=whole("a number", 1, 256),
+        default=1,
+        help="number of processes (default: 1)",
+    )
     p.add_argument(
         "--every",
         type=number("minutes", low=0.01, high=1e5),
         default=60.0,
         metavar="MINUTES",
-        help="with serve: between two checks (default: 60)",
+        help="with serve: minutes between two checks (default: 60)",
     )
     add_endpoint(p)
 

@@ -30,10 +30,10 @@ def add_catalog(commands: Any) -> None:
     p.add_argument(
         "--verify",
         action="store_true",
-        help="read every recording and compare it with its row, also where size and time agree",
+        help="read every recording and compare it with its row, even where size and time agree",
     )
     add_site(p, "list crossings of its bridges, from positions alone")
-    text = "write all crossings (with --site) or recordings here"
+    text = "CSV file of all crossings (with --site) or recordings"
     add_output_file(p, "--csv", "OUT.csv", text, CATALOG_CSV, CROSSINGS_CSV)
 
 

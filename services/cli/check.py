@@ -33,9 +33,9 @@ def add_check(commands: Any) -> None:
         "--template",
         type=OutputFile(()),
         metavar="NEW.toml",
-        help="write a site file to start from, with what each key means, and check nothing",
+        help="write a commented site file to start from, and check nothing",
     )
-    p.add_argument("--json", action="store_true", help="everything, as JSON")
+    p.add_argument("--json", action="store_true", help="print all findings as JSON")
 
 
 def _check(options: argparse.Namespace) -> int:

@@ -34,13 +34,13 @@ def add_cluster(commands: Any) -> None:
         type=whole("a number of workers", 1, _MOST),
         default=_cores(),
         metavar="N",
-        help="(default: as many as there are processors)",
+        help="number of workers (default: one for each processor)",
     )
     p.add_argument(
         "--port",
         type=whole("a port", 1, 65535),
         default=8786,
-        help="of the scheduler (default: 8786)",
+        help="port of the scheduler (default: 8786)",
     )
     p.add_argument(
         "--listen",
@@ -52,13 +52,14 @@ def add_cluster(commands: Any) -> None:
         "--tls",
         type=Path,
         metavar="FOLDER",
-        help="made by `driveby certs FOLDER --cluster`: scheduler, cluster-worker and client in it",
+        help="folder made by `driveby certs FOLDER --cluster`, with scheduler, cluster-worker "
+        "and client",
     )
     p.add_argument(
         "--memory",
         default="auto",
         metavar="SIZE",
-        help="what a worker may hold, e.g. 2GiB (default: auto, its share of this machine's)",
+        help="memory limit of a worker, e.g. 2GiB (default: auto, its share of this machine's)",
     )
 
 
@@ -67,14 +68,14 @@ def add_scheduler(p: Any) -> None:
     p.add_argument(
         "--scheduler",
         metavar="processes|processes:N|tcp://…|tls://…",
-        help="identify in so many processes of this machine (default N: as many as there are "
-        "processors), or on a Dask cluster; the results are the same",
+        help="number of processes on this machine (default N: one for each processor), or "
+        "address of a Dask cluster; the results are the same",
     )
     p.add_argument(
         "--batch",
         type=whole("a number of crossings", 1, 200),
         metavar="N",
-        help="crossings in one task of a cluster (default: 50)",
+        help="number of crossings in one task of a cluster (default: 50)",
     )
     p.add_argument(
         "--patience",
@@ -82,9 +83,7 @@ def add_scheduler(p: Any) -> None:
         metavar="S",
         help="seconds to wait for a lost scheduler or for workers (default: 300)",
     )
-    p.add_argument(
-        "--tls", type=Path, metavar="FOLDER", help="credentials of a client of a cluster"
-    )
+    p.add_argument("--tls", type=Path, metavar="FOLDER", help="credentials of a cluster's client")
 
 
 def check_scheduler(options: argparse.Namespace) -> None:

@@ -31,14 +31,17 @@ def add_export(commands: Any) -> None:
     )
     add_output_folder(p, "--to", "folder for the files", required=True)
     p.add_argument(
-        "--format", choices=("csv", "parquet"), default="csv", help="of the tables (default: csv)"
+        "--format",
+        choices=("csv", "parquet"),
+        default="csv",
+        help="format of the tables (default: csv)",
     )
     p.add_argument(
         "--sensorthings",
         action="store_true",
-        help="results as entities of OGC SensorThings API 1.1 too",
+        help="also export results as entities of OGC SensorThings API 1.1",
     )
-    add_site(p, "where bridges are (default: as the recordings say)")
+    add_site(p, "site file of the bridges (default: that of the recordings)")
 
 
 def _export(options: argparse.Namespace) -> int:

@@ -47,9 +47,14 @@ def add_history(commands: Any) -> None:
         "nothing: all bridges in a table",
     )
     add_history_folder(p)
-    p.add_argument("--realm", help="where a bridge is in several (default: the one there is)")
     p.add_argument(
-        "--period", choices=("day", "week", "month"), default="month", help="(default: month)"
+        "--realm", help="realm of the bridge, where it is in several (default: the only one)"
+    )
+    p.add_argument(
+        "--period",
+        choices=("day", "week", "month"),
+        default="month",
+        help="period of fusion (default: month)",
     )
     add_file(
         p, "--temperature", "T.csv", "with add: time_s,temperature_deg_c[,bridge] beside crossings"
@@ -59,20 +64,24 @@ def add_history(commands: Any) -> None:
         action="store_true",
         help="with add: postpone fusion until the bridge is first shown",
     )
-    text = "write a row for each period and element here"
+    text = "CSV file with a row for each period and element"
     add_output_file(p, "--csv", "OUT.csv", text, HISTORY_CSV)
-    add_output_file(p, "--json", "OUT.json", "write periods and alarms here", HISTORY_JSON)
-    add_output_folder(p, "--figures", "draw the bridge over time here, as PNG and SVG")
-    add_output_file(p, "--rrd", "OUT.rrd", "write EI over time for Rerun here", RERUN)
-    p.add_argument("--view", action="store_true", help="look at EI over time in the Rerun viewer")
-    p.add_argument("--web", action="store_true", help="look at it in the browser")
-    p.add_argument("--sql", metavar="SELECT …", help="ask about the table crossings (DuckDB)")
+    add_output_file(p, "--json", "OUT.json", "JSON file of periods and alarms", HISTORY_JSON)
+    add_output_folder(p, "--figures", "folder for figures of the bridge over time, as PNG and SVG")
+    add_output_file(p, "--rrd", "OUT.rrd", "Rerun file of EI over time", RERUN)
+    p.add_argument("--view", action="store_true", help="open EI over time in the Rerun viewer")
+    p.add_argument("--web", action="store_true", help="open it in the browser")
+    p.add_argument("--sql", metavar="SELECT …", help="query of the table crossings (DuckDB)")
 
 
 def add_history_folder(p: argparse.ArgumentParser) -> None:
     """`--history`: where a history lies."""
     p.add_argument(
-        "--history", type=Path, default=HISTORY, metavar="DIR", help="(default: history)"
+        "--history",
+        type=Path,
+        default=HISTORY,
+        metavar="DIR",
+        help="folder of the history (default: history)",
     )
 
 

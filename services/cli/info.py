@@ -36,8 +36,8 @@ def add_info(commands: Any) -> None:
         metavar="REC.mcap|DIR",
         help="recordings, or folders with recordings below",
     )
-    add_site(p, "where bridges are (default: as each recording says)")
-    p.add_argument("--json", action="store_true", help="everything, as JSON")
+    add_site(p, "site file of the bridges (default: that of each recording)")
+    p.add_argument("--json", action="store_true", help="print all findings as JSON")
 
 
 def _info(options: argparse.Namespace) -> int:

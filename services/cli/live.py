@@ -34,12 +34,12 @@ def add_demo(commands: Any) -> None:
         "simulate, publish, record, identify and draw one crossing",
         "driveby demo --speed 4",
     )
-    add_output_folder(p, "--out", "new folder for what it leaves behind")
+    add_output_folder(p, "--out", "new folder for the outputs")
     add_speed(p, 4.0)
     text = "accelerometers' noise density in µg/√Hz; 0: all exact, least squares (default: 25)"
     add_noise(p, text, 25.0)
-    p.add_argument("--live", action="store_true", help="watch it as it happens, in the viewer")
-    p.add_argument("--web", action="store_true", help="watch it in the browser")
+    p.add_argument("--live", action="store_true", help="show it live in the viewer")
+    p.add_argument("--web", action="store_true", help="show it live in the browser")
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -63,21 +63,21 @@ def add_logger(commands: Any) -> None:
         "record all messages of a realm and host the bus router",
         f"driveby logger --listen {DEFAULT_ENDPOINT} --folder recordings --site site.toml",
     )
-    p.add_argument("--listen", help=f"where to listen (default: {DEFAULT_ENDPOINT})")
+    p.add_argument("--listen", help=f"address to listen on (default: {DEFAULT_ENDPOINT})")
     add_tls(p)
     p.add_argument(
         "--insecure",
         action="store_true",
-        help="listen to other machines without --tls: whoever reaches the address is believed",
+        help="listen to other machines without --tls; any session that reaches the address is "
+        "accepted",
     )
     add_folder(p, "folder of the recordings")
-    add_output_file(p, "--file", "REC.mcap", "put everything into this one new file")
+    add_output_file(p, "--file", "REC.mcap", "single new file for all messages")
     p.add_argument(
         "--realm",
         action="append",
         metavar="REALM",
-        help="record this realm, or those that begin so, e.g. sim-* (*: all); may be given again "
-        "(default: live)",
+        help="realm to record, or pattern such as sim-* (*: all); repeatable (default: live)",
     )
     add_site(p, "site file to store in the recordings")
     add_id(p, "logger")
@@ -87,7 +87,7 @@ def add_logger(commands: Any) -> None:
         type=number("minutes", low=0.01, high=1e6),
         default=15.0,
         metavar="MIN",
-        help="begin a truck's next file after so long (default: 15; SIGUSR1: at once)",
+        help="start a truck's next file after this many minutes (default: 15; SIGUSR1: at once)",
     )
     room.add_argument(
         "--rotate-mb",
@@ -107,8 +107,8 @@ def add_logger(commands: Any) -> None:
         "--budget",
         type=number("a size in MB", low=1, high=1e9),
         metavar="MB",
-        help="delete the oldest recordings beyond it, if all of their crossings are identified "
-        "(default: delete nothing)",
+        help="limit of disk space for recordings; the oldest whose crossings are all identified "
+        "are deleted beyond it (default: delete nothing)",
     )
 
 
@@ -149,7 +149,7 @@ def add_worker(commands: Any) -> None:
     add_realm(p)
     add_site(p, "trucks and bridges", required=True)
     add_folder(p, "folder of the results")
-    text = "put the results into this one new file (and .json)"
+    text = "single new file for the results (and .json)"
     add_output_file(p, "--file", "RESULTS.mcap", text)
     add_method(p)
     p.add_argument(
@@ -157,40 +157,42 @@ def add_worker(commands: Any) -> None:
         type=whole("processes", 1, 256),
         default=1,
         metavar="N",
-        help="identify so many crossings at once, beside the process that listens (default: 1)",
+        help="number of crossings identified at once, in addition to the listening process "
+        "(default: 1)",
     )
     p.add_argument(
         "--limit",
         type=number("seconds", low=1, high=1e6),
         metavar="S",
-        help="processor time that a crossing may take; then it is tried once more (default: 900)",
+        help="CPU time limit per crossing in s; on excess the crossing is retried once (default: "
+        "900)",
     )
     add_id(p, "worker")
     first = p.add_mutually_exclusive_group()
     first.add_argument(
         "--validate-first",
         action="store_true",
-        help="identify nothing before simulated crossings of the same truck on the same bridge "
-        "have shown that the method works there (always so in realm live)",
+        help="identify only truck and bridge pairs that have passed a site validation by "
+        "simulation (always so in realm live)",
     )
     first.add_argument(
         "--no-certificates",
         action="store_true",
         help="identify in realm live without site validation",
     )
-    add_certificates(p, "where certificates are kept (default: certificates in --folder)")
+    add_certificates(p, "folder of certificates (default: certificates in --folder)")
     p.add_argument(
         "--recordings",
         type=Path,
         metavar="DIR",
-        help="the logger's --folder, for crossings that trucks do not send any more "
+        help="folder of the logger's recordings, for crossings that trucks no longer send "
         "(default: --folder)",
     )
     p.add_argument(
         "--recordings-days",
         type=number("days", low=0, high=3650),
         metavar="DAYS",
-        help="so far back (default: 2; 0: nothing is taken from recordings)",
+        help="age in days of the oldest recordings to catch up from (default: 2; 0: none)",
     )
 
 
@@ -231,9 +233,9 @@ def add_truck(commands: Any) -> None:
         "recording",
         type=Path,
         metavar="REC.mcap | DIR",
-        help="what the truck will measure: a recording, or a folder of CSV files with --site",
+        help="measurements to publish: a recording, or a folder of CSV files with --site",
     )
-    add_site(p, "of a folder of CSV files (a recording carries its own)")
+    add_site(p, "site file for a folder of CSV files (a recording carries its own)")
     _add_spool(p)
     add_endpoint(p)
     add_realm(p)
@@ -241,9 +243,13 @@ def add_truck(commands: Any) -> None:
     p.add_argument(
         "--skip-gaps",
         action="store_true",
-        help="do not wait where nothing was recorded for over 2 s, as between runs",
+        help="skip gaps of more than 2 s, as between runs",
     )
-    p.add_argument("--vehicle", metavar="ID", help="which one drives, if there are several")
+    p.add_argument(
+        "--vehicle",
+        metavar="ID",
+        help="identifier of the vehicle to publish, where there are several",
+    )
 
 
 def _add_spool(p: argparse.ArgumentParser) -> None:
@@ -251,14 +257,15 @@ def _add_spool(p: argparse.ArgumentParser) -> None:
         "--spool",
         type=Path,
         metavar="DIR",
-        help="keep every message here, too, until a logger has it; one folder for each truck",
+        help="folder that keeps every message until a logger has it; one for each truck",
     )
     p.add_argument(
         "--spool-budget",
         type=whole("MiB", 1, 1 << 30),
         default=4096,
         metavar="MIB",
-        help="room for the spool; over it the oldest is given up (default: 4096)",
+        help="size limit of the spool in MiB; beyond it the oldest messages are dropped (default: "
+        "4096)",
     )
 
 
@@ -293,10 +300,10 @@ def add_gateway(commands: Any) -> None:
         "--ros",
         required=True,
         metavar="ENDPOINT",
-        help="where rmw_zenoh's router listens, e.g. tcp/127.0.0.1:7447",
+        help="address of rmw_zenoh's router, e.g. tcp/127.0.0.1:7447",
     )
-    add_site(p, "the truck, and its topics in [ros2]", required=True)
-    p.add_argument("--vehicle", metavar="ID", help="which of the site's vehicles it is")
+    add_site(p, "site file of the truck, with its topics in [ros2]", required=True)
+    p.add_argument("--vehicle", metavar="ID", help="identifier of the site's vehicle")
     _add_spool(p)
     add_endpoint(p)
     add_realm(p)
@@ -327,7 +334,7 @@ def add_health(commands: Any) -> None:
         "query the health of a logger or worker over the bus",
         "driveby health logger",
     )
-    p.add_argument("service", metavar="ID", help="its --id, as logger or worker")
+    p.add_argument("service", metavar="ID", help="the service's --id, such as logger or worker")
     add_endpoint(p)
     add_realm(p)
 

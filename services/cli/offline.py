@@ -42,8 +42,8 @@ def add_import(commands: Any) -> None:
         help="a folder with accel_NN.csv and gps_NN.csv, one such pair, a comma2k19 segment, "
         "or a recording of ROS 2 (a rosbag2 folder, .mcap, .db3)",
     )
-    add_site(p, "what was driven, over which bridges; is stored in the recording", required=True)
-    p.add_argument("--vehicle", metavar="ID", help="which of the site's vehicles drove")
+    add_site(p, "site file of truck and bridges; stored in the recording", required=True)
+    p.add_argument("--vehicle", metavar="ID", help="identifier of the site's vehicle that drove")
     p.add_argument("--name", help="realm import-NAME (default: name of the folder)")
     add_output(p)
 
@@ -93,16 +93,18 @@ def add_identify(commands: Any) -> None:
         metavar="REC.mcap",
         help="recordings, also as s3://…; with --into also folders of them",
     )
-    add_site(p, "(default: the site stored in the recording)")
+    add_site(p, "site file (default: the site stored in the recording)")
     add_method(p)
-    add_output_file(p, "--json", "OUT.json", "write the results here", RESULTS)
-    add_output_file(p, "--rrd", "OUT.rrd", "write a Rerun recording here", RERUN)
-    text = "write the draws of method pre here, for ArviZ"
+    add_output_file(p, "--json", "OUT.json", "JSON file of the results", RESULTS)
+    add_output_file(p, "--rrd", "OUT.rrd", "Rerun file of the results", RERUN)
+    text = "file of the posterior draws of method pre, for ArviZ"
     add_output_file(p, "--draws", "OUT.npz|OUT.nc", text, ARRAYS, NETCDF)
-    add_output_folder(p, "--figures", "draw every crossing and bridge here, as PNG and SVG")
+    add_output_folder(
+        p, "--figures", "folder for figures of every crossing and bridge, as PNG and SVG"
+    )
     _add_fusing(p)
     add_certificates(
-        p, f"certificates that results name where there are such (default: {CERTIFICATES})"
+        p, f"folder of the certificates that results refer to (default: {CERTIFICATES})"
     )
     add_seed(p)
     group = p.add_argument_group("many crossings")
@@ -110,8 +112,8 @@ def add_identify(commands: Any) -> None:
         "--into",
         type=folder_here,
         metavar="DIR",
-        help="keep every result here as soon as there is one, and go on from what is there; what "
-        "cannot be read is told and left out (exit code 3)",
+        help="store each result here as it is computed; run again to resume. Unreadable input is "
+        "listed and skipped (exit code 3)",
     )
     add_scheduler(group)
 
@@ -121,7 +123,7 @@ def _add_fusing(p: argparse.ArgumentParser) -> None:
         p,
         "--baseline",
         "OLD.json",
-        "results with which the bridge is compared (default: what the site file names)",
+        "results that the bridge is compared with (default: those that the site file names)",
     )
     p.add_argument(
         "--fuse-suspect",
@@ -140,7 +142,7 @@ def add_fuse(commands: Any) -> None:
         "driveby fuse monday.json tuesday.json --json week.json",
     )
     p.add_argument("results", type=Path, nargs="+", metavar="RESULTS.json", help="results")
-    text = "write all crossings and the fused estimates here"
+    text = "JSON file of all crossings and the fused estimates"
     add_output_file(p, "--json", "OUT.json", text, RESULTS)
     _add_fusing(p)
 
@@ -203,18 +205,20 @@ def add_recover(commands: Any) -> None:
         "rewrite a damaged or truncated recording",
         "driveby recover run.mcap -o whole.mcap",
     )
-    p.add_argument("recording", type=Path, metavar="REC.mcap", help="recording, stays as it is")
+    p.add_argument(
+        "recording", type=Path, metavar="REC.mcap", help="recording to rewrite; left as it is"
+    )
     p.add_argument(
         "-o",
         "--output",
         type=OutputFile((MCAP,)),
         metavar="OUT.mcap",
-        help="(default: REC.recovered.mcap beside it)",
+        help="recording to write (default: REC.recovered.mcap beside it)",
     )
     p.add_argument(
         "--set-aside",
         action="store_true",
-        help="then rename the damaged one to REC.mcap.crashed",
+        help="rename the damaged recording to REC.mcap.crashed afterwards",
     )
     add_force(p)
     p.add_argument("--json", action="store_true", help="print the counts as JSON")

@@ -59,15 +59,18 @@ def add_common(parser: argparse.ArgumentParser, *, suppressed: bool) -> None:
         return argparse.SUPPRESS if suppressed else value
 
     group = parser.add_argument_group("messages")
-    group.add_argument("--verbose", action="store_true", default=default(False), help="say more")
+    group.add_argument("--verbose", action="store_true", default=default(False), help="log more")
     group.add_argument(
         "--log-format",
         choices=("text", "json"),
         default=default("text"),
-        help="of the messages on standard error (default: text)",
+        help="format of log lines on standard error (default: text)",
     )
     group.add_argument(
-        "--debug", action="store_true", default=default(False), help="tracebacks of internal errors"
+        "--debug",
+        action="store_true",
+        default=default(False),
+        help="show tracebacks of internal errors",
     )
 
 
@@ -151,7 +154,7 @@ def add_force(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--force",
         action="store_true",
-        help="replace a recording of that name, unless it is being written",
+        help="replace an existing recording, unless it is being written",
     )
 
 
@@ -188,7 +191,9 @@ def add_certificates(p: Any, text: str) -> None:
 
 def add_seed(p: argparse.ArgumentParser) -> None:
     """`--seed` of everything that is drawn."""
-    p.add_argument("--seed", type=whole("a seed", 0), default=1, help="(default: 1)")
+    p.add_argument(
+        "--seed", type=whole("a seed", 0), default=1, help="seed of all random numbers (default: 1)"
+    )
 
 
 def add_noise(p: argparse.ArgumentParser, text: str, default: float = 0.0) -> None:
@@ -205,7 +210,7 @@ def add_speed(p: Any, default: float, zero: str = "") -> None:
         type=number("a factor", low=0 if zero else 1e-3, high=1e6),
         default=default,
         metavar="FACTOR",
-        help=f"times real speed{', ' + zero if zero else ''} (default: {default:g})",
+        help=f"speed over real time{', ' + zero if zero else ''} (default: {default:g})",
     )
 
 
@@ -222,7 +227,7 @@ def add_method(p: argparse.ArgumentParser) -> None:
 
 def add_endpoint(p: Any) -> None:
     """`--endpoint` and `--tls`: where the bus is, and who one is there."""
-    p.add_argument("--endpoint", help=f"where the logger listens (default: {DEFAULT_ENDPOINT})")
+    p.add_argument("--endpoint", help=f"address of the logger (default: {DEFAULT_ENDPOINT})")
     add_tls(p)
 
 
@@ -239,7 +244,7 @@ def add_tls(p: Any) -> None:
 
 def add_realm(p: Any) -> None:
     """`--realm`."""
-    p.add_argument("--realm", default="live", help="(default: live)")
+    p.add_argument("--realm", default="live", help="realm on the bus (default: live)")
 
 
 def add_id(p: argparse.ArgumentParser, default: str) -> None:

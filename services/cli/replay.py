@@ -36,35 +36,35 @@ def add_replay(commands: Any) -> None:
     )
     add_endpoint(p)
     p.add_argument("--name", help="realm replay-NAME (default: name of the first recording)")
-    add_site(p, "where bridges are, for jumps to crossings (default: as the recording says)")
+    add_site(p, "site file of the bridges, for jumps to crossings (default: that of the recording)")
     when = p.add_argument_group("when")
     add_speed(when, 1.0, zero="0 for as fast as possible")
     when.add_argument(
         "--start",
         metavar="S|TIME",
-        help="begin so many seconds into the drive, or at a time in UTC (2026-09-21T22:33:20)",
+        help="start in seconds into the drive, or as a time in UTC (2026-09-21T22:33:20)",
     )
     until = when.add_mutually_exclusive_group()
-    until.add_argument("--end", metavar="S|TIME", help="end there, given as for --start")
+    until.add_argument("--end", metavar="S|TIME", help="end, given as for --start")
     until.add_argument(
         "--duration",
         type=number("seconds", low=1e-3, high=1e9),
         metavar="S",
-        help="end after so many seconds of the drive",
+        help="duration in seconds of the drive",
     )
-    when.add_argument("--skip-gaps", action="store_true", help="pass over silence of over 2 s")
+    when.add_argument("--skip-gaps", action="store_true", help="skip gaps of more than 2 s")
     when.add_argument(
         "--loop",
         action="store_true",
-        help="again and again (loggers and workers take the first time only)",
+        help="repeat without end (loggers and workers take the first pass only)",
     )
     when.add_argument("--paused", action="store_true", help="begin paused; needs a terminal")
     what = p.add_argument_group("what")
     patterns = "patterns with * and ?, commas between, of STREAM or OWNER/ID/STREAM"
     for option, text in (
         ("--topics", f"only these: {patterns} (accel,gnss or vehicle/*/accel)"),
-        ("--exclude", "all but these, given as for --topics"),
-        ("--vehicle", "only what these trucks say, and no results"),
+        ("--exclude", "topics to leave out, given as for --topics"),
+        ("--vehicle", "publish the messages of these trucks only, and no results"),
     ):
         metavar = "ID" if option == "--vehicle" else "PATTERN"
         what.add_argument(

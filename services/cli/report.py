@@ -18,7 +18,11 @@ def add_report(commands: Any) -> None:
         "driveby report drive.json --site site.toml -o report.html",
     )
     p.add_argument(
-        "results", type=Path, nargs="+", metavar="RESULTS.json", help="of identify or a worker"
+        "results",
+        type=Path,
+        nargs="+",
+        metavar="RESULTS.json",
+        help="results of identify or of a worker",
     )
     p.add_argument(
         "-o",
@@ -26,16 +30,19 @@ def add_report(commands: Any) -> None:
         type=OutputFile((HTML,)),
         default=Path("report.html"),
         metavar="OUT.html",
-        help="(default: report.html)",
+        help="HTML file to write (default: report.html)",
     )
     p.add_argument(
-        "--pdf", action="store_true", help="print it as OUT.pdf too, by an installed browser"
+        "--pdf", action="store_true", help="also print it to OUT.pdf with an installed browser"
     )
-    add_site(p, "where bridges are (default: of a recording in the folder of the results)")
+    add_site(p, "site file of the bridges (default: that of a recording in the results' folder)")
     add_file(p, "--baseline", "OLD.json", "results to compare with (default: the site file's)")
     add_file(p, "--history", "DIR", "add a page with each bridge over time, from this history")
     p.add_argument(
-        "--period", choices=("day", "week", "month"), default="month", help="(default: month)"
+        "--period",
+        choices=("day", "week", "month"),
+        default="month",
+        help="period of fusion (default: month)",
     )
 
 

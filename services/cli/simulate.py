@@ -46,7 +46,7 @@ def add_simulate(commands: Any) -> None:
         "--ei",
         type=_ratios,
         metavar="1,1,.4,…",
-        help="flexural rigidity of each element as a ratio to the sound value",
+        help="flexural rigidity of each element over its undamaged value",
     )
     add_site(p, "truck and bridge (default: those of the paper)")
     p.add_argument(
@@ -59,23 +59,26 @@ def add_simulate(commands: Any) -> None:
         type=_speed_range,
         default=(10.0, 10.0),
         metavar="M_PER_S",
-        help="a speed, or START:END for a change along the way (default: 10)",
+        help="speed in m/s, or START:END for a constant acceleration (default: 10)",
     )
     p.add_argument(
         "--direction",
         choices=("start_to_end", "end_to_start"),
         default="start_to_end",
-        help="(default: start_to_end)",
+        help="direction of travel (default: start_to_end)",
     )
     receiver = p.add_mutually_exclusive_group()
     receiver.add_argument(
-        "--gps-noise", dest="gps_noise", action="store_true", help="errors of a real receiver"
+        "--gps-noise",
+        dest="gps_noise",
+        action="store_true",
+        help="simulate the errors of a real GNSS receiver",
     )
     receiver.add_argument(
         "--perfect-gps",
         dest="gps_noise",
         action="store_false",
-        help="exact positions and speeds (default)",
+        help="simulate exact positions and speeds (default)",
     )
     p.set_defaults(gps_noise=False)
     p.add_argument(
@@ -94,7 +97,7 @@ def _add_surface(p: Any) -> None:
         "--runs",
         type=whole("a number of runs", 1, 100),
         default=1,
-        help="over the same road, ten minutes apart, in one recording (default: 1)",
+        help="number of runs over the same road, ten minutes apart, in one recording (default: 1)",
     )
     p.add_argument(
         "--drive-seed",
@@ -111,20 +114,21 @@ def _add_surface(p: Any) -> None:
     p.add_argument(
         "--tyres",
         choices=("single", "twin"),
-        help="of the rear axle, on a surface (default: the site's, or twin)",
+        help="tyres of the rear axle, on a 2-D surface (default: the site's, or twin)",
     )
     p.add_argument(
         "--rear-offset",
         type=number("an offset in m", low=-1, high=1),
         metavar="M",
-        help="the rear axle runs so far beside the front, on a surface "
-        "(default: the site's, or 0.005)",
+        help="lateral offset of the rear from the front axle in m, on a 2-D surface (default: "
+        "the site's, or 0.005)",
     )
     p.add_argument(
         "--wander",
         type=number("a standard deviation in m", low=0, high=2),
         metavar="M",
-        help="of the truck's place across the lane from run to run, on a surface (default: 0)",
+        help="standard deviation of the lateral position from run to run in m, on a 2-D surface "
+        "(default: 0)",
     )
 
 
@@ -145,13 +149,13 @@ def _add_beyond(p: Any) -> None:
         type=numbers("rotational stiffnesses in N·m/rad (START:END)", (0, 1e13), (0, 1e13)),
         default=(0.0, 0.0),
         metavar="START:END",
-        help="the ends turn against springs of so many N·m/rad",
+        help="rotational stiffness of the supports in N·m/rad",
     )
     p.add_argument(
         "--bearing-stiffness",
         type=numbers("vertical stiffnesses in N/m (START:END)", (1e7, 1e15), (1e7, 1e15)),
         metavar="START:END",
-        help="the ends sink on bearings of so many N/m",
+        help="vertical stiffness of the bearings in N/m",
     )
     p.add_argument(
         "--left",
@@ -170,14 +174,14 @@ def _add_beyond(p: Any) -> None:
         type=number("a share of the springs' load", low=0, high=0.5),
         default=0.0,
         metavar="SHARE",
-        help="dry friction of the springs over their static load",
+        help="suspension friction over the static load",
     )
     p.add_argument(
         "--friction-growth",
         type=number("a growth with the load", low=0, high=1),
         default=0.0,
         metavar="SHARE",
-        help="of the friction with the load: 1 is proportional",
+        help="share of the friction that grows with the load; 1: proportional",
     )
     p.add_argument(
         "--bilinear",
@@ -191,7 +195,7 @@ def _add_beyond(p: Any) -> None:
         type=number("a polytropic exponent", low=1, high=2),
         default=0.0,
         metavar="EXPONENT",
-        help="of the air in the springs: 1.38 is usual",
+        help="polytropic exponent of air springs; 1.38 is usual",
     )
     p.add_argument(
         "--lane-offset",

@@ -38,7 +38,8 @@ def add_survey(commands: Any) -> None:
     )
     add_site(
         p,
-        "truck, bridge and sensors, as docs/site.example.toml; the first vehicle and bridge count",
+        "site file of truck, bridge and sensors, as docs/site.example.toml; its first vehicle "
+        "and bridge are used",
         required=True,
     )
     p.add_argument(
@@ -53,14 +54,14 @@ def add_survey(commands: Any) -> None:
         type=whole("a number of crossings", 1, 300),
         default=12,
         metavar="N",
-        help="how often the truck drives over the bridge (default: 12)",
+        help="number of crossings (default: 12)",
     )
     p.add_argument(
         "--speed",
         type=_speeds,
         metavar="M_PER_S",
-        help="a speed, or SLOWEST:FASTEST that are possible: planned is the site's "
-        "survey_speed_m_per_s or 10 m/s then (default: 5:20)",
+        help="speed in m/s, or feasible range SLOWEST:FASTEST; with a range the plan uses the "
+        "site's survey_speed_m_per_s or 10 m/s (default: 5:20)",
     )
     p.add_argument(
         "--road",
@@ -70,26 +71,27 @@ def add_survey(commands: Any) -> None:
     p.add_argument(
         "--tyres",
         choices=("single", "twin"),
-        help="of the rear axle; single: like those in front (default: by twin_tyre_distance_m in "
+        help="tyres of the rear axle; single: like the front ones (default: by "
+        "twin_tyre_distance_m in "
         "the site file, or twin)",
     )
     p.add_argument(
         "--noise",
         type=number("a noise density", low=0.1, high=1e6),
         metavar="UG_PER_RTHZ",
-        help="of all four accelerometers in µg/√Hz (default: the site's)",
+        help="noise density of all accelerometers in µg/√Hz (default: the site's)",
     )
     p.add_argument(
         "--wander",
         type=number("a standard deviation in m", low=0.01, high=1),
         default=0.12,
         metavar="M",
-        help="standard deviation of the truck's place across the lane from run to run; runs beside "
-        "each other tell more (default: 0.12)",
+        help="standard deviation of the lateral position from run to run in m; lateral wander "
+        "adds information (default: 0.12)",
     )
-    text = "draw probabilities over the number of crossings"
+    text = "file of a figure of detection probability over the number of crossings"
     add_output_file(p, "--figure", "OUT.png|OUT.svg", text, PNG, SVG)
-    add_output_file(p, "--json", "OUT.json", "write everything here", SURVEY_JSON)
+    add_output_file(p, "--json", "OUT.json", "JSON file of the whole plan", SURVEY_JSON)
 
 
 def _survey(options: argparse.Namespace) -> int:

@@ -114,7 +114,7 @@ def add_validate(commands: Any) -> None:
         type=_scenarios,
         default=tuple(SCENARIOS),
         metavar="all|1,6,12",
-        help="(default: all)",
+        help="scenarios of the paper (default: all)",
     )
     add_noise(p, "accelerometers' noise density in µg/√Hz (default: 0)")
     add_site(
@@ -122,11 +122,18 @@ def add_validate(commands: Any) -> None:
         "truck and bridge (default: those of the paper); without --method: makes a certificate "
         "for every pair of them (exit code 1 if one fails)",
     )
-    text = "write the table here"
+    text = "JSON file of the table"
     add_output_file(p, "--json", "OUT.json", text, VALIDATION_JSON, AIMS_JSON)
-    add_output_folder(p, "--figures", "write figures to this folder")
-    p.add_argument("--particles", type=whole("particles", 1), default=500, help="(default: 500)")
-    p.add_argument("--steps", type=whole("steps", 1), default=600, help="(default: 600)")
+    add_output_folder(p, "--figures", "folder for figures")
+    p.add_argument(
+        "--particles",
+        type=whole("particles", 1),
+        default=500,
+        help="number of particles (default: 500)",
+    )
+    p.add_argument(
+        "--steps", type=whole("steps", 1), default=600, help="number of steps (default: 600)"
+    )
     add_seed(p)
     p.add_argument(
         "--method",
@@ -136,20 +143,24 @@ def add_validate(commands: Any) -> None:
         "neither, but certificates)",
     )
     of_site = p.add_argument_group("certificates of --site, see docs/certificates.md")
-    of_site.add_argument("--truck", metavar="ID", help="this vehicle only (default: each)")
-    of_site.add_argument("--bridge", metavar="ID", help="this bridge only (default: each)")
-    add_certificates(of_site, f"folder to write them to (default: {CERTIFICATES})")
+    of_site.add_argument(
+        "--truck", metavar="ID", help="identifier of the only vehicle to validate (default: each)"
+    )
+    of_site.add_argument(
+        "--bridge", metavar="ID", help="identifier of the only bridge to validate (default: each)"
+    )
+    add_certificates(of_site, f"folder for certificates (default: {CERTIFICATES})")
     p.add_argument(
         "--crossings",
         type=whole("a number of crossings", 0),
         default=200,
-        help="whose truth is drawn from the priors (default: 200)",
+        help="number of crossings whose truth is drawn from the priors (default: 200)",
     )
     p.add_argument(
         "--control",
         type=whole("a number of crossings", 0),
         default=20,
-        help="of these again with half the noise declared (default: 20)",
+        help="number of them repeated with half the noise declared (default: 20)",
     )
     p.add_argument(
         "--worlds",
@@ -169,15 +180,15 @@ def add_validate(commands: Any) -> None:
         type=OutputFile((RECORDS,)),
         default=Path("build/worlds.jsonl"),
         metavar="FILE.jsonl",
-        help="what --worlds or --surveys has run is kept here and not run again "
+        help="file of finished crossings of --worlds and --surveys, which are not run again "
         "(default: build/worlds.jsonl)",
     )
     p.add_argument(
         "--surveys",
         type=whole("a number of surveys", 0),
         default=0,
-        help="of 8 to 16 crossings, of each of --kinds, fused; nothing else is run then "
-        "(default: 0)",
+        help="number of fused surveys, of 8 to 16 crossings, for each of --kinds; nothing else "
+        "is run then (default: 0)",
     )
     p.add_argument(
         "--kinds",
@@ -193,8 +204,13 @@ def add_validate(commands: Any) -> None:
         metavar="DIR",
         help="folders of crossings with a truth.json (default: ../shared/crossings)",
     )
-    p.add_argument("--processes", type=whole("processes", 1, 256), default=2, help="(default: 2)")
-    add_output_file(p, "--page", "PAGE.md", "write what was found as a page", VALIDATION_PAGE)
+    p.add_argument(
+        "--processes",
+        type=whole("processes", 1, 256),
+        default=2,
+        help="number of processes (default: 2)",
+    )
+    add_output_file(p, "--page", "PAGE.md", "Markdown page of the findings", VALIDATION_PAGE)
 
 
 def _validate_site(options: argparse.Namespace) -> int:

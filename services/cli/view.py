@@ -19,13 +19,13 @@ def add_view(commands: Any) -> None:
     p.add_argument(
         "target",
         metavar="REC|RESULT|RRD|live",
-        help="a .mcap, .json or .rrd file; live: what travels on the bus now",
+        help="a .mcap, .json or .rrd file; live: the messages on the bus",
     )
     p.add_argument("--web", action="store_true", help="in the browser")
     live = p.add_argument_group("live")
     add_endpoint(live)
     add_realm(live)
-    add_site(live, "where bridges are (without it there are results, and no plan)")
+    add_site(live, "site file of the bridges (without it results are shown, but no plan)")
     live.add_argument(
         "--serve",
         action="store_true",
@@ -38,7 +38,10 @@ def add_view(commands: Any) -> None:
         help=f"where viewers connect (default: {LOOPBACK}, this machine only)",
     )
     live.add_argument(
-        "--port", type=whole("a port", 0, 65_535), default=0, help="(default: any that is free)"
+        "--port",
+        type=whole("a port", 0, 65_535),
+        default=0,
+        help="port of the server (default: any that is free)",
     )
 
 
