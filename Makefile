@@ -71,7 +71,7 @@ mutants: $(STAMP) ## do the tests see a wrong token? (MUTANTS=40 SEED=1, hours; 
 WORLDS ?= 64
 validate: $(STAMP) ## is the uncertainty true: tables, figure, docs/validation.md (long)
 	mkdir -p build
-	$(BIN)/driveby validate --method pre --worlds $(WORLDS) --records build/worlds.jsonl --json build/validation.json --figures docs/images --page docs/validation.md
+	$(BIN)/driveby validate --method pre --out-of-model $(WORLDS) --records build/worlds.jsonl --json build/validation.json --figures docs/images --page docs/validation.md
 
 lint: $(STAMP) ## format, lint, types and import contracts
 	$(BIN)/ruff format --check .

@@ -53,7 +53,7 @@ def add_alarm(commands: Any) -> None:
         help="tolerated false alarms per bridge and year (default: 0.01)",
     )
     p.add_argument(
-        "--learning",
+        "--training",
         type=whole("a number of periods", 2, 1000),
         default=8,
         metavar="PERIODS",
@@ -110,7 +110,7 @@ def _settings(options: argparse.Namespace) -> "Settings":
     from services.history.alarms import Settings
 
     return Settings(
-        options.period, options.false_alarms, options.learning, options.at_least / 100.0
+        options.period, options.false_alarms, options.training, options.at_least / 100.0
     )
 
 

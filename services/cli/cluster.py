@@ -78,7 +78,7 @@ def add_scheduler(p: Any) -> None:
         help="number of crossings in one task of a cluster (default: 50)",
     )
     p.add_argument(
-        "--patience",
+        "--reconnect-timeout",
         type=whole("seconds", 1, 86_400),
         metavar="S",
         help="seconds to wait for a lost scheduler or for workers (default: 300)",
@@ -90,9 +90,10 @@ def check_scheduler(options: argparse.Namespace) -> None:
     """InputError if `--scheduler` says nothing that there is, before anything is started."""
     said: str | None = options.scheduler
     is_cluster = said is not None and said.partition(":")[0] != _PROCESSES
-    for name in ("tls", "batch", "patience"):
+    for name in ("tls", "batch", "reconnect_timeout"):
         if getattr(options, name) is not None and not is_cluster:
-            raise InputError(f"--{name}: belongs to a cluster, --scheduler tcp://… or tls://…")
+            option = name.replace("_", "-")
+            raise InputError(f"--{option}: belongs to a cluster, --scheduler tcp://… or tls://…")
     if said is not None and not is_cluster:
         _number(said)
     if is_cluster:
@@ -119,7 +120,7 @@ def execution_of(options: argparse.Namespace) -> "Iterator[Execution | None]":
             said,
             credentials=_credentials(options),
             batch=options.batch or BATCH,
-            patience_s=options.patience or PATIENCE_S,
+            patience_s=options.reconnect_timeout or PATIENCE_S,
         ) as cluster:
             yield cluster
 

@@ -60,7 +60,7 @@ def add_history(commands: Any) -> None:
         p, "--temperature", "T.csv", "with add: time_s,temperature_deg_c[,bridge] beside crossings"
     )
     p.add_argument(
-        "--later",
+        "--defer-fusion",
         action="store_true",
         help="with add: postpone fusion until the bridge is first shown",
     )
@@ -105,7 +105,7 @@ def _add(options: argparse.Namespace, paths: list[Path]) -> int:
         print(_add_one(options, path, some, driven))
     for problem in problems:
         print(problem)
-    if not options.later:
+    if not options.defer_fusion:
         from services.execution.blas import one_blas_thread
         from services.history.past import fuse_ahead
 

@@ -160,7 +160,7 @@ def _found(
 def check_certificates(certificates: Path | None) -> None:
     """InputError if a folder of certificates is none."""
     if certificates is not None and not certificates.is_dir():
-        raise InputError(f"--certificates: {certificates} is no folder of certificates")
+        raise InputError(f"--validations: {certificates} is no folder of certificates")
 
 
 def warn_of_no_noise(site: Site, method: str) -> None:

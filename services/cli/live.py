@@ -161,7 +161,7 @@ def add_worker(commands: Any) -> None:
         "(default: 1)",
     )
     p.add_argument(
-        "--limit",
+        "--cpu-limit",
         type=number("seconds", low=1, high=1e6),
         metavar="S",
         help="CPU time limit per crossing in s; on excess the crossing is retried once (default: "
@@ -176,7 +176,7 @@ def add_worker(commands: Any) -> None:
         "simulation (always so in realm live)",
     )
     first.add_argument(
-        "--no-certificates",
+        "--skip-validation",
         action="store_true",
         help="identify in realm live without site validation",
     )
@@ -212,11 +212,11 @@ def _worker(options: argparse.Namespace) -> int:
         ready=lambda: print(f"ready, waiting for crossings in realm {options.realm}", flush=True),
         tls=options.tls,
         processes=options.processes,
-        limit_s=LIMIT_S if options.limit is None else options.limit,
-        certificates=options.certificates,
+        limit_s=LIMIT_S if options.cpu_limit is None else options.cpu_limit,
+        certificates=options.validations,
         recordings=options.recordings,
         recordings_days=DAYS if options.recordings_days is None else options.recordings_days,
-        validate=True if options.validate_first else False if options.no_certificates else None,
+        validate=True if options.validate_first else False if options.skip_validation else None,
     )
 
 

@@ -4,7 +4,7 @@ Nothing heavy is imported here: `driveby --help` does not wait for compilers and
 """
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
@@ -27,12 +27,44 @@ Handler = Callable[[argparse.Namespace], int]
 """Does what a command says; returns the exit code."""
 
 
+_FORMER_OPTIONS: Final = {
+    ("validate", "--worlds"): "--out-of-model",
+    ("validate", "--certificates"): "--validations",
+    ("identify", "--certificates"): "--validations",
+    ("worker", "--certificates"): "--validations",
+    ("worker", "--no-certificates"): "--skip-validation",
+    ("worker", "--limit"): "--cpu-limit",
+    ("alarm", "--learning"): "--training",
+    ("history", "--later"): "--defer-fusion",
+    ("identify", "--patience"): "--reconnect-timeout",
+    ("simulate", "--left"): "--departed-vehicle",
+}
+"""Former spellings of options by command; they are accepted for good and shown nowhere."""
+
+
 class Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, as every other error does."""
 
     def error(self, message: str) -> NoReturn:
         """Raise InputError."""
         raise InputError(f"{message} (see {self.prog} --help)")
+
+
+def with_current_options(arguments: Sequence[str]) -> list[str]:
+    """Return command-line arguments with former spellings of options replaced by today's.
+
+    The command is the first argument that is no option; nothing behind `--` is an option.
+    """
+    command_name = next((one for one in arguments if one in _COMMANDS_WITH_FORMER), "")
+    ends = arguments.index("--") if "--" in arguments else len(arguments)
+    current = []
+    for one in arguments[:ends]:
+        option, equals, value = one.partition("=")
+        current.append(_FORMER_OPTIONS.get((command_name, option), option) + equals + value)
+    return [*current, *arguments[ends:]]
+
+
+_COMMANDS_WITH_FORMER: Final = frozenset(name for name, _ in _FORMER_OPTIONS)
 
 
 def command(
@@ -185,8 +217,8 @@ def add_folder(p: argparse.ArgumentParser, text: str) -> None:
 
 
 def add_certificates(p: Any, text: str) -> None:
-    """`--certificates`: a folder of them."""
-    p.add_argument("--certificates", type=Path, metavar="DIR", help=text)
+    """`--validations`: a folder of them."""
+    p.add_argument("--validations", type=Path, metavar="DIR", help=text)
 
 
 def add_seed(p: argparse.ArgumentParser) -> None:

@@ -70,7 +70,6 @@ def add_simulate(commands: Any) -> None:
     receiver = p.add_mutually_exclusive_group()
     receiver.add_argument(
         "--gps-noise",
-        dest="gps_noise",
         action="store_true",
         help="simulate the errors of a real GNSS receiver",
     )
@@ -127,8 +126,7 @@ def _add_surface(p: Any) -> None:
         "--wander",
         type=number("a standard deviation in m", low=0, high=2),
         metavar="M",
-        help="standard deviation of the lateral position from run to run in m, on a 2-D surface "
-        "(default: 0)",
+        help="lateral standard deviation between runs in m, on a 2-D surface (default: 0)",
     )
 
 
@@ -158,7 +156,7 @@ def _add_beyond(p: Any) -> None:
         help="vertical stiffness of the bearings in N/m",
     )
     p.add_argument(
-        "--left",
+        "--departed-vehicle",
         type=numbers(
             "a weight in N, a speed in m/s and seconds before (N:M_PER_S:S)",
             (0, 1e7),
@@ -166,8 +164,7 @@ def _add_beyond(p: Any) -> None:
             (0, 1000),
         ),
         metavar="N:M_PER_S:S",
-        help="weight and speed of a vehicle that left the bridge, and seconds between its exit "
-        "and the truck's entry",
+        help="weight and speed of a vehicle that left S seconds before the truck came",
     )
     p.add_argument(
         "--friction",
@@ -238,7 +235,7 @@ def _simulate(options: argparse.Namespace) -> int:
         beyond=Beyond(
             options.support_springs,
             (1.0 / stiffness[0], 1.0 / stiffness[1]) if stiffness else (0.0, 0.0),
-            Left(*options.left) if options.left else None,
+            Left(*options.departed_vehicle) if options.departed_vehicle else None,
             options.friction,
             options.friction_growth,
             options.bilinear,

@@ -71,9 +71,7 @@ def add_survey(commands: Any) -> None:
     p.add_argument(
         "--tyres",
         choices=("single", "twin"),
-        help="tyres of the rear axle; single: like the front ones (default: by "
-        "twin_tyre_distance_m in "
-        "the site file, or twin)",
+        help="tyres of the rear axle; single: like the front ones (default: the site's, or twin)",
     )
     p.add_argument(
         "--noise",
@@ -86,8 +84,7 @@ def add_survey(commands: Any) -> None:
         type=number("a standard deviation in m", low=0.01, high=1),
         default=0.12,
         metavar="M",
-        help="standard deviation of the lateral position from run to run in m; lateral wander "
-        "adds information (default: 0.12)",
+        help="lateral standard deviation between runs in m; it adds information (default: 0.12)",
     )
     text = "file of a figure of detection probability over the number of crossings"
     add_output_file(p, "--figure", "OUT.png|OUT.svg", text, PNG, SVG)

@@ -74,13 +74,13 @@ KINDS: Final = (
 _OF_METHODS: Final = {
     "scenarios": tuple(SCENARIOS),
     "noise": 0.0,
-    "worlds": 0,
+    "out_of_model": 0,
     "surveys": 0,
     "json": None,
     "figures": None,
     "page": None,
 }
-_OF_CERTIFICATES: Final = {"truck": None, "bridge": None, "certificates": None}
+_OF_CERTIFICATES: Final = {"truck": None, "bridge": None, "validations": None}
 """Options that belong to one kind of validation only, with their defaults."""
 
 
@@ -150,6 +150,18 @@ def add_validate(commands: Any) -> None:
         "--bridge", metavar="ID", help="identifier of the only bridge to validate (default: each)"
     )
     add_certificates(of_site, f"folder for certificates (default: {CERTIFICATES})")
+    _add_options_of_pre(p)
+    p.add_argument(
+        "--processes",
+        type=whole("processes", 1, 256),
+        default=2,
+        help="number of processes (default: 2)",
+    )
+    add_output_file(p, "--page", "PAGE.md", "Markdown page of the findings", VALIDATION_PAGE)
+
+
+def _add_options_of_pre(p: argparse.ArgumentParser) -> None:
+    """Add the options that only `--method pre` has."""
     p.add_argument(
         "--crossings",
         type=whole("a number of crossings", 0),
@@ -163,7 +175,7 @@ def add_validate(commands: Any) -> None:
         help="number of them repeated with half the noise declared (default: 20)",
     )
     p.add_argument(
-        "--worlds",
+        "--out-of-model",
         type=whole("a number of crossings", 0),
         default=0,
         help="number of crossings for each out-of-model effect (default: 0)",
@@ -180,7 +192,7 @@ def add_validate(commands: Any) -> None:
         type=OutputFile((RECORDS,)),
         default=Path("build/worlds.jsonl"),
         metavar="FILE.jsonl",
-        help="file of finished crossings of --worlds and --surveys, which are not run again "
+        help="file of finished crossings of --out-of-model and --surveys, which are not run again "
         "(default: build/worlds.jsonl)",
     )
     p.add_argument(
@@ -204,13 +216,6 @@ def add_validate(commands: Any) -> None:
         metavar="DIR",
         help="folders of crossings with a truth.json (default: ../shared/crossings)",
     )
-    p.add_argument(
-        "--processes",
-        type=whole("processes", 1, 256),
-        default=2,
-        help="number of processes (default: 2)",
-    )
-    add_output_file(p, "--page", "PAGE.md", "Markdown page of the findings", VALIDATION_PAGE)
 
 
 def _validate_site(options: argparse.Namespace) -> int:
@@ -220,7 +225,7 @@ def _validate_site(options: argparse.Namespace) -> int:
         site=options.site,
         truck=options.truck,
         bridge=options.bridge,
-        certificates=options.certificates or CERTIFICATES,
+        certificates=options.validations or CERTIFICATES,
         seed=options.seed,
         processes=options.processes,
         console=a_console(),
@@ -234,7 +239,9 @@ def _check_one_kind(options: argparse.Namespace) -> None:
     what = "only with --method" if makes_certificates else "only with --site, no --method"
     for name, default in others.items():
         if getattr(options, name) != default:
-            raise InputError(f"--{name}: {what}, it has nothing to do with what is asked for")
+            raise InputError(
+                f"--{name.replace('_', '-')}: {what}, it has nothing to do with what is asked for"
+            )
 
 
 def _validate(options: argparse.Namespace) -> int:
@@ -259,7 +266,7 @@ def _validate(options: argparse.Namespace) -> int:
             crossings=options.crossings,
             control=options.control,
             scenarios=options.scenarios,
-            worlds=options.worlds,
+            worlds=options.out_of_model,
             effects=options.effects,
             records=options.records,
             folder=options.truth,

@@ -163,7 +163,7 @@ def _command(outcome: Outcome) -> str:
     each = len(outcome.worlds) // max(1, len(effects))
     return (
         f"driveby validate --method pre --crossings {len(outcome.drawn)} "
-        f"--control {len(outcome.control)} --worlds {each}"
+        f"--control {len(outcome.control)} --out-of-model {each}"
     )
 
 

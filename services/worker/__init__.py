@@ -200,7 +200,7 @@ def run(
     if are_required and method != "pre":
         raise InputError(
             f"--method {method.replace('_', '-')}: has no certificates, which realm live and "
-            "--validate-first ask for; take pre, or --no-certificates"
+            "--validate-first ask for; take pre, or --skip-validation"
         )
     text = read_site_text(site)
     known = parse_site(text, str(site))
@@ -232,7 +232,7 @@ def run(
     if are_required:
         check_folder_writable(certificates)
     elif realm == "live":
-        _log.warning("--no-certificates: crossings count that nobody has validated")
+        _log.warning("--skip-validation: crossings count that nobody has validated")
     ledger = Ledger(earlier.crossings, time.time())
     files = ResultFiles(file, text, header, earlier.previous, ledger.note)
     # A second signal: what was published is on the disk, and the next run takes it up.

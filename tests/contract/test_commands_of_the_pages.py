@@ -77,7 +77,7 @@ NOT_RUN = {
     "driveby validate --method pre --surveys 3 --kinds scenario-1,scenario-4,scenario-10 "
     "--records build/detection.jsonl": LONG,
     "driveby validate --site site.toml": CERTIFIES,
-    "driveby validate --site site.toml --certificates recordings/certificates": CERTIFIES,
+    "driveby validate --site site.toml --validations recordings/certificates": CERTIFIES,
     "driveby health worker": "asks a worker; tests/process_replay does, of one that runs",
     "driveby survey --site SITE": "one of those above it, of a site of one's own",
     "driveby survey --site site.toml": LONG,
@@ -97,7 +97,6 @@ NOT_RUN = {
     'pip install "driveby[notebook]"': NETWORK,
     'pip install "arviz<1"': NETWORK,
     "driveby view crossing.rrd": WINDOW,
-    "driveby view drive.rrd": WINDOW,
     f"driveby view {SAMPLE}": WINDOW,
     "driveby view live": WINDOW,
     "driveby logger --realm sim-first": FOUR,
@@ -132,9 +131,9 @@ NOT_RUN = {
     "scp -rp certs/viewer laptop.example.org:tls": MACHINES,
     "driveby validate --json validation.json --figures figures/": LONG,
     "driveby validate --scenarios 1,6,12 --noise 25": LONG,
-    "driveby validate --method pre --crossings 200 --control 20 --worlds 30 "
+    "driveby validate --method pre --crossings 200 --control 20 --out-of-model 30 "
     "--page docs/validation.md": LONG,
-    "driveby validate --method pre --crossings 0 --control 0 --scenarios 1 --worlds 200 "
+    "driveby validate --method pre --crossings 0 --control 0 --scenarios 1 --out-of-model 200 "
     "--effects free,sprung": LONG,
     "driveby simulate --scenario 6 --road A --seed 3 --noise 10 --road-surface --tyres twin "
     "--rear-offset 0.005 --wander 0.12 --runs 4 --gps-noise -o twin.mcap": LONG,
@@ -143,6 +142,7 @@ NOT_RUN = {
         "needs a browser; tests/unit/report prints where there is one"
     ),
     "python tests/numerics/table.py": LONG,
+    "python docs/scripts/commands_page.py": "tests/contract/test_pages.py compares the page",
     "python docs/scripts/reproduction.py frequencies": LONG,
     "python -m pytest -m slow tests/unit/validation/test_validation.py": LONG,
     "python -m tests.verdicts.both_ways --worlds 8 --records build/both_ways.jsonl": LONG,

@@ -65,7 +65,6 @@ LONG_FUNCTIONS = {
     "services.cli.simulate:_add_beyond": 69,
     "services.cli.survey:add_survey": 63,
     "services.cli.validate_pre:validate_pre_command": 69,
-    "services.cli.validation:add_validate": 95,
     "services.history.recorded:look": 69,
     "services.identification.bridge_state:state_of": 69,
     "services.identification.engine:Engine._advance": 67,

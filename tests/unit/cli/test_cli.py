@@ -261,7 +261,10 @@ def test_recordings_that_cannot_be_identified(
         (["simulate", "--scenario", "6", "--noise", "nan", "-o", "x"], "must be a noise density"),
         (["simulate", "--scenario", "6", "--speed", "8:", "-o", "x"], "must be a speed in m/s"),
         (["simulate", "--scenario", "6", "--seed", "1.5", "-o", "x"], "a seed, a whole number"),
-        (["simulate", "--scenario", "6", "--left", "3e5:17", "-o", "x"], "(N:M_PER_S:S)"),
+        (
+            ["simulate", "--scenario", "6", "--departed-vehicle", "3e5:17", "-o", "x"],
+            "(N:M_PER_S:S)",
+        ),
         (["simulate", "--scenario", "6", "--tyres", "wide", "-o", "x"], "--tyres: invalid choice"),
         (["simulate", "--scenario", "6", "--runs", "0", "-o", "x"], "a number of runs, a whole"),
         (["simulate", "--scenario", "6", "--wander", "-1", "-o", "x"], "a standard deviation in m"),

@@ -42,7 +42,10 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
         (["--scheduler", "tcp://scheduler:8786"], "is another machine"),
         (["--scheduler", "tls://127.0.0.1:8786"], "needs --tls FOLDER"),
         (["--batch", "5"], "--batch: belongs to a cluster"),
-        (["--scheduler", "processes", "--patience", "5"], "--patience: belongs to a cluster"),
+        (
+            ["--scheduler", "processes", "--reconnect-timeout", "5"],
+            "--reconnect-timeout: belongs to a cluster",
+        ),
         (["--scheduler", "tcp://127.0.0.1:1", "--batch", "201"], "from 1 to 200"),
         (["--into", "s3://bucket/new"], "a folder of this machine is expected"),
         (["--into", "new", "--rrd", "x.rrd"], "--rrd: is for recordings one looks at"),
@@ -77,7 +80,8 @@ def test_a_scheduler_that_does_not_answer_is_one_line(
     with socket.socket() as taken:  # bound, and nobody listens
         taken.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        code, err = said(capsys, "identify", EXACT, *QUICK, "--scheduler", address, "--patience", 1)
+        where = ("--scheduler", address, "--reconnect-timeout", 1)
+        code, err = said(capsys, "identify", EXACT, *QUICK, *where)
     assert (code, err.count("\n")) == (1, 1)
     assert f"{address}: no scheduler answers" in err
 

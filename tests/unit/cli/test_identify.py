@@ -403,12 +403,12 @@ def test_a_certificate_that_there_is_is_named(
     identify = ["identify", str(recording), "--method", "least-squares", "--json", str(out)]
     made = certificate(site, hash=pair_hash(site, Pair("truck-1", "bridge-1"), LEAST_SQUARES))
     save(folder, made)
-    assert cli.main([*identify, "--certificates", str(folder)]) == 0
+    assert cli.main([*identify, "--validations", str(folder)]) == 0
     assert only(load_results(out)).certificate == made.hash
     save(folder, made.model_copy(update={"passed": False}))
-    assert cli.main([*identify, "--certificates", str(folder)]) == 0
+    assert cli.main([*identify, "--validations", str(folder)]) == 0
     assert only(load_results(out)).certificate is None
     capsys.readouterr()
-    assert cli.main([*identify, "--certificates", str(tmp_path / "none")]) == 2
+    assert cli.main([*identify, "--validations", str(tmp_path / "none")]) == 2
     line = capsys.readouterr().err
-    assert line == f"driveby: --certificates: {tmp_path / 'none'} is no folder of certificates\n"
+    assert line == f"driveby: --validations: {tmp_path / 'none'} is no folder of certificates\n"

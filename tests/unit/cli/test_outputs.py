@@ -39,7 +39,7 @@ OUTPUTS: dict[tuple[str, str], list[str]] = {
     ("survey", "--json"): ["--site", READ],
     ("validate", "--json"): ["--method", "pre", "--site", READ],
     ("validate", "--page"): ["--method", "pre", "--site", READ],
-    ("validate", "--records"): ["--method", "pre", "--worlds", "1", "--site", READ],
+    ("validate", "--records"): ["--method", "pre", "--out-of-model", "1", "--site", READ],
     ("worker", "--file"): ["--site", READ],
 }
 FOLDERS = {
@@ -47,7 +47,7 @@ FOLDERS = {
     ("identify", "--into"), ("validate", "--figures"),
 }  # fmt: skip
 READS = {
-    "--site", "--baseline", "--tls", "--certificates", "--history", "--truth", "--temperature",
+    "--site", "--baseline", "--tls", "--validations", "--history", "--truth", "--temperature",
     "--recordings", "--folder", "--spool",
 }  # fmt: skip
 """Options with a path that no file is put to by its own name."""

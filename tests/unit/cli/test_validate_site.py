@@ -57,7 +57,7 @@ def test_every_pair_gets_a_line_and_a_file(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "made" / "here"
-    assert validate("--site", site, "--certificates", folder, "--seed", 4) == 1
+    assert validate("--site", site, "--validations", folder, "--seed", 4) == 1
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == [
         "truck-1 on bridge-1",
@@ -83,7 +83,7 @@ def test_one_pair_may_be_asked_for(
 ) -> None:
     folder = tmp_path / "certificates"
     chosen = ("--truck", "truck-2", "--bridge", "bridge-1")
-    assert validate("--site", site, "--certificates", folder, *chosen) == 0
+    assert validate("--site", site, "--validations", folder, *chosen) == 0
     assert capsys.readouterr().out.startswith("truck-2 on bridge-1: passed")
     assert len(list(folder.iterdir())) == 1
 
@@ -97,7 +97,7 @@ def test_one_pair_may_be_asked_for(
         (("--scenarios", "1"), "--scenarios: only with --method"),
         (("--noise", "25"), "--noise: only with --method"),
         (("--method", "pre", "--truck", "truck-1"), "--truck: only with --site, no --method"),
-        (("--certificates", "{site}"), "{site}: cannot be made a folder"),
+        (("--validations", "{site}"), "{site}: cannot be made a folder"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -108,7 +108,7 @@ def test_bad_input_is_one_line(
     words: str,
 ) -> None:
     given = [argument.format(site=site) for argument in arguments]
-    where = () if "--certificates" in given else ("--certificates", tmp_path / "c")
+    where = () if "--validations" in given else ("--validations", tmp_path / "c")
     if "--method" in given:
         where = ()
     assert validate("--site", site, *given, *where) == 2
