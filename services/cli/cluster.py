@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from services.cli.parsing import command, whole
+from services.cli.parsing import command, option_of, whole
 from services.common.endpoints import LOOPBACK
 from services.common.errors import InputError
 
@@ -92,8 +92,9 @@ def check_scheduler(options: argparse.Namespace) -> None:
     is_cluster = said is not None and said.partition(":")[0] != _PROCESSES
     for name in ("tls", "batch", "reconnect_timeout"):
         if getattr(options, name) is not None and not is_cluster:
-            option = name.replace("_", "-")
-            raise InputError(f"--{option}: belongs to a cluster, --scheduler tcp://… or tls://…")
+            raise InputError(
+                f"{option_of(name)}: belongs to a cluster, --scheduler tcp://… or tls://…"
+            )
     if said is not None and not is_cluster:
         _number(said)
     if is_cluster:

@@ -44,14 +44,7 @@ from services.cli.offline import (
     add_import,
     add_recover,
 )
-from services.cli.parsing import (
-    Files,
-    Handler,
-    Parser,
-    add_common,
-    files_of,
-    with_current_options,
-)
+from services.cli.parsing import Files, Handler, Parser, add_common, files_of
 from services.cli.replay import add_replay
 from services.cli.report import add_report
 from services.cli.simulate import add_simulate
@@ -116,8 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # 0.1 s of an identification.
     gc.set_threshold(_OBJECTS_BETWEEN_LOOKS)
     try:
-        given = sys.argv[1:] if arguments is None else arguments
-        options = _parser().parse_args(with_current_options(given))
+        options = _parser().parse_args(arguments)
     except InputError as error:
         return _say(str(error), EXIT_BAD_INPUT)
     # A service has nothing else to show for itself than what it says.

@@ -4,7 +4,8 @@ Nothing heavy is imported here: `driveby --help` does not wait for compilers and
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
@@ -28,16 +29,16 @@ Handler = Callable[[argparse.Namespace], int]
 
 
 _FORMER_OPTIONS: Final = {
-    ("validate", "--worlds"): "--out-of-model",
-    ("validate", "--certificates"): "--validations",
-    ("identify", "--certificates"): "--validations",
-    ("worker", "--certificates"): "--validations",
-    ("worker", "--no-certificates"): "--skip-validation",
-    ("worker", "--limit"): "--cpu-limit",
-    ("alarm", "--learning"): "--training",
-    ("history", "--later"): "--defer-fusion",
-    ("identify", "--patience"): "--reconnect-timeout",
-    ("simulate", "--left"): "--departed-vehicle",
+    "alarm": {"--learning": "--training"},
+    "history": {"--later": "--defer-fusion"},
+    "identify": {"--certificates": "--validations", "--patience": "--reconnect-timeout"},
+    "simulate": {"--left": "--departed-vehicle"},
+    "validate": {"--certificates": "--validations", "--worlds": "--out-of-model"},
+    "worker": {
+        "--certificates": "--validations",
+        "--limit": "--cpu-limit",
+        "--no-certificates": "--skip-validation",
+    },
 }
 """Former spellings of options by command; they are accepted for good and shown nowhere."""
 
@@ -45,39 +46,42 @@ _FORMER_OPTIONS: Final = {
 class Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, as every other error does."""
 
+    former_options: Mapping[str, str] = {}
+    """Former spellings of this command's options, and what they are spelt now."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse arguments whose options may have their former spellings."""
+        given = list(sys.argv[1:] if args is None else args)
+        ends = given.index("--") if "--" in given else len(given)
+        current = [self._current(one) for one in given[:ends]]
+        return super().parse_known_args([*current, *given[ends:]], namespace)
+
+    def _current(self, argument: str) -> str:
+        option, equals, value = argument.partition("=")
+        return self.former_options.get(option, option) + equals + value
+
     def error(self, message: str) -> NoReturn:
         """Raise InputError."""
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
-def with_current_options(arguments: Sequence[str]) -> list[str]:
-    """Return command-line arguments with former spellings of options replaced by today's.
-
-    The command is the first argument that is no option; nothing behind `--` is an option.
-    """
-    command_name = next((one for one in arguments if one in _COMMANDS_WITH_FORMER), "")
-    ends = arguments.index("--") if "--" in arguments else len(arguments)
-    current = []
-    for one in arguments[:ends]:
-        option, equals, value = one.partition("=")
-        current.append(_FORMER_OPTIONS.get((command_name, option), option) + equals + value)
-    return [*current, *arguments[ends:]]
-
-
-_COMMANDS_WITH_FORMER: Final = frozenset(name for name, _ in _FORMER_OPTIONS)
+def option_of(name: str) -> str:
+    """Return the option whose value has this name among the parsed ones."""
+    return f"--{name.replace('_', '-')}"
 
 
 def command(
     commands: Any, name: str, handler: Handler, summary: str, example: str
 ) -> argparse.ArgumentParser:
     """A command: what it is in a word and a sentence, and an example of its use."""
-    parser: argparse.ArgumentParser = commands.add_parser(
+    parser: Parser = commands.add_parser(
         name,
         help=summary,
         description=f"{summary[0].upper()}{summary[1:]}.",
         epilog=f"example: {example}",
         allow_abbrev=False,
     )
+    parser.former_options = _FORMER_OPTIONS.get(name, {})
     parser.set_defaults(handler=handler, parser=parser)
     add_common(parser, suppressed=True)
     return parser

@@ -12,6 +12,7 @@ from services.cli.parsing import (
     command,
     number,
     numbers,
+    option_of,
     scenario,
     whole,
 )
@@ -137,7 +138,7 @@ def _on_surface(options: argparse.Namespace) -> Any:
         return OnSurface(options.tyres, options.rear_offset, options.wander or 0.0)
     for name in ("tyres", "rear_offset", "wander"):
         if getattr(options, name) is not None:
-            raise InputError(f"--{name.replace('_', '-')}: only a --road-surface has it")
+            raise InputError(f"{option_of(name)}: only a --road-surface has it")
     return None
 
 

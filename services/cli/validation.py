@@ -18,6 +18,7 @@ from services.cli.parsing import (
     add_site,
     command,
     names,
+    option_of,
     scenario,
     whole,
 )
@@ -240,7 +241,7 @@ def _check_one_kind(options: argparse.Namespace) -> None:
     for name, default in others.items():
         if getattr(options, name) != default:
             raise InputError(
-                f"--{name.replace('_', '-')}: {what}, it has nothing to do with what is asked for"
+                f"{option_of(name)}: {what}, it has nothing to do with what is asked for"
             )
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from services.cli import main as cli
-from services.cli.parsing import with_current_options
+from services.common.errors import InputError
 
 SAME = [
     ("validate --method pre --worlds 3", "validate --method pre --out-of-model 3"),
@@ -26,7 +26,7 @@ SAME = [
 def test_former_spelling_parses_as_the_current_one(former: str, current: str) -> None:
     parse = cli._parser().parse_args
     expected = vars(parse(current.split()))
-    found = vars(parse(with_current_options(former.split())))
+    found = vars(parse(former.split()))
     del expected["parser"], found["parser"]
     assert found == expected
 
@@ -44,8 +44,17 @@ def test_help_shows_no_former_spelling(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_arguments_behind_two_dashes_stay() -> None:
-    assert with_current_options(["history", "--", "--later"]) == ["history", "--", "--later"]
+    options = cli._parser().parse_args(["history", "--", "--later"])
+    assert options.words == ["--later"]
+    assert not options.defer_fusion
 
 
 def test_other_commands_keep_their_options() -> None:
-    assert with_current_options(["view", "--limit"]) == ["view", "--limit"]
+    with pytest.raises(InputError, match="unrecognized arguments: --limit"):
+        cli._parser().parse_args(["view", "a.mcap", "--limit"])
+
+
+def test_values_that_are_called_like_a_command_are_none() -> None:
+    """The spool may be a folder `worker`: `truck` has no `--cpu-limit` for all that."""
+    with pytest.raises(InputError, match="unrecognized arguments: --limit"):
+        cli._parser().parse_args(["truck", "a.mcap", "--spool", "worker", "--limit", "5"])
