@@ -72,6 +72,23 @@ def to_chainage(
     return np.asarray(chainage), np.asarray(offset @ frame.left)
 
 
+class _North(NamedTuple):
+    """A line of some 100 m to the north, as `bridge_frame` takes it."""
+
+    start_latitude_deg: float
+    start_longitude_deg: float
+    end_latitude_deg: float
+    end_longitude_deg: float
+    span_m: float
+
+
+def on_plane_m(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
+    """Return places (m,) on a plane that touches the ground at the first: metres north and west."""
+    latitude, longitude = float(latitude_deg[0]), float(longitude_deg[0])
+    frame = bridge_frame(_North(latitude, longitude, latitude + 9e-4, longitude, 100.0))
+    return to_chainage(frame._replace(span_m=frame.ground_length_m), latitude_deg, longitude_deg)
+
+
 def chainage_of(frame: BridgeFrame, latitude_deg: float, longitude_deg: float) -> float:
     """Return the chainage of one place, to a micrometre what `to_chainage` says, in a tenth of the
     time that arrays take."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from schemas.site import Site
 from services.common.errors import InputError
-from services.common.geodesy import bridge_frame, to_chainage
+from services.common.geodesy import bridge_frame, on_plane_m, to_chainage
 from services.drives.runs import Run
 
 _DRIVING_M: Final = 20.0
@@ -44,12 +44,10 @@ def _check_exchanged(run: Run, site: Site) -> None:
 
 def _check_speed(run: Run) -> None:
     gnss = run.gnss
-    north = np.radians(gnss.latitude_deg - gnss.latitude_deg[0]) * 6.371e6
-    east = np.radians(gnss.longitude_deg - gnss.longitude_deg[0]) * 6.371e6
-    east *= np.cos(np.radians(gnss.latitude_deg[0]))
-    straight = float(np.hypot(north[-1], east[-1]))
+    north, west = on_plane_m(gnss.latitude_deg, gnss.longitude_deg)
+    straight = float(np.hypot(north[-1], west[-1]))
     steps = 0.5 * (gnss.speed_m_per_s[1:] + gnss.speed_m_per_s[:-1]) * np.diff(gnss.time_s)
-    path = float(np.hypot(np.diff(north), np.diff(east)).sum())
+    path = float(np.hypot(np.diff(north), np.diff(west)).sum())
     if straight < max(_DRIVING_M, 0.9 * path):
         return
     ratio = float(np.abs(steps).sum()) / straight

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.site import Receiver
-from services.common.geodesy import bridge_frame, to_chainage
+from services.common.geodesy import on_plane_m
 from services.identification.crossing_data import LONGEST_SURE_OUTAGE_S
 from services.identification.stays import STANDING_M_PER_S
 from services.inspection.finding import Finding, State, judged
@@ -56,7 +56,7 @@ def receiver_of(run: Recorded, declared: Receiver) -> Iterator[Finding]:
         "the antenna's view",
         is_wrong=longest_s > max(LONGEST_SURE_OUTAGE_S, 1.5 * apart_s),
     )
-    along, beside = _path_m(run)
+    along, beside = on_plane_m(run.fixes.latitude_deg, run.fixes.longitude_deg)
     yield _jumps(time_s, along, beside, run.fixes.speed_m_per_s, declared)
     if apart_s <= _LONGEST_CURVE_S:
         yield _position_noise(along, beside, declared)
@@ -70,23 +70,6 @@ def receiver_of(run: Recorded, declared: Receiver) -> Iterator[Finding]:
             "wait for a better fix, look at the antenna, use corrections",
             is_wrong=typical > _POOR_M,
         )
-
-
-class _Ends:
-    """A line of 100 m to the north through the first fix, as `bridge_frame` takes it."""
-
-    def __init__(self, latitude_deg: float, longitude_deg: float) -> None:
-        self.start_latitude_deg, self.start_longitude_deg = latitude_deg, longitude_deg
-        self.end_latitude_deg, self.end_longitude_deg = latitude_deg + 9e-4, longitude_deg
-        self.span_m = 100.0
-
-
-def _path_m(run: Recorded) -> tuple[Floats, Floats]:
-    """Fixes in a plane, (m,) each."""
-    latitude, longitude = run.fixes.latitude_deg, run.fixes.longitude_deg
-    frame = bridge_frame(_Ends(float(latitude[0]), float(longitude[0])))
-    frame = frame._replace(span_m=frame.ground_length_m)
-    return to_chainage(frame, latitude, longitude)
 
 
 def _jumps(time_s: Floats, x: Floats, y: Floats, speed: Floats, declared: Receiver) -> Finding:
