@@ -35,14 +35,13 @@ make_base() {
     tar -C "$root" -c . | docker import -c 'CMD ["python3"]' - "$base" >/dev/null
 }
 
-# As the official image: /zenohd behind /entrypoint.sh, with `nc` for the health check.
+# As the official image: /zenohd behind /entrypoint.sh.
 make_router() {
     version=${router##*:}
     CARGO_BUILD_JOBS=${CARGO_BUILD_JOBS:-2} cargo install zenohd --version "$version" --locked \
         --quiet --root "$folder"
     docker build --quiet --tag "$router" --file - "$folder/bin" >/dev/null <<END
 FROM $base
-RUN apt-get update && apt-get install --yes --no-install-recommends netcat-openbsd && rm -rf /var/lib/apt/lists/*
 COPY zenohd /zenohd
 RUN printf '#!/bin/sh\nexec /zenohd \$*\n' >/entrypoint.sh && chmod +x /entrypoint.sh
 ENV RUST_LOG=info
