@@ -27,23 +27,15 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message as AnyMessage
 
-from schemas.certificates import (
-    METHOD_EDITION,
-    Certificate,
-    Pair,
-    certificate_json,
-    certificate_path,
-    load_certificate,
-    pair_hash,
-)
+from schemas.certificates import certificate_json, certificate_path, load_certificate
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Results, load_results
-from schemas.settings import IdentificationSettings
 from schemas.signals import decode_accel, decode_gnss, decode_info
 from schemas.site_file import load_site, site_hash
 from services.history.archive import add_results
 from services.recordings.recording import read_info, read_messages, read_site
 from services.recordings.writer import write_recording
+from tests.builders.certificates import certificate, tried
 from tests.fleet import losses_of
 from tests.same.parts import PROJECT, Run, worker
 
@@ -180,46 +172,30 @@ def _make_files(scratch: Path, folder: Path) -> None:
 
 def _make_certificate(folder: Path) -> None:
     """Write a certificate that vouches for nothing but its own form."""
-    site, pair = load_site(folder / "paper.toml"), Pair("truck-1", "bridge-1")
-    settings = IdentificationSettings()
-    tried = {"seed": 1, "direction": "start_to_end", "ei_ratio": (1.0, 0.5), "weak_element": 2}
-    answer = {"ei_ratio_q025": (0.8, 0.4), "ei_ratio_q50": (1.0, 0.5), "ei_ratio_q975": (1.2, 0.6)}
-    certificate = Certificate.model_validate(
-        {
-            "version": "0.1.0",
-            "created": 0.0,
-            "hash": pair_hash(site, pair, settings),
-            "method_edition": METHOD_EDITION,
-            "vehicle": pair.vehicle,
-            "bridge": pair.bridge,
-            "settings": settings.model_dump(mode="json"),
-            "seed": 1,
-            "conditions": {
-                "speed_m_per_s": 10.0,
-                "road_class": "B",
-                "road": "groove",
-                "rate_hz": 1000.0,
-                "noise_density_ug_per_rthz": (25.0,) * 4,
-            },
-            "planned": 12,
-            "crossings": (tried | answer | {"verdict": "good", "evaluations": 100},),
-            "figures": {
-                "crossings": 1,
-                "good": 1,
-                "intervals": 2,
-                "covered": 2,
-                "rms_z": 0.5,
-                "weak": 1,
-                "weak_found": 1,
-                "evaluations": 100,
-            },
-            "passed": True,
-            "reason": "made up",
-        }
+    damaged = tried(
+        1,
+        ei_ratio=(1.0, 0.5),
+        weak_element=2,
+        ei_ratio_q025=(0.8, 0.4),
+        ei_ratio_q50=(1.0, 0.5),
+        ei_ratio_q975=(1.2, 0.6),
+        evaluations=100,
     )
-    path = certificate_path(folder / "certificates", certificate.hash)
+    figures = {
+        "crossings": 1,
+        "good": 1,
+        "intervals": 2,
+        "covered": 2,
+        "rms_z": 0.5,
+        "weak": 1,
+        "weak_found": 1,
+        "evaluations": 100,
+    }
+    site = load_site(folder / "paper.toml")
+    made = certificate(site, version="0.1.0", crossings=(damaged,), figures=figures)
+    path = certificate_path(folder / "certificates", made.hash)
     path.parent.mkdir()
-    path.write_text(certificate_json(certificate))
+    path.write_text(certificate_json(made))
 
 
 def _messages() -> dict[str, Any]:

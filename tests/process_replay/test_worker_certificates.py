@@ -18,9 +18,9 @@ from services.bus.subscription import Received, Subscription
 from services.cli.health import health_command
 from services.history.certificates import save
 from services.recordings.recording import read_messages, read_site
+from tests.builders.certificates import certificate
 from tests.builders.processes import stop
 from tests.process_replay.starting import Process, Start, start_logger
-from tests.unit.schemas.test_certificates import certificate
 from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process

@@ -140,7 +140,7 @@ def _run_one(tree: Tree, name: str) -> None:
     began = time.monotonic()
     try:
         PARTS[name](Run(tree.source, partial, tree.cache))
-    except (OSError, TimeoutError, AssertionError, subprocess.SubprocessError) as error:
+    except (OSError, AssertionError, subprocess.SubprocessError) as error:
         (partial / FAILED).write_text(f"{type(error).__name__}: {error}\n")
     partial.rename(folder)
     print(f"  {time.monotonic() - began:5.0f} s  {tree.out.parent.name}  {name}", file=sys.stderr)

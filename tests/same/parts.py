@@ -10,13 +10,13 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from tests.endpoints import free_endpoint
+from tests.waiting import until
 
 PROJECT = Path(__file__).parents[2]
 RECORDINGS = {
@@ -225,14 +225,6 @@ def _ended(
                 process.wait()
 
 
-def _wait(what: str, has_come: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + _LONGEST_S
-    while not has_come():
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"no {what} within {_LONGEST_S:.0f} s")
-        time.sleep(0.1)
-
-
 def worker(method: str, recording: str, crossings: int) -> Callable[[Run], None]:
     """Replay a recording to logger and worker as processes; keep the worker's two files."""
 
@@ -247,15 +239,15 @@ def worker(method: str, recording: str, crossings: int) -> Callable[[Run], None]
             _ended(run.start(*logger)),
             _ended(run.start("worker", *words, *files)),
         ):
-            _wait("worker", lambda: _listens(run, endpoint))
+            until(lambda: _listens(run, endpoint), "the worker")
             replay = ("replay", "drive.mcap", "--endpoint", endpoint, "--speed", "0")
             with _ended(run.start(*replay)) as player:
                 player.wait(_LONGEST_S)
             results = run.folder / "results.json"
             key = b'"crossing_id"'
-            _wait(
-                "results",
+            until(
                 lambda: results.exists() and results.read_bytes().count(key) >= crossings,
+                "all results",
             )
         (run.folder / "drive.mcap").unlink()
 

@@ -34,7 +34,7 @@ from services.history.certificates import save
 from services.recordings.recording import Message, read_messages, read_site
 from services.recordings.writer import write_recording
 from services.simulation.drive import Drive, paper_site, simulate_drive, write_drive
-from tests.unit.schemas.test_certificates import certificate
+from tests.builders.certificates import certificate
 
 SOUND_NM2 = 1.56e10
 LEAST_SQUARES = IdentificationSettings(method="least_squares")

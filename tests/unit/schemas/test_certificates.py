@@ -9,23 +9,16 @@ from pydantic import ValidationError
 
 from schemas import certificates
 from schemas.certificates import (
-    Certificate,
     Pair,
-    Tried,
     certificate_json,
     certificate_path,
     load_certificate,
     pair_hash,
 )
 from schemas.errors import InputError
-from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import parse_site, site_toml
-from services.simulation.drive import paper_site
-
-SITE = paper_site()
-PAIR = Pair("truck-1", "bridge-1")
-SETTINGS = IdentificationSettings()
+from tests.builders.certificates import PAIR, SETTINGS, SITE, certificate, tried
 
 
 def changed(part: str, **values: Any) -> Site:
@@ -34,54 +27,6 @@ def changed(part: str, **values: Any) -> Site:
         return SITE.model_copy(update={part: getattr(SITE, part).model_copy(update=values)})
     one = getattr(SITE, part)[0].model_copy(update=values)
     return SITE.model_copy(update={part: (one,)})
-
-
-def tried(number: int = 0, **values: Any) -> Tried:
-    fields: dict[str, Any] = {
-        "seed": number,
-        "direction": "start_to_end",
-        "ei_ratio": (1.0, 1.0),
-        "verdict": "good",
-        "ei_ratio_q025": (0.8, 0.8),
-        "ei_ratio_q50": (1.0, 1.0),
-        "ei_ratio_q975": (1.25, 1.25),
-    }
-    return Tried.model_validate(fields | values)
-
-
-def certificate(site: Site = SITE, pair: Pair = PAIR, **values: Any) -> Certificate:
-    """One that passed, of nothing: for who only asks whether there is one."""
-    fields: dict[str, Any] = {
-        "version": "0",
-        "created": 0.0,
-        "hash": pair_hash(site, pair, SETTINGS),
-        "method_edition": certificates.METHOD_EDITION,
-        "vehicle": pair.vehicle,
-        "bridge": pair.bridge,
-        "settings": SETTINGS.model_dump(mode="json"),
-        "seed": 1,
-        "conditions": {
-            "speed_m_per_s": 10.0,
-            "road_class": "B",
-            "road": "groove",
-            "rate_hz": 1000.0,
-            "noise_density_ug_per_rthz": (25.0,) * 4,
-        },
-        "planned": 12,
-        "crossings": (tried(),),
-        "figures": {
-            "crossings": 1,
-            "good": 1,
-            "intervals": 2,
-            "covered": 2,
-            "weak": 0,
-            "weak_found": 0,
-            "evaluations": 0,
-        },
-        "passed": True,
-        "reason": "made up",
-    }
-    return Certificate.model_validate(fields | values)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from services.execution.processes import Aftermath, Aside, Processes
 from services.history.certificates import found_in, save
 from services.simulation.drive import paper_site
 from services.worker.certificates import LOOK_AGAIN_S, Certificates
-from tests.unit.schemas.test_certificates import certificate
+from tests.builders.certificates import certificate
 from tests.unit.simulation.test_certificate import made_up
 
 SECOND = Pair("truck-1", "bridge-2")
