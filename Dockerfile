@@ -1,5 +1,6 @@
-# Two images. `service`, the default, runs every command; `truck` is the small one of a truck's
-# computer: publisher and spool, `driveby truck` and `driveby health`. See compose.yaml.
+# Two images. `service`, the default, has every extra and runs every command; `truck` is the small one
+# of a truck's computer without any: publisher and spool, `driveby truck` and `driveby health`. See
+# compose.yaml.
 #
 # The base image is named by its tag: no registry was within reach when this was written, so its
 # digest is not known here. For the same image every time give it:
@@ -39,12 +40,10 @@ COPY --from=wheel /wheels /wheels
 RUN pip --python /opt/driveby/bin/python install --no-deps --no-index /wheels/*.whl
 
 FROM tools AS service-environment
-# `runtime`, or `cluster` for what a Dask cluster needs, too.
-ARG REQUIREMENTS=runtime
-COPY requirements/runtime.txt requirements/cluster.txt requirements/
+COPY requirements/runtime.txt requirements/
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf --mount=type=secret,id=authorities \
     if [ -s /run/secrets/authorities ]; then export PIP_CERT=/run/secrets/authorities; fi \
-    && pip --python /opt/driveby/bin/python install --no-compile --require-hashes -r requirements/${REQUIREMENTS}.txt
+    && pip --python /opt/driveby/bin/python install --no-compile --require-hashes -r requirements/runtime.txt
 RUN /slim_environment /opt/driveby
 COPY --from=wheel /wheels /wheels
 RUN pip --python /opt/driveby/bin/python install --no-deps --no-index /wheels/*.whl

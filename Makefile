@@ -6,7 +6,7 @@ PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo up down test test-all faults soak day year mutants validate lint docs bench lock clean
+.PHONY: help install demo up down test test-all faults soak day year mutants validate lint tables docs dist bench lock clean
 
 help: ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -39,7 +39,7 @@ up: ## the demo's services as containers (Docker Engine 26.0, Compose 2.26)
 down: ## end the containers; recordings, results, spools and certificates stay in their volumes
 	docker compose --profile setup --profile cluster down --remove-orphans
 
-# One worker computes while the other waits for processes (tests/conftest.py); more would only wait.
+# One worker computes while the other one waits for processes (tests/groups.py).
 BESIDE := -n 2 --dist loadgroup
 
 test: $(STAMP) ## the default tests (some 17 minutes on 2 busy cores)
@@ -48,8 +48,8 @@ test: $(STAMP) ## the default tests (some 17 minutes on 2 busy cores)
 test-all: $(STAMP) ## the default tests and the slow ones
 	$(BIN)/python -m pytest $(BESIDE) -m "slow or not slow"
 
-faults: $(STAMP) ## everything that tries to lose or break data, but the soak (at most 20 minutes)
-	$(BIN)/python -m pytest tests/faults -m "not soak" --session-timeout=1200
+faults: $(STAMP) ## everything that tries to lose or break data, but the soak (20 to 30 minutes)
+	$(BIN)/python -m pytest tests/faults -m "not soak" --session-timeout=2400
 
 KILLS ?= 50
 MINUTES ?= 60
@@ -79,21 +79,28 @@ lint: $(STAMP) ## format, lint, types and import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+tables: $(STAMP) ## write the tables of the pages that follow from code
+	$(BIN)/python docs/scripts/tables.py
+
 docs: $(STAMP) ## the pages as a site, in build/site
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/docs.txt
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	@echo "build/site/index.html"
 
-bench: $(STAMP) ## time everything, with its peers, into docs/benchmarks.md (12 minutes)
+dist: $(STAMP) ## wheel and source archive of the commit, in build/dist; the same bytes each time
+	rm -rf build/dist build/source
+	mkdir -p build/source
+	git archive HEAD | tar -x -C build/source
+	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python docs/scripts/distribution.py build/source build/dist
+	rm -rf build/source
+
+bench: $(STAMP) ## time everything, with its peers, into studies/benchmarks.md (12 minutes)
 	$(BIN)/python -m tests.benchmarks.report
 
-OF_A_TRUCK := cryptography eclipse-zenoh foxglove-schemas-protobuf mcap numpy protobuf pydantic zstandard
-
 lock: ## write the pinned requirements anew (needs uv)
-	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate pyproject.toml -o requirements/runtime.txt
-	printf '%s\n' $(OF_A_TRUCK) | uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c requirements/runtime.txt - -o requirements/truck.txt
+	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --extra all pyproject.toml -o requirements/runtime.txt
+	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c requirements/runtime.txt pyproject.toml -o requirements/truck.txt
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --extra dev pyproject.toml -o requirements/dev.txt
-	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --extra cluster pyproject.toml -o requirements/cluster.txt
 	sed -n '/^docs = \[/,/^]/s/^ *"\(.*\)",.*/\1/p' pyproject.toml | uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate -c requirements/dev.txt - -o requirements/docs.txt
 	echo 'setuptools>=77' | uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate - -o requirements/build.txt
 

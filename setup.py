@@ -5,16 +5,24 @@ would shadow other people's packages of these names. So the build moves them to
 `driveby/services`, … and rewrites what names them: imports, and strings that are the name of one
 of their modules and nothing else (`python -m services`, `resources.files("services")`). Nothing is
 done to an editable installation. All else about the build is in pyproject.toml.
+
+With the variable SOURCE_DATE_EPOCH (`make dist`) the same sources give the same bytes: setuptools
+takes the wheel's times from it, and `SameBytes` those of the source archive.
 """
 
 import ast
+import gzip
+import os
 import re
 import shutil
+import tarfile
 from pathlib import Path
+from typing import Any
 
 from setuptools import setup
 from setuptools.command.build_py import build_py
 from setuptools.command.egg_info import egg_info
+from setuptools.command.sdist import sdist
 
 OUTER = "driveby"
 INNER = ("pre_core", "schemas", "services")
@@ -46,6 +54,33 @@ class NamesOnlyOuter(egg_info):
         """Called by setuptools."""
         super().run()
         Path(self.egg_info, "top_level.txt").write_text(f"{OUTER}\n")
+
+
+class SameBytes(sdist):
+    """Source archive without its builder's names, modes of files and times."""
+
+    def make_archive(self, base_name: str, format: str, **places: Any) -> str:  # noqa: A002 - its name
+        """Called by setuptools."""
+        if format != "gztar" or "SOURCE_DATE_EPOCH" not in os.environ:
+            return str(super().make_archive(base_name, format, **places))
+        seconds = int(os.environ["SOURCE_DATE_EPOCH"])
+
+        def anonymous(member: tarfile.TarInfo) -> tarfile.TarInfo:
+            member.uid = member.gid = 0
+            member.uname = member.gname = ""
+            member.mode = 0o755 if member.isdir() else 0o644
+            member.mtime = seconds
+            return member
+
+        archive = Path(f"{base_name}.tar.gz")
+        archive.parent.mkdir(parents=True, exist_ok=True)
+        with (
+            archive.open("wb") as file,
+            gzip.GzipFile("", "wb", fileobj=file, mtime=seconds) as packed,
+            tarfile.open(fileobj=packed, mode="w") as tar,
+        ):
+            tar.add(places["base_dir"], filter=anonymous)  # in the order of names
+        return str(archive)
 
 
 def moved_inside(source: bytes, name: str) -> bytes:
@@ -85,4 +120,4 @@ def _is_inner(name: object) -> bool:
 
 
 if __name__ == "__main__":
-    setup(cmdclass={"build_py": BuildInside, "egg_info": NamesOnlyOuter})
+    setup(cmdclass={"build_py": BuildInside, "egg_info": NamesOnlyOuter, "sdist": SameBytes})

@@ -1,4 +1,4 @@
-"""driveby for researchers: read, identify, simulate, plot (docs/python.md).
+"""driveby for researchers: read, identify, fuse, simulate, survey, plot (docs/python.md).
 
     import driveby
 
@@ -12,14 +12,22 @@ version only. Nothing is imported before it is used: `import driveby` takes mill
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from services.common.extras import check_extras
+
 if TYPE_CHECKING:
     from driveby.plotting import plot as plot
+    from driveby.reports import report as report
+    from driveby.surveys import SurveyPlan as SurveyPlan
+    from driveby.surveys import survey as survey
     from schemas.signals import CHANNELS as CHANNELS
     from schemas.site import Site as Site
     from schemas.site_file import load_site as load_site
+    from schemas.site_file import with_values as with_values
     from services.common.errors import FailureError as FailureError
     from services.common.errors import InputError as InputError
     from services.drives.signals import Signals as Signals
+    from services.notebook.fuse import Fusion as Fusion
+    from services.notebook.fuse import fuse as fuse
     from services.notebook.identify import identify as identify
     from services.notebook.read import read as read
     from services.notebook.simulate import Simulation as Simulation
@@ -32,34 +40,60 @@ __version__: str
 __all__ = [
     "CHANNELS",
     "FailureError",
+    "Fusion",
     "Identification",
     "InputError",
     "Signals",
     "Simulation",
     "Site",
     "Solution",
+    "SurveyPlan",
+    "fuse",
     "identify",
     "load_site",
     "plot",
     "read",
+    "report",
     "simulate",
+    "survey",
+    "with_values",
 ]
 
 _PLACES = {
     "CHANNELS": "schemas.signals",
     "FailureError": "services.common.errors",
+    "Fusion": "services.notebook.fuse",
     "Identification": "services.notebook.solution",
     "InputError": "services.common.errors",
     "Signals": "services.drives.signals",
     "Simulation": "services.notebook.simulate",
     "Site": "schemas.site",
     "Solution": "services.notebook.solution",
+    "SurveyPlan": "driveby.surveys",
+    "fuse": "services.notebook.fuse",
     "identify": "services.notebook.identify",
     "load_site": "schemas.site_file",
     "plot": "driveby.plotting",
     "read": "services.notebook.read",
+    "report": "driveby.reports",
     "simulate": "services.notebook.simulate",
+    "survey": "driveby.surveys",
+    "with_values": "schemas.site_file",
 }
+
+
+_NEEDS = {
+    "Fusion": ("identify",),
+    "Simulation": ("identify",),
+    "SurveyPlan": ("identify",),
+    "fuse": ("identify",),
+    "identify": ("identify",),
+    "plot": ("identify", "view"),
+    "report": ("identify", "view"),
+    "simulate": ("identify",),
+    "survey": ("identify",),
+}
+"""Extras, by the names that need them."""
 
 
 def __getattr__(name: str) -> object:
@@ -69,6 +103,7 @@ def __getattr__(name: str) -> object:
         return version("driveby")
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    check_extras(f"driveby.{name}", _NEEDS.get(name, ()))
     value = getattr(import_module(_PLACES[name]), name)
     globals()[name] = value
     return value

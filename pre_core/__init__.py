@@ -7,12 +7,7 @@ imports. Units are SI throughout; `x` is the chainage of `docs/contract.md`.
 import sys
 from importlib.util import LazyLoader, find_spec, module_from_spec
 
-import numba
 import numpy as np
-
-# The particle kernels hold four particles in tuples of four floats (lanes.py); LLVM packs them into
-# vector registers only with its superword pass, which numba leaves off. It changes speed alone.
-setattr(numba.config, "SLP_VECTORIZE", 1)  # noqa: B010 - the type stubs do not know it
 
 
 def _put_off(*names: str) -> None:

@@ -1,3 +1,4 @@
-"""What goes over the wire and into files: topics, messages, site file, results. Imports no other
-package of ours.
+"""Definitions of the wire and of files: topics, messages, site file, results.
+
+Imports no other package of ours.
 """

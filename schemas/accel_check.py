@@ -1,10 +1,10 @@
-"""Checks an AccelBatch without taking it apart: most of what a logger of many trucks computes.
+"""Check of an AccelBatch without decoding it: the main computing cost of a logger of many trucks.
 
-No I/O. Encoded as protobuf's own encoders do, a batch is a header of five numbers and then, channel
-by channel, some bytes that are the same in every batch (tags, lengths, position, rate), the samples
-and, of a channel without a position, its name. Read in that order nothing is left over, so what
-fits this form means here what it means to protobuf. What does not fit, or is not right, goes
-through `decode_accel`, which knows every form and says what is wrong.
+No I/O. As protobuf's own encoders write it, a batch is a header of five numbers. Then, for each
+channel, follow bytes that are the same in every batch (tags, lengths, position, rate), the samples
+and, for a channel without a position, its name. A payload that this form describes completely means
+the same to protobuf. Any other payload goes through `decode_accel`, which knows every form and
+reports the error.
 """
 
 import re
@@ -30,7 +30,7 @@ from schemas.topics import check_identifier
 
 _VARINT = rb"[\x80-\xff]{0,9}[\x00-\x7f]"
 _HEADER = re.compile(rb"\x08\x01" + b"".join(rb"\x%02x" % tag + _VARINT for tag in b"\x10\x18 ("))
-"""Version 1, boot_id, sequence, device and wall time. One that is 0 is left out: not this form."""
+"""Version 1, boot_id, sequence, device and wall time. A zero is not encoded: another form."""
 _BEFORE = re.compile(
     rb"\x32(%b)(\x08[\x00-\x7f])?\x11(.{8})\x1a(%b)" % (_VARINT, _VARINT), re.DOTALL
 )
@@ -44,26 +44,26 @@ _FLOAT64 = np.dtype("<f8")
 
 
 class _Channel(NamedTuple):
-    """What the bytes before the samples of a channel say."""
+    """Content of the bytes before the samples of a channel."""
 
     name: str
-    """Of its position; empty where its name stands behind the samples."""
+    """Name of the channel's position; empty where the name follows the samples."""
     number: int
-    """Samples; 0: these bytes do not have the form, or are not right."""
+    """Number of samples; 0 if the bytes do not have the form or are invalid."""
     behind: int = 0
-    """Bytes behind the samples, of tag, length and name."""
+    """Number of bytes after the samples: tag, length and name."""
 
 
 _NOTHING = _Channel("", 0)
 
 
 def check_accel(payload: bytes) -> Stamp:
-    """Return the times and the identity of a batch; ValueError wherever `decode_accel` says so."""
+    """Return the times and identity of a batch; raise ValueError where `decode_accel` does."""
     return _stamp_if_usual(payload) or stamp(decode_accel(payload))
 
 
 def _stamp_if_usual(payload: bytes) -> Stamp | None:
-    """Return the stamp of a batch of the usual form in which everything is right, else None."""
+    """Return the stamp of a valid batch of the usual form, else None."""
     header = _HEADER.match(payload)
     if header is None:
         return None
@@ -87,8 +87,8 @@ def _stamp_if_usual(payload: bytes) -> Stamp | None:
     if not samples or len(names) > MAX_CHANNELS:
         return None
     every = np.frombuffer(b"".join(samples), _FLOAT64)
-    # numpy's product would give up the interpreter's lock, which other threads wait for.
-    if not np.maximum.reduce(np.abs(every)) <= MAX_ACCELERATION_M_PER_S2:  # of a NaN it is false
+    # numpy's product would release the interpreter's lock, and other threads would take it.
+    if not np.maximum.reduce(np.abs(every)) <= MAX_ACCELERATION_M_PER_S2:  # false for a NaN
         return None
     try:
         message = pb.AccelBatch.FromString(header[0])
@@ -98,9 +98,9 @@ def _stamp_if_usual(payload: bytes) -> Stamp | None:
     return stamp(message)
 
 
-@lru_cache(maxsize=10_000)  # the same few come thousands of times a second
+@lru_cache(maxsize=10_000)  # a few values recur thousands of times a second
 def _channel(before: bytes) -> _Channel:
-    """Read what stands before the samples of a channel."""
+    """Parse the bytes before the samples of a channel."""
     found = _BEFORE.fullmatch(before)
     if found is None:
         return _NOTHING
@@ -121,7 +121,7 @@ def _channel(before: bytes) -> _Channel:
 
 @lru_cache(maxsize=10_000)
 def _name(behind: bytes) -> str:
-    """Read the name behind the samples of a channel; empty if it is none of the usual form."""
+    """Return the name after the samples of a channel; empty if it does not have the usual form."""
     if len(behind) < 3 or behind[:1] != _NAME or behind[1] != len(behind) - 2:
         return ""
     try:

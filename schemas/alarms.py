@@ -1,24 +1,20 @@
-"""Alarms of bridges: as files of a history, and on the wire."""
+"""Alarms of bridges, in the files of a history and on the wire."""
 
 from datetime import UTC, datetime
 from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
 from schemas.proto import driveby_pb2 as pb
+from schemas.strict_model import Finite, StrictModel
 from schemas.topics import IDENTIFIER, check_realm
 
 SCHEMA_VERSION: Final = 1
 _MAX_TEXT_CHARACTERS = 1000
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Fields(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Acknowledgement(_Fields):
-    """Somebody has taken note of an alarm: what is then is what later crossings are held to."""
+class Acknowledgement(StrictModel):
+    """An operator's note of an alarm; the state at its time is the new baseline."""
 
     edition: Literal[1] = 1
     by: Annotated[str, Field(min_length=1, max_length=200)]
@@ -27,8 +23,8 @@ class Acknowledgement(_Fields):
     note: Annotated[str, Field(max_length=_MAX_TEXT_CHARACTERS)] = ""
 
 
-class Alarm(_Fields):
-    """A bridge is not what it was. Times are seconds since 1970 UTC."""
+class Alarm(StrictModel):
+    """A detected change of a bridge. Times are seconds since 1970 UTC."""
 
     edition: Literal[1] = 1
     alarm_id: Annotated[str, Field(pattern=rf"^{IDENTIFIER}$")]
@@ -37,21 +33,21 @@ class Alarm(_Fields):
     element: Annotated[int, Field(ge=1, le=99)]
     direction: Literal["weaker", "stiffer"]
     since: Finite
-    """Beginning of the period in which the change began, most likely."""
+    """Beginning of the period in which the change most likely began."""
     raised: Finite
-    """End of the period that raised it."""
+    """End of the period that raised the alarm."""
     sum: Finite
-    """Statistic of the chart that raised it, in standard deviations: √(2 ln R), of earlier versions
-    a CUSUM. Compare it with the threshold of the same alarm only."""
+    """Chart statistic that raised the alarm, in standard deviations: √(2 ln R); a CUSUM in earlier
+    versions. Comparable with the threshold of the same alarm only."""
     threshold: Finite
     ratio: Finite
-    """EI of the element now over before, with its 95 % interval."""
+    """EI of the element after the change over EI before, with its 95 % interval."""
     ratio_q025: Finite
     ratio_q975: Finite
     acknowledged: Acknowledgement | None = None
 
     def sentence(self) -> str:
-        """What it says, in words."""
+        """Return the alarm in words."""
         change = 100.0 * abs(1.0 - self.ratio)
         ends = sorted(100.0 * abs(1.0 - end) for end in (self.ratio_q025, self.ratio_q975))
         return (
@@ -87,7 +83,7 @@ def encode_alarm(alarm: Alarm, time_ns: int) -> bytes:
 
 
 def alarm_of(message: pb.Alarm, realm: str) -> Alarm:
-    """The alarm of a message; ValueError if its version or its values are none of ours."""
+    """Return the alarm of a message; raise ValueError if its version or a value is invalid."""
     if message.schema_version != SCHEMA_VERSION:
         raise ValueError(f"Alarm has schema version {message.schema_version}, not 1")
     note = None

@@ -1,10 +1,10 @@
-"""What a person gets to read when a file or an option that they gave is wrong."""
+"""The error for files and options that are wrong, as users read it."""
 
 
 class InputError(ValueError):
-    """Bad input: one line that names the file, the field and what would be right.
+    """An error in the input: one line that names the file, the field and what would be right.
 
-    The command line prints the line and leaves with exit code 2.
+    The command line prints the line and exits with code 2.
     """
 
     def __init__(self, line: str) -> None:
@@ -12,9 +12,9 @@ class InputError(ValueError):
 
 
 def one_line(text: str) -> str:
-    """A text without line breaks, and without what a terminal would obey rather than show.
+    """Return a text without line breaks and terminal control characters.
 
-    Names in files and messages may be anybody's.
+    Names in files and messages may come from anybody.
     """
     spaced = " ".join(text.split())
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in spaced)

@@ -1,4 +1,4 @@
-"""What a reader of a recording must know, as events in the recording itself."""
+"""Events in a recording that its readers must know."""
 
 from enum import StrEnum
 from typing import NamedTuple
@@ -12,7 +12,7 @@ _MAX_TEXT_CHARACTERS = 1000
 
 
 class EventKind(StrEnum):
-    """Why an event was written. The codes are part of the recording format."""
+    """Kind of an event. The codes are part of the recording format."""
 
     GAP = "gap"
     LOST = "lost"
@@ -53,7 +53,7 @@ EVENT_TEXTS: dict[EventKind, str] = {
 
 
 class Event(NamedTuple):
-    """One event. Empty or 0 where a field does not apply."""
+    """One event. Fields that do not apply are empty or 0."""
 
     kind: EventKind
     time_ns: int
@@ -65,11 +65,11 @@ class Event(NamedTuple):
     first_sequence: int = 0
     last_sequence: int = 0
     messages: int = 0
-    """How many messages it concerns."""
+    """Number of messages concerned."""
 
 
 def encode_event(event: Event) -> bytes:
-    """Return the Event message; a text of more than 1000 characters is cut."""
+    """Return the Event message; cut its text to 1000 characters."""
     return pb.Event(
         schema_version=SCHEMA_VERSION,
         time_ns=event.time_ns,
@@ -85,7 +85,7 @@ def encode_event(event: Event) -> bytes:
 
 
 def decode_event(payload: bytes) -> Event:
-    """Return the event; ValueError with one line if it is malformed or of an unknown kind."""
+    """Return the event; raise ValueError in one line if it is malformed or of an unknown kind."""
     try:
         message = pb.Event.FromString(payload)
     except DecodeError as error:

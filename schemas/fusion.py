@@ -1,36 +1,33 @@
-"""What a crossing's result keeps for fusion: its likelihood about what crossings have in common.
+"""The part of a crossing's result that fusion needs: its likelihood of the shared parameters.
 
--|R x - z|²/2 is the logarithm of the likelihood up to a constant, of x: the bridge's unknowns, the
-truck's, and coefficients in mm of the long waves of the mismatch of its axles' roads; where there
-are `bends`, then the crossing's place in m from where it was found, and the bends. No prior of the
-first three is in it, nor the truck's total mass, to which all rigidities are proportional.
+Up to a constant the log-likelihood of x is -|R x - z|²/2. The vector x holds the parameters of the
+bridge and of the truck, and coefficients in mm of the long waves of the profile mismatch. With
+`bends` follow the longitudinal offset from the estimate in m and the curvature terms. It contains
+no prior of the first three, nor the truck's total mass, to which all rigidities are proportional.
 """
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+from schemas.strict_model import Finite, StrictModel
+
 _MOST_COORDINATES = 400
 
 
-class _Fields(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Coordinate(_Fields):
-    """An unknown: x = ln(value/location)/scale or value/scale; of EI, location/EI."""
+class Coordinate(StrictModel):
+    """A parameter: x = ln(value/location)/scale or value/scale; for EI, location/EI."""
 
     name: str
     location: Finite
     scale: Annotated[Finite, Field(gt=0)]
     is_log: bool
     absence: Annotated[Finite, Field(ge=0, le=1)] = 0.0
-    """Probability before any crossing that it is exactly zero."""
+    """Prior probability that the parameter is exactly zero."""
 
 
-class Axle(_Fields):
-    """Where an axle stands on the road, in m."""
+class AxleFootprint(StrictModel):
+    """Footprint of an axle on the road, in m."""
 
     width_m: Finite
     twin_distance_m: Finite
@@ -39,46 +36,48 @@ class Axle(_Fields):
     offset_m: Finite
 
 
-class Stretch(_Fields):
-    """Values along the road, from `begin_m` on."""
+class Stretch(StrictModel):
+    """Values at even steps along the road, from `begin_m`."""
 
     begin_m: Finite
     step_m: Annotated[Finite, Field(gt=0)]
     values: tuple[Finite, ...]
 
 
-class Bends(_Fields):
-    """What is of second order: sums of products of what bridge and place move from `about`."""
+class Bends(StrictModel):
+    """Curvature terms: sums of products of two moves, of bridge parameters or offset."""
 
     about: tuple[Finite, ...]
-    """x of the bridge's unknowns at the crossing's own optimum."""
+    """Values of the bridge's x at the optimum of this crossing, from which the moves count; shape
+    (b,)."""
     size: tuple[Annotated[Finite, Field(gt=0)], ...]
-    """Units of the moves: of the bridge's unknowns, and in m of the place."""
+    """Units of the moves: of the b bridge parameters, and in m of the offset."""
     shapes: tuple[Finite, ...]
-    """Of one bend after the other the factors of all products of two moves, i <= j row by row."""
+    """Factors of all products of two moves, i <= j row by row, one curvature term after the other.
+    """
 
 
-class FusionLikelihood(_Fields):
-    """See the module's text."""
+class FusionLikelihood(StrictModel):
+    """The likelihood of a crossing, as the module describes it."""
 
     bridge: tuple[Coordinate, ...]
-    """Elements last."""
+    """Bridge parameters; elements last."""
     truck: tuple[Coordinate, ...]
     root: tuple[Finite, ...]
     """R, upper triangular, row by row."""
     target: Annotated[tuple[Finite, ...], Field(max_length=_MOST_COORDINATES)]
-    """z."""
+    """The vector z."""
     element_lengths_m: tuple[Finite, ...]
     mass_spread: Annotated[Finite, Field(ge=0)]
-    """Relative, of the truck's total mass."""
-    footprints: tuple[Axle, Axle]
+    """Relative standard deviation of the truck's total mass."""
+    footprints: tuple[AxleFootprint, AxleFootprint]
     first_knot_m: Finite | None = None
-    """Chainage; None where both axles feel one road."""
+    """Chainage of the first mismatch coefficient; None where both axles follow one profile."""
     knot_spacing_m: Annotated[Finite, Field(gt=0)]
     level_m3: tuple[Finite, ...]
-    """Of the mismatch, as the crossing told it."""
+    """Level of the mismatch spectrum as this crossing estimates it."""
     off_bridge_m: tuple[Stretch, ...] = ()
-    """The mismatch before and behind the bridge."""
+    """Mismatch before and behind the bridge."""
     bends: Bends | None = None
 
     @model_validator(mode="after")
@@ -86,13 +85,13 @@ class FusionLikelihood(_Fields):
         m = len(self.target)
         if len(self.root) != m * (m + 1) // 2:
             raise ValueError(f"root must have {m * (m + 1) // 2} numbers, as target has {m}")
-        told = len(self.bridge) + len(self.truck) + self._of_bends()
-        if m < told or (m > told) != (self.first_knot_m is not None):
+        expected = len(self.bridge) + len(self.truck) + self._of_bends()
+        if m < expected or (m > expected) != (self.first_knot_m is not None):
             raise ValueError("target must have a place for each coordinate, knot and bend")
         return self
 
     def _of_bends(self) -> int:
-        """How many places bends take, with the crossing's place."""
+        """Return the number of coordinates of the curvature terms, with the offset."""
         if self.bends is None:
             return 0
         moves = len(self.bends.size)

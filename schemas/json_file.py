@@ -1,4 +1,4 @@
-"""A file of JSON as a model, or one line that says what is wrong with it."""
+"""JSON files as models, with one line for each error."""
 
 from pathlib import Path
 from typing import TypeVar
@@ -11,7 +11,7 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 def load_json(model: type[ModelT], path: Path, what: str) -> ModelT:
-    """Read a file that is to be `what` ("a results file"); InputError in one line if not."""
+    """Read a file as `what` ("a results file"); raise InputError in one line if it is not one."""
     try:
         return model.model_validate_json(path.read_bytes())
     except FileNotFoundError as error:

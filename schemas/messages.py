@@ -1,7 +1,7 @@
-"""From a topic's message name to its protobuf class, its descriptors and a checked message.
+"""Access from a topic's message name to its protobuf class, descriptors and checked message.
 
-`foxglove.LocationFix` comes from the package foxglove-schemas-protobuf and is imported only when
-it is needed.
+`foxglove.LocationFix` comes from the package foxglove-schemas-protobuf and is imported only when it
+is needed.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,7 +24,7 @@ MESSAGES = tuple(sorted({row.message for row in TOPICS if row.message}))
 
 @cache
 def message_class(name: str) -> type[Message]:
-    """Return the class of a full protobuf name of the topic table; ValueError if it is not one."""
+    """Return the class of a full protobuf name; raise ValueError if no topic has it."""
     if name not in MESSAGES:
         raise ValueError(f"no message {name[:80]!r}; there are {', '.join(MESSAGES)}")
     if name == LOCATION:
@@ -35,12 +35,12 @@ def message_class(name: str) -> type[Message]:
 
 @cache
 def descriptors(name: str) -> bytes:
-    """Return a serialised FileDescriptorSet: the message's file after all that it imports.
+    """Return a serialised FileDescriptorSet: the message's file after everything that it imports.
 
     This is the schema data of an MCAP channel; readers such as Rerun decode with it alone.
     """
     files = descriptor_pb2.FileDescriptorSet()
-    own: Any = message_class(name).DESCRIPTOR.file  # upb's class, which the stubs keep apart
+    own: Any = message_class(name).DESCRIPTOR.file  # upb's class, which the stubs do not know
     for file in _with_imports(own, set()):
         file.CopyToProto(files.file.add())
     return files.SerializeToString(deterministic=True)
@@ -56,7 +56,7 @@ def _with_imports(file: FileDescriptor, done: set[str]) -> Iterator[FileDescript
 
 
 def decode(name: str, payload: bytes) -> Message:
-    """Parse the payload of a message of the table; ValueError with one line if it is malformed."""
+    """Return the message of a payload; raise ValueError in one line if it is malformed."""
     try:
         return message_class(name).FromString(payload)
     except DecodeError as error:
@@ -64,16 +64,16 @@ def decode(name: str, payload: bytes) -> Message:
 
 
 def check_payload(row: Topic, payload: bytes) -> int:
-    """Return the time in ns since 1970 UTC of a payload that `check_stamp` finds right."""
+    """Return the time in ns since 1970 UTC of a payload that passes `check_stamp`."""
     return check_stamp(row, payload).wall_time_ns
 
 
 def check_stamp(row: Topic, payload: bytes) -> Stamp:
     """Check a payload as far as its topic allows and return its times and identity.
 
-    The time is the wall time of the first sample of `accel`, of the fix of `gnss` and `location`,
-    and when the message was made for all others: the `log_time` of a recording. ValueError names
-    the topic and what is wrong: too large, not that message, another version, impossible values.
+    The time is the `log_time` of a recording: the wall time of the first sample of `accel`, of the
+    fix of `gnss` and `location`, and of the creation of any other message. ValueError names the
+    topic and the fault: too large, another message, another version, impossible values.
     """
     try:
         if len(payload) > row.max_bytes:

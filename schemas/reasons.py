@@ -1,4 +1,4 @@
-"""Why a crossing is not `good`: an enumeration with a sentence each."""
+"""Reasons why a crossing is not `good`, a sentence each."""
 
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
@@ -6,9 +6,9 @@ from typing import Final
 
 
 class Reason(StrEnum):
-    """The codes in `reasons` of a result. A code is never given another meaning."""
+    """A code in `reasons` of a result. A code never changes its meaning."""
 
-    # What the recording lacks.
+    # Faults of the recording.
     CHANNEL_MISSING = "channel_missing"
     GAP_ON_BRIDGE = "gap_on_bridge"
     POSITION_OUTAGE = "position_outage"
@@ -26,16 +26,16 @@ class Reason(StrEnum):
     ROLL_NOT_SEEN = "roll_not_seen"
     SENSORS_DISAGREE = "sensors_disagree"
     INCOMPLETE_CROSSING = "incomplete_crossing"
-    # What is known beside its own signals.
+    # Knowledge from outside the signals.
     VEHICLE_DIFFERS_FROM_SITE = "vehicle_differs_from_site"
     OTHER_TRUCK_ON_BRIDGE = "other_truck_on_bridge"
-    # How the truck was driven.
+    # The way the truck was driven.
     SPEED_TOO_LOW = "speed_too_low"
     STOPPED_ON_BRIDGE = "stopped_on_bridge"
     ACCELERATING_CG_UNKNOWN = "accelerating_cg_unknown"
     AXLES_ALIKE = "axles_alike"
     APPROACH_TOO_SHORT = "approach_too_short"
-    # What the fit says.
+    # Diagnostics of the fit.
     NO_NOISE_MODEL = "no_noise_model"
     MODEL_MISFIT = "model_misfit"
     RESIDUALS_COLOURED = "residuals_coloured"
@@ -48,31 +48,32 @@ class Reason(StrEnum):
     IMPLAUSIBLE_BRIDGE = "implausible_bridge"
     POSITION_INCONSISTENT = "position_inconsistent"
     SPEED_INCONSISTENT = "speed_inconsistent"
-    # How the search ended.
+    # Outcome of the search.
     NOT_CONVERGED = "not_converged"
     SAMPLER_DIAGNOSTICS = "sampler_diagnostics"
     FAILED = "failed"
     CONTINUOUS_BRIDGE = "continuous_bridge"
+    TANDEM = "tandem"
 
 
 REASON_TEXTS: Final[dict[Reason, str]] = {
     Reason.CHANNEL_MISSING: "The truck lacks one of the four accelerometers that the method needs.",
     Reason.GAP_ON_BRIDGE: "Samples are missing while the truck was on the bridge.",
-    Reason.POSITION_OUTAGE: "The receiver gave no position while the truck was on the bridge.",
+    Reason.POSITION_OUTAGE: "The receiver reported no position while the truck was on the bridge.",
     Reason.NOT_FINITE: "The recording or the fit contains values that are not finite numbers.",
     Reason.SENSOR_SATURATED: "An accelerometer reached the end of its range.",
     Reason.CHANNEL_SWAPPED: "Two channels seem to be exchanged.",
     Reason.CHANNEL_INVERTED: "A channel seems to have the wrong sign.",
     Reason.CHANNEL_STUCK: "A channel repeats one value.",
-    Reason.CHANNEL_BRIDGED: "A channel has a straight line where no sensor measured.",
-    Reason.CHANNELS_ALIKE: "Two channels show the same.",
-    Reason.CHANNEL_BIASED: "A channel has an offset as large as a part of gravity.",
+    Reason.CHANNEL_BRIDGED: "A channel contains a straight line in place of measured samples.",
+    Reason.CHANNELS_ALIKE: "Two channels are identical.",
+    Reason.CHANNEL_BIASED: "A channel has an offset that is a considerable part of gravity.",
     Reason.CHANNEL_SLIPPED: "The delay of a channel changes within the record.",
     Reason.GAIN_CHANGED: "The gain of a channel changes within the record.",
-    Reason.SIGNAL_SPIKES: "Single samples of a channel stand out of their neighbours.",
+    Reason.SIGNAL_SPIKES: "Single samples of a channel are far from their neighbours.",
     Reason.ROLL_NOT_SEEN: (
-        "A part of the truck is measured on one side only, so its roll cannot be told from its "
-        "heave."
+        "A part of the truck is measured on one side only, so its roll cannot be separated from "
+        "its heave."
     ),
     Reason.SENSORS_DISAGREE: (
         "Accelerometers of one part of the truck do not agree: a gain or a delay is wrong, or one "
@@ -80,7 +81,7 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     ),
     Reason.INCOMPLETE_CROSSING: "The recording begins or ends while the truck is on the bridge.",
     Reason.VEHICLE_DIFFERS_FROM_SITE: (
-        "What the truck says of itself is not what the site file says of it."
+        "The truck reports values of its own that differ from the site file."
     ),
     Reason.OTHER_TRUCK_ON_BRIDGE: "Another truck was on the bridge at the same time.",
     Reason.SPEED_TOO_LOW: "The truck was too slow for its axles to feel the bridge's stiffness.",
@@ -89,47 +90,50 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
         "The truck braked or accelerated and the height of its centre of gravity is unknown."
     ),
     Reason.AXLES_ALIKE: (
-        "The axle loads are nearly equal, so the difference between the wheels says little."
+        "The axle loads are nearly equal, so the difference between the axles carries little "
+        "information."
     ),
     Reason.APPROACH_TOO_SHORT: (
-        "The axles' roads seem to differ, and too little road before and behind the bridge was "
-        "recorded to tell by how much."
+        "The axles seem to follow different road profiles, and too little road was recorded before "
+        "and after the bridge to estimate by how much they differ."
     ),
-    Reason.NO_NOISE_MODEL: "The method has no noise model, so its intervals mean nothing.",
+    Reason.NO_NOISE_MODEL: "The method has no noise model, so it provides no valid intervals.",
     Reason.MODEL_MISFIT: "The model does not explain the measured accelerations.",
-    Reason.RESIDUALS_COLOURED: "What the fit leaves over is not random noise.",
+    Reason.RESIDUALS_COLOURED: "The residuals are not random noise.",
     Reason.NOISE_ABOVE_DECLARED: "The accelerometers are noisier than the site file says.",
     Reason.NOISE_BELOW_DECLARED: (
         "The accelerometers are much quieter than the site file says, which could hide a misfit."
     ),
-    Reason.IMPLAUSIBLE_VEHICLE: "The truck that fits is not the truck of the site file.",
+    Reason.IMPLAUSIBLE_VEHICLE: "The estimated truck parameters contradict the site file.",
     Reason.MORE_AXLES_THAN_DECLARED: (
-        "The rear of the truck moves as if a further axle or a trailer, which the site file does "
-        "not declare, pushed it."
+        "The rear of the truck moves as if pushed by a further axle or a trailer that the site "
+        "file does not declare."
     ),
     Reason.MISMATCH_IMPLAUSIBLE: (
-        "The axles feel roads that differ by far more than the declared tyres and tracks can cause."
+        "The road profiles under the axles differ by far more than the declared tyres and tracks "
+        "can cause."
     ),
     Reason.COMMON_DISTURBANCE: (
-        "All sensors measure something in common that is no vertical motion, as tilted ones do."
+        "All sensors share a disturbance that is not vertical motion, as tilted sensors do."
     ),
     Reason.IMPLAUSIBLE_BRIDGE: (
-        "An element is stiffer than its nominal value and than the others by more than any damage "
-        "of these explains."
+        "An element is so much stiffer than its nominal value and than the others that no damage "
+        "of the others explains it."
     ),
-    Reason.POSITION_INCONSISTENT: "The position that fits disagrees with the receiver.",
-    Reason.SPEED_INCONSISTENT: "The receiver's speeds contradict its positions or the fit.",
+    Reason.POSITION_INCONSISTENT: "The estimated position contradicts the receiver.",
+    Reason.SPEED_INCONSISTENT: "The receiver's speeds contradict its positions or the estimate.",
     Reason.NOT_CONVERGED: "The search did not converge.",
-    Reason.SAMPLER_DIAGNOSTICS: "The draws did not pass their own checks.",
+    Reason.SAMPLER_DIAGNOSTICS: "The posterior draws did not converge.",
     Reason.FAILED: "The identification failed.",
     Reason.CONTINUOUS_BRIDGE: (
         "The bridge has supports between its ends, and the method is for a single span."
     ),
+    Reason.TANDEM: "The truck has a tandem, and the method is for two axles.",
 }
 
 
 class BridgeReason(StrEnum):
-    """Why the fused estimate of a bridge is not `good`."""
+    """A reason why the fused estimate of a bridge is not `good`."""
 
     NO_GOOD_CROSSING = "no_good_crossing"
     NOT_FUSED = "not_fused"
@@ -141,19 +145,19 @@ class BridgeReason(StrEnum):
 BRIDGE_REASON_TEXTS: Final[dict[BridgeReason, str]] = {
     BridgeReason.NO_GOOD_CROSSING: "No crossing of the bridge is good.",
     BridgeReason.NOT_FUSED: (
-        "The method leaves nothing that crossings could be fused by: this is the latest alone."
+        "The method provides no likelihood to fuse; this is the latest crossing alone."
     ),
     BridgeReason.CROSSINGS_DISAGREE: (
-        "Crossings disagree by more than their uncertainty and the change between them explain, "
-        "and too few are there to tell which is wrong."
+        "Crossings disagree by more than their uncertainty and the between-crossing variability "
+        "explain, and there are too few of them to find which one is wrong."
     ),
     BridgeReason.MANY_LEFT_OUT: "More than a third of the good crossings disagree with the others.",
-    BridgeReason.USES_SUSPECT: "Suspect crossings were fused because that was asked for.",
+    BridgeReason.USES_SUSPECT: "Suspect crossings were fused on request.",
 }
 
 
 class LeftOutReason(StrEnum):
-    """Why a crossing is not in the fused estimate of its bridge."""
+    """A reason why a crossing is excluded from the fused estimate of its bridge."""
 
     SUSPECT = "suspect"
     DISAGREES = "disagrees"
@@ -172,7 +176,7 @@ LEFT_OUT_TEXTS: Final[dict[str, str]] = {
 
 
 def texts(reasons: Iterable[Reason], about: Mapping[Reason, str] | None = None) -> list[str]:
-    """Return the sentence of each reason, in the same order, with the names that it is `about`."""
+    """Return the sentence of each reason in the same order, with the names that it concerns."""
     names = about or {}
     return [
         f"{REASON_TEXTS[reason].removesuffix('.')}: {names[reason]}."

@@ -1,7 +1,7 @@
-"""Results of identifications: the JSON file of docs/contract.md; `results_on_the_wire`: messages.
+"""Results of identifications as the JSON file of docs/contract.md.
 
-Times are seconds since 1970 UTC. A number that is not finite is refused when the model is made, so
-NaN is never written; where a value may be unknown it is None.
+Times are seconds since 1970 UTC. A model refuses numbers that are not finite, so NaN is never
+written; a value that may be unknown is None. `results_on_the_wire` converts to messages.
 """
 
 from collections.abc import Mapping
@@ -13,21 +13,17 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 from schemas.fusion import FusionLikelihood
 from schemas.json_file import load_json
 from schemas.reasons import BRIDGE_REASON_TEXTS, BridgeReason, Reason, texts
+from schemas.strict_model import Finite, StrictModel
 
 SCHEMA_VERSION: Final = 1
 
 Method = Literal["pre", "least_squares", "random_walk"]
 Verdict = Literal["good", "suspect", "rejected"]
 Direction = Literal["start_to_end", "end_to_start"]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Fields(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Prior(_Fields):
-    """What was known before the crossing."""
+class Prior(StrictModel):
+    """The prior distribution of a parameter."""
 
     distribution: Literal["normal", "log_normal", "half_normal", "uniform"]
     location: Finite
@@ -36,7 +32,7 @@ class Prior(_Fields):
     """Relative standard deviation of log_normal, half width of uniform, else in the unit."""
 
 
-class Parameter(_Fields):
+class Parameter(StrictModel):
     """A quantity with its uncertainty, all in `unit`."""
 
     unit: str
@@ -46,10 +42,10 @@ class Parameter(_Fields):
     q50: Finite
     q975: Finite
     prior: Prior | None = None
-    """None for what is derived from other parameters."""
+    """None for a quantity derived from other parameters."""
 
 
-class Covariance(_Fields):
+class Covariance(StrictModel):
     """Covariance of the parameters, in products of their units."""
 
     names: tuple[str, ...] = ()
@@ -63,56 +59,56 @@ class Covariance(_Fields):
         return self
 
 
-class AtEnds(_Fields):
+class AtEnds(StrictModel):
     """A probability for each end of the bridge."""
 
     start: Annotated[Finite, Field(ge=0, le=1)]
     end: Annotated[Finite, Field(ge=0, le=1)]
 
 
-class Thirds(_Fields):
-    """The level of each third of the bridge, from its start."""
+class Thirds(StrictModel):
+    """Overall stiffness of each third of the bridge, from its start."""
 
     left: Parameter
     middle: Parameter
     right: Parameter
 
 
-class Derived(_Fields):
-    """What follows from the parameters."""
+class Derived(StrictModel):
+    """Quantities that follow from the parameters."""
 
     f1_hz: Parameter
     max_deflection_m: Parameter
     probability_sprung: AtEnds | None = None
-    """That a rotational spring is at the support at all; None from methods that know of none."""
+    """Probability of a rotational restraint at each support; None where a method does not model it.
+    """
     probability_giving: AtEnds | None = None
-    """That the bearing gives under load at all."""
+    """Probability that each bearing is compliant."""
     probability_torsion: Annotated[Finite, Field(ge=0, le=1)] | None = None
-    """That the deck twists under the truck at all."""
+    """Probability that the deck twists under the truck."""
     springs_believed: Annotated[Finite, Field(ge=0, le=1)] | None = None
-    """How much of what the body's motion says through the truck's springs was believed: 1 if they
-    are as linear as the sensors can tell, near 0 where they rub."""
+    """Suspension weight: 1 if the suspension is linear within sensor noise, near 0 with friction.
+    """
     ei_level: Parameter | None = None
-    """The factor common to all elements: geometric mean of EI over nominal, by length. Known where
-    single elements are not."""
+    """Overall stiffness: length-weighted geometric mean of EI over nominal. Known even where single
+    elements are unresolved."""
     ei_thirds: Thirds | None = None
-    """The same of each third of the bridge."""
+    """Overall stiffness of each third of the bridge."""
     probability_below_90_percent_of_baseline: dict[str, Finite] | None = None
-    """By element; None without a stored baseline."""
+    """Probability for each element; None without a stored baseline."""
 
 
-class RoadMismatch(_Fields):
-    """By how much the axles' roads differ: S_d(n) = A/(1 + (n/n_0)²)² in m³, one-sided."""
+class RoadMismatch(StrictModel):
+    """Spectrum of the profile mismatch: S_d(n) = A/(1 + (n/n_0)²)² in m³, one-sided."""
 
     A_m3: Annotated[Finite, Field(gt=0)]
     n_0_per_m: Annotated[Finite, Field(gt=0)]
     common_share: Annotated[Finite, Field(ge=0, le=1)] | None = None
-    """What all runs of the truck in one track have in common, a share of its power; of one run
-    unknown."""
+    """Share of its power common to all runs of a wheel-path group; None for a single run."""
 
 
-class Road(_Fields):
-    """The road profile over chainage, as each axle felt it and both together."""
+class RoadResult(StrictModel):
+    """The road profile over chainage: of each axle's wheel path, and their mean."""
 
     x_m: tuple[Finite, ...]
     front_m: tuple[Finite, ...]
@@ -122,29 +118,33 @@ class Road(_Fields):
     iri_m_per_km: Finite | None = None
     iso_class: str | None = None
     mismatch: RoadMismatch | None = None
-    """None where both axles feel one road, as far as the sensors tell."""
+    """None where both axles follow one profile within sensor noise."""
 
     @model_validator(mode="after")
-    def _has_one_length(self) -> "Road":
+    def _has_one_length(self) -> "RoadResult":
         profiles = (self.front_m, self.rear_m, self.mean_m, self.std_m or self.x_m)
         if any(len(profile) != len(self.x_m) for profile in profiles):
             raise ValueError("all profiles of a road must be as long as x_m")
         return self
 
 
-_OLD_REASONS: Final = frozenset({"tyre_damping_ignored"})
-"""That older programs gave, always beside another one."""
+_RETIRED_REASONS: Final = frozenset({"tyre_damping_ignored"})
+"""Reasons of older programs, which always gave another one with them."""
 
 
-def _without_old_reasons(values: object) -> object:
-    if not isinstance(values, Mapping) or _OLD_REASONS.isdisjoint(values.get("reasons") or ()):
+def _drop_retired_reasons(values: object) -> object:
+    if not isinstance(values, Mapping) or _RETIRED_REASONS.isdisjoint(values.get("reasons") or ()):
         return values
-    kept = [code for code in values["reasons"] if code not in _OLD_REASONS]
+    kept = [code for code in values["reasons"] if code not in _RETIRED_REASONS]
     left = {key: value for key, value in values.items() if key != "reason_texts"}
     return {**left, "reasons": kept}
 
 
-class Crossing(_Fields):
+HUM = ("line_hz", "line_2_hz", "line_3_hz")
+"""Names of the diagnostics of hum that was removed."""
+
+
+class CrossingResult(StrictModel):
     """The result of one crossing by one method."""
 
     crossing_id: str
@@ -160,28 +160,28 @@ class Crossing(_Fields):
     verdict: Verdict
     reasons: tuple[Reason, ...] = ()
     reason_texts: tuple[str, ...] = ()
-    """Filled in from `reasons` if not given."""
+    """Derived from `reasons` if not given."""
     chi2_per_dof: Finite | None = None
-    diagnostics: dict[str, Finite] = {}
+    diagnostics: dict[str, Finite] = {}  # noqa: RUF012 - Pydantic copies it
     parameters: dict[str, Parameter] | None
     """None if rejected."""
     scale_error: Finite | None = None
     covariance: Covariance | None = None
     derived: Derived | None = None
-    road: Road | None = None
+    road: RoadResult | None = None
     fusion_likelihood: FusionLikelihood | None = None
-    """What fusion needs of the crossing; None from methods that know of none."""
+    """Input of fusion; None where the method provides no likelihood."""
 
     @model_validator(mode="before")
     @classmethod
     def _sentences(cls, values: object) -> object:
-        values = _without_old_reasons(values)
+        values = _drop_retired_reasons(values)
         if isinstance(values, Mapping) and values.get("reasons") and "reason_texts" not in values:
             return {**values, "reason_texts": texts(Reason(code) for code in values["reasons"])}
         return values
 
     @model_validator(mode="after")
-    def _verdict_fits(self) -> "Crossing":
+    def _verdict_fits(self) -> "CrossingResult":
         if (self.verdict == "rejected") != (self.parameters is None):
             raise ValueError("a rejected crossing has no parameters, every other one has")
         if self.verdict == "rejected" and not self.reasons:
@@ -190,8 +190,12 @@ class Crossing(_Fields):
             raise ValueError("reason_texts must have one sentence for each reason")
         return self
 
+    def hum_hz(self) -> tuple[float, ...]:
+        """Return the frequencies of the hum that was removed from the signals."""
+        return tuple(self.diagnostics[name] for name in HUM if name in self.diagnostics)
 
-class ElementState(_Fields):
+
+class ElementState(StrictModel):
     """Flexural rigidity of one element in N·m²."""
 
     mean: Finite
@@ -200,67 +204,67 @@ class ElementState(_Fields):
     q975: Finite
 
 
-class LeftOut(_Fields):
-    """A crossing that is not in the fused estimate."""
+class LeftOut(StrictModel):
+    """A crossing that is excluded from the fused estimate."""
 
     crossing_id: str
     reason: str
 
 
-class ThirdsState(_Fields):
-    """The level of each third of the bridge, from its start, relative to nominal."""
+class ThirdsState(StrictModel):
+    """Overall stiffness of each third of the bridge from its start, relative to nominal."""
 
     left: ElementState
     middle: ElementState
     right: ElementState
 
 
-class Track(_Fields):
-    """What the runs of a truck in one direction share of the mismatch of its axles' roads."""
+class Track(StrictModel):
+    """The shared part of the profile mismatch in a wheel-path group."""
 
     vehicle: str
     direction: Direction
     common_share: Annotated[Finite, Field(ge=0, le=1)]
-    """Of its power at waves of 20 m."""
+    """Share of its power at waves of 20 m."""
     wander_m: Finite | None = None
-    """How far the runs lie beside each other; None of a single run."""
+    """Lateral wander of the runs; None for a single run."""
 
 
 LOSSES_PERCENT: Final = (10, 20, 30)
 
 
 class BridgeResult(BaseModel):
-    """The fused estimate of one bridge; its elements are fields EI_1 … EI_n.
+    """The fused estimate of one bridge; its elements are the fields EI_1 … EI_n.
 
-    `verdict` judges the measurement and nothing else, `finding` is about the bridge.
+    `verdict` judges the measurement only, `finding` is about the bridge.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
     __pydantic_extra__: dict[Annotated[str, Field(pattern=r"^EI_[1-9]\d?$")], ElementState]
 
     between_crossing_std: Finite | None = None
-    """Relative standard deviation of EI from crossing to crossing, beyond what each can tell."""
+    """Relative standard deviation of EI between crossings, beyond their own uncertainty."""
     between_crossing_std_q025: Finite | None = None
     between_crossing_std_q975: Finite | None = None
     verdict: Verdict | None = None
-    """None from programs that did not fuse."""
+    """None from programs without fusion."""
     reasons: tuple[BridgeReason, ...] = ()
     reason_texts: tuple[str, ...] = ()
-    """Filled in from `reasons` if not given."""
+    """Derived from `reasons` if not given."""
     finding: str | None = None
     weakest_element: str | None = None
-    """Of which EI is smallest, relative to the baseline or to nominal."""
+    """Name of the element with the smallest EI relative to the baseline or nominal."""
     probability_of_loss: dict[str, dict[str, Finite]] | None = None
-    """By element and per cent: that it lost more of the baseline's EI; None without a baseline."""
+    """Probability of a loss of EI above each percentage, by element; None without a baseline."""
     level: ElementState | None = None
-    """Geometric mean of EI over nominal, by length."""
+    """Overall stiffness: length-weighted geometric mean of EI over nominal."""
     thirds: ThirdsState | None = None
     tracks: tuple[Track, ...] = ()
     crossings_used: tuple[str, ...] = ()
     crossings_left_out: tuple[LeftOut, ...] = ()
-    """The newest of them, if there are many."""
+    """Excluded crossings; the newest if there are many."""
     crossings_left_out_count: Annotated[int, Field(ge=0)] = 0
-    """How many there are; filled in where an older program did not say it, and listed all."""
+    """Number of excluded crossings; counted where an older program listed all without a number."""
 
     @model_validator(mode="before")
     @classmethod
@@ -277,12 +281,12 @@ class BridgeResult(BaseModel):
 
     @property
     def elements(self) -> dict[str, ElementState]:
-        """EI_1 … EI_n in the order of their numbers."""
+        """Return EI_1 … EI_n in the order of their numbers."""
         extra = self.__pydantic_extra__
         return {name: extra[name] for name in sorted(extra, key=lambda n: int(n[3:]))}
 
 
-class Results(_Fields):
+class Results(StrictModel):
     """A results file."""
 
     program: str = "driveby"
@@ -291,12 +295,12 @@ class Results(_Fields):
     site_hash: str
     settings: dict[str, JsonValue]
     seed: Annotated[int, Field(ge=0, lt=1 << 64)]
-    crossings: tuple[Crossing, ...] = ()
-    bridges: dict[str, BridgeResult] = {}
+    crossings: tuple[CrossingResult, ...] = ()
+    bridges: dict[str, BridgeResult] = {}  # noqa: RUF012 - Pydantic copies it
 
 
-class Header(NamedTuple):
-    """What a results file says once and a message on the wire says each time."""
+class ResultHeader(NamedTuple):
+    """The fields that a results file has once and every message on the wire repeats."""
 
     version: str
     created: float
@@ -307,12 +311,19 @@ class Header(NamedTuple):
 
 
 RESOLVED = 0.25
-"""Relative standard deviation of EI up to which an element is called resolved: a loss of half of it
-is then beyond chance."""
+"""Largest relative standard deviation of EI of a resolved element: a loss of half of its EI is then
+beyond chance."""
 
 
-def resolution(crossing: Crossing) -> str | None:
-    """In words what a crossing could not tell; None where it resolves every element."""
+def is_torsion_declared(crossing: CrossingResult) -> bool:
+    """Return whether the site file places the lane off the axis, so that the deck must twist."""
+    torsion = (crossing.parameters or {}).get("torsion")
+    prior = None if torsion is None else torsion.prior
+    return prior is not None and prior.distribution == "log_normal"
+
+
+def unresolved_note(crossing: CrossingResult) -> str | None:
+    """Return which elements a crossing could not resolve, in words; None if it resolved all."""
     if crossing.parameters is None or crossing.derived is None or crossing.derived.ei_level is None:
         return None
     elements = [p for name, p in crossing.parameters.items() if name.startswith("EI_")]
@@ -325,8 +336,8 @@ def resolution(crossing: Crossing) -> str | None:
     return f"mean level {level.mean:.2f} of nominal ± {spread:.0f} %, {which} not resolved"
 
 
-class Lowest(NamedTuple):
-    """The element of least EI over nominal, with its 95 % interval where the method knows one."""
+class LowestElement(NamedTuple):
+    """The element with the smallest EI over nominal, and its 95 % interval if there is one."""
 
     name: str
     ratio: float
@@ -334,15 +345,15 @@ class Lowest(NamedTuple):
     high: float | None
 
     def __str__(self) -> str:
-        """As EI_4 0.404 of nominal (0.394 to 0.415)."""
+        """Return the text, such as EI_4 0.404 of nominal (0.394 to 0.415)."""
         interval = "" if self.low is None else f" ({self.low:.3f} to {self.high:.3f})"
         return f"{self.name} {self.ratio:.3f} of nominal{interval}"
 
 
-def lowest_element(crossing: Crossing) -> Lowest | None:
-    """The element of least EI over nominal, which is that of its prior; None without any."""
+def lowest_element(crossing: CrossingResult) -> LowestElement | None:
+    """Return the element with the smallest EI over the nominal value of its prior; None if none."""
     found = [
-        Lowest(name, value.mean / nominal, value.q025 / nominal, value.q975 / nominal)
+        LowestElement(name, value.mean / nominal, value.q025 / nominal, value.q975 / nominal)
         for name, value in (crossing.parameters or {}).items()
         if name.startswith("EI_") and value.prior and (nominal := value.prior.location) > 0.0
     ]
@@ -353,15 +364,17 @@ def lowest_element(crossing: Crossing) -> Lowest | None:
     return lowest if has_interval else lowest._replace(low=None, high=None)
 
 
-def verdict_line(crossing: Crossing) -> str:
-    """Verdict, codes of its reasons and the lowest element: one line for logs and lists."""
+def verdict_line(crossing: CrossingResult) -> str:
+    """Return verdict, reason codes and lowest element in one line, for logs and lists."""
     against = f" ({', '.join(crossing.reasons)})" if crossing.reasons else ""
     lowest = lowest_element(crossing)
     return f"{crossing.verdict}{against}{'' if lowest is None else f', lowest {lowest}'}"
 
 
-def results(header: Header, crossings: list[Crossing], bridges: dict[str, BridgeResult]) -> Results:
-    """Put a results file together."""
+def results(
+    header: ResultHeader, crossings: list[CrossingResult], bridges: dict[str, BridgeResult]
+) -> Results:
+    """Return a results file with the fields of its header."""
     return Results(**header._asdict(), crossings=tuple(crossings), bridges=bridges)
 
 
@@ -371,5 +384,5 @@ def results_json(content: Results) -> str:
 
 
 def load_results(path: Path) -> Results:
-    """Read a results file; raise InputError with one line if it is none."""
+    """Read a results file; raise InputError in one line if it is not one."""
     return load_json(Results, path, "a results file")

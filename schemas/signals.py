@@ -1,8 +1,8 @@
 """Sensor messages between numpy and Protocol Buffers. No I/O.
 
-Every `decode_*` raises ValueError with one line, and nothing else, whatever bytes it is given:
-malformed, another schema version, not finite, or impossible. Every `encode_*` refuses with
-ValueError what `decode_*` would refuse.
+Whatever bytes it is given, `decode_*` raises nothing but ValueError in one line: malformed, another
+schema version, not finite, or impossible. `encode_*` refuses with ValueError everything that
+`decode_*` would refuse.
 """
 
 import math
@@ -22,14 +22,14 @@ SCHEMA_VERSION = 1
 CHANNELS = ("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear")
 
 MAX_CHANNELS = 32
-"""Accelerometers of one truck: more is no truck."""
+"""Largest number of accelerometers on one truck."""
 MAX_RATE_HZ = 50_000.0
 MAX_BATCH_S = 1.0
-"""A batch is 50-100 ms; ten times that still bounds the memory that one message can ask for."""
+"""Longest batch: ten times the usual 50-100 ms, which still bounds the memory of one message."""
 MAX_ACCELERATION_M_PER_S2 = 1e4
-"""About 1000 g: more is another unit or a broken sensor."""
+"""Largest acceleration, about 1000 g: more is another unit or a broken sensor."""
 MAX_SEQUENCE = 2**32 - 1
-"""MCAP stores 32 bits: six years of batches without a restart."""
+"""Largest sequence, 32 bits in MCAP: six years of batches without a restart."""
 NS_PER_S = 1_000_000_000
 MAX_BOOT_ID = 2**64 - 1
 EARLIEST_WALL_TIME_NS = 946_684_800_000_000_000  # 2000-01-01
@@ -51,37 +51,41 @@ _IDENTITY = struct.Struct("!QQ")
 
 
 class Identity(NamedTuple):
-    """What, with realm, vehicle and stream, makes a message unique."""
+    """The fields that, with realm, vehicle and stream, identify a message."""
 
     boot_id: int
     sequence: int
 
 
 class Stamp(NamedTuple):
-    """When a message was made, and who it says it is."""
+    """Creation time and identity of a message."""
 
     wall_time_ns: int
     device_time_ns: int | None = None
-    """By the sender's monotonic clock; None where the message has none."""
+    """Time of the sender's monotonic clock; None where the message has none."""
     identity: Identity | None = None
-    """As in the payload itself; None where it has none."""
+    """Identity in the payload itself; None where it has none."""
 
 
-class Channel(NamedTuple):
-    """Evenly spaced samples of one accelerometer, m/s², up positive, gravity removed."""
+class AccelChannel(NamedTuple):
+    """Evenly spaced samples (n,) of one accelerometer, m/s², up positive, without gravity."""
 
     rate_hz: float
     samples: npt.NDArray[np.float64]
 
 
+Channel = AccelChannel
+"""The former name, which drivers of trucks import."""
+
+
 class AccelBatch(NamedTuple):
-    """50-100 ms of all accelerometers of one truck; both times are of every first sample."""
+    """Some 50-100 ms of all accelerometers of one truck; both times are of each first sample."""
 
     boot_id: int
     sequence: int
     device_time_ns: int
     wall_time_ns: int
-    channels: dict[str, Channel]
+    channels: dict[str, AccelChannel]
 
 
 class GnssFix(NamedTuple):
@@ -102,7 +106,7 @@ class GnssFix(NamedTuple):
 
 
 class VehicleInfo(NamedTuple):
-    """What the truck says of itself: its parts of the site file, as TOML."""
+    """The truck's own parts of a site file, as TOML."""
 
     boot_id: int
     sequence: int
@@ -128,17 +132,17 @@ def encode_accel(batch: AccelBatch) -> bytes:
 
 
 def decode_accel(payload: bytes) -> AccelBatch:
-    """Return the batch in an AccelBatch message; ValueError if it is malformed or impossible."""
+    """Return the batch of an AccelBatch message; raise ValueError if malformed or impossible."""
     message = pb.AccelBatch()
     _parse(message, payload)
     if len(message.channels) > MAX_CHANNELS:
         raise ValueError(f"{len(message.channels)} channels; at most {MAX_CHANNELS}")
-    channels: dict[str, Channel] = {}
+    channels: dict[str, AccelChannel] = {}
     for channel in message.channels:
         name = _name(channel)
         if name in channels:
             raise ValueError(f"channel {name} is there twice")
-        channels[name] = Channel(channel.rate_hz, _samples(channel))
+        channels[name] = AccelChannel(channel.rate_hz, _samples(channel))
     batch = AccelBatch(
         message.boot_id, message.sequence, message.device_time_ns, message.wall_time_ns, channels
     )
@@ -165,7 +169,7 @@ def encode_gnss(fix: GnssFix) -> bytes:
 
 
 def decode_gnss(payload: bytes) -> GnssFix:
-    """Return the fix in a GnssFix message; ValueError if it is malformed or impossible."""
+    """Return the fix of a GnssFix message; raise ValueError if malformed or impossible."""
     message = pb.GnssFix()
     _parse(message, payload)
     optional = {
@@ -199,9 +203,9 @@ def encode_info(info: VehicleInfo) -> bytes:
 
 
 def decode_info(payload: bytes) -> VehicleInfo:
-    """Return what a VehicleInfo message says; ValueError if it is malformed.
+    """Return the content of a VehicleInfo message; raise ValueError if it is malformed.
 
-    That `site_toml` is a valid site file is for the reader of site files to say.
+    The reader of site files checks whether `site_toml` is a valid one.
     """
     message = pb.VehicleInfo()
     _parse(message, payload)
@@ -222,12 +226,12 @@ TRUCK_DECODERS: Final[Mapping[str, Callable[[bytes], AccelBatch | GnssFix | Vehi
     "gnss": decode_gnss,
     "info": decode_info,
 }
-"""By the streams of a truck of which an identification is made."""
+"""Decoders of the truck's streams that identification uses, by stream."""
 
 
 @cache
 def location_class() -> type[Message]:
-    """Return the class foxglove.LocationFix; imported here because few need it."""
+    """Return the class foxglove.LocationFix, imported here because few callers need it."""
     from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 
     return LocationFix
@@ -256,7 +260,7 @@ def encode_location(fix: GnssFix) -> bytes:
 
 
 def check_location(payload: bytes) -> int:
-    """Return the wall time in ns of a foxglove.LocationFix; ValueError if it is impossible."""
+    """Return the wall time in ns of a foxglove.LocationFix; raise ValueError if impossible."""
     message: Any = location_class()()
     try:
         message.ParseFromString(payload)
@@ -267,13 +271,13 @@ def check_location(payload: bytes) -> int:
 
 
 def encode_identity(boot_id: int, sequence: int) -> bytes:
-    """Return the 16 bytes of a put's Zenoh attachment: two unsigned 64-bit big-endian integers."""
+    """Return the 16 bytes of a Zenoh attachment: two unsigned 64-bit big-endian integers."""
     _check_identity(boot_id, sequence)
     return _IDENTITY.pack(boot_id, sequence)
 
 
 def decode_identity(attachment: bytes | None) -> Identity:
-    """Return what `encode_identity` put in; ValueError if missing or malformed."""
+    """Return the identity in an attachment; raise ValueError if it is missing or malformed."""
     if attachment is None:
         raise ValueError("no attachment; 16 bytes with boot_id and sequence are expected")
     if len(attachment) != _IDENTITY.size:
@@ -284,13 +288,13 @@ def decode_identity(attachment: bytes | None) -> Identity:
 
 
 def check_version(version: int) -> None:
-    """ValueError if this program cannot read messages of that schema version."""
+    """Raise ValueError if this program cannot read messages of that schema version."""
     if version != SCHEMA_VERSION:
         raise ValueError(f"schema version {version}; this program reads {SCHEMA_VERSION}")
 
 
 def check_wall_time(time_ns: int) -> int:
-    """Return the time in ns since 1970 UTC if it lies between 2000 and 2200, else ValueError."""
+    """Return a time in ns since 1970 UTC between 2000 and 2200; raise ValueError for others."""
     if not EARLIEST_WALL_TIME_NS <= time_ns < LATEST_WALL_TIME_NS:
         raise ValueError(f"time {time_ns} ns is not between the years 2000 and 2200")
     return time_ns
@@ -322,7 +326,7 @@ def _parse(message: pb.AccelBatch | pb.GnssFix | pb.VehicleInfo, payload: bytes)
 
 
 def _name(channel: pb.AccelChannel) -> str:
-    """Return the name of a channel: of its position, or its own where it has none of the four."""
+    """Return the name of a channel: that of its position, or its own without one of the four."""
     if channel.position == pb.SENSOR_POSITION_UNSPECIFIED and channel.name:
         return channel.name
     name = ACCEL_NAMES.get(channel.position)
@@ -334,24 +338,24 @@ def _name(channel: pb.AccelChannel) -> str:
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Return names of channels in the order of every table: the four first, others by alphabet."""
+    """Return channel names in the order of every table: the four first, others alphabetically."""
     there = set(names)
     return [name for name in CHANNELS if name in there] + sorted(there - set(CHANNELS))
 
 
 def _samples(channel: pb.AccelChannel) -> npt.NDArray[np.float64]:
-    """Return the samples of a channel, which may not be written to.
+    """Return the samples of a channel, shape (n,), m/s², as an array that is not writable.
 
-    Encoded again they stand together, before the name if there is one, and bytes are read four
-    times as fast as one number after the other. The length shows whether an unknown field stands
-    behind them.
+    Encoded again, the samples are contiguous, before the name if there is one, and reading bytes is
+    four times as fast as reading one number after the other. The length shows whether an unknown
+    field follows them.
     """
     values = channel.acceleration_m_per_s2
     number = len(values)
     encoded = channel.SerializeToString()
     size = 8 * number
     varint_bytes = (size.bit_length() + 6) // 7
-    name = len(channel.name.encode())  # at most 127, or the lengths do not agree
+    name = len(channel.name.encode())  # at most 127, else the lengths disagree
     behind = _TAG_BYTES + 1 + name if name else 0
     before = (_POSITION_BYTES if channel.position else 0) + _RATE_BYTES + _TAG_BYTES + varint_bytes
     if number and len(encoded) == before + size + behind:
@@ -367,13 +371,13 @@ def _check_identity(boot_id: int, sequence: int) -> None:
 
 
 def stamp(message: AccelBatch | GnssFix | VehicleInfo | pb.AccelBatch) -> Stamp:
-    """Return the times and the identity of a message of a truck."""
+    """Return the times and the identity of a truck's message."""
     identity = Identity(message.boot_id, message.sequence)
     return Stamp(message.wall_time_ns, message.device_time_ns, identity)
 
 
 def check_header(message: AccelBatch | GnssFix | VehicleInfo | pb.AccelBatch) -> None:
-    """ValueError if the identity or a time of a message of a truck is impossible."""
+    """Raise ValueError if the identity or a time of a truck's message is impossible."""
     _check_identity(message.boot_id, message.sequence)
     if not 0 <= message.device_time_ns < 2**63:
         raise ValueError(f"device time {message.device_time_ns} ns is negative or too large")
@@ -381,7 +385,7 @@ def check_header(message: AccelBatch | GnssFix | VehicleInfo | pb.AccelBatch) ->
 
 
 def check_channel(name: str, rate_hz: float, samples: int) -> None:
-    """ValueError if a channel cannot have so many samples at that rate."""
+    """Raise ValueError if a channel cannot have `samples` samples at that rate in one batch."""
     check_identifier(name)
     if not 0.0 < rate_hz <= MAX_RATE_HZ:
         raise ValueError(f"{name}: rate {rate_hz} Hz is not between 0 and {MAX_RATE_HZ:.0f}")
@@ -402,7 +406,7 @@ def _check_accel(batch: AccelBatch) -> None:
         if samples.ndim != 1:
             raise ValueError(f"{name}: samples of shape {samples.shape}; (n,) is expected")
         check_channel(name, rate_hz, samples.size)
-        if not np.abs(samples).max() <= MAX_ACCELERATION_M_PER_S2:  # of a NaN it is false, too
+        if not np.abs(samples).max() <= MAX_ACCELERATION_M_PER_S2:  # false for a NaN, too
             raise ValueError(
                 f"{name}: a sample is not finite or exceeds {MAX_ACCELERATION_M_PER_S2:.0f} m/s²"
             )
@@ -411,7 +415,8 @@ def _check_accel(batch: AccelBatch) -> None:
 def _check_position(latitude_deg: float, longitude_deg: float, altitude_m: float) -> None:
     _check_range("latitude_deg", latitude_deg, -90.0, 90.0)
     _check_range("longitude_deg", longitude_deg, -180.0, 180.0)
-    _check_range("altitude_m", altitude_m, -1000.0, 20_000.0)
+    if not math.isnan(altitude_m):  # NaN: the receiver gives none
+        _check_range("altitude_m", altitude_m, -1000.0, 20_000.0)
 
 
 def _check_gnss(fix: GnssFix) -> None:

@@ -1,4 +1,4 @@
-"""The site file: which trucks drive over which bridges, and what is known of them before.
+"""The site file: trucks and bridges, with the prior knowledge of them.
 
 Field names are the keys of the TOML file (docs/contract.md). Pairs are [front, rear]. A `…_spread`
 is a relative standard deviation of a log-normal prior, unless its name carries a unit.
@@ -18,24 +18,25 @@ from pydantic import (
     model_validator,
 )
 
-from schemas.site_errors import at
+from schemas.site_errors import error_at
+from schemas.site_import import Import
 from schemas.site_lane import Lane
 from schemas.site_numbers import Density, NotNegative, Number, Positive, Rate, Spread, Table
 from schemas.site_physics import check_bridge, check_receiver, check_sensor
 from schemas.site_ros2 import Ros2, check_ros2
-from schemas.site_vehicle import Spreadable
 from schemas.site_vehicle import Vehicle as Vehicle
+from schemas.site_vehicle import WithSpreads
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
 
 MAX_ELEMENTS: Final = 30
 MAX_TABLES: Final = 20_000
-"""Vehicles or bridges of a site file."""
+"""Largest number of vehicles or bridges in a site file."""
 MAX_SPAN_DISAGREEMENT: Final = 0.2
-"""Beyond this relative difference between `span_m` and the distance of the ends one of them is a
-slip of the pen. Ends read off a hand-held receiver are metres off, so less is not refused."""
+"""Largest relative difference between `span_m` and the distance of the ends. More is a typing
+error; less is accepted because ends from a hand-held receiver are metres off."""
 
 _SMALLEST_SLIP: Final = 1e-3
-"""Lengths of elements are rounded: they may miss the span by this share of it."""
+"""Tolerance of the sum of rounded element lengths, relative to the span."""
 
 _BEARING_COMPLIANCE_M_PER_N: Final = 1e-9
 
@@ -46,31 +47,31 @@ Text = Annotated[str, StringConstraints(min_length=1, max_length=1000)]
 Sign = Annotated[Literal[1, -1], BeforeValidator(lambda v: int(v) if v in (1.0, -1.0) else v)]
 
 
-def _four(value: object) -> object:
-    """Spell one value for all channels out as four."""
+def _per_channel(value: object) -> object:
+    """Expand one value for all channels to four."""
     return [value] * 4 if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
 Bearing = Literal["unknown", "free", "sprung"]
 
 
-def _both_ends(value: object) -> object:
-    """Spell what is true of both ends out as a pair."""
+def _per_end(value: object) -> object:
+    """Expand one value for both ends to a pair."""
     return [value] * 2 if value in ("unknown", "free", "sprung") else value
 
 
-Rates = Annotated[tuple[Rate, Rate, Rate, Rate], BeforeValidator(_four)]
-Densities = Annotated[tuple[Density, Density, Density, Density], BeforeValidator(_four)]
+Rates = Annotated[tuple[Rate, Rate, Rate, Rate], BeforeValidator(_per_channel)]
+Densities = Annotated[tuple[Density, Density, Density, Density], BeforeValidator(_per_channel)]
 
 
-class Bridge(Lane, Spreadable):
-    """One or more spans. Its ends are where the bearings are; elements are numbered from its start.
+class Bridge(Lane, WithSpreads):
+    """A bridge of one or more spans. Its ends are at the bearings; elements count from its start.
 
-    Over interior supports the bridge is continuous: their deflection is held and they turn freely.
+    Over interior supports the beam is continuous: no deflection, free rotation.
 
-    `flexural_rigidity_nm2` is the nominal (sound) value of every element;
-    `flexural_rigidity_per_element_nm2` takes its place where elements are not alike. If both are
-    given the values by element are the nominal ones and the single value is not used.
+    `flexural_rigidity_nm2` is the nominal (undamaged) value of every element.
+    `flexural_rigidity_per_element_nm2` replaces it where elements differ. If both are given, the
+    values by element are the nominal ones and the single value is not used.
     """
 
     later_keys: ClassVar[tuple[str, ...]] = tuple(Lane.model_fields)
@@ -91,20 +92,20 @@ class Bridge(Lane, Spreadable):
     support_compliance_spread_m_per_n: Annotated[Number, Field(gt=0, le=1e-6)] = (
         _BEARING_COMPLIANCE_M_PER_N
     )
-    """Scale of the half-normal prior of the vertical compliance of the bearings at the ends."""
+    """Scale of the half-normal prior of the vertical compliance of the end bearings."""
     interior_supports_m: tuple[Positive, ...] = ()
     """Chainages of the supports between the ends, ascending."""
-    bearings: Annotated[tuple[Bearing, Bearing], BeforeValidator(_both_ends)] = (
+    bearings: Annotated[tuple[Bearing, Bearing], BeforeValidator(_per_end)] = (
         "unknown",
         "unknown",
     )
-    """Whether start and end turn freely or against a spring; unknown: the data decide."""
+    """Rotational restraint at start and end: none, a spring, or unknown (estimated)."""
     start_altitude_m: Altitude | None = None
     end_altitude_m: Altitude | None = None
     owner_id: Text | None = None
     """The owner's name of the bridge."""
     road_class: Literal["A", "B", "C", "D", "E"] | None = None
-    """ISO 8608."""
+    """Road class of ISO 8608."""
     survey_speed_m_per_s: Annotated[Number, Field(gt=0, le=100)] | None = None
     baseline: Text | None = None
     """Path of a results file, relative to the site file."""
@@ -117,14 +118,14 @@ class Bridge(Lane, Spreadable):
 
     @property
     def nominal_flexural_rigidity_nm2(self) -> tuple[float, ...]:
-        """EI of each element before the crossing."""
+        """Nominal EI of each element."""
         if self.flexural_rigidity_per_element_nm2 is not None:
             return self.flexural_rigidity_per_element_nm2
         assert self.flexural_rigidity_nm2 is not None  # noqa: S101 - the validator saw to it
         return (self.flexural_rigidity_nm2,) * self.elements
 
     def nominal(self, key: str) -> tuple[float, ...]:
-        """Return what is known of a quantity before: of bearings, that nothing need be there."""
+        """Return the nominal values of a quantity: 0 for compliance and restraint of bearings."""
         if key == "flexural_rigidity_nm2":
             return self.nominal_flexural_rigidity_nm2
         if key in ("support_rotational_stiffness_nm_per_rad", "support_compliance_m_per_n"):
@@ -132,13 +133,13 @@ class Bridge(Lane, Spreadable):
         return super().nominal(key)
 
     def uniform(self) -> tuple[float, float, float]:
-        """Return longest span in m, mean nominal EI in N·m² and mass per length in kg/m."""
+        """Return the longest span in m, mean nominal EI in N·m² and mass per length in kg/m."""
         mean = sum(self.nominal_flexural_rigidity_nm2) / self.elements
         return max(self.lengths_of_spans_m), mean, self.mass_per_length_kg_per_m
 
     @property
     def lengths_m(self) -> tuple[float, ...]:
-        """Length of each element; they add up to the span. One ends at every support."""
+        """Length of each element; an element ends at every support."""
         if self.element_lengths_m is not None:
             return self.element_lengths_m
         shares = _shared(self.elements, self.lengths_of_spans_m)
@@ -156,7 +157,7 @@ class Bridge(Lane, Spreadable):
 
     @property
     def interior_support_nodes(self) -> tuple[int, ...]:
-        """After how many elements each interior support stands."""
+        """Number of elements before each interior support."""
         ends = tuple(accumulate(self.lengths_m))
         return tuple(
             1 + min(range(len(ends)), key=lambda e: abs(ends[e] - support))
@@ -191,7 +192,7 @@ class Bridge(Lane, Spreadable):
         self._supports_fit()
         per_element = self.flexural_rigidity_per_element_nm2
         if per_element is None and self.flexural_rigidity_nm2 is None:
-            raise at(
+            raise error_at(
                 "flexural_rigidity_nm2",
                 "is missing, give the sound bridge's flexural rigidity in N·m² "
                 "(or flexural_rigidity_per_element_nm2)",
@@ -201,7 +202,7 @@ class Bridge(Lane, Spreadable):
             ("element_lengths_m", self.element_lengths_m),
         ):
             if values is not None and len(values) != self.elements:
-                raise at(
+                raise error_at(
                     key,
                     f"has {len(values)} values, it must have one for each of the "
                     f"{self.elements} elements",
@@ -209,7 +210,7 @@ class Bridge(Lane, Spreadable):
         if self.element_lengths_m is not None:
             total = math.fsum(self.element_lengths_m)
             if not math.isclose(total, self.span_m, rel_tol=_SMALLEST_SLIP):
-                raise at(
+                raise error_at(
                     "element_lengths_m",
                     f"adds up to {total:g} m, it must add up to span_m, {self.span_m:g} m",
                 )
@@ -218,19 +219,19 @@ class Bridge(Lane, Spreadable):
             ):
                 end = math.fsum(self.element_lengths_m[:node])
                 if abs(end - support) > _SMALLEST_SLIP * self.span_m:
-                    raise at(
+                    raise error_at(
                         "element_lengths_m",
                         f"has no element that ends at {support:g} m, one must end at every "
                         f"interior support; the nearest ends at {end:g} m",
                     )
         distance = self.ends_distance_m
         if distance < 0.01:
-            raise at(
+            raise error_at(
                 "end_latitude_deg",
                 "and end_longitude_deg are the start's, the two ends must be different places",
             )
         if abs(self.span_m / distance - 1) > MAX_SPAN_DISAGREEMENT:
-            raise at(
+            raise error_at(
                 "span_m",
                 f"is {self.span_m:g} but the ends are {distance:.1f} m apart, "
                 "the span and the coordinates of the bearings must agree",
@@ -239,22 +240,22 @@ class Bridge(Lane, Spreadable):
         return self
 
     def _supports_fit(self) -> None:
-        """Raise if interior supports are not between the ends, ascending, an element apart."""
+        """Raise if interior supports do not ascend between the ends or a span has no element."""
         supports = (0.0, *self.interior_supports_m, self.span_m)
         for number, (before, after) in enumerate(pairwise(supports)):
             if after <= before and number < len(self.interior_supports_m):
-                raise at(
+                raise error_at(
                     f"interior_supports_m.{number}",
                     f"is {after:g}, it must be a chainage beyond {before:g} m: supports between "
                     "the ends are given from the start on",
                 )
             if after <= before:
-                raise at(
+                raise error_at(
                     f"interior_supports_m.{number - 1}",
                     f"is {before:g}, it must be a chainage between 0 and span_m, {self.span_m:g} m",
                 )
         if self.elements < len(self.lengths_of_spans_m):
-            raise at(
+            raise error_at(
                 "elements",
                 f"is {self.elements}, it must be at least {len(self.lengths_of_spans_m)}, "
                 "one for each span",
@@ -262,13 +263,13 @@ class Bridge(Lane, Spreadable):
 
 
 def _shared(count: int, lengths: Sequence[float]) -> list[int]:
-    """Share so many elements among spans by length: largest remainder first, at least one each."""
+    """Distribute elements over spans by length: largest remainder first, at least one each."""
     total = math.fsum(lengths)
     wanted = [count * length / total for length in lengths]
     shares = [max(1, math.floor(quota)) for quota in wanted]
     while sum(shares) < count:
         shares[max(range(len(shares)), key=lambda k: wanted[k] - shares[k])] += 1
-    while sum(shares) > count:  # short spans were given an element each
+    while sum(shares) > count:  # every short span has got an element
         longer = [k for k, share in enumerate(shares) if share > 1]
         shares[min(longer, key=lambda k: wanted[k] - shares[k])] -= 1
     return shares
@@ -277,16 +278,17 @@ def _shared(count: int, lengths: Sequence[float]) -> list[int]:
 class Sensor(Table):
     """The accelerometers, in the order sprung front, sprung rear, unsprung front, unsprung rear.
 
-    Of trucks with `sensors` their own densities, and rates where given, take the place of these.
+    Densities, and rates where given, of a truck's own `sensors` replace these.
     """
 
     rate_hz: Rates
     noise_density_ug_per_rthz: Densities = (0.0, 0.0, 0.0, 0.0)
-    """One-sided; 0 for a simulation without noise. Only trucks with `sensors` may leave it out."""
+    """One-sided density; 0 for a simulation without noise. Optional only if all trucks have
+    `sensors`."""
     gravity_included: StrictBool = False
     up: tuple[Sign, Sign, Sign, Sign] = (1, 1, 1, 1)
     gain_spread: Spread = 0.01
-    """Between channels."""
+    """Standard deviation between channels."""
     delay_spread_s: Annotated[Number, Field(ge=0, le=1)] = 0.0005
     common_gain_spread: Spread = 0.01
 
@@ -294,10 +296,10 @@ class Sensor(Table):
 
 
 class Receiver(Table):
-    """The satellite receiver."""
+    """The GNSS receiver."""
 
     position_spread_m: NotNegative = 1.5
-    """The spread of the slow error, which is the same during a crossing."""
+    """Standard deviation of the slow error, which is constant during a crossing."""
     position_noise_m: NotNegative = 0.4
     speed_noise_m_per_s: NotNegative = 0.07
     latency_s: Annotated[Number, Field(ge=-10, le=10)] = 0.0
@@ -307,7 +309,7 @@ class Receiver(Table):
 
 
 class Site(Table):
-    """Everything in a site file."""
+    """The content of a site file."""
 
     vehicles: Annotated[tuple[Vehicle, ...], Field(alias="vehicle", min_length=1)]
     bridges: Annotated[tuple[Bridge, ...], Field(alias="bridge", min_length=1)]
@@ -315,18 +317,20 @@ class Site(Table):
     receiver: Receiver = Receiver()
     ros2: tuple[Ros2, ...] = ()
     """Where messages of trucks with ROS 2 come from; says nothing of what they measure."""
+    imports: Annotated[Import | None, Field(alias="import")] = None
+    """The realm of imported drives."""
 
     def vehicle(self, identifier: str) -> Vehicle:
-        """Return the vehicle of that id; KeyError if the site has none."""
+        """Return the vehicle of that id; raise KeyError if the site has none."""
         return {v.id: v for v in self.vehicles}[identifier]
 
     def bridge(self, identifier: str) -> Bridge:
-        """Return the bridge of that id; KeyError if the site has none."""
+        """Return the bridge of that id; raise KeyError if the site has none."""
         return {b.id: b for b in self.bridges}[identifier]
 
     @model_validator(mode="after")
     def _identifiers_are_unique(self) -> "Site":
-        lists: dict[str, tuple[Spreadable, ...]] = {
+        lists: dict[str, tuple[WithSpreads, ...]] = {
             "vehicle": self.vehicles,
             "bridge": self.bridges,
         }
@@ -334,28 +338,32 @@ class Site(Table):
             seen: set[str] = set()
             for index, table in enumerate(tables):
                 if table.id in seen:
-                    raise at(f"{name}.{index}.id", f'is "{table.id}" again, ids must be unique')
+                    raise error_at(
+                        f"{name}.{index}.id", f'is "{table.id}" again, ids must be unique'
+                    )
                 seen.add(table.id)
         check_ros2(self.ros2, {vehicle.id: vehicle.channels for vehicle in self.vehicles})
         return self
 
     @model_validator(mode="after")
     def _sensors_are_described(self) -> "Site":
-        """Raise where [sensor] and the sensors of a vehicle leave something open."""
+        """Raise if [sensor] and the sensors of a vehicle leave a value undefined."""
         sensor = self.sensor
         by_place = [vehicle for vehicle in self.vehicles if vehicle.sensors]
         if len(by_place) < len(self.vehicles):
             if "noise_density_ug_per_rthz" not in sensor.model_fields_set:
-                raise at(
+                raise error_at(
                     "sensor.noise_density_ug_per_rthz",
                     "is missing, it must be a noise density in µg/√Hz",
                 )
         elif sensor.up != (1, 1, 1, 1):
-            raise at("sensor.up", "is of the four channels, the vehicle's sensors must point up")
+            raise error_at(
+                "sensor.up", "is of the four channels, the vehicle's sensors must point up"
+            )
         for number, vehicle in enumerate(self.vehicles):
             for place, one in enumerate(vehicle.sensors):
                 if one.rate_hz is None and len(set(sensor.rate_hz)) > 1:
-                    raise at(
+                    raise error_at(
                         f"vehicle.{number}.sensors.{place}.rate_hz",
                         "is missing, it must be a rate in Hz: sensor.rate_hz has several",
                     )
@@ -365,7 +373,7 @@ class Site(Table):
 def _distance_m(
     latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float
 ) -> float:
-    """Distance on the WGS 84 ellipsoid of places less than a few km apart."""
+    """Return the distance on the WGS 84 ellipsoid of places less than a few km apart."""
     a, e2 = SEMI_MAJOR_AXIS_M, ECCENTRICITY_SQUARED
     middle = math.radians((latitude_1 + latitude_2) / 2)
     w = 1 - e2 * math.sin(middle) ** 2

@@ -1,93 +1,24 @@
 """`[[vehicle.axles]]` and `[[vehicle.bogies]]` of a site file, converted to pairs for two axles.
 
-The tables describe any number of axles. Identification knows two: their values become the pairs
-[front, rear] of `[vehicle]`, and a truck of more axles is refused.
+The tables describe any number of axles. Identification compares two: their values become the pairs
+[front, rear] of `[vehicle]`. A truck with an equalised tandem (`site_tandem`) keeps its tables; its
+pairs are those of the front axle and of both others together. Other trucks are refused.
 """
 
 import math
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Any, Final
 
-from pydantic import Field, Strict, StrictBool
+from schemas.site_axle_tables import TYRES, Axle, Axles
+from schemas.site_errors import error_at
+from schemas.site_numbers import UNSPRUNG_MASS_SPREAD
+from schemas.site_tandem import joined, tandem_of
 
-from schemas.site_errors import at
-from schemas.site_numbers import (
-    UNSPRUNG_MASS_SPREAD,
-    NotNegative,
-    Number,
-    Positive,
-    Spread,
-    Table,
-    Track,
-)
-
-MOST_AXLES: Final = 20
-_LOAD_SPREAD: Final = 0.02
 _TOTAL_MASS_SPREAD: Final = 0.01
 _LARGEST_LOAD_ERROR: Final = 0.1
-"""Beyond this share of the total mass the loads of the axles are another truck's."""
+"""Largest difference of the sum of axle loads from the total mass, relative to it."""
 
-
-class Tyres(NamedTuple):
-    """Default dimensions of the tyres of an axle, in m."""
-
-    width_m: float
-    twin_distance_m: float
-    contact_length_m: float
-
-
-TYRES: Final = {
-    "single": Tyres(0.25, 0.0, 0.2),
-    "twin": Tyres(0.22, 0.33, 0.2),
-    "wide": Tyres(0.4, 0.0, 0.2),
-}
-
-
-class Axle(Table):
-    """One axle; both wheels together where a value is of springs, dampers or tyres."""
-
-    position_m: Annotated[Number, Field(ge=0, le=60)]
-    """Distance behind the first axle."""
-    tyres: Literal["single", "twin", "wide"] | None = None
-    """Kind of tyres: the defaults of the next three."""
-    tyre_width_m: Positive | None = None
-    twin_tyre_distance_m: NotNegative | None = None
-    tyre_contact_length_m: Positive | None = None
-    track_m: Track | None = None
-    load_kg: Annotated[Number, Field(gt=0, le=1e6)] | None = None
-    """Static load by a weighbridge."""
-    load_kg_spread: Spread = _LOAD_SPREAD
-    lateral_offset_m: Annotated[Number, Field(ge=-1, le=1)] | None = None
-    """Distance to the left of the truck's middle."""
-    unsprung_mass_kg: Positive
-    suspension_stiffness_n_per_m: Positive
-    suspension_damping_ns_per_m: NotNegative
-    tyre_stiffness_n_per_m: Positive
-    tyre_damping_ns_per_m: NotNegative = 0.0
-
-
-class Bogie(Table):
-    """Axles that share their load, by their numbers from 1."""
-
-    axles: Annotated[
-        tuple[Annotated[int, Strict(), Field(ge=1, le=MOST_AXLES)], ...],
-        Field(min_length=2, max_length=MOST_AXLES),
-    ]
-    equalised: StrictBool = False
-    """Whether the axles share one spring force by `shares`."""
-    shares: Annotated[tuple[Positive, ...], Field(max_length=MOST_AXLES)] | None = None
-    """Shares of the force, one for each axle; equal where absent."""
-    share_spread: Spread = 0.05
-
-
-class Axles(Table):
-    """The axles of a truck in the order in which they pass, and its bogies."""
-
-    axles: Annotated[tuple[Axle, ...], Field(min_length=2, max_length=MOST_AXLES)]
-    bogies: Annotated[tuple[Bogie, ...], Field(max_length=MOST_AXLES)] = ()
-
-
-# Key of [vehicle] in the short form, and the key of an axle that takes its place.
-_REPLACED: Final = {
+# Key of [vehicle] in the short form, and the key of an axle that replaces it.
+REPLACED: Final = {
     "wheelbase_m": "position_m",
     "front_axle_to_cg_m": "load_kg",
     "unsprung_mass_kg": "unsprung_mass_kg",
@@ -110,30 +41,33 @@ _ALIKE: Final = (
 
 
 def in_pairs(table: Any) -> Any:
-    """Return a [vehicle] table with its axles as pairs; one without axles is returned as it is.
+    """Return a [vehicle] table with its axles as pairs; one without axles is returned unchanged.
 
-    Raises a `FieldError` or a ValidationError where the axles are wrong, where both spellings are
-    there, and where there are more axles than identification knows.
+    A truck with a tandem keeps `axles` and `bogies` next to the pairs. Raise a `FieldError` or a
+    ValidationError where the axles are wrong, where both spellings are given, and where
+    identification does not model the axles.
     """
     if not isinstance(table, dict) or not {"axles", "bogies"} & table.keys():
         return table
     known = Axles.model_validate({k: table[k] for k in ("axles", "bogies") if k in table})
-    for old, new in _REPLACED.items():
+    for old, new in REPLACED.items():
         if old in table:
-            raise at(
+            raise error_at(
                 old,
                 f"and axles.{new} are both there, keep one: the values of [[vehicle.axles]] take "
                 f"the place of {old}",
             )
     _check_places(known)
+    kept: dict[str, Any] = {}
     if len(known.axles) > 2 or known.bogies:
-        what = f"has {len(known.axles)} axles" if len(known.axles) > 2 else "has a bogie"
-        raise at(
-            "axles",
-            f"{what}: identification with more than two axles is not there yet, it must be a truck "
-            "of two axles",
-        )
-    front, rear = known.axles
+        if len(known.axles) == 2:
+            raise error_at("bogies", "joins axles of a truck of two, it must be of axles 2 and 3")
+        axles = _with_tracks(known.axles, table.get("track_m"))
+        tandem = tandem_of(axles, known.bogies)
+        kept = {"axles": axles, "bogies": known.bogies}
+        front, rear = tandem.lead, joined(tandem)
+    else:
+        front, rear = known.axles
     rest = {key: value for key, value in table.items() if key not in ("axles", "bogies")}
     pairs: dict[str, Any] = {key: (getattr(front, key), getattr(rear, key)) for key in _ALIKE}
     pairs["wheelbase_m"] = rear.position_m
@@ -144,29 +78,41 @@ def in_pairs(table: Any) -> Any:
         pairs["rear_axle_offset_m"] = (rear.lateral_offset_m or 0.0) - (
             front.lateral_offset_m or 0.0
         )
-    return _centre_of_gravity(front, rear, table) | rest | pairs
+    return _centre_of_gravity(front, rear, table) | rest | pairs | kept
+
+
+def _with_tracks(axles: tuple[Axle, ...], default: Any) -> tuple[Axle, ...]:
+    """Return axles of which those without a track have the vehicle's, if that is one number."""
+    if isinstance(default, bool) or not isinstance(default, int | float):
+        return axles
+    return tuple(
+        axle if axle.track_m is not None else axle.model_copy(update={"track_m": float(default)})
+        for axle in axles
+    )
 
 
 def _check_places(known: Axles) -> None:
-    """Raise if the axles do not follow one another, or a bogie is of axles that there are not."""
+    """Raise if axle positions do not ascend or a bogie names a missing axle."""
     places = [axle.position_m for axle in known.axles]
     if places[0] != 0.0:
-        raise at("axles.0.position_m", f"is {places[0]:g}, it must be 0: the first axle's place")
+        raise error_at(
+            "axles.0.position_m", f"is {places[0]:g}, it must be 0: the first axle's place"
+        )
     for number in range(1, len(places)):
         if places[number] <= places[number - 1]:
-            raise at(
+            raise error_at(
                 f"axles.{number}.position_m",
                 f"is {places[number]:g}, it must be a length greater than {places[number - 1]:g} m:"
                 " axles are listed in the order in which they pass",
             )
     for number, bogie in enumerate(known.bogies):
         if max(bogie.axles) > len(places):
-            raise at(
+            raise error_at(
                 f"bogies.{number}.axles",
                 f"names axle {max(bogie.axles)}, it must be numbers from 1 to {len(places)}",
             )
         if bogie.shares is not None and len(bogie.shares) != len(bogie.axles):
-            raise at(
+            raise error_at(
                 f"bogies.{number}.shares",
                 f"has {len(bogie.shares)} values, it must have one for each of its "
                 f"{len(bogie.axles)} axles",
@@ -174,13 +120,13 @@ def _check_places(known: Axles) -> None:
 
 
 def _tyres(front: Axle, rear: Axle) -> dict[str, tuple[float, float]]:
-    """Dimensions of the tyres; nothing where neither axle's are known.
+    """Return the dimensions of the tyres; empty where neither axle states any.
 
-    An axle that says nothing has what most lorries have: single tyres in front, twin ones behind.
+    An axle without dimensions has those of most lorries: single tyres in front, twin tyres behind.
     """
     keys = ("tyre_width_m", "twin_tyre_distance_m", "tyre_contact_length_m")
-    told = [key for axle in (front, rear) for key in ("tyres", *keys) if getattr(axle, key)]
-    if not told and front.twin_tyre_distance_m is None and rear.twin_tyre_distance_m is None:
+    stated = [key for axle in (front, rear) for key in ("tyres", *keys) if getattr(axle, key)]
+    if not stated and front.twin_tyre_distance_m is None and rear.twin_tyre_distance_m is None:
         return {}
     by_axle = []
     for axle, usual in ((front, "single"), (rear, "twin")):
@@ -196,13 +142,13 @@ def _tyres(front: Axle, rear: Axle) -> dict[str, tuple[float, float]]:
 
 
 def _tracks(front: Axle, rear: Axle, default: Any) -> Any:
-    """Track of each axle; an axle without one has the vehicle's."""
+    """Return the track of each axle; an axle without one has the vehicle's."""
     defaults = default if isinstance(default, list | tuple) else [default, default]
     found = []
     for number, axle in enumerate((front, rear)):
         usual = defaults[number] if len(defaults) == 2 else None
         if axle.track_m is None and usual is None:
-            raise at(
+            raise error_at(
                 f"axles.{number}.track_m", "is missing, give the track of both axles or of none"
             )
         found.append(usual if axle.track_m is None else axle.track_m)
@@ -210,12 +156,12 @@ def _tracks(front: Axle, rear: Axle, default: Any) -> Any:
 
 
 def _centre_of_gravity(front: Axle, rear: Axle, table: dict[str, Any]) -> dict[str, float]:
-    """Return `front_axle_to_cg_m` and its spread, by the loads less the unsprung masses.
+    """Return `front_axle_to_cg_m` and its spread, from the loads less the unsprung masses.
 
-    Loads that are both known are scaled to the total mass, which is known better.
+    If both loads are known, they are scaled to the total mass, which is known better.
     """
     if front.load_kg is None and rear.load_kg is None:
-        raise at(
+        raise error_at(
             "axles.0.load_kg",
             "is missing, it must be a mass in kg: the load of one axle at least places the centre "
             "of gravity",
@@ -226,7 +172,7 @@ def _centre_of_gravity(front: Axle, rear: Axle, table: dict[str, Any]) -> dict[s
     if front.load_kg is not None and rear.load_kg is not None:
         whole = front.load_kg + rear.load_kg
         if abs(whole / total - 1.0) > _LARGEST_LOAD_ERROR:
-            raise at(
+            raise error_at(
                 "axles",
                 f"carry {whole:g} kg by their load_kg but total_mass_kg is {total:g}, both must "
                 "be of the truck as it is driven",
@@ -245,7 +191,7 @@ def _centre_of_gravity(front: Axle, rear: Axle, table: dict[str, Any]) -> dict[s
     carried = behind - rear.unsprung_mass_kg
     if not 0.0 < carried < sprung:
         number, axle = (1, rear) if carried <= 0.0 else (0, front)
-        raise at(
+        raise error_at(
             f"axles.{number}.unsprung_mass_kg",
             f"is {axle.unsprung_mass_kg:g}, it must be a mass less than the load of the axle",
         )
@@ -262,6 +208,6 @@ def _centre_of_gravity(front: Axle, rear: Axle, table: dict[str, Any]) -> dict[s
 
 
 def _number(value: Any, otherwise: float = 0.0) -> float:
-    """Return a value that is a positive number; what else it is, the model complains about."""
+    """Return a positive number or `otherwise`; the model reports other values."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if is_number and 0.0 <= value < math.inf else otherwise

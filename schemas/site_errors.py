@@ -1,4 +1,4 @@
-"""What is wrong with a site file, in one line that names the field and what would be right."""
+"""Errors of a site file in one line that names the field and what would be right."""
 
 import difflib
 import json
@@ -11,19 +11,19 @@ Tables = dict[str, type[BaseModel]]
 
 
 class FieldError(ValueError):
-    """A wrong value found by looking at several fields: says which one to mend."""
+    """A wrong value that only several fields together reveal; it names the field to correct."""
 
     def __init__(self, path: str, message: str) -> None:
         super().__init__(message)
         self.path = path
 
 
-def at(path: str, message: str) -> FieldError:
-    """The error that says what is wrong with the field at `path`."""
+def error_at(path: str, message: str) -> FieldError:
+    """Return the error for the field at `path`."""
     return FieldError(path, message)
 
 
-# The noun and the unit of a field, by the end of its name; longer endings first.
+# Noun and unit of a field by the end of its name; longer endings first.
 _QUANTITIES: Final = (
     ("_nm_per_rad", "a rotational stiffness", "N·m/rad"),
     ("_ns_per_m", "a damping", "N·s/m"),
@@ -45,9 +45,9 @@ _QUANTITIES: Final = (
 
 
 def first_line(error: ValidationError, single: set[str], tables: Tables) -> str:
-    """What to mend first, and how many more errors there are.
+    """Return the first error to correct and the number of others.
 
-    `single` are the tables that are no list in the file; `tables` the models by their names.
+    `single` are the tables that are not lists in the file; `tables` the models by their names.
     """
     # A misspelt field is also a missing one: the spelling is what the user can see. And a list
     # whose entry is wrong is counted by Pydantic as too short as well.
@@ -56,12 +56,12 @@ def first_line(error: ValidationError, single: set[str], tables: Tables) -> str:
 
 
 def all_lines(error: ValidationError, single: set[str], tables: Tables) -> list[str]:
-    """What to mend, a line each and the most telling first; arguments as above."""
+    """Return all errors, a line each and the most specific first; arguments as in `first_line`."""
     order = {"extra_forbidden": 0, "too_short": 2}
     problems = sorted(error.errors(include_url=False), key=lambda p: order.get(p["type"], 1))
     first, *others = problems
-    told = [first, *(p for p in others if p["type"] != "too_short")]
-    return [_describe(problem, single, tables) for problem in told]
+    shown = [first, *(p for p in others if p["type"] != "too_short")]
+    return [_describe(problem, single, tables) for problem in shown]
 
 
 def _describe(problem: Any, single: set[str], tables: Tables) -> str:
@@ -76,11 +76,17 @@ def _describe(problem: Any, single: set[str], tables: Tables) -> str:
     if problem["type"] == "missing":
         if len(location) == 1:
             return f"the table [{path}] is missing"
-        what = _quantity(key)
+        what = _TABLE_LISTS.get(_list_key(location)) or _quantity(key)
         return f"{path} is missing" + (f", it must be {what}" if what else "")
     if problem["type"] == "extra_forbidden":
         return f"{path} is not a known field, {_suggestion(key, len(location), tables)}"
-    return f"{path} is {_shown(problem['input'])}, it must be {_expected(problem, key, tables)}"
+    value = problem["input"]
+    if problem["type"] in ("too_short", "too_long") and _list_key(location) in _TABLE_LISTS:
+        entries = "1 entry" if len(value) == 1 else f"{len(value)} entries"
+        return f"{path} has {entries}, it must be {_TABLE_LISTS[_list_key(location)]}"
+    return (
+        f"{path} is {_shown(value)}, it must be {_expected(problem, _list_key(location), tables)}"
+    )
 
 
 def _suggestion(key: str, depth: int, tables: Tables) -> str:
@@ -96,7 +102,7 @@ def _suggestion(key: str, depth: int, tables: Tables) -> str:
 
 
 def _path(location: list[int | str], single: set[str]) -> str:
-    """Spell a place as the user typed it: no index where there was one table and no list."""
+    """Return a place as the user typed it: no index for a table that is not a list."""
     parts = list(_path_parts(location, single))
     return "".join(parts).removeprefix(".") or "the file"
 
@@ -130,7 +136,7 @@ def _expected(problem: Any, key: str, tables: Tables) -> str:
         return _quantity(key, f"{words} {context[name]:g}")
     if kind == "finite_number":
         return ", ".join(part for part in (_quantity(key), "a finite number") if part)
-    if key in ("id", "channel"):
+    if key in ("id", "channel", "name"):
         return (
             'an identifier of a-z, 0-9, "_" and "-", at most 63, beginning with a letter or digit'
         )
@@ -161,14 +167,21 @@ _CHOICES: Final = {
 
 
 _TABLE_LISTS: Final = {
-    "axles": "two or more [[vehicle.axles]], of a bogie the numbers of its axles",
-    "bogies": "tables [[vehicle.bogies]]",
+    "axles": "two [[vehicle.axles]], or three of which the last two are an equalised bogie",
+    "bogies.axles": "a list of the numbers of its axles, [2, 3]",
+    "bogies": "one [[vehicle.bogies]], with axles = [2, 3]",
     "sensors": "at most 32 [[vehicle.sensors]]",
 }
 
 
+def _list_key(location: list[int | str]) -> str:
+    """Return the name of the last key of a place; `axles` of a bogie is `bogies.axles`."""
+    keys = [str(part) for part in location if isinstance(part, str)]
+    return "bogies.axles" if keys[-2:] == ["bogies", "axles"] else keys[-1] if keys else ""
+
+
 def _list_expected(key: str, tables: Tables) -> str:
-    if key in ("axles", "bogies", "sensors"):
+    if key in _TABLE_LISTS:
         return _TABLE_LISTS[key]
     if key == "shares":
         return "a list with one number for each axle of the bogie"
@@ -188,7 +201,7 @@ def _list_expected(key: str, tables: Tables) -> str:
 
 
 def _shown(value: object) -> str:
-    """Show a value as TOML would, cut to fit a line."""
+    """Return a value as TOML would show it, cut to fit a line."""
     try:
         text = json.dumps(value, ensure_ascii=False)
     except (TypeError, ValueError):

@@ -1,7 +1,8 @@
-"""The site file as text: read into `schemas.site`, with errors that say what to mend; written."""
+"""The text of a site file: parsed into `schemas.site` with errors to correct, and written."""
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,30 +10,32 @@ from pydantic import BaseModel, ValidationError
 
 from schemas.errors import InputError
 from schemas.site import MAX_ELEMENTS, MAX_TABLES, Bridge, Receiver, Sensor, Site, Vehicle
-from schemas.site_axles import Axle, Bogie
+from schemas.site_axle_tables import Axle, Bogie
 from schemas.site_errors import Tables, all_lines, first_line
+from schemas.site_import import Import
 from schemas.site_ros2 import Ros2
 from schemas.site_sensors import PlacedSensor
 from schemas.toml_text import parse_toml, read_toml_text
 
 _MOST_FIELDS: Final = 100
-"""In a table, and values in a list: more than there can be."""
+"""Largest number of fields in a table and of values in a list."""
 _TABLES: Final[Tables] = {
     "vehicle": Vehicle,
     "bridge": Bridge,
     "sensor": Sensor,
     "receiver": Receiver,
     "ros2": Ros2,
+    "import": Import,
     "vehicle.axles": Axle,
     "vehicle.bogies": Bogie,
     "vehicle.sensors": PlacedSensor,
 }
 _LISTS: Final = ("vehicle", "bridge", "ros2")
-"""Tables of which there may be several."""
+"""Tables that may occur several times."""
 
 
 def load_site(path: str | Path) -> Site:
-    """Read a site file; raise InputError with one line if it cannot be read or is wrong."""
+    """Read a site file; raise InputError in one line if it cannot be read or is wrong."""
     return parse_site(read_site_text(Path(path)), str(path))
 
 
@@ -42,8 +45,39 @@ def read_site_text(path: Path) -> str:
 
 
 def parse_site(toml_text: str, source_name: str) -> Site:
-    """Return the site that the text describes; raise InputError that begins with `source_name`."""
-    table = parse_toml(toml_text, source_name)
+    """Return the site of a text; raise an InputError that begins with `source_name`."""
+    return _site_of(parse_toml(toml_text, source_name), source_name)
+
+
+def with_values(site: Site, values: Mapping[str, object]) -> Site:
+    """Return the site with values replaced, by names such as `bridge.mass_per_length_kg_per_m`.
+
+    Nominal values and spreads are the priors of the parameters. Where the site has several vehicles
+    or bridges, the identifier takes the place of the table's name. None restores a default. Raise
+    InputError in one line for a name or value that a site file must not have.
+    """
+    tables = parse_toml(site_toml(site), "the site")
+    by_name: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+    for kind, found in tables.items():
+        for table in found if isinstance(found, list) else [found]:
+            for name in dict.fromkeys((kind, table.get("id", kind))):
+                by_name.setdefault(name, []).append((kind, table))
+    for name, value in values.items():
+        of, _, key = name.rpartition(".")
+        possible = by_name.get(of, [])
+        if len(possible) != 1:
+            known = ", ".join(one for one, found in by_name.items() if len(found) == 1)
+            raise InputError(f"{name}: is unknown, it must be TABLE.KEY of a table of {known}")
+        ((kind, table),) = possible
+        plain = value.tolist() if hasattr(value, "tolist") else value
+        if plain is None and key in _TABLES[kind].model_fields:
+            table.pop(key, None)
+        else:  # an unknown key is refused with its table, whatever its value
+            table[key] = list(plain) if isinstance(plain, tuple) else plain
+    return _site_of(tables, "the site")
+
+
+def _site_of(table: dict[str, Any], source_name: str) -> Site:
     single = {name for name in _LISTS if isinstance(table.get(name), dict)}
     for name in single:
         table[name] = [table[name]]
@@ -57,9 +91,9 @@ def parse_site(toml_text: str, source_name: str) -> Site:
 
 
 def faults_of_site(toml_text: str, source_name: str) -> list[str]:
-    """Everything that is wrong with a site file, a line each; none if it can be read.
+    """Return all errors of a site file, a line each; empty if it is valid.
 
-    What is told from several fields together is told once each of them is right.
+    Errors between several fields appear once each of them is valid.
     """
     try:
         parse_site(toml_text, source_name)
@@ -74,7 +108,7 @@ def faults_of_site(toml_text: str, source_name: str) -> list[str]:
 
 
 def _too_many(table: dict[str, Any]) -> str | None:
-    """Say which table or list is longer than any site file's: Pydantic tells of all its errors."""
+    """Return an error if a table or list is too long; Pydantic would report each of its entries."""
     parts = [("the file", table)]
     for name, value in table.items():
         tables = value if isinstance(value, list) else [value]
@@ -91,11 +125,12 @@ def _too_many(table: dict[str, Any]) -> str | None:
 
 
 def site_hash(site: Site) -> str:
-    """Return 16 hex digits that change when any value changes, however the file is laid out.
+    """Return 16 hex digits that change with any value, however the file is laid out.
 
-    But for `[ros2]`, which says by which way messages come and nothing of what is in them.
+    But for `[ros2]` and `[import]`, which say by which way messages come and where they are filed,
+    and nothing of what is in them.
     """
-    values = site.model_dump(by_alias=True, exclude={"ros2", "vehicles"})
+    values = site.model_dump(by_alias=True, exclude={"ros2", "imports", "vehicles"})
     values["vehicle"] = [vehicle.shortest() for vehicle in site.vehicles]
     canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
@@ -107,12 +142,15 @@ def site_toml(site: Site) -> str:
     bridge = "[bridge]" if len(site.bridges) == 1 else "[[bridge]]"
     tables: list[tuple[str, BaseModel]] = [(vehicle, table) for table in site.vehicles]
     tables += [(bridge, table) for table in site.bridges]
-    ros2 = [("[[ros2]]", table) for table in site.ros2]
-    return _toml([*tables, ("[sensor]", site.sensor), ("[receiver]", site.receiver), *ros2])
+    tables += [("[sensor]", site.sensor), ("[receiver]", site.receiver)]
+    tables += [("[[ros2]]", table) for table in site.ros2]
+    if site.imports is not None:
+        tables.append(("[import]", site.imports))
+    return _toml(tables)
 
 
 def vehicle_toml(site: Site, vehicle_id: str) -> str:
-    """Return what a truck says of itself: the [vehicle], [sensor] and [receiver] parts."""
+    """Return the [vehicle], [sensor] and [receiver] parts, as a truck publishes them."""
     return _toml(
         [
             ("[vehicle]", site.vehicle(vehicle_id)),
@@ -130,7 +168,7 @@ def _toml(tables: list[tuple[str, BaseModel]]) -> str:
 
 
 def toml_of(tables: dict[str, dict[str, Any]]) -> str:
-    """Return the text of tables of numbers, texts, booleans and lists of them."""
+    """Return the TOML text of tables of numbers, texts, booleans and lists of them."""
     return "".join(_table_text(f"[{name}]", table) for name, table in tables.items())
 
 

@@ -1,9 +1,9 @@
-"""The keys of `[bridge]` on a lane beside the axis, and the torsion that follows from them.
+"""The keys of `[bridge]` for an eccentric lane, and the torsion that follows from them.
 
-A deck of torsional rigidity GJ whose wheels' middle runs at the distance e beside its axis sinks
-there by e theta, and of both only g = e²/(GJ) is an unknown (docs/contract.md, `torsion`). Owners
+On a deck of torsional rigidity GJ, wheels whose middle runs at the distance e from its axis sink
+there by e theta. Of e and GJ only g = e²/(GJ) is a parameter (docs/contract.md, `torsion`). Owners
 know the lane, and of the deck at best the ratio of its first torsional to its first bending
-frequency and the radius of gyration r of its cross-section. Of a uniform one
+frequency and the radius of gyration r of its cross-section. For a uniform deck
 
     f_1 = pi/(2 L²) sqrt(EI/rho A),   f_t = ratio f_1,   GJ = rho A r² (2 L f_t)²
 
@@ -20,14 +20,14 @@ Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Spread = Annotated[Number, Field(ge=0, le=3)]
 
 USUAL_LANE_M: Final = 2.0
-"""Half a road of two lanes: how far beside the axis a truck may well drive."""
+"""Distance of a usual lane from the axis: half of a two-lane road."""
 USUAL_FREQUENCY_RATIO: Final = 2.0
 USUAL_GYRATION_M: Final = 2.3
-"""Of a deck of two lanes, some 8 m wide."""
+"""Radius of gyration of a two-lane deck, about 8 m wide."""
 _RATIO_SPREAD, _GYRATION_SPREAD = 0.3, 0.2
 _UNKNOWN_RATIO_SPREAD, _UNKNOWN_GYRATION_SPREAD = 0.5, 0.3
 _NEGLIGIBLE_M: Final = 0.05
-"""A lane that is known to be no further from the axis than this needs no torsion."""
+"""Largest distance of a lane from the axis that needs no torsion."""
 
 
 def flexibility_per_n(
@@ -46,10 +46,10 @@ def wave_speed_m_per_s(
 
 
 class Lane(BaseModel):
-    """Where the lane runs and how the deck twists, as far as that is known."""
+    """Position of the lane and torsion of the deck, as far as known."""
 
     lane_offset_m: Annotated[Number, Field(ge=-20, le=20)] | None = None
-    """Middle of the driven lane to the left of the bridge's axis, looking from start to end."""
+    """Distance of the lane's middle to the left of the bridge's axis, seen from start to end."""
     torsional_frequency_ratio: Annotated[Number, Field(ge=0.2, le=100)] | None = None
     """First torsional over first bending frequency."""
     deck_gyration_m: Annotated[Number, Field(ge=0.1, le=30)] | None = None
@@ -62,29 +62,29 @@ class Lane(BaseModel):
 
     @abstractmethod
     def uniform(self) -> tuple[float, float, float]:
-        """Return longest span in m, mean nominal EI in N·m² and mass per length in kg/m."""
+        """Return the longest span in m, mean nominal EI in N·m² and mass per length in kg/m."""
 
     @property
     def is_lane_off_axis(self) -> bool:
-        """Whether the site file says that the lane is off the axis: then the deck twists."""
+        """Whether the site file places the lane off the axis, so that the deck twists."""
         offset = self.lane_offset_m
         return offset is not None and abs(offset) > max(self.lane_offset_m_spread, _NEGLIGIBLE_M)
 
     @property
     def reference_lane_offset_m(self) -> float:
-        """Distance from the axis at which the unknown of torsion is defined."""
+        """Distance from the axis at which the torsion parameter is defined."""
         if self.lane_offset_m is None:
             return USUAL_LANE_M
         return max(abs(self.lane_offset_m), self.lane_offset_m_spread)
 
     @property
     def torsional_flexibility_per_n(self) -> float:
-        """Nominal e²/(GJ) in 1/N; 0 where the file does not say that the lane is off the axis."""
+        """Nominal e²/(GJ) in 1/N; 0 unless the site file places the lane off the axis."""
         return self._flexibility_per_n if self.is_lane_off_axis else 0.0
 
     @property
     def torsional_flexibility_per_n_spread(self) -> float:
-        """Standard deviation of ln g: twice those of ln e, ln ratio and ln r."""
+        """Standard deviation of ln g: twice those of ln e, ln ratio and ln r, combined."""
         assert self.lane_offset_m is not None  # noqa: S101 - the lane is off the axis
         ratio, gyration = _UNKNOWN_RATIO_SPREAD, _UNKNOWN_GYRATION_SPREAD
         if self.torsional_frequency_ratio is not None:
@@ -103,7 +103,7 @@ class Lane(BaseModel):
 
     @property
     def torsional_wave_speed_m_per_s(self) -> float:
-        """Nominal 2 L f_t."""
+        """Nominal speed of torsional waves, 2 L f_t."""
         return wave_speed_m_per_s(
             self.torsional_frequency_ratio or USUAL_FREQUENCY_RATIO, *self.uniform()
         )

@@ -30,12 +30,12 @@ UNSPRUNG_MASS_SPREAD: Final = 0.15
 
 
 class Table(BaseModel):
-    """A table of a site file: no key that is not known, no change once it is read."""
+    """A table of a site file: immutable, without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     later_keys: ClassVar[tuple[str, ...]] = ()
-    """Keys that are written only where they are not at their defaults: a file without them keeps
-    the hash that it had before there were such keys."""
+    """Keys that are written only if they differ from their defaults, so that a file without them
+    keeps the hash that it had before the keys existed."""
 
     @model_serializer(mode="wrap")
     def _without_later_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

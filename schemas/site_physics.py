@@ -1,14 +1,14 @@
 """Physical bounds of a site file: values that no truck, bridge or sensor can have are refused.
 
-The bounds are generous, for a model in a laboratory is a bridge too: what is unlikely is left to
-`driveby check`. Most hold for ratios of quantities, as natural frequencies and damping ratios, and
-are given in the message as a range of the key that is out of it.
+The bounds are generous, for a laboratory model is a bridge too; `driveby check` reports unlikely
+values. Most bounds hold for ratios of quantities, such as natural frequencies and damping ratios.
+The message gives the resulting range of the key that violates one.
 """
 
 import math
 from typing import TYPE_CHECKING, Final
 
-from schemas.site_errors import at
+from schemas.site_errors import error_at
 
 if TYPE_CHECKING:
     from schemas.site import Bridge, Receiver, Sensor
@@ -18,34 +18,46 @@ _G_M_PER_S2: Final = 9.80665
 _SMALLEST_MASS_KG: Final = 0.1
 _MASS_PER_LENGTH_KG_PER_M: Final = (0.01, 1e6)
 _SMALLEST_AXLE: Final = 1e-3
-"""Mass of an axle over the truck's; and the least share of it that is sprung."""
+"""Smallest share of the truck's mass in one axle, and in the body."""
 _SMALLEST_LOAD: Final = 0.01
-"""Share of the weight that each axle carries at least."""
+"""Smallest share of the weight on one axle."""
 _SPRING_HZ: Final = (0.1, 300.0)
-"""Of the body on the springs of an axle: at 0.1 Hz it sags by 25 m under its own weight."""
+"""Natural frequency of the body on an axle's springs; at 0.1 Hz it sags by 25 m under its weight.
+"""
 _TYRE_HZ: Final = (0.1, 1000.0)
-"""Of the body on the tyres at least, of the axle on them at most."""
+"""Natural frequency: lower bound for the body on the tyres, upper bound for the axle on them."""
 _MOST_DAMPING: Final = 20.0
-"""Damping ratio of a spring with its damper, and of a tyre."""
+"""Largest damping ratio of a suspension and of a tyre."""
 _WAVE_SPEED_M_PER_S: Final = 6000.0
-"""Of the materials of bridges at most: 5100 in steel, 4000 in concrete."""
+"""Largest wave speed of bridge materials: 5100 in steel, 4000 in concrete."""
 _GYRATION: Final = 0.25
-"""Radius of gyration of the cross-section over the span: a truss half as deep as it is long."""
+"""Largest radius of gyration over the span: a truss half as deep as it is long."""
 _SAG: Final = 0.1
-"""Deflection under the own weight over the span: of real bridges 1/100 and less."""
+"""Largest deflection under self-weight over the span; 1/100 and less in real bridges."""
 _SHORTEST_PART: Final = 1e-3
-"""Length of an element over the span, and of a span over the bridge."""
+"""Smallest length of an element over the span, and of a span over the bridge."""
 _SUPPORT_SPRING: Final = (1e-6, 1e6)
-"""Over EI / span."""
+"""Bounds of a rotational restraint over EI / span."""
 _SMALLEST_COMPLIANCE_M_PER_N: Final = 1e-15
 _SLOWEST_RATE_HZ: Final = 10.0
 _LARGEST_POSITION_M: Final = 100.0
 _LARGEST_SPEED_M_PER_S: Final = 10.0
 _TYRE_M: Final = (1e-3, 2.0)
+_LIGHTEST_DECK_KG_PER_M, _SHORTEST_BRIDGE_M = 100.0, 5.0
+"""A deck of less is a laboratory's, and these are shorter."""
+_SLIPS: Final[dict[str, dict[str, float]]] = {
+    "N/m": {"kN/m": 1e3},
+    "N·s/m": {"kN·s/m": 1e3},
+    "N·m²": {"kN·m²": 1e3, "MN·m²": 1e6, "GN·m²": 1e9},
+    "kg": {"t": 1e3},
+    "kg/m": {"t/m": 1e3},
+    "m": {"mm": 1e-3, "cm": 1e-2},
+}
+"""Units in which values are written by mistake, with their factors, by the unit of a key."""
 
 
 def check_vehicle(vehicle: "Vehicle") -> None:
-    """Raise the error of the first key whose value no truck can have."""
+    """Raise an error for the first key whose value no truck can have."""
     total = vehicle.total_mass_kg
     _check("total_mass_kg", total, (_SMALLEST_MASS_KG, 1e6), "a mass", "kg")
     wheelbase = vehicle.wheelbase_m
@@ -63,7 +75,7 @@ def check_vehicle(vehicle: "Vehicle") -> None:
         limits = (_SMALLEST_AXLE * total, (1.0 - _SMALLEST_AXLE) * total)
         _check(f"unsprung_mass_kg.{k}", mass, limits, "a mass", "kg", f"the truck has {total:g} kg")
     if vehicle.sprung_mass_kg < _SMALLEST_AXLE * total:
-        raise at(
+        raise error_at(
             "unsprung_mass_kg",
             f"adds up to {sum(vehicle.unsprung_mass_kg):g}, it must be a mass of at most "
             f"{(1.0 - _SMALLEST_AXLE) * total:g} kg: a part of the truck is on springs",
@@ -81,7 +93,7 @@ def check_vehicle(vehicle: "Vehicle") -> None:
 
 
 def _check_axle(vehicle: "Vehicle", k: int, body_kg: float) -> None:
-    """Raise if springs, tyres or dampers of an axle that carries `body_kg` cannot be."""
+    """Raise if springs, tyres or dampers of an axle that carries `body_kg` are impossible."""
     axle_kg = vehicle.unsprung_mass_kg[k]
     spring, tyre = vehicle.suspension_stiffness_n_per_m[k], vehicle.tyre_stiffness_n_per_m[k]
     low, high = (_stiffness(body_kg, hz) for hz in _SPRING_HZ)
@@ -101,7 +113,7 @@ def _check_axle(vehicle: "Vehicle", k: int, body_kg: float) -> None:
 
 
 def check_bridge(bridge: "Bridge") -> None:
-    """Raise the error of the first key whose value no bridge can have."""
+    """Raise an error for the first key whose value no bridge can have."""
     _check("span_m", bridge.span_m, (0.1, 1000.0), "a length", "m")
     mass = bridge.mass_per_length_kg_per_m
     key = "mass_per_length_kg_per_m"
@@ -117,6 +129,8 @@ def check_bridge(bridge: "Bridge") -> None:
     limits = _rigidities(span, mass)
     low_hz, high_hz = (_first_hz(span, mass, rigidity) for rigidity in limits)
     because = f"{span:g} m of {mass:g} kg/m swing at {low_hz:.2g} to {high_hz:.3g} Hz"
+    if mass < _LIGHTEST_DECK_KG_PER_M and span > _SHORTEST_BRIDGE_M:
+        because += f"; or is mass_per_length_kg_per_m in t/m? then it is {1e3 * mass:g}"
     single = "flexural_rigidity_nm2"
     if bridge.flexural_rigidity_nm2 is not None:
         value = bridge.flexural_rigidity_nm2
@@ -143,10 +157,10 @@ def check_bridge(bridge: "Bridge") -> None:
 
 
 def check_sensor(sensor: "Sensor") -> "Sensor":
-    """Return the sensor; raise if a rate is none of an accelerometer."""
+    """Return the sensor; raise if no accelerometer has such a rate."""
     for rate in sensor.rate_hz:
         if rate < _SLOWEST_RATE_HZ:
-            raise at(
+            raise error_at(
                 "rate_hz",
                 f"is {rate:g}, it must be a rate of at least {_SLOWEST_RATE_HZ:g} Hz (Hz, not kHz)",
             )
@@ -154,7 +168,7 @@ def check_sensor(sensor: "Sensor") -> "Sensor":
 
 
 def check_receiver(receiver: "Receiver") -> "Receiver":
-    """Return the receiver; raise if its errors are larger than a bridge is long."""
+    """Return the receiver; raise if its errors exceed the length of a bridge."""
     for key in ("position_spread_m", "position_noise_m"):
         _check(key, getattr(receiver, key), (0.0, _LARGEST_POSITION_M), "a length", "m")
     key = "speed_noise_m_per_s"
@@ -167,12 +181,12 @@ def _stiffness(mass_kg: float, frequency_hz: float) -> float:
 
 
 def _first_hz(span_m: float, mass_kg_per_m: float, rigidity_nm2: float) -> float:
-    """Return the first natural frequency of a beam on two supports."""
+    """Return the first natural frequency of a simply supported beam."""
     return math.pi / (2.0 * span_m**2) * math.sqrt(rigidity_nm2 / mass_kg_per_m)
 
 
 def _rigidities(span_m: float, mass_kg_per_m: float) -> tuple[float, float]:
-    """Return EI at which a beam sags by a tenth of its span, and that of the stiffest section."""
+    """Return the EI at which a beam sags by a tenth of its span, and of the stiffest section."""
     least = 5.0 * mass_kg_per_m * _G_M_PER_S2 * span_m**3 / (384.0 * _SAG)
     return least, mass_kg_per_m * (_WAVE_SPEED_M_PER_S * _GYRATION * span_m) ** 2
 
@@ -189,4 +203,8 @@ def _check(
     if low <= value <= high:
         return
     reach = f"from {low:.4g} to {high:.4g} {unit}".rstrip()
-    raise at(path, f"is {value:g}, it must be {noun} {reach}" + (f": {because}" if because else ""))
+    reason = f": {because}" if because else ""
+    meant = next((u for u, f in _SLIPS.get(unit, {}).items() if low <= value * f <= high), None)
+    if meant is not None:
+        reason += f"; in {meant}? then it is {value * _SLIPS[unit][meant]:g}"
+    raise error_at(path, f"is {value:g}, it must be {noun} {reach}{reason}")

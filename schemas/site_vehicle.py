@@ -1,12 +1,13 @@
-"""`[vehicle]` of a site file: a truck of two axles, with its accelerometers where it names them."""
+"""`[vehicle]` of a site file: a truck with its axles, and its accelerometers if it names them."""
 
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from schemas.signals import CHANNELS
-from schemas.site_axles import in_pairs
-from schemas.site_errors import at
+from schemas.site_axle_tables import MOST_AXLES, Axle, Bogie
+from schemas.site_axles import REPLACED, in_pairs
+from schemas.site_errors import error_at
 from schemas.site_numbers import (
     UNSPRUNG_MASS_SPREAD,
     Identifier,
@@ -18,17 +19,18 @@ from schemas.site_numbers import (
     Track,
 )
 from schemas.site_physics import check_vehicle
-from schemas.site_sensors import MOST_SENSORS, PlacedSensor, check_sensors
+from schemas.site_sensors import MOST_SENSORS, PlacedSensor, check_places, check_sensors
+from schemas.site_tandem import Tandem, tandem_of
 
 _TYRE_DAMPING_NS_PER_M: Final = 1000.0
 
 
 def _two(value: object) -> object:
-    """Spell one value for both axles out as a pair."""
+    """Expand one value for both axles to a pair."""
     return [value] * 2 if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-class Spreadable(Table):
+class WithSpreads(Table):
     """A table whose values may have spreads."""
 
     id: Identifier
@@ -39,18 +41,24 @@ class Spreadable(Table):
         return value
 
     def nominal(self, key: str) -> tuple[float, ...]:
-        """Return what is known of a quantity before, one value or several."""
+        """Return the nominal values of a quantity, one or several."""
         value: float | tuple[float, ...] = getattr(self, key)
         return value if isinstance(value, tuple) else (value,)
 
     def scale_at_zero(self, key: str) -> float:
-        """Return the scale of the half-normal prior of a quantity that is nominally zero."""
+        """Return the scale of the half-normal prior of a quantity whose nominal value is zero."""
         value: float = getattr(self, f"{key}_scale_at_zero")
         return value
 
 
-class Vehicle(Spreadable):
-    """A truck with two axles. Nominal values are those of a data sheet."""
+class Vehicle(WithSpreads):
+    """A truck with two axles, or a front axle and a tandem. Nominal values are of a data sheet.
+
+    With a tandem, pairs are those of the front axle and of the tandem's axles together, and the
+    wheelbase ends at their common force.
+    """
+
+    later_keys: ClassVar[tuple[str, ...]] = ("axles", "bogies")
 
     total_mass_kg: Annotated[Number, Field(gt=0, le=1e6)]
     wheelbase_m: Annotated[Number, Field(gt=0, le=30)]
@@ -60,23 +68,27 @@ class Vehicle(Spreadable):
     unsprung_mass_kg: PositivePair
     tyre_stiffness_n_per_m: PositivePair
     gps_antenna_to_front_axle_m: Annotated[Number, Field(ge=-50, le=50)]
-    """How far the antenna is behind the front axle, positive to the rear."""
+    """Distance of the antenna behind the front axle."""
     cg_height_m: Annotated[Number, Field(gt=0, le=5)] | None = None
     pitch_inertia_ratio: Annotated[Number, Field(gt=0, le=10)] = 1.0
-    """κ: the pitch inertia is κ·m_s·d_1·d_2."""
+    """Ratio κ: the pitch inertia is κ·m_s·d_1·d_2."""
     tyre_damping_ns_per_m: NotNegativePair = (0.0, 0.0)
-    """Zero: not known (see `scale_at_zero`)."""
+    """Tyre damping; zero: unknown (see `scale_at_zero`)."""
     tyre_width_m: PositivePair | None = None
-    """Widths of the tread; with the next four, by how much the road differs from axle to axle."""
+    """Tread widths; with the next four they determine the profile mismatch of the axles."""
     tyre_contact_length_m: PositivePair | None = None
     twin_tyre_distance_m: NotNegativePair | None = None
-    """Between the middles of twin tyres; 0 for single ones."""
+    """Distance between the middles of twin tyres; 0 for single ones."""
     track_m: Annotated[tuple[Track, Track] | None, BeforeValidator(_two)] = None
-    """Between the middles of the wheels of both sides, of each axle."""
+    """Distance between the middles of the left and right wheels of each axle."""
     rear_axle_offset_m: Annotated[Number, Field(ge=-1, le=1)] | None = None
-    """How far the rear axle runs to the left of the front axle."""
+    """Distance of the rear axle's path to the left of the front axle's."""
     sensors: Annotated[tuple[PlacedSensor, ...], Field(max_length=MOST_SENSORS)] = ()
-    """Accelerometers by name and place; none: four by the names of `CHANNELS`, in the middle."""
+    """Accelerometers by name and place; empty: four with the names of `CHANNELS`, on the centre
+    line."""
+    axles: Annotated[tuple[Axle, ...], Field(max_length=MOST_AXLES)] = ()
+    """Axles of a truck with a tandem; empty: two, in the pairs."""
+    bogies: Annotated[tuple[Bogie, ...], Field(max_length=MOST_AXLES)] = ()
 
     total_mass_kg_spread: Spread = 0.01
     wheelbase_m_spread: Spread = 0.002
@@ -91,8 +103,30 @@ class Vehicle(Spreadable):
 
     @property
     def tyre_damping_ns_per_m_scale_at_zero(self) -> float:
-        """Scale of the half-normal prior of the damping of a tyre of which nothing is known."""
+        """Scale of the half-normal prior of the damping of a tyre without a nominal value."""
         return _TYRE_DAMPING_NS_PER_M
+
+    @property
+    def tandem(self) -> Tandem | None:
+        """The equalised tandem behind the front axle."""
+        return tandem_of(self.axles, self.bogies) if self.axles else None
+
+    @property
+    def length_m(self) -> float:
+        """Distance between the first and the last axle."""
+        return self.axles[-1].position_m if self.axles else self.wheelbase_m
+
+    @property
+    def tandem_share(self) -> float:
+        """Share of the tandem's spring force on its first axle; 0 without a tandem."""
+        tandem = self.tandem
+        return 0.0 if tandem is None else tandem.share
+
+    @property
+    def tandem_share_spread(self) -> float:
+        """Relative standard deviation of `tandem_share`."""
+        tandem = self.tandem
+        return 0.0 if tandem is None else tandem.share_spread
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -102,18 +136,22 @@ class Vehicle(Spreadable):
     def shortest(self) -> dict[str, Any]:
         """Return all values in the shortest spelling, as they go into files and hashes.
 
-        So a truck without sensors of its own is to older programs what it was.
+        A truck without sensors of its own thus keeps the form and hash of older programs.
         """
         values = self.model_dump()
         if not self.sensors:
             del values["sensors"]
+        if self.axles:
+            return {
+                key: value for key, value in values.items() if key not in (*REPLACED, "track_m")
+            }
         if self.track_m is not None and self.track_m[0] == self.track_m[1]:
             values["track_m"] = self.track_m[0]
         return values
 
     @property
     def sprung_mass_kg(self) -> float:
-        """Mass of the body: what is not axles and wheels."""
+        """Mass of the body, without axles and wheels."""
         return self.total_mass_kg - sum(self.unsprung_mass_kg)
 
     @property
@@ -124,23 +162,46 @@ class Vehicle(Spreadable):
     @model_validator(mode="before")
     @classmethod
     def _axles_in_pairs(cls, table: Any) -> Any:
+        if isinstance(table, dict) and table.get("sensors") == []:
+            raise error_at(
+                "sensors",
+                "is [], it must be [[vehicle.sensors]] with all accelerometers, or be left out for "
+                "the four usual ones",
+            )
         return in_pairs(table)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Vehicle":
         if self.front_axle_to_cg_m >= self.wheelbase_m:
-            raise at(
+            raise error_at(
                 "front_axle_to_cg_m",
                 f"is {self.front_axle_to_cg_m}, it must be a length less than wheelbase_m, "
                 f"{self.wheelbase_m} m",
             )
         if self.sprung_mass_kg <= 0:
-            raise at(
+            raise error_at(
                 "unsprung_mass_kg",
                 f"adds up to {sum(self.unsprung_mass_kg)}, it must be a mass less than "
                 f"total_mass_kg, {self.total_mass_kg} kg",
             )
+        if self.tandem is not None and not self.sensors:
+            raise error_at(
+                "sensors",
+                "is missing, it must place two accelerometers on the body and one on each axle of "
+                "the tandem",
+            )
         if self.sensors:
-            check_sensors(self.sensors, self.wheelbase_m)
+            behind = (1, 2) if self.tandem is None else (2, 3)
+            check_places(self.sensors, self.length_m, self.track_m or ())
+            check_sensors(self.sensors, self.wheelbase_m, behind)
         check_vehicle(self)
         return self
+
+
+def axle_loads_kg(vehicle: Vehicle) -> tuple[float, float]:
+    """Return the nominal static loads of the front and the rear axle in kg."""
+    share = vehicle.front_axle_to_cg_m / vehicle.wheelbase_m
+    return (
+        vehicle.sprung_mass_kg * (1.0 - share) + vehicle.unsprung_mass_kg[0],
+        vehicle.sprung_mass_kg * share + vehicle.unsprung_mass_kg[1],
+    )

@@ -1,13 +1,13 @@
-"""The query by which a truck gives again what it has on its own disk. No I/O.
+"""The query for messages in a truck's spool. No I/O.
 
-The key is that of the data with `/spool` behind it. Without parameters a truck answers with what it
-has, one `SpoolContents` for each stream; `*` may stand for vehicle and stream. With
+The key is that of the data followed by `/spool`. Without parameters a truck replies with its
+contents, one `SpoolContents` for each stream; `*` may replace vehicle and stream. With
 
     boot=BOOT;from=FIRST;to=LAST
 
-it answers with messages: payload and attachment are those of the message as it was published. The
-last reply has no attachment: a `SpoolPage`, which says from where to ask again if there is more. An
-answer without it was cut off.
+it replies with messages, whose payload and attachment are those that were published. The last reply
+has no attachment: a `SpoolPage` with the sequence to continue from, if there is more. An answer
+without it is incomplete.
 """
 
 import re
@@ -23,45 +23,45 @@ from schemas.topics import PREFIX, Key, key, parse_key, realm_chunk
 SUFFIX = "/spool"
 PAGE_MESSAGES = 1000
 PAGE_BYTES = 1 << 20
-"""What one answer holds at most; a single message that is larger is given alone."""
+"""Largest size of one answer; a larger single message is sent alone."""
 MAX_RANGES = 10_000
-"""More holes than that in what a truck holds are not told; each is a restart or a disk error."""
+"""Largest number of ranges in one answer; each gap is a restart or a disk error."""
 _DIGITS = re.compile(r"[0-9]{1,20}")
 
 Range = tuple[int, int]
 """First and last sequence, both included."""
 
 
-class Held(NamedTuple):
-    """What a spool has of one stream and boot."""
+class SpoolBoot(NamedTuple):
+    """The contents of a spool for one stream and boot."""
 
     boot_id: int
     next_sequence: int
-    """All that was sent so far has a lower one."""
+    """Sequence of the next message; every message sent so far has a lower one."""
     held: list[Range]
-    """On the truck's disk now, ascending."""
+    """Ranges on the truck's disk now, ascending."""
     durable: int
-    """A logger confirmed everything up to here; -1: nothing."""
+    """Last sequence of the messages that a logger confirmed without gap; -1: none."""
     dropped: int
-    """Messages given up for room before a logger had them."""
+    """Number of messages dropped for space before a logger had them."""
 
 
-class Query(NamedTuple):
-    """A part of one stream and boot."""
+class SpoolQuery(NamedTuple):
+    """A range of messages of one stream and boot."""
 
     boot_id: int
     first: int
     last: int
 
     def parameters(self) -> str:
-        """Return the text behind the question mark."""
+        """Return the text after the question mark."""
         return f"boot={self.boot_id};from={self.first};to={self.last}"
 
 
 def spool_selector(realm: str | None, vehicle: str | None = None, stream: str | None = None) -> str:
-    """Return the key expression of spools: of all realms, vehicles or streams where not given.
+    """Return the key expression of spools, of all realms, vehicles or streams that are not given.
 
-    `realm` may be a pattern as of `check_realms`.
+    `realm` may be a pattern as in `check_realms`.
     """
     return f"{PREFIX}/{realm_chunk(realm)}/vehicle/{vehicle or '*'}/{stream or '*'}{SUFFIX}"
 
@@ -72,7 +72,7 @@ def spool_key(where: Key) -> str:
 
 
 def parse_spool_key(text: str) -> Key:
-    """Return the key of the stream whose spool it is; ValueError if it is not one."""
+    """Return the key of the stream whose spool a key names; raise ValueError for other keys."""
     if not text.endswith(SUFFIX):
         raise ValueError(f"key {text[:100]!r} does not end in {SUFFIX}")
     where = parse_key(text.removesuffix(SUFFIX))
@@ -81,8 +81,8 @@ def parse_spool_key(text: str) -> Key:
     return where
 
 
-def parse_query(parameters: Mapping[str, str]) -> Query | None:
-    """Return what is asked for, None if the contents are; ValueError if it cannot be read."""
+def parse_query(parameters: Mapping[str, str]) -> SpoolQuery | None:
+    """Return the requested range, None for the contents; raise ValueError if it is malformed."""
     if not parameters:
         return None
     wanted = []
@@ -91,11 +91,11 @@ def parse_query(parameters: Mapping[str, str]) -> Query | None:
         if not _DIGITS.fullmatch(text) or int(text) > highest:
             raise ValueError(f"spool query: {name}={text[:40]!r}, 0 to {highest} is expected")
         wanted.append(int(text))
-    return Query(*wanted)
+    return SpoolQuery(*wanted)
 
 
-def encode_contents(time_ns: int, boots: list[Held]) -> bytes:
-    """Return the SpoolContents message; of more than `MAX_RANGES` ranges the newest."""
+def encode_contents(time_ns: int, boots: list[SpoolBoot]) -> bytes:
+    """Return the SpoolContents message; beyond `MAX_RANGES` ranges, of the newest."""
     message = pb.SpoolContents(schema_version=SCHEMA_VERSION, time_ns=time_ns)
     left = MAX_RANGES
     for boot in reversed(boots):
@@ -111,8 +111,8 @@ def encode_contents(time_ns: int, boots: list[Held]) -> bytes:
     return message.SerializeToString(deterministic=True)
 
 
-def decode_contents(payload: bytes) -> list[Held]:
-    """Return what a spool has, oldest boot first; ValueError with one line if malformed."""
+def decode_contents(payload: bytes) -> list[SpoolBoot]:
+    """Return the contents of a spool, oldest boot first; raise ValueError if malformed."""
     try:
         message = pb.SpoolContents.FromString(payload)
     except DecodeError as error:
@@ -131,11 +131,11 @@ def decode_contents(payload: bytes) -> list[Held]:
         durable = boot.durable if boot.HasField("durable") else -1
         if boot.next_sequence > MAX_SEQUENCE + 1 or durable >= max(1, boot.next_sequence):
             raise ValueError(f"spool contents: sequence {boot.next_sequence} or {durable} too high")
-        contents.append(Held(boot.boot_id, boot.next_sequence, ranges, durable, boot.dropped))
+        contents.append(SpoolBoot(boot.boot_id, boot.next_sequence, ranges, durable, boot.dropped))
     return sorted(contents)
 
 
-def encode_page(query: Query, next_sequence: int | None) -> bytes:
+def encode_page(query: SpoolQuery, next_sequence: int | None) -> bytes:
     """Return the SpoolPage message."""
     return pb.SpoolPage(
         schema_version=SCHEMA_VERSION,
@@ -146,14 +146,14 @@ def encode_page(query: Query, next_sequence: int | None) -> bytes:
     ).SerializeToString(deterministic=True)
 
 
-def decode_page(payload: bytes, query: Query) -> int | None:
-    """Return where the rest begins (None: no more); ValueError if it is no answer to the query."""
+def decode_page(payload: bytes, query: SpoolQuery) -> int | None:
+    """Return the next sequence to ask for, None at the end; raise ValueError for a wrong page."""
     try:
         message = pb.SpoolPage.FromString(payload)
     except DecodeError as error:
         raise ValueError(f"not a driveby.v1.SpoolPage: {error}") from None
     check_version(message.schema_version)
-    if Query(message.boot_id, message.first, message.last) != query:
+    if SpoolQuery(message.boot_id, message.first, message.last) != query:
         raise ValueError("spool page: answers another query")
     if not message.HasField("next"):
         return None

@@ -1,9 +1,8 @@
-"""TOML text from anybody: looked at before it is parsed, for tomllib's cost has no bound.
+"""TOML text from untrusted sources, checked before parsing because tomllib's cost has no bound.
 
 tomllib keeps a namespace for every prefix of every key, so that 60 KB of one dotted key take
-gigabytes. What is said here is counted in one pass over the text, with strings and comments left
-out; up to where a text is TOML the pass takes it apart as tomllib does, and what is behind is never
-parsed.
+gigabytes. One pass counts keys and brackets outside strings and comments. Up to the first syntax
+error it splits the text as tomllib does; beyond that nothing is parsed.
 """
 
 import re
@@ -15,14 +14,16 @@ from typing import Any, Final
 from schemas.errors import InputError
 
 MAX_BYTES: Final = 16 << 20
-"""A site file of this size has some 20,000 bridges."""
+"""Largest file; a site file of this size has some 20,000 bridges."""
 MAX_DEPTH: Final = 8
-"""Parts of a key or heading in dots, and tables and lists in each other; a site file needs two."""
+"""Largest number of parts of a dotted key, and of nested tables and lists; a site file needs two.
+"""
 MAX_DEEP: Final = 1000
-"""Keys in three parts or more, each of which costs tomllib as much as its depth squared."""
+"""Largest number of keys with three parts or more, each of which costs tomllib its depth squared.
+"""
 MAX_KEYS: Final = 500_000
 MAX_BRACKETS: Final = 150_000
-"""Tables and lists, together; `[[bridge]]` counts twice."""
+"""Largest number of tables and lists together; `[[bridge]]` counts twice."""
 
 _PART = r'(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]++|\\.)*+"|\'[^\'\n]*+\')'
 _SCAN: Final = re.compile(
@@ -40,13 +41,13 @@ _DOT: Final = re.compile(rf"{_PART}(?P<dot>[ \t]*+\.)?+")
 
 
 def read_toml_text(path: Path, what: str) -> str:
-    """Return the text of a file; InputError if it cannot be read or is longer than `MAX_BYTES`.
+    """Return the text of a file; raise InputError if it cannot be read or exceeds `MAX_BYTES`.
 
-    `what` is what is expected there, as "a site file".
+    `what` is the expected kind of file, such as "a site file".
     """
     expected = f"{what} (TOML) is expected"
     try:
-        # A pipe or a device may never end, or never begin: looked at before it is opened.
+        # A pipe or a device may never end or never begin, so check before opening.
         if not stat.S_ISREG(path.stat().st_mode) and not path.is_dir():
             raise InputError(f"{path}: is no ordinary file, {expected}")
         with path.open("rb") as file:
@@ -64,7 +65,7 @@ def read_toml_text(path: Path, what: str) -> str:
 
 
 def parse_toml(text: str, source_name: str) -> dict[str, Any]:
-    """Return what TOML text says; InputError that begins with `source_name` if it is none.
+    """Return the content of TOML text; raise an InputError that begins with `source_name`.
 
     Text that would take more time and memory than any site file is refused unparsed.
     """
@@ -78,7 +79,7 @@ def parse_toml(text: str, source_name: str) -> dict[str, Any]:
 
 
 def _too_much(text: str) -> str | None:
-    """Say what makes a text no site file, whatever it says; None if nothing does."""
+    """Return why a text is too complex for a site file; None if it is not."""
     # A character takes up to four bytes: counting them is only worth it where it can matter.
     if len(text) > MAX_BYTES or (
         len(text) > MAX_BYTES // 4 and len(text.encode(errors="replace")) > MAX_BYTES
@@ -95,7 +96,7 @@ def _too_much(text: str) -> str | None:
                 depth = max(0, depth - 1)
             case "key":
                 keys += 1
-            case "end":  # of a string that does not end: tomllib gives up here as well
+            case "end":  # an unterminated string: tomllib stops here as well
                 return None
             case "deep":
                 deep += 1
@@ -118,7 +119,7 @@ def _line(text: str, token: re.Match[str]) -> str:
 
 
 def _syntax(message: str, text: str) -> str:
-    """Turn tomllib's message into ours: the line first."""
+    """Return tomllib's message in our form: the line first."""
     match = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|(end of document))\)", message)
     if match is None:
         return f"is not TOML: {message}"

@@ -1,7 +1,7 @@
-"""The one table of topics: logger, replay, liveness, viewer and docs/topics.md derive from it.
+"""The table of topics, from which logger, replay, liveness, viewer and docs/contract.md derive.
 
 A key is `driveby/v1/{realm}/{owner}/{identifier}/{stream}`, e.g.
-`driveby/v1/live/vehicle/truck-1/accel`. Nothing here needs anything but the standard library.
+`driveby/v1/live/vehicle/truck-1/accel`. This module needs the standard library only.
 """
 
 import re
@@ -18,38 +18,38 @@ _MAX_IDENTIFIER_CHARACTERS = 63
 _REALM = re.compile(REALM)
 _NAME_BEGIN = re.compile(r"[a-z0-9][a-z0-9_-]*")
 MAX_KEY_CHARACTERS = 255
-"""Far above the longest valid key; bounds the work and the memory that hostile ones take."""
+"""Length limit far above the longest valid key; bounds the cost of hostile keys."""
 
 Owner = Literal["vehicle", "bridge", "service"]
 Delivery = Literal["reliable", "latest"]
 
 
 class Topic(NamedTuple):
-    """One row of the table: what travels under a stream's name and how it is treated."""
+    """One row of the table: the content of a stream and its handling."""
 
     owner: Owner
     stream: str
     message: str
-    """Full protobuf name; empty if presence alone is the message (a Zenoh liveliness token)."""
+    """Full protobuf name; empty where presence alone is the message (a Zenoh liveliness token)."""
     logged: bool
-    """The logger writes it, replay publishes it again."""
+    """Whether the logger records the topic and replay publishes it again."""
     latched: bool
-    """A late subscriber gets the last message at once."""
+    """Whether a late subscriber receives the last message at once."""
     nominal_rate_hz: float | None
     """Messages per second while the owner works; None: on occasion."""
     delivery: Delivery
-    """`reliable`: blocks rather than drops, cached, fetched again. `latest`: may be dropped."""
+    """Kind of delivery. `reliable` blocks, caches and fetches again; `latest` may drop."""
     cache: int
-    """Messages the publisher keeps for subscribers that were away."""
+    """Messages that the publisher keeps for absent subscribers."""
     queue: int
-    """Messages a subscriber keeps waiting before the publisher feels it."""
+    """Messages that a subscriber keeps waiting before the publisher blocks."""
     max_bytes: int
-    """A larger payload is refused."""
+    """Largest payload that is accepted."""
     description: str
 
 
 class Key(NamedTuple):
-    """A key taken apart. `str()` does not give it back: use `key(*k)`."""
+    """The parts of a key. `str()` does not restore it: use `key(*k)`."""
 
     realm: str
     owner: Owner
@@ -57,8 +57,21 @@ class Key(NamedTuple):
     stream: str
 
 
+class Message(NamedTuple):
+    """Message as it travelled on the bus, identified by (key, boot_id, sequence)."""
+
+    key: Key
+    payload: bytes
+    boot_id: int
+    sequence: int
+    log_time_ns: int
+    """Wall time of the first sample, ns since 1970 UTC."""
+    publish_time_ns: int
+    """Wall time at which the writer got it, ns since 1970 UTC."""
+
+
 HEALTH_PERIOD_S = 60.0
-"""How often each service says how it is."""
+"""Interval at which each service publishes its health."""
 
 TOPICS: tuple[Topic, ...] = (
     Topic(
@@ -119,7 +132,7 @@ _BY_NAME = {(row.owner, row.stream): row for row in TOPICS}
 
 
 def topic(owner: str, stream: str) -> Topic:
-    """Return the row of the table; ValueError if there is none."""
+    """Return the row of the table; raise ValueError if there is none."""
     try:
         return _BY_NAME[(owner, stream)]  # type: ignore[index]
     except KeyError:
@@ -129,7 +142,7 @@ def topic(owner: str, stream: str) -> Topic:
 
 
 def check_identifier(text: str) -> str:
-    """Return `text` if it may name a vehicle, bridge or service; ValueError if not."""
+    """Return `text` if it may name a vehicle, bridge or service; raise ValueError if not."""
     if not _IDENTIFIER.fullmatch(text):
         raise ValueError(
             f"identifier {text[:80]!r} must be 1 to 63 of a-z, 0-9, '_' and '-', "
@@ -144,7 +157,7 @@ def gateway_service(vehicle: str) -> str:
 
 
 def check_realm(text: str) -> str:
-    """Return `text` if it is a realm; ValueError if not."""
+    """Return `text` if it is a realm; raise ValueError if not."""
     if not _REALM.fullmatch(text):
         raise ValueError(
             f"realm {text[:80]!r} must be live, replay-NAME, sim-NAME or import-NAME, "
@@ -154,9 +167,9 @@ def check_realm(text: str) -> str:
 
 
 def check_realms(text: str) -> str:
-    """Return `text` if it is a realm, or the beginning of some with a `*` behind it.
+    """Return `text` if it is a realm or a pattern: the beginning of realms followed by `*`.
 
-    `*` is every realm, `sim-*` those of simulations. ValueError if it is neither.
+    `*` is every realm, `sim-*` those of simulations. Raise ValueError if it is neither.
     """
     begin = text.removesuffix("*")
     is_one = begin != text and any(
@@ -167,27 +180,27 @@ def check_realms(text: str) -> str:
     return text if is_one else check_realm(text)
 
 
-def realm_within(realms: Sequence[str]) -> str | None:
-    """Return the realm if there is one only, which no pattern names; else None."""
+def single_realm(realms: Sequence[str]) -> str | None:
+    """Return the realm if there is exactly one and it is not a pattern; else None."""
     return realms[0] if len(realms) == 1 and "*" not in realms[0] else None
 
 
-def is_replayed(realm: str) -> bool:
-    """Whether what travels in a realm was recorded before: who replays it twice wants it twice."""
+def is_from_recording(realm: str) -> bool:
+    """Return whether a realm's messages come from a recording, so that repeats are intended."""
     return realm.startswith(("replay-", "import-"))
 
 
 def key(realm: str, owner: str, identifier: str, stream: str) -> str:
-    """Return the Zenoh key; ValueError if a part is malformed or the topic does not exist."""
+    """Return the Zenoh key; raise ValueError if a part is malformed or the topic does not exist."""
     topic(owner, stream)
     check_realm(realm)
     check_identifier(identifier)
     return f"{PREFIX}/{realm}/{owner}/{identifier}/{stream}"
 
 
-@lru_cache(maxsize=10_000)  # the same few come thousands of times a second
+@lru_cache(maxsize=10_000)  # a few keys recur thousands of times a second
 def parse_key(text: str) -> Key:
-    """Take a key apart; ValueError if it is not one of ours, whatever the text."""
+    """Return the parts of a key; raise ValueError if it is not one of ours."""
     if len(text) > MAX_KEY_CHARACTERS:
         raise ValueError(f"key of {len(text)} characters; at most {MAX_KEY_CHARACTERS}")
     parts = text.split("/")
@@ -199,13 +212,13 @@ def parse_key(text: str) -> Key:
 
 
 def selector(realm: str | None, owner: str, stream: str = "*") -> str:
-    """Return the key expression of all streams (or one) of every such owner in a realm (or any).
+    """Return the key expression of one or all streams of all owners of a kind in a realm or any.
 
-    `realm` may be a pattern as of `check_realms`.
+    `realm` may be a pattern as in `check_realms`.
     """
     return f"{PREFIX}/{realm_chunk(realm)}/{owner}/*/{stream}"
 
 
 def realm_chunk(realm: str | None) -> str:
-    """Return what stands for a realm, a pattern of realms or (None) any in a key expression."""
+    """Return the part of a key expression for a realm, a pattern of realms or any realm (None)."""
     return "*" if realm in (None, "*") else str(realm).replace("*", "$*")

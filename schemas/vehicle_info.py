@@ -1,7 +1,6 @@
-"""What a truck says of itself (`info`): its own part of a site file, and whether that is the truck
-that the owner's site file knows under that name.
+"""A truck's own part of a site file (`info`), and its comparison with the owner's site file.
 
-A driver may say less than a whole `[vehicle]` table; only what it says is compared.
+A driver may publish less than a whole `[vehicle]` table; only given values are compared.
 """
 
 import math
@@ -15,29 +14,29 @@ from schemas.site_file import toml_of
 from schemas.toml_text import parse_toml
 
 _LARGEST_Z: Final = 4.0
-"""The difference of two independent values exceeds so many of its standard deviations in one truck
-of 16,000."""
+"""Largest difference of two independent values in standard deviations; one truck in 16,000 exceeds
+it."""
 _SMALLEST_SPREAD: Final = 1e-3
-"""Values of a data sheet are rounded, however well they are known."""
+"""Smallest spread of a value, because data sheets are rounded."""
 _TOO_LARGE: Final = 1e100
 _COMPARED: Final = tuple(
     name for name in Vehicle.model_fields if f"{name}_spread" in Vehicle.model_fields
 )
 
 
-class Difference(NamedTuple):
+class InfoDifference(NamedTuple):
     """A field in which a truck and the site file differ by more than their spreads explain."""
 
     field: str
-    said: float
+    declared: float
     known: float
 
 
-def own_part(site_toml: str, vehicle_id: str) -> str:
-    """Return what of a site file is the truck's own: [vehicle], [sensor] and [receiver].
+def vehicle_part(site_toml: str, vehicle_id: str) -> str:
+    """Return the truck's own part of a site file: [vehicle], [sensor] and [receiver].
 
-    Text that holds nothing else is returned as it is. InputError: not TOML, no vehicle of that id,
-    or longer than a message may be.
+    Text that holds nothing else is returned unchanged. Raise InputError if it is not TOML, has no
+    vehicle of that id, or is longer than a message may be.
     """
     table = parse_toml(site_toml, "info")
     mine = [one for one in _vehicles(table) if one.get("id") == vehicle_id]
@@ -50,7 +49,7 @@ def own_part(site_toml: str, vehicle_id: str) -> str:
     text = site_toml
     if not is_own:
         text = toml_of(own)
-        parse_toml(text, "info")  # what it says may be nothing that a site file can say
+        parse_toml(text, "info")  # the table may hold values that a site file cannot
     if len(text.encode()) > MAX_SITE_BYTES:
         raise InputError(
             f"info: has {len(text.encode())} bytes, at most {MAX_SITE_BYTES} are expected"
@@ -58,11 +57,11 @@ def own_part(site_toml: str, vehicle_id: str) -> str:
     return text
 
 
-def differences(info_toml: str, known: Vehicle) -> list[Difference]:
-    """What a truck says of itself that is not the vehicle of the site file.
+def differences(info_toml: str, known: Vehicle) -> list[InfoDifference]:
+    """Return the fields in which a truck's `info` contradicts the vehicle of the site file.
 
-    Both values are taken for independent measurements with log-normal errors of the spreads that
-    go with them. Text that is no TOML, says nothing of a value, or nothing sensible, says nothing.
+    Both values count as independent measurements with log-normal errors of their own spreads.
+    Missing values, implausible ones and text that is not TOML are ignored.
     """
     try:
         table = parse_toml(info_toml, "info")
@@ -84,7 +83,7 @@ def differences(info_toml: str, known: Vehicle) -> list[Difference]:
             continue
         spread = max(_SMALLEST_SPREAD, math.hypot(known.spread(name), spreads[0]))
         found += [
-            Difference(name, b, a)
+            InfoDifference(name, b, a)
             for a, b in zip(mine, theirs, strict=True)
             if a > 0.0 and b > 0.0 and abs(math.log(b / a)) > _LARGEST_Z * spread
         ]
@@ -98,7 +97,7 @@ def _vehicles(table: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _numbers(value: Any) -> list[float]:
-    """A number, or a list of them, as a list; empty if it is neither."""
+    """Return a number or a list of them as a list; empty for anything else."""
     numbers: list[float] = []
     for one in value if isinstance(value, list | tuple) else [value]:
         if isinstance(one, bool) or not isinstance(one, int | float) or not abs(one) < _TOO_LARGE:

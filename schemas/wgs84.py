@@ -1,4 +1,4 @@
-"""The ellipsoid on which all coordinates are: those of sites, fixes and results."""
+"""The ellipsoid of all coordinates: those of sites, fixes and results."""
 
 from typing import Final
 

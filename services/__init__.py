@@ -1,1 +1,1 @@
-"""What runs: the command line, the services on the bus, and what they share."""
+"""Command line, services on the bus, and their common parts."""

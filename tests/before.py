@@ -10,12 +10,12 @@ The drive is the paper's scenario 6 at 100 Hz; the history holds its crossing an
 bridge that loses a fifth of element 4 in the ninth (tests/fleet.py).
 """
 
+import contextlib
 import gzip
+import io
 import itertools
 import json
-import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -27,12 +27,13 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message as AnyMessage
 
-from schemas.certificates import certificate_json, certificate_path, load_certificate
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import Results, load_results
 from schemas.signals import decode_accel, decode_gnss, decode_info
 from schemas.site_file import load_site, site_hash
-from services.history.archive import add_results
+from schemas.validation_records import load_validation, validation_json, validation_path
+from services.cli import main as cli
+from services.history.history_store import add_results
 from services.recordings.recording import read_info, read_messages, read_site
 from services.recordings.writer import write_recording
 from tests.builders.certificates import certificate, tried
@@ -96,7 +97,12 @@ def unpacked(folder: Path, to: Path) -> Path:
 
 def essentials(folder: Path) -> Essentials:
     """Read the whole corpus; return the numbers and names that must stay what they are."""
-    certificate = load_certificate(next(folder.glob("certificates/*.json")))
+    return of_files(folder) | {"asked": _asked(folder)}
+
+
+def of_files(folder: Path) -> Essentials:
+    """Read the files of the corpus, without asking the commands about them."""
+    certificate = load_validation(next(folder.glob("certificates/*.json")))
     return {
         "sites": {path.name: site_hash(load_site(path)) for path in folder.glob("*.toml")},
         "recording": _of_recording(folder / "drive.mcap"),
@@ -106,7 +112,6 @@ def essentials(folder: Path) -> Essentials:
         "history": _rows(folder / "history/crossings", "crossing_id", "vehicle", "ei_mean_nm2"),
         "catalogue": _rows(folder / "drives", "path"),
         "certificate": certificate.model_dump(mode="json"),
-        "asked": _asked(folder),
     }
 
 
@@ -121,16 +126,12 @@ def fields_of(name: str, payload: bytes) -> dict[str, Any]:
 
 
 def _driveby(folder: Path, *words: str) -> str:
-    own = {"PYTHONPATH": str(PROJECT), "COLUMNS": "100"}
-    done = subprocess.run(
-        [sys.executable, "-m", "driveby", *words],
-        cwd=folder,
-        env=os.environ | own,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    """Run a command in this process and in the folder; return what it prints."""
+    printed = io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
+        code = cli.main(words)
+    assert code == 0, words
+    return printed.getvalue()
 
 
 def _make_files(scratch: Path, folder: Path) -> None:
@@ -193,9 +194,9 @@ def _make_certificate(folder: Path) -> None:
     }
     site = load_site(folder / "paper.toml")
     made = certificate(site, version="0.1.0", crossings=(damaged,), figures=figures)
-    path = certificate_path(folder / "certificates", made.hash)
+    path = validation_path(folder / "certificates", made.hash)
     path.parent.mkdir()
-    path.write_text(certificate_json(made))
+    path.write_text(validation_json(made))
 
 
 def _messages() -> dict[str, Any]:

@@ -10,7 +10,7 @@ from hypothesis import settings
 from tests.endpoints import free_endpoint
 
 if TYPE_CHECKING:
-    from services.simulation.drive import Drive
+    from services.simulation.drive import SimulatedDrive
 
 # As the commands do, before anything imports numpy: see services/cli/main.py.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -20,20 +20,7 @@ settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
 PROJECT = Path(__file__).parents[1]
-
-
-def pytest_itemcollected(item: pytest.Item) -> None:
-    """With `make test`, tests that start processes or listen at a port do not run side by side.
-
-    They mostly wait, and what they wait for comes late where several of them do so at a time: one
-    of the two workers takes them one after another, while the other one computes. A test with a
-    group of its own is left in it.
-    """
-    if item.get_closest_marker("xdist_group"):
-        return
-    listens = {"endpoint", "tls_endpoint"}.intersection(getattr(item, "fixturenames", ()))
-    if listens or item.get_closest_marker("process"):
-        item.add_marker(pytest.mark.xdist_group("processes"))
+pytest_plugins = ["tests.groups", "tests.left_out"]
 
 
 @pytest.fixture(scope="session")
@@ -89,7 +76,7 @@ def csv_example() -> Path:
 
 
 @pytest.fixture(scope="session")
-def scenario_6() -> "Drive":
+def scenario_6() -> "SimulatedDrive":
     """A crossing of the paper's scenario 6: fine mesh of 70 elements, 0.1 ms, no noise."""
     from pre_core.paper.experiment import scenario_ratios
     from services.simulation.drive import paper_site, simulate_drive

@@ -15,7 +15,8 @@ from schemas.signals import (
     encode_gnss,
     encode_info,
 )
-from services.recordings.recording import Message, read_messages, read_site
+from schemas.topics import Message
+from services.recordings.recording import read_messages, read_site
 from services.recordings.writer import RecordingWriter
 
 SAMPLE = Path(__file__).parents[1] / "recordings" / "sample" / "crossing.mcap"

@@ -19,17 +19,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.fusion.joint import with_mass
+from pre_core.fusion.joint import mass_sensitivity
 from schemas.fusion import FusionLikelihood
-from schemas.results import Crossing, Header, Parameter, Results, load_results, results
-from services.identification.fusing import Source, part_of
+from schemas.results import CrossingResult, Parameter, ResultHeader, Results, load_results, results
+from services.identification.fusing import part_of
 from services.identification.observed import observation_of
+from services.identification.usable import Source
 
 Floats = NDArray[np.float64]
 STORED = Path(__file__).parent / "data" / "fleet_likelihoods.json"
 DAY_S = 86_400.0
 WEEK_S = 7.0 * DAY_S
-HEADER = Header("0.1.0", 0.0, "0" * 64, {}, 1)
+HEADER = ResultHeader("0.1.0", 0.0, "0" * 64, {}, 1)
 
 
 class Template(NamedTuple):
@@ -101,7 +102,7 @@ def crossing_of(
     bridge: Bridge,
     entry_s: float,
     ei_nm2: Floats,
-) -> Crossing:
+) -> CrossingResult:
     """A crossing of a bridge that has a rigidity at that time."""
     of = template.likelihood
     name = f"{truck.name}.{bridge.name}.{entry_s:.3f}"
@@ -109,11 +110,11 @@ def crossing_of(
     n, b = priors.elements, len(of.bridge)
     x = np.concatenate([bridge.others, priors.coordinates.location[b - n :] / ei_nm2])
     # The mass scales truck and bridge alike: what is found of the bridge lies aside of what it is.
-    x = x + truck.mass * part.mass_spread * with_mass(priors, x)
+    x = x + truck.mass * part.mass_spread * mass_sensitivity(priors, x)
     target = template.root @ np.concatenate([x, truck.unknowns])
     target = target + rng.standard_normal(target.size)
     likelihood = of.model_copy(update={"target": tuple(float(f"{v:.9e}") for v in target)})
-    crossing = Crossing(
+    crossing = CrossingResult(
         crossing_id=name,
         realm=bridge.realm,
         vehicle=truck.name,
@@ -136,7 +137,7 @@ def crossing_of(
     return crossing.model_copy(update={"parameters": _parameters(values, np.sqrt(np.diag(own)))})
 
 
-def results_of(crossings: list[Crossing], created_s: float) -> Results:
+def results_of(crossings: list[CrossingResult], created_s: float) -> Results:
     """Crossings as a results file has them."""
     return results(HEADER._replace(created=created_s), crossings, {})
 

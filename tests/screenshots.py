@@ -1,4 +1,4 @@
-"""The pictures of the README, docs/viewer.md, docs/watch.md and docs/report.md.
+"""The pictures of the README and of docs/output.md.
 
 python -m tests.screenshots [NAME …]
 
@@ -26,9 +26,10 @@ from rerun.experimental import ViewerClient
 from rich.console import Console
 
 from schemas.site_file import load_site
+from schemas.topics import Message
 from services.cli import main as cli
 from services.cli.watch_page import page
-from services.recordings.recording import Message, read_messages, read_site
+from services.recordings.recording import read_messages, read_site
 from services.recordings.writer import write_recording
 from services.report.pdf import find_browser
 from services.viewer.view import convert
@@ -56,8 +57,8 @@ SHOTS = (
     Shot("view-recording", "recording.rrd", ("Recording",), None),
     Shot("view-bridge", "good.rrd", ("Bridge",), 15_000),
     Shot("view-crossing", "good.rrd", ("2026-01-01",), 15_000),
-    Shot("view-told", "good.rrd", ("2026-01-01", "Told", "Map"), 15_000),
-    Shot("view-left-over", "suspect.rrd", ("2026-01-01", "Left over", "Map"), 15_000),
+    Shot("view-told", "good.rrd", ("2026-01-01", "Posterior against", "Map"), 15_000),
+    Shot("view-left-over", "suspect.rrd", ("2026-01-01", "Residuals by", "Map"), 15_000),
     Shot("view-suspect", "suspect.rrd", ("2026-01-01",), 9_000),
     Shot("view-rejected", "rejected.rrd", ("2026-01-01",), None),
 )
@@ -73,7 +74,9 @@ OF_SHARED = {
 
 def main() -> int:
     if not has_driver():
-        print("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)", file=sys.stderr)
+        print(
+            "no Vulkan driver (Debian: apt install mesa-vulkan-drivers libvulkan1)", file=sys.stderr
+        )
         return 1
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -147,6 +150,8 @@ def take(shot: Shot, folder: Path, size: str = "1400x850") -> bytes:
         open_tab(viewer, *shot.tabs)
         if shot.chainage_mm is not None:
             viewer.set_time("chainage_mm", sequence=shot.chainage_mm, play_state="paused")
+        else:
+            viewer.set_time(play_state="paused")
         taken = picture(viewer)
         said = complaints(viewer)
         assert not said, said

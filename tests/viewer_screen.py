@@ -30,7 +30,7 @@ def opened(file: Path | str, folder: Path, *, size: str = "1000x700") -> Iterato
     """Open a file, or what a server has, in a viewer of its own, which keeps its settings in
     `folder`; skips without a driver."""
     if not has_driver():
-        pytest.skip("no Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)")
+        pytest.skip("no Vulkan driver (Debian: apt install mesa-vulkan-drivers libvulkan1)")
     port = free_port()
     arguments = viewer_arguments(file, web=False)
     arguments[arguments.index("--port") + 1] = str(port)

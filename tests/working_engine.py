@@ -2,21 +2,21 @@
 
 from collections.abc import Iterable, Iterator
 
-from schemas.results import BridgeResult, Header
+from schemas.results import BridgeResult, ResultHeader
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.topics import Key
-from services.execution.dispatch import Execution, dispatched
-from services.execution.here import Here
-from services.history.store import known_crossings
+from services.execution.dispatch import CrossingExecutor, dispatch, drain
+from services.execution.inline import InlineExecutor
 from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.identification.outputs import Output
+from services.ledger.crossing_log import known_crossings
 
 
-def unhurried() -> Here:
+def unhurried() -> InlineExecutor:
     """Identifies here, in no time: the seconds that it took are the only thing that varies."""
-    return Here(stopwatch=lambda: 0.0)
+    return InlineExecutor(stopwatch=lambda: 0.0)
 
 
 class WorkingEngine:
@@ -24,8 +24,8 @@ class WorkingEngine:
         self,
         site: Site,
         settings: IdentificationSettings,
-        header: Header,
-        execution: Execution | None = None,
+        header: ResultHeader,
+        execution: CrossingExecutor | None = None,
     ) -> None:
         self.inner = Engine(site, settings, header)
         self._execution = execution or unhurried()
@@ -33,20 +33,20 @@ class WorkingEngine:
 
     def resume(self, said: Iterable[tuple[Key, bytes]]) -> Iterator[Output]:
         known = known_crossings(said, search_hash(self._header))
-        return dispatched(self.inner, self._execution, self.inner.resume(known))
+        return dispatch(self.inner, self._execution, self.inner.resume(known))
 
     def expect(self, key: Key, payload: bytes, *, for_ever: bool = False) -> None:
         self.inner.expect(key, payload, for_ever=for_ever)
 
     def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
-        return dispatched(self.inner, self._execution, self.inner.feed(key, payload))
+        return dispatch(self.inner, self._execution, self.inner.feed(key, payload))
 
     def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Output]:
         said = self.inner.gone(realm, vehicle, for_good=for_good)
-        return dispatched(self.inner, self._execution, said)
+        return dispatch(self.inner, self._execution, said)
 
     def finish(self) -> Iterator[Output]:
-        return dispatched(self.inner, self._execution, self.inner.finish())
+        return dispatch(self.inner, self._execution, self.inner.finish())
 
     def has_undecided(self, realm: str, vehicle: str) -> bool:
         return self.inner.has_undecided(realm, vehicle)
@@ -57,3 +57,14 @@ class WorkingEngine:
     @property
     def unknown_vehicles(self) -> set[str]:
         return self.inner.unknown_vehicles
+
+
+def feed_all(
+    engine: Engine, execution: CrossingExecutor, messages: Iterable[tuple[Key, bytes]]
+) -> Iterator[Output]:
+    """Feed a whole recording, and finish."""
+    for key, payload in messages:
+        engine.expect(key, payload)
+        yield from dispatch(engine, execution, engine.feed(key, payload))
+    yield from dispatch(engine, execution, engine.finish())
+    yield from drain(engine, execution)

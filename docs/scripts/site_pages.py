@@ -1,7 +1,7 @@
-"""What the site of `make docs` has beside the pages of docs/: mkdocs calls the functions below.
+"""What the site of `make docs` has besides the pages of docs/: mkdocs calls the functions below.
 
-The repository's own pages (README, ARCHITECTURE, …) stand at its root, where their links begin with
-`docs/`; the reference of the Python interface and of the messages is made from the source.
+The repository's own pages (README, ARCHITECTURE, …) stand at its root, those of the studies in
+`studies/`; the reference of the Python interface and of the messages is made from the source.
 """
 
 import inspect
@@ -13,9 +13,12 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
-AT_ROOT = {"README.md": "index.md"} | {
-    name: name for name in ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
-}
+ELSEWHERE = (
+    {"README.md": "index.md"}
+    | {name: name for name in ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")}
+    | {f"studies/{path.name}": f"study-{path.name}" for path in (ROOT / "studies").glob("*.md")}
+)
+"""Pages outside docs/, by their names in the site."""
 MADE_FROM = {"schemas/proto/driveby.proto": "messages.md", "driveby/__init__.py": "api.md"}
 """Source that the site has as a page."""
 _LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s:]+)(#[^)\s]*)?\)")
@@ -23,7 +26,10 @@ _LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s:]+)(#[^)\s]*)?\)")
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that are not in docs/."""
-    pages = {name: _linked((ROOT / source).read_text(), "") for source, name in AT_ROOT.items()}
+    pages = {
+        name: _linked((ROOT / source).read_text(), str(Path(source).parent))
+        for source, name in ELSEWHERE.items()
+    }
     pages |= {"api.md": api_page(), "messages.md": messages_page()}
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
@@ -32,7 +38,10 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links of docs/ to what stands above it."""
-    return markdown if page.file.src_uri in AT_ROOT.values() else _linked(markdown, "docs/")
+    if page.file.src_uri in ELSEWHERE.values():
+        return markdown
+    folder = Path(page.file.src_uri).parent
+    return _linked(markdown, f"docs/{folder}", "../" * len(folder.parts))
 
 
 def api_page() -> str:
@@ -60,7 +69,7 @@ def messages_page() -> str:
     definition = (ROOT / "schemas/proto/driveby.proto").read_text()
     return (
         "# Messages\n\nEvery field of every message on the bus, as `schemas/proto/driveby.proto` "
-        "defines it. [Which topic carries which](topics.md), [units and axes]"
+        "defines it. [Which topic carries which](contract.md#streams), [units and axes]"
         f"(contract.md#units-and-axes).\n\n```proto\n{definition}```\n"
     )
 
@@ -76,9 +85,10 @@ def _docstring(value: Any) -> str:
     return inspect.cleandoc(value.__doc__ or "").replace("`docs/", "`")
 
 
-def _linked(text: str, where: str) -> str:
+def _linked(text: str, where: str, up: str = "") -> str:
     """Links as the site needs them: of a page that stands in the folder `where` of the repository.
 
+    `up` leads from the page to the root of the site.
     What is no page and not in docs/ is in the checkout only: its name stays, without a link.
     """
 
@@ -88,10 +98,10 @@ def _linked(text: str, where: str) -> str:
         if not path.exists():
             return found[0]
         name = path.relative_to(ROOT).as_posix()
-        if page := (AT_ROOT | MADE_FROM).get(name):
-            return f"[{words}]({page}{anchor})"
+        if page := (ELSEWHERE | MADE_FROM).get(name):
+            return f"[{words}]({up}{page}{anchor})"
         if name.startswith("docs/"):
-            return f"[{words}]({name.removeprefix('docs/')}{anchor})"
+            return f"[{words}]({up}{name.removeprefix('docs/')}{anchor})"
         return words
 
     return _LINK.sub(mended, text)

@@ -1,7 +1,7 @@
-"""How well one crossing can be known: derivatives of all rows of the posterior at a given point.
+"""Cramér-Rao bound of one crossing: derivatives of all residuals at a given point.
 
-The inverse of J'J, of which J is this Jacobian at the truth with all nuisances free, is the
-Cramér-Rao bound with the priors in it.
+The inverse of J'J, with J this Jacobian at the truth and all nuisances free, is the Cramér-Rao
+bound including the priors.
 """
 
 import numpy as np
@@ -12,21 +12,24 @@ from pre_core.crossing import posterior
 FloatArray = NDArray[np.float64]
 
 DIFFERENCE = 1e-4
-"""The step of a central difference, in the coordinates of the posterior: multiples of a prior's
-spread, and metres of the trajectory. Halving it moves no bound by a thousandth of itself."""
+"""Step of a central difference in the posterior's coordinates: multiples of a prior's spread, and
+metres of the trajectory. Halving it changes every bound by less than 0.1 %."""
 _NUISANCE_STEPS = 20
-"""The most steps; `_ENOUGH` ends the way sooner as a rule."""
+"""Limit of steps; `_ENOUGH` usually ends the search earlier."""
 _ENOUGH = 0.01
-"""A gain in the sum of squares, whose standard deviation is tens, that is no step."""
+"""Gain in the sum of squares, whose standard deviation is tens, that ends the search."""
 
 
 def central_jacobian(
-    problem: posterior.Problem, y: FloatArray, columns: NDArray[np.int64], step: float = DIFFERENCE
+    problem: posterior.PosteriorProblem,
+    y: FloatArray,
+    columns: NDArray[np.int64],
+    step: float = DIFFERENCE,
 ) -> FloatArray:
-    """Derivatives (rows, columns) of all rows at y by central differences.
+    """Return derivatives (rows, columns) of all residuals at y (size,) by central differences.
 
-    What must not be negative, and for which there may be no model then, is not made so: at zero
-    both points of the difference lie above.
+    Coordinates that must not be negative, where there may be no model, do not become so: at zero
+    both points of the difference are above.
     """
     begin = y[columns] - step
     bounded = np.isin(columns, posterior.layout(problem).half_normal)
@@ -38,13 +41,13 @@ def central_jacobian(
     return np.asarray((values[: columns.size] - values[columns.size :]).T / (2.0 * step))
 
 
-def settle(
-    problem: posterior.Problem,
+def optimise_subset(
+    problem: posterior.PosteriorProblem,
     y: FloatArray,
     columns: NDArray[np.int64],
     steps: int = _NUISANCE_STEPS,
 ) -> FloatArray:
-    """The best y in these columns alone, the others held: Gauss-Newton with halved steps."""
+    """Return the best y (size,) in these columns, the others fixed: damped Gauss-Newton."""
     rows = posterior.all_rows(problem, y[None, :])[0]
     for _ in range(steps):
         jacobian = central_jacobian(problem, y, columns)

@@ -1,11 +1,11 @@
-"""The four accelerations as smooth functions of time on the grid of the model.
+"""The four accelerations as smooth functions of time on the model's grid.
 
-All that the model compares lies below an eighth of its own rate M, so that signals sampled at the
-sensors' rate are first brought to M. A quintic spline through the samples gives velocity and
+Everything that the model compares is below an eighth of its own rate M, so that signals sampled at
+the sensors' rate are first converted to M. A quintic spline through the samples gives velocity and
 displacement by its antiderivatives and the jerk and its rates by its derivatives; samples that are
-too few for that are interpolated by a windowed sinc before. All of these are then low-passed alike
-and decimated. With the derivatives a channel can be moved by a small delay without interpolating it
-anew, by Taylor's series.
+too sparse are first interpolated by a windowed sinc. All of these are then low-passed equally and
+decimated. With the derivatives a channel can be shifted by a small delay without another
+interpolation, by Taylor's series.
 """
 
 from typing import NamedTuple
@@ -13,39 +13,44 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.splines import Spline, curves_at, integrals, slopes, through
+from pre_core.crossing.splines import (
+    Spline,
+    antiderivative,
+    curves_at,
+    derivative,
+    interpolating_spline,
+)
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 
 FloatArray = NDArray[np.float64]
 
 Z, V, A, A_1, A_2, A_3 = range(6)
-"""Places of displacement, velocity, acceleration and its three derivatives."""
+"""Indices of displacement, velocity, acceleration and its three derivatives."""
 
 MODEL_RATE_HZ = 340.0
-"""Highest rate of the model. Rows up to 42 Hz tell within 3 % as much of EI as rows up to 125 Hz
-(docs/method-pre.md)."""
+"""Highest rate of the model. Residuals up to 42 Hz have within 3 % the information on EI of those
+up to 125 Hz (docs/method-pre.md)."""
 _RATE_SHARE = 2.0
-"""The model is no quicker than this many times the slowest sensor (`PASS`, `_SENSOR_PASS`)."""
+"""Largest rate of the model relative to the slowest sensor (`PASS`, `_SENSOR_PASS`)."""
 PASS, STOP = 0.215, 0.4
-"""Shares of the model's rate: signals below the first pass whole, above the second nothing is
-left."""
+"""Pass and stop frequency relative to the model's rate."""
 _SENSOR_PASS = 0.45
-"""Up to this share of a sensor's rate its samples are interpolated as they are."""
+"""Pass band of the interpolation relative to a sensor's rate."""
 SEEN_ASIDE = 32
-"""Samples on each side of a moment that `read_between` needs."""
+"""Number of samples on each side of a time that `interpolate_at` needs."""
 _BLOCK = 4096
-"""Output samples that are interpolated at once, to bound memory."""
+"""Number of output samples interpolated at once, which bounds memory."""
 _SPLINE_RATE_HZ = 800.0
-"""A quintic spline through samples at this rate is good to 1e-6 up to 70 Hz."""
+"""Lowest rate of samples through which a quintic spline is exact to 1e-6 up to 70 Hz."""
 _STOP_BAND_DB = 90.0
-"""What leaks through at this depth is 3e-5 of a signal, below the 1e-4 that a sine comes out right
-to."""
+"""Stop band: the leakage is 3e-5 of a signal, below the 1e-4 error of a sine."""
 _DEGREE = 5
-"""Delays are undone with up to the third derivative, which of a quintic spline has no jumps."""
+"""Degree of the splines: delays use up to the third derivative, which is continuous for degree 5.
+"""
 
 
 class ModelSignals(NamedTuple):
-    """`signals` (4, 6, n) on an even grid that begins `start_s` after the first sample."""
+    """Signals (4, 6, n) on an even grid that begins `start_s` after the first sample."""
 
     start_s: float
     step_s: float
@@ -55,11 +60,11 @@ class ModelSignals(NamedTuple):
 def channel_signals(
     acceleration_m_per_s2: FloatArray, step_s: float, slowest_rate_hz: float
 ) -> ModelSignals:
-    """Displacement, velocity, acceleration and its three derivatives of samples (4, n).
+    """Return displacement, velocity, acceleration and three derivatives of samples (4, n).
 
-    `slowest_rate_hz` is that of the slowest sensor, where its samples were interpolated. Integrals
-    begin at zero in the middle of the record, so that what unknown initial values add is as small
-    as can be. Raises ValueError for a record shorter than the filters.
+    `slowest_rate_hz` is that of the slowest sensor, if its samples were interpolated. Integrals are
+    zero in the middle of the record, which minimises the effect of unknown initial values. Raise
+    ValueError for a record shorter than the filters.
     """
     rate = 1.0 / step_s
     times = max(1, int(np.ceil(_SPLINE_RATE_HZ / rate - 1e-9)))
@@ -88,7 +93,10 @@ def channel_signals(
 def low_pass(
     pass_share: float, stop_share: float, stop_band_db: float = _STOP_BAND_DB
 ) -> FloatArray:
-    """Symmetrical taps (odd number) of unit sum; shares are cycles per sample (Kaiser's window)."""
+    """Return symmetric FIR taps (odd,) of unit sum, by Kaiser's window.
+
+    `pass_share` and `stop_share` are the pass and stop frequency in cycles per sample.
+    """
     width = stop_share - pass_share
     count = int(np.ceil((stop_band_db - 7.95) / (14.36 * width))) + 1
     count |= 1
@@ -99,9 +107,9 @@ def low_pass(
 
 
 def _interpolated(samples: FloatArray, times: int) -> tuple[FloatArray, int]:
-    """Samples (4, n) interpolated to a rate `times` as high; the number of the first that is kept.
+    """Return samples (4, n) at a rate `times` as high, and the number of the first kept one.
 
-    What an interpolating kernel cannot see whole at both ends is left out.
+    Both ends, which the kernel does not cover, are removed.
     """
     if times == 1:
         return np.ascontiguousarray(samples), 0
@@ -110,18 +118,18 @@ def _interpolated(samples: FloatArray, times: int) -> tuple[FloatArray, int]:
     sparse[:, ::times] = samples
     if sparse.shape[1] < 2 * taps.size:
         raise ValueError("the record is shorter than the filters that it must pass")
-    # Each of the phases of the kernel sums to one, so that a constant stays what it is.
+    # Each phase of the kernel sums to one, which preserves a constant.
     for phase in range(times):
         taps[phase::times] /= taps[phase::times].sum()
     fine = np.stack([np.convolve(row, taps, mode="valid") for row in sparse])
     return fine, taps.size // 2
 
 
-def read_between(samples: FloatArray, place: FloatArray) -> FloatArray:
-    """Samples (n,) read at `place` (m,), in samples from the first: a windowed sinc.
+def interpolate_at(samples: FloatArray, place: FloatArray) -> FloatArray:
+    """Return samples (n,) at `place` (m,), in samples from the first, by a windowed sinc.
 
-    What lies below 0.45 of the rate is read as it is. NaN where the sinc does not see enough
-    samples on both sides (`SEEN_ASIDE`).
+    Frequencies below 0.45 of the rate are unchanged. NaN without enough samples on both sides
+    (`SEEN_ASIDE`).
     """
     beta = kaiser_beta(_STOP_BAND_DB)
     below = np.floor(place).astype(np.int64)
@@ -133,26 +141,26 @@ def read_between(samples: FloatArray, place: FloatArray) -> FloatArray:
         distance = offsets - (place[at] - below[at])[:, None]
         # The middle of the gap between the pass band and its image is half the rate.
         weight = windowed_sinc(distance, 0.5, SEEN_ASIDE, beta, pedestal=1.0)
-        weight /= weight.sum(axis=1, keepdims=True)  # a constant stays what it is
+        weight /= weight.sum(axis=1, keepdims=True)  # preserve a constant
         result[at] = np.einsum("mj,mj->m", weight, samples[below[at][:, None] + offsets])
     return result
 
 
 def _derivatives(acceleration: FloatArray, step_s: float) -> FloatArray:
-    """The six signals (4, 6, n) of a quintic spline through (4, n)."""
+    """Return the six signals (4, 6, n) of a quintic spline through (4, n)."""
     n = acceleration.shape[1]
     t, middle = step_s * np.arange(n, dtype=np.float64), n // 2
-    spline = through(t, acceleration.T, _DEGREE)
-    velocity = _from_zero(integrals(spline), t[middle])
-    displacement = _from_zero(integrals(velocity), t[middle])
-    first = slopes(spline)
-    second = slopes(first)
+    spline = interpolating_spline(t, acceleration.T, _DEGREE)
+    velocity = _from_zero(antiderivative(spline), t[middle])
+    displacement = _from_zero(antiderivative(velocity), t[middle])
+    first = derivative(spline)
+    second = derivative(first)
     z, v, a_1, a_2, a_3 = (
-        curves_at(one, t).T for one in (displacement, velocity, first, second, slopes(second))
+        curves_at(one, t).T for one in (displacement, velocity, first, second, derivative(second))
     )
     return np.stack([z, v, acceleration, a_1, a_2, a_3], axis=1)
 
 
 def _from_zero(spline: Spline, x: float) -> Spline:
-    """The curves less what they are at x."""
+    """Return the curves minus their values at x."""
     return spline._replace(coefficients=spline.coefficients - curves_at(spline, np.array([x])))

@@ -1,14 +1,14 @@
-"""The posterior of a crossing that tells little of its elements: normal in 1/EI, prior in ln EI.
+"""Posterior of a crossing that determines its elements poorly, normal in 1/EI.
 
-Deflections are linear in the compliances c = EI_nominal/EI, of a statically determinate bridge
-exactly. So with all other unknowns x, and c in place of ln EI, the rows are r + J (x - x_0) far
-beyond where they are linear in ln EI; with the log-normal priors of EI, the priors at zero and what
-may be absent altogether, that is a density which costs nothing and is close to the posterior even
-where an element is known to no better than a factor.
+Deflections are linear in the compliances c = EI_nominal/EI, exactly for a statically determinate
+bridge. So with all other coordinates x, and c in place of ln EI, the residuals are r + J (x - x_0)
+far beyond their linear range in ln EI. With the log-normal priors of EI, the priors at zero and the
+point masses of absence, this density is cheap, and close to the posterior even where an element is
+known only to a factor.
 
-It is drawn from by Gibbs' sampler: all unknowns that are normal given the others are integrated
-out; an element's conditional is drawn by slices (Neal 2003), that of what may be absent is a normal
-cut off at zero beside a point mass.
+It is drawn from by Gibbs' sampler: all coordinates that are conditionally normal are integrated
+out; an element's conditional is drawn by slices (Neal 2003), that of a coordinate that may be
+absent is a normal truncated at zero with a point mass there.
 """
 
 from math import erf, exp, log, sqrt
@@ -18,53 +18,58 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky
 
-from pre_core.crossing.optimum import Optimum
-from pre_core.crossing.posterior import Problem, layout, log_odds_of_absence, rigidity_spread
-from pre_core.crossing.preparation import slope_of_mismatch
+from pre_core.crossing.fit import Optimum
+from pre_core.crossing.posterior import (
+    PosteriorProblem,
+    layout,
+    log_odds_of_absence,
+    rigidity_spread,
+)
+from pre_core.crossing.preparation import mismatch_gradient
 from pre_core.kernels.lanes import kernel
 
 FloatArray = NDArray[np.float64]
 
 _SETTLING = 500
 _SWEEPS = 60
-"""From one draw to the next: an element is known by what its neighbours are not."""
+"""Sweeps between two draws, because neighbouring elements are strongly correlated."""
 LEANING_SPREAD = 0.25
-"""What is taken off the slope for the mismatch is known to this share: its level to 15 %, the
-tyres' widths and distance as little."""
+"""Relative uncertainty of the gradient correction for the mismatch: its level is known to 15 %, the
+tyres' widths and distance no better."""
 _SLICE_WIDTH = 1.0
 _MOST_WIDENINGS = 12
 
 
-class Compliances(NamedTuple):
+class CompliancePosterior(NamedTuple):
     """The density over y (f,), of which the coordinates `elements` are -ln(c)/sigma."""
 
     elements: NDArray[np.int64]
     sigma: FloatArray  # (elements,) spread of ln EI
-    told: NDArray[np.int64]
-    """Elements, then what must not be negative: (k,)."""
+    sampled: NDArray[np.int64]
+    """Indices (k,) of the elements, then of coordinates that must not be negative."""
     others: NDArray[np.int64]
     centre: FloatArray  # (elements,) compliances at the optimum
     inflation: float
-    precision: FloatArray  # (k, k) of the told, the others integrated out
+    precision: FloatArray  # (k, k) of the sampled, the others integrated out
     linear: FloatArray  # (k,)
     log_odds: FloatArray  # (k,) of being exactly zero, against the density per unit
     others_root: FloatArray
-    """(others, others) lower triangle M: M' M is the covariance of the others given the told."""
+    """Lower triangle M (others, others): M' M is the covariance of the others given the sampled."""
     others_linear: FloatArray
-    others_told: FloatArray  # (others, k) block of the precision
+    others_sampled: FloatArray  # (others, k) block of the precision
     leaning: FloatArray
-    """(f,) where the optimum goes if all is taken off that the mismatch makes of the slope."""
+    """Change (f,) of the optimum if the whole mismatch part of the gradient is removed."""
 
 
-def compliances(found: Optimum, inflation: float) -> Compliances:
-    """About the optimum, of noise `inflation` times what was declared."""
+def compliance_posterior(found: Optimum, inflation: float) -> CompliancePosterior:
+    """Return the density about an optimum, for noise `inflation` times the declared one."""
     problem, state = found.problem, found.state
     where = layout(problem)
     kept = without_priors(problem, state.residual.size, where.elements)
-    centre, jacobian = in_compliances(problem, state.y, state.jacobian[kept])
+    centre, jacobian = to_compliance_coordinates(problem, state.y, state.jacobian[kept])
     precision = jacobian.T @ jacobian / inflation**2
     linear = precision @ centre - jacobian.T @ state.residual[kept] / inflation**2
-    return of_normal(
+    return from_normal(
         precision,
         linear,
         where.elements,
@@ -73,20 +78,22 @@ def compliances(found: Optimum, inflation: float) -> Compliances:
         log_odds_of_absence(problem, inflation),
         inflation,
         centre[where.elements],
-        led_by_mismatch(found),
+        mismatch_bias(found),
     )
 
 
-def without_priors(problem: Problem, rows: int, places: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return which of so many `rows` of the posterior are not the priors of some places in y."""
-    # Rows of the priors come last, in the order of y up to the trajectory.
+def without_priors(
+    problem: PosteriorProblem, rows: int, places: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the indices (m,) of `rows` residuals without the priors of some coordinates of y."""
+    # The priors' residuals come last, in the order of y up to the trajectory.
     return np.setdiff1d(np.arange(rows), rows - layout(problem).trajectory.start + places)
 
 
-def in_compliances(
-    problem: Problem, y: FloatArray, jacobian: FloatArray
+def to_compliance_coordinates(
+    problem: PosteriorProblem, y: FloatArray, jacobian: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The point y (f,) and a Jacobian (m, f) there with c in place of the elements' coordinates."""
+    """Return y (f,) and a Jacobian (m, f) there with c in place of the elements' coordinates."""
     elements = layout(problem).elements
     sigma = rigidity_spread(problem.priors)
     centre, changed = y.copy(), jacobian.copy()
@@ -96,17 +103,17 @@ def in_compliances(
 
 
 def marginal(
-    precision: FloatArray, linear: FloatArray, told: NDArray[np.int64]
+    precision: FloatArray, linear: FloatArray, sampled: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Precision and linear part of a normal's coordinates `told`, the others integrated out."""
-    others = np.delete(np.arange(linear.size), told)
+    """Return precision and linear part of a normal (f, f), (f,) marginal in some coordinates."""
+    others = np.delete(np.arange(linear.size), sampled)
     factor = cho_factor(precision[np.ix_(others, others)], lower=True)
-    across = precision[np.ix_(others, told)]
+    across = precision[np.ix_(others, sampled)]
     led = across.T @ cho_solve(factor, np.column_stack([across, linear[others]]))
-    return precision[np.ix_(told, told)] - led[:, :-1], linear[told] - led[:, -1]
+    return precision[np.ix_(sampled, sampled)] - led[:, :-1], linear[sampled] - led[:, -1]
 
 
-def of_normal(
+def from_normal(
     precision: FloatArray,
     linear: FloatArray,
     elements: NDArray[np.int64],
@@ -116,39 +123,40 @@ def of_normal(
     inflation: float,
     centre: FloatArray,
     leaning: FloatArray,
-) -> Compliances:
-    """Return those of a normal (f,), c at `elements`, times their priors, cut off at `cut_off`.
+) -> CompliancePosterior:
+    """Return the density of a normal (f, f), (f,), c at `elements`, times priors, truncated.
 
     `log_odds` (f,) as in `posterior.log_odds_of_absence`.
     """
-    told = np.concatenate([elements, cut_off])
-    others = np.setdiff1d(np.arange(linear.size), told)
-    return Compliances(
+    sampled = np.concatenate([elements, cut_off])
+    others = np.setdiff1d(np.arange(linear.size), sampled)
+    return CompliancePosterior(
         elements,
         sigma,
-        told,
+        sampled,
         others,
         centre,
         inflation,
-        *marginal(precision, linear, told),
-        log_odds[told],
+        *marginal(precision, linear, sampled),
+        log_odds[sampled],
         np.linalg.inv(cholesky(precision[np.ix_(others, others)], lower=True)),
         linear[others],
-        precision[np.ix_(others, told)],
+        precision[np.ix_(others, sampled)],
         leaning,
     )
 
 
-def led_by_mismatch(found: Optimum) -> FloatArray:
-    """Where the optimum goes if all is taken off that the mismatch makes of the slope: (f,).
+def mismatch_bias(found: Optimum) -> FloatArray:
+    """Return the change (f,) of the optimum if the mismatch part of the gradient is removed.
 
-    Nothing of what must not be negative, and of the elements, for which it is negligible.
+    It is zero for coordinates that must not be negative, and for the elements, where it is
+    negligible.
     """
     problem, y, jacobian = found.problem, found.state.y, found.state.jacobian
     moved = np.zeros(y.size)
     if not problem.mismatch.level_m3.any():
         return moved
-    slope = slope_of_mismatch(problem, y)
+    slope = mismatch_gradient(problem, y)
     moved[: slope.size] = slope
     moved = cho_solve(cho_factor(jacobian.T @ jacobian), moved)
     where = layout(problem)
@@ -158,20 +166,20 @@ def led_by_mismatch(found: Optimum) -> FloatArray:
 
 
 def draws(
-    of: Compliances, count: int, seed: int, stream: int, after: FloatArray | None = None
+    of: CompliancePosterior, count: int, seed: int, stream: int, after: FloatArray | None = None
 ) -> FloatArray:
-    """(count, f) draws of one of Gibbs' chains; `stream` tells chains of one seed apart.
+    """Return draws (count, f) of one Gibbs chain; `stream` distinguishes chains of one seed.
 
-    A chain that goes on `after` a draw (f,) of a density much like this one settles sooner.
+    A chain that continues `after` a draw (f,) of a similar density converges sooner.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 21, stream)))
     e = of.elements.size
     if after is not None:
-        start = after[of.told]
+        start = after[of.sampled]
     else:
-        start = np.concatenate([np.log(of.centre) / -of.sigma, np.ones(of.told.size - e)])
+        start = np.concatenate([np.log(of.centre) / -of.sigma, np.ones(of.sampled.size - e)])
         start[:e] += 0.3 * rng.standard_normal(e)
-    told = np.empty((count, of.told.size))
+    sampled = np.empty((count, of.sampled.size))
     _gibbs(
         of.precision,
         of.linear,
@@ -181,15 +189,15 @@ def draws(
         start,
         _SETTLING if after is None else _SWEEPS,
         rng,
-        told,
+        sampled,
     )
-    x = told.copy()
-    x[:, :e] = np.exp(-of.sigma * told[:, :e])
-    mean = of.others_linear - x @ of.others_told.T
+    x = sampled.copy()
+    x[:, :e] = np.exp(-of.sigma * sampled[:, :e])
+    mean = of.others_linear - x @ of.others_sampled.T
     normal = rng.standard_normal((count, of.others.size))
     # With the covariance M' M the mean is M' M of the above, and the noise M' of a normal.
-    y = np.empty((count, of.told.size + of.others.size))
-    y[:, of.told] = told
+    y = np.empty((count, of.sampled.size + of.others.size))
+    y[:, of.sampled] = sampled
     y[:, of.others] = (mean @ of.others_root.T + normal) @ of.others_root
     return y + LEANING_SPREAD * rng.standard_normal((count, 1)) * of.leaning
 
@@ -206,7 +214,7 @@ def _gibbs(
     rng: np.random.Generator,
     out: FloatArray,
 ) -> None:
-    """Fill out (count, k) from `start` (k,): y of elements, then what is not negative."""
+    """Fill out (count, k) from `start` (k,): y of elements, then non-negative coordinates."""
     k, e = start.size, sigma.size
     y = start.copy()
     x = start.copy()
@@ -222,7 +230,7 @@ def _gibbs(
                 y[i] = _slice(rng, y[i], pull, precision[i, i], sigma[i], inflation)
                 x[i] = exp(-sigma[i] * y[i])
             else:
-                x[i] = _cut_off(rng, pull, precision[i, i], log_odds[i])
+                x[i] = _truncated_draw(rng, pull, precision[i, i], log_odds[i])
                 y[i] = x[i]
         done = sweep - settling
         if done >= 0 and done % _SWEEPS == _SWEEPS - 1:
@@ -239,7 +247,7 @@ def _log_conditional(y: float, pull: float, own: float, sigma: float, inflation:
 def _slice(
     rng: np.random.Generator, y: float, pull: float, own: float, sigma: float, inflation: float
 ) -> float:
-    """One step from y by a slice of the conditional, widened and narrowed again."""
+    """Take one step from y by a slice of the conditional, stepping out and shrinking."""
     level = _log_conditional(y, pull, own, sigma, inflation) + log(rng.random())
     low = y - _SLICE_WIDTH * rng.random()
     high = low + _SLICE_WIDTH
@@ -263,8 +271,8 @@ def _slice(
 
 
 @kernel
-def _cut_off(rng: np.random.Generator, pull: float, own: float, log_odds: float) -> float:
-    """From a normal cut off at zero beside a point mass there."""
+def _truncated_draw(rng: np.random.Generator, pull: float, own: float, log_odds: float) -> float:
+    """Draw from a normal truncated at zero with a point mass there."""
     if log_odds == np.inf:
         return 0.0
     scale = 1.0 / sqrt(own)

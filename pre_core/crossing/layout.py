@@ -1,4 +1,4 @@
-"""Where each group of a crossing's unknowns stands in the coordinates y."""
+"""Layout of a crossing's parameters in the search coordinates y."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -7,17 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing.residuals import SWING_MODES
-from pre_core.unknowns import EI_1, FIRST_OF_BRIDGE
+from pre_core.parameters import EI_1, FIRST_OF_BRIDGE
 
 CHANNELS = 4
 
 
-class Layout(NamedTuple):
-    """Places of the groups of unknowns in y."""
+class ParameterLayout(NamedTuple):
+    """Indices of the groups of parameters in y."""
 
     theta: slice
     bridge: NDArray[np.int64]
-    """Where in theta the bridge's unknowns are; `elements` are its last."""
+    """Indices of the bridge's parameters in theta; `elements` are the last ones."""
     elements: NDArray[np.int64]
     half_normal: NDArray[np.int64]
     """Coordinates that must not be negative."""
@@ -28,15 +28,15 @@ class Layout(NamedTuple):
     delays: slice
     initial: slice
     swing: slice
-    """The bridge's own motion when the truck comes."""
+    """Initial vibration of the bridge."""
     trajectory: slice
     offset: int
     size: int
 
 
 @lru_cache(maxsize=8)
-def laid_out(estimated: bytes, half_normal: bytes, coefficients: int) -> Layout:
-    """Of flags (p,) and so many coefficients of the trajectory: asked for at every evaluation."""
+def parameter_layout(estimated: bytes, half_normal: bytes, coefficients: int) -> ParameterLayout:
+    """Return the layout for flags (p,) and spline coefficients; cached for every evaluation."""
     kept = np.flatnonzero(np.frombuffer(estimated, dtype=np.bool_))
     t = kept.size
     gains = slice(t + 1, t + 4)
@@ -51,7 +51,7 @@ def laid_out(estimated: bytes, half_normal: bytes, coefficients: int) -> Layout:
     )
     for one in places:
         one.flags.writeable = False
-    return Layout(
+    return ParameterLayout(
         slice(0, t),
         *places,
         t,

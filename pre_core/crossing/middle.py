@@ -1,11 +1,11 @@
-"""From sensors anywhere on a truck to the four readings in its middle that the method takes.
+"""Reduction of sensors anywhere on a truck to the four centre readings of the method.
 
 Body and axles are rigid. A sensor on the body, a distance o behind the front axle and e to the left
-of the middle, reads (1 - o/D) z_1 + o/D z_2 + e phi of the accelerations z_1 and z_2 above the
+of the centre line, reads (1 - o/D) z_1 + o/D z_2 + e phi of the accelerations z_1 and z_2 above the
 axles, D apart, and of the roll phi; a sensor on an axle reads z_u + e phi_u. The coordinates of
 each part follow by least squares, weighted by the sensors' noise. z_1, z_2 and both z_u are the
-middle readings. Where the noise of z_1 and z_2 is correlated (sensors far from the axles) the
-method takes it as independent.
+centre readings. Where the noise of z_1 and z_2 is correlated (sensors far from the axles) the
+method assumes independence.
 """
 
 from typing import NamedTuple
@@ -20,40 +20,40 @@ _ROUNDING = 1e-9
 
 
 class Places(NamedTuple):
-    """Where m sensors are, all arrays (m,)."""
+    """Places of m sensors, all arrays (m,)."""
 
     axle: NDArray[np.int64]
     """Number of the axle from 1; `BODY` for a sensor on the body."""
     behind_m: FloatArray
-    """Distance behind the front axle, of sensors on the body."""
+    """Distance behind the front axle, for sensors on the body."""
     lateral_m: FloatArray
-    """Distance to the left of the middle."""
+    """Distance to the left of the centre line."""
 
 
 class Reduction(NamedTuple):
-    """How m sensors become four middle readings: body front and rear, axle front and rear."""
+    """Weights from m sensors to four centre readings: body front and rear, axle front and rear."""
 
     weights: FloatArray
-    """(4, m); NaN of a reading that these sensors do not show."""
+    """Weights (4, m); NaN for a reading that the sensors do not determine."""
     density: FloatArray
-    """(4,) noise density of the readings, in the unit of the sensors' densities."""
+    """Noise density (4,) of the readings, in the unit of the sensors' densities."""
     parities: tuple[FloatArray, ...]
-    """Per part with redundant sensors (r, m): combinations in which its motion cancels, with the
-    noise density 1 where the sensors' densities are not zero."""
+    """Combinations (r, m) that cancel the motion of a part with redundant sensors, with noise
+    density 1 unless the sensors' densities are zero."""
 
 
 def reduction(
     places: Places, density: FloatArray, wheelbase_m: float, in_the_middle_m: float
 ) -> Reduction:
-    """Return how sensors at `places` with one-sided noise `density` (m,) are reduced.
+    """Return the reduction of sensors at `places` with one-sided noise `density` (m,).
 
-    Sensors less than `in_the_middle_m` to the side are in the middle. A part whose sensors are on
-    one side only, or whose geometry leaves a reading open, has NaN there.
+    Sensors less than `in_the_middle_m` to the side are on the centre line. A part with sensors on
+    one side only, or whose geometry does not determine a reading, has NaN there.
     """
     count = places.axle.size
     weights = np.full((4, count), np.nan)
     parities = []
-    # Sensors without noise, as in simulations, weigh alike.
+    # Sensors without noise, as in simulations, have equal weights.
     scale = float(density.max()) or 1.0
     noise = np.maximum(density / scale, 1e-3) if density.any() else np.ones(count)
     for part, rows in ((BODY, (0, 1)), (1, (2,)), (2, (3,))):
@@ -87,15 +87,15 @@ def reduction(
 
 
 def _exact(weights: FloatArray) -> FloatArray:
-    """Return weights without what rounding makes of 0 and 1."""
+    """Return weights with rounded 0 and 1."""
     near = np.rint(weights)
     return np.where(np.abs(weights - near) < _ROUNDING, near, weights)
 
 
 def middle(reduced: Reduction, acceleration: FloatArray) -> FloatArray:
-    """Return the middle readings (4, n) of accelerations (m, n) on one grid.
+    """Return the centre readings (4, n) of accelerations (m, n) on one grid.
 
-    A reading that is one sensor's is that sensor's, bit for bit.
+    A reading of a single sensor equals that sensor's bit for bit.
     """
     found = np.empty((4, acceleration.shape[1]))
     for row, weights in enumerate(reduced.weights):

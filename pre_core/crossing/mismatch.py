@@ -1,18 +1,18 @@
-"""Two axles that do not feel the same road: their difference as noise that the run itself tells.
+"""Profile mismatch of the two axles as noise whose level the run itself determines.
 
-What the front axle feels at a place less what the rear axle feels there, d(x), is a stationary
+The profile of the front axle at a place less that of the rear axle there, d(x), is a stationary
 random process along the road with the one-sided spectrum
 
     S_d(n) = sum over j of A_j T_j(n),   A_j >= 0.
 
 The shapes T_j are those of axles on an isotropic surface (`physics.surface`): tyres that average
-over different strips, and an axle that runs beside the other. Both have a known limit at long
-waves, where the bridge is seen and no run tells the level. The levels A_j are read off the rows
+over different strips, and an axle with a lateral offset. Both have a known limit at long waves,
+which affect the bridge but cannot be measured in one run. The levels A_j follow from the residuals
 before and behind the bridge. At the speed v, d is noise in time with the spectrum S_d(f/v)/v.
 
-The covariance of d is brought to an end by Bohman's window, which keeps it positive, so that the
-rows' covariance is banded. Five metres keep the spectrum of unlike tyres to 2 % everywhere, and
-that of an offset, which grows like the logarithm of the wave, to a quarter down to waves of 30 m.
+Bohman's window truncates the covariance of d and keeps it positive, so that the residuals'
+covariance is banded. Five metres keep the spectrum of unequal tyres to 2 % everywhere, and that of
+an offset, which grows like the logarithm of the wave, to a quarter down to waves of 30 m.
 """
 
 from functools import lru_cache
@@ -21,33 +21,33 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.whittle import likeliest_levels
+from pre_core.crossing.whittle import maximum_likelihood_levels
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
-from pre_core.physics.surface import Footprint, common_spectrum, spectra, surface_density
+from pre_core.physics.surface import Footprint, between_run_cross_spectrum, spectra, surface_density
 
 FloatArray = NDArray[np.float64]
 
-MEMORY_M = 5.0
+CORRELATION_LENGTH_M = 5.0
 _OFFSET_M = 0.005
-"""For the shape of an axle that runs beside the other; it is the same for all small offsets."""
+"""Offset for the shape of a laterally shifted axle, which is the same for all small offsets."""
 _LARGE_OFFSET_M = 0.02
-"""Mean of the prior of such an offset's square, as a root: axles are set to millimetres, and steer
-to centimetres. Without it an offset of a hand's width passes for twin tyres."""
+"""Root mean square of the offset's prior: axles are aligned to millimetres, and steer to
+centimetres. Without it an offset of a hand's width would pass for twin tyres."""
 _WORN = 0.9
 _GRID_CYCLES_PER_M = 0.02
 _MOST_CYCLES_PER_M = 24.0
 LONG_CYCLES_PER_M = 0.05
-"""Waves by which bridges are seen, and by which a mismatch is told."""
+"""Wave number relevant for bridges, at which a mismatch is reported."""
 _EVERY_LONG, _OTHERS = 30, 50
-"""Of the grid's waves the common part is computed for so many, the longest, and for so many of the
-others: it has no detail."""
+"""Number of longest grid waves, and of others, for which the shared part is computed; it is smooth.
+"""
 _SURFACE_CYCLES_PER_M = (0.5, 4.0)
 _ENOUGH = 1e-4
 _NOTHING = 1e-12
 
 
-class Shapes(NamedTuple):
-    """Spectra (s, g) on an even grid (g,) of cycles/m from zero on, one at 0.1 cycles/m.
+class MismatchSpectra(NamedTuple):
+    """Spectra (s, g) on an even grid (g,) of cycles/m from zero, one at 0.1 cycles/m.
 
     So a level A_j is its shape's spectrum there.
     """
@@ -56,29 +56,29 @@ class Shapes(NamedTuple):
     density: FloatArray
     """The spectrum of d, windowed."""
     leaning: FloatArray
-    """Cross spectrum of what the front axle feels with d: (s, g). The rear's is that less d's."""
+    """Cross spectrum (s, g) of the front axle's profile with d. The rear's is that less d's."""
     footprints: tuple[Footprint, Footprint]
     road: FloatArray
-    """What the front axle feels of a surface of Phi k^3 = 1 m²: (g,), windowed."""
+    """Windowed profile spectrum (g,) of the front axle on a surface of Phi k^3 = 1 m²."""
     road_spread: FloatArray
-    """(g,) how many times the road itself that is: the window spreads its longest waves, which
-    are by far the highest, over all others."""
+    """Its ratio (g,) to the unwindowed one: the window spreads the longest waves, by far the
+    highest."""
     expected_m: FloatArray
-    """(s,) m³ that a level is over Phi k^3: of tyres unlike each other as they are, of an offset of
+    """Expected levels (s,) in m³, divided by Phi k^3: of the given tyres, and of an offset of
     `_LARGE_OFFSET_M`."""
 
 
 class Mismatch(NamedTuple):
-    """The noise of one run; without mismatch all levels are zero."""
+    """The mismatch noise of one run; without mismatch all levels are zero."""
 
-    shapes: Shapes
+    shapes: MismatchSpectra
     level_m3: FloatArray  # (s,)
     speed_m_per_s: float
 
 
 @lru_cache(maxsize=8)
-def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
-    """Return what tyres unlike each other leave, and one axle beside the other."""
+def mismatch_spectra(front: Footprint, rear: Footprint) -> MismatchSpectra:
+    """Return the spectra of unequal tyres, and of a laterally shifted axle."""
     grid = _above_zero()
     density, leaning, expected = [], [], []
     for (one, other), larger in zip(
@@ -92,7 +92,7 @@ def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
     road = _windowed(of_front)
     spread = road / of_front
     grid[0] = 0.0
-    return Shapes(
+    return MismatchSpectra(
         grid,
         np.stack(density),
         np.stack(leaning),
@@ -104,18 +104,18 @@ def shapes_of(front: Footprint, rear: Footprint) -> Shapes:
 
 
 @lru_cache(maxsize=64)
-def common_shapes(front: Footprint, rear: Footprint, wander_m: float) -> FloatArray:
-    """The part (s, g) of the densities of `shapes_of` that runs on tracks so wide have in common.
+def between_run_spectra(front: Footprint, rear: Footprint, wander_m: float) -> FloatArray:
+    """Return the part (s, g) of `mismatch_spectra` densities that runs with this wander share.
 
-    Long waves across the road are the same on all tracks, short ones are not: how much is common
-    depends on the wave, and what it is at long ones no run tells.
+    Lateral long waves are the same on all paths, short ones are not: the shared fraction depends on
+    the wave, and no run determines it at long ones.
     """
     at, grid = np.array([REFERENCE_CYCLES_PER_M]), _above_zero()
     some = np.concatenate([grid[:_EVERY_LONG], np.geomspace(grid[_EVERY_LONG], grid[-1], _OTHERS)])
     return np.stack(
         [
             _windowed(
-                np.interp(grid, some, common_spectrum(one, other, some, wander_m))
+                np.interp(grid, some, between_run_cross_spectrum(one, other, some, wander_m))
                 / spectra(one, other, at)[3][0]
             )
             for one, other in _pairs(front, rear)
@@ -123,11 +123,11 @@ def common_shapes(front: Footprint, rear: Footprint, wander_m: float) -> FloatAr
     )
 
 
-def levels_on(front: Footprint, rear: Footprint, road_class: str) -> FloatArray:
-    """Levels (s,) in m³ that a surface of an ISO 8608 class has under these axles.
+def expected_levels(front: Footprint, rear: Footprint, road_class: str) -> FloatArray:
+    """Return the levels (s,) in m³ on a surface of an ISO 8608 class under these axles.
 
-    Tyres that are alike differ by nothing: `shapes_of` takes them for worn ones only because no run
-    can tell that they are not.
+    Equal tyres have no mismatch: `mismatch_spectra` treats them as worn ones only because no run
+    can show that they are not.
     """
     at = np.array([REFERENCE_CYCLES_PER_M])
     single, unlike = front._replace(offset_m=0.0), rear._replace(offset_m=0.0)
@@ -137,7 +137,7 @@ def levels_on(front: Footprint, rear: Footprint, road_class: str) -> FloatArray:
 
 
 def _above_zero() -> FloatArray:
-    """The grid, but for its zero, where the spectrum of an offset has no limit."""
+    """Return the grid without its zero, where the spectrum of an offset has no limit."""
     points = round(_MOST_CYCLES_PER_M / _GRID_CYCLES_PER_M) + 1
     grid = _GRID_CYCLES_PER_M * np.arange(points, dtype=np.float64)
     grid[0] = 0.02 * _GRID_CYCLES_PER_M
@@ -145,9 +145,9 @@ def _above_zero() -> FloatArray:
 
 
 def _pairs(front: Footprint, rear: Footprint) -> tuple[tuple[Footprint, Footprint], ...]:
-    """Two axles for each shape: with tyres unlike each other, and one beside the other.
+    """Return two axles for each shape: with unequal tyres, and with a lateral offset.
 
-    Tyres that are just alike are taken for worn ones: nobody has measured any.
+    Equal tyres are replaced by worn ones, because real ones are never exactly equal.
     """
     single, unlike = front._replace(offset_m=0.0), rear._replace(offset_m=0.0)
     if unlike == single:
@@ -156,21 +156,22 @@ def _pairs(front: Footprint, rear: Footprint) -> tuple[tuple[Footprint, Footprin
 
 
 def _windowed(spectrum: FloatArray) -> FloatArray:
-    """A spectrum (g,) on the grid when its covariance ends at `MEMORY_M`."""
+    """Return a spectrum (g,) on the grid whose covariance ends at `CORRELATION_LENGTH_M`."""
     both = np.concatenate([spectrum, spectrum[-2:0:-1]])
     apart = 1.0 / (both.size * _GRID_CYCLES_PER_M)
     covariance = np.fft.irfft(spectrum, both.size)
     lag = apart * np.minimum(np.arange(both.size), both.size - np.arange(both.size))
-    return np.asarray(np.fft.rfft(covariance * _bohman(lag / MEMORY_M)).real)
+    return np.asarray(np.fft.rfft(covariance * _bohman(lag / CORRELATION_LENGTH_M)).real)
 
 
 def _bohman(share: FloatArray) -> FloatArray:
+    """Return Bohman's window at a share (…) of its length."""
     inside = np.minimum(np.abs(share), 1.0)
     return (1.0 - inside) * np.cos(np.pi * inside) + np.sin(np.pi * inside) / np.pi
 
 
 def density_at(mismatch: Mismatch, omega: FloatArray, table: FloatArray) -> FloatArray:
-    """Rows of a table (s, g) of shapes, as spectra in time: (s, f), per m³ of level, m²/Hz."""
+    """Return rows of a table (s, g) of shapes as spectra in time (s, f), per m³, in m²/Hz."""
     n = omega / (2.0 * np.pi * mismatch.speed_m_per_s)
     grid = mismatch.shapes.cycles_per_m
     read = [np.interp(n, grid, row, right=0.0) for row in table]
@@ -178,19 +179,19 @@ def density_at(mismatch: Mismatch, omega: FloatArray, table: FloatArray) -> Floa
 
 
 def spectrum(mismatch: Mismatch, omega: FloatArray) -> FloatArray:
-    """One-sided spectrum (f,) of d in time at angular frequencies (f,), in m²/Hz."""
+    """Return the one-sided spectrum (f,) of d in time at angular frequencies (f,), in m²/Hz."""
     return mismatch.level_m3 @ density_at(mismatch, omega, mismatch.shapes.density)
 
 
-def leaning(mismatch: Mismatch, omega: FloatArray) -> FloatArray:
-    """Cross spectrum (f,) in time of what the front axle feels with d, in m²/Hz."""
+def front_cross_spectrum(mismatch: Mismatch, omega: FloatArray) -> FloatArray:
+    """Return the cross spectrum (f,) in time of the front axle's profile with d, in m²/Hz."""
     return mismatch.level_m3 @ density_at(mismatch, omega, mismatch.shapes.leaning)
 
 
-def as_two_numbers(mismatch: Mismatch) -> tuple[float, float]:
-    """A (m³) and n_0 (cycles/m) of A/(1 + (n/n_0)²)² that is like the spectrum of d.
+def two_parameter_spectrum(mismatch: Mismatch) -> tuple[float, float]:
+    """Return A (m³) and n_0 (cycles/m) of A/(1 + (n/n_0)²)² similar to the spectrum of d.
 
-    A is the spectrum at waves of 20 m, n_0 where it has fallen to a quarter of that.
+    A is the spectrum at waves of 20 m; at n_0 it has fallen to a quarter of that.
     """
     density = mismatch.level_m3 @ mismatch.shapes.density
     grid = mismatch.shapes.cycles_per_m
@@ -199,31 +200,33 @@ def as_two_numbers(mismatch: Mismatch) -> tuple[float, float]:
     return long_waves, float(grid[below[0]] if below.size else grid[-1])
 
 
-def memory_s(mismatch: Mismatch) -> float:
-    """How long d remembers."""
-    return MEMORY_M / mismatch.speed_m_per_s
+def correlation_time_s(mismatch: Mismatch) -> float:
+    """Return the time after which d is uncorrelated."""
+    return CORRELATION_LENGTH_M / mismatch.speed_m_per_s
 
 
-class Segment(NamedTuple):
-    """What a periodogram shows of a stretch of rows and would show of each source: (f,), (s, f)."""
+class PeriodogramSegment(NamedTuple):
+    """Periodogram of a segment of residuals (f,), and its expectation by source (f,), (s, f)."""
 
     seen: FloatArray
     sensors: FloatArray
     shapes: FloatArray
 
 
-def segment(values: FloatArray, sensors: FloatArray, shapes: FloatArray) -> Segment:
-    """The tapered periodogram of values (m,), and its exact expectation for covariances.
+def tapered_periodogram(
+    values: FloatArray, sensors: FloatArray, shapes: FloatArray
+) -> PeriodogramSegment:
+    """Return the tapered periodogram of values (m,), and its exact expectation for covariances.
 
-    `sensors` (lags,) is the autocovariance that the sensors' noise gives the values, `shapes`
-    (s, lags) that of each shape (the debiased periodogram of Sykulski et al. 2019).
+    `sensors` (lags,) is the autocovariance of the values by sensor noise, `shapes` (s, lags) that
+    of each shape (the debiased periodogram of Sykulski et al. 2019).
     """
     m = values.size
     taper = np.hanning(m + 2)[1:-1]
     taper /= np.sqrt(taper @ taper)
     seen = np.abs(np.fft.rfft(taper * values)[1:]) ** 2
     size = 2 * m
-    # Lag by lag, how much of the taper overlaps itself.
+    # Overlap of the taper with itself, lag by lag.
     overlap = np.fft.irfft(np.abs(np.fft.rfft(taper, size)) ** 2, size)[:m]
 
     def expected(covariance: FloatArray) -> FloatArray:
@@ -232,17 +235,19 @@ def segment(values: FloatArray, sensors: FloatArray, shapes: FloatArray) -> Segm
         weighted[:lags] = covariance[:lags] * overlap[:lags]
         weighted[0] *= 0.5
         power = np.asarray(2.0 * np.fft.fft(weighted).real[1 : m // 2 + 1])
-        # Rounding alone makes what nothing is negative.
+        # Only rounding makes a zero negative.
         return np.maximum(power, _NOTHING * power.max())
 
-    return Segment(seen, expected(sensors), np.stack([expected(row) for row in shapes]))
+    return PeriodogramSegment(seen, expected(sensors), np.stack([expected(row) for row in shapes]))
 
 
-def surface_level(shapes: Shapes, roads: list[Segment], lengths_m: list[float]) -> float:
-    """Phi k^3 in m² of the surface, by periodograms of what an axle felt on stretches of it.
+def surface_level(
+    shapes: MismatchSpectra, roads: list[PeriodogramSegment], lengths_m: list[float]
+) -> float:
+    """Return Phi k^3 in m² of the surface, from periodograms of an axle's profile on it.
 
-    By the median, over waves of a quarter of a metre to two: what is longer is what the window of
-    `road` has spread. Zero if no stretch has such waves.
+    It is the median over waves of a quarter of a metre to two; the window of `road` has spread
+    longer ones. Zero if no segment has such waves.
     """
     found = []
     for one, length in zip(roads, lengths_m, strict=True):
@@ -251,19 +256,21 @@ def surface_level(shapes: Shapes, roads: list[Segment], lengths_m: list[float]) 
         spread = np.interp(n[inside], shapes.cycles_per_m, shapes.road_spread)
         found.append(one.seen[inside] / one.shapes[0, inside] * spread)
     ratio = np.concatenate(found)
-    # The median of an exponential is ln 2 of its mean.
+    # The median of an exponential is ln 2 times its mean.
     return float(np.median(ratio) / np.log(2.0)) if ratio.size else 0.0
 
 
-def levels(segments: list[Segment], usual: FloatArray | None = None) -> tuple[FloatArray, float]:
-    """Most likely levels (s,) in m³ (Whittle's likelihood), and the gain over none of them.
+def estimate_levels(
+    segments: list[PeriodogramSegment], usual: FloatArray | None = None
+) -> tuple[FloatArray, float]:
+    """Return the most likely levels (s,) in m³ (Whittle's likelihood), and the gain over none.
 
-    `usual` (s,) are the means of their exponential priors, infinite where there is none; the gain
-    is that of `likeliest_levels`.
+    `usual` (s,) are the means of their exponential priors, infinite without one; the gain is that
+    of `maximum_likelihood_levels`.
     """
     seen = np.concatenate([one.seen for one in segments])
     known = np.concatenate([one.sensors for one in segments])
     shape = np.concatenate([one.shapes for one in segments], axis=1)
     start = np.full(shape.shape[0], np.mean(seen) / np.mean(shape.sum(axis=0)))
     claimed = 0.0 if usual is None else 2.0 / usual
-    return likeliest_levels(seen, known, shape, start, claimed, _ENOUGH)
+    return maximum_likelihood_levels(seen, known, shape, start, claimed, _ENOUGH)

@@ -1,10 +1,10 @@
-"""Method `pre`: the whitened likelihood of one crossing with its priors, and its optimum.
+"""Method `pre`: the whitened likelihood of one crossing with its priors.
 
-All unknowns are put into coordinates y in which their prior is a standard normal
+All parameters are mapped to coordinates y in which their prior is a standard normal
 (docs/method-pre.md): logarithms of positive quantities, multiples of the prior's spread for the
-others. The trajectory's spline coefficients have no prior of their own; the receiver's fixes take
-its place. The sum of squares of all rows is then -2 log posterior up to a constant, and its
-Gauss-Newton curvature the precision of the normal that the Markov chains are steered by.
+others. The trajectory's spline coefficients have no prior of their own but the receiver's fixes.
+The sum of squares of all residuals is then -2 log posterior up to a constant, and its Gauss-Newton
+curvature the precision of its normal approximation.
 """
 
 from functools import partial
@@ -14,70 +14,65 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
-from pre_core.crossing import splines, whitening
-from pre_core.crossing.layout import CHANNELS, Layout, laid_out
+from pre_core.crossing import noise as _noise
+from pre_core.crossing import splines
+from pre_core.crossing.layout import CHANNELS, ParameterLayout, parameter_layout
+from pre_core.crossing.lines import without
 from pre_core.crossing.mismatch import Mismatch
+from pre_core.crossing.noise import NoisePath, force_masses, noise_path
 from pre_core.crossing.residuals import (
     SWING_MODES,
-    Crossing,
-    Points,
-    Work,
+    Buffers,
+    EvaluationPoints,
+    GriddedCrossing,
     evaluate,
     evaluate_white,
     largest_deflections,
     roads_and_deflections,
 )
-from pre_core.crossing.whitening import (
-    RESIDUALS,
-    RowFilter,
-    Truck,
-    Whitener,
-    filter_rows,
-    row_count,
-    truck_of,
-)
-from pre_core.unknowns import EI_1, K_U1, M_U1
+from pre_core.crossing.rows import RESIDUALS, RowFilter, filter_rows, row_count
+from pre_core.crossing.whitening import Whitener
+from pre_core.parameters import EI_1, K_U1, M_U1
 
 FloatArray = NDArray[np.float64]
 
-# Three directions in which four gains differ; what is common to all comes beside them.
+# Three directions in which four gains differ; the common gain is separate.
 _CONTRASTS = np.array(
     [[0.5, 0.5, -0.5, -0.5], [0.5, -0.5, 0.5, -0.5], [0.5, -0.5, -0.5, 0.5]], dtype=np.float64
 )
 _INITIAL_SPREAD = np.array([0.1, 0.1, 0.1])  # m, m/s, m/s²: wide; they are nuisances
 _SWING_M = 1e-3
 """Scale of the first mode's displacement, and velocity over omega, at its largest point: a 30 t
-lorry that has left a tenth of a second ago leaves a bridge of 30 m swinging by a millimetre. Of the
-second it is a quarter, of the third a ninth: a load bends a beam into its j-th mode by 1/j^4."""
+lorry that left a tenth of a second ago leaves a bridge of 30 m vibrating by a millimetre. For the
+second it is a quarter, for the third a ninth: a load excites the j-th mode of a beam by 1/j^4."""
 _JERK_M_PER_S3 = 1.0
-"""Root mean square of the jerk that a driver's changes of speed have, before anything is
-measured."""
+"""Prior RMS jerk of a driver's speed changes."""
 _DEGREE = 5
-"""The trajectory is a spline of this degree: load moves with its second derivative, which must not
-have kinks."""
+"""Degree of the trajectory spline: load moves with its second derivative, which must not have
+kinks."""
 _AT_ONCE = 100
-"""Points whose trajectories are written out at once: they are long."""
+"""Number of points whose trajectories are evaluated at once, which bounds memory."""
 
 
 class Priors(NamedTuple):
-    """What is known before the crossing; relative spreads are those of a log-normal."""
+    """Priors of a crossing; relative spreads are those of a log-normal."""
 
     theta: FloatArray  # (p,) nominal values
     spread: FloatArray  # (p,) relative; absolute where the prior is half-normal
     half_normal: NDArray[np.bool_]  # (p,) at zero; log-normal about the nominal value elsewhere
     estimated: NDArray[np.bool_]  # (p,) which are unknown at all
     absence: FloatArray
-    """(p,) probability before the crossing that an unknown with a half-normal prior is nothing."""
+    """Prior probability (p,) that a parameter with a half-normal prior is zero."""
     wheelbase_m: float
     wheelbase_spread: float
     gain_spread: float
-    """The spread of each channel's gain, independent of the others'."""
+    """Standard deviation of each channel's gain, independent of the others'."""
     common_gain_spread: float
     delay_spread_s: float
 
 
-class Fixes(NamedTuple):
-    """The receiver's fixes near the crossing, of the front axle's chainage; (m,) each."""
+class ChainageFixes(NamedTuple):
+    """Fixes near the crossing as chainage of the front axle, (m,) each."""
 
     time_s: FloatArray
     position_m: FloatArray
@@ -85,43 +80,52 @@ class Fixes(NamedTuple):
     position_noise_m: float
     speed_noise_m_per_s: float
     offset_spread_m: float
-    """Slow error and latency together: common to all fixes."""
+    """Standard deviation of slow error and latency together, common to all fixes."""
 
 
-class Problem(NamedTuple):
-    """Everything that stays the same during a search."""
+class PosteriorProblem(NamedTuple):
+    """The constants of a search."""
 
-    crossing: Crossing
+    crossing: GriddedCrossing
     priors: Priors
     rows: RowFilter
     noise: Whitener
     density: FloatArray  # (4,) one-sided, m/s²/√Hz
     force: FloatArray
-    """(2, shapes) noise of springs and dampers, N²/Hz; see whitening.py."""
+    """Noise (2, shapes) of springs and dampers, N²/Hz; see whitening.py."""
     mismatch: Mismatch
-    """How the roads under both axles differ; without level where they are taken for the same."""
+    """Profile mismatch; without level where both axles follow one profile."""
     basis_position: FloatArray  # (n, b): trajectory = basis @ coefficients
     basis_acceleration: FloatArray  # (n, b), positive when speeding up
     receiver_rows: FloatArray  # (r, b + 1): rows of (coefficients, offset)
     receiver_values: FloatArray  # (r,)
     noise_slope: FloatArray  # of the first coordinates: see `all_rows`
-    works: tuple[Work, ...]
+    works: tuple[Buffers, ...]
+    lines_hz: tuple[float, ...] = ()
+    """Frequencies at the rows of the lines that are taken out of them, see `lines`."""
+    waves: FloatArray = np.zeros((0, 0))
+    """(m, w) orthonormal waves of these lines."""
 
 
-def layout(problem: Problem) -> Layout:
-    """Theta (what is estimated), wheelbase, gains, delays, initial states, swing, trajectory."""
+def has_tandem(problem: PosteriorProblem) -> bool:
+    """Return whether a tandem's axles are compared, without equations of the body."""
+    return problem.crossing.lead.ahead_m > 0.0
+
+
+def layout(problem: PosteriorProblem) -> ParameterLayout:
+    """Return the layout: theta, wheelbase, gains, delays, initial states, swing, trajectory."""
     priors = problem.priors
-    return laid_out(
+    return parameter_layout(
         priors.estimated.tobytes(), priors.half_normal.tobytes(), problem.basis_position.shape[1]
     )
 
 
 def trajectory_basis(
-    fixes: Fixes, start_s: float, step_s: float, count: int, direction: int, knot_s: float
+    fixes: ChainageFixes, start_s: float, step_s: float, count: int, direction: int, knot_s: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Spline basis at the samples, the receiver's rows, and the coefficients that fit them best.
+    """Return the spline basis at the samples, the receiver's residuals, and their best fit.
 
-    Returns (n, b) positions, (n, b) accelerations, (r, b + 1), (r,) and (b + 1,).
+    These are (n, b) positions, (n, b) accelerations, (r, b + 1), (r,) and (b + 1,).
     """
     time = start_s + step_s * np.arange(count, dtype=np.float64)
     first = min(float(time[0]), float(fixes.time_s[0]))
@@ -158,25 +162,25 @@ def trajectory_basis(
 
 
 def common_gain_spread(priors: Priors) -> float:
-    """The spread of the mean of four gains: what is common to them, and the mean of each's own."""
+    """Return the standard deviation of the mean of four gains, common and individual parts."""
     return float(np.hypot(priors.common_gain_spread, 0.5 * priors.gain_spread))
 
 
 def rigidity_spread(priors: Priors) -> FloatArray:
-    """Spreads of ln EI of the elements that are estimated, (elements,)."""
+    """Return the standard deviations of ln EI of the estimated elements, (elements,)."""
     return np.asarray(priors.spread[EI_1:][priors.estimated[EI_1:]])
 
 
-class Values(NamedTuple):
-    """What points mean but for the drive and each channel's own errors."""
+class PhysicalValues(NamedTuple):
+    """Physical values of points, without trajectory and the channels' own errors."""
 
     theta: FloatArray  # (k, p)
     wheelbase_m: FloatArray  # (k,)
     common_gain: FloatArray  # (k,)
 
 
-def values_of(problem: Problem, y: FloatArray) -> Values:
-    """Truck, bridge and common gain of the points y (k, size)."""
+def values_of(problem: PosteriorProblem, y: FloatArray) -> PhysicalValues:
+    """Return truck, bridge and common gain of the points y (k, size)."""
     where = layout(problem)
     priors = problem.priors
     k = y.shape[0]
@@ -188,34 +192,34 @@ def values_of(problem: Problem, y: FloatArray) -> Values:
     theta[:, logs] = priors.theta[logs] * np.exp(priors.spread[logs] * values[:, logs])
     zero = np.flatnonzero(priors.estimated & priors.half_normal)
     theta[:, zero] = priors.spread[zero] * values[:, zero]
-    return Values(
+    return PhysicalValues(
         theta,
         priors.wheelbase_m * np.exp(priors.wheelbase_spread * y[:, where.wheelbase]),
         np.exp(common_gain_spread(priors) * y[:, where.common_gain]),
     )
 
 
-def points(problem: Problem, y: FloatArray) -> Points:
-    """What the points y (k, size) mean, the truck's place at every sample included."""
+def points(problem: PosteriorProblem, y: FloatArray) -> EvaluationPoints:
+    """Return the physical points of y (k, size), with the truck's chainage at every sample."""
     where = layout(problem)
     priors = problem.priors
-    told = values_of(problem, y)
+    values = values_of(problem, y)
     coefficients = y[:, where.trajectory]
-    return Points(
-        told.theta,
-        told.wheelbase_m,
+    return EvaluationPoints(
+        values.theta,
+        values.wheelbase_m,
         coefficients @ problem.basis_position.T,
         coefficients @ problem.basis_acceleration.T,
         priors.gain_spread * (y[:, where.gains] @ _CONTRASTS),
-        told.common_gain,
+        values.common_gain,
         priors.delay_spread_s * y[:, where.delays],
         (y[:, where.initial].reshape(-1, CHANNELS, 3) * _INITIAL_SPREAD),
         y[:, where.swing] * np.repeat(_SWING_M / np.arange(1, SWING_MODES + 1) ** 2, 2),
     )
 
 
-def data_rows(problem: Problem, y: FloatArray) -> FloatArray:
-    """White rows (k, 3 m) of the data alone."""
+def data_rows(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
+    """Return whitened residuals (k, 3 m) of the data alone, for y (k, size)."""
     out = np.empty((y.shape[0], problem.noise.reciprocal.size))
     evaluate_white(
         problem.crossing, problem.rows, problem.noise, problem.works, points(problem, y), out
@@ -223,55 +227,59 @@ def data_rows(problem: Problem, y: FloatArray) -> FloatArray:
     return out
 
 
-def filtered_rows(problem: Problem, y: FloatArray) -> FloatArray:
-    """Rows (3, m) of the data of one point y (size,), filtered and not whitened."""
+def filtered_rows(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
+    """Return residuals (3, m) of the data at one point y (size,), filtered and not whitened."""
     (residual,) = evaluate(problem.crossing, problem.works, points(problem, y[None, :]))
     out = np.empty((RESIDUALS, row_count(problem.rows, problem.crossing.rows)))
     for kind in range(RESIDUALS):
         filter_rows(problem.rows.taps, problem.rows.every, residual[kind], out[kind])
-    return out
+    return without(problem.waves, out) if problem.lines_hz else out
 
 
-def filtered_rear_road(problem: Problem, y: FloatArray) -> FloatArray:
-    """Filtered rows (m,) of what the rear wheel itself feels, of one point y (size,)."""
+def filtered_rear_road(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
+    """Return filtered residuals (m,) of the rear wheel's own profile, at one point y (size,)."""
     crossing, rows = problem.crossing, problem.rows
     at = points(problem, y[None, :])
     heights, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
     out = np.empty(row_count(rows, crossing.rows))
     own = np.ascontiguousarray(heights[1, crossing.first_row :])
     filter_rows(rows.taps, rows.every, own, out)
-    return out
+    return without(problem.waves, out) if problem.lines_hz else out
 
 
-def truck_at(problem: Problem, y: FloatArray) -> tuple[Truck, FloatArray]:
-    """The truck at y (size,) as noise meets it, and its sensors' densities (4,) with gains."""
+def noise_path_at(problem: PosteriorProblem, y: FloatArray) -> tuple[NoisePath, FloatArray]:
+    """Return the truck's noise path at y (size,), and its sensors' densities (4,) with gains."""
     at = points(problem, y[None, :])
     crossing = problem.crossing
     wheelbase = float(at.wheelbase_m[0])
-    truck = truck_of(at.theta[0], crossing.total_mass_kg, wheelbase, crossing.is_inertial)
+    truck = noise_path(
+        at.theta[0], crossing.total_mass_kg, wheelbase, crossing.is_inertial, crossing.lead
+    )
     return truck, problem.density * (1.0 + at.gain[0])
 
 
-def belief_in_springs(problem: Problem, y: FloatArray) -> float:
-    """0 to 1, of the truck at y (size,): how much its springs leave of what the sensors tell."""
-    return whitening.belief_in_springs(problem.rows, *truck_at(problem, y), problem.force)
+def suspension_weight(problem: PosteriorProblem, y: FloatArray) -> float:
+    """Return the suspension weight, 0 to 1, of the truck at y (size,); 0 with a tandem."""
+    if has_tandem(problem):
+        return 0.0
+    return _noise.suspension_weight(problem.rows, *noise_path_at(problem, y), problem.force)
 
 
-def noise_floor(problem: Problem, y: FloatArray) -> float:
-    """So many times its declared power the sensors' noise has, by the truck at y (size,)."""
+def noise_power_ratio(problem: PosteriorProblem, y: FloatArray) -> float:
+    """Return the ratio of sensor noise power to its declared value, for the truck at y (size,)."""
     body = filtered_rows(problem, y)[1:]
-    return whitening.noise_floor(problem.rows, *truck_at(problem, y), body)
+    return _noise.noise_power_ratio(problem.rows, *noise_path_at(problem, y), body)
 
 
-def all_rows(problem: Problem, y: FloatArray, temperature: float = 1.0) -> FloatArray:
-    """Rows of data, receiver and priors: their squares sum to -2 log posterior + constant.
+def all_rows(problem: PosteriorProblem, y: FloatArray, temperature: float = 1.0) -> FloatArray:
+    """Return residuals (k, rows) of data, receiver and priors: squares sum to -2 log posterior.
 
-    At a `temperature` above one the data count as if their noise were so many times what it is.
+    A `temperature` above one multiplies the noise of the data.
 
-    The data's noise is itself a function of the truck: a softer damper passes less of it. Whitened
-    for one truck, |W e|^2 is expected to be tr(C_0^-1 C(y)) of noise alone and so pulls towards
-    trucks that pass less. The slope of that trace is taken off: as a quadratic prior is there
-    already, by moving its centre (`noise_slope`, half the slope).
+    The data's noise is itself a function of the truck: a softer damper transmits less of it.
+    Whitened for one truck, |W e|^2 has the expectation tr(C_0^-1 C(y)) for noise alone and so
+    biases towards trucks that transmit less. The gradient of that trace is subtracted: by shifting
+    the centre of the existing quadratic priors (`noise_slope`, half the gradient).
     """
     where = layout(problem)
     data = problem.noise.reciprocal.size
@@ -291,11 +299,11 @@ def all_rows(problem: Problem, y: FloatArray, temperature: float = 1.0) -> Float
     return out
 
 
-def log_odds_of_absence(problem: Problem, inflation: float = 1.0) -> FloatArray:
-    """For each coordinate of y (size,): what its density at exactly zero is against per unit.
+def log_odds_of_absence(problem: PosteriorProblem, inflation: float = 1.0) -> FloatArray:
+    """Return for each coordinate (size,) the log density at exactly zero relative to that per unit.
 
-    Of noise `inflation` times as large, with a prior as much wider; minus infinity where there is
-    none.
+    For noise `inflation` times as large, with a prior as much wider; minus infinity without
+    absence.
     """
     where, priors = layout(problem), problem.priors
     odds = np.full(where.size, -np.inf)
@@ -304,15 +312,15 @@ def log_odds_of_absence(problem: Problem, inflation: float = 1.0) -> FloatArray:
 
 
 def log_odds(absence: FloatArray, inflation: float = 1.0) -> FloatArray:
-    """ln[P / ((1 - P) 2 phi(0))] of probabilities P of absence (k,), beside a half-normal prior."""
+    """Return ln[P / ((1 - P) 2 phi(0))] of probabilities P (k,), beside a half-normal prior."""
     with np.errstate(divide="ignore"):
         return np.asarray(
             np.log(absence) - np.log1p(-absence) + 0.5 * np.log(0.5 * np.pi * inflation**2)
         )
 
 
-def start(problem: Problem, trajectory: FloatArray) -> FloatArray:
-    """Coordinates of the nominal values and of a trajectory (b + 1,)."""
+def starting_point(problem: PosteriorProblem, trajectory: FloatArray) -> FloatArray:
+    """Return the coordinates (size,) of the nominal values and of a trajectory (b + 1,)."""
     where = layout(problem)
     y = np.zeros(where.size)
     y[where.trajectory.start :] = trajectory
@@ -320,40 +328,45 @@ def start(problem: Problem, trajectory: FloatArray) -> FloatArray:
 
 
 def precision_root(jacobian: FloatArray) -> FloatArray:
-    """Upper triangle R (f, f) with R'R the Gauss-Newton precision of y."""
+    """Return the upper triangle R (f, f) with R'R the Gauss-Newton precision of y."""
     (r,) = qr(jacobian, mode="r")
     f = jacobian.shape[1]
     signs = np.sign(np.diag(r[:f]))
     return np.asarray(signs[:, None] * r[:f])
 
 
-def covariance(root: FloatArray) -> FloatArray:
-    """(R'R)^-1."""
+def posterior_covariance(root: FloatArray) -> FloatArray:
+    """Return (R'R)^-1 for a root R (f, f)."""
     inverse = solve_triangular(root, np.eye(root.shape[0]))
     return np.asarray(inverse @ inverse.T)
 
 
-def roads(problem: Problem, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Chainage (m,), road (m) under the front and the rear wheel there, for one point y.
+def wheel_profiles(
+    problem: PosteriorProblem, y: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return chainage (m,) and profiles (m,) under both wheels there, at one point y (size,).
 
     On the bridge only, in the order of the rear wheel's samples. A bias common to all sensors bends
-    the whole record into a parabola, and nothing in the residuals shows it at constant speed: so
-    the record's own parabola, on the bridge and off, is taken off.
+    the whole record into a parabola, which the residuals do not show at constant speed: so the
+    record's own parabola, on the bridge and off, is subtracted.
     """
     crossing = problem.crossing
     at = points(problem, y[None, :])
     height, _ = roads_and_deflections(crossing, problem.works[0], at, 0)
-    x, front, rear = _at_same_places(crossing, at, height[0], height[1])
+    x, front, rear = _align_profiles(crossing, at, height[0], height[1])
     basis = _parabolas(x)
     bend = basis @ (basis.T @ (0.5 * (front + rear)))
     on_bridge = (x >= 0.0) & (x <= crossing.span_m)
     return x[on_bridge], (front - bend)[on_bridge], (rear - bend)[on_bridge]
 
 
-def _at_same_places(
-    crossing: Crossing, at: Points, front_height: FloatArray, rear_height: FloatArray
+def _align_profiles(
+    crossing: GriddedCrossing,
+    at: EvaluationPoints,
+    front_height: FloatArray,
+    rear_height: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Chainage and heights under both wheels wherever the rear wheel follows the front one."""
+    """Return chainage and heights under both wheels where the rear wheel follows the front."""
     sign = 1.0 if crossing.direction > 0 else -1.0
     front = at.position_m[0]
     rear = (front - sign * at.wheelbase_m[0])[crossing.first_row :]
@@ -365,16 +378,19 @@ def _at_same_places(
 
 
 def _parabolas(x: FloatArray) -> FloatArray:
-    """Orthonormal columns (m, 3) of which all parabolas at x (m,) are made."""
+    """Return orthonormal columns (m, 3) that span all parabolas at x (m,)."""
     basis, _ = np.linalg.qr(np.vander((x - x.mean()) / np.ptp(x), 3))
     return np.asarray(basis)
 
 
-def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
-    """Draws (count, m) in m of the error of the wheels' mean road that the sensors' noise makes.
+def road_noise(
+    problem: PosteriorProblem, y: FloatArray, count: int, rng: np.random.Generator
+) -> FloatArray:
+    """Return draws (count, m) in m of the error that sensor noise causes in the mean profile.
 
-    Where `roads` gives the road for y. White noise of the accelerations goes through the integrals
-    and the input estimation of the truck at y; what it does to the deflection is left out.
+    Its chainages are those of `wheel_profiles` for y (size,). White noise of the accelerations
+    passes the integrals and the input estimation of the truck at y; its effect on the deflection is
+    omitted.
     """
     crossing = problem.crossing
     at = points(problem, y[None, :])
@@ -382,8 +398,9 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
     n = crossing.signals.shape[2]
     step = crossing.step_s
     spread = problem.density * np.sqrt(0.5 / step)
-    truck = truck_of(theta, crossing.total_mass_kg, float(at.wheelbase_m[0]), True)
-    x, *_ = _at_same_places(crossing, at, np.zeros(n), np.zeros(n))
+    truck = noise_path(theta, crossing.total_mass_kg, float(at.wheelbase_m[0]), True, crossing.lead)
+    force = force_masses(truck)
+    x, *_ = _align_profiles(crossing, at, np.zeros(n), np.zeros(n))
     on_bridge = (x >= 0.0) & (x <= crossing.span_m)
     basis = _parabolas(x)
     drawn = []
@@ -392,19 +409,20 @@ def road_noise(problem: Problem, y: FloatArray, count: int, rng: np.random.Gener
         z = step * np.cumsum(step * np.cumsum(a, axis=1), axis=1)
         front_error, rear_error = (
             z[2 + w]
-            + (m_ii * a[w] + truck.m_12 * a[1 - w] + theta[M_U1 + w] * a[2 + w]) / theta[K_U1 + w]
-            for w, m_ii in enumerate((truck.m_11, truck.m_22))
+            + (force[w, w] * a[w] + force[w, 1 - w] * a[1 - w] + theta[M_U1 + w] * a[2 + w])
+            / theta[K_U1 + w]
+            for w in range(2)
         )
-        _, at_front, at_rear = _at_same_places(crossing, at, front_error, rear_error)
+        _, at_front, at_rear = _align_profiles(crossing, at, front_error, rear_error)
         mean = 0.5 * (at_front + at_rear)
         drawn.append((mean - basis @ (basis.T @ mean))[on_bridge])
     return np.stack(drawn)
 
 
-def largest_deflections_m(problem: Problem, y: FloatArray) -> FloatArray:
-    """Largest deflection under a wheel (k,), positive downwards, of the points y (k, size).
+def largest_deflections_m(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
+    """Return the largest deflection under a wheel (k,), positive downwards, for y (k, size).
 
-    Raises FloatingPointError for an impossible point.
+    Raise FloatingPointError for an impossible point.
     """
     found = [
         largest_deflections(problem.crossing, problem.works, points(problem, y[n : n + _AT_ONCE]))

@@ -1,72 +1,79 @@
-"""Method `pre`: from one crossing's signals to the problem that is to be solved, and its noise."""
+"""Method `pre`: from one crossing's signals to the problem to solve, and its noise."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
-from pre_core.crossing.channels import channel_signals
-from pre_core.crossing.mismatch import Mismatch, shapes_of
-from pre_core.crossing.posterior import (
-    Fixes,
-    Priors,
-    Problem,
-    filtered_rear_road,
-    filtered_rows,
-    layout,
-    points,
-    start,
-    trajectory_basis,
-    truck_at,
-)
-from pre_core.crossing.residuals import Crossing, Points, sinc_table, step_table, workspace
-from pre_core.crossing.whitening import (
+from pre_core.crossing import lines
+from pre_core.crossing.channels import A, channel_signals
+from pre_core.crossing.mismatch import Mismatch, mismatch_spectra
+from pre_core.crossing.noise import (
     DOUBTED,
-    Truck,
+    NoisePath,
     force_noise,
-    linear_springs,
     mismatch_levels,
     mismatch_power,
+    no_force_noise,
+    noise_path,
     noise_power,
-    row_count,
-    row_filter,
-    truck_of,
-    whitener,
 )
-from pre_core.physics.beam_basis import beam_basis, rebased
+from pre_core.crossing.posterior import (
+    ChainageFixes,
+    PosteriorProblem,
+    Priors,
+    data_rows,
+    filtered_rear_road,
+    filtered_rows,
+    has_tandem,
+    layout,
+    noise_path_at,
+    points,
+    starting_point,
+    trajectory_basis,
+)
+from pre_core.crossing.residuals import (
+    EvaluationPoints,
+    GriddedCrossing,
+    allocate_buffers,
+    roads_and_deflections,
+)
+from pre_core.crossing.rows import RESIDUALS, row_count, row_filter
+from pre_core.crossing.step_tables import sinc_table, step_table
+from pre_core.crossing.tandem import lead_motion
+from pre_core.crossing.whitening import Whitener, solve, whitener
+from pre_core.parameters import FIRST_OF_BRIDGE, TORSION
+from pre_core.physics.beam_basis import beam_basis, change_basis
 from pre_core.physics.bridge import FloatArray
 from pre_core.physics.simulate import rear_position_m
 from pre_core.physics.surface import COMMON_LORRY, Footprint
+from pre_core.physics.tandem import NO_LEAD, Lead, shared_load
 from pre_core.physics.torsion import NO_TORSION, torsion_basis
-from pre_core.unknowns import FIRST_OF_BRIDGE, TORSION
 
 _KNOT_S = 0.4
-"""Between knots of the trajectory: a driver changes the speed more slowly."""
+"""Knot spacing of the trajectory: a driver changes the speed more slowly."""
 _SLOPE_STEP = 1e-3
-"""Step of the one-sided difference for how the noise's power changes with the truck and the
-gains."""
+"""Step of the one-sided difference of the noise power over truck and gains."""
 _SWING_BEFORE_S = 0.1
-"""The bridge's swing is told at this time before the truck comes, to leave the search room."""
-_MARGIN_M = 3.0  # of road before the first row, for the trajectory to move
-
-
+"""Time before the truck's entry at which the initial vibration is defined, a margin for the search.
+"""
+_MARGIN_M = 3.0  # of road before the first residual, a margin for the trajectory
 _SILENCED = 100.0
-"""Where springs are doubted their noise is taken for so many times its level. It is not noise: it
-follows the truck's motion, and what of it looks like a heavier end or another centre of gravity
-would be believed. With it as found EI was 0.34 standard deviations too low (the median of 36
-crossings with friction) and 93 % of the intervals held the truth; so 0.09 and 97 %, and the
-intervals are as wide as before."""
-
+"""Factor of the suspension noise where its weight is reduced. It is not noise: it follows the
+truck's motion, and could pass for a heavier end or another centre of gravity. Without the factor EI
+was 0.34 standard deviations too low (the median of 36 crossings with friction) and the coverage 93
+%; with it 0.09 and 97 %, with intervals of the same width."""
 
 _FEWEST_ROWS = 24
-"""Off the bridge, in one stretch, that tell something of the mismatch."""
+"""Fewest residuals off the bridge, in one segment, that determine the mismatch."""
 _STEP_SAMPLES = 9
 MISMATCHED = 30.0
-"""So much must twice the log-likelihood of the rows off the bridge gain."""
+"""Smallest gain in twice the log-likelihood of the residuals off the bridge."""
 
 
-class Inputs(NamedTuple):
-    """One crossing as method `pre` takes it; times in s on one clock, chainage in m."""
+class CrossingInputs(NamedTuple):
+    """Input of method `pre` for one crossing; times in s on one clock, chainage in m."""
 
     acceleration_m_per_s2: FloatArray  # (4, n)
     start_s: float
@@ -75,27 +82,30 @@ class Inputs(NamedTuple):
     span_m: float
     element_lengths_m: FloatArray
     interior_supports: tuple[int, ...]
-    """Between which elements the bridge is held up: after so many of them."""
+    """Number of elements before each interior support."""
     total_mass_kg: float
     cg_height_m: float
     density_m_per_s2_per_rthz: FloatArray  # (4,) one-sided
     slowest_rate_hz: float
-    fixes: Fixes
+    fixes: ChainageFixes
     priors: Priors
     parts: int
     threads: int
     footprints: tuple[Footprint, Footprint] = COMMON_LORRY
-    """Where the front and the rear axle stand on the road."""
+    """Footprints of the front and the rear axle."""
     torsional_wave_speed_m_per_s: float = 0.0
-    """Positive where the deck may twist."""
+    """Speed of torsional waves; positive where the deck may twist."""
     lane_factor: float = 1.0
     """Square of this run's distance from the bridge's axis over that of the torsion's prior."""
+    lead: Lead = NO_LEAD
+    """Front axle of a truck with a tandem. Fixes, wheelbase, footprints and the last two signals
+    are then those of the tandem, whose first axle is the front one."""
 
 
-def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
-    """Return the problem and the coordinates of its nominal start.
+def build_problem(inputs: CrossingInputs) -> tuple[PosteriorProblem, FloatArray]:
+    """Return the problem and the coordinates (size,) of its nominal start.
 
-    Raises ValueError if torsion is estimated and no speed of its waves is given.
+    Raise ValueError if torsion is estimated without a speed of its waves.
     """
     model = channel_signals(inputs.acceleration_m_per_s2, inputs.step_s, inputs.slowest_rate_hz)
     n = model.signals.shape[2]
@@ -122,7 +132,7 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
             inputs.torsional_wave_speed_m_per_s,
             inputs.lane_factor,
         )
-    crossing = Crossing(
+    crossing = GriddedCrossing(
         model.step_s,
         model.signals,
         inputs.direction,
@@ -130,7 +140,7 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         inputs.total_mass_kg,
         inputs.cg_height_m,
         STANDARD_GRAVITY_M_PER_S2,
-        rebased(basis, inputs.priors.theta),
+        change_basis(basis, inputs.priors.theta),
         np.concatenate([[0.0], np.cumsum(basis.lengths_m)]),
         first,
         n - first,
@@ -140,62 +150,68 @@ def prepare(inputs: Inputs) -> tuple[Problem, FloatArray]:
         0,
         torsion,
     )
+    crossing = crossing._replace(lead=inputs.lead, lead_acceleration=np.zeros(n))
     crossing = crossing._replace(swing_sample=swing_sample(crossing, front))
     row = row_filter(model.step_s)
     theta = inputs.priors.theta
-    count = row_count(row, crossing.rows)
     noise = whitener(
         row,
-        count,
-        truck_of(theta, crossing.total_mass_kg, wheelbase, False),
+        row_count(row, crossing.rows),
+        noise_path(theta, crossing.total_mass_kg, wheelbase, False, crossing.lead),
         inputs.density_m_per_s2_per_rthz,
-        linear_springs(),
+        no_force_noise(),
     )
-    shapes = shapes_of(*inputs.footprints)
+    shapes = mismatch_spectra(*inputs.footprints)
     speed = float(np.ptp(front)) / ((n - 1) * model.step_s)
-    problem = Problem(
+    problem = PosteriorProblem(
         crossing,
         inputs.priors,
         row,
         noise,
         inputs.density_m_per_s2_per_rthz,
-        linear_springs(),
+        no_force_noise(),
         Mismatch(shapes, np.zeros(shapes.density.shape[0]), speed),
         position,
         speeding,
         rows,
         values,
         np.zeros(0),
-        tuple(workspace(crossing, theta.size, row) for _ in range(inputs.threads)),
+        tuple(allocate_buffers(crossing, theta.size, row) for _ in range(inputs.threads)),
     )
-    return problem, start(problem, best)
+    return problem, starting_point(problem, best)
 
 
-def swing_sample(crossing: Crossing, front: FloatArray) -> int:
-    """The sample a little before the front axle, at front (n,), comes to the bridge."""
+def swing_sample(crossing: GriddedCrossing, front: FloatArray) -> int:
+    """Return the sample shortly before the truck's first axle enters the bridge.
+
+    `front` are the chainages (n,) of the first of the compared axles.
+    """
     begin, sign = (0.0, 1.0) if crossing.direction > 0 else (crossing.span_m, -1.0)
-    entry = int(np.searchsorted(sign * front, sign * begin))
+    entry = int(np.searchsorted(sign * front + crossing.lead.ahead_m, sign * begin))
     return max(0, entry - round(_SWING_BEFORE_S / crossing.step_s))
 
 
-def with_noise_at(
-    problem: Problem,
+def update_noise(
+    problem: PosteriorProblem,
     y: FloatArray,
     force: FloatArray | None = None,
     doubted: float = DOUBTED,
     mismatch: FloatArray | None = None,
-) -> Problem:
-    """The problem with the noise as it is for the truck at y, and coordinates for its bridge.
+) -> PosteriorProblem:
+    """Return the problem with the noise for the truck at y (size,), and bridge coordinates for it.
 
-    The noise of springs and dampers is `force`, by default what the body equations leave at y if
-    that is at least `doubted` (`force_noise`). Levels of the roads' mismatch are `mismatch`, by
-    default what the rows off the bridge show at y if the problem has such levels already.
+    The suspension noise is `force` (2, shapes), by default that of the body equations at y if it is
+    at least `doubted` (`force_noise`). Mismatch levels are `mismatch` (s,), by default those of the
+    residuals off the bridge at y if the problem has levels already.
     """
     where = layout(problem)
     unknowns = where.gains.stop
+    if has_tandem(problem):
+        force = no_force_noise()
+        problem = _with_lead_motion(problem, y)
     if force is None:
         body = filtered_rows(problem, y)[1:]
-        force = force_noise(problem.rows, *truck_at(problem, y), body, doubted)
+        force = force_noise(problem.rows, *noise_path_at(problem, y), body, doubted)
     if mismatch is None:
         mismatch = problem.mismatch.level_m3
         if mismatch.any():
@@ -208,6 +224,7 @@ def with_noise_at(
     silenced = _SILENCED * force
     differs = road if mismatch.any() else None
     noise = whitener(problem.rows, count, trucks[0], density[0], silenced, differs)
+    noise = _without_lines(problem, noise)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
@@ -215,8 +232,8 @@ def with_noise_at(
     slope[changing] = 0.5 * count * power / _SLOPE_STEP
     if differs is not None:
         slope = np.concatenate([slope, np.zeros(where.delays.stop - unknowns)])
-        slope += slope_of_mismatch(problem._replace(force=force, mismatch=road), y)
-    basis = rebased(problem.crossing.basis, at.theta[0])
+        slope += mismatch_gradient(problem._replace(force=force, mismatch=road), y)
+    basis = change_basis(problem.crossing.basis, at.theta[0])
     for work in problem.works:
         work.modes_of[:] = np.nan
     return problem._replace(
@@ -228,9 +245,30 @@ def with_noise_at(
     )
 
 
-def with_mismatch_alone(problem: Problem, y: FloatArray, mismatch: Mismatch) -> Problem:
-    """The problem with another mismatch in its noise at y, all else as it is, the slope too."""
-    truck, density = truck_at(problem, y)
+def _with_lead_motion(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
+    """Return the problem with the motion of the axle ahead of the tandem, over the profile at y."""
+    crossing = problem.crossing
+    at = points(problem, y[None, :])
+    work = problem.works[0]
+    work.under_lead[:] = 0.0
+    heights, _ = roads_and_deflections(crossing, work, at, 0)
+    chainage = at.position_m[0] * crossing.direction
+    ahead = chainage + crossing.lead.ahead_m
+    profile = 0.5 * (
+        np.interp(ahead, chainage, heights[0])
+        + np.interp(ahead, chainage - float(at.wheelbase_m[0]), heights[1])
+    )
+    on = shared_load(crossing.lead, at.theta[0], crossing.total_mass_kg, float(at.wheelbase_m[0]))
+    force = on.lead_1 * crossing.signals[0, A] + on.lead_2 * crossing.signals[1, A]
+    motion = lead_motion(crossing.lead, crossing.step_s, profile + work.under_lead, force)
+    return problem._replace(crossing=crossing._replace(lead_acceleration=motion))
+
+
+def replace_mismatch(
+    problem: PosteriorProblem, y: FloatArray, mismatch: Mismatch
+) -> PosteriorProblem:
+    """Return the problem with another mismatch in its noise at y (size,), gradient included."""
+    truck, density = noise_path_at(problem, y)
     noise = whitener(
         problem.rows,
         row_count(problem.rows, problem.crossing.rows),
@@ -239,25 +277,75 @@ def with_mismatch_alone(problem: Problem, y: FloatArray, mismatch: Mismatch) -> 
         _SILENCED * problem.force,
         mismatch,
     )
-    return problem._replace(noise=noise)
+    return problem._replace(noise=_without_lines(problem, noise))
+
+
+def line_at(problem: PosteriorProblem, y: FloatArray) -> float:
+    """Return the clearest line's frequency in Hz in the residuals at y (size,), 0 without any."""
+    white = data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
+    if not np.isfinite(white).all():
+        return 0.0
+    return lines.strongest(white, problem.rows.every * problem.rows.step_s)
+
+
+def with_line(problem: PosteriorProblem, y: FloatArray, line_hz: float) -> PosteriorProblem:
+    """Return the problem, before a search from y (size,), with one more line removed."""
+    all_hz = (*problem.lines_hz, line_hz)
+    count = row_count(problem.rows, problem.crossing.rows)
+    waves = lines.waves(all_hz, count, problem.rows.every * problem.rows.step_s)
+    one_road = np.zeros_like(problem.mismatch.level_m3)
+    problem = problem._replace(lines_hz=all_hz, waves=waves)
+    return update_noise(problem, y, no_force_noise(), mismatch=one_road)
+
+
+def lines_hz(problem: PosteriorProblem) -> list[float]:
+    """Return the frequencies in Hz, in the sensors' signals, of the removed lines."""
+    crossing, rows = problem.crossing, problem.rows
+    signals = np.ascontiguousarray(crossing.signals[:, A])
+    apart_s = rows.every * rows.step_s
+    return [lines.unfolded_hz(signals, rows.step_s, apart_s, hz) for hz in problem.lines_hz]
+
+
+def with_lines_of(
+    problem: PosteriorProblem, y: FloatArray, sensors_hz: Sequence[float]
+) -> PosteriorProblem:
+    """Return the problem at y (size,), lines at the sensor frequencies removed."""
+    apart_s = problem.rows.every * problem.rows.step_s
+    for hz in sensors_hz:
+        problem = with_line(problem, y, lines.folded_hz(hz, apart_s))
+    return problem
+
+
+def _without_lines(problem: PosteriorProblem, noise: Whitener) -> Whitener:
+    """Return the whitener with the whitened columns that remove the problem's lines."""
+    if not problem.lines_hz:
+        return noise
+    waves = problem.waves
+    columns = np.zeros((waves.shape[1], RESIDUALS, RESIDUALS * waves.shape[0]))
+    for kind in range(RESIDUALS):
+        columns[:, kind, kind::RESIDUALS] = waves.T
+    white = columns.reshape(-1, columns.shape[2])
+    for column in white:
+        solve(noise.factor, noise.reciprocal, column)
+    return noise._replace(lines=np.ascontiguousarray(np.linalg.qr(white.T)[0]))
 
 
 def _aside(
-    problem: Problem, y: FloatArray, count: int, *, is_inertial: bool
-) -> tuple[Points, list[Truck]]:
-    """Points and trucks at y, and a step aside in each of the first `count` coordinates."""
+    problem: PosteriorProblem, y: FloatArray, count: int, *, is_inertial: bool
+) -> tuple[EvaluationPoints, list[NoisePath]]:
+    """Return points and noise paths at y, and a step aside in the first `count` coordinates."""
     near = np.repeat(y[None, :], 1 + count, axis=0)
     near[np.arange(1, 1 + count), np.arange(count)] += _SLOPE_STEP
     at = points(problem, near)
-    total = problem.crossing.total_mass_kg
+    total, lead = problem.crossing.total_mass_kg, problem.crossing.lead
     return at, [
-        truck_of(theta, total, float(wheelbase), is_inertial)
+        noise_path(theta, total, float(wheelbase), is_inertial, lead)
         for theta, wheelbase in zip(at.theta, at.wheelbase_m, strict=True)
     ]
 
 
-def slope_of_mismatch(problem: Problem, y: FloatArray) -> FloatArray:
-    """What the roads' mismatch alone makes of the objective's slope at y: (first coordinates,)."""
+def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
+    """Return the part of the objective's gradient at `y` (size,) by the mismatch, shape (n,)."""
     where = layout(problem)
     is_inertial = bool(problem.force.any())
     at, trucks = _aside(problem, y, where.delays.stop, is_inertial=is_inertial)
@@ -282,42 +370,46 @@ def slope_of_mismatch(problem: Problem, y: FloatArray) -> FloatArray:
     return slope
 
 
-def levels_at(problem: Problem, y: FloatArray) -> FloatArray:
-    """Levels (s,) of the roads' mismatch that the rows off the bridge show at y.
+def levels_at(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
+    """Return the mismatch levels (s,) of the residuals off the bridge at y (size,).
 
-    Nothing where these are too few, or explained as well without (`MISMATCHED`).
+    They are zero where too few residuals exist, or where a mismatch explains them no better
+    (`MISMATCHED`).
     """
     level, gain, _ = _levels_off_bridge(problem, y)
     return level if gain > MISMATCHED else np.zeros_like(level)
 
 
-def mismatch_excess(problem: Problem, y: FloatArray) -> float:
-    """Return the power of the mismatch off the bridge over what the declared axles would have.
+def mismatch_excess(problem: PosteriorProblem, y: FloatArray) -> float:
+    """Return the power of the mismatch off the bridge over that of declared axles, at y (size,).
 
-    Of waves of ten metres, on a surface as rough as the road at y; 0 where nothing is told.
+    The ratio refers to waves of ten metres on a surface as rough as the road at y; it is 0 without
+    an estimate.
     """
     level, _, expected = _levels_off_bridge(problem, y)
     return float(level.sum() / expected.sum()) if expected.sum() > 0.0 else 0.0
 
 
-def _levels_off_bridge(problem: Problem, y: FloatArray) -> tuple[FloatArray, float, FloatArray]:
-    """Return what `mismatch_levels` does, of the stretches before and behind the bridge."""
-    some = [one for one in off_bridge(problem, y) if one.stop - one.start >= _FEWEST_ROWS]
+def _levels_off_bridge(
+    problem: PosteriorProblem, y: FloatArray
+) -> tuple[FloatArray, float, FloatArray]:
+    """Return the results of `mismatch_levels` for the segments before and behind the bridge."""
+    some = [one for one in off_bridge_residuals(problem, y) if one.stop - one.start >= _FEWEST_ROWS]
     if not some:
         nothing = np.zeros_like(problem.mismatch.level_m3)
         return nothing, 0.0, nothing
     differ, felt = filtered_rows(problem, y)[0], filtered_rear_road(problem, y)
     return mismatch_levels(
         problem.rows,
-        *truck_at(problem, y),
+        *noise_path_at(problem, y),
         problem.mismatch,
         [differ[one] for one in some],
         [felt[one] for one in some],
     )
 
 
-def in_spreads(priors: Priors, theta: FloatArray) -> FloatArray:
-    """The coordinates (t,) in y of values (p,) of truck and bridge that are estimated."""
+def to_standardised(priors: Priors, theta: FloatArray) -> FloatArray:
+    """Return the coordinates (t,) in y of values (p,) of estimated truck and bridge parameters."""
     values = np.zeros(theta.size)
     logs = np.flatnonzero(priors.estimated & ~priors.half_normal)
     values[logs] = np.log(theta[logs] / priors.theta[logs]) / priors.spread[logs]
@@ -326,8 +418,8 @@ def in_spreads(priors: Priors, theta: FloatArray) -> FloatArray:
     return values[priors.estimated]
 
 
-def rear_at_rows_m(problem: Problem, y: FloatArray) -> FloatArray:
-    """Where the rear axle is at the middle of each filtered row (m,), of one point y (size,)."""
+def rear_axle_chainage_m(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
+    """Return the rear axle's chainage at the middle of each filtered residual (m,) at y (size,)."""
     crossing, rows = problem.crossing, problem.rows
     at = points(problem, y[None, :])
     rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
@@ -335,22 +427,22 @@ def rear_at_rows_m(problem: Problem, y: FloatArray) -> FloatArray:
     return rear[crossing.first_row + rows.taps.size // 2 + rows.every * np.arange(count)]
 
 
-def off_bridge_m(problem: Problem, y: FloatArray) -> float:
-    """How many metres of road the rows off the bridge compare, in stretches that tell something."""
-    rows = [one.stop - one.start for one in off_bridge(problem, y)]
+def compared_length_m(problem: PosteriorProblem, y: FloatArray) -> float:
+    """Return the length of road compared by usable residuals off the bridge, at y (size,)."""
+    rows = [one.stop - one.start for one in off_bridge_residuals(problem, y)]
     apart_m = problem.rows.every * problem.rows.step_s * problem.mismatch.speed_m_per_s
     return apart_m * sum(one for one in rows if one >= _FEWEST_ROWS)
 
 
-def off_bridge(problem: Problem, y: FloatArray) -> tuple[slice, slice]:
-    """Filtered rows that compare the roads before and behind the bridge alone."""
+def off_bridge_residuals(problem: PosteriorProblem, y: FloatArray) -> tuple[slice, slice]:
+    """Return the slices of filtered residuals before and behind the bridge, at y (size,)."""
     at = points(problem, y[None, :])
     crossing, rows = problem.crossing, problem.rows
     rear = rear_position_m(at.position_m[0], float(at.wheelbase_m[0]), crossing.direction)
     travel = (rear if crossing.direction > 0 else crossing.span_m - rear)[crossing.first_row :]
     on, left = np.searchsorted(travel, [0.0, crossing.span_m])
     count = row_count(rows, crossing.rows)
-    # A bearing that gives is felt some samples before and behind the end.
+    # A compliant bearing affects some samples before and behind the end.
     last = (int(on) - _STEP_SAMPLES - rows.taps.size) // rows.every + 1
     first = -((-int(left) - _STEP_SAMPLES) // rows.every)
     return slice(0, min(max(0, last), count)), slice(min(max(0, first), count), count)

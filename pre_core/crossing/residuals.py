@@ -1,15 +1,14 @@
-"""The residuals of one crossing for one set of unknowns: road mismatch and two body equations.
+"""The residuals of one crossing at given parameters: profile mismatch and two body equations.
 
 Everything that method `pre` estimates may change here from one evaluation to the next: truck,
-bridge, wheelbase, trajectory, and each channel's gain, delay, initial state and bias. Rows follow
-the samples of the rear wheel: row n compares the road under the rear wheel at sample n with the
-road under the front wheel when it was at the same place; the front body equation is taken at that
-moment too, so that the noise of all three residuals of a row meets at no delay. All of it happens
-at the model's own rate (channels.py), in which every signal is smooth; the rows are then made white
-(whitening.py).
+bridge, wheelbase, trajectory, and each channel's gain, delay, initial state and bias. Residuals
+follow the samples of the rear wheel: residual n compares the profile under the rear wheel at sample
+n with that under the front wheel at the same place; the front body equation is evaluated at that
+time too, so that the noise of all three is in phase. All of it happens at the model's own rate
+(channels.py), in which every signal is smooth; the residuals are then whitened (whitening.py).
 
 Longer than other modules: an evaluation is a chain of kernels over the same work arrays, and numba
-sees that a kernel has changed only where it stands in the same file.
+notices a changed kernel only in the same file.
 """
 
 from collections.abc import Callable
@@ -19,28 +18,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.channels import A_1, A_2, A_3, PASS, STOP, A, V, Z
-from pre_core.crossing.whitening import (
-    DOUBTED_SPRING_N_PER_M,
-    RESIDUALS,
-    RowFilter,
-    Whitener,
-    row_count,
-    whiten_into,
-)
+from pre_core.crossing import tandem
+from pre_core.crossing.channels import A_1, A_2, A_3, A, V, Z
+from pre_core.crossing.lines import without
+from pre_core.crossing.noise import DOUBTED_SPRING_N_PER_M
+from pre_core.crossing.rows import RESIDUALS, RowFilter, row_count
+from pre_core.crossing.step_tables import PHASES as _PHASES
+from pre_core.crossing.step_tables import SINC_TAPS as _SINC_TAPS
+from pre_core.crossing.step_tables import STEP_REACH as _STEP_REACH
+from pre_core.crossing.whitening import Whitener, whiten_into
 from pre_core.kernels.lanes import LANES, kernel, summing
-from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
-from pre_core.physics import modal_response
-from pre_core.physics.beam_basis import BeamBasis
-from pre_core.physics.torsion import (
-    GROUPS,
-    NO_TORSION,
-    TorsionBasis,
-    flexibility_remainder,
-    torsion_filters,
-)
-from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
-from pre_core.unknowns import (
+from pre_core.parameters import (
     C_S1,
     C_U1,
     D_1,
@@ -53,29 +41,33 @@ from pre_core.unknowns import (
     RHO_A,
     TORSION,
 )
+from pre_core.physics import modal_response
+from pre_core.physics.beam_basis import BeamBasis
+from pre_core.physics.tandem import NO_LEAD, Lead
+from pre_core.physics.torsion import (
+    GROUPS,
+    NO_TORSION,
+    TorsionBasis,
+    flexibility_remainder,
+    torsion_filters,
+)
+from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
 
 FloatArray = NDArray[np.float64]
 
 _LONGEST_STRETCH = 128
-"""Steps that are marched at a time, so that their work arrays stay in the cache."""
-_PHASES = 64
-"""Places between two samples for which the step of a wheel that comes on or leaves is tabled."""
-_SINC_TAPS = 16
-"""Samples that reading a signal between two samples takes."""
-_STEP_REACH = 8
-"""Samples to either side that a step of the model's own band rings for."""
+"""Steps marched at a time, so that their work arrays stay in the cache."""
 SWING_MODES = 3
-"""Modes that may swing before the truck comes: what has left swings the j-th by 1/j^2 as much."""
+"""Number of modes with initial vibration; a load excites the j-th by 1/j^2 of the first."""
 _FEW = 4  # points that are not worth starting a thread
 _WHITE, _PLAIN, _DEFLECTIONS = range(3)
-"""What is asked of `_evaluate`: white rows (3 m or more,), residuals (3 rows,), or the bridge's
-deflections at every sample (2 n,)."""
+"""Outputs of `_evaluate`: whitened (3 m or more,), residuals (3 rows,), or deflections (2 n,)."""
 _NOTHING = np.zeros(0)
 _NO_ROWS = RowFilter(_NOTHING, 1, 0.0, _NOTHING, _NOTHING, np.zeros((0, 0), dtype=np.complex128))
 _NO_NOISE = Whitener(np.zeros((0, 0)), _NOTHING)
 
 
-class Crossing(NamedTuple):
+class GriddedCrossing(NamedTuple):
     """The data of one crossing on an even grid of n samples."""
 
     step_s: float
@@ -93,20 +85,22 @@ class Crossing(NamedTuple):
     sinc: FloatArray  # (phases + 1, 2, taps): see `sinc_table`
     step: FloatArray  # (phases + 1, 2 reach): see `step_table`
     is_inertial: bool
-    """Whether the force on a tyre is taken from the masses above it, or, where springs and dampers
-    are believed, from these and the axle: the same, but for what the body equations leave over."""
+    """Whether the tyre force is computed from the masses above it; with suspension weight it is
+    computed from springs, dampers and the axle, which differs by the body equations."""
     swing_sample: int
-    """At which the bridge's swing is what `Points.swing` says; more than the reach of a step
-    (`step_table`) before a wheel is on it."""
+    """Sample of `EvaluationPoints.swing`, more than a step's reach before the entry."""
     torsion: TorsionBasis = NO_TORSION
+    lead: Lead = NO_LEAD
+    """Front axle of a truck whose tandem is compared: "front" and "rear" are then the tandem's."""
+    lead_acceleration: FloatArray = _NOTHING  # (n,) of that axle, zero without one: see tandem.py
 
 
-class Points(NamedTuple):
-    """k points at which to evaluate; see `evaluate`.
+class EvaluationPoints(NamedTuple):
+    """Points (k) at which to evaluate; see `evaluate`.
 
-    A gain common to all sensors scales everything that is measured, signal and noise, and changes
-    no residual but for the static load, which is not measured: residuals are left in the sensors'
-    own scale, and the loads that are known (weight, load transfer) are brought to it.
+    A gain common to all sensors scales all measurements and changes no residual except by the
+    static load, which is not measured: residuals stay in the sensors' own scale, and known loads
+    (weight, load transfer) are converted to it.
     """
 
     theta: FloatArray  # (k, p): truck and bridge, as in parameters.py
@@ -117,10 +111,10 @@ class Points(NamedTuple):
     common_gain: FloatArray  # (k,): factor by which all four sensors read too little
     delay_s: FloatArray  # (k, 4): corrections, read from Taylor's series
     initial: FloatArray  # (k, 4, 3): displacement, velocity, bias to be added
-    swing: FloatArray  # (k, 2 modes): see `_set_swinging`
+    swing: FloatArray  # (k, 2 modes): see `_set_initial_vibration`
 
 
-class Work(NamedTuple):
+class Buffers(NamedTuple):
     """Work arrays of one thread; modified in place."""
 
     matrix: FloatArray  # (m, m)
@@ -128,13 +122,13 @@ class Work(NamedTuple):
     cubics: FloatArray  # (parts, groups, 4, 4)
     feedback: FloatArray  # (groups, 5, 4)
     state: FloatArray  # (groups, 2, 4)
-    force: FloatArray  # (2, stretch, 4)
-    lanes: FloatArray  # (2, stretch, 4)
-    place: FloatArray  # (2, n)
-    part: NDArray[np.int64]  # (2, n)
+    force: FloatArray  # (wheels, stretch, 4)
+    lanes: FloatArray  # (wheels, stretch, 4)
+    place: FloatArray  # (wheels, n): the compared two, and that ahead of a tandem
+    part: NDArray[np.int64]  # (wheels, n)
     corrected: FloatArray  # (4, 3, n)
-    load: FloatArray  # (2, n)
-    sharp: FloatArray  # (2, n)
+    load: FloatArray  # (wheels, n)
+    sharp: FloatArray  # (wheels, n)
     road: FloatArray  # (2, n)
     body: FloatArray  # (2, n)
     begin: NDArray[np.int64]  # (rows,)
@@ -144,28 +138,30 @@ class Work(NamedTuple):
     modes_of: FloatArray  # (p,) the bridge whose modes are in `cubics`
     modes: FloatArray  # (m, 3): see `modal_filters`
     end_force: FloatArray  # (2 ends, n)
-    end_share: FloatArray  # (2 wheels, 2 ends, n)
+    end_share: FloatArray  # (wheels, 2 ends, n)
     at_end: NDArray[np.bool_]  # (n,) whether one of these is not zero
+    under_lead: FloatArray  # (n,) deflection under the axle ahead of a tandem
 
 
-def workspace(crossing: Crossing, parameters: int, rows: RowFilter) -> Work:
-    """Allocate for this crossing."""
+def allocate_buffers(crossing: GriddedCrossing, parameters: int, rows: RowFilter) -> Buffers:
+    """Allocate the work arrays for this crossing."""
     parts, _, m = crossing.basis.cubics.shape
     groups = (m + LANES - 1) // LANES + GROUPS * crossing.torsion.ends_m.shape[0]
     n = crossing.signals.shape[2]
-    return Work(
+    wheels = 3 if crossing.lead.ahead_m > 0.0 else 2
+    return Buffers(
         np.zeros((m, m)),
         np.zeros((m, m)),
         np.zeros((parts, groups, 4, LANES)),
         np.zeros((groups, modal_response.COEFFICIENTS, LANES)),
         np.zeros((groups, 2, LANES)),
-        np.zeros((2, _LONGEST_STRETCH, LANES)),
-        np.zeros((2, _LONGEST_STRETCH, LANES)),
-        np.zeros((2, n)),
-        np.zeros((2, n), dtype=np.int64),
+        np.zeros((wheels, _LONGEST_STRETCH, LANES)),
+        np.zeros((wheels, _LONGEST_STRETCH, LANES)),
+        np.zeros((wheels, n)),
+        np.zeros((wheels, n), dtype=np.int64),
         np.zeros((4, 3, n)),
-        np.zeros((2, n)),
-        np.zeros((2, n)),
+        np.zeros((wheels, n)),
+        np.zeros((wheels, n)),
         np.zeros((2, n)),
         np.zeros((2, n)),
         np.zeros(crossing.rows, dtype=np.int64),
@@ -175,58 +171,10 @@ def workspace(crossing: Crossing, parameters: int, rows: RowFilter) -> Work:
         np.full(parameters, np.nan),
         np.zeros((m, 3)),
         np.zeros((2, n)),
-        np.zeros((2, 2, n)),
+        np.zeros((wheels, 2, n)),
         np.full(n, False),
+        np.zeros(n if wheels == 3 else 0),
     )
-
-
-def step_table() -> FloatArray:
-    """A step of the band that the model sees, (phases + 1, 2 reach), between two samples.
-
-    Row p is the step that happens p/phases of a sample before sample `reach`. It is the integral of
-    the sinc of `sinc_table`: a wheel comes on to a bearing that gives, and both its force on the
-    end and the end's deflection under it begin at once.
-    """
-    fine = np.arange(2 * _STEP_REACH * _PHASES + 1) / _PHASES - _STEP_REACH
-    impulse = windowed_sinc(fine, *_sinc_design(_STEP_REACH), pedestal=1.0)
-    rising = np.concatenate([[0.0], np.cumsum(0.5 * (impulse[1:] + impulse[:-1]))])
-    rising /= rising[-1]
-    phases = np.arange(_PHASES + 1)
-    samples = _PHASES * np.arange(2 * _STEP_REACH)
-    return np.ascontiguousarray(rising[samples[None, :] + phases[:, None]])
-
-
-def sinc_table() -> FloatArray:
-    """Weights (phases + 1, 2, taps) that read the model's signals between two samples.
-
-    Row p reads at p/phases of the way from sample taps/2 - 1 of those weighted to the next; beside
-    the weights are their slopes per phase, so that cubics between the rows are smooth in the place.
-    A sinc in Kaiser's window: what the model's signals contain (up to channels.STOP of the rate)
-    has its images from 1 - STOP on.
-    """
-    phase = np.arange(_PHASES + 1) / _PHASES
-    step = 1e-4
-    before, at, after = (_sinc_weights(phase + shift) for shift in (-step, 0.0, step))
-    slope = (after - before) / (2.0 * step * _PHASES)
-    return np.ascontiguousarray(np.stack([at, slope], axis=1))
-
-
-def _sinc_design(half: int) -> tuple[float, int, float]:
-    """Cutoff, half length and Kaiser's beta of the sinc that tells the band from its images."""
-    width = 1.0 - STOP - PASS
-    attenuation = 14.36 * width * (2 * half - 1) + 7.95
-    return 0.5 * (PASS + 1.0 - STOP), half, kaiser_beta(attenuation)
-
-
-def _sinc_weights(phase: FloatArray) -> FloatArray:
-    half = _SINC_TAPS // 2
-    distance = np.arange(_SINC_TAPS) - (half - 1) - phase[:, None]
-    weight = windowed_sinc(distance, *_sinc_design(half), pedestal=1.0)
-    # Integrated accelerations drift far; parabolas are read exactly, wherever the taps begin.
-    powers = distance[:, None, :] ** np.arange(3)[:, None]
-    moments = np.einsum("pit,pjt,pt->pij", powers, powers, weight)
-    share = np.linalg.solve(moments, np.tile([[1.0], [0.0], [0.0]], (phase.size, 1, 1)))
-    return np.asarray(weight * np.einsum("pi,pit->pt", share[:, :, 0], powers))
 
 
 @kernel
@@ -238,7 +186,7 @@ def _correct(
     initial: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Displacement, velocity and acceleration (4, 3, n) of the four points."""
+    """Compute displacement, velocity and acceleration (4, 3, n) above and on the axles."""
     n = signals.shape[2]
     middle = n // 2
     for c in range(4):
@@ -262,17 +210,14 @@ def _correct(
 
 @kernel
 def _wheels(
-    crossing: Crossing,
-    work: Work,
+    crossing: GriddedCrossing,
+    work: Buffers,
     theta: FloatArray,
     wheelbase: float,
     gravity: float,
     speeding: FloatArray,
 ) -> None:
-    """Minus the input profile (`road`), contact force (`load`) and body equation (`body`).
-
-    `gravity` is in the scale of the sensors: one over the common gain.
-    """
+    """Compute minus the profile (`road`), `load` and `body`; `gravity` is over the common gain."""
     m_s = crossing.total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
     m_11, m_22, m_12 = masses_above_axles(m_s, theta[D_1], wheelbase, theta[KAPPA])
     on_axles = masses_on_axles(m_s, theta[D_1], wheelbase, theta[M_U1], theta[M_U1 + 1])
@@ -297,8 +242,8 @@ def _wheels(
         for i in range(n):
             inertial = m_ii * a_s[i] + m_12 * a_other[i]
             load[i] = sign * transfer * speeding[i] - weight - inertial - m_u * a_u[i]
-        # The tyre carries what moves the masses above it, whatever springs are between; believed
-        # springs tell the same with far less noise of the body's sensors.
+        # The tyre force accelerates the masses above it, whatever springs are between; with
+        # suspension weight, springs give the same with far less noise of the body sensors.
         force = work.sharp[w]  # not in use yet
         if crossing.is_inertial:
             for i in range(n):
@@ -309,14 +254,7 @@ def _wheels(
         for i in range(n):
             road[i] = -z_u[i] - force[i] * soft
         if tau != 0.0:
-            for i in range(2, n - 2):
-                rate = 8.0 * (force[i + 1] - force[i - 1]) - (force[i + 2] - force[i - 2])
-                second = force[i + 1] - 2.0 * force[i] + force[i - 1]
-                road[i] += (slope * rate - bend * second) * soft
-            for i in range(2):
-                road[i] += slope * soft * 12.0 * (force[i + 1] - force[i])
-                last = n - 1 - i
-                road[last] += slope * soft * 12.0 * (force[last] - force[last - 1])
+            tandem.add_tyre_damping(force, slope, bend, soft, road)
         for i in range(n):
             spring = c * (v_u[i] - v_s[i]) + k * (z_u[i] - z_s[i])
             inertial = m_ii * a_s[i] + m_12 * a_other[i]
@@ -324,12 +262,14 @@ def _wheels(
 
 
 @kernel
-def _locate(crossing: Crossing, work: Work, front: FloatArray, wheelbase: float) -> None:
+def _locate(crossing: GriddedCrossing, work: Buffers, front: FloatArray, wheelbase: float) -> None:
     edges = crossing.edges_m
     parts = edges.size - 1
     n = front.size
-    for w in range(2):
+    for w in range(work.part.shape[0]):
         offset = 0.0 if w == 0 else -crossing.direction * wheelbase
+        if w == 2:
+            offset = crossing.direction * crossing.lead.ahead_m
         e = 0 if crossing.direction > 0 else parts - 1
         for i in range(n):
             x = front[i] + offset
@@ -346,8 +286,8 @@ def _locate(crossing: Crossing, work: Work, front: FloatArray, wheelbase: float)
 
 
 @kernel
-def _bridge(crossing: Crossing, work: Work, theta: FloatArray) -> bool:
-    """Modes of this bridge into the work arrays, unless they are there already."""
+def _bridge(crossing: GriddedCrossing, work: Buffers, theta: FloatArray) -> bool:
+    """Compute the modes of this bridge in the work arrays, unless they are there already."""
     same = True
     for i in range(FIRST_OF_BRIDGE, theta.size):
         if theta[i] != work.modes_of[i]:
@@ -377,17 +317,17 @@ def _bridge(crossing: Crossing, work: Work, theta: FloatArray) -> bool:
 
 @kernel
 def _soften_ends(
-    crossing: Crossing,
+    crossing: GriddedCrossing,
     front: FloatArray,
     part: NDArray[np.int64],
     place: FloatArray,
     force: FloatArray,
 ) -> None:
-    """Weigh a wheel's force at its first and last sample on the bridge.
+    """Weight a wheel's force at its first and last sample on the bridge.
 
-    Between the bearing and that sample, f of a step away, the load on a mode grows from nothing
-    over f of the step, not over the whole: a weight of (1 + f)/2 keeps its impulse. Without it the
-    deflection depends on where between two samples a wheel comes on.
+    Between the bearing and that sample, f of a step away, the load on a mode grows over f of the
+    step: a weight of (1 + f)/2 keeps its impulse, so that the deflection is independent of the
+    entry's phase.
     """
     n = part.size
     parts = crossing.edges_m.size - 1
@@ -402,15 +342,15 @@ def _soften_ends(
 
 
 @kernel
-def _step_onto_ends(
-    crossing: Crossing, work: Work, front: FloatArray, offset: float, w: int
+def _apply_end_steps(
+    crossing: GriddedCrossing, work: Buffers, front: FloatArray, offset: float, w: int
 ) -> None:
-    """What wheel w's coming on to the bridge and leaving it mean where its ends give way.
+    """Apply the steps of wheel w's entry and exit where the ends are compliant.
 
-    With Theta_n the samples at which the wheel is on the bridge and S_n the step of the model's
-    band, the end of the bridge feels P S, of which the samples on the bridge have P Theta: the rest
-    is a force at the end (`end_force`). The wheel feels S of the end's deflection, not Theta
-    (`end_share`). To be called when the wheel's force has been sharpened and softened.
+    With Theta_n the samples at which the wheel is on the bridge and S_n the band-limited step, the
+    force on the bridge's end is P S, of which the samples on the bridge have P Theta: the rest is a
+    force at the end (`end_force`). The wheel follows S of the end's deflection, not Theta
+    (`end_share`). Call it after the wheel's force has been precompensated and softened.
     """
     n = work.part.shape[1]
     load, sharp, part = work.load[w], work.sharp[w], work.part[w]
@@ -449,22 +389,23 @@ def _step_onto_ends(
 
 
 @kernel
-def _set_swinging(crossing: Crossing, work: Work, rho_a: float, amplitude: FloatArray) -> None:
-    """The bridge's lowest modes as they swing before the truck comes.
+def _set_initial_vibration(
+    crossing: GriddedCrossing, work: Buffers, rho_a: float, amplitude: FloatArray
+) -> None:
+    """Set the initial vibration of the bridge's lowest modes.
 
-    `amplitude` (2 modes) in m: displacement and velocity over omega of each mode, at the largest
-    point of that of a uniform beam.
+    `amplitude` (2 modes) in m: displacement and velocity over omega at a mode's largest point.
     """
     length = crossing.edges_m[crossing.edges_m.size - 1]
     size = np.sqrt(0.5 * rho_a * length)
     for k in range(min(SWING_MODES, work.modes.shape[0])):
         q = size * amplitude[2 * k]
         v = size * amplitude[2 * k + 1] * np.sqrt(max(work.modes[k, 0], 0.0))
-        modal_response.swing(work.feedback, work.state, work.modes[k], k, q, v)
+        modal_response.add_free_vibration(work.feedback, work.state, work.modes[k], k, q, v)
 
 
 @kernel
-def _deflect(crossing: Crossing, work: Work, points: Points, k: int) -> None:
+def _deflect(crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int) -> None:
     """Add the bridge's deflection to `road` (which is minus the input profile)."""
     front = points.position_m[k]
     n = work.road.shape[1]
@@ -473,77 +414,89 @@ def _deflect(crossing: Crossing, work: Work, points: Points, k: int) -> None:
         work.end_force[:] = 0.0
         work.end_share[:] = 0.0
         work.at_end[:] = False
-    for w in range(2):
-        modal_response.sharpened(work.load[w], work.sharp[w])
+    for w in range(work.part.shape[0]):
+        modal_response.precompensate_force(work.load[w], work.sharp[w])
         _soften_ends(crossing, front, work.part[w], work.place[w], work.sharp[w])
         if gives:
             offset = 0.0 if w == 0 else -crossing.direction * points.wheelbase_m[k]
-            _step_onto_ends(crossing, work, front, offset, w)
+            if w == 2:
+                offset = crossing.direction * crossing.lead.ahead_m
+            _apply_end_steps(crossing, work, front, offset, w)
     work.state[:] = 0.0
-    _set_swinging(crossing, work, points.theta[k, RHO_A], points.swing[k])
-    last = n  # behind the last sample at which a wheel is on the bridge nothing is asked for
-    while last > 0 and not (
-        work.part[0, last - 1] >= 0 or work.part[1, last - 1] >= 0 or work.at_end[last - 1]
-    ):
+    _set_initial_vibration(crossing, work, points.theta[k, RHO_A], points.swing[k])
+    last = n  # nothing is needed after the last sample with a wheel on the bridge
+    while last > 0 and not (tandem.is_loaded(work.part, last - 1) or work.at_end[last - 1]):
         last -= 1
     begin = 0
     while begin < last and begin < crossing.swing_sample and not work.at_end[begin]:
-        if work.part[0, begin] >= 0 or work.part[1, begin] >= 0:
+        if tandem.is_loaded(work.part, begin):
             break
         begin += 1
     while begin < last:
-        e1, e2 = work.part[0, begin], work.part[1, begin]
         stop = begin + 1
         while (
             stop < last
             and stop - begin < _LONGEST_STRETCH
-            and work.part[0, stop] == e1
-            and work.part[1, stop] == e2
+            and tandem.are_parts_equal(work.part, begin, stop)
             and work.at_end[stop] == work.at_end[begin]
         ):
             stop += 1
-        for w in range(2):
+        for w in range(work.part.shape[0]):
             for i in range(begin, stop):
                 p = work.sharp[w, i]
                 for lane in range(LANES):
                     work.force[w, i - begin, lane] = p
                     work.lanes[w, i - begin, lane] = 0.0
-        if work.at_end[begin]:
-            modal_response.advance_with_ends(
-                work.cubics,
-                e1,
-                e2,
-                work.feedback,
-                work.state,
-                work.place[:, begin:stop],
-                work.force,
-                work.end_force[:, begin:stop],
-                work.end_share[:, :, begin:stop],
-                work.lanes,
-            )
-        else:
-            modal_response.advance(
-                work.cubics,
-                e1,
-                e2,
-                work.feedback,
-                work.state,
-                work.place[:, begin:stop],
-                work.force,
-                work.lanes,
-            )
+        _advance(work, begin, stop)
         for w in range(2):
             for i in range(begin, stop):
                 y = work.lanes[w, i - begin]
                 work.road[w, i] += (y[0] + y[1]) + (y[2] + y[3])
+        if work.part.shape[0] == 3:
+            for i in range(begin, stop):
+                y = work.lanes[2, i - begin]
+                work.under_lead[i] = (y[0] + y[1]) + (y[2] + y[3])
         begin = stop
     if crossing.torsion.ends_m.shape[0] > 0:
         _twist_at_once(crossing, work, points, k, last)
 
 
 @kernel
-def _twist_at_once(crossing: Crossing, work: Work, points: Points, k: int, last: int) -> None:
-    """Add to `road` the twist that follows the load at once: what no marched mode has."""
+def _advance(work: Buffers, begin: int, stop: int) -> None:
+    """March all modes over the samples of a stretch in which each wheel stays in one part."""
+    if work.part.shape[0] == 3:
+        tandem.advance(work, begin, stop)
+    elif work.at_end[begin]:
+        modal_response.advance_with_ends(
+            work.cubics,
+            work.part[0, begin],
+            work.part[1, begin],
+            work.feedback,
+            work.state,
+            work.place[:, begin:stop],
+            work.force,
+            work.end_force[:, begin:stop],
+            work.end_share[:, :, begin:stop],
+            work.lanes,
+        )
+    else:
+        modal_response.advance(
+            work.cubics,
+            work.part[0, begin],
+            work.part[1, begin],
+            work.feedback,
+            work.state,
+            work.place[:, begin:stop],
+            work.force,
+            work.lanes,
+        )
+
+
+@kernel
+def _twist_at_once(
+    crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int, last: int
+) -> None:
+    """Add the quasi-static twist, beyond the marched modes, to `road`."""
     torsion = crossing.torsion
     flexibility = max(points.theta[k, TORSION], 0.0) * torsion.load_factor
     if flexibility == 0.0:
@@ -563,20 +516,25 @@ def _twist_at_once(crossing: Crossing, work: Work, points: Points, k: int, last:
         if e2 >= 0:
             own = flexibility_remainder(torsion, e2, p2, x2, e2, p2, x2)
             work.road[1, i] += flexibility * (own * work.load[1, i] + across * work.load[0, i])
+        if work.part.shape[0] == 3 and work.part[2, i] >= 0:
+            e3, p3 = work.part[2, i], work.place[2, i]
+            x3 = x1 + crossing.direction * crossing.lead.ahead_m
+            pushed = flexibility * work.load[2, i]
+            work.road[0, i] += pushed * flexibility_remainder(torsion, e1, p1, x1, e3, p3, x3)
+            work.road[1, i] += pushed * flexibility_remainder(torsion, e2, p2, x2, e3, p3, x3)
 
 
 @kernel
-def _find(
-    crossing: Crossing,
+def _locate_front_sample(
+    crossing: GriddedCrossing,
     front: FloatArray,
     wheelbase: float,
     begin: NDArray[np.int64],
     between: FloatArray,
 ) -> bool:
-    """When the front wheel was where the rear wheel is; False if it is not known to have been.
+    """Find when the front wheel was at the rear wheel's place; return False if it is unknown.
 
-    For every row the first sample that is weighted (`begin`), and how far (0 to 1) the moment is
-    from the last one before it to the next.
+    Outputs by residual: first weighted sample (`begin`), place between its neighbours (`between`).
     """
     sign = 1.0 if crossing.direction > 0 else -1.0
     n = front.size
@@ -605,11 +563,10 @@ def _find(
 def _read(
     sinc: FloatArray, place: float, begin: int, wheel: int, road: FloatArray, body: FloatArray
 ) -> tuple[float, float]:
-    """`road` and `body` (2, n) of a wheel at `place` (0 to 1) between the middle two of the taps.
+    """Return `road` and `body` (2, n) of a wheel at `place` (0 to 1) between the middle two taps.
 
-    These are the samples from `begin` on. The indices have no sign: of one that has, every access
-    asks whether it counts from the end, and the compiler leaves the vector registers alone, which
-    takes four times as long.
+    Samples start at `begin`. Indices are unsigned: with signed ones every access would test for
+    counting from the end, and the compiler would not use the vector registers, four times as slow.
     """
     phase = min(int(place * _PHASES), _PHASES - 1)
     share = place * _PHASES - phase
@@ -631,8 +588,8 @@ def _read(
 
 
 @kernel
-def _compare(crossing: Crossing, work: Work, out: FloatArray) -> None:
-    """The residuals of every row into `out` (3, rows), read where `_find` found them."""
+def _compare(crossing: GriddedCrossing, work: Buffers, out: FloatArray) -> None:
+    """Compute all residuals to `out` (3, rows), at the times of `_locate_front_sample`."""
     road, body = work.road, work.body
     first = np.uintp(crossing.first_row)
     for row in range(np.uintp(crossing.rows)):
@@ -646,24 +603,24 @@ def _compare(crossing: Crossing, work: Work, out: FloatArray) -> None:
 
 @kernel
 def _evaluate(
-    crossing: Crossing,
+    crossing: GriddedCrossing,
     rows: RowFilter,
     noise: Whitener,
-    work: Work,
-    points: Points,
+    work: Buffers,
+    points: EvaluationPoints,
     begin: int,
     stop: int,
     what: int,
     out: FloatArray,
 ) -> None:
-    """What is asked for of some points into their rows of `out`; NaN where a point is impossible.
+    """Compute the requested output of some points to their rows of `out`; NaN if impossible.
 
     One kernel for all three: each would hold a copy of the model, and take as long to load.
     """
     for k in range(begin, stop):
         row = out[k]
         if not (
-            _is_possible(points.theta[k], points.wheelbase_m[k])
+            _is_possible(points.theta[k], points.wheelbase_m[k], crossing.lead.readings_apart_m)
             and _roads(crossing, work, points, k)
         ):
             row[:] = np.nan
@@ -671,7 +628,7 @@ def _evaluate(
         road = work.road.reshape(work.road.size)
         if what == _DEFLECTIONS:
             row[:] = road
-        elif not _find(
+        elif not _locate_front_sample(
             crossing, points.position_m[k], points.wheelbase_m[k], work.begin, work.between
         ):
             row[:] = np.nan
@@ -689,16 +646,16 @@ def _evaluate(
 
 
 @kernel
-def _is_possible(theta: FloatArray, wheelbase_m: float) -> bool:
+def _is_possible(theta: FloatArray, wheelbase_m: float, lead_base_m: float) -> bool:
     for i in range(theta.size):
         if not np.isfinite(theta[i]):
             return False
-    return theta[D_1] < wheelbase_m
+    return theta[D_1] < max(wheelbase_m, lead_base_m)
 
 
 @kernel
-def _roads(crossing: Crossing, work: Work, points: Points, k: int) -> bool:
-    """Everything of point k that comes before the bridge's deflection into the work arrays."""
+def _roads(crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int) -> bool:
+    """Compute the work arrays of point k up to the deflection; return False if impossible."""
     _correct(
         crossing.signals,
         crossing.step_s,
@@ -707,26 +664,27 @@ def _roads(crossing: Crossing, work: Work, points: Points, k: int) -> bool:
         points.initial[k],
         work.corrected,
     )
-    _wheels(
-        crossing,
-        work,
-        points.theta[k],
-        points.wheelbase_m[k],
-        1.0 / points.common_gain[k],
-        points.acceleration_m_per_s2[k],
-    )
+    gravity = 1.0 / points.common_gain[k]
+    speeding = points.acceleration_m_per_s2[k]
+    if work.part.shape[0] == 3:
+        gap = points.wheelbase_m[k]
+        tandem.wheels(crossing, work, points.theta[k], gap, gravity, speeding)
+    else:
+        _wheels(crossing, work, points.theta[k], points.wheelbase_m[k], gravity, speeding)
     _locate(crossing, work, points.position_m[k], points.wheelbase_m[k])
     return _bridge(crossing, work, points.theta[k])
 
 
-def evaluate(crossing: Crossing, works: tuple[Work, ...], points: Points) -> FloatArray:
-    """Residuals (k, 3, rows) in m: R_1 - R_2, front and rear body equation over k_s.
+def evaluate(
+    crossing: GriddedCrossing, works: tuple[Buffers, ...], points: EvaluationPoints
+) -> FloatArray:
+    """Return residuals (k, 3, rows) in m: R_1 - R_2, front and rear body equation over k_s.
 
-    NaN where a point is impossible (or its trajectory turns round). One thread for each of `works`.
+    NaN for an impossible point or a trajectory that turns back. `works`: one per thread.
     """
     out = np.empty((points.theta.shape[0], RESIDUALS * crossing.rows))
 
-    def part(work: Work, begin: int, stop: int) -> None:
+    def part(work: Buffers, begin: int, stop: int) -> None:
         _evaluate(crossing, _NO_ROWS, _NO_NOISE, work, points, begin, stop, _PLAIN, out)
 
     _in_threads(part, works, out.shape[0])
@@ -734,23 +692,28 @@ def evaluate(crossing: Crossing, works: tuple[Work, ...], points: Points) -> Flo
 
 
 def evaluate_white(
-    crossing: Crossing,
+    crossing: GriddedCrossing,
     rows: RowFilter,
     noise: Whitener,
-    works: tuple[Work, ...],
-    points: Points,
+    works: tuple[Buffers, ...],
+    points: EvaluationPoints,
     out: FloatArray,
 ) -> None:
-    """White rows of k points into the first columns of `out` (k, 3 m or more); NaN as above."""
+    """Compute whitened residuals of points to columns of `out` (k, 3 m or more); NaN as above."""
 
-    def part(work: Work, begin: int, stop: int) -> None:
+    def part(work: Buffers, begin: int, stop: int) -> None:
         _evaluate(crossing, rows, noise, work, points, begin, stop, _WHITE, out)
 
     _in_threads(part, works, out.shape[0])
+    if noise.lines.size:
+        white = out[:, : noise.reciprocal.size]
+        white[:] = without(noise.lines, white)
 
 
 def _in_threads(
-    part: Callable[[Work, int, int], None], works: tuple[Work, ...], count: int
+    part: Callable[[Buffers, int, int], None],
+    works: tuple[Buffers, ...],
+    count: int,
 ) -> None:
     if count < _FEW or len(works) == 1:
         part(works[0], 0, count)
@@ -767,11 +730,11 @@ def _in_threads(
 
 
 def roads_and_deflections(
-    crossing: Crossing, work: Work, points: Points, k: int
+    crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Road heights (2, n) in m under both wheels at every sample, the bridge's deflections (2, n).
+    """Return profile heights (2, n) in m under both wheels at every sample, and deflections (2, n).
 
-    Raises FloatingPointError for an impossible point.
+    Raise FloatingPointError for an impossible point.
     """
     deflection = _deflections(crossing, work, points, k)
     if np.isnan(deflection[0, 0]):
@@ -780,14 +743,13 @@ def roads_and_deflections(
     return -gain * work.road, gain * deflection
 
 
-def largest_deflections(crossing: Crossing, works: tuple[Work, ...], points: Points) -> FloatArray:
-    """Largest deflection (k,) in m under a wheel of every point, positive downwards; as `evaluate`.
-
-    NaN of an impossible point. One thread for each of `works`.
-    """
+def largest_deflections(
+    crossing: GriddedCrossing, works: tuple[Buffers, ...], points: EvaluationPoints
+) -> FloatArray:
+    """Return the largest deflection (k,) in m under a wheel, positive downwards; NaN as above."""
     out = np.empty(points.theta.shape[0])
 
-    def part(work: Work, begin: int, stop: int) -> None:
+    def part(work: Buffers, begin: int, stop: int) -> None:
         for k in range(begin, stop):
             out[k] = -_deflections(crossing, work, points, k).min()
 
@@ -795,9 +757,11 @@ def largest_deflections(crossing: Crossing, works: tuple[Work, ...], points: Poi
     return points.common_gain * out
 
 
-def _deflections(crossing: Crossing, work: Work, points: Points, k: int) -> FloatArray:
-    """Those of point k (2, n), its roads in `work.road` (minus the road); NaN if impossible."""
-    one = Points(*(of[k : k + 1] for of in points))
+def _deflections(
+    crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int
+) -> FloatArray:
+    """Return the deflections of point k (2, n), `work.road` its negated profiles; or NaN."""
+    one = EvaluationPoints(*(of[k : k + 1] for of in points))
     out = np.empty((1, work.road.size))
     _evaluate(crossing, _NO_ROWS, _NO_NOISE, work, one, 0, 1, _DEFLECTIONS, out)
     return out.reshape(work.road.shape)

@@ -1,54 +1,48 @@
-"""Draws from the posterior of one crossing: weighted ones or, where those fail, chains."""
+"""Posterior draws of one crossing by adaptive importance sampling.
 
-from functools import partial
+Draws of a cheap density near the posterior (`surrogate`) are weighted by the posterior, and refine
+that density for the next draws. All batches are weighted as of one mixture.
+"""
+
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from pre_core.crossing import compliances, optimum, posterior
+from pre_core.crossing import compliances, posterior, surrogate
+from pre_core.crossing.fit import Optimum, normal_approximation
+from pre_core.parameters import RHO_A, TORSION
 from pre_core.physics.torsion import NO_TORSION
-from pre_core.search import approximation, crank_nicolson, importance, levenberg_marquardt
-from pre_core.search.loop import Ending, Report, run
-from pre_core.unknowns import TORSION, element_count, table
+from pre_core.search import convergence, importance, levenberg_marquardt
+from pre_core.search.loop import Report, Termination
 
 FloatArray = NDArray[np.float64]
+LogDensity = Callable[[FloatArray], FloatArray]
+"""Logarithm of the posterior (k,) at points (k, f), up to a constant."""
 
-LARGEST_R_HAT = 1.05
-SMALLEST_ESS = 100.0
-"""Chains agree if no unknown that is told to users is beyond these."""
-_LEARNING_SHARE = 0.4
-"""Each stage of learning takes this share of the draws that are asked for."""
-_LEARNING_STAGES = 3
-"""So many stages at most; one with chains that are accepted often enough is the last."""
-_WELL_ACCEPTED = 0.3
-"""From here on the approximation is good enough, and nothing more is learnt."""
+_LARGEST_R_HAT = 1.05
+"""Convergence limit of R-hat of rigidities and mass."""
+_WORTH = 1.0 / 3.0
+"""Required effective size of the draws, relative to the requested ones."""
+_BATCH_SHARE = 1.0 / 3.0
+"""Size of a batch of weighted draws, relative to the requested ones."""
+_MOST_BATCHES = 25
 _MOST_RUNS = 14
-"""So many times the draws that are asked for may be drawn before the chains are given up."""
-_BATCH_SHARE = 0.25
-"""Weighted draws come in batches of this share of those that are asked for, in such numbers:"""
-_FEWEST_BATCHES, _MOST_BATCHES = 4, 10
-_TAME_BATCHES = 6
-"""Weights whose tail is still too heavy by then are given up: the fit of few scatters."""
+"""Limit of draws with mismatch, relative to the requested ones."""
 _LARGEST_PARETO_K = 0.7
 _IMPROBABLE = 0.02
-"""Odds below which torsion is left out of the draws: it changes no interval, and a chain that has
-to find it now and then takes longer to agree."""
-_WORTH = 1.0 / 3.0
-"""Weighted draws are enough if they are worth this share of those that are asked for. It is more
-than is asked of chains: what weights are worth is an estimate from the weights themselves."""
+"""Odds below which torsion is omitted from the draws: it changes no interval and costs draws."""
+_AT_ONCE = 100
+"""Number of points evaluated together: their residuals take some megabytes."""
 
 
-_Weighted = tuple[importance.Draws, importance.Smoothed]
-"""Draws, and what they are worth."""
+class PosteriorDraws(NamedTuple):
+    """Draws (n, chains, f) in the coordinates of the posterior, with their diagnostics.
 
-
-class Sampled(NamedTuple):
-    """Draws (n, chains, f) in the coordinates of the posterior; `pareto_k` of weighted ones.
-
-    Weighted ones are drawn again by their weights and dealt out; their `acceptance` is what each is
-    worth.
+    Weighted draws are resampled by their weights into chains; their `acceptance` is the relative
+    effective size.
     """
 
     draws: FloatArray
@@ -56,34 +50,34 @@ class Sampled(NamedTuple):
     ess: float
     acceptance: float
     evaluations: int
-    ending: Ending
+    ending: Termination
     pareto_k: float | None = None
 
 
 def sample(
-    found: optimum.Optimum,
+    found: Optimum,
     draws: int,
     seed: int,
     *,
     inflation: float = 1.0,
     report: Report = lambda stage, fraction: None,
-) -> Sampled:
-    """Draw from the posterior about its optimum, of noise `inflation` times what was declared.
+) -> PosteriorDraws:
+    """Draw from the posterior about its optimum, for noise `inflation` times the declared one.
 
-    At least `draws` in all chains together; STEPS_EXHAUSTED if they do not agree. Torsion that is
-    improbable is left out: zero in all draws.
+    Return at least `draws` in all chains together; STEPS_EXHAUSTED without convergence. Improbable
+    torsion is omitted: zero in all draws.
     """
     if found.problem.mismatch.level_m3.any():
-        return _sampled_on_two_roads(found, draws, seed, inflation)
+        return _mismatch_draws(found, draws, seed, inflation)
     place = _improbable_torsion(found, inflation)
     if place is None:
-        return _sampled_on_one_road(found, draws, seed, inflation, report)
-    stiff = _sampled_on_one_road(without_torsion(found, place), draws, seed, inflation, report)
+        return _single_profile_draws(found, draws, seed, inflation, report)
+    stiff = _single_profile_draws(without_torsion(found, place), draws, seed, inflation, report)
     return stiff._replace(draws=np.insert(stiff.draws, place, 0.0, axis=2))
 
 
-def _improbable_torsion(found: optimum.Optimum, inflation: float) -> int | None:
-    """Return the place in y of torsion that is hardly there, by the normal about the optimum."""
+def _improbable_torsion(found: Optimum, inflation: float) -> int | None:
+    """Return the index in y of improbable torsion, by the normal about the optimum; else None."""
     problem = found.problem
     where = posterior.layout(problem)
     kept = np.flatnonzero(problem.priors.estimated)
@@ -91,7 +85,7 @@ def _improbable_torsion(found: optimum.Optimum, inflation: float) -> int | None:
     if places.size == 0:
         return None
     place = int(places[0])
-    centre, covariance = optimum.normal_approximation(found)
+    centre, covariance = normal_approximation(found)
     scale = inflation * np.sqrt(covariance[place, place])
     at = float(centre[place] / scale)
     # Mass above zero over the density at zero, as in `compliances`.
@@ -100,8 +94,8 @@ def _improbable_torsion(found: optimum.Optimum, inflation: float) -> int | None:
     return place if log_above - log_odds < np.log(_IMPROBABLE) else None
 
 
-def without_torsion(found: optimum.Optimum, place: int) -> optimum.Optimum:
-    """Return the optimum of the deck that does not twist, whose unknown was at `place` in y."""
+def without_torsion(found: Optimum, place: int) -> Optimum:
+    """Return the optimum without its torsion coordinate `place`, not refitted."""
     problem = found.problem
     priors = problem.priors
     estimated = priors.estimated.copy()
@@ -112,222 +106,136 @@ def without_torsion(found: optimum.Optimum, place: int) -> optimum.Optimum:
         noise_slope=np.delete(problem.noise_slope, place),
     )
     y = np.delete(found.state.y, place)
-    state = levenberg_marquardt.begin(lambda at: posterior.all_rows(stiff, at), y)
+    state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(stiff, at), y)
     return found._replace(problem=stiff, state=state)
 
 
-def _sampled_on_one_road(
-    found: optimum.Optimum, draws: int, seed: int, inflation: float, report: Report
-) -> Sampled:
+def _single_profile_draws(
+    found: Optimum, draws: int, seed: int, inflation: float, report: Report
+) -> PosteriorDraws:
     problem = found.problem
-    mixed = _approximation(found, inflation, seed)
 
     def target(points: FloatArray) -> FloatArray:
         rows = posterior.all_rows(problem, points)
         return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
 
-    where = posterior.layout(problem)
-    delays = np.arange(where.delays.start, where.delays.stop)
-    mixed = approximation.probed(target, mixed, delays)
-    spent = approximation.probes(mixed, delays)
-    weighted, mixed, drawn = _weighted(target, mixed, draws, report)
-    spent += drawn
-    if weighted is not None:
-        return _dealt_out(*weighted, _told(problem), draws, seed, spent)
-    return _by_chains(target, mixed, draws, _told(problem), spent, report)
+    of = surrogate.coordinates(found, inflation)
+    first = surrogate.gauss_newton_surrogate(found, of)
+    weighted = _importance_draws(target, of, first, found.state.y, draws, seed, report)
+    return _resample_to_chains(weighted, _monitored_indices(problem), draws, seed)
 
 
-def _approximation(found: optimum.Optimum, inflation: float, seed: int) -> approximation.Mixture:
-    problem = found.problem
-    centre, covariance = optimum.normal_approximation(found)
-    return approximation.mixture(
-        centre,
-        inflation**2 * covariance,
-        posterior.layout(problem).half_normal,
-        optimum.bends(problem),
-        seed,
-        posterior.log_odds_of_absence(problem, inflation),
-    )
+class _WeightedDraws(NamedTuple):
+    """Points y (k, f) and their smoothed weights."""
+
+    y: FloatArray
+    worth: importance.SmoothedWeights
 
 
-def _weighted(
-    target: approximation.LogDensity, mixed: approximation.Mixture, draws: int, report: Report
-) -> tuple[_Weighted | None, approximation.Mixture, int]:
-    """Weighted draws that are worth enough or none, the approximation, the evaluations.
+def _importance_draws(
+    target: LogDensity,
+    of: surrogate.SurrogateCoordinates,
+    now: surrogate.Surrogate,
+    start: FloatArray,
+    draws: int,
+    seed: int,
+    report: Report,
+) -> _WeightedDraws:
+    """Return weighted draws in batches until they suffice, or all of `_MOST_BATCHES`.
 
-    Where the first are not, the approximation is fitted to what they show, they are thrown away,
-    and others are drawn.
+    Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
+    start about `start` (f,). All draws are weighted as of the mixture of the surrogates.
     """
-    first, worth = _worth_enough(target, mixed, draws, 0, report)
-    if _is_enough(worth, draws):
-        return (first, worth), mixed, first.log_weight.size
-    fitted = approximation.learnt(mixed, first.part, first.v, first.log_weight)
-    second, worth_now = _worth_enough(target, fitted, draws, _MOST_BATCHES, report)
-    spent = first.log_weight.size + second.log_weight.size
-    if _is_enough(worth_now, draws):
-        return (second, worth_now), fitted, spent
-    per_draw = worth.ess / first.log_weight.size, worth_now.ess / second.log_weight.size
-    return None, fitted if per_draw[1] > per_draw[0] else mixed, spent
+    centre = surrogate.transform(of, start)
+    count = convergence.CHAINS * -(-round(_BATCH_SHARE * draws) // convergence.CHAINS)
+    used: list[surrogate.Surrogate] = []
+    y, x = np.empty((0, centre.size)), np.empty((0, centre.size))
+    log_target = np.empty(0)
+    while True:
+        report("weighting draws of the posterior", 0.5 + 0.02 * len(used))
+        new = surrogate.draw(now, of, centre, count, seed, len(used))
+        used.append(now)
+        log_posterior = _in_parts(target, new)
+        y, x = np.concatenate([y, new]), np.concatenate([x, surrogate.transform(of, new)])
+        log_target = np.concatenate([log_target, log_posterior - surrogate.log_prior(of, new)])
+        log_density = np.stack([surrogate.log_likelihood(one, x) for one in used], axis=1)
+        counts = np.full(len(used), count)
+        worth = importance.pareto_smooth(
+            importance.mixture_log_weights(log_target, log_density, counts)
+        )
+        if _is_enough(worth, draws) or len(used) == _MOST_BATCHES:
+            return _WeightedDraws(y, worth)
+        now = surrogate.refine(now, of, x, log_target, count)
 
 
-def _is_enough(worth: importance.Smoothed, draws: int) -> bool:
+def _in_parts(target: LogDensity, y: FloatArray) -> FloatArray:
+    """Return the target (k,) at y (k, f), minus infinity where it is not finite."""
+    found = np.concatenate([target(y[i : i + _AT_ONCE]) for i in range(0, y.shape[0], _AT_ONCE)])
+    return np.where(np.isfinite(found), found, -np.inf)
+
+
+def _is_enough(worth: importance.SmoothedWeights, draws: int) -> bool:
     return worth.pareto_k <= _LARGEST_PARETO_K and worth.ess >= _WORTH * draws
 
 
-def _worth_enough(
-    target: approximation.LogDensity,
-    mixed: approximation.Mixture,
-    draws: int,
-    number: int,
-    report: Report,
-) -> _Weighted:
-    """Weighted draws in batches from `number` on, until they are enough or will not be."""
-    batches: list[importance.Draws] = []
-    while True:
-        report("weighting draws of the posterior", 0.5 + 0.02 * (number + len(batches)))
-        count = round(_BATCH_SHARE * draws)
-        batches.append(importance.draw(target, mixed, count, number + len(batches)))
-        together = importance.Draws(*map(np.concatenate, zip(*batches, strict=True)))
-        if len(batches) < _FEWEST_BATCHES:
-            continue
-        worth = importance.smoothed(together.log_weight)
-        hopeless = worth.ess * _MOST_BATCHES / len(batches) < _WORTH * draws
-        if worth.pareto_k > _LARGEST_PARETO_K and len(batches) >= _TAME_BATCHES:
-            hopeless = True
-        if _is_enough(worth, draws) or hopeless or len(batches) >= _MOST_BATCHES:
-            return together, worth
-
-
-def _dealt_out(
-    weighted: importance.Draws,
-    worth: importance.Smoothed,
-    told: NDArray[np.int64],
-    draws: int,
-    seed: int,
-    evaluations: int,
-) -> Sampled:
-    """Weighted draws, each as often as its weight says, as if chains had drawn them."""
+def _resample_to_chains(
+    weighted: _WeightedDraws, monitored: NDArray[np.int64], draws: int, seed: int
+) -> PosteriorDraws:
+    """Return weighted draws resampled by their weights, in the form of chains."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
-    count = -(-max(draws, weighted.log_weight.size) // crank_nicolson.CHAINS)
-    chosen = importance.evenly(worth.weight, count * crank_nicolson.CHAINS, rng)
-    dealt = weighted.y[chosen].reshape(count, crank_nicolson.CHAINS, -1)
-    return Sampled(
+    y, worth = weighted
+    count = -(-max(draws, y.shape[0]) // convergence.CHAINS)
+    chosen = importance.systematic_resample(worth.weight, count * convergence.CHAINS, rng)
+    dealt = y[chosen].reshape(count, convergence.CHAINS, -1)
+    return PosteriorDraws(
         dealt,
-        float(crank_nicolson.split_r_hat(dealt[:, :, told]).max()),
+        float(convergence.split_r_hat(dealt[:, :, monitored]).max()),
         worth.ess,
-        worth.ess / weighted.log_weight.size,
-        evaluations,
-        Ending.STEPS_DONE,
+        worth.ess / y.shape[0],
+        y.shape[0],
+        Termination.STEPS_DONE if _is_enough(worth, draws) else Termination.STEPS_EXHAUSTED,
         worth.pareto_k,
     )
 
 
-def _by_chains(
-    target: approximation.LogDensity,
-    mixed: approximation.Mixture,
-    draws: int,
-    told: NDArray[np.int64],
-    spent: int,
-    report: Report,
-) -> Sampled:
-    """Chains that are run until they agree; STEPS_EXHAUSTED if they do not."""
-    wanted = draws // crank_nicolson.CHAINS
-    state, mixed, steps = _learnt(target, mixed, round(_LEARNING_SHARE * wanted), report)
-    kept: list[FloatArray] = []
-    acceptance: list[float] = []
-    r_hat, ess, ending = np.inf, 0.0, Ending.STEPS_EXHAUSTED
-    for number in range(_MOST_RUNS):
+def _mismatch_draws(found: Optimum, draws: int, seed: int, inflation: float) -> PosteriorDraws:
+    """Return draws with mismatch and poorly determined elements: those of `compliances`.
 
-        def step(
-            before: crank_nicolson.State,
-        ) -> tuple[crank_nicolson.State, crank_nicolson.Info]:
-            after, info = crank_nicolson.step(target, mixed, before)
-            kept.append(after.y)
-            acceptance.append(info.acceptance)
-            return after, info
-
-        def tell(count: int, info: crank_nicolson.Info, number: int = number) -> None:
-            done = (number + count / wanted) / (number + 1)
-            report("sampling the posterior", 0.7 + 0.3 * done)
-
-        state = run(partial(_begun, state), step, wanted, progress=tell).state
-        steps += wanted
-        r_hat, ess, ending = _agreement(np.stack(kept)[:, :, told])
-        if ending is Ending.STEPS_DONE:
-            break
-    evaluations = spent + crank_nicolson.CHAINS * (1 + crank_nicolson.MOVES * steps)
-    return Sampled(np.stack(kept), r_hat, ess, float(np.mean(acceptance)), evaluations, ending)
-
-
-def _sampled_on_two_roads(
-    found: optimum.Optimum, draws: int, seed: int, inflation: float
-) -> Sampled:
-    """Draws where the axles' roads differ and elements are hardly known: those of `compliances`.
-
-    The rows are not evaluated again. The truck's unknowns are known by its sensors alone, through
-    rows so exact that their curvature keeps chains from moving; what it makes of EI is far below
-    what the mismatch leaves open.
+    The residuals are not evaluated again. The truck is determined by its own sensors, through
+    residuals so exact that their curvature keeps chains from moving; its effect on EI is far below
+    the uncertainty by the mismatch.
     """
-    near = compliances.compliances(found, inflation)
-    told = _told(found.problem)
+    near = compliances.compliance_posterior(found, inflation)
+    monitored = _monitored_indices(found.problem)
     kept: list[FloatArray] = []
-    r_hat, ess, ending = np.inf, 0.0, Ending.STEPS_EXHAUSTED
+    r_hat, ess, ending = np.inf, 0.0, Termination.STEPS_EXHAUSTED
     for number in range(_MOST_RUNS):
-        first = number * crank_nicolson.CHAINS
-        streams = range(first, first + crank_nicolson.CHAINS)
-        wanted = draws // crank_nicolson.CHAINS
+        first = number * convergence.CHAINS
+        streams = range(first, first + convergence.CHAINS)
+        wanted = draws // convergence.CHAINS
         kept.append(
             np.stack([compliances.draws(near, wanted, seed, one) for one in streams], axis=1)
         )
-        r_hat, ess, ending = _agreement(np.concatenate(kept)[:, :, told])
-        if ending is Ending.STEPS_DONE:
+        r_hat, ess, ending = _convergence(np.concatenate(kept)[:, :, monitored], _WORTH * draws)
+        if ending is Termination.STEPS_DONE:
             break
-    return Sampled(np.concatenate(kept), r_hat, ess, 1.0, 0, ending)
+    return PosteriorDraws(np.concatenate(kept), r_hat, ess, 1.0, 0, ending)
 
 
-def _agreement(draws: FloatArray) -> tuple[float, float, Ending]:
-    """R-hat, effective sample size and what they say of draws (n, chains, unknowns)."""
-    r_hat = float(crank_nicolson.split_r_hat(draws).max())
-    ess = float(crank_nicolson.effective_sample_size(draws).min())
-    agrees = r_hat < LARGEST_R_HAT and ess > SMALLEST_ESS
-    return r_hat, ess, Ending.STEPS_DONE if agrees else Ending.STEPS_EXHAUSTED
+def _convergence(draws: FloatArray, least_ess: float) -> tuple[float, float, Termination]:
+    """Return R-hat, effective sample size and the verdict on draws (n, chains, parameters)."""
+    r_hat = float(convergence.split_r_hat(draws).max())
+    ess = float(convergence.effective_sample_size(draws).min())
+    agrees = r_hat < _LARGEST_R_HAT and ess > least_ess
+    return r_hat, ess, Termination.STEPS_DONE if agrees else Termination.STEPS_EXHAUSTED
 
 
-def _begun(state: crank_nicolson.State) -> crank_nicolson.State:
-    return state
+def _monitored_indices(problem: posterior.PosteriorProblem) -> NDArray[np.int64]:
+    """Return the indices in y of the parameters that must converge: rigidities and mass.
 
-
-def _learnt(
-    target: approximation.LogDensity, mixed: approximation.Mixture, count: int, report: Report
-) -> tuple[crank_nicolson.State, approximation.Mixture, int]:
-    """A state and an approximation that is accepted often enough, and the steps it took."""
-    state = crank_nicolson.init(target, mixed)
-    before, best, steps = mixed, 0.0, 0
-    for stage in range(_LEARNING_STAGES):
-        seen, acceptance = [], []
-        for number in range(count):
-            report("learning the posterior's shape", 0.5 + 0.1 * (stage + number / count))
-            state, info = crank_nicolson.step(target, mixed, state)
-            seen.append(state.v)
-            acceptance.append(info.acceptance)
-        steps += count
-        accepted = float(np.mean(acceptance))
-        if accepted < best:  # few draws teach nonsense now and then
-            return crank_nicolson.moved(target, mixed, before, state), before, steps
-        if accepted > _WELL_ACCEPTED or stage == _LEARNING_STAGES - 1:
-            break
-        best, before = accepted, mixed
-        mixed = approximation.adapted(mixed, np.stack(seen[count // 3 :]))
-        state = crank_nicolson.moved(target, before, mixed, state)
-    return state, mixed, steps
-
-
-def _told(problem: posterior.Problem) -> NDArray[np.int64]:
-    """Places in y of the unknowns that must have converged.
-
-    Not of those that may be nothing at all: a chain that seldom finds a spring says by that how
-    unlikely it is, and the rest does not depend on it.
+    Level and frequencies follow from these. Whatever of truck and supports they depend on has then
+    converged, too; the rest is no reason against a crossing.
     """
-    rows = table(element_count(problem.priors.theta))
-    kept = [rows[i] for i in np.flatnonzero(problem.priors.estimated)]
-    return np.flatnonzero([not row.may_be_zero for row in kept])
+    kept = np.flatnonzero(problem.priors.estimated)
+    mass = np.flatnonzero(kept == RHO_A)
+    return np.concatenate([posterior.layout(problem).elements, mass])

@@ -1,30 +1,31 @@
-"""Whether all sensors measure something in common that is no vertical motion of their places.
+"""Detection of a disturbance common to all sensors that is not vertical motion.
 
-Sensors mounted off the vertical by an angle measure the sine of it times the acceleration along or
-across the road, all alike. The strokes of the springs do not contain it, the inertia of the body
-does: both body equations leave it over at the same time. What friction and dampers leave over
-belongs to each axle by itself.
+Sensors mounted off the vertical by an angle measure its sine times the longitudinal or lateral
+acceleration, all equally. The strokes of the springs do not contain it, the inertia of the body
+does: it appears in both body equations at the same time. Residuals of friction and dampers are
+specific to each axle.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.posterior import Problem, filtered_rows, points
+from pre_core.crossing.posterior import PosteriorProblem, filtered_rows, points
 from pre_core.physics.simulate import rear_position_m
 
 FloatArray = NDArray[np.float64]
 
 _BAND_HZ = (3.0, 12.0)
-"""Below it, what the truck's values are off by moves both ends alike; above it there is noise."""
+"""Band: below it, errors of the truck's parameters move both ends equally; above it there is noise.
+"""
 _PART_S = 2.0
-"""Length of the half-overlapping parts of which the coherence is a mean."""
+"""Length of the half-overlapping segments of the mean coherence."""
 _FEWEST_PARTS = 3
 
 
-def coherence(problem: Problem, y: FloatArray) -> float:
+def coherence(problem: PosteriorProblem, y: FloatArray) -> float:
     """Return the real part of the coherence of both body equations' residuals, at the same time.
 
-    Of the fit y (size,), from 3 to 12 Hz, each frequency as an acceleration. Zero of a record too
+    For the fit y (size,), from 3 to 12 Hz, each frequency as an acceleration. Zero for a record too
     short for it.
     """
     crossing, rows = problem.crossing, problem.rows
@@ -36,7 +37,7 @@ def coherence(problem: Problem, y: FloatArray) -> float:
     rear_s = crossing.step_s * (
         crossing.first_row + rows.taps.size // 2 + rows.every * np.arange(body.shape[1])
     )
-    # The front equation of a row is taken when the front axle was where the rear one is.
+    # The front equation of a residual is taken when the front axle was at the rear one's place.
     sign = crossing.direction
     place_m = np.interp(rear_s, time_s, rear_m)
     front_s = np.interp(sign * place_m, sign * front_m, time_s)

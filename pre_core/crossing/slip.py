@@ -1,17 +1,17 @@
-"""Whether a channel's delay or gain changes within the record, by the rows that a fit leaves over.
+"""Detection of a change of a channel's delay or gain within the record, from a fit's residuals.
 
 A sensor that loses samples publishes the later ones too early: its delay changes by a step. The
-search estimates one delay and one gain for the whole record, so that a step is spread over truck
-and bridge. Rows are linear in the signals, and a unit step of channel c at time t_0 adds to them
+search estimates one delay and one gain for the whole record, so that a step affects truck and
+bridge instead. Residuals are linear in the signals, and a unit step of channel c at time t_0 adds
 
     g = dr/d(delay of c), of the signals from t_0 on alone,
 
-with velocity and displacement integrated from the changed acceleration, as `channels` does it. The
-score test projects the white rows on the part of g that the unknowns of the fit do not explain:
+with velocity and displacement integrated from the changed acceleration, as in `channels`. The score
+test projects the whitened residuals on the part of g that the fit's coordinates do not explain:
 
     z = (g'r - g'J S J'r) / sqrt(g'g - g'J S J'g),    S = (J'J)^-1,
 
-a standard normal where nothing changes, for every channel and every t_0.
+a standard normal without a change, for every channel and every t_0.
 """
 
 from typing import NamedTuple
@@ -21,37 +21,38 @@ from numpy.typing import NDArray
 
 from pre_core.crossing.channels import A_1, A_2, A_3, A, V, Z
 from pre_core.crossing.layout import CHANNELS
-from pre_core.crossing.posterior import Problem, points
+from pre_core.crossing.posterior import PosteriorProblem, points
 from pre_core.crossing.residuals import evaluate_white
-from pre_core.search.levenberg_marquardt import State
+from pre_core.search.levenberg_marquardt import LMState
 
 FloatArray = NDArray[np.float64]
 
 DELAY, GAIN = range(2)
 _MOMENTS = ((24, 0.0), (10, 0.15))
-"""Number of moments, evenly spaced, at which the delay and the gain of every channel may change,
-and the share of the record at either end that has none."""
+"""Number of evenly spaced times at which delay and gain of every channel may change, and the share
+of the record at either end without any."""
 _STEP = 1e-4
-"""Step of the difference in s, and relative for the gain: the rows are linear in it."""
+"""Step of the difference in s, and relative for the gain: the residuals are linear in it."""
 _LEAST_SHARE = 1e-3
-"""A step near an end of the record changes next to no row: its share of the largest norm."""
+"""Smallest norm of a step's effect relative to the largest; near an end it affects few residuals.
+"""
 
 
 class Step(NamedTuple):
     """The most significant step of one channel's delay or gain."""
 
     kind: int
-    """`DELAY` or `GAIN`."""
+    """Kind of the step: `DELAY` or `GAIN`."""
     channel: int
     time_s: float
     """Time since the first sample of the model's signals."""
     size: float
     """Time in s by which the later samples come early, or the relative change of the gain."""
     z: float
-    """Size over its standard deviation, for rows of unit variance."""
+    """Size over its standard deviation, for residuals of unit variance."""
 
 
-def largest_step(problem: Problem, state: State, covariance: FloatArray) -> Step:
+def largest_step(problem: PosteriorProblem, state: LMState, covariance: FloatArray) -> Step:
     """Return the most significant step at the optimum `state` with `covariance` (f, f) of y."""
     crossing = problem.crossing
     m = problem.noise.reciprocal.size
@@ -98,7 +99,7 @@ def largest_step(problem: Problem, state: State, covariance: FloatArray) -> Step
 
 
 def unit_step(signals: FloatArray, kind: int, moment: int, step_s: float) -> FloatArray:
-    """Return what a unit step at sample `moment` adds to the signals (6, n) of one channel."""
+    """Return the effect of a unit step at sample `moment` on the signals (6, n) of one channel."""
     out = np.zeros_like(signals)
     own, new = signals[:, moment:], out[:, moment:]
     since_s = step_s * np.arange(own.shape[1])

@@ -1,20 +1,20 @@
-"""How far a receiver's speeds are from those that a fit drives."""
+"""Deviation of a receiver's speeds from those of a fit."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.posterior import Problem, layout
+from pre_core.crossing.posterior import PosteriorProblem, layout
 
 FloatArray = NDArray[np.float64]
 
 
-def speed_bias(problem: Problem, y: FloatArray) -> float:
-    """Return how far the receiver's speeds are above those of y (size,), on average.
+def speed_bias(problem: PosteriorProblem, y: FloatArray) -> float:
+    """Return the mean excess of the receiver's speeds over those of y (size,).
 
-    In multiples of the noise of one speed.
+    The unit is the standard deviation of one speed.
     """
     where, rows = layout(problem), problem.receiver_rows
     left = problem.receiver_values - rows @ y[where.trajectory.start : where.offset + 1]
-    # The offset is in the rows of the positions and in its own, the last; speeds follow positions.
+    # The offset is in the residuals of the positions and in its own, the last; then come speeds.
     fixes = int(np.count_nonzero(rows[:, -1])) - 1
     return problem.crossing.direction * float(np.mean(left[fixes : 2 * fixes]))

@@ -1,8 +1,8 @@
-"""B-splines: values and derivatives of a basis, of a curve; curves through samples.
+"""B-splines: values and derivatives of a basis and of a curve; interpolating curves.
 
-Written out because `scipy.interpolate` takes as long to import as a crossing's search does
-(docs/benchmarks.md); tests/numerics/test_splines.py compares the two. The recurrences are those of
-de Boor (1972) and Cox (1972); beyond the ends the first and the last polynomial go on.
+Implemented here because `scipy.interpolate` takes as long to import as a crossing's search does
+(studies/benchmarks.md); tests/numerics/test_splines.py compares the two. The recurrences are those
+of de Boor (1972) and Cox (1972); the first and the last polynomial extend beyond the ends.
 """
 
 from typing import NamedTuple
@@ -24,13 +24,13 @@ class Spline(NamedTuple):
 
 
 def clamped_knots(inner: FloatArray, degree: int) -> FloatArray:
-    """Knots of curves that begin at the first and end at the last of `inner`."""
+    """Return the knots (n,) of curves from the first to the last of the points `inner` (k,)."""
     ends = np.full(degree, inner[0]), np.full(degree, inner[-1])
     return np.concatenate([ends[0], inner, ends[1]])
 
 
 def basis(knots: FloatArray, degree: int, x: FloatArray, derivative: int = 0) -> FloatArray:
-    """Values (n, b) at x (n,) of each basis function, or of its derivative."""
+    """Return the values (n, b) at x (n,) of each basis function, or of its derivative."""
     if derivative > 0:
         inner = knots[1:-1]
         lower = basis(inner, degree - 1, x, derivative - 1)
@@ -47,9 +47,9 @@ def basis(knots: FloatArray, degree: int, x: FloatArray, derivative: int = 0) ->
 
 
 def _not_zero(knots: FloatArray, degree: int, x: FloatArray) -> tuple[IntArray, FloatArray]:
-    """The first basis function (n,) that is not zero at x (n,), values (degree + 1, n) from it on.
+    """Return the first nonzero basis function (n,) at x (n,), and values (degree + 1, n) from it.
 
-    The sums of the recurrence are built up in place, from the last function to the first.
+    The sums of the recurrence are accumulated in place, from the last function to the first.
     """
     count = knots.size - degree - 1
     span = np.clip(np.searchsorted(knots, x, side="right") - 1, degree, count - 1)
@@ -58,7 +58,7 @@ def _not_zero(knots: FloatArray, degree: int, x: FloatArray) -> tuple[IntArray, 
     values = np.zeros((degree + 1, x.size))
     values[-1] = 1.0
     for k in range(1, degree + 1):
-        # Those of degree k - 1 that are not zero are the last k.
+        # The nonzero ones of degree k - 1 are the last k.
         carried = np.zeros(x.size)
         for i in range(k):
             of = degree - k + 1 + i
@@ -70,15 +70,15 @@ def _not_zero(knots: FloatArray, degree: int, x: FloatArray) -> tuple[IntArray, 
 
 
 def value_at(spline: Spline, x: FloatArray, derivative: int = 0) -> FloatArray:
-    """Values (n,) of a curve or of its derivative at x (n,)."""
+    """Return the values (n,) of a curve or of its derivative at x (n,)."""
     return np.asarray(basis(spline.knots, spline.degree, x, derivative) @ spline.coefficients)
 
 
-def through(x: FloatArray, y: FloatArray, degree: int) -> Spline:
-    """The curves through y (n, c) at x (n,), increasing, n > degree; the degree is odd.
+def interpolating_spline(x: FloatArray, y: FloatArray, degree: int) -> Spline:
+    """Return the curves through y (n, c) at x (n,), increasing, n > degree; the degree is odd.
 
-    No derivative jumps at the (degree - 1)/2 places that are next to each end (de Boor's
-    "not a knot").
+    All derivatives are continuous at the (degree - 1)/2 places next to each end (de Boor's "not a
+    knot").
     """
     ends = (degree + 1) // 2
     knots = clamped_knots(np.concatenate([x[:1], x[ends:-ends], x[-1:]]), degree)
@@ -90,7 +90,7 @@ def through(x: FloatArray, y: FloatArray, degree: int) -> Spline:
 
 
 def curves_at(spline: Spline, x: FloatArray) -> FloatArray:
-    """Values (n, c) of curves at x (n,)."""
+    """Return the values (n, c) of curves at x (n,)."""
     first, values = _not_zero(spline.knots, spline.degree, x)
     out = np.zeros((x.size, spline.coefficients.shape[1]))
     for k, value in enumerate(values):
@@ -98,16 +98,16 @@ def curves_at(spline: Spline, x: FloatArray) -> FloatArray:
     return out
 
 
-def slopes(spline: Spline) -> Spline:
-    """The curves' derivatives."""
+def derivative(spline: Spline) -> Spline:
+    """Return the curves' derivatives."""
     knots, degree = spline.knots[1:-1], spline.degree
     width = knots[degree:] - knots[:-degree]
     rise = np.diff(spline.coefficients, axis=0) * (degree / width)[:, None]
     return Spline(knots, rise, degree - 1)
 
 
-def integrals(spline: Spline) -> Spline:
-    """The curves' integrals from the first knot on."""
+def antiderivative(spline: Spline) -> Spline:
+    """Return the curves' integrals from the first knot."""
     knots, degree = spline.knots, spline.degree + 1
     width = (knots[degree:] - knots[:-degree]) / degree
     sums = np.cumsum(spline.coefficients * width[:, None], axis=0)

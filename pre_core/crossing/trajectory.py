@@ -1,4 +1,4 @@
-"""Where the front axle was at every sample: a smooth curve through a receiver's fixes.
+"""Trajectory of the front axle: a smooth curve through a receiver's fixes.
 
 The curve is a cubic B-spline x(t) that minimises
 
@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 
 _KNOT_SPACING_S = 0.5
 _JERK_M_PER_S3 = 0.3
-"""Scale of the jerk of a truck that is driven steadily, in m/s^3 over one second."""
+"""Scale of the jerk of a steadily driven truck, in m/s^3 over one second."""
 
 
 class Trajectory(NamedTuple):
@@ -42,7 +42,7 @@ def fit_trajectory(
 ) -> Trajectory:
     """Fit x(t) over [start, stop] to fixes (m,) of position and signed velocity.
 
-    Needs at least two fixes; raises ValueError otherwise.
+    Raise ValueError for fewer than two fixes.
     """
     if time_s.size < 2:
         raise ValueError("a trajectory needs at least two fixes")
@@ -62,7 +62,7 @@ def fit_trajectory(
             np.full(time_s.size, 1.0 / speed_noise_m_per_s),
         ]
     )
-    # A fit about the straight line through the fixes: the small numbers keep their digits.
+    # Fit relative to the straight line through the fixes, to keep the digits of small numbers.
     line = np.polynomial.Polynomial.fit(time_s, position_m, 1)
     measured = np.concatenate([position_m - line(time_s), velocity_m_per_s - line.deriv()(time_s)])
     system = np.vstack([fixes * weight[:, None], jerk / _JERK_M_PER_S3])
@@ -75,7 +75,10 @@ def fit_trajectory(
 
 
 def motion_at(trajectory: Trajectory, time_s: FloatArray, direction: int) -> Motion:
-    """Position, speed and acceleration (positive when speeding up) of the front axle at times."""
+    """Return position, speed and acceleration of the front axle at times (n,).
+
+    The acceleration is positive when speeding up.
+    """
     spline = trajectory.spline
     return Motion(
         value_at(spline, time_s),
@@ -84,10 +87,10 @@ def motion_at(trajectory: Trajectory, time_s: FloatArray, direction: int) -> Mot
     )
 
 
-def passing_time_s(
+def arrival_time_s(
     trajectory: Trajectory, position_m: float, direction: int, start_s: float, stop_s: float
 ) -> float:
-    """The first time at which the front axle has reached a chainage; NaN if it does not."""
+    """Return the first time at which the front axle reaches a chainage; NaN if it does not."""
     t = np.linspace(start_s, stop_s, max(2, round((stop_s - start_s) / 0.01) + 1))
     beyond = direction * (value_at(trajectory.spline, t) - position_m) >= 0.0
     first = int(np.argmax(beyond))

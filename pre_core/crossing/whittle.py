@@ -1,4 +1,4 @@
-"""How loud sources of known spectra are, by what a periodogram shows (Whittle 1953)."""
+"""Levels of sources with known spectra, from a periodogram (Whittle 1953)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,7 @@ FloatArray = NDArray[np.float64]
 _PASSES = 200
 
 
-def likeliest_levels(
+def maximum_likelihood_levels(
     seen: FloatArray,
     known: FloatArray,
     shape: FloatArray,
@@ -16,12 +16,12 @@ def likeliest_levels(
     claimed: FloatArray | float = 0.0,
     enough: float = 0.0,
 ) -> tuple[FloatArray, float]:
-    """The most likely levels (s,) of shapes (s, f) in a periodogram (f,), and what they gain.
+    """Return the most likely levels (s,) of shapes (s, f) in a periodogram (f,), and their gain.
 
-    `known` (f,) is what is there without them. The gain, over none of them, is that of the
-    log-likelihood: twice it, halved because a taper makes neighbours alike and only every other
-    frequency tells something new. Every level is multiplied by the root of what it explains over
-    what it claims (`claimed` more, by a prior) until none changes by more than `enough`.
+    `known` (f,) is the spectrum without them. The gain in log-likelihood over none of them is
+    doubled, and halved because a taper correlates neighbours, so that every other frequency is
+    independent. Every level is multiplied by the root of its explained over its claimed power
+    (`claimed` more, by a prior) until none changes by more than `enough`.
     """
     level = start
     for _ in range(_PASSES):

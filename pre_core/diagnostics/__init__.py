@@ -1,1 +1,1 @@
-"""What numbers can be trusted for: of signals, of a fit, of many crossings."""
+"""Diagnostics of signals, of a fit, and of many crossings."""

@@ -1,9 +1,9 @@
-"""What many crossings of known truth say about a method's intervals.
+"""Calibration of a method's intervals by many crossings of known truth.
 
-Each function takes errors or ranks and returns how far they are from what true intervals would
-give. Ranks and normal scores of one crossing are not independent of each other (its elements share
-a scale error, neighbours trade rigidity), so standard errors are taken between crossings, and a
-group of parameters is tested parameter by parameter.
+Each function takes errors or ranks and returns their deviation from those of true intervals. Ranks
+and normal scores of one crossing are dependent (its elements share a scale error, neighbours trade
+rigidity), so standard errors are taken between crossings, and a group of parameters is tested
+parameter by parameter.
 """
 
 from typing import NamedTuple
@@ -23,11 +23,11 @@ class Scores(NamedTuple):
     seeds: NDArray[np.int64]  # (crossings,)
     is_good: NDArray[np.bool_]  # (crossings,)
     z: FloatArray
-    """(mean - truth)/std of EI."""
+    """Normal score (mean - truth)/std of EI."""
     z_log: FloatArray
-    """The same of ln EI, whose mean and std are read off the quantiles."""
+    """Normal score of ln EI, whose mean and std come from the quantiles."""
     is_covered: NDArray[np.bool_]
-    """The truth lies between the 2.5 and 97.5 % quantiles."""
+    """Whether the truth lies between the 2.5 and 97.5 % quantiles."""
     std_log: FloatArray
     bound: FloatArray
     """Cramér-Rao bound of ln EI with the scale error."""
@@ -42,8 +42,10 @@ class Share(NamedTuple):
 
 
 def pooled_share(hits: FloatArray) -> Share:
-    """Share of hits (crossings, parameters), each 0 or 1; crossings are independent, hits in one
-    are not."""
+    """Return the share of hits (crossings, parameters), each 0 or 1.
+
+    Crossings are independent, hits in one crossing are not.
+    """
     per_crossing = hits.mean(axis=1)
     n = per_crossing.size
     error = float(per_crossing.std(ddof=1) / np.sqrt(n)) if n > 1 else float("nan")
@@ -51,24 +53,24 @@ def pooled_share(hits: FloatArray) -> Share:
 
 
 def root_mean_square(z: FloatArray) -> float:
-    """Root mean square of normal scores of any shape: 1 for true intervals."""
+    """Return the root mean square of normal scores (…): 1 for true intervals."""
     return float(np.sqrt(np.mean(z * z)))
 
 
 def rank(draws: FloatArray, truth: FloatArray) -> FloatArray:
-    """Share (p,) of draws (n, p) below the truth (p,): uniform for a true posterior.
+    """Return the share (p,) of draws (n, p) below the truth (p,): uniform for a true posterior.
 
-    Half of the draws that equal it count as below.
+    Half of the draws that equal the truth count as below.
     """
     below = np.mean(draws < truth, axis=0)
     return np.asarray(below + 0.5 * np.mean(draws == truth, axis=0))
 
 
 def rank_from_quantiles(truth: float, low: float, middle: float, high: float) -> float:
-    """The rank of the truth as far as the 2.5, 50 and 97.5 % quantiles tell.
+    """Return the rank of the truth from the 2.5, 50 and 97.5 % quantiles.
 
-    The normal score is interpolated between them, and beyond them, linearly in the logarithm where
-    all is positive, linearly otherwise: exact for a log-normal posterior, and for a normal one that
+    The normal score is interpolated between and beyond them, linearly in the logarithm if all are
+    positive, linearly otherwise: exact for a log-normal posterior, and for a normal one that
     reaches below zero. Draws (`rank`) need no such shape.
     """
     values = np.array([low, middle, high, truth])
@@ -96,13 +98,13 @@ def uniformity(ranks: FloatArray, bins: int = 10) -> Uniformity:
     return Uniformity(statistic, float(chdtrc(bins - 1, statistic)), counts)
 
 
-def group_p_value(p_values: FloatArray) -> float:
-    """Chance of the worst of k p-values under any dependence (Bonferroni)."""
+def bonferroni_p_value(p_values: FloatArray) -> float:
+    """Return the probability of the worst of p-values (k,) under any dependence (Bonferroni)."""
     return float(min(1.0, p_values.size * p_values.min()))
 
 
-def without_negative(covariance: FloatArray, i: int, centre: float) -> FloatArray:
-    """Covariance (f, f) when coordinate i, normal about `centre`, cannot be negative.
+def truncated_covariance(covariance: FloatArray, i: int, centre: float) -> FloatArray:
+    """Return the covariance (f, f) if coordinate i, normal about `centre`, cannot be negative.
 
     Its variance becomes that of the truncated normal; the others keep their regression on it.
     """

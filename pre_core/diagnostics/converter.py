@@ -1,4 +1,4 @@
-"""The step of the converter that a signal came through."""
+"""Quantisation step of the converter that recorded a signal."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _OFF_GRID = 0.01
-"""Part of a step by which values may miss a grid."""
+"""Tolerance of a grid, relative to its step."""
 _ROUNDING = 1e-9
-"""Part of the largest value below which differences are those of floating point."""
+"""Floating-point tolerance, relative to the largest value."""
 
 
 def converter_step(values: FloatArray) -> float:

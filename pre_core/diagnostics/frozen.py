@@ -1,9 +1,9 @@
-"""Stretches of a signal that no sensor measured: held at one value, or bridged by a straight line.
+"""Stretches of a signal without a measurement: held at one value, or interpolated linearly.
 
-Noise and motion change every sample and every difference of samples. Of a coarse converter
-neighbours are often alike: a stretch counts if it is longer than chance makes one in a thousand
-million records' samples, and a held one if the signal then jumps by more than the converter's
-steps, which a signal that a converter holds by itself cannot do.
+Noise and motion change every sample and every difference of samples, but a coarse converter often
+gives equal neighbours. A stretch counts if it is longer than chance produces in one of a thousand
+million records. A held one also requires that the signal then jumps by more than the converter's
+steps, which does not happen to a signal that merely stays within one step.
 """
 
 import numpy as np
@@ -12,31 +12,32 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _SHORTEST_S, _LONG_S = 0.01, 0.04
-"""No shorter stretch counts; a longer one that is held counts however many neighbours are alike."""
+"""Shortest stretch that counts, and shortest held one that counts whatever the share of equal
+neighbours."""
 _FEWEST = 5
-"""Samples of the shortest stretch that counts."""
+"""Fewest samples of a stretch that counts."""
 _CHANCE = 1e-9
-"""Probability of a stretch at one place by chance: a record has some ten thousand samples."""
+"""Probability of a random stretch at one place; a record has some ten thousand samples."""
 _COARSE_SHARE = 0.02
-"""A signal with a larger share of equal neighbours is coarse."""
+"""Share of equal neighbours above which a signal is coarse."""
 _JUMP = 4.0
-"""Steps of the converter."""
+"""Smallest jump after a held stretch, in steps of the converter."""
 _LOW_STEPS = 0.05
-"""Quantile of the changes of a coarse signal that is one step."""
+"""Quantile of the changes of a coarse signal that equals one step."""
 _STRAIGHT = 1e-3
-"""Part of the median second difference below which there is none."""
+"""Largest second difference on a line, relative to the median one."""
 _ON_GRID = 1e-3
-"""Part of a step by which changes of a quantised signal miss whole numbers of steps."""
+"""Tolerance of changes of a quantised signal, relative to a step."""
 _ROUNDING = 1e-9
-"""Part of the largest value below which differences are those of floating point."""
+"""Floating-point tolerance, relative to the largest value."""
 _BLOCKS = 8
-"""Parts of a record: where the truck is calm, more neighbours are alike."""
+"""Number of parts of a record: in calm ones more neighbours are equal."""
 
 
 def longest_hold_s(values: FloatArray, step_s: float) -> float:
-    """Return the length of the longest stretch of (n,) that is held at one value; 0 if none is.
+    """Return the duration of the longest stretch of (n,) with one value; 0 without one.
 
-    Both ends of the range are left out, where a sensor is saturated and not stuck.
+    Both ends of the range are excluded, where a sensor is saturated and not stuck.
     """
     change = np.diff(values)
     is_equal = change == 0.0
@@ -56,7 +57,7 @@ def longest_hold_s(values: FloatArray, step_s: float) -> float:
 
 
 def longest_line_s(values: FloatArray, step_s: float) -> float:
-    """Return the length of the longest stretch of (n,) that is a slanting line; 0 if none is."""
+    """Return the duration of the longest stretch of (n,) that is a sloping line; 0 without one."""
     change = np.diff(values)
     bend = np.abs(np.diff(change))
     is_bent = bend > _ROUNDING * np.abs(values).max()
@@ -64,7 +65,7 @@ def longest_line_s(values: FloatArray, step_s: float) -> float:
         return 0.0
     flat = max(_STRAIGHT * float(np.median(bend[is_bent])), float(bend[~is_bent].max(initial=0.0)))
     is_straight = (bend <= flat) & (np.abs(change[1:]) > flat) & (np.abs(change[:-1]) > flat)
-    # A quantised signal may rise by one step at every sample; a line between two values does not.
+    # A quantised signal may rise by one step at every sample; an interpolated line does not.
     step = float(np.quantile(np.abs(change[np.abs(change) > flat]), _LOW_STEPS))
     off_grid = np.abs(change / step - np.round(change / step))
     if float(np.median(off_grid)) < _ON_GRID:
@@ -98,5 +99,5 @@ def _largest_share(
 
 
 def _by_chance(share: float) -> int:
-    """Return the length that a run of flags, each true with a probability, has next to never."""
+    """Return the length that a run of flags of a given probability practically never has."""
     return int(np.ceil(np.log(_CHANCE) / np.log(min(max(share, 1e-9), 0.999))))

@@ -1,10 +1,10 @@
-"""What signals and residuals say about whether an answer can be trusted: numbers, no verdicts.
+"""Statistics of signals and residuals that decide whether an answer is reliable; no verdicts.
 
-Before the fit, of four accelerations alone: does a channel stand still or stop at an end of its
-range, do the channels obey the body equation (which contains no unknown input), does the front axle
-meet the road before the rear. After it, of the white rows: how large is their mean square, for each
-kind of residual, part of the drive and band of frequencies, and how unlikely is that by chance.
-Thresholds stand where verdicts are made.
+Before the fit, from four accelerations alone: whether a channel is stuck or saturated, whether the
+channels satisfy the body equation (which has no unknown input), whether the front axle meets the
+road before the rear. After it, from the whitened residuals: their mean square for each kind of
+residual, segment of the drive and frequency band, and its significance. The thresholds belong to
+the verdicts.
 """
 
 from itertools import permutations, product
@@ -18,35 +18,35 @@ from pre_core.diagnostics.converter import converter_step
 FloatArray = NDArray[np.float64]
 
 _BODY_BAND_HZ = (0.7, 10.0)
-"""Where bodies move on their springs; wheels hop above."""
+"""Band in which bodies vibrate on their springs; wheels hop above it."""
 _BODY_FACTOR = 4.0
-"""k/m and c/m may be so many times what is known, either way."""
+"""Range of k/m and c/m: a factor in both directions."""
 _LARGEST_COUPLING = 0.6
-"""The coupling of a pair through the pitch inertia is sought up to this, either way."""
+"""Largest absolute coupling of a pair through the pitch inertia."""
 _SAME = 1e-6
-"""Ways to connect the channels that explain as much, within this part, are the same."""
+"""Relative tolerance within which two channel assignments explain equally well."""
 _ROAD_BAND_HZ = (1.0, 8.0)
-"""Where both axles feel the road alike."""
+"""Band in which both axles follow the road equally."""
 
 
 _FINE = 0.2
-"""Part of a bin below which a converter's step does not show in it."""
+"""Largest converter step, relative to a bin, that does not show in it."""
 _FEWEST_LEVELS = 12
-"""A signal of fewer levels does not show how its density falls."""
+"""Fewest levels of a signal that show how its density decreases."""
 
 
 # Signals.
 
 
 def longest_hold(values: FloatArray) -> int:
-    """Length of the longest run of equal values (n,), in samples."""
+    """Return the length of the longest run of equal values (n,), in samples."""
     changes = np.flatnonzero(np.diff(values) != 0.0)
     edges = np.concatenate([[-1], changes, [values.size - 1]])
     return int(np.diff(edges).max())
 
 
 def smallest_difference(signals: FloatArray) -> float:
-    """Least root mean square of the difference of two of the signals (c, n), over their own."""
+    """Return the smallest RMS difference of two of the signals (c, n), relative to their RMS."""
     smallest = np.inf
     for i in range(signals.shape[0]):
         for j in range(i):
@@ -58,10 +58,10 @@ def smallest_difference(signals: FloatArray) -> float:
 
 
 def repeated_extremes(values: FloatArray, digits: float = 1e-5) -> int:
-    """How often a signal (n,) has exactly its largest or smallest value.
+    """Return how often a signal (n,) takes its maximum or its minimum, whichever is more frequent.
 
-    Zero where values are so coarse (their least step above `digits` of the largest) that repeats
-    are to be expected.
+    It is zero for coarse values (least step above `digits` of the largest), where repeats are
+    expected.
     """
     distinct = np.unique(values)
     if distinct.size < 3 or np.diff(distinct).min() > digits * np.abs(distinct).max():
@@ -72,23 +72,23 @@ def repeated_extremes(values: FloatArray, digits: float = 1e-5) -> int:
 
 
 class Rail(NamedTuple):
-    """Where the values of a signal pile up at an end of its range; see `pile_up`."""
+    """Accumulation of a signal's values at an end of its range; see `pile_up`."""
 
     ratio: float
-    """Samples in the fullest outer bin over the mean of the bins just inside it."""
+    """Samples in the fullest outer bin over the mean of the adjacent bins."""
     visits: int
-    """How many separate times the signal was there."""
+    """Number of separate times at this level."""
     level: float
 
 
 def pile_up(values: FloatArray, bins: int = 100) -> Rail:
-    """Look for a level beyond which a signal (n,) should go and does not.
+    """Detect a level that a signal (n,) should exceed and does not.
 
-    The density of a signal that is not cut off falls towards its ends: a smooth peak spends most of
+    The density of an unsaturated signal decreases towards its ends: a smooth peak spends most of
     its time at its top, yet in the uppermost hundredth only 2.4 times as long as in the next. A
-    signal that is cut off spends in the last bin all the time that it should have been beyond.
-    Both ends are looked at; the worse one is returned. Bins are no narrower than the steps of a
-    converter, of which some would hold two values and some none.
+    saturated signal spends in the last bin all the time that it should have been beyond. The worse
+    of both ends is returned. Bins are at least as wide as the steps of a converter, otherwise some
+    would hold two values and some none.
     """
     centred = values - np.median(values)
     step = converter_step(values)
@@ -108,7 +108,7 @@ def pile_up(values: FloatArray, bins: int = 100) -> Rail:
             count = bins
             place = np.floor(side * (bins / top)).astype(np.int64).clip(-1, bins - 1)
         counts = np.bincount(place[place >= 0], minlength=count).astype(np.float64)
-        # What a filter after the clipping lets through lies a little beyond the rail.
+        # A filter after the clipping overshoots the rail slightly.
         for k in range(count - 1, int(0.8 * count), -1):
             inside = counts[k - 6 : k - 1].mean()
             ratio = counts[k] / max(inside, 1.0)
@@ -120,11 +120,11 @@ def pile_up(values: FloatArray, bins: int = 100) -> Rail:
 
 
 def spikes(values: FloatArray, height: float = 20.0) -> int:
-    """Number of single samples (n,) that stand out of neighbours which go on smoothly without them.
+    """Return the number of single samples (n,) that deviate from smooth neighbours.
 
     A sample's distance from the cubic through its four nearest neighbours counts if it is more than
     `height` times the typical one, and if the two nearest lie within a seventh of it of the cubic
-    through the others: a kink or a step of the signal, as an impact makes, is no single sample.
+    through the others: a kink or step, as an impact causes, is not a single sample.
     """
     if values.size < 9:
         return 0
@@ -138,32 +138,32 @@ def spikes(values: FloatArray, height: float = 20.0) -> int:
     return int(np.count_nonzero((distance > height * typical) & alone)) if typical > 0.0 else 0
 
 
-class Pairing(NamedTuple):
-    """Which of four channels behave as body and axle, front and rear; see `pairing`."""
+class ChannelAssignment(NamedTuple):
+    """Assignment of four channels to body and axle, front and rear; see `assign_channels`."""
 
     recorded: float
-    """Part of the body's motion that the body equations leave unexplained, channels as recorded."""
+    """Share of the body's motion that the body equations do not explain, channels as recorded."""
     upright: tuple[float, float]
-    """What the front and the rear pair leave, each by itself."""
+    """Unexplained share of the front and of the rear pair."""
     reversed_: tuple[float, float]
-    """The same with the axle's sign turned round."""
+    """Unexplained shares with the axle's sign reversed."""
     best: float
-    """The same for the best other way to connect the channels."""
+    """Unexplained share of the best other assignment."""
     best_order: tuple[int, int, int, int]
-    """That way: which channel is sprung front, sprung rear, unsprung front, unsprung rear."""
+    """Channels of that assignment: sprung front, sprung rear, unsprung front, unsprung rear."""
 
 
-def pairing(
+def assign_channels(
     acceleration_m_per_s2: FloatArray,
     step_s: float,
     stiffness_per_mass: FloatArray,
     damping_per_mass: FloatArray,
-) -> Pairing:
+) -> ChannelAssignment:
     """Test the order and the signs of four accelerations (4, n) by the body equations.
 
     a_s + (c/m)(v_s - v_u) + (k/m)(z_s - z_u) + (m_12/m) a_s,other = 0 holds for the right channels
-    whatever the road and the bridge, and for hardly any others. c/m and k/m (2,) are free within a
-    factor of 4 of what is known (front, rear), the coupling within 0.6. Between 0.7 and 10 Hz.
+    on any road and bridge, and for hardly any others. c/m and k/m (2,) are free within a factor of
+    4 of their known values (front, rear), the coupling within 0.6. Between 0.7 and 10 Hz.
     """
     spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
     left: dict[tuple[int, int, int, int, bool], float] = {}
@@ -183,17 +183,17 @@ def pairing(
 
     upright = (unexplained(0, 0, 2, 1), unexplained(1, 1, 3, 0))
     best, best_order = np.inf, (0, 1, 2, 3)
-    # The one that moves the fewest channels comes first: to exchange both pairs besides makes a way
-    # just as good, but for rounding.
-    for order in sorted(permutations(range(4)), key=_moved):
+    # The assignment that moves the fewest channels comes first: exchanging both pairs as well is
+    # equally good within rounding.
+    for order in sorted(permutations(range(4)), key=_moved_channels):
         s_1, s_2, u_1, u_2 = order
-        # To exchange both pairs changes neither equation: that is for `lead`.
+        # To exchange both pairs changes neither equation: that is for `axle_correlation`.
         if order in ((0, 1, 2, 3), (1, 0, 3, 2)):
             continue
         value = max(unexplained(0, s_1, u_1, s_2), unexplained(1, s_2, u_2, s_1))
         if value < best * (1.0 - _SAME):
             best, best_order = value, (s_1, s_2, u_1, u_2)
-    return Pairing(
+    return ChannelAssignment(
         max(upright),
         upright,
         (unexplained(0, 0, 2, 1, upright=False), unexplained(1, 1, 3, 0, upright=False)),
@@ -208,7 +208,7 @@ def unexplained_by_axle(
     stiffness_per_mass: FloatArray,
     damping_per_mass: FloatArray,
 ) -> tuple[float, float]:
-    """Return `Pairing.upright` of channels (4, n), without the search for another order."""
+    """Return `ChannelAssignment.upright` of channels (4, n), without testing other orders."""
     spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
     front, rear = (
         _unexplained(
@@ -224,7 +224,7 @@ def unexplained_by_axle(
     return front, rear
 
 
-def _moved(order: tuple[int, ...]) -> int:
+def _moved_channels(order: tuple[int, ...]) -> int:
     return sum(channel != place for place, channel in enumerate(order))
 
 
@@ -234,9 +234,9 @@ def stiffness_per_mass(
     known_stiffness: FloatArray,
     known_damping: FloatArray,
 ) -> tuple[float, float]:
-    """k/m in 1/s² of front and rear by the body equations of accelerations (4, n).
+    """Return k/m in 1/s² of front and rear from the body equations of accelerations (4, n).
 
-    Within a factor of 4 of what is known, as in `pairing`.
+    They lie within a factor of 4 of the known ones (2,), as in `assign_channels`.
     """
     spectrum, omega = _spectrum(acceleration_m_per_s2, step_s, _BODY_BAND_HZ)
     found = [
@@ -276,7 +276,7 @@ def _unexplained(
     stiffness_per_mass: float,
     damping_per_mass: float,
 ) -> float:
-    """Smallest |residual|^2 of the body equation over |body|^2, constants within their bounds."""
+    """Return the smallest |residual|^2 of the body equation over |body|^2 within the bounds."""
     power = float(np.vdot(body, body).real)
     if not power > 0.0:
         return 1.0
@@ -291,7 +291,7 @@ def _constants(
     stiffness_per_mass: float,
     damping_per_mass: float,
 ) -> tuple[FloatArray, float]:
-    """The fit of the body equation: factors of k/m and c/m, and the coupling; |residual|^2."""
+    """Fit the body equation: return factors of k/m and c/m, the coupling, and |residual|^2."""
     stroke = body - axle
     columns = np.stack(
         [
@@ -305,17 +305,17 @@ def _constants(
     right = -np.concatenate([body.real, body.imag])
     low = [1.0 / _BODY_FACTOR, 0.0, -_LARGEST_COUPLING]
     high = [_BODY_FACTOR, _BODY_FACTOR, _LARGEST_COUPLING]
-    return least_squares_in_a_box(matrix, right, np.array(low), np.array(high))
+    return bounded_least_squares(matrix, right, np.array(low), np.array(high))
 
 
-def least_squares_in_a_box(
+def bounded_least_squares(
     matrix: FloatArray, right: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Minimiser x (k,) of |matrix x - right|^2 within low <= x <= high, and the minimum.
+    """Return the minimiser x (k,) of |matrix x - right|^2 within low <= x <= high, and the minimum.
 
-    `matrix` (m, k) is of full rank with few columns: every face of the box is tried (3^k), and as
-    the problem is convex, the best of the minima that lie within it is the one. (scipy.optimize has
-    it for any number, and takes longer to import than a tenth of a crossing takes.)
+    `matrix` (m, k) has full rank and few columns: every face of the box is tried (3^k). As the
+    problem is convex, the best of the minima within the box is the solution. (scipy.optimize
+    handles any number, but its import takes longer than a tenth of a crossing.)
     """
     k = low.size
     root = np.asarray(np.linalg.qr(np.column_stack([matrix, right]), mode="r"))
@@ -324,7 +324,7 @@ def least_squares_in_a_box(
     for is_free in product((True, False), repeat=k):  # all of them first
         free = np.array(is_free)
         ends = [(np.nan,) if one else (low[i], high[i]) for i, one in enumerate(is_free)]
-        x = np.array(list(product(*ends))).T  # (k, faces): those with the same unknowns free
+        x = np.array(list(product(*ends))).T  # (k, faces): those with the same free coordinates
         if free.any():
             rest = image[:, None] - triangle[:, ~free] @ x[~free]
             x[free] = np.linalg.lstsq(triangle[:, free], rest, rcond=None)[0]
@@ -339,18 +339,18 @@ def least_squares_in_a_box(
     return best, least + float(np.sum(root[k:, k] ** 2))
 
 
-def lead(
+def axle_correlation(
     front_m_per_s2: FloatArray,
     rear_m_per_s2: FloatArray,
     step_s: float,
     travelled_m: FloatArray,
     wheelbase_m: float,
 ) -> tuple[float, float]:
-    """Correlation of what both axles feel at the same place, as recorded and with them exchanged.
+    """Return the correlation of both axles' motion at the same place, as recorded and exchanged.
 
-    Below 8 Hz an axle follows the road. `travelled_m` (n,) is how far the front axle has come, at
-    every sample, increasing; the rear axle is where the front axle was a wheelbase before. With the
-    axles exchanged the one that is called rear is in front.
+    Below 8 Hz an axle follows the road. `travelled_m` (n,) is the increasing distance of the front
+    axle at every sample (n,); the rear axle is where the front axle was a wheelbase before. With
+    the axles exchanged, the one that is named rear is in front.
     """
     smooth = _band_passed(np.stack([front_m_per_s2, rear_m_per_s2]), step_s, _ROAD_BAND_HZ)
     return (
@@ -370,7 +370,7 @@ def _band_passed(signals: FloatArray, step_s: float, band_hz: tuple[float, float
 def _correlation(
     front: FloatArray, rear: FloatArray, travelled_m: FloatArray, rear_offset_m: float
 ) -> float:
-    """Correlation at the same place of signals whose places differ by an offset."""
+    """Return the correlation at the same place of signals whose places differ by an offset."""
     rear_at = travelled_m + rear_offset_m
     low, high = max(travelled_m[0], rear_at[0]), min(travelled_m[-1], rear_at[-1])
     if high - low < 2.0 * abs(rear_offset_m):
@@ -382,18 +382,18 @@ def _correlation(
     return float(a @ b / scale) if scale > 0.0 else 0.0
 
 
-# White rows.
+# Whitened residuals.
 
 
-class Cell(NamedTuple):
-    """A part of the white rows: one kind of residual, stretch of the drive and band."""
+class ResidualBin(NamedTuple):
+    """Whitened residuals of one kind, segment of the drive and band."""
 
     mean_square: float
     size: int
 
 
-def cell_excess(cell: Cell, expected: float = 1.0) -> float:
-    """How many standard deviations a mean square lies above what is expected of `size` normals.
+def cell_excess(cell: ResidualBin, expected: float = 1.0) -> float:
+    """Return how far a bin's mean square exceeds `expected`, in standard deviations.
 
     Wilson and Hilferty: the cube root of chi squared over its degrees of freedom is nearly normal.
     """
@@ -403,17 +403,17 @@ def cell_excess(cell: Cell, expected: float = 1.0) -> float:
     return float((np.cbrt(cell.mean_square / expected) - 1.0 + spread) / np.sqrt(spread))
 
 
-def cells(
+def residual_bins(
     white: FloatArray, stretches: NDArray[np.int64], step_s: float, edges_hz: FloatArray
-) -> dict[tuple[int, int, int], Cell]:
-    """Mean squares of white rows (m, kinds) by kind, stretch and band.
+) -> dict[tuple[int, int, int], ResidualBin]:
+    """Return mean squares of whitened residuals (m, kinds) by kind, segment and band.
 
-    `stretches` (m,) numbers contiguous stretches of rows. Within each the rows are turned into
-    their cosine transform, which is orthogonal: of white rows of unit variance every coefficient
-    is a standard normal, and coefficient k of n belongs to the frequency k/(2 n step). Bands lie
-    between consecutive `edges_hz`.
+    `stretches` (m,) numbers contiguous segments. Each is transformed to its cosine transform, which
+    is orthogonal: with white residuals of unit variance every coefficient is a standard normal, and
+    coefficient k of n belongs to the frequency k/(2 n step). Bands lie between consecutive
+    `edges_hz`.
     """
-    found: dict[tuple[int, int, int], Cell] = {}
+    found: dict[tuple[int, int, int], ResidualBin] = {}
     for stretch in np.unique(stretches).tolist():
         rows = white[stretches == stretch]
         power = cosine_transform(rows) ** 2
@@ -424,14 +424,14 @@ def cells(
             for kind in range(white.shape[1]):
                 count = chosen.shape[0]
                 mean = float(chosen[:, kind].mean()) if count else 0.0
-                found[kind, stretch, b] = Cell(mean, count)
+                found[kind, stretch, b] = ResidualBin(mean, count)
     return found
 
 
 def cosine_transform(rows: FloatArray) -> FloatArray:
-    """The orthogonal cosine transform (DCT-II) of columns (n, c), which need no end in common.
+    """Return the orthogonal cosine transform (DCT-II) of columns (n, c), periodic or not.
 
-    By the Fourier transform of the columns and their mirror image. (scipy.fft has it, and takes
+    It is the Fourier transform of the columns and their mirror image. (scipy.fft has it, and takes
     longer to import than this takes.)
     """
     n = rows.shape[0]
@@ -441,8 +441,8 @@ def cosine_transform(rows: FloatArray) -> FloatArray:
     return np.asarray((turn[:, None] * mirrored).real)
 
 
-def joined(parts: list[Cell]) -> Cell:
-    """Several cells as one."""
+def merge_bins(parts: list[ResidualBin]) -> ResidualBin:
+    """Return several bins as one."""
     count = sum(part.size for part in parts)
     total = sum(part.mean_square * part.size for part in parts)
-    return Cell(total / count if count else 0.0, count)
+    return ResidualBin(total / count if count else 0.0, count)

@@ -1,4 +1,4 @@
-"""Whether a receiver's speeds and its positions contradict each other."""
+"""Consistency of a receiver's speeds with its positions."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,10 @@ def speed_scale(
     noise_m: float,
     spread_m: float,
 ) -> tuple[float, float]:
-    """Return by which part the speeds are too high for the positions, and its standard deviation.
+    """Return the relative excess of the speeds over the positions, and its standard deviation.
 
-    Positions (m,) are a + b times the integrated speeds, with white noise and a slow error of
-    exponential correlation. Nothing of fewer than four fixes, whose deviation is infinite.
+    Positions (m,) are a + b times the integrated speeds (m,), with white noise and a slow error of
+    exponential correlation. Fewer than four fixes give zero with an infinite deviation.
     """
     if time_s.size < _FEWEST:
         return 0.0, np.inf

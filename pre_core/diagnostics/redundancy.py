@@ -1,17 +1,18 @@
-"""What redundant sensors of a rigid part say against one another: numbers, no verdicts.
+"""Consistency of redundant sensors on a rigid part; no verdicts.
 
-A part with more sensors than it has motions (a body shows three: above both axles, and roll; an
-axle two) has combinations of sensors in which its motion cancels. What is left of them is noise,
-unless a gain or a delay is wrong or a sensor is loose. Four sensors on the corners of a body have
-one such combination: it sees a gain that is off by some 5 %, and a delay of some ms.
+A part with more sensors than motions (a body has three: above both axles, and roll; an axle two)
+has combinations of sensors that cancel its motion. They contain noise only, unless a gain or a
+delay is wrong or a sensor is loose. Four sensors on the corners of a body have one such
+combination: it reveals a gain error of about 5 %, and a delay of some ms.
 
-It cannot see what all sensors of a part share, nor tell a wrong gain from the opposite error of a
-sensor that moves alike; then both are named. A frame that twists shows as well, and is no fault:
-what is not explained by one sensor's gain and delay counts only where it is large.
+It reveals neither errors that all sensors of a part share, nor whether a gain is wrong or another
+sensor with equal motion has the opposite error; then both are named. A frame that twists also
+shows, and is not a fault: a part that no sensor's gain and delay explains counts only if it is
+large.
 
-Left and right on an axle are not redundant: their difference is the axle's roll, which at its hop
-is several times its heave. Only physics bounds it, and loosely: one side does not move several
-times as much as the other. A gain that is off by less is not seen before the fit.
+Left and right on an axle are not redundant: their difference is the axle's roll, which near wheel
+hop is several times its heave. Only a loose physical bound holds: one side does not move several
+times as much as the other. Smaller gain errors are not detected before the fit.
 """
 
 from typing import NamedTuple
@@ -22,35 +23,36 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _BAND_HZ = (0.7, 12.0)
-"""Where bodies and axles move more than sensors hiss."""
+"""Band in which the motion of bodies and axles exceeds sensor noise."""
 
 
-class Leftover(NamedTuple):
-    """What is left where the motion of a part cancels; powers in units of the parity's noise."""
+class RedundancyResidual(NamedTuple):
+    """Power of the motion-free combinations, in units of their noise."""
 
     power: float
-    """Mean square of the combinations, over the band."""
+    """Mean square of the combinations in the band."""
     expected: float
-    """What noise, gains and delays within their spreads make of it, at `slack` deviations."""
+    """Mean square from noise, gains and delays within their spreads, at `slack` deviations."""
     motion: float
-    """What it were if every sensor moved for itself."""
+    """Mean square if all sensors moved independently."""
     unexplained: FloatArray
-    """(m,) part of the power that one sensor's gain and delay leave; NaN of sensors elsewhere."""
+    """Share (m,) of the power that one sensor's gain and delay do not explain; NaN for other
+    sensors."""
     gain: FloatArray
-    """(m,) relative error of that gain."""
+    """Relative error (m,) of that gain."""
     delay_s: FloatArray
-    """(m,) that delay, positive if the sensor is late."""
+    """Delay (m,) of that sensor, positive if late."""
 
 
-def leftover(
+def redundancy_residual(
     parity: FloatArray,
     acceleration: FloatArray,
     step_s: float,
     gain_spread: float,
     delay_spread_s: float,
     slack: float,
-) -> Leftover:
-    """Judge sensors (m, n) by the combinations `parity` (r, m) of unit one-sided noise density."""
+) -> RedundancyResidual:
+    """Compare sensors (m, n) by combinations `parity` (r, m) of unit one-sided noise density."""
     spectrum, omega = _spectrum(acceleration, step_s)
     rate = 1j * omega * spectrum
     left = parity @ spectrum
@@ -68,13 +70,13 @@ def leftover(
         rest = left.ravel() - found @ shapes
         unexplained[k] = _power(rest) / total if total > 0.0 else 0.0
         gain[k], delay[k] = found
-    return Leftover(
+    return RedundancyResidual(
         total, slack**2 * (noise + errors), float(size @ moved), unexplained, gain, delay
     )
 
 
-def apart(one: FloatArray, other: FloatArray, step_s: float) -> float:
-    """Return how many times more the livelier of two signals (n,) moves than the other."""
+def motion_ratio(one: FloatArray, other: FloatArray, step_s: float) -> float:
+    """Return the ratio of the larger to the smaller motion of two signals (n,)."""
     spectrum, _ = _spectrum(np.stack([one, other]), step_s)
     power = np.sum(np.abs(spectrum) ** 2, axis=1)
     return float(np.sqrt(power.max() / power.min())) if power.min() > 0.0 else np.inf

@@ -1,1 +1,1 @@
-"""What several crossings of one bridge say together."""
+"""Estimates from several crossings of one bridge."""

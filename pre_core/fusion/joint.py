@@ -1,13 +1,13 @@
-"""One bridge from the likelihoods of several crossings: each prior counts once.
+"""One bridge from the likelihoods of several crossings, with each prior once.
 
-The unknowns are the bridge's; each truck's, with its total mass; and, of each track (a truck in one
-direction), the long waves of the part of the mismatch that its runs share, which no number of them
-averages out. A crossing has of its own the rest of those waves, and a change of every element's
-compliance: between crossings EI changes with temperature and with what the model lacks, by a
-relative standard deviation tau of which a share rho is common to all elements. All that is normal
-is integrated out; tau and rho are looked at on a grid.
+The coordinates are those of the bridge; of each truck, with its total mass; and, for each
+wheel-path group (a truck in one direction), the long waves of the shared mismatch, which do not
+average out. A crossing has of its own the other part of those waves, and a change of every
+element's compliance: between crossings EI varies with temperature and with effects that the model
+lacks, by a relative standard deviation tau of which a share rho is common to all elements. Normal
+variables are integrated out; tau and rho are evaluated on a grid.
 
-Longer than other modules: all of it goes by one layout of all unknowns.
+Longer than other modules: all of it uses one layout of all coordinates.
 """
 
 from collections.abc import Collection, Sequence
@@ -18,70 +18,89 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.compliances import Compliances, draws, marginal, of_normal
-from pre_core.fusion.between import Between, between_of, changed, may_be_zero, of_change, tau_draws
-from pre_core.fusion.likelihood import Likelihood, loosened, straightened
-from pre_core.fusion.sums import BridgePriors, Joint, Layout, Ready
-from pre_core.fusion.tracks import Key, Part, Shared, Track, key_of, tracks_of
-from pre_core.search.crank_nicolson import CHAINS
-from pre_core.search.levenberg_marquardt import minimised
+from pre_core.crossing.compliances import CompliancePosterior, draws, from_normal, marginal
+from pre_core.fusion.information import (
+    BridgePriors,
+    CrossingInformation,
+    JointInformation,
+    JointLayout,
+)
+from pre_core.fusion.likelihood import CrossingLikelihood, add_covariance, linearised_likelihood
+from pre_core.fusion.path_groups import (
+    FusionInput,
+    PathGroup,
+    PathGroupKey,
+    SharedMismatch,
+    path_group_key,
+    path_groups,
+)
+from pre_core.fusion.variability import (
+    VariabilityPosterior,
+    is_consistent_with_zero,
+    marginalise_variability,
+    tau_draws,
+    variability_posterior,
+    varying_bridge,
+)
+from pre_core.search.convergence import CHAINS
+from pre_core.search.levenberg_marquardt import minimise
 from pre_core.search.loop import Report
 
 FloatArray = NDArray[np.float64]
 
 _USUAL = (0.03, 0.3)
-"""tau and rho by which the bridge is found about which it changes."""
+"""Values of tau and rho for the bridge about which likelihoods are linearised."""
 _SETTLED = 0.01
-"""Of a compliance and of the other unknowns' coordinates: far within what is known of them."""
+"""Tolerance of a compliance and of other coordinates, far below their uncertainty."""
 _MOST_STEPS, _ENOUGH = 60, 1e-6
 _PASSES = 12
-"""Of finding the bridge about which it changes, and crossings' likelihoods are normal."""
+"""Largest number of linearisations about the current estimate."""
 
 
-class Fused(NamedTuple):
-    """Draws of the bridge's unknowns in the coordinates of `crossing.posterior`."""
+class FusedDraws(NamedTuple):
+    """Draws of the bridge's parameters in the coordinates of `crossing.posterior`."""
 
     draws: FloatArray  # (n, chains, b): the bridge's, elements last
     between: FloatArray
-    """(n, chains) the standard deviation tau of ln EI between crossings."""
+    """Standard deviation tau of ln EI between crossings, (n, chains)."""
     between_may_be_zero: bool
-    """Whether no tau is much likelier than none at all."""
-    tracks: tuple[Shared, ...]
+    """Whether tau is consistent with zero."""
+    tracks: tuple[SharedMismatch, ...]
 
 
-def fuse(parts: Sequence[Part], priors: BridgePriors, count: int, seed: int) -> Fused:
-    """Draws of a bridge, `count` of each chain, from crossings with the coordinates of `priors`.
+def fuse(parts: Sequence[FusionInput], priors: BridgePriors, count: int, seed: int) -> FusedDraws:
+    """Return draws of a bridge, `count` of each chain, from crossings in coordinates of `priors`.
 
-    The order of the parts does not matter. ValueError without parts.
+    The order of the parts does not matter. Raise ValueError without parts.
     """
     if not parts:
         raise ValueError("no crossings to fuse")
-    return fuse_joined(join(parts, priors), priors, count, seed)
+    return sample_joint(build_joint(parts, priors), priors, count, seed)
 
 
-def fuse_joined(
-    joint: Joint,
+def sample_joint(
+    joint: JointInformation,
     priors: BridgePriors,
     count: int,
     seed: int,
     report: Report = lambda stage, fraction: None,
     threads: int = 1,
-) -> Fused:
-    """As `fuse`, of crossings that are ready; the draws do not depend on the number of threads."""
-    between = between_of(joint, priors)
-    drawn = _drawn(joint, priors, between, count, seed, report, threads)
-    return Fused(*drawn, may_be_zero(between), joint.shared)
+) -> FusedDraws:
+    """Return draws as `fuse` does, from a joint; they do not depend on the number of threads."""
+    between = variability_posterior(joint, priors)
+    drawn = _draw_bridge(joint, priors, between, count, seed, report, threads)
+    return FusedDraws(*drawn, is_consistent_with_zero(between), joint.shared)
 
 
-def join(
-    parts: Sequence[Part], priors: BridgePriors, trusted: Collection[str] | None = None
-) -> Joint:
-    """Crossings with what is their own integrated out, but for the change of the bridge.
+def build_joint(
+    parts: Sequence[FusionInput], priors: BridgePriors, trusted: Collection[str] | None = None
+) -> JointInformation:
+    """Return crossings with their own variables integrated out, except the bridge's change.
 
-    Changes are relative to what all give together, or the `trusted` of them by name.
+    Changes are relative to the estimate from all, or from the `trusted` of them by name.
     """
     parts = sorted(parts, key=lambda part: part.name)
-    tracks = tracks_of(parts)
+    tracks = path_groups(parts)
     layout = _layout_of(parts, tracks, priors)
     prior = _prior(layout, tracks)
     shared = tuple(track.shared for track in tracks.values())
@@ -90,27 +109,33 @@ def join(
     for number in range(_PASSES):
         bridge = centre if number else None
         ready = tuple(
-            _ready(_about(part, tracks, bridge), layout, tracks, priors, centre) for part in parts
+            _crossing_information(
+                _linearised_about(part, tracks, bridge), layout, tracks, priors, centre
+            )
+            for part in parts
         )
-        joint = Joint(names, layout, ready, prior, centre, shared)
-        # Without a change crossings surer than the bridge is steady would lead it astray.
-        of = of_change(joint._replace(ready=joint.of(trusted)))
-        before, centre = centre, _most_likely(layout, priors, *changed(joint, of, *_USUAL)[:2])
+        joint = JointInformation(names, layout, ready, prior, centre, shared)
+        # Without a change, crossings more precise than the bridge is constant would bias it.
+        of = varying_bridge(joint._replace(ready=joint.select(trusted)))
+        before, centre = (
+            centre,
+            _most_likely(layout, priors, *marginalise_variability(joint, of, *_USUAL)[:2]),
+        )
         if np.all(np.abs(centre - before) < _SETTLED):
             break
     return joint._replace(centre=centre)
 
 
 def _most_likely(
-    layout: Layout, priors: BridgePriors, precision: FloatArray, linear: FloatArray
+    layout: JointLayout, priors: BridgePriors, precision: FloatArray, linear: FloatArray
 ) -> FloatArray:
-    """The likeliest bridge (b,) by a sum of crossings and its own priors, log-normal in EI.
+    """Return the most likely bridge (b,) from a sum of crossings and priors, log-normal in EI.
 
-    Where crossings hardly tell elements apart normal priors of c would let neighbours take turns at
-    being stiff; likelihoods that are made normal there say little of the bridge.
+    Where crossings hardly separate elements, normal priors of c would let neighbours alternate
+    between stiff and weak; likelihoods linearised there are uninformative.
     """
-    told, pull = marginal(precision, linear, np.arange(layout.bridge))
-    root = np.linalg.cholesky(told).T
+    reduced, pull = marginal(precision, linear, np.arange(layout.bridge))
+    root = np.linalg.cholesky(reduced).T
     target = np.linalg.solve(root.T, pull)
     sigma = priors.coordinates.scale[layout.elements]
 
@@ -123,29 +148,31 @@ def _most_likely(
         return np.concatenate([bridge(y) @ root.T - target, y], axis=1)
 
     lower = np.where(priors.coordinates.is_log, -np.inf, 0.0)
-    found = minimised(rows, np.zeros(layout.bridge), _MOST_STEPS, _ENOUGH, lower)
+    found = minimise(rows, np.zeros(layout.bridge), _MOST_STEPS, _ENOUGH, lower)
     return bridge(found.state.y[None, :])[0]
 
 
-def alone(part: Part, priors: BridgePriors) -> Joint:
-    """One crossing by itself, about what it says of the bridge; its waves are its own."""
-    tracks = tracks_of([part])
+def single_crossing_joint(part: FusionInput, priors: BridgePriors) -> JointInformation:
+    """Return one crossing as a joint, about its own estimate; its waves are its own."""
+    tracks = path_groups([part])
     layout = _layout_of([part], tracks, priors)
     centre = _nominal(layout)
-    ready = _ready(_about(part, tracks, None), layout, tracks, priors, centre)
+    ready = _crossing_information(
+        _linearised_about(part, tracks, None), layout, tracks, priors, centre
+    )
     shared = tuple(track.shared for track in tracks.values())
-    return Joint((part.name,), layout, (ready,), _prior(layout, tracks), centre, shared)
+    return JointInformation((part.name,), layout, (ready,), _prior(layout, tracks), centre, shared)
 
 
-def _nominal(layout: Layout) -> FloatArray:
-    """(b,) of a bridge as the site file has it."""
+def _nominal(layout: JointLayout) -> FloatArray:
+    """Return the coordinates (b,) of the nominal bridge."""
     centre = np.zeros(layout.bridge)
     centre[layout.elements] = 1.0
     return centre
 
 
-def _prior(layout: Layout, tracks: dict[Key, Track]) -> FloatArray:
-    """Precision (n, n) of trucks and tracks before any crossing."""
+def _prior(layout: JointLayout, tracks: dict[PathGroupKey, PathGroup]) -> FloatArray:
+    """Return the prior precision (n, n) of trucks and wheel-path groups."""
     prior = np.zeros((layout.size, layout.size))
     for places in layout.trucks.values():
         prior[places, places] = 1.0
@@ -156,16 +183,22 @@ def _prior(layout: Layout, tracks: dict[Key, Track]) -> FloatArray:
     return prior
 
 
-def _about(part: Part, tracks: dict[Key, Track], bridge: FloatArray | None) -> Part:
-    """The crossing with a likelihood that is normal about a `bridge` (b,); None: the crossing's."""
-    told = part.likelihood
-    if told.bends is None:
+def _linearised_about(
+    part: FusionInput, tracks: dict[PathGroupKey, PathGroup], bridge: FloatArray | None
+) -> FusionInput:
+    """Return the crossing linearised about a `bridge` (b,); None: about its own estimate."""
+    of = part.likelihood
+    if of.bends is None:
         return part
-    at = told.bends.about if bridge is None else bridge
-    return part._replace(likelihood=straightened(told, at, tracks[key_of(part)].whole))
+    at = of.bends.about if bridge is None else bridge
+    return part._replace(
+        likelihood=linearised_likelihood(of, at, tracks[path_group_key(part)].whole)
+    )
 
 
-def _layout_of(parts: Sequence[Part], tracks: dict[Key, Track], priors: BridgePriors) -> Layout:
+def _layout_of(
+    parts: Sequence[FusionInput], tracks: dict[PathGroupKey, PathGroup], priors: BridgePriors
+) -> JointLayout:
     b = len(priors.coordinates.names)
     size, trucks, places = b, {}, {}
     for part in parts:
@@ -173,53 +206,53 @@ def _layout_of(parts: Sequence[Part], tracks: dict[Key, Track], priors: BridgePr
             own = len(part.likelihood.truck.names) + 1
             trucks[part.truck] = size + np.arange(own)
             size += own
-        key = key_of(part)
+        key = path_group_key(part)
         if key not in places and key in tracks and tracks[key].common is not None:
             q = part.likelihood.knots_m.size
             places[key] = size + np.arange(q)
             size += q
-    return Layout(b, np.arange(b - priors.elements, b), trucks, places, size)
+    return JointLayout(b, np.arange(b - priors.elements, b), trucks, places, size)
 
 
-def _ready(
-    part: Part,
-    layout: Layout,
-    tracks: dict[Key, Track],
+def _crossing_information(
+    part: FusionInput,
+    layout: JointLayout,
+    tracks: dict[PathGroupKey, PathGroup],
     priors: BridgePriors,
     centre: FloatArray,
-) -> Ready:
+) -> CrossingInformation:
     of, b = part.likelihood, layout.bridge
     truck = layout.trucks[part.truck]
-    precision, linear = mass_freed(of, part.mass_spread, priors, centre)
+    precision, linear = add_mass_parameter(of, part.mass_spread, priors, centre)
     places = np.concatenate([np.arange(b), truck])
-    key = key_of(part)
+    key = path_group_key(part)
     if key in tracks:
         q = of.knots_m.size
         along = np.zeros((linear.size, q))
         along[-q:] = np.eye(q)
-        precision, linear = loosened(precision, linear, along, tracks[key].own_root)
+        precision, linear = add_covariance(precision, linear, along, tracks[key].own_root)
         if key in layout.tracks:
             places = np.concatenate([places, layout.tracks[key]])
-        else:  # nothing else moves these waves
+        else:  # no other variable affects these waves
             precision, linear = precision[:-q, :-q], linear[:-q]
-    return Ready(precision, linear, places)
+    return CrossingInformation(precision, linear, places)
 
 
-def mass_freed(
-    of: Likelihood, spread: float, priors: BridgePriors, centre: FloatArray
+def add_mass_parameter(
+    of: CrossingLikelihood, spread: float, priors: BridgePriors, centre: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Precision and linear part of bridge, truck, unit normal of the mass, and waves.
+    """Return precision and linear part of bridge, truck, unit normal of the mass, and waves.
 
-    The mass scales truck and bridge alike: what is found of the bridge lies aside of what it is.
+    The mass scales truck and bridge together; `centre` (b,) is the bridge that is scaled.
     """
     b, t = len(of.bridge.names), len(of.truck.names)
-    heavier = of.root[:, :b] @ (spread * with_mass(priors, centre))[:, None]
+    heavier = of.root[:, :b] @ (spread * mass_sensitivity(priors, centre))[:, None]
     root = np.hstack([of.root[:, : b + t], heavier, of.root[:, b + t :]])
     return root.T @ root, root.T @ of.target
 
 
-def with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
-    """How the bridge's coordinates (b,) at `centre` change with the logarithm of the total mass."""
+def mass_sensitivity(priors: BridgePriors, centre: FloatArray) -> FloatArray:
+    """Return the derivative (b,) of the bridge's coordinates at `centre` (b,) by ln of the mass."""
     of, power = priors.coordinates, priors.mass_powers
     change = np.where(of.is_log, power / of.scale, power * centre)
     elements = np.arange(centre.size - priors.elements, centre.size)
@@ -227,26 +260,26 @@ def with_mass(priors: BridgePriors, centre: FloatArray) -> FloatArray:
     return np.asarray(change)
 
 
-def _drawn(
-    joint: Joint,
+def _draw_bridge(
+    joint: JointInformation,
     priors: BridgePriors,
-    between: Between,
+    between: VariabilityPosterior,
     count: int,
     seed: int,
     report: Report,
     threads: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Draws (count, chains, b) of the bridge's coordinates, and of tau (count, chains)."""
+    """Return draws (count, chains, b) of the bridge's coordinates, and of tau (count, chains)."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 22,)))
-    # As many of each as its weight says, but for chance: systematic sampling.
+    # Systematic sampling: the number of draws of each follows its weight.
     at = (np.arange(count) + rng.random()) / count
     chosen = np.minimum(np.searchsorted(np.cumsum(between.weight), at), between.weight.size - 1)
-    of = of_change(joint)
+    of = varying_bridge(joint)
     steps, taus = [], []
     for k in np.unique(chosen):
         some = int((chosen == k).sum())
         tau, rho = float(between.tau[k]), float(between.rho[k])
-        density = _posterior(joint, priors, *changed(joint, of, tau, rho)[:2])
+        density = _posterior(joint, priors, *marginalise_variability(joint, of, tau, rho)[:2])
         steps.append(_Step(density, some, (int(k) + 1) * CHAINS))
         taus.append(tau_draws(between, int(k), (some, CHAINS), rng))
     of_chains: list[FloatArray] = []
@@ -259,16 +292,16 @@ def _drawn(
 
 
 class _Step(NamedTuple):
-    """A change between crossings of which some draws are wanted."""
+    """A set of draws for one value of the variability."""
 
-    density: Compliances
+    density: CompliancePosterior
     number: int
     stream: int
-    """Of the random numbers of the first chain."""
+    """Stream of random numbers of the first chain."""
 
 
 def _chain(steps: Sequence[_Step], seed: int, chain: int) -> FloatArray:
-    """One chain's draws (count, b) of all steps: from one change to the next little moves."""
+    """Return one chain's draws (count, b) of all steps; successive steps differ little."""
     out: list[FloatArray] = []
     for step in steps:
         after = out[-1][-1] if out else None
@@ -277,14 +310,14 @@ def _chain(steps: Sequence[_Step], seed: int, chain: int) -> FloatArray:
 
 
 def _posterior(
-    joint: Joint, priors: BridgePriors, precision: FloatArray, linear: FloatArray
-) -> Compliances:
-    """A sum of crossings times the priors, with what is not the bridge's integrated out."""
+    joint: JointInformation, priors: BridgePriors, precision: FloatArray, linear: FloatArray
+) -> CompliancePosterior:
+    """Return a sum of crossings times the priors, marginal in the bridge's coordinates."""
     layout, of = joint.layout, priors.coordinates
     precision, linear = marginal(precision, linear, np.arange(layout.bridge))
     single = np.arange(layout.bridge - priors.elements)
     precision[single, single] += 1.0
-    return of_normal(
+    return from_normal(
         precision,
         linear,
         layout.elements,

@@ -1,1 +1,1 @@
-"""What the vector kernels are written in: four lanes, Jacobi's eigenvalues, one filter."""
+"""Building blocks of the vector kernels: four lanes, Jacobi eigenvalues, one filter."""

@@ -1,9 +1,9 @@
-"""Eigenvalues and eigenvectors of small symmetric matrices: one, or four at once.
+"""Eigenvalues and eigenvectors of small symmetric matrices, one or four at once.
 
-A LAPACK call on one 14 x 14 matrix costs more than the time integration it serves. Cyclic Jacobi
-rotations (Golub and Van Loan, Matrix Computations, section 8.5) are branch-free, so that four
-matrices share the vector registers, and they are quick here because the caller hands over matrices
-that are already nearly diagonal.
+A LAPACK call for one 14 x 14 matrix costs more than the time integration that it serves. Cyclic
+Jacobi rotations (Golub and Van Loan, Matrix Computations, section 8.5) are branch-free, so that
+four matrices share the vector registers. They are fast here because the matrices are nearly
+diagonal.
 """
 
 import numpy as np
@@ -14,22 +14,22 @@ from pre_core.kernels.lanes import LANES, Lanes, fma, kernel, load, mul, store
 FloatArray = NDArray[np.float64]
 
 MAX_SWEEPS = 30
-"""Where all numbers are finite a few sweeps do; this bounds the others."""
+"""Bound for matrices with values that are not finite; others need a few sweeps."""
 _NEGLIGIBLE = 1e-16
-"""A sweep that begins with a_pq^2/(a_pp a_qq) below this is the last: convergence is quadratic, so
-that what it leaves is far below rounding."""
+"""Largest a_pq^2/(a_pp a_qq) before the last sweep: convergence is quadratic, so that the remainder
+is far below rounding."""
 
 
 @kernel
 def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArray) -> float:
-    """Cosine and sine (4,) that annul a_pq, and how far a_pq was from negligible (> 0: not)."""
+    """Compute cosine and sine (4,) that annul a_pq; return its excess over negligible."""
     left = -1.0
     for lane in range(LANES):
         off = a[p, q, lane]
         app = a[p, p, lane]
         aqq = a[q, q, lane]
         half = 0.5 * (aqq - app)
-        root = np.sqrt(half * half + off * off) + 1e-300  # no 0/0 where nothing is to be done
+        root = np.sqrt(half * half + off * off) + 1e-300  # avoid 0/0 where a_pq is zero
         t = off / (half + (root if half >= 0.0 else -root))
         c = 1.0 / np.sqrt(1.0 + t * t)
         cosine[lane] = c
@@ -40,7 +40,7 @@ def _rotation(a: FloatArray, p: int, q: int, cosine: FloatArray, sine: FloatArra
 
 @kernel
 def _rotate(x: FloatArray, i: int, y: FloatArray, j: int, c: Lanes, s: Lanes, n: Lanes) -> None:
-    """Rows i of x and j of y become c x - s y and s x + c y; n is -s."""
+    """Replace rows i of x and j of y by c x - s y and s x + c y; n is -s."""
     xi = load(x, i)
     yj = load(y, j)
     store(x, i, fma(c, xi, mul(n, yj)))
@@ -52,8 +52,8 @@ def diagonalise(a: FloatArray, v: FloatArray) -> bool:
     """Rotate `a` (m, m, 4) to diagonal form, four matrices at once; both are modified in place.
 
     Only the upper triangle of `a` is read and kept. On return its diagonal holds the eigenvalues,
-    unsorted, and the *rows* of `v` (m, m, 4) the orthonormal eigenvectors. False if some matrix
-    does not get there in MAX_SWEEPS (which happens only where it holds a value that is not finite).
+    unsorted, and the *rows* of `v` (m, m, 4) the orthonormal eigenvectors. Return False if a matrix
+    does not converge in MAX_SWEEPS, which happens only with values that are not finite.
     """
     m = a.shape[0]
     v[:] = 0.0
@@ -94,25 +94,25 @@ def diagonalise(a: FloatArray, v: FloatArray) -> bool:
 
 @kernel
 def diagonalise_one(a: FloatArray, v: FloatArray) -> bool:
-    """The same for one matrix `a` (m, m), of which both triangles are read; `v` is (m, m).
+    """Rotate one matrix `a` (m, m) to diagonal form, reading both triangles; `v` is (m, m).
 
-    Here a rotation that would change nothing is skipped, which four matrices cannot agree on. And
-    the matrix is turned end for end meanwhile: the modes of a beam rise by powers of ten, and a
-    matrix so graded takes half as many sweeps from its large end.
+    Unlike `diagonalise` it skips rotations without effect, which four matrices cannot agree on. It
+    also reverses the matrix meanwhile: beam modes rise by powers of ten, and a matrix graded in
+    this way needs half as many sweeps from its large end.
     """
-    _turn(a)
+    _reverse(a)
     v[:] = 0.0
     for k in range(a.shape[0]):
         v[k, k] = 1.0
-    is_done = _swept(a, v)
-    _turn(a)
-    _turn(v)
+    is_done = _sweep(a, v)
+    _reverse(a)
+    _reverse(v)
     return is_done
 
 
 @kernel
-def _turn(x: FloatArray) -> None:
-    """Last row and last column first, in place."""
+def _reverse(x: FloatArray) -> None:
+    """Reverse the order of rows and columns in place."""
     flat = x.reshape(x.size)
     last = x.size - 1
     for i in range(x.size // 2):
@@ -120,10 +120,10 @@ def _turn(x: FloatArray) -> None:
 
 
 @kernel
-def _swept(a: FloatArray, v: FloatArray) -> bool:
-    """Cyclic sweeps over the upper triangle of `a` (m, m), each rotation into the rows of `v` too.
+def _sweep(a: FloatArray, v: FloatArray) -> bool:
+    """Sweep over the upper triangle of `a` (m, m) until it converges; rotate rows of `v` too.
 
-    The indices have no sign: of one that has, every access asks whether it counts from the end.
+    Indices are unsigned: with signed ones, every access would test for counting from the end.
     """
     one = np.uintp(1)
     m = np.uintp(a.shape[0])
@@ -135,7 +135,7 @@ def _swept(a: FloatArray, v: FloatArray) -> bool:
                 size = off * off
                 if size <= _NEGLIGIBLE**2 * np.abs(app * aqq):
                     continue
-                # Written so that a NaN counts as something left.
+                # Written so that a NaN counts as not converged.
                 left = left or not size <= _NEGLIGIBLE * np.abs(app * aqq)
                 half = 0.5 * (aqq - app)
                 root = np.sqrt(half * half + size)

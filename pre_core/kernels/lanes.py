@@ -1,43 +1,50 @@
-"""Four numbers at once: the vocabulary of the vector kernels.
+"""Operations on four numbers at once: the vocabulary of the vector kernels.
 
-A `Lanes` is a tuple of four floats, one for each of four particles (or four modes). Written this
-way, numba's compiler keeps each tuple in one 256-bit register, which it does not manage for short
-inner loops over arrays. None of the functions allocates.
+A `Lanes` is a tuple of four floats, one for each of four particles (or four modes). In this form
+numba's compiler keeps each tuple in one 256-bit register, which it does not achieve for short inner
+loops over arrays. None of the functions allocates.
 """
 
 from functools import partial
 
 import numpy as np
-from numba import njit
+from numba import config, njit
 from numpy.typing import NDArray
+
+# LLVM packs the tuples into vector registers only with its superword pass, which numba leaves off.
+# It changes speed alone. The cache of compiled kernels does not know the flag, so every kernel is
+# compiled by `compiled` below, and none before this line.
+setattr(config, "SLP_VECTORIZE", 1)  # noqa: B010 - the type stubs do not know it
 
 FloatArray = NDArray[np.float64]
 Lanes = tuple[float, float, float, float]
 
 LANES = 4
 
+compiled = partial(njit, cache=True, nogil=True)
+
 # A kernel that calls another one holds a copy of it, optimised once more with it: rounded otherwise
 # than the first one. Which of them is run, where it is not inlined, depends on which was loaded
 # first; a process that compiled gave other last digits than one that loaded. So all are inlined.
-_compiled = partial(njit, error_model="numpy", cache=True, nogil=True, forceinline=True)
+_inlined = partial(compiled, error_model="numpy", forceinline=True)
 
 # Contraction allows fused multiply-add; no other reordering of the arithmetic is allowed, so that
 # results depend only to rounding on which particles are evaluated together.
-kernel = _compiled(fastmath={"contract", "nsz"})
+kernel = _inlined(fastmath={"contract", "nsz"})
 
 # For sums over many terms, which may be taken in any order.
-summing = _compiled(fastmath={"contract", "nsz", "reassoc"})
+summing = _inlined(fastmath={"contract", "nsz", "reassoc"})
 
 
 @kernel
 def load(a: FloatArray, i: int) -> Lanes:
-    """Row i of a (n, 4) array."""
+    """Return row i of an array (n, 4)."""
     return (a[i, 0], a[i, 1], a[i, 2], a[i, 3])
 
 
 @kernel
 def store(a: FloatArray, i: int, v: Lanes) -> None:
-    """Write row i of a (n, 4) array."""
+    """Write row i of an array (n, 4)."""
     a[i, 0] = v[0]
     a[i, 1] = v[1]
     a[i, 2] = v[2]
@@ -46,35 +53,35 @@ def store(a: FloatArray, i: int, v: Lanes) -> None:
 
 @kernel
 def add(a: Lanes, b: Lanes) -> Lanes:
-    """a + b."""
+    """Return a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3])
 
 
 @kernel
 def sub(a: Lanes, b: Lanes) -> Lanes:
-    """a - b."""
+    """Return a - b."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3])
 
 
 @kernel
 def mul(a: Lanes, b: Lanes) -> Lanes:
-    """a b."""
+    """Return a b."""
     return (a[0] * b[0], a[1] * b[1], a[2] * b[2], a[3] * b[3])
 
 
 @kernel
 def scale(a: Lanes, s: float) -> Lanes:
-    """a s, with one s for all lanes."""
+    """Return a s, with one s for all lanes."""
     return (a[0] * s, a[1] * s, a[2] * s, a[3] * s)
 
 
 @kernel
 def fma(a: Lanes, b: Lanes, c: Lanes) -> Lanes:
-    """a b + c."""
+    """Return a b + c."""
     return (a[0] * b[0] + c[0], a[1] * b[1] + c[1], a[2] * b[2] + c[2], a[3] * b[3] + c[3])
 
 
 @kernel
 def fma_scalar(a: Lanes, s: float, c: Lanes) -> Lanes:
-    """a s + c, with one s for all lanes."""
+    """Return a s + c, with one s for all lanes."""
     return (a[0] * s + c[0], a[1] * s + c[1], a[2] * s + c[2], a[3] * s + c[3])

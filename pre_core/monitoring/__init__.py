@@ -1,1 +1,1 @@
-"""A bridge over years: what crossings say of its change, and when that is more than chance."""
+"""A bridge over years: observations of its change, and their significance."""

@@ -1,19 +1,19 @@
 """A bridge's baseline: ln EI at a reference temperature, its usual movements, and shared errors.
 
 Every period has an observation y of ln EI with own covariance R and loadings K on unit normals z
-that other periods have too (trucks, tracks, the bridge's other unknowns):
+that it shares with other periods (trucks, wheel-path groups, the other bridge parameters):
 
     y = mu + beta (T - T_0) + wander + K z + own + change,
     change ~ N(0, q^2 C),    wander: Ornstein-Uhlenbeck of standard deviation s, memory tau,
 
-with C = (1 - rho) I + rho 1 1'. A period of unknown temperature has instead of beta (T - T_0) an
-annual wave of unknown amplitude and phase in each element, half an annual one and an offset common
-to all, and the weather's deviation from it as noise.
+with C = (1 - rho) I + rho 1 1'. Without a temperature, beta (T - T_0) is replaced by an annual wave
+of unknown amplitude and phase in each element, half an annual one and an offset common to all, and
+the weather's deviation from it as noise.
 
-mu, beta, wander, season and z are one normal state, followed by a Kalman filter. q, s and tau are
-unknown: the filter runs for each of `scales_compared()` at once, and each run's weight is its prior
-times the density of what was observed. Innovations of a bridge that does not change are
-independent of each other, whatever periods share, for what they share is in the prediction.
+mu, beta, wander, season and z are one normal state of a Kalman filter. q, s and tau are unknown:
+the filter runs for each of `scales_compared()` at once, and the weight of each run is its prior
+times the density of the observations. Innovations of an unchanged bridge are independent even if
+periods share errors, because the prediction contains the shared part.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,37 +22,37 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.fusion.between import BETWEEN_SCALE
-from pre_core.monitoring.observation import Observation, Shared
+from pre_core.fusion.variability import BETWEEN_SCALE
+from pre_core.monitoring.observation import Observation, SharedError
 
 FloatArray = NDArray[np.float64]
 
 REFERENCE_DEG_C = 10.0
 LEVEL_SPREAD = 1.0
-"""Prior standard deviation of ln EI: next to nothing is known."""
+"""Prior standard deviation of ln EI, nearly uninformative."""
 SLOPE_SPREAD, SLOPE_SPREAD_OWN = 4e-3, 1e-3
 """Prior of d ln EI/dT in 1/K, common to all elements and own of each: concrete and asphalt lose
-some tenths of a per cent a kelvin."""
+some tenths of a per cent per kelvin."""
 SEASON_K, HALF_SEASON_K, OFFSET_K, WEATHER_K = 11.0, 3.0, 8.0, 4.0
-"""Temperature in K, as standard deviation, where it is unknown: each part of the annual wave, of
-the wave of half a year, of the annual mean, and of a period's weather."""
+"""Standard deviations in K of an unknown temperature: of each part of the annual wave, of the
+half-annual wave, of the annual mean, and of a period's weather."""
 DAYS_PER_YEAR = 365.25
 CHANGES = (0.0, 0.005, 0.015, 0.04)
-"""Values of q that are compared; half-normal prior of scale 4 %, as between crossings."""
+"""Grid of q; half-normal prior of scale 4 %, as between crossings."""
 WANDERS = (0.0, 0.006, 0.012, 0.02)
-"""Values of s that are compared: larger ones would explain a slow loss."""
+"""Grid of s; larger values would explain a slow loss."""
 WANDER_SCALE = 0.012
 """Scale of the half-normal prior of s."""
 MEMORIES_DAYS = (56.0, 280.0)
-"""Values of tau that are compared, equally likely."""
+"""Grid of tau, equally likely."""
 COMMON_CHANGE = 0.5
-"""rho."""
+"""Correlation rho of the changes of two elements."""
 _NEGLIGIBLE = 0.01
 """Share of an observation's own variance below which a direction of shared error counts as own."""
 
 
 class Period(NamedTuple):
-    """What the crossings of some time say together."""
+    """The observation of a bridge in one period of time."""
 
     observation: Observation
     temperature_deg_c: float | None
@@ -61,33 +61,33 @@ class Period(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """Sizes of the usual movements that are compared, (m,) each."""
+    """Grid of the sizes of usual movements, (m,) each."""
 
     change: FloatArray
-    """q."""
+    """Values of q."""
     wander: FloatArray
-    """s."""
+    """Values of s."""
     memory_days: FloatArray
-    """tau."""
+    """Values of tau."""
     log_prior: FloatArray
 
 
-class State(NamedTuple):
-    """What is known, by each of m scales: a normal of all unknowns (size,)."""
+class BaselineState(NamedTuple):
+    """State of the filter for each of m scales: a normal of all variables (size,)."""
 
     mean: FloatArray  # (m, size)
     covariance: FloatArray  # (m, size, size)
     log_weight: FloatArray
-    """(m,) logarithm of the posterior weight, normalised."""
+    """Logarithm (m,) of the posterior weight, normalised."""
     places: Mapping[str, slice]
-    """Place of each unknown: level, wander, slope, season, change, and the names of what is
-    shared."""
+    """Position of each variable: level, wander, slope, season, change, and the names of shared
+    errors."""
     scales: Scales
     time_days: float
 
 
 class Innovation(NamedTuple):
-    """The difference between what a period says and its prediction, by each scale."""
+    """Difference between the observation of a period and its prediction, for each scale."""
 
     value: FloatArray  # (m, n)
     covariance: FloatArray  # (m, n, n) of it
@@ -113,8 +113,8 @@ def scales_compared() -> Scales:
     return Scales(rows[:, 0], rows[:, 1], rows[:, 2], log_prior)
 
 
-def begin(periods: Sequence[Period], scales: Scales) -> State:
-    """Return the state before the first of some periods; they say what unknowns there are."""
+def initial_baseline(periods: Sequence[Period], scales: Scales) -> BaselineState:
+    """Return the state before the first of some periods, with all variables that they need."""
     n, m = periods[0].observation.value.size, scales.change.size
     blocks: dict[str, FloatArray] = {"level": LEVEL_SPREAD**2 * np.eye(n), "wander": _alike(n)}
     if any(period.temperature_deg_c is not None for period in periods):
@@ -138,11 +138,11 @@ def begin(periods: Sequence[Period], scales: Scales) -> State:
         covariance[:, places[name], places[name]] = factor[:, None, None] * block
     mean = np.zeros((m, size))
     mean[:, :n] = periods[0].observation.value
-    return State(mean, covariance, scales.log_prior, places, scales, periods[0].time_days)
+    return BaselineState(mean, covariance, scales.log_prior, places, scales, periods[0].time_days)
 
 
-def moved_on(state: State, time_days: float) -> tuple[State, FloatArray]:
-    """Return the state at a later time, and the share of the wander that is left by then, (m,)."""
+def predict_state(state: BaselineState, time_days: float) -> tuple[BaselineState, FloatArray]:
+    """Return the state at a later time, and the remaining share (m,) of the wander."""
     passed = max(0.0, time_days - state.time_days)
     kept = np.exp(-passed / state.scales.memory_days)
     at = state.places["wander"]
@@ -155,7 +155,7 @@ def moved_on(state: State, time_days: float) -> tuple[State, FloatArray]:
     return state._replace(mean=mean, covariance=covariance, time_days=time_days), kept
 
 
-def innovation(state: State, period: Period) -> Innovation:
+def filter_step(state: BaselineState, period: Period) -> Innovation:
     """Return the innovation of a period at the time of the state."""
     across, noise = _rows(state, period)
     n = len(across)
@@ -166,28 +166,31 @@ def innovation(state: State, period: Period) -> Innovation:
     return Innovation(value, covariance, across, gain)
 
 
-def learned(state: State, told: Innovation) -> tuple[State, FloatArray]:
-    """Return the state that knows of an innovation, and Kalman's gain (m, size, n)."""
+def update_state(state: BaselineState, innovation: Innovation) -> tuple[BaselineState, FloatArray]:
+    """Return the state after an innovation, and Kalman's gain (m, size, n)."""
     weight = np.asarray(
-        np.linalg.solve(told.covariance, told.gain.transpose(0, 2, 1)).transpose(0, 2, 1)
+        np.linalg.solve(innovation.covariance, innovation.gain.transpose(0, 2, 1)).transpose(
+            0, 2, 1
+        )
     )
-    mean = state.mean + (weight @ told.value[:, :, None])[:, :, 0]
-    covariance = state.covariance - weight @ told.gain.transpose(0, 2, 1)
+    mean = state.mean + (weight @ innovation.value[:, :, None])[:, :, 0]
+    covariance = state.covariance - weight @ innovation.gain.transpose(0, 2, 1)
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    log = state.log_weight + log_density(told)
+    log = state.log_weight + log_density(innovation)
     return state._replace(mean=mean, covariance=covariance, log_weight=log - log_sum(log)), weight
 
 
-def log_density(told: Innovation) -> FloatArray:
-    """Return the logarithm of the density of an innovation by each scale, but for a constant."""
-    apart = np.linalg.solve(told.covariance, told.value[:, :, None])[:, :, 0]
+def log_density(innovation: Innovation) -> FloatArray:
+    """Return the log density (m,) of an innovation for each scale, up to a constant."""
+    apart = np.linalg.solve(innovation.covariance, innovation.value[:, :, None])[:, :, 0]
     return np.asarray(
-        -0.5 * np.sum(apart * told.value, axis=1) - 0.5 * np.linalg.slogdet(told.covariance)[1]
+        -0.5 * np.sum(apart * innovation.value, axis=1)
+        - 0.5 * np.linalg.slogdet(innovation.covariance)[1]
     )
 
 
-def of_scales(state: State, kept: NDArray[np.bool_]) -> State:
-    """Return the state with some of its scales (m,) only."""
+def select_scales(state: BaselineState, kept: NDArray[np.bool_]) -> BaselineState:
+    """Return the state with a subset of its scales (m,)."""
     log = state.log_weight[kept]
     return state._replace(
         mean=state.mean[kept],
@@ -197,16 +200,16 @@ def of_scales(state: State, kept: NDArray[np.bool_]) -> State:
     )
 
 
-def standardised(state: State, told: Innovation) -> FloatArray:
-    """Return the innovation (n,) by all scales together over its standard deviation."""
+def standardised(state: BaselineState, innovation: Innovation) -> FloatArray:
+    """Return the innovation (n,) of all scales together over its standard deviation."""
     weight = np.exp(state.log_weight)
-    mean = weight @ told.value
-    spread = np.diagonal(told.covariance, axis1=1, axis2=2) + (told.value - mean) ** 2
+    mean = weight @ innovation.value
+    spread = np.diagonal(innovation.covariance, axis1=1, axis2=2) + (innovation.value - mean) ** 2
     return np.asarray(mean / np.sqrt(weight @ spread))
 
 
-def with_change(state: State, spread: float) -> State:
-    """Return the state with a change of ln EI from now on, a prior standard deviation of it."""
+def with_change(state: BaselineState, spread: float) -> BaselineState:
+    """Return the state with a change of ln EI from now on, of prior standard deviation `spread`."""
     m, size = state.mean.shape
     n = state.places["level"].stop
     covariance = np.zeros((m, size + n, size + n))
@@ -217,7 +220,7 @@ def with_change(state: State, spread: float) -> State:
     return state._replace(mean=mean, covariance=covariance, places=places)
 
 
-def change_of(state: State) -> tuple[FloatArray, FloatArray]:
+def change_of(state: BaselineState) -> tuple[FloatArray, FloatArray]:
     """Return mean (n,) and covariance (n, n) of the change of `with_change`."""
     at = state.places[_CHANGE]
     weight = np.exp(state.log_weight)
@@ -227,8 +230,8 @@ def change_of(state: State) -> tuple[FloatArray, FloatArray]:
     return mean, np.einsum("m,mij->ij", weight, state.covariance[:, at, at]) + between
 
 
-def change_taken(state: State) -> State:
-    """Return the state with level + change for the level, and without the change."""
+def adopt_change(state: BaselineState) -> BaselineState:
+    """Return the state with level + change as the level, and without the change."""
     at = state.places[_CHANGE]
     n = at.stop - at.start
     move = np.eye(state.mean.shape[1])
@@ -242,15 +245,15 @@ def change_taken(state: State) -> State:
 _CHANGE = "change"
 
 
-def compressed(periods: Sequence[Period]) -> list[Period]:
-    """Return periods whose shared errors have as few unknowns as matter.
+def compress_shared_errors(periods: Sequence[Period]) -> list[Period]:
+    """Return periods whose shared errors have as few variables as necessary.
 
-    Of each name the directions are kept that carry more than a hundredth of an observation's own
-    variance in any period; the rest is added to the own covariance.
+    For each name, directions that carry more than a hundredth of an observation's own variance in
+    any period are kept; the rest is added to the own covariance.
     """
     stacked: dict[str, list[FloatArray]] = {}
     for period in periods:
-        # Whitened by what is the observation's own.
+        # Whitened by the observation's own covariance.
         root = np.linalg.inv(np.linalg.cholesky(period.observation.own))
         for one in period.observation.shared:
             stacked.setdefault(one.name, []).append(root @ one.loading)
@@ -259,7 +262,7 @@ def compressed(periods: Sequence[Period]) -> list[Period]:
 
 
 def _directions(whitened: Iterable[FloatArray]) -> FloatArray:
-    """Return an orthonormal basis (r, p) of what matters in loadings (n, r)."""
+    """Return an orthonormal basis (r, p) of the significant directions of loadings (n, r)."""
     some = list(whitened)
     basis = np.linalg.svd(np.concatenate(some), full_matrices=False)[2].T
     size = np.array([np.sum((one @ basis) ** 2, axis=0) for one in some])  # (periods, p)
@@ -275,12 +278,12 @@ def _with_directions(period: Period, kept: Mapping[str, FloatArray]) -> Period:
         rest = loading - moved @ kept[name].T
         own = own + rest @ rest.T
         if moved.shape[1]:
-            shared.append(Shared(name, moved))
+            shared.append(SharedError(name, moved))
     return period._replace(observation=Observation(of.value, own, tuple(shared)))
 
 
-def _rows(state: State, period: Period) -> tuple[FloatArray, FloatArray]:
-    """How an observation depends on the state (n, size), and its noise (n, n) beside q."""
+def _rows(state: BaselineState, period: Period) -> tuple[FloatArray, FloatArray]:
+    """Return the observation matrix (n, size) and the noise (n, n) in addition to q."""
     of = period.observation
     n = of.value.size
     across = np.zeros((n, state.mean.shape[1]))
@@ -308,13 +311,13 @@ def _of_slope(n: int) -> FloatArray:
 
 
 def _alike(n: int) -> FloatArray:
-    """C."""
+    """Return the matrix C."""
     return (1.0 - COMMON_CHANGE) * np.eye(n) + COMMON_CHANGE
 
 
 def log_sum(log: FloatArray) -> FloatArray:
-    """Return the logarithm of the sum of exponentials over the first axis."""
+    """Return the logarithm of the sum of exponentials over the first axis of (k, …)."""
     top = log.max(axis=0)
     top = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):  # of what is nothing everywhere
+    with np.errstate(divide="ignore"):  # where all terms are zero
         return np.asarray(top + np.log(np.exp(log - top).sum(axis=0)))

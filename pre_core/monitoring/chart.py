@@ -1,20 +1,20 @@
-"""The chart: has one element stepped, at any of the past periods, by more than a smallest change?
+"""Chart for a step in one element, in any past period, by more than a smallest change.
 
 A step delta of ln EI in period k adds G(t, k) delta to every later innovation of the Kalman filter
 (A. S. Willsky and H. L. Jones, IEEE Trans. Automatic Control 21 (1976)), with G known:
 
     G = I - H F,    F <- Phi F + W G,
 
-H the rows of the observation, Phi the motion of the state, W Kalman's gain. So no filter has to be
-run for a change: sums of G' S^-1 G and G' S^-1 e say all about it. With delta ~ N(0, s^2) of one
-element j the ratio of the densities with and without it is L_jk, the scales of the usual movements
-integrated out in both. The Shiryaev-Roberts statistic
+H the observation matrix, Phi the motion of the state, W Kalman's gain. So no filter has to run for
+a change: sums of G' S^-1 G and G' S^-1 e suffice. With delta ~ N(0, s^2) of one element j, L_jk is
+the ratio of the densities with and without it, the scales of the usual movements integrated out in
+both. The Shiryaev-Roberts statistic
 
     R_t = sum over k of the mean over j of L_jk(t)
 
-has the mean t where nothing changes: R_t - t is a martingale, so the mean time to a false alarm at
-R > A is at least A (M. Pollak, Annals of Statistics 13 (1985)), whatever is uncertain of the
-baseline, as long as its priors are true.
+has the mean t without a change: R_t - t is a martingale, so the mean time to a false alarm at R > A
+is at least A (M. Pollak, Annals of Statistics 13 (1985)), whatever the uncertainty of the baseline,
+if its priors are true.
 """
 
 from typing import NamedTuple
@@ -23,22 +23,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from pre_core.monitoring.baseline import LEVEL_SPREAD, Innovation, State, log_sum
+from pre_core.monitoring.baseline import LEVEL_SPREAD, BaselineState, Innovation, log_sum
 
 FloatArray = NDArray[np.float64]
 
 STEP_SPREAD = 0.15
-"""s: prior standard deviation of a step of one element's ln EI."""
+"""Prior standard deviation s of a step of one element's ln EI."""
 LARGEST = 4.0
-"""An innovation counts as so many standard deviations at most."""
+"""Limit of an innovation, in standard deviations."""
 FEWEST = 3
-"""Periods that a change must have lasted to raise an alarm."""
+"""Fewest periods since the change for an alarm."""
 _ALL_KEPT = 8
-"""Beginnings so many periods back are all kept; of older ones two in each doubling of the lag."""
+"""Number of latest beginnings that are all kept; of older ones, two in each doubling of the lag."""
 
 
 class Chart(NamedTuple):
-    """Possible beginnings of a change (c) and what innovations since say of each."""
+    """Possible beginnings (c) of a change and the statistics of later innovations for each."""
 
     begins: tuple[int, ...]
     """Numbers of periods."""
@@ -48,52 +48,52 @@ class Chart(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What a chart says after a period."""
+    """Result of the chart after a period."""
 
     log_ratio: float
-    """ln R."""
+    """Logarithm of R."""
     element: int
     """Element, from 0, that most likely changed."""
     begin: int
-    """Number of the period in which that most likely began."""
+    """Number of the period in which the change most likely began."""
     is_stiffer: bool
     probability: float
-    """Of a change larger than the smallest one of interest, if there was a change."""
+    """Probability that a change, if any, exceeds the smallest one of interest."""
 
 
-def nothing(state: State) -> Chart:
-    """Return a chart that begins."""
+def empty_chart(state: BaselineState) -> Chart:
+    """Return a chart without periods."""
     m, size = state.mean.shape
     n = state.places["level"].stop
     return Chart((), np.zeros((m, size, 0, n)), np.zeros((m, 0, n, n)), np.zeros((m, 0, n)))
 
 
-def by_scales(chart: Chart, kept: NDArray[np.bool_]) -> Chart:
-    """Return the chart with some of its scales (m,) only."""
+def select_chart_scales(chart: Chart, kept: NDArray[np.bool_]) -> Chart:
+    """Return the chart with a subset of its scales (m,)."""
     return Chart(chart.begins, chart.response[kept], chart.information[kept], chart.score[kept])
 
 
-def still(
-    chart: Chart, kept: FloatArray, wander: slice, weight: FloatArray, told: Innovation
+def skip_period(
+    chart: Chart, kept: FloatArray, wander: slice, weight: FloatArray, innovation: Innovation
 ) -> Chart:
-    """Return the chart after a period that is learned but not judged; arguments as of `moved`."""
-    return chart._replace(response=_responded(chart, kept, wander, weight, told)[0])
+    """Return the chart after a period that is not tested; `kept` (m,), `weight` (m, size, n)."""
+    return chart._replace(response=_responded(chart, kept, wander, weight, innovation)[0])
 
 
-def moved(
+def update_chart(
     chart: Chart,
     number: int,
     kept: FloatArray,
     wander: slice,
     weight: FloatArray | None,
-    told: Innovation,
+    innovation: Innovation,
     inflation: float,
 ) -> Chart:
     """Return the chart after a period.
 
-    `number` is the period's, `kept` (m,) the share of the wander left since the previous one,
-    `weight` (m, size, n) Kalman's gain (None where nothing was learned), `inflation` what the
-    innovation's covariance is multiplied by.
+    `number` is the period's, `kept` (m,) the remaining share of the wander since the previous one,
+    `weight` (m, size, n) Kalman's gain (None without an update), `inflation` the factor of the
+    innovation's covariance.
     """
     m, size, _, n = chart.response.shape
     chart = Chart(
@@ -103,10 +103,12 @@ def moved(
         np.concatenate([chart.score, np.zeros((m, 1, n))], axis=1),
     )
     c = len(chart.begins)
-    response, shown = _responded(chart, kept, wander, weight, told)
+    response, shown = _responded(chart, kept, wander, weight, innovation)
     flat = shown.reshape(m, n, c * n)
-    covariance = inflation * told.covariance
-    solved = np.linalg.solve(covariance, np.concatenate([flat, told.value[:, :, None]], axis=2))
+    covariance = inflation * innovation.covariance
+    solved = np.linalg.solve(
+        covariance, np.concatenate([flat, innovation.value[:, :, None]], axis=2)
+    )
     by_begin = solved[:, :, :-1].reshape(m, n, c, n)
     information = chart.information + np.matmul(
         shown.transpose(0, 2, 3, 1), by_begin.transpose(0, 2, 1, 3)
@@ -126,13 +128,13 @@ def _responded(
     kept: FloatArray,
     wander: slice,
     weight: FloatArray | None,
-    told: Innovation,
+    innovation: Innovation,
 ) -> tuple[FloatArray, FloatArray]:
-    """F after a period, and G (m, n, c, n)."""
+    """Return F after a period, and G (m, n, c, n)."""
     m, size, c, n = chart.response.shape
     before = chart.response.copy()
     before[:, wander] *= kept[:, None, None, None]
-    shown = -(told.across @ before.reshape(m, size, c * n)).reshape(m, n, c, n)
+    shown = -(innovation.across @ before.reshape(m, size, c * n)).reshape(m, n, c, n)
     shown += np.eye(n)[:, None, :]
     if weight is not None:
         before += (weight @ shown.reshape(m, n, c * n)).reshape(m, size, c, n)
@@ -145,8 +147,8 @@ def _is_kept(begin: int, lag: int) -> bool:
     return begin % (2 ** int(np.log2(lag / 2.0))) == 0
 
 
-def log_ratio(chart: Chart, state: State, number: int) -> tuple[float, FloatArray]:
-    """Return ln R after a period, and ln L (c, n), minus infinity where it is too early to say."""
+def log_ratio(chart: Chart, state: BaselineState, number: int) -> tuple[float, FloatArray]:
+    """Return ln R after a period, and ln L (c, n), minus infinity where it is too early."""
     n = state.places["level"].stop
     if not chart.begins:
         return -np.inf, np.zeros((0, n))
@@ -158,11 +160,13 @@ def log_ratio(chart: Chart, state: State, number: int) -> tuple[float, FloatArra
     return float(log_sum(log.ravel()) - np.log(n)), log
 
 
-def judged(chart: Chart, state: State, number: int, smallest: tuple[float, float]) -> Verdict:
-    """Return what the chart says; a change is of interest outside of `smallest` (of ln EI).
+def chart_verdict(
+    chart: Chart, state: BaselineState, number: int, smallest: tuple[float, float]
+) -> Verdict:
+    """Return the chart's result; a change is of interest outside of `smallest` (of ln EI).
 
-    The probability is that of the element's own change, all elements free to have changed, and
-    averaged over elements and beginnings by how likely each is.
+    The probability is that of the element's own change, with all elements free to change, averaged
+    over elements and beginnings by their probability.
     """
     total, log = log_ratio(chart, state, number)
     n = chart.score.shape[2]

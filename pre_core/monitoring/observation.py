@@ -1,14 +1,13 @@
-"""What one crossing says of ln EI as numbers with two kinds of error: its own, and those it shares.
+"""Observation of ln EI by one crossing, with its own and its shared errors.
 
-From the crossing's likelihood, normal in the compliances x and in everything else v (the bridge's
-other unknowns, the truck's with its mass and gain, the long waves of its track): with the parts L
-of its precision and P the precision of v before any crossing, M = L_vv + P,
+It follows from the crossing's likelihood, normal in the compliances x and in all other variables v
+(the other bridge parameters, the truck's with its mass and gain, the long waves of its wheel-path
+group). With the parts L of its precision and P the prior precision of v, M = L_vv + P,
 
     C = (L_xx - L_xv M^-1 L_vx)^-1,    x^ = C (l_x - L_xv M^-1 l_v) = x + C L_xv M^-1 P v + own.
 
-What v does to x^ is the same in all crossings that have that v: it is kept as a loading on unit
-normals z, v = P^-1/2 z. The rest of C is the crossing's own. In logarithms
-d ln EI = -dx/x.
+The effect of v on x^ is the same in all crossings that share v: it is kept as a loading on unit
+normals z, v = P^-1/2 z. The rest of C is the crossing's own. In logarithms d ln EI = -dx/x.
 """
 
 from typing import NamedTuple
@@ -16,52 +15,53 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.fusion.joint import mass_freed
-from pre_core.fusion.likelihood import straightened
-from pre_core.fusion.sums import BridgePriors
-from pre_core.fusion.tracks import Part, key_of, tracks_of
+from pre_core.fusion.information import BridgePriors
+from pre_core.fusion.joint import add_mass_parameter
+from pre_core.fusion.likelihood import linearised_likelihood
+from pre_core.fusion.path_groups import FusionInput, path_group_key, path_groups
 
 FloatArray = NDArray[np.float64]
 
 _WEAK = 0.05
-"""Precision of a compliance relative to nominal where the crossing tells nothing of an element."""
+"""Precision of a compliance relative to nominal where the crossing does not determine an element.
+"""
 
 
-class Shared(NamedTuple):
-    """Errors that all crossings have in common that have something in common."""
+class SharedError(NamedTuple):
+    """Errors that crossings with a common cause share."""
 
     name: str
-    """What they have in common: the bridge, a truck, a track."""
+    """Cause of the errors: the bridge, a truck, a wheel-path group."""
     loading: FloatArray
-    """(n, r): what unit normals of it do to ln EI."""
+    """Effect (n, r) of its unit normals on ln EI."""
 
 
 class Observation(NamedTuple):
-    """ln EI of n elements, EI in N·m², as one crossing or several tell it."""
+    """Values of ln EI of n elements, EI in N·m², from one crossing or several."""
 
     value: FloatArray  # (n,)
     own: FloatArray  # (n, n) covariance
-    shared: tuple[Shared, ...]
+    shared: tuple[SharedError, ...]
 
 
 def observation(
-    part: Part, priors: BridgePriors, ei_nm2: FloatArray, common_share: float
+    part: FusionInput, priors: BridgePriors, ei_nm2: FloatArray, common_share: float
 ) -> Observation:
-    """What a crossing says, about the rigidities (n,) that it found.
+    """Return a crossing's observation, linearised about its rigidities (n,).
 
-    `common_share` of the power of its mismatch's long waves is taken to be the same in all runs in
-    its track, the rest to be its own.
+    `common_share` is the shared fraction of the power of its mismatch's long waves in the
+    wheel-path group.
     """
     of, n = part.likelihood, priors.elements
     b, t = len(of.bridge.names), len(of.truck.names)
     location = priors.coordinates.location[b - n :]
     centre = np.zeros(b)
     centre[b - n :] = location / ei_nm2
-    track = tracks_of([part]).get(key_of(part))
+    track = path_groups([part]).get(path_group_key(part))
     waves = np.zeros((0, 0)) if track is None else track.whole
     if of.bends is not None:
-        of = straightened(of, centre, waves)
-    precision, linear = mass_freed(of, part.mass_spread, priors, centre)
+        of = linearised_likelihood(of, centre, waves)
+    precision, linear = add_mass_parameter(of, part.mass_spread, priors, centre)
     x = np.arange(b - n, b)
     v = np.setdiff1d(np.arange(linear.size), x)
     before = np.eye(v.size)
@@ -71,14 +71,14 @@ def observation(
         before[-q:, -q:] = waves
         half[-q:, -q:] = np.linalg.cholesky(waves)
     across = precision[np.ix_(x, v)]
-    told = np.linalg.solve(
+    solved = np.linalg.solve(
         precision[np.ix_(v, v)] + before, np.column_stack([across.T, linear[v], half])
     )
-    within = precision[np.ix_(x, x)] - across @ told[:, :n] + _WEAK * np.eye(n)
+    within = precision[np.ix_(x, x)] - across @ solved[:, :n] + _WEAK * np.eye(n)
     covariance = np.linalg.inv(within)
-    found = covariance @ (linear[x] - across @ told[:, n] + _WEAK * centre[x])
+    found = covariance @ (linear[x] - across @ solved[:, n] + _WEAK * centre[x])
     # P = half half', so that P^1/2 stands for half: any root does.
-    loading = covariance @ across @ told[:, n + 1 :]
+    loading = covariance @ across @ solved[:, n + 1 :]
     own = covariance - loading @ loading.T
     if q:
         apart = np.sqrt(1.0 - common_share) * loading[:, -q:]
@@ -94,10 +94,10 @@ def observation(
     )
 
 
-def fused(some: list[Observation], elements: int) -> Observation:
-    """Several observations of one bridge as one: weighted by what is their own.
+def combine_observations(some: list[Observation], elements: int) -> Observation:
+    """Return several observations of one bridge as one, weighted by their own errors.
 
-    ValueError without any.
+    Raise ValueError without any.
     """
     if not some:
         raise ValueError("no observations to fuse")
@@ -114,20 +114,22 @@ def fused(some: list[Observation], elements: int) -> Observation:
             moved = share @ loading
             shared[name] = shared[name] + moved if name in shared else moved
     return Observation(
-        value, 0.5 * (covariance + covariance.T), tuple(Shared(*item) for item in shared.items())
+        value,
+        0.5 * (covariance + covariance.T),
+        tuple(SharedError(*item) for item in shared.items()),
     )
 
 
 def _shared(
-    part: Part, loading: FloatArray, others: int, truck: int, waves: int
-) -> tuple[Shared, ...]:
-    """The columns of the bridge's other unknowns, of the truck's, of the track's waves."""
+    part: FusionInput, loading: FloatArray, others: int, truck: int, waves: int
+) -> tuple[SharedError, ...]:
+    """Return the columns of the other bridge parameters, of the truck, and of the group's waves."""
     pieces = [
-        Shared(f"bridge {others}", loading[:, :others]),
-        Shared(f"truck {part.truck} {truck}", loading[:, others : others + truck]),
+        SharedError(f"bridge {others}", loading[:, :others]),
+        SharedError(f"truck {part.truck} {truck}", loading[:, others : others + truck]),
     ]
     if waves:
-        key = key_of(part)
+        key = path_group_key(part)
         name = f"track {key.truck} {key.direction} {key.first_knot} {key.knots}"
-        pieces.append(Shared(name, loading[:, -waves:]))
+        pieces.append(SharedError(name, loading[:, -waves:]))
     return tuple(piece for piece in pieces if piece.loading.shape[1])

@@ -5,7 +5,7 @@ import numpy as np
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate
-from pre_core.paper.residual import Window, build_window
+from pre_core.paper.residual import PaperWindow, build_window
 from pre_core.physics.bridge import Beam
 from pre_core.physics.road import iso_8608_profile, under_wheels
 from pre_core.physics.simulate import constant_speed, simulate
@@ -13,7 +13,8 @@ from pre_core.physics.vehicle import HalfCar, total_mass_kg
 
 ROAD_CLASS = "B"
 ROAD_SEED = 1
-"""The paper's road is not published; docs/reproduction.md says what another one changes."""
+"""Seed of the road. The paper's is not published; studies/reproduction.md shows the effect of
+another one."""
 
 
 def paper_window(
@@ -23,11 +24,11 @@ def paper_window(
     seed: int,
     *,
     road: tuple[str, int] = (ROAD_CLASS, ROAD_SEED),
-) -> Window:
-    """One crossing of the paper's experiment (Table 4), with white sensor noise if asked for.
+) -> PaperWindow:
+    """Simulate the paper's experiment (Table 4), optionally with white sensor noise.
 
-    `noise` is one-sided, in µg/√Hz; `road` is an ISO 8608 class and the seed of its phases.
-    ArithmeticError where truck and bridge do not settle.
+    `noise` is one-sided, in µg/√Hz; `road` is an ISO 8608 class and the seed of its phases. Raise
+    ArithmeticError if the forces do not converge.
     """
     span = float(beam.element_lengths_m.sum())
     travel = span + car.wheelbase_m - experiment.FRONT_AXLE_START_M

@@ -1,8 +1,8 @@
 """The numerical experiment of the paper: Tables 1 to 4.
 
 Numerical Verification of the Drive-By Monitoring Method for Identifying Vehicle and Bridge
-Mechanical Parameters, Applied Sciences (2023), CC BY. m_s is printed broken in the text at hand;
-8310 kg reproduces the rear body frequency and both wheel-hop frequencies of its Table 5.
+Mechanical Parameters, Applied Sciences (2023), CC BY. m_s is misprinted in the available text; 8310
+kg reproduces the rear body frequency and both wheel-hop frequencies of its Table 5.
 """
 
 import numpy as np
@@ -50,7 +50,7 @@ SCENARIOS = tuple(_REDUCED)
 
 
 def scenario_ratios(scenario: int) -> FloatArray:
-    """EI of the seven elements relative to the sound value (Table 3)."""
+    """Return EI of the elements (7,) relative to the undamaged value (Table 3)."""
     elements, ratio = _REDUCED[scenario]
     ratios = np.ones(ELEMENTS)
     ratios[list(elements)] = ratio
@@ -58,7 +58,7 @@ def scenario_ratios(scenario: int) -> FloatArray:
 
 
 def beam(ratios: FloatArray) -> Beam:
-    """The bridge of Table 2 with these ratios of the flexural rigidity."""
+    """Return the bridge of Table 2 with these ratios (7,) of the flexural rigidity."""
     return uniform_beam(
         SPAN_M,
         FLEXURAL_RIGIDITY_NM2 * np.asarray(ratios, dtype=np.float64),

@@ -1,4 +1,4 @@
-"""Input estimation problem (IEP): what each wheel must have been fed to move as it did.
+"""Input estimation problem (IEP): the profile under each wheel from its motion.
 
 From the equation of motion of an axle (paper eq. 1, last two rows),
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import kernel
 from pre_core.paper.integrate import Integrated
-from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
+from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
 
 FloatArray = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ def iep_signals(
     step_s: float,
     integrate: Callable[[FloatArray, float], Integrated],
 ) -> FloatArray:
-    """The four signals of each wheel: (2, 4, n) z_u, z''_u, z'_u - z'_s, z_u - z_s.
+    """Return the four signals of each wheel: (2, 4, n) z_u, z''_u, z'_u - z'_s, z_u - z_s.
 
     `acceleration` is (4, n): sprung front, sprung rear, unsprung front, unsprung rear.
     """
@@ -44,12 +44,15 @@ def iep_signals(
 
 @kernel
 def iep_factors(theta: FloatArray, wheel: int) -> tuple[float, float, float]:
-    """What z''_u, z'_u - z'_s and z_u - z_s are multiplied by: m_u, c_s and k_s over k_u."""
+    """Return the factors m_u/k_u, c_s/k_u and k_s/k_u of z''_u, z'_u - z'_s and z_u - z_s.
+
+    `theta` is one vector (p,).
+    """
     k_u = theta[K_U1 + wheel]
     return theta[M_U1 + wheel] / k_u, theta[C_S1 + wheel] / k_u, theta[K_S1 + wheel] / k_u
 
 
 def input_profiles(signals: FloatArray, theta: FloatArray) -> FloatArray:
-    """Input profiles u (2, n) of the two wheels for one vector of parameters."""
+    """Return the input profiles u (2, n) of the two wheels for signals (2, 4, n) and theta (p,)."""
     factors = np.array([(1.0, *iep_factors(theta, wheel)) for wheel in range(2)])
     return np.asarray(np.einsum("wj,wjn->wn", factors, signals))

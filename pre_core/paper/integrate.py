@@ -1,15 +1,16 @@
-"""From accelerations to velocities and displacements.
+"""Integration of accelerations to velocities and displacements.
 
-The paper integrates with Newmark's average acceleration, which returns a simulation made with the
-same scheme and step exactly and hides its own error. Real sensors are not sampled by Newmark: there
-the antiderivative of a cubic spline is far better (docs/reproduction.md measures both).
+The paper integrates with Newmark's average acceleration, which returns a simulation by the same
+scheme and step exactly and hides its own error. Real sensors do not sample by Newmark: there the
+antiderivative of a cubic spline is far better (studies/reproduction.md measures both).
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pre_core.kernels.lanes import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -21,7 +22,7 @@ class Integrated(NamedTuple):
     displacement: FloatArray
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _newmark(acceleration: FloatArray, step_s: float, v: FloatArray, u: FloatArray) -> None:
     for i in range(acceleration.shape[0]):
         for n in range(1, acceleration.shape[1]):
@@ -32,7 +33,7 @@ def _newmark(acceleration: FloatArray, step_s: float, v: FloatArray, u: FloatArr
 
 
 def newmark_integrate(acceleration: FloatArray, step_s: float) -> Integrated:
-    """Integrate rows of evenly spaced samples (channels, n) twice, as Newmark's scheme does."""
+    """Integrate rows of evenly spaced samples (channels, n) twice by Newmark's scheme."""
     v = np.zeros_like(acceleration)
     u = np.zeros_like(acceleration)
     _newmark(acceleration, step_s, v, u)

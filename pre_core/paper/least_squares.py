@@ -1,8 +1,9 @@
-"""Least squares on the paper's residual: Levenberg-Marquardt in logarithms of the unknowns.
+"""Least squares on the paper's residual: Levenberg-Marquardt in logarithms of the parameters.
 
-Without noise the surface is benign (docs/reproduction.md): from anywhere in the paper's prior about
-ten steps lead to the one minimum. All unknowns are positive, so the search moves in logarithms and
-needs no bounds, except that d_1 must lie between the axles: there it moves in the logit.
+Without noise the surface is benign (studies/reproduction.md): from anywhere in the paper's prior
+about ten steps lead to the one minimum. All parameters are positive, so the search moves in
+logarithms and needs no bounds, except that d_1 must lie between the axles: there it
+moves in the logit.
 """
 
 from typing import NamedTuple
@@ -10,30 +11,36 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.paper.residual import Window, Workspace, residual_batch
+from pre_core.paper.residual import PaperWindow, Workspace, residual_batch
+from pre_core.parameters import D_1
 from pre_core.search import levenberg_marquardt
-from pre_core.search.levenberg_marquardt import Info, Rows, State, begin, descend, polish
-from pre_core.unknowns import D_1
+from pre_core.search.levenberg_marquardt import (
+    LMInfo,
+    LMState,
+    Rows,
+    descend,
+    initial_state,
+    polish,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
 MAX_STEPS = 60
-"""Ten to fifteen lead to the minimum without noise (docs/reproduction.md); who needs this many is
-lost."""
+"""Limit of steps; without noise ten to fifteen reach the minimum (studies/reproduction.md)."""
 
 
-class Problem(NamedTuple):
-    """What stays the same during a search: the data, all parameters, and which of them are free."""
+class LeastSquaresProblem(NamedTuple):
+    """The constants of a search: data, all parameters, and the free ones."""
 
-    window: Window
-    fixed: FloatArray  # (p,) values of the parameters that are not searched for
+    window: PaperWindow
+    fixed: FloatArray  # (p,) values of the fixed parameters
     free: IntArray  # (f,)
 
 
-def transform(problem: Problem, values: FloatArray) -> FloatArray:
-    """Free parameters (…, f) in physical units to search coordinates."""
+def transform(problem: LeastSquaresProblem, values: FloatArray) -> FloatArray:
+    """Return the search coordinates of free parameters (…, f) in physical units."""
     y = np.log(values)
     at = np.flatnonzero(problem.free == D_1)
     d_1 = values[..., at]
@@ -41,23 +48,23 @@ def transform(problem: Problem, values: FloatArray) -> FloatArray:
     return np.asarray(y)
 
 
-def untransform(problem: Problem, y: FloatArray) -> FloatArray:
-    """Search coordinates (…, f) to free parameters in physical units."""
+def untransform(problem: LeastSquaresProblem, y: FloatArray) -> FloatArray:
+    """Return the free parameters in physical units of search coordinates (…, f)."""
     values = np.exp(y)
     at = np.flatnonzero(problem.free == D_1)
     values[..., at] = problem.window.wheelbase_m / (1.0 + np.exp(-y[..., at]))
     return np.asarray(values)
 
 
-def full_vector(problem: Problem, y: FloatArray) -> FloatArray:
-    """All parameters (…, p) in physical units for search coordinates (…, f)."""
+def full_vector(problem: LeastSquaresProblem, y: FloatArray) -> FloatArray:
+    """Return all parameters (…, p) in physical units for search coordinates (…, f)."""
     theta = np.broadcast_to(problem.fixed, (*y.shape[:-1], problem.fixed.size)).copy()
     theta[..., problem.free] = untransform(problem, y)
     return theta
 
 
-def _derivative_of_values(problem: Problem, y: FloatArray) -> FloatArray:
-    """d value/d y (f,) at y: for carrying a covariance into physical units."""
+def _derivative_of_values(problem: LeastSquaresProblem, y: FloatArray) -> FloatArray:
+    """Return d value/d y (f,) at y, to convert a covariance to physical units."""
     values = untransform(problem, y)
     slope = values.copy()
     at = np.flatnonzero(problem.free == D_1)
@@ -65,25 +72,25 @@ def _derivative_of_values(problem: Problem, y: FloatArray) -> FloatArray:
     return slope
 
 
-def _rows_of(problem: Problem, work: Workspace) -> Rows:
+def _rows_of(problem: LeastSquaresProblem, work: Workspace) -> Rows:
     return lambda y: residual_batch(problem.window, work, full_vector(problem, y))
 
 
-def init(problem: Problem, work: Workspace, start: FloatArray) -> State:
-    """Begin at the free parameters `start` (f,) in physical units."""
-    return begin(_rows_of(problem, work), transform(problem, start))
+def init(problem: LeastSquaresProblem, work: Workspace, start: FloatArray) -> LMState:
+    """Return the state at the free parameters `start` (f,) in physical units."""
+    return initial_state(_rows_of(problem, work), transform(problem, start))
 
 
-def step(problem: Problem, work: Workspace, state: State) -> tuple[State, Info]:
-    """One step on the paper's residual; at the bottom forward differences give way to central ones.
+def step(problem: LeastSquaresProblem, work: Workspace, state: LMState) -> tuple[LMState, LMInfo]:
+    """Take one step on the paper's residual; at the end, central differences replace forward ones.
 
-    So the way costs no more than it must, and where it ends does not depend on the processor.
+    The search then costs no more than necessary, and its end does not depend on the processor.
     """
     return polish(_rows_of(problem, work), *descend(_rows_of(problem, work), state))
 
 
-def covariance(problem: Problem, work: Workspace, y: FloatArray) -> FloatArray:
-    """Formal covariance (f, f) of the free parameters, in physical units, at the bottom y (f,)."""
+def formal_covariance(problem: LeastSquaresProblem, work: Workspace, y: FloatArray) -> FloatArray:
+    """Return the formal covariance (f, f) of the free parameters, in physical units, at y (f,)."""
     slope = _derivative_of_values(problem, y)
-    in_logarithms = levenberg_marquardt.covariance(_rows_of(problem, work), y)
+    in_logarithms = levenberg_marquardt.gauss_newton_covariance(_rows_of(problem, work), y)
     return np.asarray(in_logarithms * np.outer(slope, slope))

@@ -1,12 +1,12 @@
-"""The paper's search (section 3.1): a cloud of particles, each walking downhill at random.
+"""The paper's search (section 3.1): particles that walk downhill at random.
 
-A particle moves by a random step if its J does not grow, and stays otherwise (paper eq. 23). The
-paper calls it MCMC; it is not a sampler of a posterior, since no probability decides, and the
-spread of its particles is no uncertainty: it follows from the width of the step. It is here for
+A particle makes a random step if its J does not grow, and stays otherwise (paper eq. 23). The paper
+calls it MCMC, but it does not sample a posterior, because acceptance is not probabilistic. The
+spread of its particles is not an uncertainty: it follows from the width of the step. It is here for
 comparison.
 
 The paper does not print the distribution of the step. Here it is Gaussian with a standard deviation
-of 7 % of the sound value, in all coordinates at once (docs/reproduction.md tells how it was found).
+of 7 % of the undamaged value, in all coordinates at once (derivation in studies/reproduction.md).
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import LANES
-from pre_core.paper.residual import Window, Workspace, objective_batch, workspace
-from pre_core.search.loop import Ending
-from pre_core.unknowns import D_1
+from pre_core.paper.residual import PaperWindow, Workspace, objective_batch, workspace
+from pre_core.parameters import D_1
+from pre_core.search.loop import Termination
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -29,10 +29,10 @@ PRIOR_LOW, PRIOR_HIGH = 0.8, 1.2
 STEP_RATIO = 0.07
 
 
-class Problem(NamedTuple):
-    """What stays the same: data, sound values, which of them are free, a workspace per thread."""
+class RandomWalkProblem(NamedTuple):
+    """The constants of a search: data, undamaged values, the free ones, a workspace per thread."""
 
-    window: Window
+    window: PaperWindow
     nominal: FloatArray  # (p,)
     free: IntArray  # (f,)
     step_ratio: float
@@ -40,44 +40,44 @@ class Problem(NamedTuple):
     workspaces: tuple[Workspace, ...]
 
 
-class State(NamedTuple):
-    """The particles (k, f) as ratios to the sound values, their J (k,), and the steps taken."""
+class RandomWalkState(NamedTuple):
+    """The particles (k, f) as ratios to the undamaged values, their J (k,), and the steps taken."""
 
     ratios: FloatArray
     objective: FloatArray
     steps: int
 
 
-class Info(NamedTuple):
-    """What one step did."""
+class RandomWalkInfo(NamedTuple):
+    """Statistics of one step."""
 
     objective: float  # the smallest J of all particles
     acceptance: float
-    ending: Ending | None
+    ending: Termination | None
 
 
 def problem(
-    window: Window,
+    window: PaperWindow,
     nominal: FloatArray,
     free: IntArray,
     seed: int,
     *,
     step_ratio: float = STEP_RATIO,
     threads: int = 2,
-) -> Problem:
-    """Bind the data; the answer does not depend on the number of threads."""
-    return Problem(
+) -> RandomWalkProblem:
+    """Bind data, values (p,) and free indices (f,); threads do not affect the results."""
+    return RandomWalkProblem(
         window, nominal, free, step_ratio, seed, tuple(workspace(window) for _ in range(threads))
     )
 
 
 def _random(seed: int, count: int) -> np.random.Generator:
-    """Random numbers of one step: they follow from the seed and the step alone."""
+    """Return the random numbers of one step, which follow from the seed and the step alone."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(count,)))
 
 
-def _evaluate(bound: Problem, ratios: FloatArray, limit: FloatArray) -> FloatArray:
-    """J (k,) of particles; exact wherever it does not exceed `limit` (k,)."""
+def _evaluate(bound: RandomWalkProblem, ratios: FloatArray, limit: FloatArray) -> FloatArray:
+    """Return J (k,) of particles; exact wherever it does not exceed `limit` (k,)."""
     theta = np.repeat(bound.nominal[None, :], ratios.shape[0], axis=0)
     theta[:, bound.free] *= ratios
     physical = np.all(theta[:, bound.free] > 0.0, axis=1)
@@ -101,15 +101,17 @@ def _evaluate(bound: Problem, ratios: FloatArray, limit: FloatArray) -> FloatArr
     return total
 
 
-def init(bound: Problem, particles: int = PARTICLES) -> State:
-    """Particles uniform between 0.8 and 1.2 of the sound values."""
+def init(bound: RandomWalkProblem, particles: int = PARTICLES) -> RandomWalkState:
+    """Return particles uniform between 0.8 and 1.2 of the undamaged values."""
     rng = _random(bound.seed, 0)
     ratios = rng.uniform(PRIOR_LOW, PRIOR_HIGH, (particles, bound.free.size))
-    return State(ratios, _evaluate(bound, ratios, np.full(particles, np.inf)), 0)
+    return RandomWalkState(ratios, _evaluate(bound, ratios, np.full(particles, np.inf)), 0)
 
 
-def step(bound: Problem, state: State) -> tuple[State, Info]:
-    """Propose one random step for every particle and keep those that do not make J larger."""
+def step(
+    bound: RandomWalkProblem, state: RandomWalkState
+) -> tuple[RandomWalkState, RandomWalkInfo]:
+    """Propose one random step for every particle and accept those that do not increase J."""
     rng = _random(bound.seed, state.steps + 1)
     proposal = state.ratios + bound.step_ratio * rng.standard_normal(state.ratios.shape)
     objective = _evaluate(bound, proposal, state.objective)
@@ -117,5 +119,7 @@ def step(bound: Problem, state: State) -> tuple[State, Info]:
     ratios = np.where(accepted[:, None], proposal, state.ratios)
     kept = np.where(accepted, objective, state.objective)
     best = float(kept.min())
-    ending = None if np.isfinite(best) else Ending.NOT_FINITE
-    return State(ratios, kept, state.steps + 1), Info(best, float(accepted.mean()), ending)
+    ending = None if np.isfinite(best) else Termination.NOT_FINITE
+    return RandomWalkState(ratios, kept, state.steps + 1), RandomWalkInfo(
+        best, float(accepted.mean()), ending
+    )

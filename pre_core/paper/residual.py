@@ -1,11 +1,11 @@
-"""The paper's residual: the road that the front wheel felt less the road that the rear wheel felt.
+"""The paper's residual: the road under the front wheel less the road under the rear wheel.
 
 r_i = u_i - y_i (IEP less DRS) at each wheel; R_1(x) - R_2(x) vanishes for the right parameters, and
-J = integral of (R_1 - R_2)^2 dx (paper eq. 21). Everything that does not depend on the parameters
-is computed once, in a `Window`.
+J = integral of (R_1 - R_2)^2 dx (paper eq. 21). A `PaperWindow` holds everything that does not
+depend on the parameters.
 
-Longer than other modules: J of four particles, J of one, rows and roads come out of the same work
-arrays, and numba sees that a kernel has changed only where it stands in the same file.
+Longer than other modules: J of four particles, J of one, residuals and roads share the work arrays,
+and numba notices a changed kernel only in the same file.
 """
 
 import itertools
@@ -19,6 +19,7 @@ from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, scale, store, sub
 from pre_core.paper.iep import iep_factors, iep_signals, input_profiles
 from pre_core.paper.integrate import Integrated
+from pre_core.parameters import D_1, KAPPA, M_U1
 from pre_core.physics.beam_basis import (
     BeamBasis,
     advance,
@@ -26,10 +27,9 @@ from pre_core.physics.beam_basis import (
     modal_filters,
     modal_filters_one,
 )
-from pre_core.physics.bridge import locate
+from pre_core.physics.bridge import locate_element
 from pre_core.physics.simulate import rear_position_m
 from pre_core.physics.vehicle import masses_above_axles, masses_on_axles
-from pre_core.unknowns import D_1, KAPPA, M_U1
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -38,11 +38,11 @@ _LONGEST_STRETCH = 128  # steps: four particles' work arrays of one stretch stay
 _STENCIL = 2  # samples to either side that the cubic interpolation needs
 
 
-class Window(NamedTuple):
+class PaperWindow(NamedTuple):
     """One crossing, prepared for many evaluations.
 
-    n samples from shortly before the first axle enters until the last has left; m rows: the samples
-    at which the rear axle is between the ends of the compared stretch of road.
+    n samples from shortly before the first axle enters until the last has left; m residuals while
+    the rear axle is on the compared stretch of road.
     """
 
     step_s: float
@@ -58,13 +58,13 @@ class Window(NamedTuple):
     front_sample: IntArray  # (m,): first of the four samples at which the front passed the same x
     front_weight: FloatArray  # (m, 4)
     row_weight: FloatArray  # (m,): square root of dx
-    nuisance: FloatArray  # (m, q): orthonormal weighted columns that a row's sums must not see
+    nuisance: FloatArray  # (m, q): orthonormal weighted columns projected out of the residuals
     x_m: FloatArray  # (m,) chainage of the rows
     basis: BeamBasis
 
 
 class WindowError(ValueError):
-    """The samples do not cover the crossing; the message says what is missing."""
+    """An error of samples that do not cover the crossing; the message names the missing part."""
 
 
 def _stretches(element: IntArray) -> IntArray:
@@ -79,10 +79,10 @@ def _stretches(element: IntArray) -> IntArray:
 
 
 def _cubic_weights(travel: FloatArray, wanted: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Four-point Lagrange interpolation of a function of the increasing `travel` at `wanted`.
+    """Return four-point Lagrange weights of a function of the increasing `travel` at `wanted`.
 
-    In the variable "sample number", in which the points are evenly spaced: the number belonging to
-    `wanted` is found by cubic interpolation too, so that a changing speed costs no accuracy.
+    The variable is the sample number, in which the points are evenly spaced: the number belonging
+    to `wanted` is found by cubic interpolation too, so that a changing speed costs no accuracy.
     """
     sample = np.interp(wanted, travel, np.arange(travel.size))
     base = np.clip(np.floor(sample).astype(np.int64) - 1, 0, travel.size - 4)
@@ -123,23 +123,23 @@ def build_window(
     gravity_m_per_s2: float = STANDARD_GRAVITY_M_PER_S2,
     parts: int = 1,
     coordinates: int | None = None,
-) -> Window:
+) -> PaperWindow:
     """Prepare one crossing.
 
     `acceleration` (4, N) and `front_position` (N,) are evenly spaced in time by `step_s`;
     `direction` is 1 driving from start to end, else -1. With `initial_state_known` the truck was at
-    rest at the first sample, as in the paper; otherwise whatever initial displacement and velocity
-    (and, unless `bias_known`, constant bias) the channels had is projected out of the residual.
-    `parts` and `coordinates` refine the beam (see `beam_basis`); the defaults are the paper's mesh.
+    rest at the first sample, as in the paper; otherwise the effect of unknown initial displacement
+    and velocity (and, unless `bias_known`, constant bias) is projected out of the residual. `parts`
+    and `coordinates` refine the beam (see `beam_basis`); the defaults are the paper's mesh.
 
-    Raises WindowError if the samples do not reach from the entry to the exit.
+    Raise WindowError if the samples do not reach from the entry to the exit.
     """
     span = float(element_lengths_m.sum())
     front = np.asarray(front_position_m, dtype=np.float64)
     rear = rear_position_m(front, wheelbase_m, direction)
     travel_front = front if direction > 0 else span - front
     travel_rear = travel_front - wheelbase_m
-    # The first passage only: before and after it the truck may do as it likes.
+    # The first crossing only; the motion before and after it is arbitrary.
     entry = int(np.argmax(travel_front >= 0.0))
     leave = int(np.argmax(travel_rear > span))
     if entry < _STENCIL:
@@ -155,7 +155,7 @@ def build_window(
         signals = iep_signals(acceleration_m_per_s2[:, begin : leave + 1], step_s, integrate)
     part = slice(begin, leave + 1)
     basis = beam_basis(element_lengths_m, parts, coordinates)
-    element, place = locate(basis.lengths_m, np.stack([front[part], rear[part]]))
+    element, place = locate_element(basis.lengths_m, np.stack([front[part], rear[part]]))
 
     first_row = int(np.argmax(travel_rear >= 0.0)) - begin
     rows = slice(first_row + begin, leave)
@@ -175,7 +175,7 @@ def build_window(
     transfer = np.zeros(leave + 1 - begin)
     if speed_change_m_per_s2 is not None:
         transfer = total_mass_kg * cg_height_m / wheelbase_m * speed_change_m_per_s2[part]
-    return Window(
+    return PaperWindow(
         step_s,
         total_mass_kg,
         wheelbase_m,
@@ -218,7 +218,7 @@ class Workspace(NamedTuple):
     seen: FloatArray  # (q, 4): sums of the rows with the nuisance columns
 
 
-def workspace(window: Window) -> Workspace:
+def workspace(window: PaperWindow) -> Workspace:
     """Allocate the work arrays for this window."""
     elements, _, m = window.basis.cubics.shape
     return Workspace(
@@ -237,8 +237,7 @@ def workspace(window: Window) -> Workspace:
 def _vehicle_factors(
     theta: FloatArray, total_mass: float, wheelbase: float, gravity: float, out: FloatArray
 ) -> None:
-    """Rows of `out` (13, 4): minus the IEP factors of front (3) and rear (3), static loads (2),
-    m_11, m_22, m_12, m_u1, m_u2."""
+    """Write minus IEP factors (6), loads (2), m_11, m_22, m_12, m_u1, m_u2 to `out` (13, 4)."""
     for lane in range(LANES):
         p = theta[lane]
         m_s = total_mass - p[M_U1] - p[M_U1 + 1]
@@ -262,7 +261,7 @@ def _vehicle_factors(
 
 @kernel
 def _march_stretch(
-    window: Window,
+    window: PaperWindow,
     work: Workspace,
     factors: FloatArray,
     begin: int,
@@ -272,7 +271,7 @@ def _march_stretch(
     cubics: FloatArray,
     feedback: FloatArray,
 ) -> None:
-    """Minus the road under both wheels, y - u, of one stretch into `work.road`: IEP, then DRS."""
+    """Write minus the road under both wheels, y - u, of one stretch to `work.road`."""
     a = window.acceleration
     s = window.signals
     u1, c1, k1 = load(factors, 0), load(factors, 1), load(factors, 2)
@@ -310,13 +309,12 @@ def _march_stretch(
 
 @kernel
 def march_particles(
-    window: Window, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
+    window: PaperWindow, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
 ) -> None:
-    """J of four particles `theta` (4, p) into `total` (4,); their roads are left in `work.road`.
+    """Compute J of four particles `theta` (4, p) to `total` (4,); roads stay in `work.road`.
 
-    An evaluation stops early once every particle's J has passed its `limit`, which decides a
-    comparison J <= limit exactly; `total` is then some value above the limit. J that is not finite
-    is returned as infinity.
+    An evaluation stops early once every particle's J has passed its `limit` (4,), which decides a
+    comparison J <= limit exactly; `total` then exceeds the limit. It is infinite if not finite.
     """
     total[:] = np.inf
     for i in range(theta.shape[0]):
@@ -376,8 +374,8 @@ def march_particles(
 
 
 @kernel
-def _rows(window: Window, road: FloatArray, lane: int, out: FloatArray) -> None:
-    """Weighted rows of one particle into `out` (m,), nuisance columns not yet removed."""
+def _rows(window: PaperWindow, road: FloatArray, lane: int, out: FloatArray) -> None:
+    """Write weighted residuals of one particle to `out` (m,), nuisance columns not yet removed."""
     front, rear = road[0], road[1]
     for row in range(out.size):
         n = window.front_sample[row]
@@ -389,9 +387,9 @@ def _rows(window: Window, road: FloatArray, lane: int, out: FloatArray) -> None:
 
 @kernel
 def objective_batch(
-    window: Window, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
+    window: PaperWindow, work: Workspace, theta: FloatArray, limit: FloatArray, total: FloatArray
 ) -> None:
-    """J of many particles, four at a time: `theta` (k, p), `limit` (k,), output `total` (k,)."""
+    """Compute J of many particles by fours: `theta` (k, p), `limit` (k,), output `total` (k,)."""
     count = theta.shape[0]
     four = np.empty((LANES, theta.shape[1]))
     four_limit = np.empty(LANES)
@@ -407,7 +405,9 @@ def objective_batch(
 
 
 @kernel
-def _residual_batch(window: Window, work: Workspace, theta: FloatArray, out: FloatArray) -> None:
+def _residual_batch(
+    window: PaperWindow, work: Workspace, theta: FloatArray, out: FloatArray
+) -> None:
     count = theta.shape[0]
     four = np.empty((LANES, theta.shape[1]))
     no_limit = np.full(LANES, np.inf)
@@ -423,8 +423,8 @@ def _residual_batch(window: Window, work: Workspace, theta: FloatArray, out: Flo
                 out[begin + lane] = np.nan
 
 
-def residual_batch(window: Window, work: Workspace, theta: FloatArray) -> FloatArray:
-    """Weighted residual rows (k, m) of vectors (k, p); their squares sum to J. NaN: not finite."""
+def residual_batch(window: PaperWindow, work: Workspace, theta: FloatArray) -> FloatArray:
+    """Return weighted residuals (k, m) of vectors (k, p), NaN if not finite; squares sum to J."""
     theta = np.ascontiguousarray(theta)
     out = np.empty((theta.shape[0], window.front_sample.size))
     _residual_batch(window, work, theta, out)
@@ -434,8 +434,8 @@ def residual_batch(window: Window, work: Workspace, theta: FloatArray) -> FloatA
 
 
 @kernel
-def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
-    """J of one vector (p,), quicker than a batch of one: modes, not particles, share the lanes."""
+def objective(window: PaperWindow, work: Workspace, theta: FloatArray) -> float:
+    """Return J of one vector (p,), faster than a batch of one: modes share the lanes."""
     if not np.all(np.isfinite(theta)):
         return np.inf
     basis = window.basis
@@ -506,15 +506,14 @@ def objective(window: Window, work: Workspace, theta: FloatArray) -> float:
 
 @kernel
 def _one_particle_stretch(
-    window: Window,
+    window: PaperWindow,
     work: Workspace,
     factors: FloatArray,
     begin: int,
     stop: int,
     scratch: FloatArray,
 ) -> None:
-    """Minus the input profiles into lane 0 of `work.road` (the modes of the other lanes begin at
-    zero), and the contact forces into all lanes of `work.force`."""
+    """Write minus the input profiles to lane 0 of `work.road`, forces to all of `work.force`."""
     a = window.acceleration
     s = window.signals
     for w in range(2):
@@ -552,28 +551,29 @@ def _one_particle_stretch(
             store(force, i, (p[i], p[i], p[i], p[i]))
 
 
-class Roads(NamedTuple):
-    """The two road profiles that a vector of parameters implies, over the compared stretch."""
+class ImpliedProfiles(NamedTuple):
+    """The two road profiles that a parameter vector implies, over the compared stretch."""
 
     x_m: FloatArray  # (m,)
     front_m: FloatArray  # (m,)
     rear_m: FloatArray  # (m,)
 
 
-def road_profiles(window: Window, work: Workspace, theta: FloatArray) -> Roads:
-    """Road under the front and under the rear wheel at the rows' chainages, in order of travel."""
+def road_profiles(window: PaperWindow, work: Workspace, theta: FloatArray) -> ImpliedProfiles:
+    """Return the profiles under both wheels (m,) at the residuals' chainages, for theta (p,)."""
     four = np.repeat(theta[None, :], LANES, axis=0)
     march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
     front = -work.road[0, :, 0]
     gathered = front[window.front_sample[:, None] + np.arange(4)]
     rear = -work.road[1, window.first_row : window.first_row + window.x_m.size, 0]
-    return Roads(window.x_m.copy(), np.einsum("mj,mj->m", window.front_weight, gathered), rear)
+    front = np.einsum("mj,mj->m", window.front_weight, gathered)
+    return ImpliedProfiles(window.x_m.copy(), front, rear)
 
 
-def deflections_m(window: Window, theta: FloatArray) -> FloatArray:
-    """Deflection (2, n) of the bridge under the front and the rear wheel, positive downwards."""
+def deflections_m(window: PaperWindow, theta: FloatArray) -> FloatArray:
+    """Return the deflection (2, n) of the bridge under front and rear wheel, positive downwards."""
     work = workspace(window)
     four = np.repeat(theta[None, :], LANES, axis=0)
     march_particles(window, work, four, np.full(LANES, np.inf), np.empty(LANES))
-    # The road that is left there is minus r, and y = u - r.
+    # That array holds minus r, and y = u - r.
     return np.asarray(-input_profiles(window.signals, theta) - work.road[:, :, 0])

@@ -1,1 +1,1 @@
-"""The forward problem: half-car, beam, road, sensors, and both driven together."""
+"""The forward problem: half-car, beam, road, sensors, and the coupled simulation."""

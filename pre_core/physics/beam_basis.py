@@ -1,4 +1,4 @@
-"""Dynamic response simulation (DRS): the bridge's deflection under wheels whose forces are known.
+"""Dynamic response simulation (DRS): deflection of the bridge under wheels of known forces.
 
 For one time step Newmark's average acceleration on a mode of unit mass, q'' + c q' + lambda q = p,
 is the bilinear transform of its transfer function,
@@ -6,18 +6,18 @@ is the bilinear transform of its transfer function,
     b_0 q[n] + b_1 q[n-1] + b_2 q[n-2] = p[n] + 2 p[n-1] + p[n-2],
     b_0 = a^2 + a c + lambda,  b_1 = 2 (lambda - a^2),  b_2 = a^2 - a c + lambda,  a = 2/step,
 
-so that a mode costs a handful of multiplications a step. The recursion here is the direct form II,
-w[n] = p[n] - (b_1 w[n-1] + b_2 w[n-2])/b_0, q[n] = (w[n] + 2 w[n-1] + w[n-2])/b_0, with 1/b_0 split
+so that a mode costs a few multiplications per step. The recursion here is the direct form II, w[n]
+= p[n] - (b_1 w[n-1] + b_2 w[n-2])/b_0, q[n] = (w[n] + 2 w[n-1] + w[n-2])/b_0, with 1/b_0 split
 evenly into the mode shapes. It starts from rest before the first wheel arrives.
 
-What is marched is w and its change d[n] = w[n] - w[n-1],
+The march keeps w and its change d[n] = w[n] - w[n-1],
 
     d[n] = p[n] + (a^2 - a c - 3 lambda)/b_0 d[n-1] - 4 lambda/b_0 w[n-2].
 
-In the form above the factors of a slow mode are all but 2 and -1, and what is rounded off them and
-off their sum comes back (a^2/lambda) times: hundreds of roundings, other ones on every processor,
-which slopes by differences then divide by their step. It is w[n-2] here and not w[n-1], so that a
-step need not wait for the sum before it.
+In the form above the factors of a slow mode are nearly 2 and -1. Their rounding, and that of their
+sum, is amplified (a^2/lambda) times: hundreds of roundings, different on every processor, which
+difference quotients then divide by their step. The use of w[n-2] instead of w[n-1] saves a step
+from waiting for the previous sum.
 """
 
 from typing import NamedTuple
@@ -28,30 +28,30 @@ from scipy.linalg import eigh
 
 from pre_core.kernels.jacobi import diagonalise, diagonalise_one
 from pre_core.kernels.lanes import LANES, add, fma, fma_scalar, kernel, load, mul, store, sub
+from pre_core.parameters import ALPHA, BETA, EI_1, K_ROT, RHO_A, F
 from pre_core.physics.bridge import (
     element_cubics,
-    held_nodes,
     mass_matrix,
+    supported_nodes,
     uniform_beam,
     unit_stiffness_matrices,
 )
-from pre_core.unknowns import ALPHA, BETA, EI_1, K_ROT, RHO_A, F
 
 FloatArray = NDArray[np.float64]
 
 
 RIGID_M_PER_N = 2e-12
-"""Compliance that every bearing has besides its own, a hundredth of a micrometre under a heavy
-axle: a spring of no compliance at all would be infinitely stiff."""
+"""Compliance added to every bearing, a hundredth of a micrometre under a heavy axle: without any
+compliance the spring would be infinitely stiff."""
 
 
 class BeamBasis(NamedTuple):
-    """What every evaluation shares: the beam in coordinates in which the sound one is diagonal.
+    """The data that evaluations share: the beam in coordinates that diagonalise the undamaged one.
 
-    `stiffness` (n + 2 or n + 4, m, m): dK/ds of the n elements' EI, of the rotational and, where
-    bearings may give, of the vertical springs at the ends, in coordinates that make the mass matrix
-    of 1 kg/m the identity. `cubics` (n parts, 4, m): deflection in each part of an element for each
-    coordinate. `lengths_m` (n parts,).
+    `stiffness` (n + 2 or n + 4, m, m) is dK/ds of the n elements' EI, of the rotational and, for
+    compliant bearings, of the vertical springs at the ends, in coordinates that make the mass
+    matrix of 1 kg/m the identity. `cubics` (n parts, 4, m) is the deflection in each part of an
+    element for each coordinate. `lengths_m` is (n parts,).
     """
 
     stiffness: FloatArray
@@ -67,12 +67,13 @@ def beam_basis(
     interior_supports: tuple[int, ...] = (),
     bearings_give: bool = False,
 ) -> BeamBasis:
-    """Coordinates: the lowest modes of the uniform beam whose elements are cut into `parts`.
+    """Return a beam in the lowest modes of the uniform beam, its n elements cut into `parts`.
 
-    All of them by default, which is the finite-element model itself. Fewer are quicker but poor for
-    a beam that is not uniform or has springs at its supports, whose kinked curvature smooth modes
-    do not span: f_1 of the paper's scenario 6 is 1 % off with 14 of 28. `interior_supports` are
-    nodes between elements. With `bearings_give` the ends have a vertical spring each.
+    Without `coordinates` all modes are used, which is the finite-element model itself. Fewer are
+    faster but poor for a beam that is not uniform or has springs at its supports, whose kinked
+    curvature smooth modes do not span: f_1 of the paper's scenario 6 is 1 % off with 14 of 28.
+    `element_lengths_m` is (n,); `interior_supports` are nodes between elements. With
+    `bearings_give` each end has a vertical spring.
     """
     n = element_lengths_m.size
     lengths = np.repeat(element_lengths_m / parts, parts)
@@ -82,13 +83,13 @@ def beam_basis(
         support_compliance_m_per_n=give,
         interior_supports=tuple(node * parts for node in interior_supports),
     )
-    held = held_nodes(unit)
+    held = supported_nodes(unit)
     fine = unit_stiffness_matrices(lengths, held)
     count = fine.shape[1] if coordinates is None else min(coordinates, fine.shape[1])
     units = np.concatenate(
         [fine[: n * parts].reshape(n, parts, *fine.shape[1:]).sum(axis=1), fine[n * parts :]]
     )[: n + 4 if bearings_give else n + 2]
-    # The springs, as stiff as an element of this length, only keep the beam from floating away.
+    # The springs, as stiff as an element of this length, only suppress rigid-body motion.
     reference = units[:n].sum(axis=0) + units[n + 2 :].sum(axis=0) * 12.0 / lengths[0] ** 3
     _, shapes = eigh(reference, mass_matrix(unit), subset_by_index=(0, count - 1))
     return BeamBasis(
@@ -98,11 +99,12 @@ def beam_basis(
     )
 
 
-def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
-    """The same beam in coordinates in which the bridge `theta` (p,) is diagonal.
+def change_basis(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
+    """Return the same beam in coordinates that diagonalise the bridge `theta` (p,).
 
-    Bridges near it are then nearly diagonal, which makes their modes quick to find. All modes rise
-    from the start: an eigenvector's sign is chance, and how a mode swings is told with it.
+    Bridges near it are then nearly diagonal, so that their modes are quick to find. Every mode
+    rises from the start: the sign of an eigenvector is arbitrary, but initial vibration depends on
+    it.
     """
     factors = stiffness_factors(theta, basis.stiffness.shape[0])
     _, shapes = eigh(np.tensordot(factors, basis.stiffness, axes=1))
@@ -116,7 +118,7 @@ def rebased(basis: BeamBasis, theta: FloatArray) -> BeamBasis:
 
 
 def first_frequencies_hz(basis: BeamBasis, theta: FloatArray) -> FloatArray:
-    """First natural frequency (k,) in Hz, undamped, of the bridges `theta` (k, p)."""
+    """Return the undamped first natural frequencies (k,) in Hz of bridges `theta` (k, p)."""
     factors = stiffness_factors(theta, basis.stiffness.shape[0])
     stiffness = np.tensordot(factors, basis.stiffness, axes=1)
     lowest = np.linalg.eigvalsh(stiffness)[:, 0]
@@ -124,7 +126,7 @@ def first_frequencies_hz(basis: BeamBasis, theta: FloatArray) -> FloatArray:
 
 
 def stiffness_factors(theta: FloatArray, count: int) -> FloatArray:
-    """What multiplies the `count` matrices of `BeamBasis.stiffness`: (…, count) for (…, p)."""
+    """Return the factors (…, count) of the matrices `BeamBasis.stiffness` for theta (…, p)."""
     vertical = 1.0 / (theta[..., F : F + 2] + RIGID_M_PER_N)
     factors = [theta[..., EI_1:], theta[..., K_ROT : K_ROT + 2], vertical]
     return np.concatenate(factors, axis=-1)[..., :count]
@@ -132,7 +134,7 @@ def stiffness_factors(theta: FloatArray, count: int) -> FloatArray:
 
 @kernel
 def stiffness_factor(theta: FloatArray, i: int) -> float:
-    """The same for one vector (p,) and matrix i, in kernels."""
+    """Return factor i of `stiffness_factors` for one vector (p,), in kernels."""
     spring = i - (theta.size - EI_1)
     if spring < 0:
         return theta[EI_1 + i]
@@ -143,7 +145,7 @@ def stiffness_factor(theta: FloatArray, i: int) -> float:
 
 @kernel
 def modal_damping(theta: FloatArray, eigenvalue: float) -> float:
-    """Rayleigh damping of a mode of unit mass: alpha + beta omega^2."""
+    """Return the Rayleigh damping alpha + beta omega^2 of a unit-mass mode for theta (p,)."""
     return theta[ALPHA] + theta[BETA] * eigenvalue
 
 
@@ -158,10 +160,10 @@ def modal_filters(
     cubics: FloatArray,
     feedback: FloatArray,
 ) -> bool:
-    """Modes of four bridges as the coefficients of their recursions; False if not finite.
+    """Compute the recursions of the modes of four bridges; return False if not finite.
 
-    `theta` is (4, p). Written: `cubics` (parts, m, 4, 4) [part, mode, power, particle], scaled
-    by 1/sqrt(b_0), and `feedback` (m, 2, 4): what multiplies w[n-2] and d[n-1].
+    `theta` is (4, p). Outputs: `cubics` (parts, m, 4, 4) [part, mode, power, particle], scaled by
+    1/sqrt(b_0), and `feedback` (m, 2, 4), the factors of w[n-2] and d[n-1].
     """
     factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
     by_lane = np.empty((factors, LANES))
@@ -169,7 +171,7 @@ def modal_filters(
         for lane in range(LANES):
             by_lane[e, lane] = stiffness_factor(theta[lane], e)
     for i in range(m):
-        for j in range(i, m):  # the upper triangle is all that is read
+        for j in range(i, m):  # only the upper triangle is read
             total = (0.0, 0.0, 0.0, 0.0)
             for e in range(factors):
                 total = fma_scalar(load(by_lane, e), basis_stiffness[e, i, j], total)
@@ -200,9 +202,10 @@ def modal_filters(
 def diagonalise_bridge(
     basis_stiffness: FloatArray, theta: FloatArray, matrix: FloatArray, vectors: FloatArray
 ) -> bool:
-    """Eigenvalues times rho A on the diagonal of `matrix`, mode shapes in the rows of `vectors`.
+    """Diagonalise one bridge `theta` (p,); return False if not finite.
 
-    Both are (m, m), of one bridge `theta` (p,). False if not finite.
+    On return `matrix` (m, m) has the eigenvalues times rho A on its diagonal and `vectors` (m, m)
+    the mode shapes in its rows.
     """
     factors, m = basis_stiffness.shape[0], basis_stiffness.shape[1]
     matrix[:] = 0.0
@@ -220,7 +223,7 @@ def diagonalise_bridge(
 def shape_cubics(
     basis_cubics: FloatArray, vectors: FloatArray, size: FloatArray, out: FloatArray
 ) -> None:
-    """Cubics of all modes in every part into out (parts, g, 4, 4) [part, group, power, mode].
+    """Compute cubics of all modes in every part: `out` (parts, g, 4, 4) [part, group, power, mode].
 
     `vectors` (m, m) has the modes in its rows, each of which is multiplied by its `size` (m,).
     """
@@ -232,7 +235,7 @@ def shape_cubics(
     row = np.empty(size.size)
     for e in range(basis_cubics.shape[0]):
         for power in range(4):
-            # Mode beside mode, so that they share the vector registers.
+            # Adjacent modes share the vector registers.
             row[:] = 0.0
             for i in range(m):
                 one = basis_cubics[e, power, i]
@@ -253,10 +256,10 @@ def modal_filters_one(
     cubics: FloatArray,
     feedback: FloatArray,
 ) -> bool:
-    """The same for one bridge `theta` (p,), its modes in the lanes: g groups of four.
+    """Compute the recursions of one bridge `theta` (p,), its modes in the lanes: g groups of four.
 
-    `matrix` and `vectors` are (m, m). Written: `cubics` (parts, g, 4, 4) [part, group, power, mode]
-    and `feedback` (g, 2, 4); lanes beyond the last mode stay zero.
+    `matrix` and `vectors` are (m, m). Outputs: `cubics` (parts, g, 4, 4) [part, group, power, mode]
+    and `feedback` (g, 2, 4); lanes beyond the last mode stay zero. Return False if not finite.
     """
     if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
         return False
@@ -361,7 +364,7 @@ def advance(
 
     Cubics are (m, 4, 4) of the element under each wheel, `feedback` and `state` (m, 2, 4), places
     (steps,), `force` (2, steps, 4), deflections (steps, 4). `state` is updated and the deflections
-    are *added* to. What the fourth axis is (particles, or groups of modes) does not matter here.
+    are *added* to. The fourth axis may be particles or groups of modes.
     """
     for k in range(feedback.shape[0]):
         if front_on and rear_on:

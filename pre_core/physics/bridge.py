@@ -1,8 +1,8 @@
 """The bridge: an Euler-Bernoulli beam of Hermite elements (paper section 2.1) on its supports.
 
-Degrees of freedom are deflection and rotation at every node in order, less the deflections that are
-held: those of interior supports, and of the ends unless their bearings give. With n elements on two
-rigid bearings there are 2n.
+Degrees of freedom are deflection and rotation at every node in order, without the deflections that
+are fixed: those of interior supports, and of the ends unless their bearings are compliant. With n
+elements on two rigid bearings there are 2n.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Beam(NamedTuple):
-    """One or more spans with Rayleigh damping C = alpha M + beta K; one entry per element."""
+    """A beam of n elements with Rayleigh damping C = alpha M + beta K; arrays are (n,)."""
 
     element_lengths_m: FloatArray
     flexural_rigidity_nm2: FloatArray
@@ -24,13 +24,13 @@ class Beam(NamedTuple):
     rayleigh_beta_s: float
     support_rotational_stiffness_nm_per_rad: tuple[float, float] = (0.0, 0.0)
     support_compliance_m_per_n: tuple[float, float] = (0.0, 0.0)
-    """How far the bearings at the ends give under load; 0 is rigid."""
+    """Vertical compliance of the end bearings; 0 is rigid."""
     interior_supports: tuple[int, ...] = ()
-    """Nodes, 1 to n - 1, whose deflection is held; they turn freely."""
+    """Nodes, 1 to n - 1, whose deflection is fixed; they rotate freely."""
     torsional_flexibility_per_n: float = 0.0
-    """e²/(GJ) of wheels whose middle runs at the distance e beside the axis (torsion.py)."""
+    """Ratio e²/(GJ) for wheels whose middle runs at the distance e from the axis (torsion.py)."""
     torsional_wave_speed_m_per_s: float = 0.0
-    """Positive where the deck twists."""
+    """Speed of torsional waves; positive where the deck twists."""
 
 
 class Modes(NamedTuple):
@@ -49,7 +49,7 @@ def uniform_beam(
     rayleigh_beta_s: float,
     support_rotational_stiffness_nm_per_rad: tuple[float, float] = (0.0, 0.0),
 ) -> Beam:
-    """A beam of equal elements, as many as rigidities are given."""
+    """Return a beam of equal elements, one for each of the rigidities (n,)."""
     rigidity = np.asarray(flexural_rigidity_nm2, dtype=np.float64)
     n = rigidity.size
     return Beam(
@@ -63,7 +63,7 @@ def uniform_beam(
 
 
 def refine(beam: Beam, parts: int) -> Beam:
-    """The same beam with every element cut into `parts` equal ones."""
+    """Return the same beam with every element cut into `parts` equal ones."""
     return beam._replace(
         element_lengths_m=np.repeat(beam.element_lengths_m / parts, parts),
         flexural_rigidity_nm2=np.repeat(beam.flexural_rigidity_nm2, parts),
@@ -72,8 +72,8 @@ def refine(beam: Beam, parts: int) -> Beam:
     )
 
 
-def held_nodes(beam: Beam) -> tuple[int, ...]:
-    """Nodes whose deflection is held."""
+def supported_nodes(beam: Beam) -> tuple[int, ...]:
+    """Return the nodes whose deflection is fixed."""
     ends = (0, beam.element_lengths_m.size)
     rigid = [
         node
@@ -84,15 +84,15 @@ def held_nodes(beam: Beam) -> tuple[int, ...]:
 
 
 def span_m(beam: Beam) -> float:
-    """Distance between the bearings at the ends."""
+    """Return the distance between the bearings at the ends."""
     return float(beam.element_lengths_m.sum())
 
 
 def element_mass(length_m: float, coupling_sign: float = 1.0) -> FloatArray:
-    """Consistent mass matrix (4, 4) of a Hermite element of 1 kg/m.
+    """Return the consistent mass matrix (4, 4) of a Hermite element of 1 kg/m.
 
     `coupling_sign` = -1 flips the terms of 13 l/420. It is wrong; it is here because the bridge
-    frequencies of the paper's Table 5 appear with it (docs/reproduction.md).
+    frequencies of the paper's Table 5 result from it (studies/reproduction.md).
     """
     s = length_m
     t = coupling_sign * 13.0 * s
@@ -107,7 +107,7 @@ def element_mass(length_m: float, coupling_sign: float = 1.0) -> FloatArray:
 
 
 def element_stiffness(length_m: float) -> FloatArray:
-    """Stiffness matrix (4, 4) of a Hermite element of 1 N m^2."""
+    """Return the stiffness matrix (4, 4) of a Hermite element of 1 N m^2."""
     s = length_m
     return np.array(
         [
@@ -120,14 +120,14 @@ def element_stiffness(length_m: float) -> FloatArray:
 
 
 def node_dofs(elements: int, held: tuple[int, ...]) -> NDArray[np.int64]:
-    """Degrees of freedom (n + 1, 2) of every node: deflection (-1 where it is held), rotation."""
+    """Return the degrees of freedom (n + 1, 2) of every node: deflection (-1: fixed), rotation."""
     is_free = np.full((elements + 1, 2), True)
     is_free[list(held), 0] = False
     return np.where(is_free, np.cumsum(is_free).reshape(is_free.shape) - 1, -1)
 
 
 def element_dofs(elements: int, held: tuple[int, ...]) -> NDArray[np.int64]:
-    """Degrees of freedom (n, 4) of each element, node by node: deflection, rotation; -1 is held."""
+    """Return the degrees of freedom (n, 4) of each element, node by node; -1 is fixed."""
     nodes = node_dofs(elements, held)
     return np.concatenate([nodes[:-1], nodes[1:]], axis=1)
 
@@ -142,7 +142,7 @@ def _assemble(blocks: list[FloatArray], held: tuple[int, ...]) -> FloatArray:
 
 
 def mass_matrix(beam: Beam, coupling_sign: float = 1.0) -> FloatArray:
-    """Consistent mass matrix (d, d), kg."""
+    """Return the consistent mass matrix (d, d), kg."""
     return _assemble(
         [
             rho * element_mass(length, coupling_sign)
@@ -150,15 +150,15 @@ def mass_matrix(beam: Beam, coupling_sign: float = 1.0) -> FloatArray:
                 beam.mass_per_length_kg_per_m, beam.element_lengths_m, strict=True
             )
         ],
-        held_nodes(beam),
+        supported_nodes(beam),
     )
 
 
 def unit_stiffness_matrices(element_lengths_m: FloatArray, held: tuple[int, ...]) -> FloatArray:
-    """dK/ds_j (n + 4, d, d): the n flexural rigidities, then the springs at start and end.
+    """Return dK/ds_j (n + 4, d, d): of the n flexural rigidities, then of the end springs.
 
-    First the two rotational springs, then the two vertical ones (zero where the end is held).
-    K = sum over j of s_j times these, exactly.
+    The two rotational springs precede the two vertical ones (zero where the end is fixed). K is
+    exactly the sum of these matrices times s_j. `element_lengths_m` is (n,).
     """
     n = element_lengths_m.size
     nodes = node_dofs(n, held)
@@ -177,13 +177,13 @@ def unit_stiffness_matrices(element_lengths_m: FloatArray, held: tuple[int, ...]
 
 
 def stiffness_matrix(beam: Beam) -> FloatArray:
-    """Stiffness matrix (d, d) with the support springs."""
-    units = unit_stiffness_matrices(beam.element_lengths_m, held_nodes(beam))
+    """Return the stiffness matrix (d, d) with the support springs."""
+    units = unit_stiffness_matrices(beam.element_lengths_m, supported_nodes(beam))
     return np.tensordot(_stiffness_factors(beam), units, axes=1)
 
 
 def _stiffness_factors(beam: Beam) -> FloatArray:
-    """What multiplies the matrices (n + 4, d, d) of `unit_stiffness_matrices`."""
+    """Return the factors (n + 4,) of the matrices of `unit_stiffness_matrices`."""
     vertical = [1.0 / f if f > 0.0 else 0.0 for f in beam.support_compliance_m_per_n]
     return np.concatenate(
         [beam.flexural_rigidity_nm2, beam.support_rotational_stiffness_nm_per_rad, vertical]
@@ -191,7 +191,7 @@ def _stiffness_factors(beam: Beam) -> FloatArray:
 
 
 def modes(beam: Beam, count: int | None = None, coupling_sign: float = 1.0) -> Modes:
-    """The lowest `count` modes (all by default)."""
+    """Return the lowest `count` modes (all by default)."""
     stiffness = stiffness_matrix(beam)
     last = (stiffness.shape[0] if count is None else count) - 1
     eigenvalues, shapes = eigh(
@@ -204,25 +204,27 @@ def modes(beam: Beam, count: int | None = None, coupling_sign: float = 1.0) -> M
 def natural_frequencies_hz(
     beam: Beam, count: int | None = None, coupling_sign: float = 1.0
 ) -> FloatArray:
-    """Undamped natural frequencies, ascending."""
+    """Return the undamped natural frequencies (k,), ascending."""
     return np.asarray(np.sqrt(modes(beam, count, coupling_sign).eigenvalues_per_s2) / (2.0 * np.pi))
 
 
 def strain_energy_shares(beam: Beam) -> FloatArray:
-    """Shares (n + 4,) of the lowest mode's strain energy that the n elements and the springs hold.
+    """Return the shares (n + 4,) of elements and springs in the first mode's strain energy.
 
-    They say what its frequency answers to: Rayleigh's quotient is stationary at the mode, so that
-    d ln f_1/d ln s_j is half of share j for each factor s_j of `unit_stiffness_matrices`, and
+    They are the sensitivity of its frequency: Rayleigh's quotient is stationary at the mode, so
+    that d ln f_1/d ln s_j is half of share j for each factor s_j of `unit_stiffness_matrices`, and
     d ln f_1/d ln rho A is -1/2.
     """
     shape = modes(beam, 1).shapes[:, 0]
-    units = unit_stiffness_matrices(beam.element_lengths_m, held_nodes(beam))
+    units = unit_stiffness_matrices(beam.element_lengths_m, supported_nodes(beam))
     energy = _stiffness_factors(beam) * np.einsum("i,jik,k->j", shape, units, shape)
     return np.asarray(energy / energy.sum())
 
 
-def locate(element_lengths_m: FloatArray, x_m: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-    """Element number (-1 off the bridge) and place 0..1 within it for chainages of any shape."""
+def locate_element(
+    element_lengths_m: FloatArray, x_m: FloatArray
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return element number (-1 off the bridge) and place 0..1 within it for chainages (…)."""
     edges = np.concatenate([[0.0], np.cumsum(element_lengths_m)])
     element = np.clip(np.searchsorted(edges, x_m, side="right") - 1, 0, element_lengths_m.size - 1)
     place = (x_m - edges[element]) / element_lengths_m[element]
@@ -231,7 +233,7 @@ def locate(element_lengths_m: FloatArray, x_m: FloatArray) -> tuple[NDArray[np.i
 
 
 def cubic_from_nodes(length_m: float) -> FloatArray:
-    """Coefficients (4, 4) of 1, xi, xi^2, xi^3 (rows) from w_1, theta_1, w_2, theta_2."""
+    """Return the matrix (4, 4) from w_1, theta_1, w_2, theta_2 to the powers 1, xi, xi^2, xi^3."""
     s = length_m
     return np.array(
         [
@@ -246,9 +248,9 @@ def cubic_from_nodes(length_m: float) -> FloatArray:
 def element_cubics(
     element_lengths_m: FloatArray, held: tuple[int, ...], nodal: FloatArray
 ) -> FloatArray:
-    """Cubics (n, 4, k) in the element's place 0..1 of k nodal vectors (d, k)."""
+    """Return cubics (n, 4, k) in the element's place 0..1 of k nodal vectors (d, k)."""
     dofs = element_dofs(element_lengths_m.size, held)
-    padded = np.vstack([nodal, np.zeros((1, nodal.shape[1]))])  # row -1: what is held
+    padded = np.vstack([nodal, np.zeros((1, nodal.shape[1]))])  # row -1: fixed deflections
     return np.stack(
         [
             cubic_from_nodes(length) @ padded[dof]
@@ -258,9 +260,9 @@ def element_cubics(
 
 
 def interpolation_matrix(beam: Beam, x_m: FloatArray) -> FloatArray:
-    """N (m, d): deflection at m chainages is N @ nodal; rows of zeros off the bridge."""
-    element, place = locate(beam.element_lengths_m, np.asarray(x_m, dtype=np.float64))
-    held = held_nodes(beam)
+    """Return N (m, d), so that N @ nodal is the deflection at m chainages; zero off the bridge."""
+    element, place = locate_element(beam.element_lengths_m, np.asarray(x_m, dtype=np.float64))
+    held = supported_nodes(beam)
     free = int(node_dofs(beam.element_lengths_m.size, held).max()) + 1
     cubics = element_cubics(beam.element_lengths_m, held, np.eye(free))
     powers = place[:, None] ** np.arange(4)
@@ -272,7 +274,7 @@ def interpolation_matrix(beam: Beam, x_m: FloatArray) -> FloatArray:
 def static_deflection_m(
     beam: Beam, load_x_m: FloatArray, load_n: FloatArray, x_m: FloatArray
 ) -> FloatArray:
-    """Deflection at `x_m` under standing point loads, up positive for loads up positive."""
+    """Return the deflection (m,) at `x_m` (m,) under static loads (k,), up positive like these."""
     force = interpolation_matrix(beam, load_x_m).T @ np.asarray(load_n, dtype=np.float64)
     return np.asarray(
         interpolation_matrix(beam, x_m) @ np.linalg.solve(stiffness_matrix(beam), force)

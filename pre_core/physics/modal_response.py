@@ -1,4 +1,4 @@
-"""A mode's response to a force that is linear between samples: exact at any step.
+"""Response of a mode to a force that is linear between samples: exact at any step.
 
 For q'' + c q' + lambda q = p with p linear between samples (Nigam and Jennings 1969) the samples of
 q obey
@@ -11,26 +11,26 @@ the response to a unit ramp after n steps h:
     b_0 = r_1/h,  b_1 = (r_2 - 2 r_1)/h + a_1 b_0,  b_2 = (r_3 - 2 r_2 + r_1)/h + a_1 (…) + a_2 b_0.
 
 Newmark's scheme, in contrast, shifts a mode at a fifth of the sampling rate by a tenth of its
-frequency. A force that is not linear between samples loses (omega h)^2/12 of its part at omega to
-the straight lines; `sharpened` gives that back.
+frequency. Linear interpolation attenuates a force at omega by (omega h)^2/12; `precompensate_force`
+restores this part.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import LANES, fma, fma_scalar, kernel, load, mul, store
+from pre_core.parameters import RHO_A
 from pre_core.physics.beam_basis import diagonalise_bridge, modal_damping, shape_cubics
-from pre_core.unknowns import RHO_A
 
 FloatArray = NDArray[np.float64]
 
 COEFFICIENTS = 5
-"""Numbers that a mode has: -a_1, -a_2 and b_0, b_1, b_2 over their sum."""
+"""Number of coefficients of a mode: -a_1, -a_2 and b_0, b_1, b_2 over their sum."""
 
 
 @kernel
 def _ramp_response(time: float, damping: float, eigenvalue: float) -> float:
-    """Displacement after `time` of a mode at rest when a force of one per second has grown."""
+    """Return the displacement of a mode at rest, `time` after a unit ramp force began."""
     half = 0.5 * damping
     square = eigenvalue - half * half
     # q = t/lambda - c/lambda^2 + exp(-half t) (C cos + S sin/w) with q(0) = q'(0) = 0.
@@ -51,7 +51,7 @@ def _ramp_response(time: float, damping: float, eigenvalue: float) -> float:
 
 @kernel
 def mode_coefficients(eigenvalue: float, damping: float, step: float, out: FloatArray) -> float:
-    """Coefficients (5,) of one mode (see COEFFICIENTS); returns the sum of the b."""
+    """Write the coefficients (5,) of one mode (see COEFFICIENTS); return the sum of the b."""
     half = 0.5 * damping
     square = eigenvalue - half * half
     if square > 0.0:
@@ -85,13 +85,13 @@ def modal_filters(
     feedback: FloatArray,
     modes: FloatArray,
 ) -> bool:
-    """Modes of one bridge `theta` (p,) in the lanes, g groups of four; False: not finite.
+    """Compute the recursions of the modes of one bridge `theta` (p,), g groups of four lanes.
 
-    `matrix` and `vectors` are (m, m). Written: `cubics` (parts, g, 4, 4) [part, group, power, mode]
-    times the root of the sum of the b, `feedback` (g, 5, 4), whose lanes beyond the last mode stay
-    zero, and `modes` (m, 3): omega^2, damping, and what the recursion's q is to be multiplied by
-    for the coordinate of the mass-normalised mode, with the sign that keeps a mode's direction from
-    one bridge to a similar one.
+    `matrix` and `vectors` are (m, m). Outputs: `cubics` (parts, g, 4, 4) [part, group, power, mode]
+    times the root of the sum of the b; `feedback` (g, 5, 4), whose lanes beyond the last mode stay
+    zero; `modes` (m, 3): omega^2, damping, and the factor from the recursion's q to the coordinate
+    of the mass-normalised mode, with a sign that is the same for similar bridges. Return False if
+    not finite.
     """
     if not diagonalise_bridge(basis_stiffness, theta, matrix, vectors):
         return False
@@ -109,15 +109,15 @@ def modal_filters(
         feedback[group, :, lane] = one
         size[k] = np.sqrt(total / theta[RHO_A])
         modes[k, 0], modes[k, 1] = eigenvalue, damping
-        # In coordinates in which a bridge near by is diagonal a mode is nearly a unit vector.
+        # In coordinates that diagonalise a similar bridge, a mode is nearly a unit vector.
         modes[k, 2] = np.sqrt(total) if vectors[k, k] >= 0.0 else -np.sqrt(total)
     shape_cubics(basis_cubics, vectors, size, cubics)
     return True
 
 
 @kernel
-def sharpened(force: FloatArray, out: FloatArray) -> None:
-    """p - (p[n+1] - 2 p[n] + p[n-1])/12 of a force (n,): see the module's docstring."""
+def precompensate_force(force: FloatArray, out: FloatArray) -> None:
+    """Write p - (p[n+1] - 2 p[n] + p[n-1])/12 of a force (n,) to `out` (n,); see the module."""
     last = force.size - 1
     out[0], out[last] = force[0], force[last]
     for n in range(1, last):
@@ -230,18 +230,19 @@ def advance(
             _one_wheel(
                 cubics[part_rear, g], feedback[g], state[g], place[1], force[1], deflection[1]
             )
-        else:  # a span shorter than the wheelbase swings on between the axles
+        else:  # a span shorter than the wheelbase vibrates freely between the axles
             _no_wheel(feedback[g], state[g], place.shape[1])
 
 
 @kernel
-def swing(
+def add_free_vibration(
     feedback: FloatArray, state: FloatArray, mode: FloatArray, k: int, q: float, v: float
 ) -> None:
-    """Let mode k swing freely: before the next sample it is at q and moves with v; adds to `state`.
+    """Add free vibration of mode k to `state`: displacement q and velocity v at the next sample.
 
-    `mode` (3,) is its row of `modal_filters`. The recursion's w is B z^n, z = exp((-s + i w) step),
-    where q[n] = B (n_0 + n_1/z + n_2/z^2) z^n. A mode that is damped beyond swinging stays at rest.
+    `mode` (3,) is its row of `modal_filters`, `state` (g, 2, 4). The recursion's w is B z^n, z =
+    exp((-s + i w) step), where q[n] = B (n_0 + n_1/z + n_2/z^2) z^n. An overdamped mode stays at
+    rest.
     """
     half = 0.5 * mode[1]
     square = mode[0] - half * half
@@ -327,10 +328,11 @@ def advance_with_ends(
     end_share: FloatArray,
     deflection: FloatArray,
 ) -> None:
-    """As `advance`, with forces at both ends of the bridge, and its ends felt by the wheels.
+    """March as `advance` does, with forces at both ends of the bridge, whose motion wheels follow.
 
-    `end_force` (2 ends, steps) acts besides the wheels' forces; `end_share` (2 wheels, 2 ends,
-    steps) of an end's deflection is felt by a wheel besides that of its own place.
+    `end_force` (2 ends, steps) acts in addition to the wheels' forces; `end_share` (2 wheels, 2
+    ends, steps) is the share of an end's deflection that a wheel follows in addition to that at its
+    place.
     """
     for g in range(feedback.shape[0]):
         _group_with_ends(

@@ -1,11 +1,9 @@
-"""A truck and a bridge as one vector of parameters, and back (unknowns.py)."""
+"""Conversion of a truck and a bridge to one parameter vector and back (parameters.py)."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.physics.bridge import Beam
-from pre_core.physics.vehicle import HalfCar
-from pre_core.unknowns import (
+from pre_core.parameters import (
     ALPHA,
     BETA,
     BRIDGE,
@@ -19,20 +17,24 @@ from pre_core.unknowns import (
     F,
     table,
 )
+from pre_core.physics.bridge import Beam
+from pre_core.physics.vehicle import HalfCar
 
 FloatArray = NDArray[np.float64]
 
 
 def from_models(car: HalfCar, beam: Beam) -> FloatArray:
-    """The vector theta (p,) of this truck and this bridge (of one mass per length throughout).
+    """Return the vector theta (p,) of a truck and a bridge of constant mass per length.
 
-    ValueError for a beam whose mass per length changes: the unknown rhoA is one number.
+    A half-car has no tandem, whose share is zero.
+
+    Raise ValueError for a beam of varying mass per length: the parameter rhoA is one number.
     """
     if np.ptp(beam.mass_per_length_kg_per_m) > 0.0:
         raise ValueError("the unknown rhoA is one number: the beam must be of one mass per length")
     of = {TRUCK: car, BRIDGE: beam}
     rows = table(beam.flexural_rigidity_nm2.size)
-    return np.array([np.ravel(getattr(of[row.part], row.key))[row.which] for row in rows])
+    return np.array([np.ravel(getattr(of[row.part], row.key, 0.0))[row.which] for row in rows])
 
 
 def beam_from(
@@ -41,9 +43,9 @@ def beam_from(
     interior_supports: tuple[int, ...] = (),
     wave_speed_m_per_s: float = 0.0,
 ) -> Beam:
-    """Return the bridge of theta (p,) over supports at its ends and at the nodes given.
+    """Return the bridge of theta (p,) over supports at its ends and at the given nodes.
 
-    The torsional wave speed is not among the unknowns.
+    The torsional wave speed is not a parameter of theta.
     """
     rigidities = theta[EI_1:]
     return Beam(
@@ -61,7 +63,7 @@ def beam_from(
 
 
 def body_masses(theta: FloatArray, total_mass_kg: float, wheelbase_m: float) -> FloatArray:
-    """Derived m_s, m_s1 = m_s d_2/D, m_s2 = m_s d_1/D: (..., 3) for vectors (..., p)."""
+    """Return m_s, m_s1 = m_s d_2/D and m_s2 = m_s d_1/D, shape (…, 3), for vectors (…, p)."""
     m_s = total_mass_kg - theta[..., M_U1] - theta[..., M_U1 + 1]
     rear = m_s * theta[..., D_1] / wheelbase_m
     return np.stack([m_s, m_s - rear, rear], axis=-1)

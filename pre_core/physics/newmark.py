@@ -1,14 +1,15 @@
 """Newmark's method with average acceleration (gamma = 1/2, beta = 1/4; paper Tables 4 and 6).
 
-Two ways through the same scheme: on full matrices, and mode by mode. With Rayleigh damping they
-agree to rounding, which is why the modal one may be used where speed matters.
+The scheme is implemented twice: with full matrices, and mode by mode. With Rayleigh damping both
+agree to rounding, so that the modal one may be used where speed matters.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pre_core.kernels.lanes import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -21,7 +22,7 @@ class Response(NamedTuple):
     acceleration: FloatArray
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _march(
     mass: FloatArray,
     damping: FloatArray,
@@ -70,11 +71,11 @@ def newmark(
     return Response(u, v, a)
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def newmark_modal(
     eigenvalues_per_s2: FloatArray, damping_per_s: FloatArray, force: FloatArray, step_s: float
 ) -> FloatArray:
-    """Modal displacements (steps, k) from rest for modal forces (steps, k) of unit modal masses."""
+    """Return modal displacements (steps, k) from rest for forces (steps, k) and unit masses."""
     steps, count = force.shape
     q = np.zeros((steps, count))
     for k in range(count):

@@ -1,7 +1,7 @@
-"""Road profiles: made from an ISO 8608 class and a seed, felt through a tyre, judged (IRI, class).
+"""Road profiles: generated from an ISO 8608 class, filtered by a tyre, rated (IRI, class).
 
-ISO 8608 describes a profile by the displacement spectral density G_d(n) = G_d(n_0) (n/n_0)^-w,
-n_0 = 0.1 cycles/m, w = 2; class A has the geometric mean G_d(n_0) = 16e-6 m^3, each next class four
+ISO 8608 describes a profile by the displacement spectral density G_d(n) = G_d(n_0) (n/n_0)^-w, n_0
+= 0.1 cycles/m, w = 2; class A has the geometric mean G_d(n_0) = 16e-6 m^3, each next class four
 times that.
 """
 
@@ -25,12 +25,12 @@ GOLDEN_CAR_K1_PER_S2 = 653.0
 GOLDEN_CAR_K2_PER_S2 = 63.3
 GOLDEN_CAR_C_PER_S = 6.0
 GOLDEN_CAR_MU = 0.15
-_GOLDEN_CAR_BASE_M = 0.25  # moving average that stands for the tyre's contact patch
-_GOLDEN_CAR_START_M = 0.5 * GOLDEN_CAR_SPEED_M_PER_S  # length whose mean slope starts the filter
+_GOLDEN_CAR_BASE_M = 0.25  # length of the moving average that models the contact patch
+_GOLDEN_CAR_START_M = 0.5 * GOLDEN_CAR_SPEED_M_PER_S  # travel whose mean slope starts the filter
 
 
 class Profile(NamedTuple):
-    """Heights (n,) at the increasing chainages x (n,), evenly spaced."""
+    """Heights (n,) at increasing, evenly spaced chainages x (n,)."""
 
     x_m: FloatArray
     height_m: FloatArray
@@ -46,17 +46,17 @@ def iso_8608_profile(
     longest_wave_m: float = 100.0,
     shortest_wave_m: float = 0.1,
 ) -> Profile:
-    """A profile with the spectral density of an ISO 8608 class at its geometric mean.
+    """Return a random profile with the geometric mean spectral density of an ISO 8608 class.
 
-    A sum of harmonics of random phase whose amplitudes sqrt(2 G_d(n) dn) follow the density between
-    the longest and the shortest wave. Shorter ones do not reach the vehicle through a tyre; none is
-    shorter than two spacings.
+    It is a sum of harmonics of random phase whose amplitudes sqrt(2 G_d(n) dn) follow the density
+    between the longest and the shortest wave. Shorter waves do not reach the vehicle through a
+    tyre; none is shorter than two spacings.
     """
     rng = np.random.default_rng(seed)
     count = round((stop_m - start_m) / spacing_m) + 1
     x = start_m + spacing_m * np.arange(count, dtype=np.float64)
     lowest = 1.0 / longest_wave_m
-    # Waves fit four times into the stretch asked for, so that no period is seen to repeat.
+    # The period is four times the requested length, so that it does not repeat visibly.
     period = max(4 * (count - 1), int(np.ceil(longest_wave_m / spacing_m)))  # samples
     step = 1.0 / (period * spacing_m)
     n = np.arange(lowest, min(1.0 / shortest_wave_m, 0.5 / spacing_m), step)
@@ -69,10 +69,10 @@ def iso_8608_profile(
 
 
 def contact_patch_average(profile: Profile, length_m: float) -> Profile:
-    """The profile as a tyre feels it that stands on `length_m` of road: its moving average.
+    """Return the moving average of a profile over a tyre's contact length.
 
-    The average of the cubic spline through the heights, exact for any length; a wave of n cycles/m
-    is multiplied by sin(pi n L)/(pi n L). Beyond its ends the road goes on level.
+    The average of the cubic spline through the heights is exact for any length; a wave of n
+    cycles/m is multiplied by sin(pi n L)/(pi n L). Beyond its ends the road is level.
     """
     if length_m <= 0.0:
         return profile
@@ -93,9 +93,9 @@ def contact_patch_average(profile: Profile, length_m: float) -> Profile:
 
 
 def under_wheels(profile: Profile, motion: Motion, wheelbase_m: float, direction: int) -> WheelRoad:
-    """Height and rate of change under both wheels, through a cubic spline of the profile.
+    """Return height and rate of change under both wheels, by a cubic spline of the profile.
 
-    Raises ValueError if the profile does not reach under both wheels all the way.
+    Raise ValueError if the profile does not cover the path of both wheels.
     """
     return under_axles(profile, profile, motion, wheelbase_m, direction)
 
@@ -103,7 +103,7 @@ def under_wheels(profile: Profile, motion: Motion, wheelbase_m: float, direction
 def under_axles(
     front: Profile, rear: Profile, motion: Motion, wheelbase_m: float, direction: int
 ) -> WheelRoad:
-    """The same where each axle has a profile of its own."""
+    """Return height and rate of change under both wheels, each axle with its own profile."""
     from scipy.interpolate import CubicSpline  # slow to import, of drawn roads alone
 
     behind_m = rear_position_m(motion.position_m, wheelbase_m, direction)
@@ -124,7 +124,7 @@ def under_axles(
 
 
 def golden_car_matrices(dx_m: float) -> tuple[FloatArray, FloatArray]:
-    """State transition (4, 4) and input (4,) of the quarter car of the IRI over one sample.
+    """Return state transition (4, 4) and input (4,) of the IRI's quarter car for one sample.
 
     States are the slopes [z_s', z_s'', z_u', z_u''] of Sayers' formulation (World Bank Technical
     Paper 46; ASTM E1926); the input is the slope of the profile, constant over the sample.
@@ -150,11 +150,11 @@ def golden_car_matrices(dx_m: float) -> tuple[FloatArray, FloatArray]:
 
 
 def iri_m_per_km(profile: Profile, segment_m: float | None = None) -> FloatArray:
-    """International Roughness Index of the profile, whole or per segment (m/km): (segments,).
+    """Return the International Roughness Index, whole or per segment: (segments,) in m/km.
 
     Mean rectified slope of the golden car at 80 km/h (ASTM E1926), which starts on the mean slope
-    of the first 0.5 s. Slopes are taken over 0.25 m. A last segment that is not whole is left out,
-    unless it is the only one.
+    of the first 0.5 s. Slopes are taken over 0.25 m. An incomplete last segment is omitted, unless
+    it is the only one.
     """
     x, height = profile.x_m, profile.height_m
     dx = float(x[1] - x[0])
@@ -180,7 +180,7 @@ def iri_m_per_km(profile: Profile, segment_m: float | None = None) -> FloatArray
 def roughness_coefficient_m3(
     profile: Profile, band_cycles_per_m: tuple[float, float] = (0.05, 1.0)
 ) -> float:
-    """G_d(n_0) of a profile: the level of a line of slope -2 fitted to its spectrum in the band."""
+    """Return G_d(n_0) of a profile: the level of a line of slope -2 fitted to its spectrum."""
     spacing = float(profile.x_m[1] - profile.x_m[0])
     n, density = _welch(
         profile.height_m, spacing, min(profile.height_m.size, round(100.0 / spacing))
@@ -189,18 +189,18 @@ def roughness_coefficient_m3(
     level = density[1:] * (n[1:] / REFERENCE_CYCLES_PER_M) ** WAVINESS
     octave = np.floor(np.log2(n[1:] / lowest))
     within = (n[1:] >= lowest) & (n[1:] <= band_cycles_per_m[1])
-    # Averaged within an octave before the logarithm (as ISO 8608 smooths): the mean logarithm of
-    # single lines of a periodogram lies far below the logarithm of their mean. Then every octave
-    # has the same say.
+    # Average within an octave before the logarithm, as ISO 8608 smooths: the mean logarithm of
+    # single periodogram lines is far below the logarithm of their mean. Then every octave
+    # has the same weight.
     octaves = [level[within & (octave == k)].mean() for k in np.unique(octave[within])]
     return float(np.exp(np.mean(np.log(octaves))))
 
 
 def _welch(values: FloatArray, spacing: float, length: int) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (f,) and one-sided power density (f,) of evenly spaced values (n,), n >= length.
+    """Return frequencies (f,) and one-sided power density (f,) of even values (n,), n >= length.
 
-    Welch's mean over Hann-windowed segments of `length` values that overlap by half, a line taken
-    off each. (scipy.signal has it too, and takes half a second to import.)
+    Welch's mean over Hann-windowed segments of `length` values that overlap by half, each detrended
+    by a line. (scipy.signal has it too, and takes half a second to import.)
     """
     segments = np.lib.stride_tricks.sliding_window_view(values, length)[:: length - length // 2]
     line = np.vander(np.linspace(-1.0, 1.0, length), 2)
@@ -215,6 +215,6 @@ def _welch(values: FloatArray, spacing: float, length: int) -> tuple[FloatArray,
 
 
 def iso_8608_class(coefficient_m3: float) -> str:
-    """Class of a roughness coefficient: limits lie a factor of 2 to both sides of the means."""
+    """Return the class of a roughness coefficient: limits are a factor of 2 from the means."""
     index = round(np.log(coefficient_m3 / GEOMETRIC_MEAN_M3["A"]) / np.log(4.0))
     return CLASSES[int(np.clip(index, 0, len(CLASSES) - 1))]

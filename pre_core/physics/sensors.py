@@ -1,4 +1,4 @@
-"""What an accelerometer and a satellite receiver make of the truth.
+"""Models of an accelerometer and a GNSS receiver.
 
 An accelerometer's chain, in this order: gain and bias, low-pass and sampling at the output rate
 (late by the delay), white and pink noise, saturation, quantisation. Noise is declared as the
@@ -20,7 +20,7 @@ from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 FloatArray = NDArray[np.float64]
 
 _STOP_BAND_DB = 90.0
-_PASS_SHARE = 0.8  # of half the output rate: up to there the anti-aliasing filter passes all
+_PASS_SHARE = 0.8  # pass band of the anti-aliasing filter, relative to half the output rate
 _SMALLEST_HALF_LENGTH = 48  # input samples to either side in the interpolation kernel
 _BLOCK = 2048  # output samples interpolated at once, to bound memory
 
@@ -31,19 +31,19 @@ class Accelerometer(NamedTuple):
     rate_hz: float
     noise_density_ug_per_rthz: float = 0.0
     pink_corner_hz: float = 0.0
-    """Where the power of the 1/f noise equals that of the white noise."""
+    """Frequency at which 1/f noise has the power of the white noise."""
     bias_m_per_s2: float = 0.0
     gain_error: float = 0.0
-    """Relative: 0.01 reads 1 % too much."""
+    """Relative error: 0.01 reads 1 % too high."""
     delay_s: float = 0.0
-    """A sample stamped t shows what was at t - delay."""
+    """Delay: a sample stamped t shows the acceleration at t - delay."""
     quantisation_m_per_s2: float = 0.0
     range_m_per_s2: float = np.inf
-    """Readings stop at plus and minus this."""
+    """Largest reading, plus or minus."""
 
 
-class Receiver(NamedTuple):
-    """A satellite receiver; chainage and lateral position have like, independent errors."""
+class ReceiverModel(NamedTuple):
+    """A GNSS receiver; chainage and lateral position have equal, independent errors."""
 
     rate_hz: float
     position_noise_m: float = 0.0
@@ -51,16 +51,16 @@ class Receiver(NamedTuple):
     position_spread_m: float = 0.0
     """Standard deviation of the slowly varying error (a Gauss-Markov process)."""
     correlation_s: float = np.inf
-    """Time after which the slow error is forgotten to 1/e; infinite: a constant bias."""
+    """Time in which the slow error decorrelates to 1/e; infinite: a constant bias."""
     speed_noise_m_per_s: float = 0.0
     latency_s: float = 0.0
-    """A fix stamped t shows where the truck was at t - latency."""
+    """Latency: a fix stamped t shows the position at t - latency."""
     outages_s: tuple[tuple[float, float], ...] = ()
-    """Intervals of time, first included and last excluded, without fixes."""
+    """Time intervals without fixes, first included and last excluded."""
 
 
-class Fixes(NamedTuple):
-    """What the receiver reports: (m,) each."""
+class SimulatedFixes(NamedTuple):
+    """Fixes of a receiver model, (m,) each."""
 
     time_s: FloatArray
     chainage_m: FloatArray
@@ -69,7 +69,7 @@ class Fixes(NamedTuple):
 
 
 def quantisation_m_per_s2(range_m_per_s2: float, bits: int) -> float:
-    """Step of a converter of so many bits over plus and minus the range."""
+    """Return the step of a converter of `bits` bits over plus and minus the range."""
     return 2.0 * range_m_per_s2 / 2.0**bits
 
 
@@ -79,11 +79,11 @@ def measure_acceleration(
     sensor: Accelerometer,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """What `sensor` reports of an acceleration (n,) sampled at `rate_hz`: (m,) at its own rate.
+    """Return the readings (m,) of `sensor` for an acceleration (n,) sampled at `rate_hz`.
 
     Sample k is stamped k/sensor.rate_hz after the first input sample; the last does not lie beyond
-    the last input sample. Before its first sample the input is taken for constant. Raises
-    ValueError for a sensor quicker than its input, which would have to be invented.
+    the last input sample. Before its first sample the input is constant. Raise ValueError for a
+    sensor that is faster than its input.
     """
     if sensor.rate_hz > rate_hz * (1.0 + 1e-9):
         raise ValueError(
@@ -100,12 +100,12 @@ def measure_acceleration(
 
 
 def resample(samples: FloatArray, rate_hz: float, new_rate_hz: float, delay_s: float) -> FloatArray:
-    """Low-pass `samples` (n,) and read them at times k/new_rate - delay: (m,).
+    """Low-pass `samples` (n,) and evaluate them at times k/new_rate - delay: (m,).
 
     A windowed sinc in continuous time (Kaiser, 90 dB) is anti-aliasing filter, interpolation and
-    delay in one. To a lower rate it passes all up to 0.4 of the new rate and stops all from 0.5 of
-    it on; at the same rate nothing is filtered. Its own delay is zero. Beyond its ends the signal
-    is taken for constant.
+    delay in one. For a lower rate it passes frequencies up to 0.4 of the new rate and stops those
+    from 0.5; at the same rate nothing is filtered. Its own delay is zero. Beyond its ends the
+    signal is constant.
     """
     count = int(np.floor((samples.size - 1) * new_rate_hz / rate_hz + 1e-9)) + 1
     position = np.arange(count) * (rate_hz / new_rate_hz) - delay_s * rate_hz  # in input samples
@@ -127,28 +127,28 @@ def resample(samples: FloatArray, rate_hz: float, new_rate_hz: float, delay_s: f
         wanted = position[begin : begin + _BLOCK]
         first = np.floor(wanted).astype(np.int64)
         index = first[:, None] + offsets
-        # At most rates the samples lie at a few different places between the input samples.
+        # At most rates the samples have few different phases between the input samples.
         place, which = np.unique(np.round(wanted - first, 9), return_inverse=True)
         distance = offsets - place[:, None]
         weight = windowed_sinc(distance, cutoff, half_length, beta)
-        weight /= weight.sum(axis=1, keepdims=True)  # a constant stays what it is
+        weight /= weight.sum(axis=1, keepdims=True)  # preserve a constant
         values = samples[np.clip(index, 0, samples.size - 1)]
         result[begin : begin + _BLOCK] = np.einsum("mj,mj->m", weight[which], values)
     return result
 
 
 def white_noise(count: int, rate_hz: float, density: float, rng: np.random.Generator) -> FloatArray:
-    """White noise (count,) of the one-sided amplitude density (unit/sqrt(Hz))."""
+    """Return white noise (count,) of the one-sided amplitude density in unit/sqrt(Hz)."""
     return density * np.sqrt(0.5 * rate_hz) * rng.standard_normal(count)
 
 
 def pink_noise(
     count: int, rate_hz: float, density: float, corner_hz: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Noise (count,) of the one-sided power density density^2 corner/f.
+    """Return noise (count,) of the one-sided power density density^2 corner/f.
 
-    It is made of random harmonics over twice the time and cut in half, so that its end does not run
-    into its beginning. It has no power below the lowest of them.
+    It is composed of random harmonics over twice the time and cut in half, so that its end does not
+    continue in its beginning. It has no power below the lowest harmonic.
     """
     if corner_hz <= 0.0 or density <= 0.0:
         return np.zeros(count)
@@ -166,7 +166,7 @@ def pink_noise(
 def gauss_markov(
     time_s: FloatArray, spread: float, correlation_s: float, rng: np.random.Generator
 ) -> FloatArray:
-    """A stationary Gauss-Markov process (n,) at evenly spaced times.
+    """Return a stationary Gauss-Markov process (n,) at evenly spaced times (n,).
 
     e_k = phi e_(k-1) + sqrt(1 - phi^2) w_k, phi = exp(-dt/correlation): its standard deviation is
     `spread` and its autocorrelation exp(-|t|/correlation); a constant for an infinite one.
@@ -187,14 +187,14 @@ def measure_position(
     chainage_m: FloatArray,
     lateral_m: FloatArray,
     speed_m_per_s: FloatArray,
-    receiver: Receiver,
+    receiver: ReceiverModel,
     rng: np.random.Generator,
-) -> Fixes:
-    """What `receiver` reports of a drive given at increasing times (n,).
+) -> SimulatedFixes:
+    """Return the fixes of `receiver` on a drive given at increasing times (n,).
 
-    Fixes come every 1/rate from the first time on; the first is the first whose true time, which is
-    its stamp less the latency, lies within the drive. During an outage random errors go on, so that
-    an outage changes no other fix.
+    Fixes come every 1/rate from the first time; the first is the first whose true time, its stamp
+    less the latency, lies within the drive. Random errors continue during an outage, so that an
+    outage changes no other fix.
     """
     count = int(np.floor((time_s[-1] - time_s[0]) * receiver.rate_hz + 1e-9)) + 1
     stamp = time_s[0] + np.arange(count) / receiver.rate_hz
@@ -212,4 +212,4 @@ def measure_position(
     kept = (true >= time_s[0] - 1e-9) & (true <= time_s[-1] + 1e-9)
     for start, stop in receiver.outages_s:
         kept &= (stamp < start) | (stamp >= stop)
-    return Fixes(stamp[kept], chainage[kept], lateral[kept], speed[kept])
+    return SimulatedFixes(stamp[kept], chainage[kept], lateral[kept], speed[kept])

@@ -1,32 +1,32 @@
 """The coupled forward problem: a half-car drives over a rough road and a bridge.
 
 Vehicle and bridge are each marched with Newmark's average acceleration; within every step they
-exchange wheel displacement and contact force until the forces stand still (paper section 2.1).
+exchange wheel displacement and contact force until the forces converge (paper section 2.1).
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
+from pre_core.kernels.lanes import compiled
 from pre_core.physics import bridge as _bridge
 from pre_core.physics import vehicle as _vehicle
-from pre_core.physics.torsional_modes import torsional_modes, twist_at_once
+from pre_core.physics.torsional_modes import quasi_static_twist, torsional_modes
 
 FloatArray = NDArray[np.float64]
 
 
 class Motion(NamedTuple):
-    """Where the front axle is at the times 0, step, 2 step, …: (steps,) each.
+    """Motion of the front axle at the times 0, step, 2 step, …: (steps,) each.
 
     `position_m` is the chainage x_1; driving from the bridge's end to its start it decreases.
     """
 
     position_m: FloatArray
     speed_m_per_s: FloatArray
-    """dx_1/dt, negative when the chainage decreases."""
+    """Velocity dx_1/dt, negative when the chainage decreases."""
     acceleration_m_per_s2: FloatArray
     """Rate of change of the magnitude of the speed: positive when the truck speeds up."""
 
@@ -38,8 +38,8 @@ class WheelRoad(NamedTuple):
     rate_m_per_s: FloatArray
 
 
-class Simulation(NamedTuple):
-    """What the truck and the bridge did; `converged` is False if a step's forces did not settle."""
+class CoupledResponse(NamedTuple):
+    """Response of truck and bridge; `converged` is False if the forces of a step did not."""
 
     displacement_m: FloatArray  # (steps, 4): z_s1, z_s2, z_u1, z_u2
     velocity_m_per_s: FloatArray  # (steps, 4)
@@ -55,7 +55,7 @@ class Simulation(NamedTuple):
 
 
 def constant_speed(start_m: float, speed_m_per_s: float, steps: int, step_s: float) -> Motion:
-    """Motion from x_1 = start at a constant (signed) speed."""
+    """Return the motion from x_1 = start at a constant (signed) speed."""
     position = start_m + speed_m_per_s * step_s * np.arange(steps, dtype=np.float64)
     return Motion(position, np.full(steps, speed_m_per_s), np.zeros(steps))
 
@@ -67,7 +67,7 @@ def constant_acceleration(
     steps: int,
     step_s: float,
 ) -> Motion:
-    """Motion from x_1 = start; the signed speed says the direction, acceleration > 0 speeds up."""
+    """Return the motion from x_1 = start; the sign of the speed is the direction of travel."""
     t = step_s * np.arange(steps)
     sign = np.sign(speed_m_per_s)
     position = start_m + speed_m_per_s * t + 0.5 * sign * acceleration_m_per_s2 * t**2
@@ -76,11 +76,11 @@ def constant_acceleration(
 
 
 def rear_position_m(front_position_m: FloatArray, wheelbase_m: float, direction: int) -> FloatArray:
-    """x_2 = x_1 - D driving from start to end (direction 1), x_1 + D the other way (-1)."""
+    """Return x_2 (steps,): x_1 - D from start to end (direction 1), x_1 + D in the other (-1)."""
     return front_position_m - direction * wheelbase_m
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _march(
     step_s: float,
     inverse_mass: FloatArray,
@@ -145,8 +145,8 @@ def _march(
     step_rate = np.zeros(2)
     rubbing = np.zeros(2)
     worst = 0
-    # At time 0 displacement and velocity are given (zero) and only the accelerations are unknown.
-    # So they are of the modes when the bridge is found swinging; before, it rests.
+    # At time 0 displacement and velocity are given (zero) and only accelerations are unknown.
+    # The same holds for the modes when initial vibration begins; before, the bridge is at rest.
     quarter = 0.0
     half = 0.0
     inverse = inverse_mass
@@ -193,15 +193,15 @@ def _march(
             step_rate[w] = 0.0
             was = element[n - 1, w] if n > 0 else e
             if (e >= 0) != (was >= 0):
-                # The bridge's end gives: the wheel goes up or down a step, which its tyre's damper
-                # feels. A rate that is there at one sample has the impulse of a step's length.
+                # The bridge's end is compliant: the wheel passes a step, which its tyre's damper
+                # transmits. A rate at one sample has the impulse of one time step.
                 near = max(e, was)
                 end = 0.0
                 for k in range(count):
                     at_end = cubics[near, 0, k]
                     if near > 0:
                         at_end += cubics[near, 1, k] + cubics[near, 2, k] + cubics[near, 3, k]
-                    # A bridge that swings is not where it rested before.
+                    # Initial vibration displaces the bridge from its position at rest.
                     end += at_end * (q_guess[k] if n == swing_step else q[n - 1, k])
                 step_rate[w] = end / step_s if e >= 0 else -end / step_s
         for i in range(4):
@@ -255,7 +255,7 @@ def _march(
                 force[2 + w] += tyre_stiffness[w] * (road[n, w] + y[w]) + tyre_damping[w] * (
                     road_rate[n, w] + yd[w]
                 )
-                # What damper and spring pull beyond their linear parts, positive in extension.
+                # Forces of damper and spring beyond their linear parts, positive in extension.
                 stroke_rate = zd_new[w] - zd_new[2 + w]
                 strut = bilinear_n_s_per_m[w] * abs(stroke_rate)
                 stroke = z_new[w] - z_new[2 + w]
@@ -328,24 +328,24 @@ def simulate(
     max_iterations: int = 50,
     gravity_m_per_s2: float = STANDARD_GRAVITY_M_PER_S2,
     swing_step: int | None = None,
-) -> Simulation:
+) -> CoupledResponse:
     """Drive the truck along `motion` and return accelerations, forces and deflections.
 
-    The truck starts at rest in its static equilibrium on a flat road at height zero, its springs
-    without friction, and the bridge at rest, unloaded. Where something has left before, `swing`
-    (2, modes) is displacement and velocity of the modes of the bridge (`bridge.modes` of this beam
-    and number) at `swing_step`, by default that at which the first wheel comes on, or time 0 if
-    none does (`passing.state_after`); until then no wheel feels the bridge and it is left at rest.
+    The truck starts at rest in static equilibrium on a flat road at height zero, without spring
+    friction, and the bridge at rest, unloaded. `swing` (2, modes) is the initial vibration:
+    displacement and velocity of the modes (`bridge.modes` of this beam and number) at `swing_step`,
+    by default when the first wheel enters, or time 0 if none does; until then the bridge is at
+    rest.
 
-    All `modes` of the mesh are kept unless fewer are asked for. `tolerance` is the largest change
+    All `modes` of the mesh are kept unless fewer are requested. `tolerance` is the largest change
     of a contact force between two iterations, relative to the static axle load; the paper uses
     1e-3.
 
-    Because the scheme is that of average acceleration, integrating the accelerations with the same
-    scheme from zero (paper.integrate.newmark_integrate) gives the displacements to rounding.
+    Integrating the accelerations by the same scheme from zero gives the displacements to rounding.
     """
     basis = _bridge.modes(beam, modes)
-    cubics = _bridge.element_cubics(beam.element_lengths_m, _bridge.held_nodes(beam), basis.shapes)
+    fixed = _bridge.supported_nodes(beam)
+    cubics = _bridge.element_cubics(beam.element_lengths_m, fixed, basis.shapes)
     direction = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
     wheels = np.stack(
         [
@@ -354,7 +354,7 @@ def simulate(
         ],
         axis=1,
     )
-    element, place = _bridge.locate(beam.element_lengths_m, wheels)
+    element, place = _bridge.locate_element(beam.element_lengths_m, wheels)
     mass, damping, stiffness = _vehicle.matrices(car)
     transfer = (
         _vehicle.total_mass_kg(car)
@@ -397,7 +397,7 @@ def simulate(
         eigenvalues,
         damping_of_modes,
         cubics,
-        twist_at_once(beam, wheels),
+        quasi_static_twist(beam, wheels),
         beam.element_lengths_m,
         element,
         place,
@@ -417,7 +417,7 @@ def simulate(
         qd,
         friction,
     )
-    return Simulation(
+    return CoupledResponse(
         z,
         zd,
         zdd,
@@ -432,7 +432,7 @@ def simulate(
     )
 
 
-def deflection_m(beam: _bridge.Beam, run: Simulation, x_m: FloatArray) -> FloatArray:
-    """Deflection (steps, m) of the bridge at m fixed chainages, up positive."""
+def deflection_m(beam: _bridge.Beam, run: CoupledResponse, x_m: FloatArray) -> FloatArray:
+    """Return the deflection (steps, m) of the bridge at m fixed chainages, up positive."""
     shapes = _bridge.interpolation_matrix(beam, x_m) @ run.modes.shapes
     return np.asarray(run.modal_displacement @ shapes.T)

@@ -1,4 +1,4 @@
-"""Roads as surfaces: what an axle feels that stands on strips of one, and how two axles differ.
+"""Road surfaces: an axle's profile on a surface, and the difference between two axles' profiles.
 
 A tyre averages the road over its width and contact length, an axle over its two wheel tracks, twin
 tyres over two strips each. On an isotropic random surface with the one-sided spectrum Phi(k), k the
@@ -6,9 +6,9 @@ wave number in any direction, an axle multiplies the wave (n_x, n_y) by
 
     H = sinc(width n_y) sinc(length n_x) cos(pi track n_y) cos(pi twins n_y) exp(2 pi i offset n_y)
 
-with sinc x = sin(pi x)/(pi x), and what axles i and j feel along the road has the cross spectrum
-S_ij(n) = integral of Phi(k) H_i conj(H_j) over n_y, k^2 = n^2 + n_y^2. The surface is the one whose
-profile along every line has the density of ISO 8608, G_d(n_0) (n/n_0)^-2: Phi = G_d n_0^2/2 k^-3.
+with sinc x = sin(pi x)/(pi x), and the profiles of axles i and j have the cross spectrum S_ij(n) =
+integral of Phi(k) H_i conj(H_j) over n_y, k^2 = n^2 + n_y^2. The surface is the one whose profile
+along every line has the density of ISO 8608, G_d(n_0) (n/n_0)^-2: Phi = G_d n_0^2/2 k^-3.
 """
 
 from typing import NamedTuple
@@ -22,56 +22,56 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _WIDEST_CYCLES_PER_M = 40.0
-"""Waves across the road that are shorter no tyre feels."""
+"""Largest lateral wave number; tyres average shorter waves out."""
 _ACROSS, _FINE = 400, 4000
-"""Waves across: of a drawn surface, and of the integral to one side."""
+"""Number of lateral waves: of a drawn surface, and of the integral to one side."""
 _SHORTEST_WAVE_M, _LONGEST_WAVE_M = 0.05, 100.0
 _SCALE = 0.02
-"""Cycles/m across from which on waves stand apart by a share of themselves."""
+"""Lateral wave number in cycles/m above which waves are spaced proportionally."""
 _STEP = float(np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)) / _FINE
 
 
 class Footprint(NamedTuple):
-    """Where an axle stands on the road, in m."""
+    """Position and size of an axle's contact patches, in m."""
 
     width_m: float = 0.25
     """Width of a tyre's tread."""
     twin_distance_m: float = 0.0
-    """Between the middles of twin tyres; 0 for single ones."""
+    """Distance between the middles of twin tyres; 0 for single ones."""
     length_m: float = 0.2
     """Length of the contact patch."""
     track_m: float = 1.9
-    """Between the middles of the wheels of both sides."""
+    """Distance between the middles of the left and right wheels."""
     offset_m: float = 0.0
-    """How far to the left of the truck's line the axle runs."""
+    """Distance of the axle to the left of the truck's path."""
 
 
 COMMON_LORRY = (Footprint(), Footprint(width_m=0.22, twin_distance_m=0.33))
-"""Front and rear axle of a lorry nobody has measured: single tyres, and twin tyres behind."""
+"""Front and rear axle of a typical lorry: single tyres, and twin tyres behind."""
 
 
 def response(axle: Footprint, n_x: FloatArray, n_y: FloatArray) -> ComplexArray:
-    """H of the module's text for waves (…,) along and across the road, in cycles/m."""
+    """Return H of the module for waves (…,) along and across the road, in cycles/m."""
     return np.asarray(np.sinc(axle.length_m * n_x) * _strips(axle, n_y))
 
 
 def _strips(axle: Footprint, n_y: FloatArray) -> ComplexArray:
-    """The part of H across the road."""
+    """Return the lateral factor of H."""
     strips = np.cos(np.pi * axle.track_m * n_y) * np.cos(np.pi * axle.twin_distance_m * n_y)
     width = np.sinc(axle.width_m * n_y)
     return np.asarray(width * strips * np.exp(2j * np.pi * axle.offset_m * n_y))
 
 
 def surface_density(road_class: str) -> float:
-    """Phi k^3 in m² (Phi in m^4): 8e-8 for class A."""
+    """Return Phi k^3 in m² (Phi in m^4): 8e-8 for class A."""
     return 0.5 * GEOMETRIC_MEAN_M3[road_class] * REFERENCE_CYCLES_PER_M**2
 
 
 def spectra(front: Footprint, rear: Footprint, n: FloatArray) -> tuple[FloatArray, ...]:
-    """One-sided spectra (f,) at n > 0 cycles/m of a surface with Phi = k^-3, in m (times m²).
+    """Return one-sided spectra (f,) at n > 0 cycles/m on a surface with Phi = k^-3, in m times m².
 
-    Front axle, rear axle, the real part of their cross spectrum, and their difference front less
-    rear.
+    These are of the front axle, the rear axle, the real part of their cross spectrum, and their
+    difference front less rear.
     """
     at_front, at_rear, n_y = _patches_and_waves(front, rear, n)
     of_front, of_rear = _strips(front, n_y), _strips(rear, n_y)
@@ -92,13 +92,13 @@ def spectra(front: Footprint, rear: Footprint, n: FloatArray) -> tuple[FloatArra
     )
 
 
-def common_spectrum(
+def between_run_cross_spectrum(
     front: Footprint, rear: Footprint, n: FloatArray, wander_m: float
 ) -> FloatArray:
-    """What the difference of `spectra` has in common in two runs: one-sided cross spectrum (f,).
+    """Return the one-sided cross spectrum (f,) between two runs of the difference in `spectra`.
 
-    The track of each run lies beside the line by a normal of standard deviation `wander_m`, so that
-    two are apart by sqrt(2) of it: waves across the road are multiplied by exp(-(2 pi n_y w)²).
+    The path of each run deviates laterally by a normal of standard deviation `wander_m`, so that
+    two are apart by sqrt(2) of it: lateral waves are multiplied by exp(-(2 pi n_y w)²).
     """
     at_front, at_rear, n_y = _patches_and_waves(front, rear, n)
     both = np.exp(-((2.0 * np.pi * n_y * wander_m) ** 2))
@@ -111,7 +111,7 @@ def common_spectrum(
 def _patches_and_waves(
     front: Footprint, rear: Footprint, n: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What the contact lengths of both axles leave of waves (f,) along; waves (q,) across."""
+    """Return the contact length factors of both axles for waves (f,), and lateral waves (q,)."""
     patches = (np.asarray(np.sinc(axle.length_m * np.asarray(n))) for axle in (front, rear))
     return *patches, _SCALE * np.sinh(_STEP * np.arange(_FINE + 1))
 
@@ -123,9 +123,9 @@ def _difference(
     apart_rear: FloatArray,
     rear_rear: FloatArray,
 ) -> FloatArray:
-    """Integral of |a F - b R|² with D = F - R apart: where the patches are alike, a² |D|² alone.
+    """Return the integral of |a F - b R|² with D = F - R apart; with equal patches, a² |D|² alone.
 
-    Not a² |F|² - 2 a b Re(F conj R) + b² |R|²: long waves differ by a millionth of what they are.
+    The form a² |F|² - 2 a b Re(F conj R) + b² |R|² would cancel: long waves differ by a millionth.
     """
     more = at_front - at_rear
     return at_front**2 * apart_apart + 2.0 * at_front * more * apart_rear + more**2 * rear_rear
@@ -134,10 +134,10 @@ def _difference(
 def _integrals(
     n: FloatArray, n_y: FloatArray, powers: tuple[FloatArray, ...]
 ) -> tuple[FloatArray, ...]:
-    """Integrals (f,) over all n_y of k^-3 times each of `powers` (q,), even and given at n_y >= 0.
+    """Return the integrals (f,) over all n_y of k^-3 times each of `powers` (q,), even in n_y >= 0.
 
-    A sum of even steps in asinh(n_y/scale); the integrands fall off like a power. One wave along at
-    a time: together they would take a hundred megabytes.
+    A sum of even steps in asinh(n_y/scale); the integrands decay like a power. Waves along are
+    processed one at a time: together they would take a hundred megabytes.
     """
     weight = 2.0 * _STEP * np.hypot(_SCALE, n_y)
     weight[0] *= 0.5
@@ -151,7 +151,7 @@ def _integrals(
 
 
 class Surface(NamedTuple):
-    """A stretch of random road as its waves: `amplitude` (along, across), complex, in m."""
+    """A patch of random road as waves: `amplitude` (along, across), complex, in m."""
 
     start_m: float
     spacing_m: float
@@ -164,11 +164,10 @@ class Surface(NamedTuple):
 def random_surface(
     start_m: float, stop_m: float, spacing_m: float, road_class: str, seed: int
 ) -> Surface:
-    """An isotropic surface whose profile along the road has an ISO 8608 class's geometric mean.
+    """Return an isotropic surface whose profiles have an ISO 8608 class's geometric mean.
 
-    Gaussian: waves along are even and as many as fit into the stretch with a margin, so that no
-    period is seen to repeat; waves across stand closer where they are long. Waves between 0.05 m
-    and 100 m.
+    It is Gaussian. Waves along are even, with a period longer than the patch, so that it does not
+    repeat; lateral waves are denser where they are long. Waves are between 0.05 m and 100 m long.
     """
     rng = np.random.default_rng(seed)
     count = round((stop_m - start_m) / spacing_m) + 1
@@ -178,18 +177,18 @@ def random_surface(
     longest = np.arcsinh(_WIDEST_CYCLES_PER_M / _SCALE)
     edges = _SCALE * np.sinh(np.linspace(-longest, longest, _ACROSS + 1))
     n_y = 0.5 * (edges[1:] + edges[:-1])
-    # The density's integral over each strip of n_y, exactly: that of k^-3 is n_y/(n_x^2 k).
+    # Exact integral of the density over each strip of n_y: that of k^-3 is n_y/(n_x^2 k).
     power = np.diff(edges / np.hypot(n_x[:, None], edges), axis=1)
     power *= surface_density(road_class) * step / n_x[:, None] ** 2
-    # In place: of half a kilometre these are a hundred megabytes each.
+    # In place: for half a kilometre these are a hundred megabytes each.
     amplitude = np.empty(power.shape, dtype=np.complex128)
     rng.standard_normal(out=amplitude.view(np.float64))
     amplitude *= np.sqrt(power, out=power)
     return Surface(start_m, spacing_m, count, n_x, n_y, amplitude)
 
 
-def felt_by(surface: Surface, axle: Footprint, beside_m: float = 0.0) -> Profile:
-    """The profile that an axle feels whose truck drives `beside_m` to the left of the line."""
+def axle_profile(surface: Surface, axle: Footprint, beside_m: float = 0.0) -> Profile:
+    """Return the profile of an axle whose truck drives `beside_m` to the left of the line."""
     moved = axle._replace(offset_m=axle.offset_m + beside_m)
     across = response(moved, np.zeros(1), surface.n_y)
     wave = np.sinc(axle.length_m * surface.n_x) * (surface.amplitude @ across)
@@ -197,7 +196,7 @@ def felt_by(surface: Surface, axle: Footprint, beside_m: float = 0.0) -> Profile
     step = surface.n_x[1] - surface.n_x[0]
     period = round(1.0 / (step * surface.spacing_m))
     phase = np.exp(2j * np.pi * surface.n_x * surface.start_m)
-    # ifft sums exp(+2 pi i n x) over harmonics of the period; the first one is not zero.
+    # ifft sums exp(+2 pi i n x) over harmonics of the period; the first is not zero.
     waves = period * np.fft.ifft(wave * phase, period)[: surface.samples]
     lowest = surface.n_x[0]
     height = np.real(waves * np.exp(2j * np.pi * lowest * (x - surface.start_m)))

@@ -1,18 +1,18 @@
-"""Uniform St. Venant torsion of the deck under wheels that run beside the bridge's axis.
+"""Uniform St. Venant torsion of the deck under wheels on an eccentric lane.
 
-A deck of torsional rigidity GJ whose twist is held at every support turns by theta under the
+A deck of torsional rigidity GJ whose twist is fixed at every support rotates by theta under the
 moment e P of a wheel pair at the lateral distance e of its middle from the axis, and the middle of
-that axle sinks by e theta. Of the two only g = e²/(GJ) matters to what the middle of an axle feels:
+that axle sinks by e theta. Only g = e²/(GJ) affects the motion of an axle's middle:
 
     y(x) = g G(x, x') P,   G(x, x') = (min(x, x') - a) (b - max(x, x')) / (b - a)
 
-under a standing load P at x' in the same span from a to b. In motion theta is a sum of sines of
-each span, of which the j-th swings at j c/(2 (b - a)) where c is the torsional wave speed, the root
-of GJ over the rotational inertia of a metre of deck. The lowest `MODES` of each span are marched
-as modes (modal_response.py); the rest follows the load at once (`flexibility_remainder`).
+under a static load P at x' in the same span from a to b. In motion theta is a sum of sines in each
+span. The j-th vibrates at j c/(2 (b - a)), where c is the torsional wave speed, the root of GJ over
+the rotational inertia of a metre of deck. The lowest `MODES` of each span are marched as modes
+(modal_response.py); the others respond quasi-statically (`flexibility_remainder`).
 
-Torsion and bending are taken for independent, as they are for a deck that is symmetric about its
-axis, and the axis for the middle between the ends given in the site file.
+Torsion and bending are independent, as in a deck that is symmetric about its axis, and the axis is
+the middle between the ends given in the site file.
 """
 
 from typing import Final, NamedTuple
@@ -21,20 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.kernels.lanes import LANES, kernel
+from pre_core.parameters import TORSION
 from pre_core.physics.beam_basis import modal_damping
 from pre_core.physics.modal_response import COEFFICIENTS, mode_coefficients
-from pre_core.unknowns import TORSION
 
 FloatArray = NDArray[np.float64]
 
 GROUPS = 2
-"""Of lanes for each span."""
+"""Number of lane groups for each span."""
 MODES = GROUPS * LANES
-"""Modes of each span that swing."""
+"""Number of dynamic modes of each span."""
 
 
 class TorsionBasis(NamedTuple):
-    """What every evaluation shares of a deck with parts (parts,) in some spans; of none, if empty.
+    """The data that all evaluations of a twisting deck share; empty for one that does not twist.
 
     `cubics` (parts, 4, modes): unit sines of the part's span in powers of the place 0..1 in it.
     """
@@ -44,13 +44,13 @@ class TorsionBasis(NamedTuple):
     ends_m: FloatArray  # (spans, 2) chainages
     wave_speed_m_per_s: float
     load_factor: float
-    """Of g, for a crossing whose distance from the axis is another than that of g: its square."""
+    """Factor of g for a crossing at another distance from the axis: the square of their ratio."""
 
 
 NO_TORSION: Final = TorsionBasis(
     np.zeros((0, 4, MODES)), np.zeros(0, dtype=np.int64), np.zeros((0, 2)), 0.0, 1.0
 )
-"""Of a deck that does not twist."""
+"""Basis of a deck that does not twist."""
 
 
 def torsion_basis(
@@ -59,7 +59,7 @@ def torsion_basis(
     wave_speed_m_per_s: float,
     load_factor: float = 1.0,
 ) -> TorsionBasis:
-    """Return the basis of a deck of these parts (parts,), held at its ends and at some nodes."""
+    """Return the basis of a deck of parts (parts,), fixed at its ends and at some nodes."""
     spans = span_ends_m(part_lengths_m, supports)
     span_of_part = np.searchsorted(np.array(supports), np.arange(part_lengths_m.size), side="right")
     edges = np.concatenate([[0.0], np.cumsum(part_lengths_m)])
@@ -73,7 +73,7 @@ def torsion_basis(
 
 
 def span_ends_m(part_lengths_m: FloatArray, supports: tuple[int, ...]) -> FloatArray:
-    """Return the chainages (spans, 2) between which the deck may twist."""
+    """Return the chainages (spans, 2) of the ends of each span."""
     edges = np.concatenate([[0.0], np.cumsum(part_lengths_m)])
     held = edges[[0, *supports, part_lengths_m.size]]
     return np.stack([held[:-1], held[1:]], axis=1)
@@ -82,7 +82,7 @@ def span_ends_m(part_lengths_m: FloatArray, supports: tuple[int, ...]) -> FloatA
 def sine_cubics(part_m: FloatArray, span_m: FloatArray, modes: int) -> FloatArray:
     """Return cubics (4, modes) in the place 0..1 of a part (2,) through a span's (2,) unit sines.
 
-    Value and slope are those of the sines at both ends of the part (Hermite).
+    Values and slopes are those of the sines at both ends of the part (Hermite).
     """
     length = part_m[1] - part_m[0]
     wave = np.arange(1, modes + 1) * np.pi / (span_m[1] - span_m[0])
@@ -102,9 +102,9 @@ def torsion_filters(
     cubics: FloatArray,
     feedback: FloatArray,
 ) -> bool:
-    """Write the torsional modes of `theta` (p,) into the last groups of lanes, one for each span.
+    """Write the torsional modes of `theta` (p,) into the last lane groups, one for each span.
 
-    As `modal_response.modal_filters` writes those in bending: `cubics` (parts, groups, 4, 4) and
+    The form is that of `modal_response.modal_filters`: `cubics` (parts, groups, 4, 4) and
     `feedback` (groups, 5, 4). Return False if not finite.
     """
     first = feedback.shape[0] - GROUPS * basis.ends_m.shape[0]
@@ -135,9 +135,10 @@ def torsion_filters(
 def flexibility_remainder(
     basis: TorsionBasis, part: int, place: float, at_m: float, other: int, there: float, to_m: float
 ) -> float:
-    """Return G(x, x') in m less the part of the modes that are marched, of two places.
+    """Return G(x, x') in m between two places, without the part of the dynamic modes.
 
     A place is its part, the place 0..1 in that, and its chainage; parts of -1 are off the bridge.
+    `basis` holds the spans (spans, 2).
     """
     if part < 0 or other < 0 or basis.span_of_part[part] != basis.span_of_part[other]:
         return 0.0

@@ -1,6 +1,6 @@
-"""Torsion of the deck for the coupled simulation: many sines of every span, and what is left over.
+"""Torsion of the deck for the coupled simulation: many sines of every span, and the remainder.
 
-The equations are those of `torsion`, from which the identification takes eight sines in a coarser
+The equations are those of `torsion`, of which the identification uses eight sines in a coarser
 mesh.
 """
 
@@ -12,11 +12,11 @@ from pre_core.physics.bridge import Beam, FloatArray
 from pre_core.physics.torsion import sine_cubics, span_ends_m
 
 _MODES = 40
-"""Of each span; what quicker ones would do follows the load at once."""
+"""Number of modes of each span; higher ones respond quasi-statically."""
 
 
 class TorsionalModes(NamedTuple):
-    """Modes (k,) of a deck that twists; none of one that does not."""
+    """Torsional modes (k,) of a deck; empty if it does not twist."""
 
     eigenvalues_per_s2: FloatArray  # (k,)
     damping_per_s: FloatArray  # (k,)
@@ -26,7 +26,7 @@ class TorsionalModes(NamedTuple):
 def torsional_modes(beam: Beam) -> TorsionalModes:
     """Return the sines of every span, normalised to the modal mass of e theta.
 
-    Raises ValueError for a deck that twists without a torsional wave speed.
+    Raise ValueError for a deck that twists without a torsional wave speed.
     """
     lengths = beam.element_lengths_m
     flexibility, speed = beam.torsional_flexibility_per_n, beam.torsional_wave_speed_m_per_s
@@ -48,15 +48,15 @@ def torsional_modes(beam: Beam) -> TorsionalModes:
     return TorsionalModes(eigenvalues, damping, cubics)
 
 
-def twist_at_once(beam: Beam, wheels_m: FloatArray) -> FloatArray:
-    """Return the twist (steps, 2, 2) in m/N at each wheel by each wheel's load beyond the modes."""
+def quasi_static_twist(beam: Beam, wheels_m: FloatArray) -> FloatArray:
+    """Return the quasi-static flexibility (steps, 2, 2) in m/N at the wheels for their loads."""
     if beam.torsional_flexibility_per_n == 0.0:
         return np.zeros((0, 2, 2))
     out = np.zeros((wheels_m.shape[0], 2, 2))
     j = np.arange(1, _MODES + 1)
     for begin, end in span_ends_m(beam.element_lengths_m, beam.interior_supports):
         length = end - begin
-        place = np.clip(wheels_m - begin, 0.0, length)  # at a support there is no twist
+        place = np.clip(wheels_m - begin, 0.0, length)  # no twist at a support
         sines = np.sin(place[:, :, None] * (j * np.pi / length)) / (j * np.pi)
         low, high = place.min(axis=1), place.max(axis=1)
         for w in range(2):

@@ -16,11 +16,11 @@ FloatArray = NDArray[np.float64]
 Pair = tuple[float, float]
 
 _LEAST_HEIGHT = 0.05
-"""An air spring keeps this share of its height at rest; real ones have a bump stop before."""
+"""Smallest height of an air spring relative to rest; real ones have a bump stop earlier."""
 
 
 class HalfCar(NamedTuple):
-    """Mechanical parameters; pairs are (front, rear)."""
+    """Mechanical parameters of a truck; pairs are (front, rear)."""
 
     body_mass_kg: float
     front_axle_to_cg_m: float
@@ -30,34 +30,34 @@ class HalfCar(NamedTuple):
     unsprung_mass_kg: Pair
     tyre_stiffness_n_per_m: Pair
     pitch_inertia_ratio: float = 1.0
-    """kappa in I = kappa m_s d_1 d_2; 1 makes front and rear independent, as the paper assumes."""
+    """Ratio kappa in I = kappa m_s d_1 d_2; 1 decouples front and rear, as the paper assumes."""
     tyre_damping_ns_per_m: Pair = (0.0, 0.0)
     bilinear_damping: float = 0.0
-    """b: dampers act with c (1 + b) in rebound and c (1 - b) in compression."""
+    """Asymmetry b: dampers act with c (1 + b) in rebound and c (1 - b) in compression."""
     cg_height_m: float = 0.0
     dry_friction_n: Pair = (0.0, 0.0)
-    """F_c of each axle's springs: the friction F tends to it, see `dahl_friction_n`."""
+    """Limit F_c of the suspension friction F of each axle, see `dahl_friction_n`."""
     friction_length_m: float = 0.002
     friction_load_growth: float = 0.0
-    """g: F_c is multiplied by 1 + g (load/static load - 1) of the spring; 1 makes it proportional
-    to the load that the spring carries."""
+    """Growth g: F_c is multiplied by 1 + g (load/static load - 1) of the spring; 1 makes it
+    proportional to the load that the spring carries."""
     air_spring_exponent: float = 0.0
-    """n of air springs, 0 for steel ones. Air under the static load L obeys L (1 - k c/(n L))^-n at
-    the compression c: of stiffness k at rest, stiffer the further it is compressed."""
+    """Exponent n of air springs, 0 for steel ones. Air under the static load L obeys L (1 - k c/(n
+    L))^-n at the compression c: stiffness k at rest, increasing with compression."""
 
 
 def total_mass_kg(car: HalfCar) -> float:
-    """M = m_s + m_u1 + m_u2."""
+    """Return M = m_s + m_u1 + m_u2."""
     return car.body_mass_kg + car.unsprung_mass_kg[0] + car.unsprung_mass_kg[1]
 
 
 @kernel
 def dahl_friction_n(friction: float, stroke: float, level: float, length: float) -> float:
-    """Friction after the spring has lengthened by `stroke` (m) from where it was `friction` (N).
+    """Return the friction after the spring has lengthened by `stroke` (m) from `friction` (N).
 
     Dahl's law dF/du = (F_c/length) (1 - sign(du) F/F_c), exact for a stroke in one direction; a
-    positive F resists lengthening. Swept between -a and a it encloses
-    4 F_c (a - length tanh(a/length)).
+    positive F resists lengthening. Swept between -a and a it encloses 4 F_c (a - length
+    tanh(a/length)).
     """
     towards = level if stroke >= 0.0 else -level
     return towards + (friction - towards) * np.exp(-abs(stroke) / length)
@@ -67,9 +67,9 @@ def dahl_friction_n(friction: float, stroke: float, level: float, length: float)
 def air_spring_excess_n(
     compression: float, stiffness: float, load: float, exponent: float
 ) -> float:
-    """What an air spring under the static `load` carries beyond load + stiffness * compression.
+    """Return the force of an air spring under static `load` beyond load + stiffness * compression.
 
-    L ((1 - k c/(n L))^-n - 1) - k c; where hardly any height is left it stays as it is.
+    L ((1 - k c/(n L))^-n - 1) - k c; below the smallest height it stays constant.
     """
     height = max(1.0 - stiffness * compression / (exponent * load), _LEAST_HEIGHT)
     return load * (height**-exponent - 1.0) - stiffness * compression
@@ -79,10 +79,10 @@ def air_spring_excess_n(
 def masses_above_axles(
     body_mass: float, d_1: float, wheelbase: float, kappa: float
 ) -> tuple[float, float, float]:
-    """(m_11, m_22, m_12) of the body in the coordinates above the axles.
+    """Return (m_11, m_22, m_12) of the body in the coordinates above the axles.
 
-    m_11 = (m_s d_2^2 + I)/D^2, m_22 = (m_s d_1^2 + I)/D^2, m_12 = (m_s d_1 d_2 - I)/D^2 with
-    I = kappa m_s d_1 d_2.
+    m_11 = (m_s d_2^2 + I)/D^2, m_22 = (m_s d_1^2 + I)/D^2, m_12 = (m_s d_1 d_2 - I)/D^2 with I =
+    kappa m_s d_1 d_2.
     """
     d_2 = wheelbase - d_1
     inertia = kappa * body_mass * d_1 * d_2
@@ -98,7 +98,7 @@ def masses_above_axles(
 def masses_on_axles(
     body_mass: float, d_1: float, wheelbase: float, unsprung_1: float, unsprung_2: float
 ) -> tuple[float, float]:
-    """What rests on the front and on the rear axle of the standing truck, wheels included."""
+    """Return the masses on the front and rear axle of the standing truck, wheels included."""
     return (
         body_mass * (wheelbase - d_1) / wheelbase + unsprung_1,
         body_mass * d_1 / wheelbase + unsprung_2,
@@ -106,7 +106,7 @@ def masses_on_axles(
 
 
 def body_masses_kg(car: HalfCar) -> tuple[float, float, float]:
-    """(m_11, m_22, m_12), see `masses_above_axles`."""
+    """Return (m_11, m_22, m_12), see `masses_above_axles`."""
     m_11, m_22, m_12 = masses_above_axles(
         car.body_mass_kg, car.front_axle_to_cg_m, car.wheelbase_m, car.pitch_inertia_ratio
     )
@@ -114,7 +114,7 @@ def body_masses_kg(car: HalfCar) -> tuple[float, float, float]:
 
 
 def static_axle_loads_n(car: HalfCar, gravity_m_per_s2: float) -> Pair:
-    """Weight on the front and on the rear axle of the standing truck."""
+    """Return the weight on the front and on the rear axle of the standing truck."""
     front, rear = masses_on_axles(
         car.body_mass_kg, car.front_axle_to_cg_m, car.wheelbase_m, *car.unsprung_mass_kg
     )
@@ -122,10 +122,10 @@ def static_axle_loads_n(car: HalfCar, gravity_m_per_s2: float) -> Pair:
 
 
 def matrices(car: HalfCar) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mass, damping and stiffness matrices (4, 4) in z = [z_s1, z_s2, z_u1, z_u2].
+    """Return mass, damping and stiffness matrices (4, 4) in z = [z_s1, z_s2, z_u1, z_u2].
 
-    What is not linear is left out and enters the simulation as forces: the bilinear part of the
-    damping, friction, and what air springs carry beyond linear ones.
+    Nonlinear parts enter the simulation as forces instead: bilinear damping, friction, and the
+    excess of air springs.
     """
     m_11, m_22, m_12 = body_masses_kg(car)
     mass = np.diag([m_11, m_22, *car.unsprung_mass_kg])
@@ -147,6 +147,6 @@ def matrices(car: HalfCar) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def natural_frequencies_hz(car: HalfCar) -> FloatArray:
-    """The four undamped natural frequencies, ascending."""
+    """Return the undamped natural frequencies (4,), ascending."""
     mass, _, stiffness = matrices(car)
     return np.asarray(np.sqrt(eigh(stiffness, mass, eigvals_only=True)) / (2.0 * np.pi))

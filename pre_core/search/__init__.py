@@ -1,1 +1,1 @@
-"""Ways to search, one file each and all of one shape, and the one loop that runs them."""
+"""Search methods, one file each and all of one form, and the loop that runs them."""

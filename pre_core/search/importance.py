@@ -1,73 +1,74 @@
-"""Weighted draws from the posterior: many at once, and no chain to wait for.
+"""Importance sampling: draws of known densities, weighted by the target over their mixture.
 
-Points are drawn from the approximation and weighted by what the target is there over how often they
-come. Such weights are worth as much as the largest of them are tame: the upper ones are replaced by
-the quantiles of the generalised Pareto distribution that fits them, whose shape k says whether to
-believe them (Vehtari, Simpson, Gelman, Yao and Gabry 2024: below 0.7).
+The upper weights are replaced by the quantiles of the generalised Pareto distribution that fits
+them. Its shape k is the test of reliability (Vehtari, Simpson, Gelman, Yao and Gabry 2024: below
+0.7).
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from pre_core.search.approximation import LogDensity, Mixture, mapped, weighed
+from scipy.special import logsumexp
 
 FloatArray = NDArray[np.float64]
 
-_AT_ONCE = 100
-"""So many points are evaluated together: their rows take some megabytes."""
+_MOST_ROUNDS, _SAME_SCALE = 50, 1e-6
+"""Limit of the rounds in which densities are scaled alike, and the change that ends them."""
 
 
-class Draws(NamedTuple):
-    """Points y (k, f), the parts (k,) and normals (k, f) they come from, log weights (k,)."""
-
-    y: FloatArray
-    part: NDArray[np.int64]
-    v: FloatArray
-    log_weight: FloatArray
-
-
-class Smoothed(NamedTuple):
-    """Weights (k,) that sum to one, the shape of their tail and how many draws they are worth."""
+class SmoothedWeights(NamedTuple):
+    """Weights (k,) with sum one, the shape of their tail and the effective number of draws."""
 
     weight: FloatArray
     pareto_k: float
     ess: float
 
 
-def draw(target: LogDensity, mixed: Mixture, count: int, number: int) -> Draws:
-    """Points of the approximation, in each part as many as its share; `number` tells batches."""
-    rng = np.random.default_rng(np.random.SeedSequence(mixed.seed, spawn_key=(1 << 21, number)))
-    v = rng.standard_normal((count, mixed.parts[0].centre.size))
-    part = evenly(np.exp([one.log_share for one in mixed.parts]), count, rng)
-    y, log_q = mapped(mixed, part, v)
-    log_weight = np.concatenate(
-        [
-            weighed(target, y[i : i + _AT_ONCE], log_q[i : i + _AT_ONCE])
-            for i in range(0, count, _AT_ONCE)
-        ]
-    )
-    return Draws(y, part, v, log_weight)
+def mixture_log_weights(
+    log_target: FloatArray, log_density: FloatArray, counts: NDArray[np.int64]
+) -> FloatArray:
+    """Return the log weights (k,) of draws from several densities, as of one mixture of them.
+
+    `log_target` (k,) and `log_density` (k, r) are at all draws, which come in the order of the
+    densities, `counts` (r,) of each. None is normalised: the densities are scaled so that each has
+    its share of the mixture (Shirts and Chodera 2008, equation 11).
+    """
+    stops = np.cumsum(counts)
+    log_counts = np.log(counts)
+    log_scale = np.zeros(counts.size)
+    for r, (count, stop) in enumerate(zip(counts, stops, strict=True)):
+        own = slice(stop - count, stop)
+        log_mean = logsumexp(log_target[own] - log_density[own, r]) - log_counts[r]
+        log_scale[r] = -log_mean if np.isfinite(log_mean) else np.median(log_density[own, r])
+    for _ in range(_MOST_ROUNDS):
+        log_mixture = logsumexp(log_density - log_scale + log_counts, axis=1)
+        change = logsumexp(log_density - log_mixture[:, None], axis=0) - log_scale
+        log_scale += change
+        if np.ptp(change) < _SAME_SCALE:
+            break
+    return np.asarray(log_target - log_mixture)
 
 
-def evenly(share: FloatArray, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """`count` places, each as often as its `share` but for rounding, in random order."""
+def systematic_resample(
+    share: FloatArray, count: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Return `count` shuffled indices (count,), each as often as its `share` (k,)."""
     steps = (np.arange(count) + rng.uniform()) / count
     upto = np.cumsum(share) / np.sum(share)
     return rng.permutation(np.minimum(np.searchsorted(upto, steps), share.size - 1))
 
 
-def smoothed(log_weight: FloatArray) -> Smoothed:
-    """Weights of draws by Pareto smoothing; k is infinite where hardly any is possible.
+def pareto_smooth(log_weight: FloatArray) -> SmoothedWeights:
+    """Return Pareto-smoothed weights of log weights (k,); k is infinite if few are finite.
 
-    Where the largest are all alike there is no tail to be fitted, and k is zero.
+    Where the largest are equal there is no tail to fit, and k is zero.
     """
     count = log_weight.size
     tail = int(np.ceil(min(0.2 * count, 3.0 * np.sqrt(count))))
     order = np.argsort(log_weight)
     if tail < 5 or not np.isfinite(log_weight[order[-tail - 1]]):
-        return Smoothed(np.full(count, 1.0 / count), np.inf, 0.0)
+        return SmoothedWeights(np.full(count, 1.0 / count), np.inf, 0.0)
     log = log_weight - log_weight[order[-1]]
     largest, cut = order[-tail:], float(np.exp(log[order[-tail - 1]]))
     weight, k = np.exp(log), 0.0
@@ -76,7 +77,7 @@ def smoothed(log_weight: FloatArray) -> Smoothed:
         part = (np.arange(tail) + 0.5) / tail
         weight[largest] = np.minimum(cut + _quantiles(part, k, scale), 1.0)
     weight /= weight.sum()
-    return Smoothed(weight, k, float(1.0 / np.sum(weight**2)))
+    return SmoothedWeights(weight, k, float(1.0 / np.sum(weight**2)))
 
 
 def _quantiles(part: FloatArray, k: float, scale: float) -> FloatArray:
@@ -85,9 +86,9 @@ def _quantiles(part: FloatArray, k: float, scale: float) -> FloatArray:
 
 
 def _generalised_pareto(x: FloatArray) -> tuple[float, float]:
-    """Shape k and scale of x (n,) > 0, ascending (Zhang and Stephens 2009).
+    """Return shape k and scale of x (n,) > 0, ascending (Zhang and Stephens 2009).
 
-    A prior of ten draws at one half keeps the shape of few from running away.
+    A prior of ten draws at one half stabilises the shape of few.
     """
     n = x.size
     points = 30 + int(np.sqrt(n))

@@ -1,7 +1,7 @@
-"""Levenberg-Marquardt for any rows whose squares are to be summed to as little as can be.
+"""Levenberg-Marquardt for any sum of squared residuals.
 
-The coordinates are the caller's, and without bounds; a row that is not finite marks a point that is
-impossible, and the damping grows until the step avoids it (Nocedal and Wright, section 10.3).
+The coordinates are the caller's and have no bounds. A residual that is not finite marks an
+impossible point, and the damping grows until the step avoids it (Nocedal and Wright, section 10.3).
 """
 
 from collections.abc import Callable
@@ -11,100 +11,100 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
-from pre_core.search.loop import Ending, Solution, run
+from pre_core.search.loop import SearchResult, Termination, run_search
 
 FloatArray = NDArray[np.float64]
 
 _FIRST_DAMPING = 1e-3
-"""Relative to the Jacobian's columns: nearly a Gauss-Newton step."""
+"""Initial damping relative to the Jacobian's columns: nearly a Gauss-Newton step."""
 _SMALLEST_DAMPING = 1e-14
-"""Damping that is smaller changes nothing within rounding."""
+"""Smallest damping; less has no effect within rounding."""
 _GIVE_UP_DAMPING = 1e8
-"""Steps that are so short and do not help: the search is stuck."""
+"""Damping at which the search is stuck: very short steps do not help."""
 _CONVERGED_STEP = 1e-9  # in logarithms
 _KEPT = 0.5
-"""A step that gains less than this part of what slopes led on promise has them taken anew."""
+"""Smallest gain relative to the prediction of an updated Jacobian before it is recomputed."""
 _LARGEST_STEP = 1.0  # in logarithms: nothing changes by more than a factor of e in one step
 
 
-class Differences(NamedTuple):
-    """How a Jacobian is taken, and the gain at which a search that uses it is at the bottom."""
+class DifferenceScheme(NamedTuple):
+    """Scheme of a Jacobian, and the gain at which a search that uses it has converged."""
 
     step: float  # in search coordinates
     central: bool
-    converged_gain: float  # relative decrease of J that the linear model still promises
-    rounding: (
-        float  # a relative rise of J by less than this is rounding, and no reason to turn back
-    )
+    converged_gain: float  # relative decrease of J that the linear model still predicts
+    rounding: float  # a smaller relative rise of J is rounding and does not reject a step
 
 
-FORWARD = Differences(1e-6, central=False, converged_gain=1e-7, rounding=0.0)
-"""On the way: f evaluations, six digits. What is in the others depends on the processor's rounding
-and moves the bottom by about 1e-6, little beside a standard deviation of any real crossing."""
+FORWARD = DifferenceScheme(1e-6, central=False, converged_gain=1e-7, rounding=0.0)
+"""Scheme during the search: f evaluations, six digits. The others depend on the processor's
+rounding and move the optimum by about 1e-6, little compared with a standard deviation of any real
+crossing."""
 
-CENTRAL = Differences(1e-3, central=True, converged_gain=1e-12, rounding=1e-9)
-"""At the bottom: 2f evaluations, a rounding a thousand times smaller. The error of the formula is
-larger, and would be 2e-5 of a standard deviation, but the same on every processor: so is the
-bottom. What is told of it, `covariance`, takes `slopes`."""
+CENTRAL = DifferenceScheme(1e-3, central=True, converged_gain=1e-12, rounding=1e-9)
+"""Scheme at the optimum: 2f evaluations, a rounding a thousand times smaller. The formula's error
+is larger, about 2e-5 of a standard deviation, but the same on every processor: so is the optimum.
+Uncertainties (`gauss_newton_covariance`) use `sixth_order_jacobian`."""
 
 _SLOPE_STEP = 3e-3
 _SLOPE_WEIGHTS = (3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0)
-"""Weights of central differences over one, two and three steps, which are together exact for
-polynomials of sixth degree. With this step the error of the formula and what rounding makes of it
-are alike."""
+"""Weights of central differences over one, two and three steps, together exact for polynomials of
+sixth degree. With this step the formula's error and rounding are similar."""
 
 
-class State(NamedTuple):
-    """Where the search is: `y` are the transformed free parameters (f,)."""
+class LMState(NamedTuple):
+    """State of the search: `y` are the transformed free parameters (f,)."""
 
     y: FloatArray
     residual: FloatArray  # (m,)
     jacobian: FloatArray  # (m, f), d residual/d y
     objective: float
     damping: float
-    differences: Differences
+    differences: DifferenceScheme
     is_fresh: bool = True
-    """Whether the Jacobian was taken here, and not led on from where it was (`_follow`)."""
+    """Whether the Jacobian was computed at `y` and not updated from elsewhere (`_follow`)."""
 
 
-class Info(NamedTuple):
-    """What one step did."""
+class LMInfo(NamedTuple):
+    """Statistics of one step."""
 
     objective: float
     step_size: float  # largest change of a logarithm
     damping: float
     accepted: bool
     evaluations: int
-    ending: Ending | None
+    ending: Termination | None
 
 
 Rows = Callable[[FloatArray], FloatArray]
-"""Residual rows (k, m) at points (k, f); a row that is not finite marks an impossible point."""
+"""Residuals (k, m) at points (k, f); a value that is not finite marks an impossible point."""
 
 
-def begin(rows: Rows, y: FloatArray, differences: Differences = FORWARD) -> State:
-    """The state at search coordinates `y` (f,) of any least-squares problem."""
+def initial_state(rows: Rows, y: FloatArray, differences: DifferenceScheme = FORWARD) -> LMState:
+    """Return the state at search coordinates `y` (f,) of any least-squares problem."""
     residual = rows(y[None, :])[0]
     jacobian = _jacobian(rows, y, residual, differences)
-    return State(y, residual, jacobian, _square(residual), _FIRST_DAMPING, differences)
+    return LMState(y, residual, jacobian, _square(residual), _FIRST_DAMPING, differences)
 
 
-class Move(NamedTuple):
-    """Where a step leads, before the slopes there are known."""
+class TrialStep(NamedTuple):
+    """A step, before the Jacobian at its end is known."""
 
     y: FloatArray
     residual: FloatArray
     objective: float
     damping: float
-    """Of the following step."""
+    """Damping of the following step."""
     size: float  # largest change of a coordinate
     evaluations: int
 
 
-def move(rows: Rows, state: State, lower: FloatArray | None = None) -> Move | tuple[State, Info]:
-    """The way to a smaller objective from `state`, or why there is none; see `descend`."""
+def trial_step(
+    rows: Rows, state: LMState, lower: FloatArray | None = None
+) -> TrialStep | tuple[LMState, LMInfo]:
+    """Return a step to a smaller objective, or the final state; `lower` (f,) as in `descend`."""
     if not (np.isfinite(state.objective) and np.all(np.isfinite(state.jacobian))):
-        return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.NOT_FINITE)
+        return state, LMInfo(state.objective, 0.0, state.damping, False, 0, Termination.NOT_FINITE)
     f = state.y.size
     free = np.full(f, True)
     if lower is not None:
@@ -118,14 +118,14 @@ def move(rows: Rows, state: State, lower: FloatArray | None = None) -> Move | tu
     scale[scale == 0.0] = 1.0
     rows_of[:, :count] /= scale
     triangle, projected = _triangle(rows_of)
-    # Where even the full linear step promises next to nothing, the search is at the bottom.
+    # If even the full linear step predicts next to no gain, the search has converged.
     if _square(projected) <= state.differences.converged_gain * state.objective:
-        return state, Info(state.objective, 0.0, state.damping, False, 0, Ending.CONVERGED)
+        return state, LMInfo(state.objective, 0.0, state.damping, False, 0, Termination.CONVERGED)
     damping = state.damping
     evaluations = 0
     while damping < _GIVE_UP_DAMPING:
         change = np.zeros(f)
-        change[free] = _damped(triangle, projected, damping) / scale
+        change[free] = _damped_step(triangle, projected, damping) / scale
         size = float(np.abs(change).max())
         if size > _LARGEST_STEP:
             change *= _LARGEST_STEP / size
@@ -139,46 +139,48 @@ def move(rows: Rows, state: State, lower: FloatArray | None = None) -> Move | tu
         # False for NaN too.
         if objective < state.objective * (1.0 + state.differences.rounding):
             eased = max(damping * 0.1, _SMALLEST_DAMPING)
-            return Move(trial, residual, objective, eased, size, evaluations)
+            return TrialStep(trial, residual, objective, eased, size, evaluations)
         if size < _CONVERGED_STEP:
-            return state, Info(state.objective, size, damping, False, evaluations, Ending.CONVERGED)
+            return state, LMInfo(
+                state.objective, size, damping, False, evaluations, Termination.CONVERGED
+            )
         damping *= 10.0
-    return state, Info(state.objective, 0.0, damping, False, evaluations, Ending.STUCK)
+    return state, LMInfo(state.objective, 0.0, damping, False, evaluations, Termination.STUCK)
 
 
-def descend(rows: Rows, state: State, lower: FloatArray | None = None) -> tuple[State, Info]:
-    """One Levenberg-Marquardt step of any problem: damping grows until the objective falls.
+def descend(rows: Rows, state: LMState, lower: FloatArray | None = None) -> tuple[LMState, LMInfo]:
+    """Take one Levenberg-Marquardt step: damping grows until the objective falls.
 
-    No coordinate goes below `lower` (f,); one that lies there and would is held for this step.
+    No coordinate goes below `lower` (f,); one on its bound that would do so is fixed for the step.
     """
-    there = move(rows, state, lower)
-    if not isinstance(there, Move):
+    there = trial_step(rows, state, lower)
+    if not isinstance(there, TrialStep):
         return there
     slopes = _jacobian(rows, there.y, there.residual, state.differences)
     evaluations = there.evaluations + _evaluations(state.differences, state.y.size)
-    ending = Ending.CONVERGED if there.size < _CONVERGED_STEP else None
+    ending = Termination.CONVERGED if there.size < _CONVERGED_STEP else None
     return (
-        State(there.y, there.residual, slopes, there.objective, there.damping, state.differences),
-        Info(there.objective, there.size, there.damping, True, evaluations, ending),
+        LMState(there.y, there.residual, slopes, there.objective, there.damping, state.differences),
+        LMInfo(there.objective, there.size, there.damping, True, evaluations, ending),
     )
 
 
-def _follow(rows: Rows, state: State, lower: FloatArray | None) -> tuple[State, Info]:
-    """`descend` with slopes that are led on from step to step, as long as steps lead there.
+def _follow(rows: Rows, state: LMState, lower: FloatArray | None) -> tuple[LMState, LMInfo]:
+    """Take a step as `descend` does, updating the Jacobian as long as steps succeed.
 
-    Broyden's update (Dennis and Schnabel, section 8.1): of all slopes that explain the change of
-    the rows along the step those that are nearest to the last ones. Where a step kept too little of
-    its promise slopes are taken anew; and where one with slopes led on leads no further.
+    Broyden's update (Dennis and Schnabel, section 8.1) is the nearest Jacobian that explains the
+    change of the residuals along the step. It is recomputed where a step gains too little of its
+    prediction, and where a step with an updated Jacobian fails.
     """
-    there = move(rows, state, lower)
-    if not isinstance(there, Move):
+    there = trial_step(rows, state, lower)
+    if not isinstance(there, TrialStep):
         stays, info = there
-        return (stays, info) if state.is_fresh else _refreshed(rows, stays, info)
+        return (stays, info) if state.is_fresh else _refresh_jacobian(rows, stays, info)
     change = there.y - state.y
-    told = state.jacobian @ change
-    promised = state.objective - _square(state.residual + told)
-    missed = there.residual - state.residual - told
-    ending = Ending.CONVERGED if there.size < _CONVERGED_STEP else None
+    predicted = state.jacobian @ change
+    promised = state.objective - _square(state.residual + predicted)
+    missed = there.residual - state.residual - predicted
+    ending = Termination.CONVERGED if there.size < _CONVERGED_STEP else None
     following = state._replace(
         y=there.y,
         residual=there.residual,
@@ -188,14 +190,14 @@ def _follow(rows: Rows, state: State, lower: FloatArray | None) -> tuple[State, 
         damping=there.damping,
         is_fresh=False,
     )
-    info = Info(there.objective, there.size, there.damping, True, there.evaluations, ending)
+    info = LMInfo(there.objective, there.size, there.damping, True, there.evaluations, ending)
     if ending is None and state.objective - there.objective < _KEPT * promised:
-        return _refreshed(rows, following, info)
+        return _refresh_jacobian(rows, following, info)
     return following, info
 
 
-def _refreshed(rows: Rows, state: State, info: Info) -> tuple[State, Info]:
-    """The same place with slopes taken there, from which a search goes on."""
+def _refresh_jacobian(rows: Rows, state: LMState, info: LMInfo) -> tuple[LMState, LMInfo]:
+    """Return the same point with a Jacobian computed there, to continue from."""
     jacobian = _jacobian(rows, state.y, state.residual, state.differences)
     evaluations = info.evaluations + _evaluations(state.differences, state.y.size)
     damping = min(state.damping, _FIRST_DAMPING)
@@ -206,12 +208,12 @@ def _refreshed(rows: Rows, state: State, info: Info) -> tuple[State, Info]:
 
 
 def _square(residual: FloatArray) -> float:
-    with np.errstate(over="ignore"):  # of a point far off: infinite, and no step is taken there
+    with np.errstate(over="ignore"):  # infinite at a distant point, where no step is taken
         return float(residual @ residual)
 
 
 def _jacobian(
-    rows: Rows, y: FloatArray, residual: FloatArray, differences: Differences
+    rows: Rows, y: FloatArray, residual: FloatArray, differences: DifferenceScheme
 ) -> FloatArray:
     moves = differences.step * np.eye(y.size)
     if not differences.central:
@@ -220,12 +222,12 @@ def _jacobian(
     return np.asarray(((ahead - behind) / (2.0 * differences.step)).T)
 
 
-def _evaluations(differences: Differences, f: int) -> int:
+def _evaluations(differences: DifferenceScheme, f: int) -> int:
     return 2 * f if differences.central else f
 
 
-def _damped(triangle: FloatArray, projected: FloatArray, damping: float) -> FloatArray:
-    """Minimiser of |R x + p|^2 + damping |x|^2."""
+def _damped_step(triangle: FloatArray, projected: FloatArray, damping: float) -> FloatArray:
+    """Return the minimiser of |R x + p|^2 + damping |x|^2."""
     f = projected.size
     stacked = np.zeros((2 * f, f + 1), order="F")
     stacked[:f, :f] = triangle
@@ -236,18 +238,18 @@ def _damped(triangle: FloatArray, projected: FloatArray, damping: float) -> Floa
 
 
 def _triangle(stacked: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """R (f, f) and Q'b (f,) of columns A and b side by side (m, f + 1), which are overwritten."""
+    """Return R (f, f) and Q'b (f,) of columns A and b side by side (m, f + 1), overwriting them."""
     f = stacked.shape[1] - 1
     _, r = qr(stacked, mode="raw", overwrite_a=True, check_finite=False)
     return r[:f, :f], r[:f, f]
 
 
-def polish(rows: Rows, state: State, info: Info) -> tuple[State, Info]:
-    """Where a search with forward differences has ended, let it go on with central ones.
+def polish(rows: Rows, state: LMState, info: LMInfo) -> tuple[LMState, LMInfo]:
+    """Continue with central differences where a search with forward ones has ended.
 
-    So the way costs no more than it must, and where it ends does not depend on the processor.
+    The search then costs no more than necessary, and its end does not depend on the processor.
     """
-    if state.differences.central or info.ending not in (Ending.CONVERGED, Ending.STUCK):
+    if state.differences.central or info.ending not in (Termination.CONVERGED, Termination.STUCK):
         return state, info
     jacobian = _jacobian(rows, state.y, state.residual, CENTRAL)
     evaluations = info.evaluations + _evaluations(CENTRAL, state.y.size)
@@ -257,7 +259,7 @@ def polish(rows: Rows, state: State, info: Info) -> tuple[State, Info]:
     )
 
 
-def minimised(
+def minimise(
     rows: Rows,
     start: FloatArray,
     steps: int,
@@ -265,34 +267,34 @@ def minimised(
     lower: FloatArray | None = None,
     *,
     is_followed: bool = False,
-) -> Solution[State, Info]:
-    """The bottom below `start` (f,), reached when a step gains less than `enough`.
+) -> SearchResult[LMState, LMInfo]:
+    """Return the minimum near `start` (f,), reached when a step gains less than `enough`.
 
-    Where no step helps any more, forward differences have reached their rounding: the bottom too.
-    With `is_followed` slopes are taken where the search begins, and then only where those that are
-    led on (`_follow`) no longer tell the way. A step that gains too little ends the search only if
-    its slopes were taken where it began. The slopes at the end need not be (`State.is_fresh`).
+    Where no step helps, forward differences have reached their rounding: a minimum too. With
+    `is_followed` the Jacobian is computed at the start, and then only where updates (`_follow`)
+    fail. A step that gains too little ends the search only with a fresh Jacobian. The Jacobian at
+    the end need not be fresh (`LMState.is_fresh`). No coordinate goes below `lower` (f,).
     """
 
-    def step(state: State) -> tuple[State, Info]:
+    def step(state: LMState) -> tuple[LMState, LMInfo]:
         following, info = (_follow if is_followed else descend)(rows, state, lower)
-        if info.ending is Ending.STUCK:
-            return following, info._replace(ending=Ending.CONVERGED)
+        if info.ending is Termination.STUCK:
+            return following, info._replace(ending=Termination.CONVERGED)
         if info.ending is None and state.objective - following.objective < enough:
             if state.is_fresh:
-                return following, info._replace(ending=Ending.CONVERGED)
+                return following, info._replace(ending=Termination.CONVERGED)
             if not following.is_fresh:
-                return _refreshed(rows, following, info)
+                return _refresh_jacobian(rows, following, info)
         return following, info
 
-    return run(lambda: begin(rows, start), step, steps)
+    return run_search(lambda: initial_state(rows, start), step, steps)
 
 
-def slopes(rows: Rows, y: FloatArray) -> FloatArray:
-    """d rows/d y (m, f) at y (f,) by central differences of sixth order: 6f evaluations.
+def sixth_order_jacobian(rows: Rows, y: FloatArray) -> FloatArray:
+    """Return d residuals/d y (m, f) at y (f,) by central differences of sixth order.
 
-    For what is told of a point rather than for the way there. The error is step^6/140 of the
-    seventh derivative.
+    It takes 6f evaluations and serves uncertainties rather than the search. The error is step^6/140
+    of the seventh derivative.
     """
     differences = []
     for count, weight in enumerate(_SLOPE_WEIGHTS, start=1):
@@ -302,14 +304,14 @@ def slopes(rows: Rows, y: FloatArray) -> FloatArray:
     return np.asarray((np.sum(differences, axis=0) / _SLOPE_STEP).T)
 
 
-def covariance(rows: Rows, y: FloatArray) -> FloatArray:
-    """Gauss-Newton covariance (f, f) of the bottom y (f,), scaled by the residual's own variance.
+def gauss_newton_covariance(rows: Rows, y: FloatArray) -> FloatArray:
+    """Return the Gauss-Newton covariance (f, f) at y (f,), scaled by the residual variance.
 
-    It takes the rows for independent, which double-integrated sensor noise is not: a formal figure,
+    It assumes independent residuals, which double-integrated sensor noise is not: a formal value,
     not an uncertainty.
     """
     residual = rows(y[None, :])[0]
-    jacobian = slopes(rows, y)
+    jacobian = sixth_order_jacobian(rows, y)
     count, f = jacobian.shape
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0

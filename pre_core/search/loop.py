@@ -1,8 +1,8 @@
-"""The one loop that runs every search method, and how it ends.
+"""The loop that runs every search method, and its outcomes.
 
 A method is a State, an Info, `init` and `step`: `step(state) -> (state, info)` is a pure function
-of the state, which holds all that the next step needs, its random numbers included. How a search
-ended is a value, never an exception.
+of the state, which holds everything for the next step, including its random numbers. The outcome of
+a search is a value, never an exception.
 """
 
 from collections.abc import Callable
@@ -10,8 +10,8 @@ from enum import Enum
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 
-class Ending(Enum):
-    """Why a search stopped, with a sentence for people."""
+class Termination(Enum):
+    """Reason for the end of a search, with a sentence for users."""
 
     CONVERGED = "The search converged."
     STEPS_DONE = "All the steps that were asked for were taken."
@@ -21,11 +21,11 @@ class Ending(Enum):
 
 
 class StepInfo(Protocol):
-    """What every method's Info says; `ending` is None while the search goes on."""
+    """The fields that every method's Info has; `ending` is None while the search continues."""
 
     @property
-    def ending(self) -> Ending | None:
-        """Why the search is over, None while it is not."""
+    def ending(self) -> Termination | None:
+        """The reason for the end of the search, None while it continues."""
 
     @property
     def objective(self) -> float:
@@ -33,29 +33,29 @@ class StepInfo(Protocol):
 
 
 Report = Callable[[str, float], None]
-"""Is told the stage of a computation in words, and how much of all is done, 0 to 1."""
+"""Callback with the stage of a computation in words and the completed fraction, 0 to 1."""
 
 StateT = TypeVar("StateT")
 InfoT = TypeVar("InfoT", bound=StepInfo)
 
 
-class Solution(NamedTuple, Generic[StateT, InfoT]):
-    """What a search gives, whatever its method: where it is, what its steps did, why it stopped."""
+class SearchResult(NamedTuple, Generic[StateT, InfoT]):
+    """The final state of a search, the statistics of its steps, and the reason for its end."""
 
     state: StateT
     infos: list[InfoT]
-    ending: Ending
+    ending: Termination
 
 
-def run(
+def run_search(
     init: Callable[[], StateT],
     step: Callable[[StateT], tuple[StateT, InfoT]],
     max_steps: int,
     *,
-    at_the_end: Ending = Ending.STEPS_EXHAUSTED,
+    at_the_end: Termination = Termination.STEPS_EXHAUSTED,
     progress: Callable[[int, InfoT], None] | None = None,
-) -> Solution[StateT, InfoT]:
-    """Step until a method says that it has ended, or `max_steps` are taken (`at_the_end`)."""
+) -> SearchResult[StateT, InfoT]:
+    """Step until a method ends, or `max_steps` are taken (`at_the_end`)."""
     state = init()
     infos: list[InfoT] = []
     for count in range(1, max_steps + 1):
@@ -64,5 +64,5 @@ def run(
         if progress is not None:
             progress(count, info)
         if info.ending is not None:
-            return Solution(state, infos, info.ending)
-    return Solution(state, infos, at_the_end)
+            return SearchResult(state, infos, info.ending)
+    return SearchResult(state, infos, at_the_end)

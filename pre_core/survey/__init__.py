@@ -1,1 +1,1 @@
-"""How well a bridge will be known, and what damage will be seen, before anyone drives."""
+"""Prediction of a survey's accuracy and of the damage that it detects."""

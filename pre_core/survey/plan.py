@@ -1,15 +1,15 @@
-"""What a survey will tell of a bridge: likelihoods at the truth, so many of each, priors once.
+"""Information of a planned survey: likelihoods times numbers of crossings, plus priors.
 
 One crossing of the nominal truck over the nominal bridge, without noise but with all of it in the
-model, has the information that a driven one will have on average: J'J of its white rows does not
-depend on what the noise happens to be. Deflection is linear in the compliances c = EI_nominal/EI
-(`crossing.compliances`), so that this information is that of a damaged bridge, too.
+model, has the mean information of a driven one: J'J of its whitened residuals does not depend on
+the noise realisation. Deflection is linear in the compliances c = EI_nominal/EI
+(`crossing.compliances`), so that this is also the information on a damaged bridge.
 
-Crossings in one track share a part of the mismatch of the axles' roads (`fusion.joint`): it has its
-place among the unknowns once for all of them, so that no number of crossings averages it out. What
-is this crossing's own (truck, trajectory, delays, its part of the mismatch) is integrated out of
-each. What scales all elements alike (total mass, gain of all sensors) no crossing shows: whoever
-compares with a nominal value adds it.
+Crossings of a wheel-path group share a part of the profile mismatch (`fusion.joint`): it has
+coordinates of its own, once for all of them, so that the number of crossings does not average it
+out. The variables of a single crossing (truck, trajectory, delays, its part of the mismatch) are
+integrated out of each. A common scale of all elements (total mass, gain of all sensors) is not
+observable: a comparison with nominal values has to add it.
 """
 
 from collections.abc import Sequence
@@ -17,60 +17,62 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 
 from pre_core.crossing import posterior
-from pre_core.crossing.compliances import draws, marginal, of_normal
-from pre_core.crossing.mismatch import Mismatch, common_shapes
-from pre_core.crossing.optimum import Optimum
+from pre_core.crossing.compliances import draws, from_normal, marginal
+from pre_core.crossing.fit import Optimum
+from pre_core.crossing.mismatch import Mismatch, between_run_spectra
 from pre_core.fusion.likelihood import (
-    Likelihood,
+    CrossingLikelihood,
+    add_covariance,
     covariance_of_coefficients,
     likelihood,
-    loosened,
 )
-from pre_core.fusion.tracks import root_of
+from pre_core.fusion.path_groups import low_rank_root
 from pre_core.search import levenberg_marquardt
-from pre_core.search.loop import Ending
+from pre_core.search.loop import Termination
 
 FloatArray = NDArray[np.float64]
 
 _DRAWS, _CHAINS = 1000, 2
-"""A standard deviation of so many draws is right to 2 %."""
+"""Number of draws, which give a standard deviation to 2 %, and of chains."""
 
 
-class Truth(NamedTuple):
+class PosteriorAtTruth(NamedTuple):
     """A crossing's posterior with y (f,) at the truth."""
 
-    problem: posterior.Problem
+    problem: posterior.PosteriorProblem
     y: FloatArray
 
 
-class Known(NamedTuple):
-    """What is known of the bridge before any crossing: its unknowns (b,), the elements last."""
+class BridgePrior(NamedTuple):
+    """Prior of the bridge: its parameters (b,), the elements last."""
 
     sigma: FloatArray  # (e,) spread of ln EI
     half_normal: NDArray[np.int64]
-    """Places of what must not be negative."""
+    """Indices of parameters that are not negative."""
     log_odds: FloatArray
-    """(b,) of being exactly nothing, as in `posterior.log_odds_of_absence`."""
+    """Log odds (b,) of absence, as in `posterior.log_odds_of_absence`."""
     second_moment: FloatArray  # (b - e,) of the priors of all but the elements
 
 
-class Track(NamedTuple):
-    """Crossings of which there are equally many, in one track."""
+class PlannedPathGroup(NamedTuple):
+    """Crossings of one wheel-path group in equal numbers."""
 
     precisions: tuple[FloatArray, ...]
-    """(b + k, b + k) each: the bridge's unknowns, then the common mismatch in mm at k knots."""
+    """Precisions (b + k, b + k): the bridge's parameters, then the shared mismatch in mm at k
+    knots."""
     common: FloatArray | None
-    """(k, k) prior precision of these; None where tracks share nothing."""
+    """Prior precision (k, k) of the shared mismatch; None where runs share nothing."""
 
 
-def known_before(problem: posterior.Problem) -> Known:
-    """What a crossing's priors say of the bridge."""
+def bridge_prior(problem: posterior.PosteriorProblem) -> BridgePrior:
+    """Return the prior of the bridge in a crossing's problem."""
     priors, where = problem.priors, posterior.layout(problem)
     absence = priors.absence[priors.estimated][where.bridge]
     e = where.elements.size
-    return Known(
+    return BridgePrior(
         posterior.rigidity_spread(priors),
         np.searchsorted(where.bridge, np.intersect1d(where.half_normal, where.bridge)),
         posterior.log_odds_of_absence(problem)[where.bridge],
@@ -78,47 +80,56 @@ def known_before(problem: posterior.Problem) -> Known:
     )
 
 
-def track_of(truths: Sequence[Truth], whole: Mismatch, wander_m: float) -> Track:
-    """What crossings in one track tell; tracks lie beside each other by `wander_m` (std)."""
-    told = [_told(truth, whole) for truth in truths]
+def planned_path_group(
+    truths: Sequence[PosteriorAtTruth], whole: Mismatch, wander_m: float
+) -> PlannedPathGroup:
+    """Return the information of a wheel-path group; its runs wander by `wander_m` (std)."""
+    likelihoods = [_crossing_likelihood(truth, whole) for truth in truths]
     if not whole.level_m3.any():
-        return Track(tuple(_of_bridge(one, None) for one in told), None)
+        return PlannedPathGroup(tuple(_of_bridge(one, None) for one in likelihoods), None)
     shapes = whole.shapes
     n = shapes.cycles_per_m
-    shared = whole.level_m3 @ common_shapes(*shapes.footprints, wander_m)
-    # The crossings' own knots stand at the same places on the bridge and near it.
-    knots_m = told[0].knots_m
+    shared = whole.level_m3 @ between_run_spectra(*shapes.footprints, wander_m)
+    # The crossings' own knots coincide on the bridge and near it.
+    knots_m = likelihoods[0].knots_m
     of_all = covariance_of_coefficients(knots_m, n, whole.level_m3 @ shapes.density)
     common = covariance_of_coefficients(knots_m, n, shared)
-    own = root_of(of_all - common)
-    return Track(tuple(_of_bridge(one, own) for one in told), np.asarray(np.linalg.inv(common)))
+    own = low_rank_root(of_all - common)
+    return PlannedPathGroup(
+        tuple(_of_bridge(one, own) for one in likelihoods), np.asarray(np.linalg.inv(common))
+    )
 
 
-def _told(truth: Truth, whole: Mismatch) -> Likelihood:
-    """The likelihood of one crossing: all that this room needs of `fusion`."""
+def _crossing_likelihood(truth: PosteriorAtTruth, whole: Mismatch) -> CrossingLikelihood:
+    """Return the likelihood of one crossing, the only part of `fusion` that this room needs."""
     problem, y = truth
     mismatch = whole._replace(speed_m_per_s=problem.mismatch.speed_m_per_s)
     problem = problem._replace(mismatch=mismatch)
-    state = levenberg_marquardt.begin(lambda at: posterior.all_rows(problem, at), y)
-    return likelihood(Optimum(problem, state, Ending.CONVERGED, 1.0, 0, 1), with_bends=False)
+    state = levenberg_marquardt.initial_state(lambda at: posterior.all_rows(problem, at), y)
+    return likelihood(Optimum(problem, state, Termination.CONVERGED, 1.0, 0, 1), with_bends=False)
 
 
-def _of_bridge(told: Likelihood, own: FloatArray | None) -> FloatArray:
-    """Precision (b + k, b + k): the truck and the crossing's own waves integrated out."""
-    precision = told.root.T @ told.root
-    b, t = len(told.bridge.names), len(told.truck.names)
+def _of_bridge(crossing: CrossingLikelihood, own: FloatArray | None) -> FloatArray:
+    """Return the precision (b + k, b + k), truck and own waves of the crossing integrated out."""
+    precision = crossing.root.T @ crossing.root
+    b, t = len(crossing.bridge.names), len(crossing.truck.names)
     truck = b + np.arange(t)
-    precision[truck, truck] += 1.0  # before the survey nothing but its data sheet is known
+    precision[truck, truck] += 1.0  # before the survey, the truck is known by its data sheet only
     linear = np.zeros(precision.shape[0])
     if own is not None:
         along = np.zeros((linear.size, own.shape[0]))
         along[b + t :] = np.eye(own.shape[0])
-        precision, linear = loosened(precision, linear, along, own)
+        precision, linear = add_covariance(precision, linear, along, own)
     return marginal(precision, linear, np.setdiff1d(np.arange(linear.size), truck))[0]
 
 
-def together(tracks: Sequence[Track], crossings: float, bridge: int) -> FloatArray:
-    """Precision (b, b) that so many crossings, shared evenly, have of the bridge's unknowns."""
+def survey_information(
+    tracks: Sequence[PlannedPathGroup], crossings: float, bridge: int
+) -> FloatArray:
+    """Return the precision (b, b) of the bridge after `crossings`, divided evenly among groups.
+
+    `bridge` is the number b of its parameters.
+    """
     total = np.zeros((bridge, bridge))
     each = crossings / sum(len(track.precisions) for track in tracks)
     for track in tracks:
@@ -130,26 +141,26 @@ def together(tracks: Sequence[Track], crossings: float, bridge: int) -> FloatArr
     return total
 
 
-class Spreads(NamedTuple):
-    """Standard deviations of ln EI, of what is common to all elements free."""
+class SurveySpreads(NamedTuple):
+    """Standard deviations of ln EI, conditional on the scale common to all elements."""
 
     elements: FloatArray  # (e,)
     level: float
-    """Of the mean over the bridge, by length."""
+    """Standard deviation of the length-weighted mean over the bridge."""
 
 
-def spreads(
-    known: Known,
+def survey_spreads(
+    known: BridgePrior,
     precision: FloatArray,
     lengths_m: FloatArray,
     truth: FloatArray | None = None,
     seed: int = 1,
-) -> Spreads:
-    """Of the posterior that a survey of this precision (b, b) ends in.
+) -> SurveySpreads:
+    """Return the posterior spreads of a survey of this precision (b, b).
 
-    `truth` (b,) is the bridge with c in place of ln EI, by default the nominal one. By Gibbs'
-    draws of the normal in 1/EI times the priors: the posterior is far from normal in ln EI where
-    hardly anything is known of an element.
+    `lengths_m` is (e,). `truth` (b,) is the bridge with c in place of ln EI, by default the nominal
+    one. Gibbs draws of the normal in 1/EI times the priors are used, because the posterior is far
+    from normal in ln EI for poorly determined elements.
     """
     b, e = precision.shape[0], known.sigma.size
     elements = np.arange(b - e, b)
@@ -160,7 +171,7 @@ def spreads(
     single = np.arange(b - e)
     whole = precision.copy()
     whole[single, single] += 1.0
-    of = of_normal(
+    of = from_normal(
         whole,
         linear,
         elements,
@@ -173,4 +184,14 @@ def spreads(
     )
     drawn = np.concatenate([draws(of, _DRAWS, seed, chain) for chain in range(_CHAINS)])
     ln_ei = drawn[:, elements] * known.sigma
-    return Spreads(ln_ei.std(axis=0), float((ln_ei @ lengths_m / lengths_m.sum()).std()))
+    return SurveySpreads(ln_ei.std(axis=0), float((ln_ei @ lengths_m / lengths_m.sum()).std()))
+
+
+def non_increasing(spreads: FloatArray) -> FloatArray:
+    """Return the non-increasing columns closest to `spreads` (n, k) in least squares.
+
+    More crossings never widen a posterior: what rises between two rows is the error of a standard
+    deviation from a finite number of draws.
+    """
+    columns = [isotonic_regression(column, increasing=False).x for column in spreads.T]
+    return np.stack(columns, axis=1)

@@ -1,15 +1,14 @@
-"""Who a process is on the bus: a folder with a certificate, its private key and the authority.
+"""Identity of a process on the bus: a folder with a certificate, its private key and the authority.
 
 `driveby certs` makes one such folder for each router, service and truck, and without the last file
 for each part of a Dask cluster:
 
-    ca.pem        the authority's certificate: whom to believe
-    cert.pem      this one's certificate; its common name is ROLE/NAME, e.g. truck/truck-1
+    ca.pem        the authority's certificate, which verifies others
+    cert.pem      the own certificate; its common name is ROLE/NAME, e.g. truck/truck-1
     key.pem       its private key, readable by its owner alone
-    zenoh.json5   the same as a configuration for the programs of Zenoh; for those who listen also
-                  the access control
+    zenoh.json5   the same as a configuration of Zenoh; with access control for listeners
 
-Nothing here ever puts a key into a message or a log.
+No key is ever written to a message or a log.
 """
 
 import logging
@@ -32,13 +31,13 @@ from services.common.files import read_bytes
 
 BUS_ROLES = ("router", "logger", "worker", "viewer", "replay", "truck")
 CLUSTER_ROLES = ("scheduler", "cluster-worker", "client")
-"""Of a Dask cluster, which runs whatever it is sent: they have an authority of their own, which
-nobody on the bus has a certificate of."""
+"""Roles of a Dask cluster, which runs any code that it receives: they have an authority of their
+own, which issues no certificate for the bus."""
 ROLES = (*BUS_ROLES, *CLUSTER_ROLES)
 LISTENERS = ("router", "logger")
-"""Roles to which others connect: their certificates are valid for servers and name hosts."""
+"""Roles that accept connections: their certificates are valid for servers and name hosts."""
 CLUSTER_LISTENERS = ("scheduler", "cluster-worker")
-"""Their certificates are valid for servers; Dask looks at the authority and not at hosts."""
+"""Roles with certificates for servers; Dask checks the authority and not the hosts."""
 AUTHORITY, CERTIFICATE, KEY, CONFIGURATION = "ca.pem", "cert.pem", "key.pem", "zenoh.json5"
 
 _log = logging.getLogger(__name__)
@@ -47,7 +46,7 @@ _CLOCK_TOLERANCE = timedelta(minutes=5)
 
 
 class Subject(NamedTuple):
-    """The one a certificate speaks for."""
+    """The subject of a certificate."""
 
     role: str
     name: str
@@ -58,7 +57,7 @@ class Subject(NamedTuple):
 
 
 def parse_subject(text: str) -> Subject:
-    """Take ROLE/NAME apart; ValueError if it is none."""
+    """Return the parts of ROLE/NAME; raise ValueError if it is malformed."""
     role, _, name = text.partition("/")
     if role not in ROLES:
         raise ValueError(f"{text[:80]!r}: ROLE/NAME is expected, ROLE one of {', '.join(ROLES)}")
@@ -66,7 +65,7 @@ def parse_subject(text: str) -> Subject:
 
 
 def subject_of(certificate: x509.Certificate) -> Subject:
-    """Return whom a certificate is for; ValueError if its common name is not ROLE/NAME."""
+    """Return the subject of a certificate; raise ValueError if its common name is not ROLE/NAME."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     if len(names) != 1:
         raise ValueError("the certificate has no common name")
@@ -74,11 +73,11 @@ def subject_of(certificate: x509.Certificate) -> Subject:
 
 
 def check_credentials(folder: Path, now: datetime | None = None) -> Subject:
-    """Return whose credentials lie in a folder, after all that can be checked before connecting.
+    """Return the subject of the credentials in a folder, after all checks possible offline.
 
-    A router answers a bad certificate with silence, so whatever can be said is said here: a
+    A router answers a bad certificate with silence, so every detectable error is reported here: a
     missing file, a key that others may read or of another certificate, another authority, a
-    certificate that has expired or is not valid yet. InputError names the file.
+    certificate that has expired or is not valid yet. The InputError names the file.
     """
     now = now or datetime.now(UTC)
     certificate = read_certificate(folder / CERTIFICATE)
@@ -108,8 +107,8 @@ def check_credentials(folder: Path, now: datetime | None = None) -> Subject:
 def check_speaks_for(folder: Path | None, role: str, name: str | None = None) -> None:
     """Raise InputError if the credentials are not those of this role and name (None: any name).
 
-    The access control of a router drops what somebody else says without a word: whoever used the
-    wrong folder would never learn why nothing arrives. None, no credentials, passes.
+    The access control of a router drops the messages of other roles silently: after a mistake in
+    the folder nothing would show why they do not arrive. None, no credentials, passes.
     """
     if folder is None:
         return
@@ -119,7 +118,7 @@ def check_speaks_for(folder: Path | None, role: str, name: str | None = None) ->
 
 
 def read_certificate(path: Path) -> x509.Certificate:
-    """Return the certificate of a PEM file; InputError if there is none."""
+    """Return the certificate of a PEM file; raise InputError if there is none."""
     content = read_bytes(path)
     try:
         return x509.load_pem_x509_certificate(content)
@@ -128,10 +127,10 @@ def read_certificate(path: Path) -> x509.Certificate:
 
 
 def link_settings(folder: Path | str) -> dict[str, Any]:
-    """Return Zenoh's settings for mutual TLS, and nothing but TLS, with a folder's credentials.
+    """Return Zenoh's settings for mutual TLS, and TLS only, with a folder's credentials.
 
-    The client proves who it is and checks that the router's certificate names the host that it
-    meant to reach. A link ends when a certificate on it expires.
+    The client authenticates itself and checks that the router's certificate names the intended
+    host. A link ends when a certificate on it expires.
     """
     key, certificate = f"{folder}/{KEY}", f"{folder}/{CERTIFICATE}"
     return {

@@ -1,8 +1,9 @@
-"""How a publisher knows that its messages arrived.
+"""Confirmation that published messages have arrived.
 
-A put returns when Zenoh has it, no more. Loggers publish on `durable` how many messages of each
-stream and boot are on their disk, after fsync: `Delivery` waits for that. Where no logger answers,
-`LINGER_S` leaves subscribers the time for two announcements and the queries that follow from them.
+A put returns when Zenoh has accepted it, no more. Loggers publish on `durable` how many messages of
+each stream and boot are on their disk, after fsync: `DeliveryTracker` waits for that. Without an
+answer from a logger, `LINGER_S` leaves subscribers the time for two announcements and the resulting
+queries.
 """
 
 import logging
@@ -21,18 +22,18 @@ from schemas.topics import Key, parse_key, selector
 
 _log = logging.getLogger(__name__)
 _POLL_S = 0.005
-"""How often it is looked whether a logger has spoken."""
+"""Interval of polling for messages of loggers."""
 LINGER_S = 1.5
-"""Two heartbeats and the time to answer the queries that they cause."""
+"""Duration of two heartbeats and of the queries that they cause."""
 _DURABLES_WAITING = 100
-"""More than there are loggers in a realm."""
+"""Queue length, more than there are loggers in a realm."""
 
 
-class Delivery:
-    """Follows what loggers of a realm have on disk, so that a publisher knows when it may leave."""
+class DeliveryTracker:
+    """Tracker of messages on the disks of a realm's loggers, after which a publisher may leave."""
 
     def __init__(self, session: zenoh.Session | None, realm: str) -> None:
-        """Follow the loggers of a realm; without a session from `connect` on."""
+        """Follow the loggers of a realm; without a session, from `connect` on."""
         self.realm = realm
         self._sent: Counter[tuple[str, str, str, int]] = Counter()
         self._durable: dict[str, dict[tuple[str, str, str, int], _OnDisk]] = {}
@@ -42,8 +43,8 @@ class Delivery:
             self.connect(session)
 
     def connect(self, session: zenoh.Session) -> None:
-        """Listen from now on, to what was said before, too."""
-        # Each message tells everything: of many that nobody has read the last few are enough.
+        """Listen from now on, including each logger's last message."""
+        # Each message is complete: of many unread ones the last few are enough.
         self._subscriber = ext.declare_advanced_subscriber(
             session,
             selector(self.realm, "service", "durable"),
@@ -53,16 +54,16 @@ class Delivery:
         )
 
     def sent(self, where: Key, identity: Identity) -> None:
-        """Count a message that was published; every identity once."""
+        """Count a published message, each identity once."""
         self._sent[(where.owner, where.identifier, where.stream, identity.boot_id)] += 1
 
     @property
     def has_logger(self) -> bool:
-        """Whether any logger has spoken yet."""
+        """Whether any logger has published yet."""
         return bool(self._durable)
 
     def missing(self) -> int:
-        """Return how many sent messages the logger that has most of them does not have yet."""
+        """Return the number of sent messages that the most complete logger does not have yet."""
         self._read()
         by_logger = [
             sum(
@@ -74,10 +75,10 @@ class Delivery:
         return min(by_logger, default=self._sent.total())
 
     def wait(self, timeout_s: float, most_missing: int = 0) -> int:
-        """Wait until at most so many messages are not on disk; return how many are not.
+        """Wait until at most `most_missing` messages are not on disk; return how many are not.
 
-        Where no logger has spoken within `LINGER_S`, it waits no longer: subscribers have had
-        the time to ask for what they missed.
+        Without a message from a logger within `LINGER_S` the wait ends: subscribers have had the
+        time to request missing messages.
         """
         began = time.monotonic()
         while (missing := self.missing()) > most_missing:
@@ -88,7 +89,7 @@ class Delivery:
         return missing
 
     def confirmed(self, vehicle: str) -> dict[tuple[str, int], int]:
-        """Return up to where at least one logger has everything, by (stream, boot_id)."""
+        """Return the last sequence that a logger has without gap, by (stream, boot_id)."""
         self._read()
         highest: dict[tuple[str, int], int] = {}
         for durable in self._durable.values():
@@ -109,7 +110,7 @@ class Delivery:
         with self._lock:
             newest: dict[str, bytes] = {}
             while (sample := self._subscriber.try_recv()) is not None:
-                newest[str(sample.key_expr)] = sample.payload.to_bytes()  # each tells everything
+                newest[str(sample.key_expr)] = sample.payload.to_bytes()  # each is complete
             for where, payload in newest.items():
                 try:
                     message = decode("driveby.v1.Durable", payload)
@@ -129,4 +130,4 @@ class Delivery:
 class _OnDisk(NamedTuple):
     messages: int
     sequence: int
-    """The highest with nothing missing below it; -1: none."""
+    """The highest sequence without a gap below it; -1: none."""

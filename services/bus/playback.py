@@ -1,4 +1,4 @@
-"""Publishing recorded messages at their own spacing, and leaving only when they have arrived."""
+"""Publication of recorded messages at their original spacing, confirmed before leaving."""
 
 import logging
 import math
@@ -10,48 +10,48 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from schemas.topics import Key
-from services.bus.delivery import Delivery
+from schemas.topics import Key, Message
+from services.bus.delivery import DeliveryTracker
 from services.bus.publisher import Publisher
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
-from services.recordings.recording import Message
 
 _log = logging.getLogger(__name__)
 _MAX_IN_FLIGHT = 20_000
-"""Far fewer than a logger's queue holds, so that even `--speed 0` cannot overrun it."""
+"""Largest number of unconfirmed messages, far fewer than a logger's queue, even with `--speed 0`.
+"""
 _CHECK_EVERY = 1000
-"""So many messages are sent between two looks at what has arrived."""
+"""Messages between two checks of what has arrived."""
 DELIVERY_TIMEOUT_S = 30.0
-"""A logger may have a slow disk; one that is silent for longer has gone."""
+"""Longest silence of a logger, which may have a slow disk, before it counts as gone."""
 GAP_S = 2.0
-"""A silence of a recording that is longer is passed over where gaps are skipped."""
+"""Longest silence of a recording that is kept where gaps are skipped."""
 _LOOK_S = 0.05
-"""How often is looked whether a signal has come, which ends no sleep."""
+"""Interval of checks for a signal, which does not end a sleep."""
 SETTLE_S = 0.3
-"""For the queries that every subscriber sends to a new publisher."""
+"""Time for the queries that every subscriber sends to a new publisher."""
 
 
 def check_speed(speed: float) -> float:
-    """Return the speed if it is a factor >= 0 (0: as fast as possible), else InputError."""
+    """Return the speed if it is a factor >= 0 (0: as fast as possible); raise InputError if not."""
     if not 0.0 <= speed < float("inf"):
         raise InputError(f"speed {speed}: a factor of 0 or more is expected (0: no waiting)")
     return speed
 
 
-def play(
+def publish_paced(
     messages: Iterable[Message],
     put: Callable[[Message], None],
-    delivery: Delivery,
+    delivery: DeliveryTracker,
     *,
     speed: float,
     stop: threading.Event,
     longest_gap_s: float = math.inf,
 ) -> int:
-    """Put the messages with the spacing of their log times divided by `speed`; how many.
+    """Publish messages at their spacing divided by `speed`; return how many.
 
-    A message whose log time is not later than that of the one before follows at once (recovered
-    messages stand late in a recording), and so does one after a silence of the recording of more
-    than `longest_gap_s`. Ends early when `stop` is set.
+    A message whose log time is not later than the previous one follows at once (recovered messages
+    stand late in a recording), and so does one after a silence longer than `longest_gap_s`. Return
+    early when `stop` is set.
     """
     number = 0
     began: tuple[float, int] | None = None
@@ -69,20 +69,20 @@ def play(
             break
         put(message)
         number += 1
-        hold_back(delivery, number)
+        apply_backpressure(delivery, number)
     return number
 
 
-def hold_back(delivery: Delivery, number: int) -> None:
-    """Wait for the logger, if there is one, where too much of so many messages is under way."""
+def apply_backpressure(delivery: DeliveryTracker, number: int) -> None:
+    """Wait for the logger, if any, while too many of `number` messages are unconfirmed."""
     if number % _CHECK_EVERY == 0 and delivery.missing() and delivery.has_logger:
         delivery.wait(DELIVERY_TIMEOUT_S, most_missing=_MAX_IN_FLIGHT)
 
 
-def settle(publisher: Publisher, keys: Iterable[Key], timeout_s: float) -> bool:
-    """Declare the publishers of all keys and wait for a subscriber; False if none came in time.
+def declare_and_wait(publisher: Publisher, keys: Iterable[Key], timeout_s: float) -> bool:
+    """Declare the publishers of all keys and wait for a subscriber; return False on timeout.
 
-    Only then do the streams begin, so that no subscriber gets the beginning of one stream as
+    Only then do the streams begin, so that no subscriber receives the beginning of one stream as
     history and of another one live, in another order.
     """
     first: Key | None = None
@@ -96,10 +96,10 @@ def settle(publisher: Publisher, keys: Iterable[Key], timeout_s: float) -> bool:
     return found
 
 
-def confirm(delivery: Delivery, sent: int) -> None:
-    """Wait until a logger has everything on disk; FailureError if it does not get there.
+def confirm(delivery: DeliveryTracker, sent: int) -> None:
+    """Wait until a logger has everything on disk; raise FailureError if it fails.
 
-    Without a logger this only gives the subscribers time to fetch what they missed.
+    Without a logger this only gives the subscribers time to fetch missing messages.
     """
     missing = delivery.wait(DELIVERY_TIMEOUT_S)
     if missing and delivery.has_logger:
@@ -108,14 +108,14 @@ def confirm(delivery: Delivery, sent: int) -> None:
             f"{DELIVERY_TIMEOUT_S:.0f} s"
         )
     if missing:
-        _log.warning("no logger in realm %s: nobody confirmed the messages", delivery.realm)
+        _log.warning("no logger in realm %s: delivery was not confirmed", delivery.realm)
 
 
 class _SetBySignal(threading.Event):
     """An event without a lock, so that a signal may set it while its own thread waits for it.
 
-    The lock of the standard one is taken by `wait`; a signal's handler that comes in that moment
-    runs in the same thread, waits for the lock in `set`, and the process stands still for ever.
+    The standard event's `wait` takes a lock; a signal handler that runs at that moment in the same
+    thread waits for the lock in `set`: a deadlock.
     """
 
     def __init__(self) -> None:
@@ -145,7 +145,7 @@ class _SetBySignal(threading.Event):
 def stopped_by_signals(
     on_second: Callable[[], None] | None = None,
 ) -> Iterator[threading.Event]:
-    """Give an event that SIGINT and SIGTERM set; see `set_by_signals`."""
+    """Yield an event that SIGINT and SIGTERM set; see `set_by_signals`."""
     with set_by_signals(signal.SIGINT, signal.SIGTERM, on_second=on_second) as stop:
         yield stop
 
@@ -154,10 +154,9 @@ def stopped_by_signals(
 def set_by_signals(
     *numbers: signal.Signals, on_second: Callable[[], None] | None = None
 ) -> Iterator[threading.Event]:
-    """Give an event that signals set; the handlers before are put back at the end.
+    """Yield an event that signals set; restore the previous handlers at the end.
 
-    One that comes while it is set calls `on_second`. In another thread than the main one signals
-    are left alone.
+    A signal while it is set calls `on_second`. Outside the main thread signals are unchanged.
     """
     stop = _SetBySignal()
 
@@ -178,5 +177,5 @@ def set_by_signals(
 
 
 def leave_at_once() -> None:
-    """End the process as a second signal wants it: what is on the disk stays as it is."""
+    """End the process on a second signal; files keep their current state."""
     os._exit(EXIT_INTERRUPTED)

@@ -1,7 +1,7 @@
-"""Publishers that keep what they sent.
+"""Publishers that keep their last messages.
 
-They block instead of dropping, keep their last messages (the topic table says how many) and
-announce the number of the last one twice a second, so that a subscriber can ask for what it missed.
+They block instead of dropping, keep as many messages as the topic table requires and announce the
+number of the last one twice a second, so that a subscriber can request missing ones.
 """
 
 import threading
@@ -16,24 +16,23 @@ from schemas.signals import Identity, encode_identity
 from schemas.topics import key, parse_key, topic
 
 _HEARTBEAT_S = 0.5
-"""So soon a subscriber hears of the last message that it missed."""
+"""Longest delay until a subscriber notices that it missed the last message."""
 _POLL_S = 0.005
-"""How often it is looked whether a subscriber is there."""
+"""Interval of polling for a subscriber."""
 _QUERIES_WAITING = 100
-"""Who asks for a latched message is answered at once, so few ever wait."""
+"""Queue length for queries of latched messages, which are answered at once."""
 
 
 class Publisher:
-    """Publishes messages of the topic table in one realm, each with its identity.
+    """A publisher of the topic table's messages in one realm, each with its identity.
 
-    A publisher of Zenoh is declared at the first put to a key and kept until `close()`. May be
-    used from several threads.
+    A Zenoh publisher is declared at the first put to a key and kept until `close()`. Thread-safe.
     """
 
     def __init__(
         self, session: zenoh.Session | None, realm: str, boot_id: int | None = None
     ) -> None:
-        """Publish through a session; None: nothing can be put before `connect`."""
+        """Publish through a session; with None, nothing can be put before `connect`."""
         self.realm = realm
         self.boot_id = time.time_ns() if boot_id is None else boot_id
         """The start of this process unless given: higher after every restart."""
@@ -55,10 +54,10 @@ class Publisher:
     ) -> Identity:
         """Publish one message and return its identity.
 
-        Without `identity` it gets this publisher's boot_id and the next sequence of its key,
-        beginning at 0. Blocks while the connection is congested. Of a latched topic the last
-        message is kept for late subscribers and answers `session.get(key)`.
-        ValueError if the key is not in the table or the payload larger than it allows.
+        Without `identity` it gets this publisher's boot_id and the next sequence of its key, from
+        0. Block while the connection is congested. The last message of a latched topic is kept for
+        late subscribers and answers `session.get(key)`. Raise ValueError if the key is not in the
+        table or the payload larger than it allows.
         """
         where = key(self.realm, owner, identifier, stream)
         row = topic(owner, stream)
@@ -72,12 +71,12 @@ class Publisher:
             publisher = self._declare(where)
             if row.latched:
                 self._latest[where] = (payload, attachment)
-            # Within the lock, or two threads could send two messages in the wrong order.
+            # Inside the lock, otherwise two threads could send two messages in the wrong order.
             publisher.put(payload, attachment=attachment)
         return identity
 
     def connect(self, session: zenoh.Session) -> None:
-        """Give a publisher that was made without one its session."""
+        """Provide the session of a publisher that was created without one."""
         self._opened = session
 
     @property
@@ -90,7 +89,7 @@ class Publisher:
         """Declare the publisher of a key before its first message.
 
         Subscribers ask a new publisher for its history; doing so before the data flow keeps the
-        streams of one truck in step with each other from the first message on.
+        streams of one truck synchronous from the first message.
         """
         with self._lock:
             self._declare(key(self.realm, owner, identifier, stream))
@@ -98,7 +97,7 @@ class Publisher:
     def wait_for_subscriber(
         self, owner: str, identifier: str, stream: str, timeout_s: float
     ) -> bool:
-        """Wait until somebody subscribes to a key; False if nobody did in time."""
+        """Wait for a subscriber to a key; return False on timeout."""
         probe = self._session.declare_publisher(key(self.realm, owner, identifier, stream))
         try:
             deadline = time.monotonic() + timeout_s
@@ -111,7 +110,7 @@ class Publisher:
             probe.undeclare()  # type: ignore[no-untyped-call]
 
     def close(self) -> None:
-        """Undeclare all; what was put and not yet fetched is lost (see `Delivery`)."""
+        """Undeclare all; messages that were not fetched are lost (see `DeliveryTracker`)."""
         with self._lock:
             for queryable in self._queryables:
                 queryable.undeclare()  # type: ignore[no-untyped-call]
@@ -133,8 +132,8 @@ class Publisher:
         return publisher
 
     def _answer_queries(self, where: str) -> None:
-        # A thread of our own: one of Zenoh's that still calls Python while the interpreter ends
-        # takes the process down with it.
+        # A thread of our own: one of Zenoh's that calls Python while the interpreter ends
+        # would crash the process.
         queryable = self._session.declare_queryable(
             where, handlers.FifoChannel(_QUERIES_WAITING), complete=True
         )

@@ -1,6 +1,6 @@
-"""The bus: Zenoh sessions, through which a service hears and speaks.
+"""Zenoh sessions of services.
 
-For a service it comes down to
+A service looks like this:
 
     with open_session(connect=endpoint, timeout_s=10) as session:
         with Subscription(session, selector("live", "vehicle")) as vehicles:
@@ -12,8 +12,8 @@ For a service it comes down to
                     publisher.put("bridge", bridge, "estimate", estimate.SerializeToString())
             publisher.close()
 
-How nothing is lost on the way stands in `publisher` and `subscription`, how a publisher knows that
-its messages arrived in `delivery`.
+`publisher` and `subscription` describe how no message is lost, `delivery` how a publisher confirms
+arrival.
 """
 
 import contextlib
@@ -44,15 +44,16 @@ from services.common.files import read_bytes
 _log = logging.getLogger(__name__)
 _ENDPOINT = re.compile(r"(tcp|tls|quic|ws|unixsock-stream)/\S+")
 _CONNECT_TRY_MS = 500
-"""An attempt is so short that a signal is heard between two."""
+"""Duration of an attempt, short enough to handle a signal between two."""
 _CONNECT_S = 1.0
-"""So long is tried before it is looked whether to go on trying."""
+"""Duration of attempts before `is_over` is checked again."""
 _PATIENCE_WITH_SUBSCRIBER_US = 1_000_000
-"""Zenoh's own is 5 s; who is cut off connects again and gets what it missed."""
+"""Timeout of a blocked subscriber. Zenoh's default is 5 s; a subscriber that is cut off connects
+again and fetches missing messages."""
 _RUNTIME = "(rx: (handover: acc), acc: (worker_threads: 2))"
-"""A router has what comes read by the threads that wait for it. Zenoh's own pool of receiving
-threads has to be woken for every message, which costs more than all that it does with one. There
-are two, as new connections wait for them too and one may be held up by a frozen subscriber."""
+"""Threads of a router: the waiting threads also read. Waking Zenoh's own pool of receiving threads
+for every message costs more than handling it. There are two, because new connections need one too
+and one may be blocked by a frozen subscriber."""
 
 
 def open_session(
@@ -65,20 +66,18 @@ def open_session(
 ) -> zenoh.Session:
     """Open a session: a client of the router at `connect`, or a router that listens at `listen`.
 
-    A client waits `timeout_s` (None: for ever) for the router and connects again by itself
-    whenever the connection is lost. It must be closed, or the process does not end; it is a
-    context manager.
+    A client waits `timeout_s` (None: for ever) for the router and reconnects by itself after the
+    connection is lost. It must be closed, or the process does not end; it is a context manager.
 
-    `tls` is a folder of `driveby certs`: both sides prove who they are, nothing but TLS is spoken,
-    and a router lets everybody say and hear only what its access control allows. Without it only
-    this machine can be listened to, unless `insecure` says that whoever reaches the address may
-    say and hear everything.
+    `tls` is a folder of `driveby certs`: both sides authenticate, only TLS is used, and the
+    router's access control limits every client. Without it the router is reachable from this
+    machine only, unless `insecure` opens it to everyone who reaches the address.
 
-    A process whose first session is a router's has Zenoh's threads set up for many publishers, by
-    the environment variable ZENOH_RUNTIME, unless it is set already.
+    In a process whose first session is a router's, the environment variable ZENOH_RUNTIME, unless
+    set, is chosen for many publishers.
 
-    InputError for a malformed endpoint, bad credentials, or an address open to strangers;
-    FailureError if nobody answers in time or the address cannot be listened at.
+    Raise InputError for a malformed endpoint, bad credentials, or an address open to strangers;
+    FailureError on timeout or if the address is not available.
     """
     if (connect is None) == (listen is None):
         raise ValueError("either connect or listen")
@@ -99,25 +98,27 @@ def open_session(
             _log.debug("zenoh: %s", error)
             if listen is not None:
                 raise FailureError(_why_not_listening(endpoint, error)) from None
-            # Zenoh would wait by itself, but meanwhile Python hears no signal.
+            # Zenoh could wait by itself, but Python would handle no signal meanwhile.
             if time.monotonic() >= deadline:
                 raise FailureError(_why_not_connected(endpoint, timeout_s, tls)) from None
 
 
-def connected(endpoint: str, tls: Path | None, is_over: Callable[[], bool]) -> zenoh.Session | None:
-    """A session as soon as a router answers; None if it is over before.
+def wait_for_router(
+    endpoint: str, tls: Path | None, is_over: Callable[[], bool]
+) -> zenoh.Session | None:
+    """Return a session once a router answers; None if `is_over` before.
 
-    InputError: a malformed endpoint or bad credentials.
+    Raise InputError for a malformed endpoint or bad credentials.
     """
-    is_told = False
+    is_logged = False
     while not is_over():
-        # Zenoh itself would wait for ever, and no signal would be heard meanwhile.
+        # Zenoh itself would wait for ever, and Python would handle no signal.
         try:
             return open_session(connect=endpoint, timeout_s=_CONNECT_S, tls=tls)
         except FailureError as error:
-            if not is_told:
+            if not is_logged:
                 _log.warning("%s; trying on", error)
-            is_told = True
+            is_logged = True
     return None
 
 
@@ -155,7 +156,7 @@ def _configuration(endpoint: str, tls: Path | None, *, is_client: bool) -> zenoh
         "timestamping/enabled": True,
     }
     if not is_client:
-        # A router waits for a subscriber that has stopped reading, and with it wait all others.
+        # A router blocks on a subscriber that has stopped reading, and blocks all others with it.
         block = "transport/link/tx/queue/congestion_control/block/wait_before_close"
         settings[block] = _PATIENCE_WITH_SUBSCRIBER_US
     for name, value in settings.items():
@@ -177,9 +178,9 @@ def _add_security(config: zenoh.Config, tls: Path, *, is_client: bool) -> None:
 
 
 def _access_control(tls: Path) -> dict[str, Any]:
-    """The access control in the configuration of a folder; InputError if it would let all pass."""
+    """Return the access control of a folder; raise InputError if it would admit everything."""
     path = tls / CONFIGURATION
-    read_bytes(path)  # says what is wrong better than Zenoh
+    read_bytes(path)  # reports the error better than Zenoh
     try:
         access: Any = json.loads(zenoh.Config.from_file(path).get_json("access_control"))
     except zenoh.ZError as error:
@@ -203,7 +204,7 @@ def _check_endpoint(endpoint: str, tls: Path | None) -> str:
 
 
 def _is_on_this_machine(endpoint: str) -> bool:
-    """Whether only programs on this machine can reach what listens at an endpoint."""
+    """Return whether only programs on this machine can reach an endpoint."""
     protocol, _, address = endpoint.partition("/")
     if protocol == "unixsock-stream":
         return True
@@ -213,9 +214,9 @@ def _is_on_this_machine(endpoint: str) -> bool:
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
-        return False  # a name may be that of any interface
+        return False  # a host name may be that of any interface
 
 
 def _first_sentence(error: Exception) -> str:
-    """Return what a user can read of an error of Zenoh: without the places in its source."""
+    """Return the readable part of a Zenoh error, without places in its source."""
     return re.split(r" at /|\[", str(error), maxsplit=1)[0].strip()

@@ -1,9 +1,9 @@
-"""Subscribers that fetch again what they missed.
+"""Subscribers that request missing messages.
 
-A subscriber asks for the history of every publisher that it meets and for every number that it
-misses. That alone loses a gap now and then when router and subscriber die together, so a thread
-asks once more for every gap that has lasted. What comes twice that way is told by its identity; a
-subscriber that must not see anything twice uses `Seen`.
+A subscriber requests the history of every publisher that it meets and every missing number. That
+alone loses a gap now and then when router and subscriber die together, so a thread requests every
+lasting gap once more. Duplicates are identified by their identity; a subscriber that must not see
+any uses `SeenSequences`.
 """
 
 import logging
@@ -23,25 +23,25 @@ from services.common.intervals import Intervals
 
 _log = logging.getLogger(__name__)
 _IDLE_POLL_S = 0.005
-"""Zenoh wakes nobody who also waits for something else: so long a message may lie."""
+"""Interval of polling, because Zenoh cannot wake a thread that also waits for something else."""
 _GAP_PATIENCE_S = 0.5
-"""A gap that has lasted for so long is asked for again."""
+"""Age of a gap before it is requested again."""
 _GAP_TRIES = 3
-"""What does not come then is no longer in the publisher's cache."""
+"""Number of requests after which a message is no longer in the publisher's cache."""
 _GAP_QUERY_TIMEOUT_S = 5.0
-"""For a publisher that answers over a mobile network."""
+"""Timeout for a publisher that answers over a mobile network."""
 _MAX_HOLES_PER_ROUND = 100
-"""The others have their turn in the next round."""
+"""Gaps requested in one round; the others follow in the next."""
 _MAX_HOLES_PER_SOURCE = 10_000
-"""More are noted of no publisher: a stranger could make up as many as it likes."""
+"""Largest number of gaps noted for a publisher, because a hostile one could invent any number."""
 _MAX_SOURCES = 10_000
-"""The same for publishers."""
+"""Largest number of publishers noted."""
 _SourceName = tuple[str, zenoh.ZenohId, int]
-"""A key, and a publisher of Zenoh: session and number in it."""
+"""A key and a Zenoh publisher: session and number in it."""
 
 
-class Received(NamedTuple):
-    """A message as it came from the bus; nothing of it has been checked yet.
+class RawSample(NamedTuple):
+    """A message from the bus, before any check.
 
     `key_text` may be any key, `attachment` may be missing: see `checked`.
     """
@@ -50,24 +50,24 @@ class Received(NamedTuple):
     payload: bytes
     attachment: bytes | None
     recovered: bool
-    """It was missing and has been asked for."""
+    """Whether it was missing and has been requested."""
     spooled: bool = False
-    """It came from the truck's own disk: there is no better copy of it."""
+    """Whether it came from the truck's own disk: there is no better copy."""
 
     def identity(self) -> Identity:
-        """Return (boot_id, sequence); ValueError if the attachment is missing or malformed."""
+        """Return (boot_id, sequence); raise ValueError if the attachment is missing or bad."""
         return decode_identity(self.attachment)
 
     def key(self) -> Key:
-        """Return the key taken apart; ValueError if it is not in the topic table."""
+        """Return the parts of the key; raise ValueError if it is not in the topic table."""
         return parse_key(self.key_text)
 
 
 class Subscription:
-    """Receives all messages under a key expression, old ones of living publishers first.
+    """A receiver of all messages under a key expression, old ones of living publishers first.
 
-    A message may come twice (after a reconnection) and recovered ones come late: `Seen` tells
-    duplicates, and the sequence orders a stream. One thread receives.
+    A message may come twice (after a reconnection) and recovered ones come late: `SeenSequences`
+    detects duplicates, and the sequence orders a stream. One thread receives.
     """
 
     def __init__(
@@ -79,12 +79,12 @@ class Subscription:
     ) -> None:
         """Subscribe; `capacity` messages may wait (default: the largest of the topic table).
 
-        More would make the publishers wait, and after a second the router cuts the connection:
-        receive quickly and do long work in another thread.
+        More would block the publishers, and after a second the router cuts the connection: receive
+        quickly and do long work in another thread.
         """
         self._session = session
         self._fetched: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-        self._sources: dict[_SourceName, _Source] = {}
+        self._sources: dict[_SourceName, _PublisherGaps] = {}
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self.fetched = 0
@@ -100,8 +100,8 @@ class Subscription:
         self._filler = threading.Thread(target=self._fill_gaps, name="gap-fill", daemon=True)
         self._filler.start()
 
-    def receive(self, timeout_s: float = 0.0) -> Received | None:
-        """Return the next message, or None if none came within `timeout_s`."""
+    def receive(self, timeout_s: float = 0.0) -> RawSample | None:
+        """Return the next message, or None after `timeout_s`."""
         received = self._next()
         if received is not None or timeout_s <= 0:
             return received
@@ -112,7 +112,7 @@ class Subscription:
         return received
 
     def close(self) -> None:
-        """Stop receiving; what has already come can still be had from `receive`."""
+        """Stop receiving; `receive` still returns messages that have already arrived."""
         if not self._closing.is_set():
             self._closing.set()
             self._filler.join()
@@ -129,7 +129,7 @@ class Subscription:
     ) -> None:
         self.close()
 
-    def _next(self) -> Received | None:
+    def _next(self) -> RawSample | None:
         try:
             sample = self._handler.try_recv()
         except zenoh.ZError:  # closed and empty
@@ -143,7 +143,7 @@ class Subscription:
         where = str(sample.key_expr)
         self._note(where, sample)
         attachment = sample.attachment
-        return Received(
+        return RawSample(
             where,
             sample.payload.to_bytes(),
             None if attachment is None else attachment.to_bytes(),
@@ -151,7 +151,7 @@ class Subscription:
         )
 
     def _note(self, where: str, sample: zenoh.Sample) -> None:
-        """Remember the publisher's own numbering of the sample, which shows what is missing."""
+        """Record the publisher's own number of the sample, which reveals gaps."""
         source = sample.source_info
         if source is None:
             return
@@ -162,9 +162,9 @@ class Subscription:
                 if len(where) > MAX_KEY_CHARACTERS:
                     return
                 if len(self._sources) >= _MAX_SOURCES:
-                    # The oldest: a publisher that has gone, or a stranger who makes up names.
+                    # The oldest: a publisher that is gone, or a hostile one that invents names.
                     del self._sources[next(iter(self._sources))]
-                found = self._sources[name] = _Source()
+                found = self._sources[name] = _PublisherGaps()
             if found.numbers.runs < _MAX_HOLES_PER_SOURCE:
                 found.numbers.add(source.source_sn)
 
@@ -175,11 +175,11 @@ class Subscription:
                     return
                 try:
                     self._fetch(name, hole)
-                except zenoh.ZError as error:  # the session is closing or the router away
+                except zenoh.ZError as error:  # the session is closing or the router gone
                     _log.debug("gap query for %s: %s", name[0], error)
 
     def _due_holes(self) -> list[tuple[_SourceName, tuple[int, int]]]:
-        """Return holes that have lasted a round and were not asked for too often."""
+        """Return gaps that have lasted a round and were not requested too often."""
         due = []
         with self._lock:
             for name, source in self._sources.items():
@@ -204,19 +204,19 @@ class Subscription:
                 self._fetched.put(sample)
 
 
-class Seen:
-    """Which messages have been seen, by identity; its memory grows with gaps, not with time."""
+class SeenSequences:
+    """The identities of received messages; its memory grows with gaps, not with time."""
 
     def __init__(self) -> None:
         self.streams: dict[tuple[Key, int], Intervals] = {}
-        """By (key, boot_id)."""
+        """Received sequences by (key, boot_id)."""
 
     def add(self, where: Key, identity: Identity) -> bool:
-        """Note a message; False if it had been seen before."""
+        """Add a message; return False if it was present."""
         return self.numbers(where, identity.boot_id).add(identity.sequence)
 
     def numbers(self, where: Key, boot_id: int) -> Intervals:
-        """Return the sequences that have been seen of a key and boot, to be added to."""
+        """Return the received sequences of a key and boot, to be added to."""
         name = (where, boot_id)
         numbers = self.streams.get(name)
         if numbers is None:
@@ -226,12 +226,12 @@ class Seen:
 
 def subscribe_latest(
     session: zenoh.Session, key_expression: str, capacity: int = 100, past: int = 1
-) -> Iterator[Received | None]:
-    """Yield the newest messages for a live display, and None whenever there is none at the time.
+) -> Iterator[RawSample | None]:
+    """Yield the newest messages for a live display, and None while there are none.
 
-    It never holds anybody up: of more than `capacity` waiting messages the oldest are dropped. Of
-    what each publisher still keeps the last `past` come first.
-    The consumer decides how long to sleep on None; closing the generator ends the subscription.
+    It never blocks a publisher: of more than `capacity` waiting messages the oldest are dropped.
+    The last `past` messages that each publisher still keeps come first. The consumer decides how
+    long to sleep on None; closing the generator ends the subscription.
     """
     subscriber = ext.declare_advanced_subscriber(
         session,
@@ -246,7 +246,7 @@ def subscribe_latest(
                 yield None
                 continue
             attachment = sample.attachment
-            yield Received(
+            yield RawSample(
                 str(sample.key_expr),
                 sample.payload.to_bytes(),
                 None if attachment is None else attachment.to_bytes(),
@@ -257,14 +257,14 @@ def subscribe_latest(
 
 
 def get_latest(session: zenoh.Session, key_expression: str, timeout_s: float = 5.0) -> list[bytes]:
-    """Ask for the last message of every latched topic under a key expression; their payloads."""
+    """Return the last payload of every latched topic under a key expression."""
     replies = session.get(key_expression, target=zenoh.QueryTarget.ALL, timeout=timeout_s)
     samples = [reply.ok for reply in replies]
     return [sample.payload.to_bytes() for sample in samples if sample is not None]
 
 
-class _Source:
-    """One publisher of Zenoh: its own numbers that came, and how often holes were asked for."""
+class _PublisherGaps:
+    """The received numbers of one Zenoh publisher, and the requests for its gaps."""
 
     def __init__(self) -> None:
         self.numbers = Intervals()

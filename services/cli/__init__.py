@@ -1,1 +1,1 @@
-"""The command `driveby`: one file a group of commands, what they print, and the demo."""
+"""The command `driveby`: one module per group of commands, their output, and the demo."""

@@ -1,4 +1,4 @@
-"""The command that says who may say and hear what on the bus, or run on a cluster: certs."""
+"""The command for certificates of the bus and of clusters: certs."""
 
 import argparse
 from pathlib import Path
@@ -8,7 +8,7 @@ from services.cli.parsing import command, names, whole
 
 
 def add_certs(commands: Any) -> None:
-    """`driveby certs`: make certificates and access control for a bus between machines."""
+    """Add `driveby certs`: make certificates and access control for a bus between machines."""
     p = command(
         commands,
         "certs",

@@ -1,4 +1,4 @@
-"""`driveby alarm`: has a bridge changed? Looked for in a history, told, and acknowledged."""
+"""The command `driveby alarm`: detect, list, acknowledge and publish changes of bridges."""
 
 import argparse
 import time
@@ -11,11 +11,11 @@ from services.common.endpoints import default_endpoint
 from services.common.errors import InputError
 
 if TYPE_CHECKING:
-    from services.history.alarms import Checked, Settings
+    from services.history.alarms import AlarmCheck, AlarmSettings
 
 _WHAT = ("check", "list", "ack", "serve")
 _MOST_LINES = 20
-"""Of bridges that are not watched."""
+"""Maximum number of listed bridges without monitoring."""
 _HOW = (
     "see it: driveby history BRIDGE --period week --figures DIR; look at the bridge, then: "
     "driveby alarm ack BRIDGE --by NAME --note TEXT"
@@ -23,7 +23,7 @@ _HOW = (
 
 
 def add_alarm(commands: Any) -> None:
-    """`driveby alarm`: check, list, acknowledge, or tell on the bus."""
+    """Add `driveby alarm`: check, list, acknowledge, or publish on the bus."""
     p = command(
         commands,
         "alarm",
@@ -97,7 +97,7 @@ def _alarm(options: argparse.Namespace) -> int:
     checked = _checked(options)
     many = "bridges" if checked.bridges != 1 else "bridge"
     alarms = "alarms" if len(checked.raised) != 1 else "alarm"
-    print(f"{checked.bridges} {many} looked at, {len(checked.raised)} new {alarms}")
+    print(f"{checked.bridges} {many} checked, {len(checked.raised)} new {alarms}")
     for alarm in checked.standing:
         print(alarm_line(alarm))
     _print_watches(options.history)
@@ -106,15 +106,15 @@ def _alarm(options: argparse.Namespace) -> int:
     return 0
 
 
-def _settings(options: argparse.Namespace) -> "Settings":
-    from services.history.alarms import Settings
+def _settings(options: argparse.Namespace) -> "AlarmSettings":
+    from services.history.alarms import AlarmSettings
 
-    return Settings(
+    return AlarmSettings(
         options.period, options.false_alarms, options.training, options.at_least / 100.0
     )
 
 
-def _checked(options: argparse.Namespace) -> "Checked":
+def _checked(options: argparse.Namespace) -> "AlarmCheck":
     from services.execution.blas import one_blas_thread
     from services.history.alarms import check
 
@@ -133,9 +133,9 @@ def _checked(options: argparse.Namespace) -> "Checked":
 
 def _list(folder: Path) -> int:
     from services.history.alarm_files import alarms_of, bridges_with_alarms
-    from services.history.archive import bridges_of
+    from services.history.history_store import bridges_of
 
-    bridges_of(folder)  # says so where there is no such folder
+    bridges_of(folder)  # it raises where there is no such folder
     number = standing = 0
     for realm, bridge in bridges_with_alarms(folder):
         alarms, problems = alarms_of(folder, realm, bridge)
@@ -152,10 +152,10 @@ def _list(folder: Path) -> int:
 
 
 def _print_watches(folder: Path) -> None:
-    """Print how many bridges are watched, and why the others are not."""
-    from services.history.alarms import watches
+    """Print how many bridges are monitored, and why the others are not."""
+    from services.history.alarms import monitoring_states
 
-    found, problems = watches(folder, time.time())
+    found, problems = monitoring_states(folder, time.time())
     for problem in problems:
         print(problem)
     if not found:
@@ -172,7 +172,7 @@ def _acknowledge(options: argparse.Namespace) -> int:
     from services.history.alarm_files import acknowledge, alarms_of
 
     if not options.by:
-        raise InputError("alarm ack: say who takes note of it with --by NAME")
+        raise InputError("alarm ack: name the person who acknowledges with --by NAME")
     realm = _realm_of(options.history, options.bridge, options.realm)
     alarms, problems = alarms_of(options.history, realm, options.bridge)
     for problem in problems:
@@ -187,9 +187,9 @@ def _acknowledge(options: argparse.Namespace) -> int:
 
 
 def _realm_of(folder: Path, bridge: str, realm: str | None) -> str:
-    """The realm of a bridge's alarms; they stand whatever became of its crossings."""
+    """Return the realm of a bridge's alarms; they stand whatever happened to its crossings."""
     from services.history.alarm_files import bridges_with_alarms
-    from services.history.archive import realm_of
+    from services.history.history_store import realm_of
 
     realms = [r for r, b in bridges_with_alarms(folder) if b == bridge and realm in (None, r)]
     return realms[0] if len(realms) == 1 else realm_of(folder, bridge, realm)

@@ -1,4 +1,4 @@
-"""`driveby alarm serve`: tells on the bus which bridges have changed, until somebody takes note."""
+"""The command `driveby alarm serve`: publish changed bridges until they are acknowledged."""
 
 import contextlib
 import logging
@@ -10,35 +10,36 @@ from typing import Final
 from schemas.alarms import Alarm, encode_alarm
 from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.publisher import Publisher
-from services.bus.session import connected
+from services.bus.session import wait_for_router
 from services.common.errors import FailureError, InputError
-from services.history.alarm_files import acknowledged_since, alarms_of, standing
-from services.history.alarms import Checked
+from services.history.alarm_files import acknowledged_since, alarms_of, standing_alarms
+from services.history.alarms import AlarmCheck
 
 _log = logging.getLogger(__name__)
-_LOOK_S = 1.0
-"""How often it looks whether somebody has acknowledged an alarm."""
+_POLL_S = 1.0
+"""Interval in s at which acknowledgements are checked."""
 _REMEMBERED_S: Final = 30 * 86_400.0
-"""Acknowledgements of so long are told at the start: who heard an alarm, and not its end while this
-service was not there, still shows it."""
+"""Age in s up to which acknowledgements are published at the start.
+
+A subscriber that received an alarm, and not its end while this service was stopped, still shows it.
+"""
 
 
-class Teller:
-    """Publishes each alarm when it is raised and when it is acknowledged, and no other time.
+class AlarmPublisher:
+    """Publisher of each alarm, when it is raised and when it is acknowledged.
 
-    Alarms are latched: the bridge's last one answers whoever comes later. What stands when the
-    service starts, and what somebody took note of lately, is told first, so that a restart forgets
-    nothing.
+    Alarms are latched: a later subscriber receives the bridge's last one. Standing alarms and
+    recent acknowledgements are published at the start, so that a restart loses nothing.
     """
 
     def __init__(self, put: Callable[[Alarm, bytes], None]) -> None:
         self._put = put
         self._standing: dict[tuple[str, str], Alarm] | None = None
-        """None until something was told."""
+        """Published alarms; None before the first publication."""
 
-    def tell(self, folder: Path, time_ns: int) -> None:
-        """Tell what is new since the last time."""
-        now = {(alarm.realm, alarm.bridge): alarm for alarm in standing(folder)[0]}
+    def publish_changes(self, folder: Path, time_ns: int) -> None:
+        """Publish the changes since the last call."""
+        now = {(alarm.realm, alarm.bridge): alarm for alarm in standing_alarms(folder)[0]}
         if self._standing is None:
             for alarm in acknowledged_since(folder, time_ns / 1e9 - _REMEMBERED_S):
                 self._put(alarm, encode_alarm(alarm, time_ns))
@@ -56,16 +57,16 @@ class Teller:
 
 
 def serve(
-    folder: Path, check: Callable[[], Checked], endpoint: str, tls: Path | None, every_s: float
+    folder: Path, check: Callable[[], AlarmCheck], endpoint: str, tls: Path | None, every_s: float
 ) -> int:
-    """Check the history every so often and tell its alarms, until a signal; return 0.
+    """Check the history at intervals and publish its alarms, until a signal; return 0.
 
-    InputError or FailureError: the history cannot be looked at when it is looked at first. Later
-    that is an error in the log, and it is tried again: what stands is told all the same.
+    InputError or FailureError: the first check of the history fails. A later failure is logged and
+    the check is repeated; standing alarms are published all the same.
     """
     publishers: dict[str, Publisher] = {}
     with stopped_by_signals(leave_at_once) as stop, contextlib.ExitStack() as stack:
-        bus = connected(endpoint, tls, stop.is_set)
+        bus = wait_for_router(endpoint, tls, stop.is_set)
         if bus is None:
             return 0
         session = stack.enter_context(bus)
@@ -76,8 +77,8 @@ def serve(
             state = "acknowledged" if alarm.acknowledged else "stands"
             print(f"{alarm.bridge}: {alarm.sentence()}: {state}", flush=True)
 
-        teller = Teller(put)
-        teller.tell(folder, time.time_ns())  # a check may take minutes
+        alarms = AlarmPublisher(put)
+        alarms.publish_changes(folder, time.time_ns())  # a check may take minutes
         check()
         due_s = time.monotonic() + every_s
         while not stop.is_set():
@@ -85,10 +86,10 @@ def serve(
                 try:
                     check()
                 except (InputError, FailureError) as error:
-                    _log.error("%s; it is looked at again in %.0f s", error, every_s)
+                    _log.error("%s; checking again in %.0f s", error, every_s)
                 due_s = time.monotonic() + every_s
-            teller.tell(folder, time.time_ns())
-            stop.wait(_LOOK_S)
+            alarms.publish_changes(folder, time.time_ns())
+            stop.wait(_POLL_S)
         for publisher in publishers.values():
             publisher.close()
     return 0

@@ -1,4 +1,4 @@
-"""A bridge and its elements as they are printed."""
+"""Printed tables of a bridge and its elements."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
@@ -10,24 +10,24 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-class Elements(Protocol):
-    """What a table says of a bridge itself: of a site file's, or of one that results tell of."""
+class BridgeElements(Protocol):
+    """Data of a bridge in a table: from a site file, or from results."""
 
     @property
     def id(self) -> str:
-        """Its name."""
+        """Return its name."""
 
     @property
     def lengths_m(self) -> Sequence[float]:
-        """Of its elements."""
+        """Return the lengths of its elements, m."""
 
     @property
     def nominal_flexural_rigidity_nm2(self) -> Sequence[float]:
-        """Of its elements."""
+        """Return the nominal rigidities of its elements, N·m²."""
 
 
-def print_bridge(console: "Console", bridge: Elements, state: BridgeResult) -> None:
-    """All crossings of a bridge together: first how good the measurement is, then the bridge."""
+def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult) -> None:
+    """Print the fused state of a bridge: first the quality of the measurement, then the bridge."""
     used, left = len(state.crossings_used), state.crossings_left_out_count
     console.print(
         f"[bold]{bridge.id}[/], {used} crossing{'' if used == 1 else 's'} together"
@@ -56,35 +56,35 @@ def print_bridge(console: "Console", bridge: Elements, state: BridgeResult) -> N
 def _of_state(state: BridgeResult) -> Iterator[str]:
     if state.level is not None and state.thirds is not None:
         thirds = (state.thirds.left, state.thirds.middle, state.thirds.right)
-        told = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
-        yield f"EI of nominal: mean {state.level.mean:.2f} ± {state.level.std:.2f}; thirds {told}"
+        parts = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
+        yield f"EI / nominal: mean {state.level.mean:.2f} ± {state.level.std:.2f}; thirds {parts}"
     if state.between_crossing_std is not None and len(state.crossings_used) == 1:
         yield (
-            "one crossing: intervals are wider than its own, for how a bridge changes from one "
-            "crossing to the next it cannot tell"
+            "single crossing: intervals include the between-crossing variability, which one "
+            "crossing cannot estimate"
         )
     if state.between_crossing_std is not None and len(state.crossings_used) > 1:
         low, high = state.between_crossing_std_q025, state.between_crossing_std_q975
         yield (
-            f"EI changes by {100.0 * state.between_crossing_std:.1f} % from crossing to crossing, "
+            f"between-crossing variability of EI: {100.0 * state.between_crossing_std:.1f} %, "
             f"{100.0 * (low or 0.0):.1f} to {100.0 * (high or 0.0):.1f} %"
         )
     for track in state.tracks:
         beside = "" if track.wander_m is None else f", {track.wander_m:.2f} m beside each other"
         yield (
             f"runs of {track.vehicle}, {track.direction.replace('_', ' ')}{beside}: "
-            f"{100.0 * track.common_share:.0f} % of what its axles' roads differ by is the same"
+            f"{100.0 * track.common_share:.0f} % of the profile mismatch is the same in every run"
         )
 
 
 def print_elements(
     console: "Console",
-    bridge: Elements,
+    bridge: BridgeElements,
     elements: Mapping[str, Parameter | ElementState],
     has_meaning: bool,
     losses: Mapping[str, Mapping[str, float]] | None,
 ) -> None:
-    """A line for each element; `has_meaning` says whether intervals have.
+    """Print a line for each element; `has_meaning` is whether intervals have one.
 
     `losses` are probabilities, by element and per cent of the baseline.
     """
@@ -96,7 +96,7 @@ def print_elements(
     if has_meaning:
         table.add_column("95 % interval", justify="right")
     table.add_column("of nominal", justify="right")
-    if has_meaning and not losses:  # what it lost says more, and a line has eighty characters
+    if has_meaning and not losses:  # the loss is more important, and a line has 80 characters
         table.add_column("95 % interval", justify="right")
     percents = list(next(iter(losses.values()))) if losses else []
     if losses:

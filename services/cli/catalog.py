@@ -1,4 +1,4 @@
-"""`driveby catalog`: what recordings a fleet has, and where its trucks were on bridges."""
+"""The command `driveby catalog`: recordings of a fleet, and crossings in them."""
 
 import argparse
 from collections.abc import Iterator
@@ -9,16 +9,16 @@ from services.cli.parsing import add_output_file, add_site, command
 from services.common.kinds import CATALOG_CSV, CROSSINGS_CSV
 
 if TYPE_CHECKING:
-    from services.history.catalog_row import Row
-    from services.history.positions import Looked
-    from services.identification.bridges import Passing
+    from services.catalogue.positions import CatalogScan
+    from services.catalogue.row import CatalogRow
+    from services.finding.bridges import DetectedCrossing
 
 _MOST_LINES = 40
 _NS_PER_S = 1_000_000_000
 
 
 def add_catalog(commands: Any) -> None:
-    """`driveby catalog`: build or mend the catalogue of a folder of recordings."""
+    """Add `driveby catalog`: build or update the catalogue of a folder of recordings."""
     p = command(
         commands,
         "catalog",
@@ -39,17 +39,17 @@ def add_catalog(commands: Any) -> None:
 
 def _catalog(options: argparse.Namespace) -> int:
     from schemas.site_file import load_site
+    from services.catalogue.index import update_catalog
+    from services.catalogue.positions import crossings_of
     from services.common.files import check_writable, write_atomically
     from services.common.stores import check_folder, folder_at
-    from services.history.catalog import mend
-    from services.history.positions import crossings_of
 
     if options.csv is not None:
         check_writable(options.csv)
     site = None if options.site is None else load_site(options.site)
     folder = folder_at(options.folder)
     check_folder(folder)
-    mended = mend(folder, verify=options.verify)
+    mended = update_catalog(folder, verify=options.verify)
     for problem in mended.problems:
         print(problem)
     rows = sorted(mended.rows.values(), key=lambda row: (row.first_ns, row.path))
@@ -67,7 +67,7 @@ def _catalog(options: argparse.Namespace) -> int:
     return 0
 
 
-def _summary(rows: "list[Row]", added: int) -> str:
+def _summary(rows: "list[CatalogRow]", added: int) -> str:
     vehicles = {vehicle for row in rows for vehicle in row.vehicles}
     size = sum(row.size_bytes for row in rows)
     gaps = sum(row.gaps for row in rows)
@@ -81,7 +81,7 @@ def _summary(rows: "list[Row]", added: int) -> str:
     return said
 
 
-def _table_of_rows(rows: "list[Row]") -> Iterator[tuple[object, ...]]:
+def _table_of_rows(rows: "list[CatalogRow]") -> Iterator[tuple[object, ...]]:
     yield (
         *("recording", "vehicles", "first_time", "last_time", "bytes", "messages", "gaps"),
         *("gap_s", "south_deg", "west_deg", "north_deg", "east_deg", "sha256"),
@@ -93,7 +93,7 @@ def _table_of_rows(rows: "list[Row]") -> Iterator[tuple[object, ...]]:
         yield (row.path, " ".join(row.vehicles), *times, *counts, *box, row.content.hex())
 
 
-def _table_of_crossings(found: "tuple[Passing, ...]") -> Iterator[tuple[object, ...]]:
+def _table_of_crossings(found: "tuple[DetectedCrossing, ...]") -> Iterator[tuple[object, ...]]:
     yield (
         *("realm", "vehicle", "bridge", "direction", "entry_time", "exit_time", "passage"),
         "recordings",
@@ -114,7 +114,7 @@ def _csv(line: tuple[object, ...]) -> str:
     return out.getvalue()
 
 
-def _print_crossings(found: "Looked") -> None:
+def _print_crossings(found: "CatalogScan") -> None:
     for one in found.crossings[:_MOST_LINES]:
         seconds = (one.exit_ns - one.entry_ns) / _NS_PER_S
         how = f"{seconds:.1f} s on it" if one.passage.value == "through" else one.passage.value

@@ -1,4 +1,4 @@
-"""`driveby check`: what is wrong with truck, site file and recording, before it is too late."""
+"""The command `driveby check`: faults of truck, site file and recording before a survey."""
 
 import argparse
 import json
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 from services.cli.parsing import OutputFile, command
 
 if TYPE_CHECKING:
-    from services.inspection.inspect import Report
+    from services.inspection.inspect import CheckReport
 
 
 def add_check(commands: Any) -> None:
-    """`driveby check`: look at a site file and at recordings before a survey."""
+    """Add `driveby check`: check a site file and recordings before a survey."""
     p = command(
         commands,
         "check",
@@ -59,7 +59,7 @@ def _check(options: argparse.Namespace) -> int:
         raise InputError("a site file or recordings are expected, or --template NEW.toml")
     for path in options.paths:
         if path.suffix == ".toml":
-            _refuse_faults(path, wants_json=options.json)
+            _raise_on_faults(path, wants_json=options.json)
     recordings = [path for path in options.paths if path.suffix != ".toml"]
     with reading_bar("looking", recordings) as next_file:
         found = list(inspect(options.paths, next_file))
@@ -82,12 +82,12 @@ def _check(options: argparse.Namespace) -> int:
     return int(is_wrong)
 
 
-def _refuse_faults(path: Path, *, wants_json: bool) -> None:
-    """InputError if a site file cannot be read; of several faults all are printed before."""
+def _raise_on_faults(path: Path, *, wants_json: bool) -> None:
+    """Raise InputError for an unreadable site file; print several faults before."""
     from schemas.site_file import faults_of_site, read_site_text
     from services.common.errors import InputError
-    from services.inspection.finding import Finding, State
-    from services.inspection.inspect import Report
+    from services.inspection.finding import CheckFinding, CheckStatus
+    from services.inspection.inspect import CheckReport
 
     faults = faults_of_site(read_site_text(path), str(path))
     if not faults:
@@ -95,24 +95,26 @@ def _refuse_faults(path: Path, *, wants_json: bool) -> None:
     if len(faults) == 1:
         raise InputError(faults[0])
     texts = [fault.removeprefix(f"{path}: ") for fault in faults]
-    report = Report(
-        str(path), tuple(Finding("site_file", State.WRONG, text) for text in texts), is_run=False
+    report = CheckReport(
+        str(path),
+        tuple(CheckFinding("site_file", CheckStatus.WRONG, text) for text in texts),
+        is_run=False,
     )
     if wants_json:
         _print_json([report])
     else:
         print("\n".join(lines_of(report, is_brief=False)))
-    raise InputError(f"{path}: {len(faults)} things are wrong; nothing else was looked at")
+    raise InputError(f"{path}: {len(faults)} things are wrong; nothing else was checked")
 
 
-def _print_json(reports: "list[Report]") -> None:
+def _print_json(reports: "list[CheckReport]") -> None:
     is_wrong = any(report.is_wrong for report in reports)
     content = {"is_wrong": is_wrong, "reports": [as_json(report) for report in reports]}
     print(json.dumps(content, indent=1, ensure_ascii=False))
 
 
-def lines_of(report: "Report", *, is_brief: bool) -> Iterator[str]:
-    """A line for each finding; of what is in order only how many, where there are many runs."""
+def lines_of(report: "CheckReport", *, is_brief: bool) -> Iterator[str]:
+    """Yield a line for each finding; for many runs only the number of those in order."""
     yield report.source
     fine = 0
     for finding in report.findings:
@@ -125,8 +127,8 @@ def lines_of(report: "Report", *, is_brief: bool) -> Iterator[str]:
         yield f"  ok     {fine} others (--json has all)"
 
 
-def as_json(report: "Report") -> dict[str, Any]:
-    """One source and its findings."""
+def as_json(report: "CheckReport") -> dict[str, Any]:
+    """Return one source and its findings."""
     return {
         "source": report.source,
         "findings": [

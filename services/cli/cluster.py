@@ -1,4 +1,4 @@
-"""`driveby cluster`, and `--scheduler`: where crossings are identified beside this process."""
+"""The command `driveby cluster`, and `--scheduler`: where crossings are identified."""
 
 import argparse
 import os
@@ -12,8 +12,8 @@ from services.common.endpoints import LOOPBACK
 from services.common.errors import InputError
 
 if TYPE_CHECKING:
-    from services.cluster import Roles
-    from services.execution.dispatch import Execution
+    from services.cluster import ClusterCredentials
+    from services.execution.dispatch import CrossingExecutor
     from services.execution.scheduler import Credentials
 
 _PROCESSES: Final = "processes"
@@ -21,7 +21,7 @@ _MOST: Final = 256
 
 
 def add_cluster(commands: Any) -> None:
-    """`driveby cluster`: run a Dask scheduler and workers on this machine."""
+    """Add `driveby cluster`: run a Dask scheduler and workers on this machine."""
     p = command(
         commands,
         "cluster",
@@ -64,7 +64,7 @@ def add_cluster(commands: Any) -> None:
 
 
 def add_scheduler(p: Any) -> None:
-    """`--scheduler` and what belongs to it."""
+    """Add `--scheduler` and its related options."""
     p.add_argument(
         "--scheduler",
         metavar="processes|processes:N|tcp://…|tls://…",
@@ -87,7 +87,7 @@ def add_scheduler(p: Any) -> None:
 
 
 def check_scheduler(options: argparse.Namespace) -> None:
-    """InputError if `--scheduler` says nothing that there is, before anything is started."""
+    """Raise InputError for an invalid `--scheduler`, before anything is started."""
     said: str | None = options.scheduler
     is_cluster = said is not None and said.partition(":")[0] != _PROCESSES
     for name in ("tls", "batch", "reconnect_timeout"):
@@ -104,20 +104,20 @@ def check_scheduler(options: argparse.Namespace) -> None:
 
 
 @contextmanager
-def execution_of(options: argparse.Namespace) -> "Iterator[Execution | None]":
-    """What `--scheduler` says, started as late as it is entered; None without."""
+def execution_of(options: argparse.Namespace) -> "Iterator[CrossingExecutor | None]":
+    """Run the executor of `--scheduler`, started at entry; None without the option."""
     said: str | None = options.scheduler
     if said is None:
         yield None
     elif said.partition(":")[0] == _PROCESSES:
-        from services.execution.processes import Processes
+        from services.execution.processes import ProcessExecutor
 
-        with Processes(_number(said)) as processes:
+        with ProcessExecutor(_number(said)) as processes:
             yield processes
     else:
-        from services.execution.cluster import BATCH, PATIENCE_S, Cluster
+        from services.execution.cluster import BATCH, PATIENCE_S, DaskExecutor
 
-        with Cluster(
+        with DaskExecutor(
             said,
             credentials=_credentials(options),
             batch=options.batch or BATCH,
@@ -131,7 +131,7 @@ def _credentials(options: argparse.Namespace) -> "Credentials | None":
 
 
 def credentials_of(folder: Path, role: str) -> "Credentials":
-    """The files of a folder of credentials; InputError unless they are those of this role."""
+    """Return the files of a folder of credentials; InputError for those of another role."""
     from services.bus.credentials import AUTHORITY, CERTIFICATE, KEY, check_speaks_for
     from services.execution.scheduler import Credentials
 
@@ -156,20 +156,20 @@ def _cores() -> int:
     return min(os.cpu_count() or 1, _MOST)
 
 
-def _roles(folder: Path) -> "Roles":
-    from services.cluster import Roles
+def _roles(folder: Path) -> "ClusterCredentials":
+    from services.cluster import ClusterCredentials
 
     if not folder.is_dir():
         raise InputError(f"--tls: {folder} is no folder; driveby certs {folder} --cluster makes it")
     names = ("scheduler", "cluster-worker", "client")
-    return Roles(*(credentials_of(folder / name, name) for name in names))
+    return ClusterCredentials(*(credentials_of(folder / name, name) for name in names))
 
 
 def _cluster(options: argparse.Namespace) -> int:
-    from services.cluster import Wanted, run
+    from services.cluster import ClusterConfig, run
 
     return run(
-        Wanted(
+        ClusterConfig(
             options.workers,
             options.listen,
             options.port,
@@ -180,4 +180,4 @@ def _cluster(options: argparse.Namespace) -> int:
 
 
 SERVICES: Final = (_cluster,)
-"""Run until they are stopped, and have nothing else to show for themselves than what they say."""
+"""Handlers that run until they are stopped, and whose log is their only output."""

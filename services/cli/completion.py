@@ -1,4 +1,4 @@
-"""Completion of commands, options and their choices in a shell, made from the parser itself."""
+"""Completion of commands, options and their choices in a shell, derived from the parser."""
 
 import argparse
 import shlex
@@ -36,7 +36,7 @@ _ZSH = "autoload -Uz compinit bashcompinit\ncompinit\nbashcompinit\n"
 
 
 def completion(parser: argparse.ArgumentParser, shell: str) -> str:
-    """A script for `bash`, or `zsh`, which takes that of bash, of all that `parser` takes."""
+    """Return a script for `bash`, or `zsh`, which accepts that of bash, for all of `parser`."""
     commands = _commands(parser)
     everything = {"": parser, **commands}
     script = _SCRIPT.format(

@@ -1,8 +1,8 @@
-"""`driveby demo`: logger, worker and truck as three processes, and what comes of them.
+"""The command `driveby demo`: logger, worker and truck as three processes.
 
-A crossing of the paper's scenario 6 (element 4 at 40 %) is simulated, played as a truck that drives
-now, recorded by the logger, identified by the worker, received by this process as a subscriber to
-the live result, and drawn. It can be watched as it happens (`--live`).
+A crossing of the paper's scenario 6 (element 4 at 40 %) is simulated, published as a truck that
+drives now, recorded by the logger, identified by the worker, received by this process as a
+subscriber to the live result, and drawn. It can be watched live (`--live`).
 """
 
 import contextlib
@@ -26,38 +26,48 @@ from numpy.typing import NDArray
 from pre_core.paper import experiment
 from schemas.messages import decode
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing, load_results
+from schemas.results import CrossingResult, load_results
 from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import site_toml
 from services.bus.playback import set_by_signals
 from services.bus.session import open_session
-from services.bus.subscription import Received, Subscription
+from services.bus.subscription import RawSample, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import write_atomically
 from services.recordings.recording import read_info, read_messages
-from services.simulation.drive import Drive, declared, paper_site, simulate_drive, write_drive
+from services.simulation.drive import (
+    SimulatedDrive,
+    declared_site,
+    paper_site,
+    simulate_drive,
+    write_drive,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 Floats = NDArray[np.float64]
 Live = Literal["window", "web"]
-"""Where a demo is watched as it happens."""
+"""Display of a running demo."""
 
 SCENARIO = 6
 REALM = "sim-demo"
 ROAD_CLASS = "A"
 SEED = 1
-"""Any other shows a crossing as well."""
-_READY_S = 60.0
-"""The worker may have to compile its kernels first."""
-_RESULT_S = 60.0
-"""From the last message of the truck on; an identification takes seconds."""
+"""Seed of the simulation; any other shows a crossing as well."""
+_READY_S = 600.0
+"""Longest time in s to readiness: compiling the kernels takes minutes on a slow or busy machine."""
+_RESULT_S = 300.0
+"""Longest time in s from the truck's last message to the result; the usual one is seconds."""
 _STOP_S = 10.0
-"""A service that is stopped finishes what it has begun; here nothing is under way."""
+"""Longest time in s for the end of a service; nothing is running then."""
 _RECORDING, _RESULTS, _TEXT = "recording.mcap", "results.mcap", "results.json"
 _VIEWS, _FIGURE = "demo.rrd", "demo.png"
+_INTERVAL = 0.95
+"""Probability with which an interval contains its element's true value."""
+
+_Printer = Callable[[str], None]
 
 
 class _Services(NamedTuple):
@@ -72,17 +82,17 @@ def demo_command(
 ) -> int:
     """Run the demonstration; 0 only if the crossing was recorded, identified and received.
 
-    With a `noise` in µg/√Hz the receiver errs as real ones do, too; with zero everything is exact,
-    and the method is the one that knows of no noise. `live` shows it meanwhile, in a window or a
-    browser, and after it until somebody closes that.
+    With a `noise` in µg/√Hz the receiver has realistic errors, too; with zero everything is exact,
+    and the method is the one without a noise model. `live` shows it meanwhile, in a window or a
+    browser, and afterwards until that is closed.
 
-    FailureError says which of them did not happen. InputError: the folder exists.
+    Raise FailureError with the step that failed, InputError if the folder exists.
     """
     folder = _new_folder(out)
     try:
         return _run(folder, speed, noise, console, live)
     except KeyboardInterrupt:
-        shutil.rmtree(folder, ignore_errors=True)  # half a demo is of no use to anybody
+        shutil.rmtree(folder, ignore_errors=True)  # half a demo is useless
         raise
 
 
@@ -92,7 +102,7 @@ def _run(folder: Path, speed: float, noise: float, console: "Console", live: Liv
         status = watching.enter_context(
             console.status("simulating a crossing of the paper's bridge", spinner="dots")
         )
-        site = declared(paper_site(), noise, 1000.0)
+        site = declared_site(paper_site(), noise, 1000.0)
         drive = simulate_drive(
             site,
             experiment.scenario_ratios(SCENARIO),
@@ -123,8 +133,8 @@ def _run(folder: Path, speed: float, noise: float, console: "Console", live: Liv
 
 
 @contextlib.contextmanager
-def _view(services: _Services, live: Live) -> Iterator["_Running"]:
-    """The live view, in a process of its own; it is told to end, for it has a viewer to close."""
+def _view(services: _Services, live: Live) -> Iterator["_ChildProcess"]:
+    """Run the live view in a process of its own; it closes its viewer when it is stopped."""
     where = ("--endpoint", services.endpoint, "--realm", REALM, "--site", str(services.site))
     web = ("--web",) if live == "web" else ()
     with _process(services.folder, "view", "live", *where, *web) as view:
@@ -136,8 +146,8 @@ def _view(services: _Services, live: Live) -> Iterator["_Running"]:
                 view.process.wait(timeout=_STOP_S)
 
 
-def _wait_until_closed(view: "_Running", console: "Console") -> None:
-    """Until somebody closes the window, or ends the demo; what was found is printed by then."""
+def _wait_until_closed(view: "_ChildProcess", console: "Console") -> None:
+    """Wait until the window is closed or the demo ended; results are printed before."""
     address = re.search(r"in a browser: (http://\S+)", view.log.read_text(errors="replace"))
     said = "The live view stays until its window is closed, or Ctrl-C."
     if address is not None:
@@ -152,7 +162,7 @@ def _wait_until_closed(view: "_Running", console: "Console") -> None:
 
 @contextlib.contextmanager
 def _terminated_as_interrupted() -> Iterator[None]:
-    """SIGTERM ends the processes too, as Ctrl-C does, instead of leaving them behind."""
+    """Let SIGTERM end the processes too, as Ctrl-C does, instead of leaving them behind."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -181,8 +191,8 @@ def _free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def _live(services: _Services, source: Path, speed: float, say: Callable[[str], None]) -> Crossing:
-    """Run the three processes until the result has come over the bus; return it."""
+def _live(services: _Services, source: Path, speed: float, say: _Printer) -> CrossingResult:
+    """Run the three processes until the result has been received; return it."""
     endpoint, site, folder, method = services
     common = ["--realm", REALM, "--site", str(site)]
     say("starting the logger, which hosts the router")
@@ -219,10 +229,10 @@ def _live(services: _Services, source: Path, speed: float, say: Callable[[str], 
             )
         )
 
-        def is_estimate(received: Received) -> bool:
+        def is_estimate(received: RawSample) -> bool:
             if received.key().stream == "crossing":
                 state = decode("driveby.v1.Crossing", received.payload)
-                assert isinstance(state, pb.Crossing)  # noqa: S101 - `decode` made it so
+                assert isinstance(state, pb.Crossing)  # noqa: S101 - by `decode`
                 say(f"crossing {pb.CrossingState.Name(state.state).lower().replace('_', ' ')}")
             return received.key().stream == "estimate"
 
@@ -242,26 +252,26 @@ def _live(services: _Services, source: Path, speed: float, say: Callable[[str], 
     return crossing
 
 
-class _Running(NamedTuple):
+class _ChildProcess(NamedTuple):
     name: str
     process: subprocess.Popen[bytes]
     log: Path
 
 
 @contextlib.contextmanager
-def _process(folder: Path, name: str, *arguments: str) -> Iterator[_Running]:
+def _process(folder: Path, name: str, *arguments: str) -> Iterator[_ChildProcess]:
     """Start a sub-command as a process of its own; its log stays in the folder if it fails."""
     log = folder / f"{name}.log"
     process: subprocess.Popen[bytes] | None = None
     try:
-        with log.open("wb") as file, _held_back():
+        with log.open("wb") as file, _defer_signals():
             process = subprocess.Popen(
                 [sys.executable, "-m", "services", name, *arguments],
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
             )
-        yield _Running(name, process, log)
+        yield _ChildProcess(name, process, log)
     finally:
         if process is not None:
             if process.poll() is None:
@@ -271,10 +281,10 @@ def _process(folder: Path, name: str, *arguments: str) -> Iterator[_Running]:
 
 
 @contextlib.contextmanager
-def _held_back() -> Iterator[None]:
-    """Signals that end the demo count from the end of this on.
+def _defer_signals() -> Iterator[None]:
+    """Defer signals that end the demo to the end of this context.
 
-    An interrupt inside of `Popen` would leave a process behind that nobody knows.
+    An interrupt within `Popen` would leave an unknown process behind.
     """
     with set_by_signals(signal.SIGINT, signal.SIGTERM) as caught:
         yield
@@ -284,25 +294,25 @@ def _held_back() -> Iterator[None]:
 
 def _wait(
     subscription: Subscription,
-    wanted: Callable[[Received], bool],
-    running: list[_Running],
+    wanted: Callable[[RawSample], bool],
+    running: list[_ChildProcess],
     timeout_s: float,
     otherwise: str,
-) -> Received:
-    """The first message wanted; FailureError if a process dies or the time runs out."""
+) -> RawSample:
+    """Return the first matching message; FailureError if a process dies or the time runs out."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         received = subscription.receive(0.1)
         if received is not None and wanted(received):
             return received
         for one in running:
-            # A truck that has driven may leave; a service may not, however well it ended.
+            # A truck that has driven may leave; a service may not, even with exit code 0.
             if one.process.poll() not in (None, 0 if one.name == "truck" else None):
                 raise FailureError(f"the {one.name} ended early: {_last_line(one.log)}")
     raise FailureError(f"{otherwise} after {timeout_s:.0f} s; see the logs beside {running[0].log}")
 
 
-def _finish(running: _Running, with_signal: signal.Signals | None) -> None:
+def _finish(running: _ChildProcess, with_signal: signal.Signals | None) -> None:
     if with_signal is not None:
         running.process.send_signal(with_signal)
     try:
@@ -319,14 +329,14 @@ def _last_line(log: Path) -> str:
 
 
 def _check_recording(path: Path, sent: int) -> None:
-    """Every message of the truck is in the recording, which was closed properly."""
+    """Check that every message of the truck is in the recording, which was closed properly."""
     info = read_info(path)
     recorded = sum(count for key, count in info.messages.items() if "/vehicle/" in key)
     if info.end is None or info.truncated or recorded != sent:
         raise FailureError(f"{path}: holds {recorded} of the truck's {sent} messages")
 
 
-def _draw(folder: Path, crossing: Crossing, drive: Drive, site: Site) -> None:
+def _draw(folder: Path, crossing: CrossingResult, drive: SimulatedDrive, site: Site) -> None:
     from services.viewer.bridge_view import views_of_bridges
     from services.viewer.crossing_view import view_of_crossing
     from services.viewer.figure import crossing_figure
@@ -350,8 +360,8 @@ def _draw(folder: Path, crossing: Crossing, drive: Drive, site: Site) -> None:
     )
 
 
-def _true_road(crossing: Crossing, drive: Drive) -> tuple[Floats, Floats] | None:
-    """The road under the wheels, with level, slope and curvature of the estimate.
+def _true_road(crossing: CrossingResult, drive: SimulatedDrive) -> tuple[Floats, Floats] | None:
+    """Return the road under the wheels, with level, slope and curvature of the estimate.
 
     Integrated accelerations do not show these three; the rest can be compared.
     """
@@ -363,7 +373,7 @@ def _true_road(crossing: Crossing, drive: Drive) -> tuple[Floats, Floats] | None
     return x, height - np.polynomial.Polynomial.fit(x, apart, 2)(x)
 
 
-def _print(console: "Console", crossing: Crossing, drive: Drive, site: Site) -> None:
+def _print(console: "Console", crossing: CrossingResult, drive: SimulatedDrive, site: Site) -> None:
     from rich.table import Table
 
     parameters = crossing.parameters or {}
@@ -371,6 +381,7 @@ def _print(console: "Console", crossing: Crossing, drive: Drive, site: Site) -> 
     has_meaning = "no_noise_model" not in crossing.reasons
     table = Table(title="Flexural rigidity as a ratio to the sound bridge", title_justify="left")
     table.add_column("element")
+    misses = 0
     for heading in ("truth", "estimate", "interval (95 %)", "holds the truth"):
         table.add_column(heading, justify="right")
     for number, (sound, truth) in enumerate(
@@ -384,11 +395,19 @@ def _print(console: "Console", crossing: Crossing, drive: Drive, site: Site) -> 
         if has_meaning:
             interval = f"{p.q025 / sound:.3f} … {p.q975 / sound:.3f}"
             holds = "yes" if p.q025 <= truth * sound <= p.q975 else "no"
+            misses += holds == "no"
         table.add_row(f"EI_{number}", f"{truth:.3f}", f"{p.mean / sound:.3f}", interval, holds)
     console.print(table)
+    if misses:
+        share = 100.0 * (1.0 - _INTERVAL ** len(nominal))
+        console.print(
+            f"Of {len(nominal)} intervals of 95 % at least one misses the truth "
+            f"in {share:.0f} % of crossings.",
+            highlight=False,
+        )
     if not has_meaning:
         console.print(
-            "* The method least-squares has no noise model, so it cannot say how sure it is.",
+            "* The method least-squares has no noise model, so its uncertainty is unknown.",
             highlight=False,
         )
     if not crossing.reasons:

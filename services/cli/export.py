@@ -1,4 +1,4 @@
-"""`driveby export`: what was measured and found, in forms that other programs read."""
+"""The command `driveby export`: measurements and results for other programs."""
 
 import argparse
 from pathlib import Path
@@ -10,11 +10,11 @@ from services.common.errors import InputError
 if TYPE_CHECKING:
     from schemas.results import Results
     from schemas.site import Site
-    from services.export.tables import Format, Table
+    from services.export.tables import Format, NamedTable
 
 
 def add_export(commands: Any) -> None:
-    """`driveby export`: write recordings and results as tables and maps."""
+    """Add `driveby export`: write recordings and results as tables and maps."""
     p = command(
         commands,
         "export",
@@ -45,6 +45,7 @@ def add_export(commands: Any) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
+    from services.catalogue.contents import summarise_recording
     from services.common.files import (
         check_folder_writable,
         check_site_kept,
@@ -53,13 +54,12 @@ def _export(options: argparse.Namespace) -> int:
     )
     from services.common.progress import reading_bar, steps_bar
     from services.drives.signals import signals_of_recording
-    from services.drives.survey import survey
-    from services.export.found import tables_of_results
     from services.export.geojson import crossings_geojson, elements_geojson
-    from services.export.measured import as_measured, tables_of_run, tables_of_runs
+    from services.export.result_tables import tables_of_results
     from services.export.sensorthings import sensorthings
+    from services.export.signal_tables import as_measured, tables_of_run, tables_of_runs
     from services.export.tables import write_table
-    from services.recordings.together import recordings_in
+    from services.recordings.merge import recordings_in
 
     form: Format = options.format
     folder: Path = options.to
@@ -76,12 +76,11 @@ def _export(options: argparse.Namespace) -> int:
     passings = []
     if results is None and site is not None:
         with reading_bar("looking for crossings", recordings) as next_file:
-            passings = [
-                p for path in recordings for p in survey(path, site, progress=next_file()).passings
-            ]
+            every = (summarise_recording(one, site, progress=next_file()) for one in recordings)
+            passings = [passing for summary in every for passing in summary.passings]
     if form == "csv" and runs and site is not None:
         check_site_kept(folder / "site.toml", as_measured(site))
-    tables: list[Table] = []
+    tables: list[NamedTable] = []
     if form == "parquet":
         tables += tables_of_runs(runs) if runs else []
     else:
@@ -114,7 +113,7 @@ def _export(options: argparse.Namespace) -> int:
 
 
 def _check_no_others(folder: Path, names: set[str]) -> None:
-    """Runs of an earlier export would be imported together with these."""
+    """Raise InputError for runs of an earlier export, which would be imported with these."""
     others = {path.name for kind in ("accel_", "gps_") for path in folder.glob(f"{kind}*.csv")}
     if names and others - names:
         raise InputError(
@@ -134,9 +133,9 @@ def _results(sources: list[Path]) -> "tuple[Results | None, Path]":
 def _site(
     given: Path | None, recordings: list[Path], results: "Results | None", results_path: Path
 ) -> "Site | None":
-    """The site file given, or of the recordings, or of one beside the results; None without any."""
+    """Return the site file given, of the recordings, or beside the results; None without any."""
     from schemas.site_file import load_site
-    from services.history.site_of_results import site_of_results, site_within, wanted_bridges
+    from services.ledger.site_of_results import site_of_results, site_within, wanted_bridges
 
     if results is not None and (given is not None or not recordings):
         try:

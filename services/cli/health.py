@@ -1,8 +1,8 @@
-"""`driveby health`: whether a service does its work, asked over the bus that it works on.
+"""The command `driveby health`: query the health of a service over its bus.
 
-The answer is the service's own latest `health`, which its main loop says every minute and which its
-session keeps for who comes later: to have it there must be a router that answers, certificates that
-it takes, and a service that connects, is let through and has not stopped.
+The answer is the service's own latest `health`, which its main loop publishes every minute and its
+session keeps for later subscribers. It requires a router that answers, certificates that it
+accepts, and a service that connects, is admitted and has not stopped.
 """
 
 import time
@@ -16,18 +16,18 @@ from services.bus.subscription import Subscription
 from services.common.errors import FailureError, InputError
 
 OLDEST_S = 150.0
-"""Two and a half times the period."""
+"""Largest age of a healthy service's message in s, two and a half periods."""
 _ANSWER_S = 5.0
-"""A service that is well answers from memory, at once but for the network."""
+"""Longest wait for the answer in s; a healthy service answers from memory."""
 
 
 def health_command(
     *, service: str, endpoint: str, tls: Path | None, realm: str, patience_s: float = _ANSWER_S
 ) -> str:
-    """Return a line that says how a service is, with what it says of itself, if anything.
+    """Return a line on the health of a service, with its own note, if any.
 
-    InputError: a bad realm or name. FailureError: no router answers, the service says nothing, has
-    said nothing for `OLDEST_S`, or says itself that it is not well.
+    InputError: a bad realm or name. FailureError: no router answers, the service sends nothing, has
+    sent nothing for `OLDEST_S`, or declares itself unhealthy.
     """
     try:
         where = key(check_realm(realm), "service", check_identifier(service), "health")
@@ -39,10 +39,12 @@ def health_command(
     ):
         latest = _latest(subscription, patience_s)
     if latest is None:
-        raise FailureError(f"{service} in realm {realm} says nothing at {endpoint}")
+        raise FailureError(
+            f"{service} in realm {realm} sends nothing at {endpoint}; --realm NAME asks another"
+        )
     age_s = time.time() - latest.time_ns * 1e-9
     if age_s > OLDEST_S:
-        raise FailureError(f"{service} in realm {realm} has said nothing for {age_s:.0f} s")
+        raise FailureError(f"{service} in realm {realm} has sent nothing for {age_s:.0f} s")
     if not latest.ok:
         raise FailureError(
             f"{service} in realm {realm} is not well: {latest.note or 'see its log'}"
@@ -52,7 +54,7 @@ def health_command(
 
 
 def _latest(subscription: Subscription, patience_s: float) -> pb.Health | None:
-    """The first that comes, which is the last that was said; None if none comes in time."""
+    """Return the first message received, the latest published one; None if none arrives in time."""
     deadline_s = time.monotonic() + patience_s
     while time.monotonic() < deadline_s:
         received = subscription.receive(0.1)

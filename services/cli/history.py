@@ -1,4 +1,4 @@
-"""`driveby history`: results of years, and one bridge of them over time."""
+"""The command `driveby history`: results over years, and one bridge over time."""
 
 import argparse
 import json
@@ -22,7 +22,7 @@ from services.common.kinds import HISTORY_CSV, HISTORY_JSON, RERUN
 if TYPE_CHECKING:
     from schemas.alarms import Alarm
     from schemas.results import Results
-    from services.history.past import Driven, Past
+    from services.history.bridge_history import BridgeHistory, HistoryEntry
     from services.history.periods import FusedPeriod
 
 HISTORY = Path("history")
@@ -30,7 +30,7 @@ _ADD = "add"
 
 
 def add_history(commands: Any) -> None:
-    """`driveby history`: add results, or show a bridge over time."""
+    """Add `driveby history`: add results, or show a bridge over time."""
     p = command(
         commands,
         "history",
@@ -57,7 +57,10 @@ def add_history(commands: Any) -> None:
         help="period of fusion (default: month)",
     )
     add_file(
-        p, "--temperature", "T.csv", "with add: time_s,temperature_deg_c[,bridge] beside crossings"
+        p,
+        "--temperature",
+        "T.csv",
+        "with add: CSV file of temperatures (time_s,temperature_deg_c[,bridge])",
     )
     p.add_argument(
         "--defer-fusion",
@@ -75,7 +78,7 @@ def add_history(commands: Any) -> None:
 
 
 def add_history_folder(p: argparse.ArgumentParser) -> None:
-    """`--history`: where a history lies."""
+    """Add `--history`: the folder of a history."""
     p.add_argument(
         "--history",
         type=Path,
@@ -98,26 +101,26 @@ def _history(options: argparse.Namespace) -> int:
 
 def _add(options: argparse.Namespace, paths: list[Path]) -> int:
     problems: list[str] = []
-    # All of them are looked at before any is written.
+    # All of them are checked before any is written.
     sources = [(path, _results_of(path, problems.append)) for path in paths]
-    driven: set[Driven] = set()
+    driven: set[HistoryEntry] = set()
     for path, some in sources:
         print(_add_one(options, path, some, driven))
     for problem in problems:
         print(problem)
     if not options.defer_fusion:
         from services.execution.blas import one_blas_thread
-        from services.history.past import fuse_ahead
+        from services.history.bridge_history import prefuse_periods
 
         with a_console().status("fusing what was added"), one_blas_thread():
-            fuse_ahead(options.history, driven, options.period, print)
+            prefuse_periods(options.history, driven, options.period, print)
     return EXIT_SOMETHING_LOST if problems else 0
 
 
 def _results_of(path: Path, problem: Callable[[str], object]) -> "Iterable[Results]":
-    """What a results file holds, or a folder of `identify --into`; InputError if it is neither."""
+    """Yield the results of a file, or a folder of `identify --into`; InputError for others."""
     from schemas.results import load_results
-    from services.execution.kept import files_of, kept_results
+    from services.execution.result_store import files_of, kept_results
 
     if not path.is_dir():
         return (load_results(path),)
@@ -129,11 +132,11 @@ def _results_of(path: Path, problem: Callable[[str], object]) -> "Iterable[Resul
 
 
 def _add_one(
-    options: argparse.Namespace, path: Path, some: "Iterable[Results]", driven: "set[Driven]"
+    options: argparse.Namespace, path: Path, some: "Iterable[Results]", driven: "set[HistoryEntry]"
 ) -> str:
-    """Add what a file or a folder holds, note where the crossings are, and say what was added."""
-    from services.history.archive import add_results
-    from services.history.past import Driven
+    """Add a file or a folder, record the positions of its crossings, and return a summary."""
+    from services.history.bridge_history import HistoryEntry
+    from services.history.history_store import add_results
     from services.history.temperatures import temperatures_of
 
     new, there, warm, bridges = 0, 0, 0, set[str]()
@@ -144,7 +147,9 @@ def _add_one(
         added = add_results(options.history, results, known)
         new, there, warm = new + added.crossings, there + added.known, warm + len(known)
         bridges.update(added.bridges)
-        driven.update(Driven(one.realm, one.bridge, one.entry_time) for one in results.crossings)
+        driven.update(
+            HistoryEntry(one.realm, one.bridge, one.entry_time) for one in results.crossings
+        )
     of = f" of {', '.join(sorted(bridges))}" if bridges else ""
     before = f", {there} there already" if there else ""
     beside = f", {warm} with a temperature" if options.temperature is not None else ""
@@ -152,9 +157,11 @@ def _add_one(
 
 
 def _table(options: argparse.Namespace) -> int:
-    from services.history.questions import ask, overview
+    from services.history.sql import overview, query
 
-    answer = overview(options.history) if options.sql is None else ask(options.history, options.sql)
+    answer = (
+        overview(options.history) if options.sql is None else query(options.history, options.sql)
+    )
     for problem in answer.problems:
         print(problem)
     rows = [answer.columns, *(tuple(map(str, row)) for row in answer.rows)]
@@ -168,8 +175,8 @@ def _table(options: argparse.Namespace) -> int:
 def _show(options: argparse.Namespace, bridge: str) -> int:
     from services.common.files import check_writable, write_atomically
     from services.execution.blas import one_blas_thread
-    from services.history.archive import realm_of
-    from services.history.past import past_of
+    from services.history.bridge_history import bridge_history
+    from services.history.history_store import realm_of
 
     for path in (options.csv, options.json, options.rrd):
         if path is not None:
@@ -178,7 +185,7 @@ def _show(options: argparse.Namespace, bridge: str) -> int:
     realm = realm_of(folder, bridge, options.realm)
     console = a_console()
     with console.status("fusing crossings"), one_blas_thread():
-        past = past_of(folder, realm, bridge, options.period, print)
+        past = bridge_history(folder, realm, bridge, options.period, print)
     if not past.periods:
         raise InputError(f"{folder}: no crossing of {bridge} can be read")
     for line in _lines(past):
@@ -197,8 +204,8 @@ def _show(options: argparse.Namespace, bridge: str) -> int:
     return 0
 
 
-def _drawn(options: argparse.Namespace, past: "Past") -> Iterator[Path]:
-    """Draw what was asked for."""
+def _drawn(options: argparse.Namespace, past: "BridgeHistory") -> Iterator[Path]:
+    """Draw the requested pictures."""
     if options.figures is not None:
         from services.common.files import make_folder
         from services.viewer.history_figure import history_figure
@@ -215,8 +222,8 @@ def _drawn(options: argparse.Namespace, past: "Past") -> Iterator[Path]:
         yield options.rrd
 
 
-def _lines(past: "Past") -> Iterator[str]:
-    from services.history.past import statements
+def _lines(past: "BridgeHistory") -> Iterator[str]:
+    from services.history.bridge_history import statements
 
     bridge, realm, unit, periods, alarms = past[:5]
     number = sum(one.crossings for one in periods)
@@ -232,7 +239,7 @@ def _lines(past: "Past") -> Iterator[str]:
         used = 0 if one.state is None else len(one.state.crossings_used)
         head = f"{_day(one.begin_s)}  {used:>3} of {one.crossings:<3} {warm}"
         if one.state is None or not one.state.elements:
-            yield f"{head}  none of them tells of the bridge"
+            yield f"{head}  none of them could be used"
             continue
         cells = "".join(
             f"{e.mean / 1e9:7.2f} ± {(e.q975 - e.q025) / 2e9:<5.2f}"
@@ -246,7 +253,7 @@ def _lines(past: "Past") -> Iterator[str]:
 
 
 def alarm_line(alarm: "Alarm") -> str:
-    """An alarm as it is printed."""
+    """Return the printed line of an alarm."""
     note = alarm.acknowledged
     state = "stands" if note is None else f"acknowledged by {note.by} on {_day(note.time)}"
     said = f": {note.note}" if note is not None and note.note else ""
@@ -271,9 +278,9 @@ def _csv(periods: "Sequence[FusedPeriod]") -> Iterator[str]:
             yield f"{one.begin_s:.0f},{one.end_s:.0f},{name},{values},{rest}\n"
 
 
-def _json(past: "Past") -> str:
+def _json(past: "BridgeHistory") -> str:
     bridge, realm, unit, periods, alarms, watch, comparison = past
-    told = {
+    fields = {
         "bridge": bridge,
         "realm": realm,
         "period": unit,
@@ -306,7 +313,7 @@ def _json(past: "Past") -> str:
             },
         },
     }
-    return json.dumps(told, indent=1) + "\n"
+    return json.dumps(fields, indent=1) + "\n"
 
 
 def _day(time_s: float) -> str:

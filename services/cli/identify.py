@@ -1,4 +1,4 @@
-"""`driveby identify`: identifies the crossings of recordings, prints and writes what was found."""
+"""The command `driveby identify`: identify crossings of recordings, print and write results."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,17 +7,20 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from schemas.certificates import Pair
 from schemas.results import (
     AtEnds,
-    Crossing,
+    BridgeResult,
+    CrossingResult,
     Derived,
     Results,
-    resolution,
+    is_torsion_declared,
     results_json,
+    unresolved_note,
 )
 from schemas.settings import IdentificationSettings
-from schemas.site import Site
+from schemas.site import Bridge, Site
+from schemas.validation_records import VehicleBridgePair
+from services.catalogue.contents import summarise_recording
 from services.cli.bridge_table import print_bridge, print_elements
 from services.cli.parsing import CERTIFICATES
 from services.common.errors import FailureError, InputError
@@ -28,16 +31,15 @@ from services.common.files import (
     write_atomically,
 )
 from services.common.progress import parts_bar, reading_bar, steps_bar
-from services.drives.survey import survey
-from services.execution.dispatch import Execution
-from services.execution.offline import identify_drives, site_of
-from services.execution.overview import look_over, messages_of_trucks
-from services.history.baselines import baselines_of
-from services.history.certificates import found_in
+from services.execution.dispatch import CrossingExecutor
+from services.execution.offline import identify_drives, messages_of_trucks, site_of
+from services.finding.order import index_messages
 from services.history.draws import Draws, DrawsOfCrossing, check_draws, write_draws
+from services.history.validation_files import passed_validations
 from services.identification.bridge_state import Fusing
-from services.recordings.away import Source, all_at_hand, is_folder_of_recordings
+from services.ledger.baselines import baselines_of
 from services.recordings.recording import read_messages
+from services.recordings.remote import Source, all_fetched, is_folder_of_recordings
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,14 +61,16 @@ def identify_command(
     seed: int,
     baseline: Path | None,
     fuse_suspect: bool,
-    executing: AbstractContextManager[Execution | None] | None = None,
+    executing: AbstractContextManager[CrossingExecutor | None] | None = None,
     console: "Console",
 ) -> int:
-    """Identify every crossing in the recordings, print a table and write what was asked for.
+    """Identify every crossing in the recordings, print a table and write the requested files.
 
-    `executing` is entered when it is known that there is something to do: None, in this process.
-    InputError: a file that cannot be read or written, or has no accelerations or positions; a
-    folder of certificates that is none; draws are wanted from elsewhere.
+    `executing` is entered once there is something to do; its value None means this process.
+
+    Raise InputError for a file that cannot be read or written, or has no accelerations or
+    positions, for an invalid folder of validation records, and if draws of another executor are
+    requested.
     """
     check_certificates(certificates)
     for source in recordings:
@@ -83,21 +87,16 @@ def identify_command(
             check_writable(path)
     if figures is not None:
         check_folder_writable(figures)
-    with all_at_hand(recordings) as files:
+    with all_fetched(recordings) as files:
         known = site_of(files, site)
         beside = None if site is None else site.parent
         fusing = Fusing(baselines_of(known, beside, baseline), fuse_suspect)
         settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
         warn_of_no_noise(known, method)
-        asked = _Asked(
-            files,
-            known,
-            settings,
-            fusing,
-            found_in(certificates or CERTIFICATES, known, settings),
-        )
+        records = passed_validations(certificates or CERTIFICATES, known, settings)
+        request = _IdentifyRequest(files, known, settings, fusing, records)
         draws: dict[str, Draws] = {}
-        found = _found(asked, draws, executing, console)
+        found = _found(request, draws, executing, console)
         _print(console, found, known)
         if json_path is not None:
             write_atomically(json_path, results_json(found))
@@ -118,27 +117,27 @@ def identify_command(
     return 0
 
 
-class _Asked(NamedTuple):
-    """What is to be identified, and how."""
+class _IdentifyRequest(NamedTuple):
+    """Recordings to identify, with settings."""
 
     recordings: list[Path]
     site: Site
     settings: IdentificationSettings
     fusing: Fusing
-    certificates: Mapping[Pair, str]
+    certificates: Mapping[VehicleBridgePair, str]
 
 
 def _found(
-    asked: _Asked,
+    request: _IdentifyRequest,
     draws: dict[str, Draws],
-    executing: AbstractContextManager[Execution | None] | None,
+    executing: AbstractContextManager[CrossingExecutor | None] | None,
     console: "Console",
 ) -> Results:
-    """What the recordings give; `draws` gets those of each crossing."""
-    recordings, known = asked.recordings, asked.site
+    """Return the results of the recordings; `draws` receives those of each crossing."""
+    recordings, known = request.recordings, request.site
     seen = _crossings_seen(recordings, known, console)
     with reading_bar("reading", recordings, console) as next_file:
-        drives = look_over(
+        drives = index_messages(
             ", ".join(map(str, recordings)), messages_of_trucks(recordings, next_file), known
         )
     with (
@@ -148,29 +147,29 @@ def _found(
         return identify_drives(
             drives,
             known,
-            asked.settings,
+            request.settings,
             report,
             keep=draws.__setitem__,
-            fusing=asked.fusing,
-            certificates=asked.certificates,
+            fusing=request.fusing,
+            certificates=request.certificates,
             execution=execution,
         )
 
 
 def check_certificates(certificates: Path | None) -> None:
-    """InputError if a folder of certificates is none."""
+    """Raise InputError for an invalid folder of validation records."""
     if certificates is not None and not certificates.is_dir():
         raise InputError(f"--validations: {certificates} is no folder of certificates")
 
 
 def warn_of_no_noise(site: Site, method: str) -> None:
-    """Say so where a method cannot believe in sensors without noise."""
-    from services.identification.placed import middle_sensor
+    """Warn where a method cannot use sensors without noise."""
+    from services.finding.placed import middle_sensor
 
     noise = (middle_sensor(site.sensor, one).noise_density_ug_per_rthz for one in site.vehicles)
     if method == "pre" and not any(map(any, noise)):
         _log.warning(
-            "the site says that the sensors have no noise, which method pre cannot believe; "
+            "the site declares sensors without noise, which method pre cannot use; "
             "simulations without noise are for --method least-squares"
         )
 
@@ -183,7 +182,7 @@ def _write_rerun(
     beside: Path,
     console: "Console",
 ) -> None:
-    """The Rerun file of what was found; baselines are looked for `beside`."""
+    """Write the Rerun file of the results; baselines are relative to `beside`."""
     from services.viewer.bridge_view import views_of_bridges
     from services.viewer.residuals import residual_cells
     from services.viewer.vehicle_signals import signals_of_messages
@@ -210,16 +209,19 @@ def _write_rerun(
                 residuals=left,
                 drawing=drawing,
             )
-    except RuntimeError as error:  # so Rerun says that its file could not be written
+    except RuntimeError as error:  # Rerun's error for a file that cannot be written
         raise FailureError(f"{path}: could not be written: {error}") from error
 
 
 def _crossings_seen(recordings: list[Path], site: Site, console: "Console") -> int:
-    """How many a bar is of; 0 without a terminal, where nobody sees it."""
+    """Return the number of crossings for a progress bar; 0 without a terminal."""
     if not console.is_terminal:
         return 0
     with reading_bar("looking for crossings", recordings, console) as next_file:
-        return sum(len(survey(path, site, progress=next_file()).passings) for path in recordings)
+        return sum(
+            len(summarise_recording(path, site, progress=next_file()).passings)
+            for path in recordings
+        )
 
 
 def _print(console: "Console", found: Results, site: Site) -> None:
@@ -236,9 +238,24 @@ def _print(console: "Console", found: Results, site: Site) -> None:
         if len(crossed) > 1 or state.probability_of_loss is not None:
             console.print()
             print_bridge(console, site.bridge(name), state)
+        elif state.between_crossing_std is not None:
+            console.print(_as_state(site.bridge(name), state), highlight=False)
 
 
-def _print_crossing(console: "Console", crossing: Crossing, site: Site) -> None:
+def _as_state(bridge: Bridge, state: BridgeResult) -> str:
+    """Return the lowest element of a state of one crossing, as reports and pictures show it."""
+    nominal = bridge.nominal_flexural_rigidity_nm2
+    ratio, low, high, name = min(
+        (one.mean / ei, one.q025 / ei, one.q975 / ei, name)
+        for (name, one), ei in zip(state.elements.items(), nominal, strict=True)
+    )
+    return (
+        f"with between-crossing variability, as in reports: {name} {ratio:.3f} "
+        f"({low:.3f} … {high:.3f})"
+    )
+
+
+def _print_crossing(console: "Console", crossing: CrossingResult, site: Site) -> None:
     method = crossing.method.replace("_", " ")
     console.print(
         f"[bold]{crossing.crossing_id}[/]\n"
@@ -259,10 +276,10 @@ def _print_crossing(console: "Console", crossing: Crossing, site: Site) -> None:
         "no_noise_model" not in crossing.reasons,
         None if crossing.derived is None else _below(crossing.derived),
     )
-    words = resolution(crossing)
+    words = unresolved_note(crossing)
     if words is not None:
         console.print(f"[bold]{words}[/]", highlight=False)
-    for line in _remarks(crossing):
+    for line in _fit_lines(crossing):
         console.print(line, highlight=False)
 
 
@@ -271,52 +288,58 @@ def _below(derived: Derived) -> dict[str, dict[str, float]] | None:
     return None if below is None else {name: {"10": share} for name, share in below.items()}
 
 
-def _of_ends_and_springs(derived: Derived) -> Iterator[str]:
-    """What was decided about things that may be there or not."""
+def _support_lines(derived: Derived, *, torsion_declared: bool) -> Iterator[str]:
+    """Describe the probabilities of what may be absent, and the suspension's weight."""
 
     def at_ends(likely: AtEnds) -> str:
         return f"{100.0 * likely.start:.0f} % at the start, {100.0 * likely.end:.0f} % at the end"
 
     if derived.probability_sprung is not None:
-        yield f"a spring holds the end of the bridge: {at_ends(derived.probability_sprung)}"
+        yield f"probability of rotational restraint: {at_ends(derived.probability_sprung)}"
     if derived.probability_giving is not None:
-        yield f"a bearing gives under load: {at_ends(derived.probability_giving)}"
-    if derived.probability_torsion:
+        yield f"probability of bearing compliance: {at_ends(derived.probability_giving)}"
+    if torsion_declared:
+        yield "the deck twists under the truck: declared, the lane is off the axis"
+    elif derived.probability_torsion:
         likely = f"{100.0 * derived.probability_torsion:.0f} %"
         yield f"probability that the deck twists under the truck: {likely}"
     if derived.springs_believed is not None:
-        yield f"the truck's springs are believed to {100.0 * derived.springs_believed:.0f} %"
+        yield f"suspension weight: {100.0 * derived.springs_believed:.0f} %"
 
 
-def _of_level_and_road(crossing: Crossing) -> Iterator[str]:
-    """The coarser picture, and by how much the axles' roads differ."""
+def _level_lines(crossing: CrossingResult) -> Iterator[str]:
+    """Describe level and thirds of EI, and the mismatch of the road profiles."""
     derived = crossing.derived
     if derived is not None and derived.ei_level is not None and derived.ei_thirds is not None:
         thirds = (derived.ei_thirds.left, derived.ei_thirds.middle, derived.ei_thirds.right)
-        told = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
+        parts = ", ".join(f"{p.mean:.2f} ± {p.std:.2f}" for p in thirds)
         level = derived.ei_level
-        yield f"EI of nominal: mean {level.mean:.2f} ± {level.std:.2f}; thirds {told}"
+        yield f"EI / nominal: mean {level.mean:.2f} ± {level.std:.2f}; thirds {parts}"
     if crossing.road is not None and crossing.road.mismatch is not None:
         mismatch = crossing.road.mismatch
         yield (
-            f"the axles' roads differ by {mismatch.A_m3:.2g} m³ at long waves, a quarter of it at "
+            f"profile mismatch: {mismatch.A_m3:.2g} m³ at long wavelengths, a quarter of that at "
             f"{mismatch.n_0_per_m:.1f} cycles/m"
         )
 
 
-def _remarks(crossing: Crossing) -> Iterator[str]:
-    """How well the model fits, and what of the intervals all elements have in common."""
+def _fit_lines(crossing: CrossingResult) -> Iterator[str]:
+    """Describe how well the model fits and what all intervals have in common."""
     diagnostics = crossing.diagnostics
     if crossing.scale_error is not None:
         yield (
-            f"of that common to all elements: {100.0 * crossing.scale_error:.1f} % "
+            f"common to all elements: {100.0 * crossing.scale_error:.1f} % "
             "(standard deviation; mass, gain)"
         )
     if crossing.chi2_per_dof is not None:
-        yield f"misfit against the declared noise: chi2 {crossing.chi2_per_dof:.2f}, 1 expected"
-    yield from _of_level_and_road(crossing)
+        yield f"reduced chi-square: {crossing.chi2_per_dof:.2f} (expected 1)"
+    if crossing.hum_hz():
+        found = ", ".join(f"{hz:.1f} Hz" for hz in crossing.hum_hz())
+        yield f"hum removed from the signals: {found}"
+    yield from _level_lines(crossing)
     if crossing.derived is not None:
-        yield from _of_ends_and_springs(crossing.derived)
+        declared = is_torsion_declared(crossing)
+        yield from _support_lines(crossing.derived, torsion_declared=declared)
     if "relative_misfit" in diagnostics:
         yield (
             f"the two roads differ by {diagnostics['residual_rms_m'] * 1e6:.2f} µm rms, "

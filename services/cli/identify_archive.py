@@ -1,4 +1,4 @@
-"""`driveby identify --into DIR`: an archive of recordings, whose results are kept as they come."""
+"""The command `driveby identify --into DIR`: an archive of recordings, stored as computed."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -6,10 +6,12 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.results import Crossing, Header, results, results_json
+from schemas.results import CrossingResult, ResultHeader, results, results_json
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site
+from services.catalogue.index import update_catalog
+from services.catalogue.positions import crossings_of
 from services.cli.bridge_table import print_bridge
 from services.cli.identify import check_certificates, warn_of_no_noise
 from services.cli.parsing import CERTIFICATES, EXIT_SOMETHING_LOST
@@ -17,18 +19,16 @@ from services.common.errors import InputError
 from services.common.files import check_writable, make_folder, write_atomically
 from services.common.progress import progress_bar
 from services.common.stores import Folder, files_below, folder_at
-from services.execution.archive import Archive, Asked, identify_archive
-from services.execution.dispatch import Execution
-from services.execution.here import Here
-from services.execution.kept import BRIDGES, Kept
-from services.history.baselines import baselines_of
-from services.history.catalog import mend
-from services.history.certificates import found_in
-from services.history.positions import crossings_of
+from services.execution.archive import ArchiveJob, ArchiveResult, identify_archive
+from services.execution.dispatch import CrossingExecutor
+from services.execution.inline import InlineExecutor
+from services.execution.result_store import BRIDGES, ResultStore
+from services.history.validation_files import passed_validations
 from services.identification.bridge_state import Fusing, with_common_shares
-from services.recordings.away import (
-    Away,
+from services.ledger.baselines import baselines_of
+from services.recordings.remote import (
     Recording,
+    RemoteRecording,
     Source,
     is_folder_of_recordings,
     recording_at,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _MOST_BRIDGES = 20
-"""So many are printed; all are in the file."""
+"""Maximum number of printed bridges; the file has all."""
 
 
 def archive_command(
@@ -54,13 +54,13 @@ def archive_command(
     baseline: Path | None,
     fuse_suspect: bool,
     of_single: Mapping[str, Path | None],
-    executing: AbstractContextManager[Execution | None],
+    executing: AbstractContextManager[CrossingExecutor | None],
     console: "Console",
 ) -> int:
-    """Identify what has no result in a folder yet, say what came of it; 3 if something is lost.
+    """Identify crossings without a result in a folder, print a summary; 3 if input was lost.
 
-    `of_single` are outputs that are made of single crossings only. InputError: one of these, a file
-    or folder that cannot be written, no site file, a catalogue that cannot be made.
+    `of_single` are outputs of single crossings only. Raise InputError for one of these, a file or
+    folder that cannot be written, no site file, or a catalogue that cannot be created.
     """
     for name, path in of_single.items():
         if path is not None:
@@ -77,22 +77,22 @@ def archive_command(
     recordings = _recordings(sources, known, problems)
     settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
     warn_of_no_noise(known, method)
-    asked = Asked(
+    asked = ArchiveJob(
         tuple(recordings),
         known,
         settings,
         Fusing(baselines_of(known, None if site is None else site.parent, baseline), fuse_suspect),
-        found_in(certificates or CERTIFICATES, known, settings),
+        passed_validations(certificates or CERTIFICATES, known, settings),
     )
-    kept = Kept(into)
-    crossings: list[Crossing] = []
+    kept = ResultStore(into)
+    crossings: list[CrossingResult] = []
     with executing as execution, progress_bar(console) as bar:
         task = bar.add_task("crossings", total=None)
         found = identify_archive(
             asked,
-            Here() if execution is None else execution,
+            InlineExecutor() if execution is None else execution,
             kept,
-            take=crossings.append if json_path is not None else lambda crossing: None,
+            on_result=crossings.append if json_path is not None else lambda crossing: None,
             report=lambda number: bar.update(task, description=f"{number} crossings"),
         )
     header = asked.header
@@ -100,17 +100,17 @@ def archive_command(
     if json_path is not None:
         crossings.sort(key=lambda one: (one.entry_time, one.crossing_id))
         _write(json_path, header, with_common_shares(crossings, found.bridges), found)
-    return _told(found, [*problems, *found.problems], known, into, console)
+    return _print_summary(found, [*problems, *found.problems], known, into, console)
 
 
 def _site_of(sources: Sequence[Source], site: Path | None) -> Site:
-    """The site file given, or the first one that a recording has; one that is damaged has none."""
+    """Return the site file given, or the first of a recording; a damaged recording has none."""
     if site is not None:
         return load_site(site)
     for recording in chain.from_iterable(map(_all_of, sources)):
         try:
             text = stored_site(recording)
-        except InputError:  # told where it is read
+        except InputError:  # reported where it is read
             continue
         if text is not None:
             return parse_site(text, f"{recording}: site.toml")
@@ -118,7 +118,7 @@ def _site_of(sources: Sequence[Source], site: Path | None) -> Site:
 
 
 def _all_of(source: Source) -> Iterator[Recording]:
-    """The recording that is named, or all of a folder."""
+    """Yield the named recording, or all of a folder."""
     if not is_folder_of_recordings(source):
         yield recording_at(source)
         return
@@ -128,14 +128,14 @@ def _all_of(source: Source) -> Iterator[Recording]:
 
 
 def _in_folder(source: Source, folder: Folder, name: str) -> Recording:
-    return source / name if isinstance(source, Path) else Away(folder, name)
+    return source / name if isinstance(source, Path) else RemoteRecording(folder, name)
 
 
 def _recordings(sources: Sequence[Source], site: Site, problems: list[str]) -> list[Recording]:
-    """Recordings that are named; of folders those in which positions show a crossing.
+    """Return named recordings, and of folders those with a crossing by their positions.
 
-    A folder's catalogue is mended first: what it said that was not so is a problem, a line each. It
-    is kept there if the folder may be written.
+    A folder's catalogue is updated first; each contradiction in it is a problem, one line each. It
+    is stored there if the folder is writable.
     """
     found: list[Recording] = []
     for source in sources:
@@ -143,20 +143,22 @@ def _recordings(sources: Sequence[Source], site: Site, problems: list[str]) -> l
             found.append(recording_at(source))
             continue
         folder = folder_at(str(source))
-        mended = mend(folder, must_write=False)
-        looked = crossings_of(folder, mended.rows.values(), site)
-        problems += (*mended.problems, *looked.problems)
-        with_crossings = {path for one in looked.crossings for path in one.recordings}
+        mended = update_catalog(folder, must_write=False)
+        scan = crossings_of(folder, mended.rows.values(), site)
+        problems += (*mended.problems, *scan.problems)
+        with_crossings = {path for one in scan.crossings for path in one.recordings}
         found += (_in_folder(source, folder, path) for path in sorted(with_crossings))
     return found
 
 
-def _write(path: Path, header: Header, crossings: list[Crossing], found: Archive) -> None:
+def _write(
+    path: Path, header: ResultHeader, crossings: list[CrossingResult], found: ArchiveResult
+) -> None:
     write_atomically(path, results_json(results(header, crossings, found.bridges)))
 
 
-def _told(
-    found: Archive, problems: Sequence[str], site: Site, into: Path, console: "Console"
+def _print_summary(
+    found: ArchiveResult, problems: Sequence[str], site: Site, into: Path, console: "Console"
 ) -> int:
     def say(line: str) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`driveby info`: what is in recordings, for people and as JSON."""
+"""The command `driveby info`: contents of recordings, for people and as JSON."""
 
 import argparse
 import json
@@ -12,16 +12,16 @@ from services.cli.parsing import add_site, command
 from services.common.errors import InputError
 
 if TYPE_CHECKING:
-    from services.drives.survey import Gap, Survey, Truck
-    from services.identification.bridges import Passing
+    from services.catalogue.contents import Gap, RecordingSummary, TruckSummary
+    from services.finding.bridges import DetectedCrossing
 
 _NS_PER_S: Final = 1_000_000_000  # schemas.signals has it too, and takes numpy to import
 _MOST_LINES: Final = 20
-"""So many gaps and crossings of one recording are listed for people."""
+"""Maximum number of gaps and crossings of a recording in the listing."""
 
 
 def add_info(commands: Any) -> None:
-    """`driveby info`: say what is in recordings."""
+    """Add `driveby info`: summarise recordings."""
     p = command(
         commands,
         "info",
@@ -42,20 +42,20 @@ def add_info(commands: Any) -> None:
 
 def _info(options: argparse.Namespace) -> int:
     from schemas.site_file import load_site
+    from services.catalogue.contents import summarise_recording
     from services.common.progress import reading_bar
-    from services.drives.survey import survey
-    from services.recordings.together import recordings_in
+    from services.recordings.merge import recordings_in
 
     site = None if options.site is None else load_site(options.site)
-    found: list[Survey] = []
+    found: list[RecordingSummary] = []
     unreadable: dict[Path, str] = {}
     recordings = list(recordings_in(options.paths))
     with reading_bar("reading", recordings) as next_file:
         for path in recordings:
             try:
-                found.append(survey(path, site, progress=next_file()))
+                found.append(summarise_recording(path, site, progress=next_file()))
             except InputError as error:
-                if path in options.paths:  # of a folder the others are of interest all the same
+                if path in options.paths:  # the other files of a folder are still of interest
                     raise
                 unreadable[path] = str(error).removeprefix(f"{path}: ")
     if options.json:
@@ -70,8 +70,8 @@ def _info(options: argparse.Namespace) -> int:
     return 0
 
 
-def as_json(one: "Survey") -> dict[str, Any]:
-    """Everything that is known of a recording; times are seconds since 1970 UTC."""
+def as_json(one: "RecordingSummary") -> dict[str, Any]:
+    """Return the complete summary of a recording; times are seconds since 1970 UTC."""
     about, info = one.info.about, one.info
     return {
         "path": str(one.path),
@@ -135,8 +135,8 @@ def as_json(one: "Survey") -> dict[str, Any]:
     }
 
 
-def lines_of(one: "Survey") -> Iterator[str]:
-    """What a person wants to know of one recording."""
+def lines_of(one: "RecordingSummary") -> Iterator[str]:
+    """Yield the lines of one recording's summary."""
     seconds = (one.last_ns - one.first_ns) / _NS_PER_S
     yield f"{one.path}"
     yield f"  {_size(one.size_bytes)}, {_state(one)}"
@@ -170,7 +170,7 @@ def lines_of(one: "Survey") -> Iterator[str]:
         yield from _some("crossing", one.passings, map(_line_of_passing, one.passings))
 
 
-def _lines_of_truck(truck: "Truck") -> Iterator[str]:
+def _lines_of_truck(truck: "TruckSummary") -> Iterator[str]:
     seconds = (truck.last_ns - truck.first_ns) / _NS_PER_S
     boots = f", {truck.boots} runs" if truck.boots > 1 else ""
     yield f"{truck.vehicle} in realm {truck.realm}: {_length(seconds)}{boots}"
@@ -200,7 +200,7 @@ def _line_of_gap(gap: "Gap") -> str:
     return f"{_time(gap.begin_ns)}  {gap.vehicle} {gap.stream}: nothing for {seconds:.1f} s"
 
 
-def _line_of_passing(passing: "Passing") -> str:
+def _line_of_passing(passing: "DetectedCrossing") -> str:
     seconds = (passing.exit_ns - passing.entry_ns) / _NS_PER_S
     through = passing.passage.value == "through"
     how = f"{seconds:.1f} s on it" if through else passing.passage.value
@@ -210,10 +210,13 @@ def _line_of_passing(passing: "Passing") -> str:
     )
 
 
-def _print_table(found: "list[Survey]", unreadable: dict[Path, str]) -> None:
-    """A line for each file, its name last: names are long."""
+def _print_table(found: "list[RecordingSummary]", unreadable: dict[Path, str]) -> None:
+    """Print a line for each file, its name last, as names are long."""
     rows = [("from (UTC)", "length", "trucks", "crossings", "gaps", "size", "state", "recording")]
-    for one in sorted(found, key=lambda survey: (survey.first_ns, survey.path)):
+    for one in sorted(
+        found,
+        key=lambda summarise_recording: (summarise_recording.first_ns, summarise_recording.path),
+    ):
         begin = f"{_day(one.first_ns)} {_time(one.first_ns)[:8]}"
         rows.append(
             (
@@ -248,18 +251,18 @@ def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def _state(one: "Survey") -> str:
+def _state(one: "RecordingSummary") -> str:
     damage = f", {one.info.damaged_chunks} damaged places" if one.info.damaged_chunks else ""
     if one.info.truncated:
         return f"cut off{damage}"
     return f"whole{damage}" if not damage else damage.removeprefix(", ")
 
 
-def _direction(passing: "Passing") -> str:
+def _direction(passing: "DetectedCrossing") -> str:
     return "start to end" if passing.forward else "end to start"
 
 
-def _end(one: "Survey") -> str:
+def _end(one: "RecordingSummary") -> str:
     same_day = _day(one.first_ns) == _day(one.last_ns)
     return _time(one.last_ns) if same_day else f"{_day(one.last_ns)} {_time(one.last_ns)}"
 

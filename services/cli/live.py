@@ -26,7 +26,7 @@ from services.common.endpoints import DEFAULT_ENDPOINT, default_endpoint
 
 
 def add_demo(commands: Any) -> None:
-    """`driveby demo`: simulate, publish, record, identify and draw one crossing."""
+    """Add `driveby demo`: simulate, publish, record, identify and draw one crossing."""
     p = command(
         commands,
         "demo",
@@ -55,7 +55,7 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def add_logger(commands: Any) -> None:
-    """`driveby logger`: record all messages of a realm and host the bus router."""
+    """Add `driveby logger`: record all messages of a realm and host the bus router."""
     p = command(
         commands,
         "logger",
@@ -114,7 +114,7 @@ def add_logger(commands: Any) -> None:
 
 def _logger(options: argparse.Namespace) -> int:
     from services import logger
-    from services.logger.writer import Limits
+    from services.logger.writer import RotationLimits
 
     listen = options.listen or default_endpoint(options.tls)
     return logger.run(
@@ -127,7 +127,7 @@ def _logger(options: argparse.Namespace) -> int:
         ready=lambda: print(f"ready, listening at {listen}", flush=True),
         tls=options.tls,
         insecure=options.insecure,
-        limits=Limits(
+        limits=RotationLimits(
             age_s=options.rotate_minutes * 60.0,
             bytes=round(options.rotate_mb * 1e6),
             min_free_bytes=round(options.min_free * 1e6),
@@ -137,7 +137,7 @@ def _logger(options: argparse.Namespace) -> int:
 
 
 def add_worker(commands: Any) -> None:
-    """`driveby worker`: identify crossings as they happen and publish the results."""
+    """Add `driveby worker`: identify crossings as they happen and publish the results."""
     p = command(
         commands,
         "worker",
@@ -198,8 +198,8 @@ def add_worker(commands: Any) -> None:
 
 def _worker(options: argparse.Namespace) -> int:
     from services import worker
-    from services.execution.watch import LIMIT_S
-    from services.worker.catching_up import DAYS
+    from services.execution.hang_watchdog import LIMIT_S
+    from services.worker.backfill import DAYS
 
     return worker.run(
         endpoint=options.endpoint or default_endpoint(options.tls),
@@ -221,7 +221,7 @@ def _worker(options: argparse.Namespace) -> int:
 
 
 def add_truck(commands: Any) -> None:
-    """`driveby truck`: publish a recording as a truck that drives now."""
+    """Add `driveby truck`: publish a recording as a truck that drives now."""
     p = command(
         commands,
         "truck",
@@ -287,7 +287,7 @@ def _truck(options: argparse.Namespace) -> int:
 
 
 def add_gateway(commands: Any) -> None:
-    """`driveby gateway`: publish as a truck of ours what a truck of others says."""
+    """Add `driveby gateway`: publish the data of a ROS 2 truck on the bus."""
     p = command(
         commands,
         "gateway",
@@ -295,7 +295,7 @@ def add_gateway(commands: Any) -> None:
         "publish the data of a ROS 2 truck on the bus",
         "driveby gateway ros2 --ros tcp/127.0.0.1:7447 --endpoint tcp/office:7447 --site site.toml",
     )
-    p.add_argument("what", choices=("ros2",), help="ros2: with rmw_zenoh, see docs/ros2.md")
+    p.add_argument("what", choices=("ros2",), help="ros2: with rmw_zenoh, see docs/truck.md")
     p.add_argument(
         "--ros",
         required=True,
@@ -326,7 +326,7 @@ def _gateway(options: argparse.Namespace) -> int:
 
 
 def add_health(commands: Any) -> None:
-    """`driveby health`: query the health of a logger or worker over the bus."""
+    """Add `driveby health`: query the health of a logger or worker over the bus."""
     p = command(
         commands,
         "health",
@@ -354,4 +354,4 @@ def _health(options: argparse.Namespace) -> int:
 
 
 SERVICES: Final = (_logger, _worker, _truck, _gateway)
-"""Run until they are stopped, and have nothing else to show for themselves than what they say."""
+"""Handlers that run until they are stopped, and whose log is their only output."""

@@ -1,9 +1,8 @@
-"""The command `driveby`: reads the arguments, calls one function, turns errors into exit codes.
+"""Entry point of `driveby`: parse arguments, call one function, map errors to exit codes.
 
-0 it worked, 1 it failed, 2 the input was bad; 3 of `recover`, `identify --into` and `history
-add`: it worked, but something is lost.
-The functions are imported when they are called, so that `driveby --help` does not wait for
-compilers and viewers.
+Exit codes: 0 success, 1 failure, 2 bad input; 3 for `recover`, `identify --into` and `history add`:
+success, but something is lost. Functions are imported when they are called, so that `driveby
+--help` does not wait for compilers and viewers.
 """
 
 import argparse
@@ -23,6 +22,7 @@ from services.cli.access import add_certs
 from services.cli.alarm import add_alarm
 from services.cli.catalog import add_catalog
 from services.cli.check import add_check
+from services.cli.closed_pipe import outliving_output, to_null
 from services.cli.cluster import SERVICES as CLUSTERS
 from services.cli.cluster import add_cluster
 from services.cli.completion import SHELLS, completion
@@ -38,6 +38,7 @@ from services.cli.live import (
     add_truck,
     add_worker,
 )
+from services.cli.needs import check_needs
 from services.cli.offline import (
     add_fuse,
     add_identify,
@@ -58,7 +59,7 @@ from services.common.outputs import declared
 
 _OBJECTS_BETWEEN_LOOKS: Final = 20_000
 _COUNTS_AT_EXIT: Final = ("_duckdb", "duckdb")
-"""Modules made with nanobind, whose types are in circles that a last collection takes apart."""
+"""Modules made with nanobind, whose types are in cycles that a last collection frees."""
 _COMMANDS: Final = (
     add_survey,
     add_check,
@@ -86,16 +87,33 @@ _COMMANDS: Final = (
     add_cluster,
     add_certs,
 )
-"""In the order in which `driveby --help` lists them."""
+"""Commands in the order of `driveby --help`."""
 
+_LARGEST_CHECKED: Final = 1 << 20
+"""Maximum size in bytes of a site file that is read once more for warnings."""
 EXIT_FAILED: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _BAD_NAMES: Final = frozenset(
     (errno.ENAMETOOLONG, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.ELOOP)
 )
-"""Errors of the system that the user mends by another name."""
+"""Errors of the system that another name avoids."""
 EXIT_BROKEN_PIPE: Final = 141
-"""What a shell reports of SIGPIPE, as `EXIT_INTERRUPTED` is of SIGINT."""
+"""Exit code that a shell reports for SIGPIPE, as `EXIT_INTERRUPTED` for SIGINT."""
+
+
+def _warn_of_site(path: object) -> None:
+    """Log unusual values in the site file of a command; the command reports errors."""
+    if not isinstance(path, Path) or not path.is_file() or path.stat().st_size > _LARGEST_CHECKED:
+        return
+    from schemas.site_file import load_site
+    from schemas.site_usual import warnings_of
+
+    try:
+        found = warnings_of(load_site(path))
+    except InputError:
+        return
+    for line in found:
+        logging.getLogger(__name__).warning("%s: %s", path, line)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -103,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Our matrices are small: threads that wait for each other at every column cost up to fifty
     # times the work itself when other processes want the cores too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Nobody's plugins look into our models, and looking for some takes time.
+    # No plugin inspects our models, and searching for plugins takes time.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     # Imports make a million objects that stay: to look for circles among them at every 700 takes
     # 0.1 s of an identification.
@@ -111,54 +129,59 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = _parser().parse_args(arguments)
     except InputError as error:
-        return _say(str(error), EXIT_BAD_INPUT)
-    # A service has nothing else to show for itself than what it says.
+        return _print_error(str(error), EXIT_BAD_INPUT)
+    # The log is a service's only output.
     _log(options.log_format, verbose=options.verbose or options.handler in (*SERVICES, *CLUSTERS))
     handler: Handler = options.handler
-    # A name need not be Unicode, and a line that says it must not fail.
+    # A name may be no Unicode, and a line with it must not fail.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
+        check_needs(options)
         files = files_of(options)
         _check_names(files)
         with declared(files.inputs, files.outputs):
             for path, kinds in files.outputs.items():
                 check_kind(path, kinds)
-            code = handler(options)
+            _warn_of_site(getattr(options, "site", None))
+            with outliving_output(is_needed=bool(files.outputs or files.folders)):
+                code = handler(options)
         sys.stdout.flush()
     except InputError as error:
-        return _say(str(error), EXIT_BAD_INPUT)
+        return _print_error(str(error), EXIT_BAD_INPUT)
     except FailureError as error:
-        return _say(str(error), EXIT_FAILED)
+        return _print_error(str(error), EXIT_FAILED)
     except KeyboardInterrupt:
-        return _say("interrupted", EXIT_INTERRUPTED)
+        return _print_error("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
-        # The reader of our output has gone; Python would complain again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # The reader of our output has closed it; Python would fail again when it flushes at exit.
+        to_null(sys.stdout)
         return EXIT_BROKEN_PIPE
     except Exception as error:
         if options.debug:
             traceback.print_exc()
         if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":
-            return _say(f"{error.object[:200]}: is no name in UTF-8; rename it", EXIT_BAD_INPUT)
+            return _print_error(
+                f"{error.object[:200]}: is no name in UTF-8; rename it", EXIT_BAD_INPUT
+            )
         if isinstance(error, OSError) and error.filename is not None:
             code = EXIT_BAD_INPUT if error.errno in _BAD_NAMES else EXIT_FAILED
-            return _say(str(name_error(Path(os.fsdecode(error.filename)), error)), code)
+            return _print_error(str(name_error(Path(os.fsdecode(error.filename)), error)), code)
         what = " ".join(f"{type(error).__name__}: {error}".split())[:300]
         hint = "" if options.debug else "; run with --debug for the traceback"
-        return _say(f"internal error, please report: {what}{hint}", EXIT_FAILED)
+        return _print_error(f"internal error, please report: {what}{hint}", EXIT_FAILED)
     return code
 
 
 def _check_names(files: Files) -> None:
-    """InputError if a name cannot be one of this file system, or relative names mean nothing."""
+    """Raise InputError for impossible names of files, and relative ones without a folder."""
     try:
         Path.cwd()
     except OSError as error:
         raise InputError("the working directory is gone, change to one that exists") from error
     for path in (*files.outputs, *files.folders):
-        if not is_unicode(str(path)):  # libraries that write cannot take such a name
+        if not is_unicode(str(path)):  # libraries that write cannot use such a name
             raise InputError(f"{path}: the name is not UTF-8; give another name to write")
     for path in (*files.inputs, *files.outputs, *files.folders):
         try:
@@ -169,10 +192,10 @@ def _check_names(files: Files) -> None:
 
 
 def program() -> int:
-    """`main` of a process of its own, which ends with it.
+    """Run `main` in a process of its own, which ends with it.
 
-    What is left is not looked through for circles once more, at the end of Python: 0.15 s. Not so
-    where a library counts what it finds alive at the very end, and prints a line for each object.
+    The last search for reference cycles at the end of Python is skipped: 0.15 s. It is not where a
+    library counts remaining objects at the very end, and prints a line for each.
     """
     code = main()
     if not any(name in sys.modules for name in _COUNTS_AT_EXIT):
@@ -211,7 +234,7 @@ class _Version(argparse.Action):
         sys.exit(0)
 
 
-def _say(line: str, code: int) -> int:
+def _print_error(line: str, code: int) -> int:
     print(f"driveby: {line}", file=sys.stderr)
     return code
 

@@ -1,4 +1,4 @@
-"""What the commands' options have in common: how they are named, explained, parsed and refused.
+"""Common parts of the commands' options: names, help, parsing and errors.
 
 Nothing heavy is imported here: `driveby --help` does not wait for compilers and viewers.
 """
@@ -21,17 +21,18 @@ RECORDINGS: Final = Path("recordings")
 SCENARIOS: Final = range(1, 13)
 CERTIFICATES: Final = RECORDINGS / "certificates"
 EXIT_SOMETHING_LOST: Final = 3
-"""As of `recover`: it worked, but something could not be read or identified."""
+"""Exit code of a success in which input could not be read or identified."""
 METHODS: Final = ("pre", "least-squares", "random-walk")
 
 Handler = Callable[[argparse.Namespace], int]
-"""Does what a command says; returns the exit code."""
+"""Type of a command's function, which returns the exit code."""
 
 
 _FORMER_OPTIONS: Final = {
     "alarm": {"--learning": "--training"},
     "history": {"--later": "--defer-fusion"},
     "identify": {"--certificates": "--validations", "--patience": "--reconnect-timeout"},
+    "import": {"--name": "--realm"},
     "simulate": {"--left": "--departed-vehicle"},
     "validate": {"--certificates": "--validations", "--worlds": "--out-of-model"},
     "worker": {
@@ -44,10 +45,10 @@ _FORMER_OPTIONS: Final = {
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, as every other error does."""
+    """Parser whose errors are one line, as all others."""
 
     former_options: Mapping[str, str] = {}
-    """Former spellings of this command's options, and what they are spelt now."""
+    """Former spellings of this command's options, with the present ones."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse arguments whose options may have their former spellings."""
@@ -73,7 +74,7 @@ def option_of(name: str) -> str:
 def command(
     commands: Any, name: str, handler: Handler, summary: str, example: str
 ) -> argparse.ArgumentParser:
-    """A command: what it is in a word and a sentence, and an example of its use."""
+    """Return a command with its summary, description and an example."""
     parser: Parser = commands.add_parser(
         name,
         help=summary,
@@ -88,10 +89,10 @@ def command(
 
 
 def add_common(parser: argparse.ArgumentParser, *, suppressed: bool) -> None:
-    """Options that may stand before or after the sub-command."""
+    """Add options that may precede or follow the sub-command."""
 
     def default(value: object) -> Any:
-        # A sub-command's default would overwrite what stood before the sub-command.
+        # A sub-command's default would overwrite the value before the sub-command.
         return argparse.SUPPRESS if suppressed else value
 
     group = parser.add_argument_group("messages")
@@ -111,19 +112,19 @@ def add_common(parser: argparse.ArgumentParser, *, suppressed: bool) -> None:
 
 
 def source(text: str) -> Path | str:
-    """A file or folder; an address such as s3://bucket/fleet stays as it is."""
+    """Return a file or folder; an address such as s3://bucket/fleet stays as it is."""
     return text if "://" in text else Path(text)
 
 
 @dataclass(frozen=True)
 class OutputFile:
-    """The type of an argument that names a file to write, and the kinds that it may replace.
+    """Type of an argument that names a file to write, and the kinds that it may replace.
 
     Every other path is an input, or a folder to write to (`folder_here`).
     """
 
     kinds: tuple[Kind, ...]
-    """None: the command has a rule of its own, as that the file must be new."""
+    """Kinds that may be replaced; None if the command has a rule of its own."""
 
     def __call__(self, text: str) -> Path:
         """Return the path."""
@@ -131,7 +132,7 @@ class OutputFile:
 
 
 class Files(NamedTuple):
-    """The paths among the arguments of a command."""
+    """Paths among the arguments of a command."""
 
     inputs: list[Path]
     """Files and folders to read."""
@@ -142,7 +143,7 @@ class Files(NamedTuple):
 
 
 def files_of(options: argparse.Namespace) -> Files:
-    """Return the paths that were given to a command, by what the command does with them."""
+    """Return the paths that were given to a command, by their use."""
     files = Files([], {}, [])
     for action in options.parser._actions:
         value = getattr(options, action.dest, None)
@@ -161,24 +162,24 @@ def files_of(options: argparse.Namespace) -> Files:
 
 
 def folder_here(text: str) -> Path:
-    """A folder of this machine to write to; an address would else become a folder called s3:."""
+    """Return a local folder to write to; an address would otherwise name a folder s3:."""
     if "://" in text:
         raise argparse.ArgumentTypeError(f"is {text!r}, a folder of this machine is expected")
     return Path(text)
 
 
 def add_site(p: Any, text: str, *, required: bool = False) -> None:
-    """`--site`: a site file."""
+    """Add `--site`: a site file."""
     p.add_argument("--site", type=Path, required=required, metavar="SITE.toml", help=text)
 
 
-def add_output(p: argparse.ArgumentParser) -> None:
-    """`-o`: the recording to write, which is replaced with `--force` only."""
+def add_output(p: argparse.ArgumentParser, *, required: bool = True) -> None:
+    """Add `-o`: the recording to write, which is replaced with `--force` only."""
     p.add_argument(
         "-o",
         "--output",
         type=OutputFile((MCAP,)),
-        required=True,
+        required=required,
         metavar="REC.mcap",
         help="recording to write",
     )
@@ -186,7 +187,7 @@ def add_output(p: argparse.ArgumentParser) -> None:
 
 
 def add_force(p: argparse.ArgumentParser) -> None:
-    """`--force`: replace what is there."""
+    """Add `--force`: replace existing files."""
     p.add_argument(
         "--force",
         action="store_true",
@@ -195,22 +196,22 @@ def add_force(p: argparse.ArgumentParser) -> None:
 
 
 def add_file(p: Any, option: str, metavar: str, text: str) -> None:
-    """An option that names a file to read."""
+    """Add an option that names a file to read."""
     p.add_argument(option, type=Path, metavar=metavar, help=text)
 
 
 def add_output_file(p: Any, option: str, metavar: str, text: str, *kinds: Kind) -> None:
-    """An option that names a file to write, which replaces a file of these kinds only."""
+    """Add an option that names a file to write, which replaces a file of these kinds only."""
     p.add_argument(option, type=OutputFile(kinds), metavar=metavar, help=text)
 
 
 def add_output_folder(p: Any, option: str, text: str, *, required: bool = False) -> None:
-    """An option that names a folder to write to."""
+    """Add an option that names a folder to write to."""
     p.add_argument(option, type=folder_here, required=required, metavar="DIR", help=text)
 
 
 def add_folder(p: argparse.ArgumentParser, text: str) -> None:
-    """`--folder`: where a service keeps what it writes."""
+    """Add `--folder`: where a service writes its files."""
     p.add_argument(
         "--folder",
         type=Path,
@@ -221,26 +222,26 @@ def add_folder(p: argparse.ArgumentParser, text: str) -> None:
 
 
 def add_certificates(p: Any, text: str) -> None:
-    """`--validations`: a folder of them."""
+    """Add `--validations`: a folder of validation records."""
     p.add_argument("--validations", type=Path, metavar="DIR", help=text)
 
 
 def add_seed(p: argparse.ArgumentParser) -> None:
-    """`--seed` of everything that is drawn."""
+    """Add `--seed` of all random numbers."""
     p.add_argument(
         "--seed", type=whole("a seed", 0), default=1, help="seed of all random numbers (default: 1)"
     )
 
 
 def add_noise(p: argparse.ArgumentParser, text: str, default: float = 0.0) -> None:
-    """`--noise` of the accelerometers."""
+    """Add `--noise` of the accelerometers."""
     p.add_argument(
         "--noise", type=number("a noise density", low=0, high=1e6), default=default, help=text
     )
 
 
 def add_speed(p: Any, default: float, zero: str = "") -> None:
-    """`--speed` in times of what it really was; `zero` says what 0 would mean."""
+    """Add `--speed` as a multiple of the original one; `zero` explains the value 0."""
     p.add_argument(
         "--speed",
         type=number("a factor", low=0 if zero else 1e-3, high=1e6),
@@ -251,7 +252,7 @@ def add_speed(p: Any, default: float, zero: str = "") -> None:
 
 
 def add_method(p: argparse.ArgumentParser) -> None:
-    """`--method`: how to identify."""
+    """Add `--method` of identification."""
     p.add_argument(
         "--method",
         choices=METHODS,
@@ -262,13 +263,13 @@ def add_method(p: argparse.ArgumentParser) -> None:
 
 
 def add_endpoint(p: Any) -> None:
-    """`--endpoint` and `--tls`: where the bus is, and who one is there."""
+    """Add `--endpoint` and `--tls`: address of the bus, and credentials."""
     p.add_argument("--endpoint", help=f"address of the logger (default: {DEFAULT_ENDPOINT})")
     add_tls(p)
 
 
 def add_tls(p: Any) -> None:
-    """`--tls`: a folder of credentials."""
+    """Add `--tls`: a folder of credentials."""
     p.add_argument(
         "--tls",
         type=Path,
@@ -279,17 +280,17 @@ def add_tls(p: Any) -> None:
 
 
 def add_realm(p: Any) -> None:
-    """`--realm`."""
+    """Add `--realm`."""
     p.add_argument("--realm", default="live", help="realm on the bus (default: live)")
 
 
 def add_id(p: argparse.ArgumentParser, default: str) -> None:
-    """`--id` of a service."""
+    """Add `--id` of a service."""
     p.add_argument("--id", default=default, help=f"name of this service (default: {default})")
 
 
 def number(what: str, *, low: float, high: float, hint: str = "") -> Callable[[str], float]:
-    """Parse a number between two limits; `what` it must be stands in the error, and a `hint`."""
+    """Return a parser of numbers between two limits; `what` and `hint` are for its error."""
 
     def parse(text: str) -> float:
         try:
@@ -307,7 +308,7 @@ def number(what: str, *, low: float, high: float, hint: str = "") -> Callable[[s
 
 
 def numbers(what: str, *limits: tuple[float, float]) -> Callable[[str], tuple[float, ...]]:
-    """As many numbers, with colons between, as there are limits."""
+    """Return a parser of as many numbers, separated by colons, as there are limits."""
 
     def parse(text: str) -> tuple[float, ...]:
         parts = text.split(":")
@@ -327,7 +328,7 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def whole(what: str, low: int, high: int = (1 << 63) - 1) -> Callable[[str], int]:
-    """Parse a whole number between two limits; `what` it must be stands in the error."""
+    """Return a parser of whole numbers between two limits; `what` is for its error."""
 
     def parse(text: str) -> int:
         try:
@@ -352,7 +353,11 @@ def scenario(text: str) -> int:
 
 
 def a_console() -> "Console":
-    """A console for what commands print."""
+    """Return a console for the output of commands."""
     from rich.console import Console
 
-    return Console()
+    class PipeConsole(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # Rich would exit with 1, a failure
+
+    return PipeConsole()

@@ -1,4 +1,4 @@
-"""`driveby recover`: a damaged recording becomes one that every reader opens."""
+"""The command `driveby recover`: rewrite a damaged recording for every reader."""
 
 import json
 from pathlib import Path
@@ -19,11 +19,12 @@ EXIT_CLEAN, EXIT_LOSSY = 0, 3
 def recover_command(
     *, source: Path, output: Path | None, set_aside: bool, as_json: bool, force: bool = False
 ) -> tuple[int, str]:
-    """Recover one recording; return 0 (nothing was lost) or 3, and a line that says what was found.
+    """Recover one recording; return 0 (nothing was lost) or 3, and a summary.
 
-    Writes to `output`, or beside the recording, where `force` replaces a recording. With
+    It is written to `output`, or beside the recording, where `force` replaces a recording. With
     `set_aside` the damaged file is then renamed to `….mcap.crashed`, so that a folder holds every
-    recording once. InputError and FailureError as of `recover_recording`; then nothing has changed.
+    recording once. Raise InputError and FailureError as `recover_recording` does, with nothing
+    changed.
     """
     if set_aside and output is not None:
         raise InputError("--set-aside goes with the usual name beside the recording, not with -o")

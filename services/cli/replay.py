@@ -1,4 +1,4 @@
-"""`driveby replay`: its options, and what it says at the end."""
+"""The command `driveby replay`: its options, and its summary."""
 
 import argparse
 from pathlib import Path
@@ -14,12 +14,12 @@ from services.cli.parsing import (
 )
 
 if TYPE_CHECKING:
-    from services.replay import Statistics
+    from services.replay import ReplayStatistics
 from services.common.endpoints import default_endpoint
 
 
 def add_replay(commands: Any) -> None:
-    """`driveby replay`: publish recorded messages again, unchanged, in a realm of their own."""
+    """Add `driveby replay`: publish recorded messages again, unchanged, in a separate realm."""
     p = command(
         commands,
         "replay",
@@ -84,10 +84,10 @@ def _replay(options: argparse.Namespace) -> int:
     from services.cli.terminal import has_terminal, terminal
     from services.common.errors import InputError
     from services.common.naming import checked_identifier, identifier_from
-    from services.replay.choice import Choice, parsed_rename
+    from services.replay.choice import ReplaySelection, parsed_rename
 
     if options.paused and not has_terminal():
-        raise InputError("--paused: nobody could go on: neither input nor output is a terminal")
+        raise InputError("--paused: cannot be resumed: neither input nor output is a terminal")
     name = options.name
     return replay.run(
         recordings=options.recordings,
@@ -98,7 +98,7 @@ def _replay(options: argparse.Namespace) -> int:
             if name is None
             else checked_identifier(name, "--name")
         ),
-        choice=Choice(
+        choice=ReplaySelection(
             options.start,
             options.end,
             options.duration,
@@ -117,12 +117,12 @@ def _replay(options: argparse.Namespace) -> int:
     )
 
 
-def _print(found: "Statistics") -> None:
+def _print(found: "ReplayStatistics") -> None:
     print("\n".join(summary(found)))
 
 
-def summary(found: "Statistics") -> list[str]:
-    """What was published, in lines; the pace is of what was played, and of no jump."""
+def summary(found: "ReplayStatistics") -> list[str]:
+    """Return a summary of the replay in lines; the pace covers played parts, no jumps."""
     streams = ", ".join(f"{stream} {n}" for stream, n in found.by_stream.items()) or "none"
     rounds = f", {found.rounds} rounds" if found.rounds > 1 else ""
     pace = ""
@@ -142,7 +142,7 @@ def summary(found: "Statistics") -> list[str]:
     if found.jumped_over:
         lines.append(f"{found.jumped_over} messages left out by jumps")
     if found.skipped_s:
-        lines.append(f"{found.skipped_s:.1f} s of silence passed over")
+        lines.append(f"{found.skipped_s:.1f} s of silence skipped")
     on_disk = "a logger has them on disk" if found.is_confirmed else "no logger confirmed them"
     lines.append(on_disk)
     return lines

@@ -1,4 +1,4 @@
-"""`driveby report`: results as a page to hand over."""
+"""The command `driveby report`: results as a page to hand over."""
 
 import argparse
 from pathlib import Path
@@ -6,10 +6,11 @@ from typing import Any
 
 from services.cli.parsing import OutputFile, add_file, add_site, command
 from services.common.kinds import HTML, PDF
+from services.common.language import LANGUAGES
 
 
 def add_report(commands: Any) -> None:
-    """`driveby report`: write results as one printable HTML file."""
+    """Add `driveby report`: write results as one printable HTML file."""
     p = command(
         commands,
         "report",
@@ -36,7 +37,15 @@ def add_report(commands: Any) -> None:
         "--pdf", action="store_true", help="also print it to OUT.pdf with an installed browser"
     )
     add_site(p, "site file of the bridges (default: that of a recording in the results' folder)")
-    add_file(p, "--baseline", "OLD.json", "results to compare with (default: the site file's)")
+    add_file(
+        p,
+        "--baseline",
+        "BEFORE.json",
+        "earlier results, shown beside these with the change (default: the site file's)",
+    )
+    p.add_argument(
+        "--language", choices=tuple(LANGUAGES), default="en", help="language (default: en)"
+    )
     add_file(p, "--history", "DIR", "add a page with each bridge over time, from this history")
     p.add_argument(
         "--period",
@@ -50,9 +59,10 @@ def _report(options: argparse.Namespace) -> int:
     from schemas.results import load_results
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
+    from services.common.language import language_of
     from services.common.progress import steps_bar
-    from services.history.site_of_results import site_of_results
-    from services.report.bridge import bridge_reports, with_pasts
+    from services.ledger.site_of_results import site_of_results
+    from services.report.bridge import bridge_reports, with_histories
     from services.report.page import page
     from services.report.pdf import find_browser, write_pdf
 
@@ -69,11 +79,12 @@ def _report(options: argparse.Namespace) -> int:
         results = load_results(path)
         files.append((path, results, site_of_results(path, results, options.site)))
     beside = None if options.site is None else options.site.parent
-    reports = bridge_reports(files, options.baseline, beside)
+    language = language_of(options.language)
+    reports = bridge_reports(files, options.baseline, beside, language)
     if options.history is not None:
-        reports = with_pasts(reports, options.history, options.period, print)
+        reports = with_histories(reports, options.history, options.period, print)
     with steps_bar(f"drawing {output}") as progress:
-        text = page(reports, progress)
+        text = page(reports, progress, language)
     write_atomically(output, text)
     for report in reports:
         print(f"{report.bridge.id}: {report.finding.headline} {' '.join(report.finding.sentences)}")

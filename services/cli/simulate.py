@@ -1,4 +1,4 @@
-"""`driveby simulate`: crossings of a known truth, with more physics where it is asked for."""
+"""The command `driveby simulate`: crossings with a known truth and out-of-model effects."""
 
 import argparse
 from typing import Any
@@ -31,7 +31,7 @@ def _speed_range(text: str) -> tuple[float, float]:
 
 
 def add_simulate(commands: Any) -> None:
-    """`driveby simulate`: write the recording of a simulated crossing."""
+    """Add `driveby simulate`: write the recording of a simulated crossing."""
     p = command(
         commands,
         "simulate",
@@ -70,9 +70,7 @@ def add_simulate(commands: Any) -> None:
     )
     receiver = p.add_mutually_exclusive_group()
     receiver.add_argument(
-        "--gps-noise",
-        action="store_true",
-        help="simulate the errors of a real GNSS receiver",
+        "--gps-noise", action="store_true", help="simulate the errors of a real GNSS receiver"
     )
     receiver.add_argument(
         "--perfect-gps",
@@ -87,18 +85,33 @@ def add_simulate(commands: Any) -> None:
         metavar="HZ",
         help="sampling rate (default: the site's, or 1000)",
     )
-    _add_surface(p.add_argument_group("several runs, and a road that is a surface"))
-    _add_beyond(p.add_argument_group("beyond what a site file tells (default: nothing)"))
+    _add_schedule(p.add_argument_group("several runs"))
+    _add_surface(p.add_argument_group("two-dimensional road surface"))
+    _add_beyond(p.add_argument_group("effects that a site file does not declare (default: none)"))
     add_output(p)
 
 
-def _add_surface(p: Any) -> None:
+def _add_schedule(p: Any) -> None:
     p.add_argument(
         "--runs",
         type=whole("a number of runs", 1, 100),
         default=1,
         help="number of runs over the same road, ten minutes apart, in one recording (default: 1)",
     )
+    p.add_argument(
+        "--days",
+        type=whole("a number of days", 1, 1000),
+        default=1,
+        help="number of days with these runs each, in one recording (default: 1)",
+    )
+    p.add_argument(
+        "--start",
+        metavar="TIME",
+        help="start of the first run, ISO 8601 with a zone (default: 2026-01-01T00:00:00Z)",
+    )
+
+
+def _add_surface(p: Any) -> None:
     p.add_argument(
         "--drive-seed",
         type=whole("a seed", 0),
@@ -132,10 +145,10 @@ def _add_surface(p: Any) -> None:
 
 
 def _on_surface(options: argparse.Namespace) -> Any:
-    from services.simulation.wheel_paths import OnSurface
+    from services.simulation.wheel_paths import SurfaceOptions
 
     if options.road_surface:
-        return OnSurface(options.tyres, options.rear_offset, options.wander or 0.0)
+        return SurfaceOptions(options.tyres, options.rear_offset, options.wander or 0.0)
     for name in ("tyres", "rear_offset", "wander"):
         if getattr(options, name) is not None:
             raise InputError(f"{option_of(name)}: only a --road-surface has it")
@@ -200,7 +213,7 @@ def _add_beyond(p: Any) -> None:
         type=number("a distance in m", low=-20, high=20),
         metavar="M",
         help="distance of the lane's middle to the left of the bridge's axis, looking from start "
-        "to end; with --torsion the deck twists under it (default: 0)",
+        "to end; with --torsion the deck twists under it (default: the site's, or 0)",
     )
     p.add_argument(
         "--torsion",
@@ -209,19 +222,20 @@ def _add_beyond(p: Any) -> None:
         ),
         metavar="RATIO:M",
         help="first torsional over first bending frequency of the deck and its radius of "
-        "gyration, with --lane-offset (2:2.3 is usual; default: the deck does not twist)",
+        "gyration, with a lane offset (2:2.3 is usual; default: the site's, or no twist)",
     )
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    from services.simulation.drive import Beyond, Left, simulate_command
+    from schemas.site_file import load_site
+    from services.simulation.drive import DepartedVehicle, OutOfModelEffects, simulate_command
+    from services.simulation.schedule import schedule_of
 
-    if (options.lane_offset is None) != (options.torsion is None):
-        given, missing = ("--torsion", "--lane-offset")
-        if options.torsion is None:
-            given, missing = missing, given
-        raise InputError(f"{given}: is of use with {missing} only, which is missing")
     stiffness = options.bearing_stiffness
+    if options.site is not None:
+        known = load_site(options.site)
+        if known.vehicles[0].tandem is not None:
+            return _simulate_tandem(options, known)
     return simulate_command(
         site=options.site,
         scenario=options.scenario,
@@ -233,20 +247,56 @@ def _simulate(options: argparse.Namespace) -> int:
         direction=options.direction,
         gps_noise=options.gps_noise,
         rate=options.rate,
-        beyond=Beyond(
+        beyond=OutOfModelEffects(
             options.support_springs,
             (1.0 / stiffness[0], 1.0 / stiffness[1]) if stiffness else (0.0, 0.0),
-            Left(*options.departed_vehicle) if options.departed_vehicle else None,
+            DepartedVehicle(*options.departed_vehicle) if options.departed_vehicle else None,
             options.friction,
             options.friction_growth,
             options.bilinear,
             options.air_springs,
         ),
-        twist=None if options.torsion is None else (options.lane_offset, *options.torsion),
+        lane=(options.lane_offset, options.torsion),
         surface=_on_surface(options),
-        runs=options.runs,
+        schedule=schedule_of(options.runs, options.days, options.start),
         drive_seed=options.drive_seed,
         output=options.output,
         force=options.force,
         console=a_console(),
+    )
+
+
+def _simulate_tandem(options: argparse.Namespace, site: Any) -> int:
+    from services.common.files import check_writable
+    from services.simulation.drive import ratios_of
+    from services.simulation.drive_tandem import TandemDrive, simulate_tandem
+    from services.simulation.lane import driven_lane
+    from services.simulation.schedule import schedule_of
+
+    for name in ("bearing_stiffness", "departed_vehicle", "bilinear", "air_springs", "tyres"):
+        if getattr(options, name):
+            raise InputError(f"{option_of(name)}: is not simulated for a truck with a tandem")
+    begin, end = options.speed
+    if begin != end:
+        raise InputError("--speed: is START:END, it must be one speed for a truck with a tandem")
+    check_writable(options.output, force=options.force)
+    lane_m, torsion = driven_lane(site.bridges[0], options.lane_offset, options.torsion)
+    how = TandemDrive(
+        (options.road, options.seed),
+        options.noise,
+        begin,
+        options.direction == "start_to_end",
+        options.gps_noise,
+        options.rate,
+        options.friction,
+        options.support_springs,
+        lane_m,
+        torsion,
+        _on_surface(options),
+        schedule_of(options.runs, options.days, options.start),
+        options.seed if options.drive_seed is None else options.drive_seed,
+    )
+    ratios = ratios_of(site.bridges[0], options.scenario, options.ei)
+    return simulate_tandem(
+        site, ratios, how, options.output, force=options.force, console=a_console()
     )

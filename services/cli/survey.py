@@ -1,21 +1,12 @@
-"""`driveby survey`: what a survey will tell, before anyone drives."""
+"""The command `driveby survey`: forecast a survey before the drive."""
 
 import argparse
 import json
-from collections.abc import Iterator
-from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any
 
 from services.cli.parsing import a_console, add_output_file, add_site, command, number, whole
 from services.common.kinds import PNG, SURVEY_JSON, SVG
-
-if TYPE_CHECKING:
-    from services.planning.survey import Expected, Outlook, Survey
-
-_SPEEDS: Final = (5.0, 20.0)
-_USUAL_M_PER_S: Final = 10.0
-_ROAD_CLASS: Final = "A"
 
 
 def _speeds(text: str) -> tuple[float, float]:
@@ -28,7 +19,7 @@ def _speeds(text: str) -> tuple[float, float]:
 
 
 def add_survey(commands: Any) -> None:
-    """`driveby survey`: say what a survey will tell."""
+    """Add `driveby survey`: forecast accuracy and detection of a survey."""
     p = command(
         commands,
         "survey",
@@ -96,10 +87,9 @@ def _survey(options: argparse.Namespace) -> int:
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
     from services.common.progress import progress_bar
-    from services.identification.placed import middle_site, sensor_rows, sensors_in_words
-    from services.planning.alternatives import with_noise, with_tyres
-    from services.planning.crossings import Road
-    from services.planning.survey import Asked, survey
+    from services.finding.placed import sensor_rows, sensors_in_words
+    from services.planning.forecast_text import as_json, lines_of
+    from services.planning.plan_survey import SurveyWishes, plan_survey
 
     figure: Path | None = options.figure
     if figure is not None and figure.suffix not in (".png", ".svg"):
@@ -108,23 +98,19 @@ def _survey(options: argparse.Namespace) -> int:
         if path is not None:
             check_writable(path)
     given = load_site(options.site)
-    site = middle_site(given)
-    if options.tyres is not None:
-        site = with_tyres(site, options.tyres)
-    if options.noise is not None:
-        site = with_noise(site, (options.noise,) * 4)
-    speeds = options.speed or _SPEEDS
-    wanted = site.bridges[0].survey_speed_m_per_s or _USUAL_M_PER_S
-    asked = Asked(options.loss, options.crossings, min(max(wanted, speeds[0]), speeds[1]), speeds)
-    road = Road(options.road or site.bridges[0].road_class or _ROAD_CLASS, options.wander)
-    console = a_console()
-    with progress_bar(console) as bar:
+    wishes = SurveyWishes(
+        options.loss,
+        options.crossings,
+        options.speed,
+        options.road,
+        options.tyres,
+        options.noise,
+        options.wander,
+    )
+    with progress_bar(a_console()) as bar:
         task = bar.add_task("crossings", total=None)
-        found = survey(
-            site,
-            road,
-            asked,
-            lambda done, jobs: bar.update(task, completed=done, total=jobs),
+        found = plan_survey(
+            given, wishes, lambda done, jobs: bar.update(task, completed=done, total=jobs)
         )
     if options.json is not None:
         rows = sensor_rows(given.sensor, given.vehicles[0])
@@ -139,179 +125,3 @@ def _survey(options: argparse.Namespace) -> int:
     for line in sensors_in_words(given.sensor, given.vehicles[0]):
         print(f"sensor {line}")
     return 0
-
-
-def as_json(found: "Survey") -> dict[str, Any]:
-    """Everything that was found, elements from the bridge's start."""
-    from pre_core.survey.detection import FALSE_ALARM, SURE
-    from services.planning.advice import advice, warnings
-    from services.planning.crossings import scale_error
-
-    site = found.planned.plan.site
-    return {
-        "vehicle": site.vehicles[0].id,
-        "bridge": site.bridges[0].id,
-        "loss": found.asked.loss,
-        "false_alarm": FALSE_ALARM,
-        "sure": SURE,
-        "crossings": found.asked.crossings,
-        "speed_m_per_s": found.asked.speed_m_per_s,
-        "road_class": found.road.road_class,
-        "wander_m": found.road.wander_m,
-        "scale_error": scale_error(site),
-        "planned": _outlook_json(found.planned),
-        "alternatives": [_outlook_json(one) for one in found.others],
-        "rougher_road": None if found.rougher is None else _outlook_json(found.rougher),
-        "speeds": [one._asdict() for one in found.speeds],
-        "growth": [_expected_json(one) for one in found.growth],
-        "warnings": list(warnings(found)),
-        "advice": advice(found),
-    }
-
-
-def _outlook_json(one: "Outlook") -> dict[str, Any]:
-    bridge = one.plan.site.bridges[0]
-    return {
-        "name": one.plan.name,
-        "element_lengths_m": list(bridge.lengths_m),
-        "middle_element": one.middle + 1,
-        "one_crossing": _expected_json(one.once),
-        "all_crossings": _expected_json(one.expected),
-        "crossings_needed": {"middle": one.needed_middle, "ends": one.needed_ends},
-    }
-
-
-def _expected_json(one: "Expected") -> dict[str, Any]:
-    return {
-        "crossings": one.crossings,
-        "std_ln_ei": one.std.tolist(),
-        "level_std": one.level_std,
-        "probability_seen": one.seen.tolist(),
-        "probability_seen_among_others": one.seen_among_others.tolist(),
-        "smallest_loss": one.smallest_loss.tolist(),
-    }
-
-
-def lines_of(found: "Survey") -> Iterator[str]:
-    """All that is said, at most 80 characters a line but for warnings and advice."""
-    from pre_core.survey.detection import FALSE_ALARM, SURE
-    from services.planning.advice import advice, tracks_of, tyres_of, warnings
-    from services.planning.survey import MOST_CROSSINGS
-
-    asked, planned = found.asked, found.planned
-    vehicle, bridge = planned.plan.site.vehicles[0], planned.plan.site.bridges[0]
-    speeds = [crossing.speed_m_per_s for crossing in planned.plan.tracks[0]]
-    tonnes = vehicle.total_mass_kg / 1e3
-    yield f"{vehicle.id} ({tonnes:.1f} t, {tyres_of(planned)}) over {bridge.id}"
-    yield (
-        f"({bridge.span_m:g} m, {bridge.elements} elements), road of class "
-        f"{found.road.road_class}, {asked.crossings} crossings at {speeds[0]:.1f} to "
-        f"{speeds[-1]:.1f} m/s"
-    )
-    if found.road.is_surface:
-        yield tracks_of(found)
-    yield f"a loss of {asked.loss:.0%} is to be seen; false alarms: {FALSE_ALARM:.0%} an element"
-    yield ""
-    yield from _aligned(_elements(found))
-    yield (
-        f"mean of all elements: ± {_percent(planned.once.level_std)} by 1 crossing, "
-        f"± {_percent(planned.expected.level_std)} by {asked.crossings}"
-    )
-    yield "±: standard deviation of EI, near 55% nothing is learnt; seen: probability that"
-    yield "the loss is seen, against the nominal value; by others: against the other"
-    yield f"elements; smallest: loss that is seen with {SURE:.0%}"
-    yield ""
-    yield from _aligned(_comparison(found))
-    yield f"by {asked.crossings} crossings; mean ±: of what all elements share; mid ±, seen,"
-    yield f"smallest: at midspan; needed, ends: crossings until it is seen with {SURE:.0%} at"
-    yield f"midspan, at both ends (elsewhere between them); –: more than {MOST_CROSSINGS};"
-    yield "t: only if the law lets it weigh that; the other way: in the other lane;"
-    yield "elements: longer ones"
-    yield ""
-    for line in warnings(found):
-        yield f"warning: {line}"
-    yield advice(found)
-
-
-def _aligned(rows: "list[list[str]]") -> Iterator[str]:
-    """Rows with their first cells at the left, the others at the right."""
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    for first, *cells in rows:
-        aligned = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
-        yield "  ".join([first.ljust(widths[0]), *aligned]).rstrip()
-
-
-def _elements(found: "Survey") -> list[list[str]]:
-    planned, count = found.planned, found.asked.crossings
-    ends = list(accumulate(planned.plan.site.bridges[0].lengths_m, initial=0.0))
-    once, whole = planned.once, planned.expected
-    heads = [
-        "element",
-        "from m",
-        "to m",
-        "± by 1",
-        f"± by {count}",
-        "seen",
-        "by others",
-        "smallest",
-    ]
-    return [
-        heads,
-        *(
-            [
-                f"EI_{e + 1}",
-                f"{ends[e]:.2f}",
-                f"{ends[e + 1]:.2f}",
-                _percent(once.std[e]),
-                _percent(whole.std[e]),
-                _percent(whole.seen[e]),
-                _percent(whole.seen_among_others[e]),
-                _percent(whole.smallest_loss[e]),
-            ]
-            for e in range(len(ends) - 1)
-        ),
-    ]
-
-
-def _comparison(found: "Survey") -> list[list[str]]:
-    rows = [["what if", "mean ±", "mid ±", "seen", "smallest", "needed", "ends"]]
-    rows += [_cells(one, one.plan.name) for one in (found.planned, *found.others)]
-    rows += [
-        [
-            f"at {at.speed_m_per_s:g} m/s",
-            _percent(at.level_std),
-            _percent(at.std_middle),
-            _percent(at.seen_middle),
-            _percent(at.smallest_middle),
-            "",
-            "",
-        ]
-        for at in found.speeds
-    ]
-    if found.rougher is not None:
-        name = f"road of class {chr(ord(found.road.road_class) + 1)}"
-        rows.append(_cells(found.rougher, name))
-    return rows
-
-
-def _cells(one: "Outlook", name: str) -> list[str]:
-    e = one.middle
-    return [
-        name,
-        _percent(one.expected.level_std),
-        _percent(one.expected.std[e]),
-        _percent(one.expected.seen[e]),
-        _percent(one.expected.smallest_loss[e]),
-        _count(one.needed_middle),
-        _count(one.needed_ends),
-    ]
-
-
-def _count(crossings: int | None) -> str:
-    return "–" if crossings is None else str(crossings)
-
-
-def _percent(share: float) -> str:
-    """Two digits that mean something."""
-    value = 100.0 * share
-    return f"{value:.1f}%" if value < 9.95 else f"{value:.0f}%"

@@ -1,4 +1,4 @@
-"""A replay on a terminal: keys, and a line that says where it is. Nothing of it anywhere else."""
+"""Terminal control of a replay: keys, and a status line."""
 
 import contextlib
 import logging
@@ -13,7 +13,7 @@ import tty
 from collections.abc import Iterator
 from typing import Final
 
-from services.replay.drive import Drive
+from services.replay.drive import ReplayDrive
 from services.replay.player import Command, Controls, Status
 
 KEYS: Final = {
@@ -31,11 +31,11 @@ HELP: Final = "space pause · s step · + - speed · n next crossing · q quit"
 _ERASE = "\r\x1b[K"
 _BAR_CELLS: Final = 24
 _FEWEST_CELLS: Final = 6
-"""A shorter bar tells nothing."""
+"""Fewest cells of a useful bar."""
 
 
 def has_terminal() -> bool:
-    """Whether somebody sees the output and can press keys: in the foreground, at both ends."""
+    """Return whether there is a user with keys: in the foreground, with terminals at both ends."""
     try:
         both = sys.stdin.isatty() and sys.stdout.isatty()
         return both and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
@@ -44,8 +44,8 @@ def has_terminal() -> bool:
 
 
 @contextlib.contextmanager
-def terminal(realm: str, drive: Drive, stop: threading.Event) -> Iterator[Controls]:
-    """Take keys and show the line; the terminal is at the end as it was before."""
+def terminal(realm: str, drive: ReplayDrive, stop: threading.Event) -> Iterator[Controls]:
+    """Read keys and show the status line; restore the terminal at the end."""
     waiting = bytearray()
 
     def wait(seconds: float) -> Command | None:
@@ -68,10 +68,10 @@ def terminal(realm: str, drive: Drive, stop: threading.Event) -> Iterator[Contro
             sys.stdout.flush()
 
 
-def status_line(drive: Drive, status: Status, width: int) -> str:
-    """Where the replay is: ▶ 10×  0:12.3 / 0:35.9  ━━━◆━━━────◇──  crossing 1 of 2.
+def status_line(drive: ReplayDrive, status: Status, width: int) -> str:
+    """Return the status line: ▶ 10×  0:12.3 / 0:35.9  ━━━◆━━━────◇──  crossing 1 of 2.
 
-    In at most `width` columns: where they are few the bar is shorter, for the words say more.
+    It has at most `width` columns: the bar is shortened first, as the words are more useful.
     """
     begin_ns, end_ns = drive.window
     length_s = (end_ns - begin_ns) * 1e-9
@@ -91,7 +91,7 @@ def status_line(drive: Drive, status: Status, width: int) -> str:
     return "  ".join(parts)[:width]
 
 
-def _bar(share: float, drive: Drive, length: int) -> str:
+def _bar(share: float, drive: ReplayDrive, length: int) -> str:
     begin_ns, end_ns = drive.window
     done = round(share * length)
     cells = ["━" if cell < done else "─" for cell in range(length)]
@@ -108,21 +108,21 @@ def _clock(seconds: float) -> str:
 
 
 def _next_command(pressed: bytearray) -> Command | None:
-    """Take the next key off what was pressed; keys that mean nothing are dropped."""
+    """Remove and return the next command from the keys; ignore keys without a meaning."""
     while pressed:
         text = pressed.decode("latin-1")
         key = next((key for key in KEYS if text.lower().startswith(key.lower())), None)
         if key is not None:
             del pressed[: len(key)]
             return KEYS[key]
-        # Of an unknown sequence that begins with Escape nothing may be taken for a key.
+        # No part of an unknown sequence that begins with Escape may count as a key.
         del pressed[: len(text) if text[0] == "\x1b" else 1]
     return None
 
 
 @contextlib.contextmanager
 def _pressed_at_once(descriptor: int) -> Iterator[None]:
-    """Keys come without Enter and are not echoed; also after a stop by Ctrl-Z."""
+    """Receive keys without Enter and echo; also after a stop by Ctrl-Z."""
     before = termios.tcgetattr(descriptor)
 
     def again(*_: object) -> None:
@@ -139,7 +139,7 @@ def _pressed_at_once(descriptor: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _log_on_lines_of_its_own() -> Iterator[None]:
-    """What is logged meanwhile is not written behind the line."""
+    """Write log messages on lines of their own, not behind the status line."""
 
     def erase(record: logging.LogRecord) -> bool:
         sys.stdout.write(_ERASE)

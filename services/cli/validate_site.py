@@ -1,4 +1,4 @@
-"""`driveby validate --site`: certificates of the pairs of a site file."""
+"""The command `driveby validate --site`: validation records of a site file's pairs."""
 
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -6,72 +6,76 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.certificates import Certificate, Pair, certificate_path, pair_hash
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import load_site
+from schemas.validation_records import (
+    ValidationRecord,
+    VehicleBridgePair,
+    pair_hash,
+    validation_path,
+)
+from services.common.child_process import end_with_parent
 from services.common.errors import InputError
 from services.common.files import check_writable, make_folder
 from services.common.progress import progress_bar
-from services.history.certificates import save
-from services.simulation.certificate import CROSSINGS, Trial, tried_in_processes
+from services.history.validation_files import save
+from services.simulation.validation_options import CertificateOptions
+from services.simulation.validation_trial import CROSSINGS, ValidationTrial, run_trial
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
-def validate_site_command(
-    *,
-    site: Path,
-    truck: str | None,
-    bridge: str | None,
-    certificates: Path,
-    seed: int,
-    processes: int,
-    console: "Console",
-) -> int:
-    """Make the certificate of every pair of the site, print a line for each; 1 if one failed.
+def validate_site_command(asked: CertificateOptions, console: "Console") -> int:
+    """Validate every pair of the site, print a line for each; return 1 if one failed.
 
-    InputError: a bad site file, a vehicle or bridge that it has not, a folder where nothing can be
-    written.
+    InputError: a bad site file, an unknown vehicle or bridge, or a folder that is not writable.
     """
-    known = load_site(site)
-    pairs = _pairs(known, site, truck, bridge)
+    known = load_site(asked.site)
+    pairs = _pairs(known, asked)
     settings = IdentificationSettings()
-    make_folder(certificates)
+    make_folder(asked.validations)
     for pair in pairs:
-        check_writable(certificate_path(certificates, pair_hash(known, pair, settings)))
+        check_writable(validation_path(asked.validations, pair_hash(known, pair, settings)))
     have_passed = True
-    # Not by fork: numba's and OpenBLAS's threads would not survive it.
+    # A fork is impossible: the threads of numba and OpenBLAS would not survive it.
     with (
         progress_bar(console) as bar,
-        ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool,
+        ProcessPoolExecutor(asked.processes, get_context("spawn"), end_with_parent) as pool,
     ):
         task = bar.add_task("simulated crossings", total=len(pairs))
         for done, pair in enumerate(pairs):
-            trial = Trial(known, pair, settings, seed)
-            for share in tried_in_processes(trial, pool, processes):
+            trial = ValidationTrial(known, pair, settings, asked.seed)
+            for share in run_trial(trial, pool, asked.processes):
                 bar.update(task, completed=done + share)
             certificate = trial.certificate(time.time())
-            path = save(certificates, certificate)
+            path = save(asked.validations, certificate)
             have_passed &= certificate.passed
             console.print(line_of(certificate, path), highlight=False, soft_wrap=True)
     return 0 if have_passed else 1
 
 
-def _pairs(known: Site, path: Path, truck: str | None, bridge: str | None) -> list[Pair]:
-    """The pairs that are asked for; InputError if the site has no such vehicle or bridge."""
+def _pairs(known: Site, asked: CertificateOptions) -> list[VehicleBridgePair]:
+    """Return the requested pairs; InputError for an unknown vehicle or bridge."""
     vehicles, bridges = [v.id for v in known.vehicles], [b.id for b in known.bridges]
+    truck, bridge = asked.truck, asked.bridge
     for option, wanted, ids in (("--truck", truck, vehicles), ("--bridge", bridge, bridges)):
         if wanted is not None and wanted not in ids:
-            raise InputError(f"{option}: {path} has no {wanted}, it has {', '.join(ids[:20])}")
+            raise InputError(
+                f"{option}: {asked.site} has no {wanted}, it has {', '.join(ids[:20])}"
+            )
     return [
-        Pair(v, b) for v in vehicles if truck in (None, v) for b in bridges if bridge in (None, b)
+        VehicleBridgePair(v, b)
+        for v in vehicles
+        if truck in (None, v)
+        for b in bridges
+        if bridge in (None, b)
     ]
 
 
-def line_of(certificate: Certificate, path: Path) -> str:
-    """What a certificate says, in one line."""
+def line_of(certificate: ValidationRecord, path: Path) -> str:
+    """Return a validation record in one line."""
     figures = certificate.figures
     how = "passed" if certificate.passed else "FAILED"
     fewer = "" if figures.crossings == CROSSINGS else f" (of {CROSSINGS}, the rest not needed)"

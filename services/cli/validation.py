@@ -1,9 +1,13 @@
-"""The command that asks whether the answers are true: validate."""
+"""The command for studies of the method's accuracy: validate."""
 
 import argparse
+import sys
 from collections.abc import Callable
+from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from types import ModuleType
+from typing import Any, Final, TypeVar
 
 from services.cli.parsing import (
     CERTIFICATES,
@@ -24,6 +28,14 @@ from services.cli.parsing import (
 )
 from services.common.errors import InputError
 from services.common.kinds import AIMS_JSON, RECORDS, VALIDATION_JSON, VALIDATION_PAGE
+from services.simulation.effects import EFFECTS
+from services.simulation.survey_kinds import KINDS
+from services.simulation.validation_options import (
+    CertificateOptions,
+    IntervalOptions,
+    ScenarioOptions,
+    SurveyOptions,
+)
 
 
 def _scenarios(text: str) -> tuple[int, ...]:
@@ -32,57 +44,14 @@ def _scenarios(text: str) -> tuple[int, ...]:
     return tuple(dict.fromkeys(scenario(part.strip()) for part in text.split(",")))
 
 
-EFFECTS: Final = (
-    "free",
-    "sprung",
-    "sinking",
-    "swing",
-    "tyres",
-    "friction",
-    "bilinear",
-    "air",
-    "spans",
-    "surface",
-    "torsion",
-    "left-and-right",
-    "everything",
+_CHECKOUT: Final = Path(__file__).parents[2]
+_Options = TypeVar("_Options", CertificateOptions, ScenarioOptions, IntervalOptions, SurveyOptions)
+_OF_CERTIFICATES: Final = frozenset(field.name for field in fields(CertificateOptions))
+_OF_METHODS: Final = frozenset(
+    field.name
+    for kind in (ScenarioOptions, IntervalOptions, SurveyOptions)
+    for field in fields(kind)
 )
-"""As in `simulation.worlds`, which is not imported for a line of help."""
-
-
-KINDS: Final = (
-    "steady",
-    "changing-2",
-    "changing-5",
-    "twin",
-    "single-5",
-    "single-10",
-    "loaded-and-empty",
-    "two-trucks",
-    "both-ways",
-    "five-elements",
-    "three-elements",
-    "everything",
-    "scenario-1",
-    "scenario-4",
-    "scenario-10",
-    "scenario-5",
-    "scenario-11",
-)
-"""As in `validation.surveys`, which is not imported for a line of help."""
-
-
-_OF_METHODS: Final = {
-    "scenarios": tuple(SCENARIOS),
-    "noise": 0.0,
-    "out_of_model": 0,
-    "surveys": 0,
-    "json": None,
-    "figures": None,
-    "page": None,
-}
-_OF_CERTIFICATES: Final = {"truck": None, "bridge": None, "validations": None}
-"""Options that belong to one kind of validation only, with their defaults."""
 
 
 def _some_of(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
@@ -102,7 +71,7 @@ def _some_of(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
 
 
 def add_validate(commands: Any) -> None:
-    """`driveby validate`: compare simulated crossings with the truth and the paper."""
+    """Add `driveby validate`: compare simulated crossings with the truth and the paper."""
     p = command(
         commands,
         "validate",
@@ -143,7 +112,7 @@ def add_validate(commands: Any) -> None:
         "(exit code 1 if an aim is missed; the options below) (default: paper, and with --site "
         "neither, but certificates)",
     )
-    of_site = p.add_argument_group("certificates of --site, see docs/certificates.md")
+    of_site = p.add_argument_group("certificates of --site, see docs/worker.md")
     of_site.add_argument(
         "--truck", metavar="ID", help="identifier of the only vehicle to validate (default: each)"
     )
@@ -205,8 +174,8 @@ def _add_options_of_pre(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument(
         "--kinds",
-        type=_some_of(KINDS),
-        default=KINDS,
+        type=_some_of(tuple(KINDS)),
+        default=tuple(KINDS),
         metavar="all|twin,steady,…",
         help=f"of {', '.join(KINDS)} (default: all)",
     )
@@ -219,75 +188,48 @@ def _add_options_of_pre(p: argparse.ArgumentParser) -> None:
     )
 
 
-def _validate_site(options: argparse.Namespace) -> int:
-    from services.cli.validate_site import validate_site_command
+def _validate(options: argparse.Namespace) -> int:
+    if options.site is not None and options.method is None:
+        from services.cli.validate_site import validate_site_command
 
-    return validate_site_command(
-        site=options.site,
-        truck=options.truck,
-        bridge=options.bridge,
-        certificates=options.validations or CERTIFICATES,
-        seed=options.seed,
-        processes=options.processes,
-        console=a_console(),
-    )
+        _refuse(options, _OF_METHODS - _OF_CERTIFICATES, "only with --method")
+        options.validations = options.validations or CERTIFICATES
+        return validate_site_command(_taken(CertificateOptions, options), a_console())
+    _refuse(options, _OF_CERTIFICATES - _OF_METHODS, "only with --site, no --method")
+    code: int
+    if options.method == "pre" and options.surveys:
+        run_surveys = _study("validation.run_surveys")
+        code = run_surveys.run(_taken(SurveyOptions, options), a_console())
+    elif options.method == "pre":
+        run_intervals = _study("validation.run_intervals")
+        code = run_intervals.run(_taken(IntervalOptions, options), a_console())
+    else:
+        paper = _study("paper.run")
+        code = paper.run(_taken(ScenarioOptions, options), a_console())
+    return code
 
 
-def _check_one_kind(options: argparse.Namespace) -> None:
-    """InputError if an option belongs to another kind of validation than the one asked for."""
-    makes_certificates = options.site is not None and options.method is None
-    others = _OF_METHODS if makes_certificates else _OF_CERTIFICATES
-    what = "only with --method" if makes_certificates else "only with --site, no --method"
-    for name, default in others.items():
-        if getattr(options, name) != default:
+def _refuse(options: argparse.Namespace, others: frozenset[str], what: str) -> None:
+    """Raise InputError if an option of another kind of validation was given."""
+    for action in options.parser._actions:
+        if action.dest in others and getattr(options, action.dest) != action.default:
             raise InputError(
-                f"{option_of(name)}: {what}, it has nothing to do with what is asked for"
+                f"{option_of(action.dest)}: {what}, it has nothing to do with what is asked for"
             )
 
 
-def _validate(options: argparse.Namespace) -> int:
-    _check_one_kind(options)
-    if options.site is not None and options.method is None:
-        return _validate_site(options)
-    if options.method == "pre" and options.surveys:
-        from services.cli.validate_surveys import validate_surveys_command
+def _taken(kind: type[_Options], options: argparse.Namespace) -> _Options:
+    """Return the options of one kind of validation."""
+    return kind(**{field.name: getattr(options, field.name) for field in fields(kind)})
 
-        return validate_surveys_command(
-            surveys=options.surveys,
-            kinds=options.kinds,
-            records=options.records,
-            site=options.site,
-            processes=options.processes,
-            console=a_console(),
+
+def _study(module: str) -> ModuleType:
+    """Import a module of the checkout's studies; InputError where there is no checkout."""
+    if not (_CHECKOUT / "studies").is_dir():
+        raise InputError(
+            "driveby validate runs from a checkout of the source only; the installed program has "
+            "the validation of a site: --site SITE.toml without --method"
         )
-    if options.method == "pre":
-        from services.cli.validate_pre import validate_pre_command
-
-        return validate_pre_command(
-            crossings=options.crossings,
-            control=options.control,
-            scenarios=options.scenarios,
-            worlds=options.out_of_model,
-            effects=options.effects,
-            records=options.records,
-            folder=options.truth,
-            site=options.site,
-            processes=options.processes,
-            json_path=options.json,
-            figures=options.figures,
-            page=options.page,
-            console=a_console(),
-        )
-    from services.cli.validate_paper import validate_command
-
-    return validate_command(
-        scenarios=options.scenarios,
-        noise=options.noise,
-        json_path=options.json,
-        figures=options.figures,
-        seed=options.seed,
-        site=options.site,
-        particles=options.particles,
-        steps=options.steps,
-        console=a_console(),
-    )
+    if str(_CHECKOUT) not in sys.path:
+        sys.path.insert(0, str(_CHECKOUT))
+    return import_module(f"studies.{module}")

@@ -1,4 +1,4 @@
-"""`driveby view`: a file, or what travels on the bus now, in the Rerun viewer."""
+"""The command `driveby view`: a file, or the live bus, in the Rerun viewer."""
 
 import argparse
 from typing import Any
@@ -8,7 +8,7 @@ from services.common.endpoints import LOOPBACK, default_endpoint
 
 
 def add_view(commands: Any) -> None:
-    """`driveby view`: open a recording, a result or the live bus in the Rerun viewer."""
+    """Add `driveby view`: open a recording, a result or the live bus in the Rerun viewer."""
     p = command(
         commands,
         "view",
@@ -57,7 +57,7 @@ def _view(options: argparse.Namespace) -> int:
             show=None if options.serve else "web" if options.web else "window",
             address=options.listen,
             port=options.port,
-            say=lambda line: print(line, flush=True),
+            print_line=lambda line: print(line, flush=True),
         )
     from services.viewer.view import view_command
 

@@ -1,4 +1,4 @@
-"""`driveby watch`: what happens in a realm, on a terminal as a page, elsewhere line by line."""
+"""The command `driveby watch`: a realm as a page on a terminal, elsewhere line by line."""
 
 import argparse
 import threading
@@ -14,16 +14,16 @@ from services.common.endpoints import default_endpoint
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from services.bus.listening import Listening
+    from services.bus.realm_listener import RealmListener
 
 _PERIOD_S: Final = 0.25
-"""How often the page is drawn."""
+"""Interval in s at which the page is drawn."""
 _HINT_AFTER_S: Final = 2.0
-"""Who has heard nothing for so long may be in the wrong realm."""
+"""Silence in s after which a hint names other realms."""
 
 
 def add_watch(commands: Any) -> None:
-    """`driveby watch`: trucks, crossings and results as they come."""
+    """Add `driveby watch`: show trucks, crossings and results live."""
     p = command(
         commands,
         "watch",
@@ -45,16 +45,16 @@ def _watch(options: argparse.Namespace) -> int:
 
 
 def watch_command(*, endpoint: str, realm: str, tls: Path | None, console: "Console") -> int:
-    """Show a realm until a signal comes; return 0. Waits for the router for ever.
+    """Show a realm until a signal arrives; return 0. Wait for the router without limit.
 
     InputError: a bad realm, endpoint or credentials.
     """
-    from services.bus.listening import listening
     from services.bus.playback import leave_at_once, stopped_by_signals
+    from services.bus.realm_listener import open_listener
 
     with (
         stopped_by_signals(leave_at_once) as stop,
-        listening(endpoint, tls, realm, stop.is_set) as heard,
+        open_listener(endpoint, tls, realm, stop.is_set) as heard,
     ):
         if heard is None:
             return 0
@@ -66,21 +66,21 @@ def watch_command(*, endpoint: str, realm: str, tls: Path | None, console: "Cons
 
 
 def _show_page(
-    listening: "Listening", endpoint: str, stop: threading.Event, console: "Console"
+    listening: "RealmListener", endpoint: str, stop: threading.Event, console: "Console"
 ) -> None:
     from rich.live import Live
 
+    from services.cli.realm_model import RealmModel
     from services.cli.watch_page import page
-    from services.cli.watched import Watched
 
-    watched = Watched()
+    model = RealmModel()
     with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
         while not stop.is_set():
             for heard in listening.heard():
-                watched.take(heard, time.monotonic(), time.time_ns())
+                model.ingest(heard, time.monotonic(), time.time_ns())
             where = f"realm {listening.realm} at {endpoint}"
             shown = page(
-                watched,
+                model,
                 where,
                 listening,
                 now_s=time.monotonic(),
@@ -92,31 +92,33 @@ def _show_page(
             stop.wait(_PERIOD_S)
 
 
-def _print_lines(listening: "Listening", stop: threading.Event, say: Callable[[str], None]) -> None:
-    from services.bus.listening import elsewhere_line
+def _print_lines(
+    listening: "RealmListener", stop: threading.Event, say: Callable[[str], None]
+) -> None:
+    from services.bus.realm_listener import other_realms_hint
+    from services.cli.realm_model import RealmModel
     from services.cli.watch_page import silent_trucks
-    from services.cli.watched import Watched
 
-    watched = Watched()
+    model = RealmModel()
     began_s = time.monotonic()
     hinted, silent = "", frozenset[str]()
 
-    def tell(line: str | None) -> None:
+    def print_line(line: str | None) -> None:
         if line is not None:
             say(f"{datetime.now(UTC):%H:%M:%S} {line}")
 
     while not stop.is_set():
         for heard in listening.heard():
             now_s = time.monotonic()
-            tell(watched.take(heard, now_s, time.time_ns()))
+            print_line(model.ingest(heard, now_s, time.time_ns()))
         now_s = time.monotonic()
-        gone = silent_trucks(watched, now_s)
+        gone = silent_trucks(model, now_s)
         for name in sorted(gone - silent):
-            tell(f"{name} is silent")
+            print_line(f"{name} is silent")
         silent = gone
-        hint = elsewhere_line(listening.realm, listening.elsewhere) or ""
-        is_empty = not watched.trucks and not watched.crossings
+        hint = other_realms_hint(listening.realm, listening.elsewhere) or ""
+        is_empty = not model.trucks and not model.crossings
         if is_empty and hint != hinted and now_s - began_s > _HINT_AFTER_S:
             hinted = hint
-            tell(hint or None)
+            print_line(hint or None)
         stop.wait(_PERIOD_S)

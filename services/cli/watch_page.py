@@ -1,4 +1,4 @@
-"""The page of `driveby watch`: what is known of a realm, as tables of a given width and height."""
+"""The page of `driveby watch`: the state of a realm in tables of given width and height."""
 
 from collections.abc import Iterable, Sequence, Set
 from datetime import UTC, datetime
@@ -9,30 +9,30 @@ from rich.table import Table
 from rich.text import Text
 
 from schemas.alarms import Alarm
-from schemas.topics import is_replayed
-from services.bus.listening import elsewhere_line
-from services.cli.watched import (
+from schemas.topics import is_from_recording
+from services.bus.realm_listener import other_realms_hint
+from services.cli.realm_model import (
     SILENT_S,
     BridgeRow,
-    Row,
-    Truck,
-    Watched,
+    CrossingRow,
+    RealmModel,
+    TruckRow,
     alarm_state,
+    route_text,
     service_figures,
-    way,
 )
 
 _BLOCKS: Final = "▁▂▃▄▅▆▇█"
 _STEP: Final = 0.2
-"""Of EI over nominal for each step of a bar: what is within a tenth of 1 is as high as 1."""
+"""Step of a bar in EI over nominal: all values within a tenth of 1 have equal height."""
 _WIDE: Final = 110
-"""Columns from which on there is room for intervals and reasons beside each other."""
+"""Columns from which intervals and reasons fit next to each other."""
 _OLD_S: Final = 60.0
-"""Samples that are older when they come are not of now."""
+"""Age in s at arrival from which samples are old."""
 _LATE_S: Final = 150.0
-"""A service that has said nothing for so long is not well, as for `driveby health`."""
+"""Silence in s after which a service is unhealthy, as for `driveby health`."""
 _MOST_ALARMS: Final = 4
-"""Lines of them at the head of a page, fewer on a low one."""
+"""Maximum number of alarm lines at the head of a page, fewer on a low one."""
 _MOST_BRIDGES: Final = 4
 _NO_ALARM: Final = (
     "No alarm was received; it is not known here whether driveby alarm serve watches any bridge."
@@ -40,8 +40,8 @@ _NO_ALARM: Final = (
 _VERDICTS: Final = {"good": "green", "suspect": "yellow", "rejected": "red"}
 
 
-class Heard(Protocol):
-    """What of a `Listening` is shown."""
+class ListenerView(Protocol):
+    """The shown part of a `RealmListener`."""
 
     realm: str
 
@@ -52,30 +52,30 @@ class Heard(Protocol):
 
 
 def page(
-    watched: Watched,
+    model: RealmModel,
     where: str,
-    listening: Heard,
+    listening: ListenerView,
     *,
     now_s: float,
     now_ns: int,
     width: int,
     height: int,
 ) -> RenderableType:
-    """The page at a moment; where there is no room the newest crossings and first trucks."""
+    """Return the page; without room it has the newest crossings and first trucks."""
     is_wide = width >= _WIDE
-    trucks, rows = _sorted_trucks(watched, now_s), watched.rows()
-    alarms = _alarms(watched.alarms.values(), max(1, min(_MOST_ALARMS, height // 10)))
-    taken = 11 + len(watched.services) + 3 * min(len(watched.bridges), _MOST_BRIDGES) + len(alarms)
-    taken += bool(watched.bridges) and not alarms
+    trucks, rows = _sorted_trucks(model, now_s), model.rows()
+    alarms = _alarms(model.alarms.values(), max(1, min(_MOST_ALARMS, height // 10)))
+    taken = 11 + len(model.services) + 3 * min(len(model.bridges), _MOST_BRIDGES) + len(alarms)
+    taken += bool(model.bridges) and not alarms
     room = max(8 - len(alarms), height - taken)
     most_trucks = max(2, min(len(trucks), room // 3))
-    parts: list[RenderableType] = [_headline(watched, where, now_ns), *alarms]
-    hint = elsewhere_line(listening.realm, listening.elsewhere)
+    parts: list[RenderableType] = [_headline(model, where, now_ns), *alarms]
+    hint = other_realms_hint(listening.realm, listening.elsewhere)
     if not trucks and not rows:
-        parts.append(Text(hint or "Nobody drives yet.", style="yellow" if hint else "dim"))
+        parts.append(Text(hint or "No trucks yet.", style="yellow" if hint else "dim"))
     if trucks:
         parts.append(_trucks(trucks[:most_trucks], listening, now_s))
-        parts += _old(trucks, listening.realm)
+        parts += _late_sample_notes(trucks, listening.realm)
         if len(trucks) > most_trucks:
             parts.append(Text(f"  and {len(trucks) - most_trucks} more", style="dim"))
     if rows:
@@ -83,13 +83,13 @@ def page(
         parts.append(_crossings(shown, is_wide=is_wide))
         if len(rows) > len(shown):
             parts.append(Text(f"  and {len(rows) - len(shown)} earlier", style="dim"))
-    if watched.bridges and not alarms:
+    if model.bridges and not alarms:
         parts.append(Text(_NO_ALARM, style="dim", no_wrap=True, overflow="ellipsis"))
-    if watched.bridges:
-        standing = {name for name, one in watched.alarms.items() if one.acknowledged is None}
-        parts.append(_bridges(watched.bridges, standing))
-    if watched.services:
-        parts.append(_services(watched, now_ns))
+    if model.bridges:
+        standing = {name for name, one in model.alarms.items() if one.acknowledged is None}
+        parts.append(_bridges(model.bridges, standing))
+    if model.services:
+        parts.append(_services(model, now_ns))
     spaced = [
         one for part in parts for one in ([Text()] if isinstance(part, Table) else []) + [part]
     ]
@@ -97,7 +97,7 @@ def page(
 
 
 def bars(ratios: Sequence[float], weak: frozenset[int], *, doubtful: bool = False) -> Text:
-    """A bar for each element, as high as its EI is of nominal; the weak ones stand out."""
+    """Return a bar for each element, as high as its relative EI; weak ones stand out."""
     text = Text()
     for number, ratio in enumerate(ratios, start=1):
         level = min(max(round(ratio / _STEP), 0), len(_BLOCKS) - 1)
@@ -106,30 +106,30 @@ def bars(ratios: Sequence[float], weak: frozenset[int], *, doubtful: bool = Fals
     return text
 
 
-def silent_trucks(watched: Watched, now_s: float) -> frozenset[str]:
-    """The trucks that have said nothing for a while."""
-    return frozenset(n for n, truck in watched.trucks.items() if now_s - truck.heard_s > SILENT_S)
+def silent_trucks(model: RealmModel, now_s: float) -> frozenset[str]:
+    """Return the trucks that have been silent for a while."""
+    return frozenset(n for n, truck in model.trucks.items() if now_s - truck.received_s > SILENT_S)
 
 
-def _sorted_trucks(watched: Watched, now_s: float) -> list[tuple[str, Truck]]:
-    """Those that drive first."""
-    silent = silent_trucks(watched, now_s)
-    return sorted(watched.trucks.items(), key=lambda item: (item[0] in silent, item[0]))
+def _sorted_trucks(model: RealmModel, now_s: float) -> list[tuple[str, TruckRow]]:
+    """Return the trucks, driving ones first."""
+    silent = silent_trucks(model, now_s)
+    return sorted(model.trucks.items(), key=lambda item: (item[0] in silent, item[0]))
 
 
-def _headline(watched: Watched, where: str, now_ns: int) -> Text:
-    over = [row for row in watched.crossings.values() if row.is_over]
+def _headline(model: RealmModel, where: str, now_ns: int) -> Text:
+    over = [row for row in model.crossings.values() if row.is_over]
     text = Text(no_wrap=True, overflow="ellipsis")
     text.append("driveby watch", style="bold")
     text.append(f"  {where}  {_clock(now_ns)} UTC  ")
-    text.append(f"{len(over)} done, {watched.waiting} waiting", style="dim")
+    text.append(f"{len(over)} done, {model.waiting} waiting", style="dim")
     return text
 
 
-def _trucks(trucks: Sequence[tuple[str, Truck]], listening: Heard, now_s: float) -> Table:
+def _trucks(trucks: Sequence[tuple[str, TruckRow]], listening: ListenerView, now_s: float) -> Table:
     table = _table("truck", "", "accelerometers", "batches/s", "fixes/s", "m/s", "lag")
     for name, truck in trucks:
-        silent_s = now_s - truck.heard_s
+        silent_s = now_s - truck.received_s
         batches, fixes = truck.rates(now_s)
         state = Text("drives", style="green")
         if silent_s > SILENT_S:
@@ -137,7 +137,9 @@ def _trucks(trucks: Sequence[tuple[str, Truck]], listening: Heard, now_s: float)
             state = Text(f"silent {_length(silent_s)}{there}", style="dim")
         hertz = "/".join(f"{rate:g}" for rate in sorted(set(truck.channels.values())))
         speed = "" if truck.speed_m_per_s is None else f"{truck.speed_m_per_s:.1f}"
-        lag = Text("replay", style="dim") if is_replayed(listening.realm) else _lag(truck.lag_s)
+        lag = (
+            Text("replay", style="dim") if is_from_recording(listening.realm) else _lag(truck.lag_s)
+        )
         table.add_row(
             name,
             state,
@@ -154,17 +156,17 @@ def _lag(seconds: float) -> Text:
     return Text(_length(seconds), style="yellow" if seconds > _OLD_S else "")
 
 
-def _old(trucks: Sequence[tuple[str, Truck]], realm: str) -> list[Text]:
-    """Why samples may be old when they come, where they are."""
+def _late_sample_notes(trucks: Sequence[tuple[str, TruckRow]], realm: str) -> list[Text]:
+    """Return lines on why samples are old at their arrival, if they are."""
     old = [name for name, truck in trucks if truck.lag_s > _OLD_S]
-    if not old or is_replayed(realm):
+    if not old or is_from_recording(realm):
         return []
     why = "played faster than real, sent late, or a clock is off"
     said = f"  {', '.join(old[:3])}: samples are old when they come: {why}"
     return [Text(said, style="yellow", no_wrap=True, overflow="ellipsis")]
 
 
-def _crossings(rows: Sequence[Row], *, is_wide: bool) -> Table:
+def _crossings(rows: Sequence[CrossingRow], *, is_wide: bool) -> Table:
     names = ("entry", "crossing", "", "EI", "lowest, of nominal")
     table = _table(*names, *(["why"] if is_wide else []))
     for row in rows:
@@ -182,13 +184,19 @@ def _crossings(rows: Sequence[Row], *, is_wide: bool) -> Table:
         elif not is_wide:
             lowest = why
         heights = bars(row.ratios, row.weak, doubtful=row.state != "good")
-        cells: list[RenderableType] = [_clock(row.entry_ns), way(row), state, heights, lowest]
+        cells: list[RenderableType] = [
+            _clock(row.entry_ns),
+            route_text(row),
+            state,
+            heights,
+            lowest,
+        ]
         table.add_row(*cells, *([why] if is_wide else []))
     return table
 
 
 def _bridges(bridges: dict[str, BridgeRow], standing: Set[str]) -> Table:
-    """Those of which an alarm stands, then those that were heard of last."""
+    """Return the bridges: with a standing alarm first, then by the latest message."""
     table = _table("bridge", "crossings", "EI", "by all crossings")
     alarmed = [name for name in bridges if name in standing][-_MOST_BRIDGES:]
     quiet = [name for name in bridges if name not in standing]
@@ -205,7 +213,7 @@ def _bridges(bridges: dict[str, BridgeRow], standing: Set[str]) -> Table:
 
 
 def _alarms(alarms: Iterable[Alarm], most: int) -> list[Text]:
-    """A line for each, those that stand first: they are for whoever looks at nothing else."""
+    """Return a line for each alarm, standing ones first, for readers of the first lines."""
     known = sorted(alarms, key=lambda one: (one.acknowledged is not None, -one.raised, one.bridge))
     lines = [
         Text(
@@ -223,16 +231,16 @@ def _alarms(alarms: Iterable[Alarm], most: int) -> list[Text]:
     return lines
 
 
-def _services(watched: Watched, now_ns: int) -> Table:
+def _services(model: RealmModel, now_ns: int) -> Table:
     table = _table("service", "", "")
-    for name, service in sorted(watched.services.items()):
+    for name, service in sorted(model.services.items()):
         age_s = (now_ns - service.time_ns) * 1e-9
         state = Text("well", style="green")
         if age_s > _LATE_S:
             state = Text(f"silent {_length(age_s)}", style="red")
         elif not service.ok:
             state = Text("not well", style="red")
-        said = [service_figures(service), watched.work.get(name, "")]
+        said = [service_figures(service), model.work.get(name, "")]
         table.add_row(name, state, "; ".join(one for one in said if one))
     return table
 

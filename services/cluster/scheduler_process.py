@@ -1,11 +1,11 @@
-"""The scheduler below `driveby cluster`: Dask's own, which ends with that command only.
+"""Scheduler process of `driveby cluster`: Dask's own, which ends with that command only.
 
-    python -m services.common.leash services.cluster.scheduler_process ARGUMENT…
+    python -m services.common.child_process services.cluster.scheduler_process ARGUMENT…
 
 The arguments are those of `dask scheduler`. Dask's scheduler ends with exit code 0 on SIGTERM and
-SIGINT, when any client asks for it (`Client.shutdown`) and after the time-out `idle-timeout` of its
-configuration, and each of them is a line at level INFO that nobody sees. Here a client is refused,
-and the cause of any end stands in the file that the environment names (`CAUSE_FILE`).
+SIGINT, at the request of any client (`Client.shutdown`) and after the time-out `idle-timeout` of
+its configuration, each of which is a line at level INFO that is not shown. Here a client is
+refused, and the cause of any end is written to the file that the environment names (`CAUSE_FILE`).
 """
 
 import os
@@ -16,7 +16,7 @@ from typing import Any, Final
 CAUSE_FILE: Final = "DRIVEBY_CLUSTER_CAUSE_FILE"
 """Name of the environment variable with the path of the file for the cause of the end."""
 _BY_SIGNAL: Final = "signal-"
-"""Dask's reasons begin so where a signal is the cause; its number follows."""
+"""Beginning of Dask's reasons where a signal is the cause; its number follows."""
 
 
 def main() -> None:
@@ -45,7 +45,7 @@ def _refuse(**_: object) -> None:
 
 
 def _record(reason: str) -> None:
-    """Write the cause of the end; the first one, as Dask closes what it has closed once more."""
+    """Write the first cause of the end: Dask closes twice."""
     path = Path(os.environ[CAUSE_FILE])
     if not path.exists():
         path.write_text(_cause(reason))

@@ -1,1 +1,1 @@
-"""What several services need. Imports none of them."""
+"""Functions that several services need; imports none of the services."""

@@ -1,4 +1,4 @@
-"""The disk as recordings see it: the few calls that can fail, in one place."""
+"""Disk operations of recordings: the few calls that can fail, in one place."""
 
 import errno
 import os
@@ -9,16 +9,16 @@ from typing import NamedTuple, Protocol
 
 
 class RawFile(Protocol):
-    """An unbuffered file opened for writing, as `open(path, "xb", buffering=0)` gives it."""
+    """An unbuffered file opened for writing, as `open(path, "xb", buffering=0)` returns it."""
 
     def write(self, data: memoryview, /) -> int | None:
-        """Write some of the data; return how many bytes."""
+        """Write some of the data; return the number of bytes."""
 
     def truncate(self, size: int, /) -> int:
-        """Cut the file."""
+        """Truncate the file."""
 
     def seek(self, offset: int, /) -> int:
-        """Write from there on."""
+        """Move to an offset for the next write."""
 
     def fileno(self) -> int:
         """Return the descriptor."""
@@ -28,20 +28,20 @@ class RawFile(Protocol):
 
 
 class Disk(NamedTuple):
-    """What a writer of recordings asks of the disk. Each may raise OSError."""
+    """The disk operations of a recording's writer. Each may raise OSError."""
 
     create: Callable[[Path], RawFile]
-    """Make a new file; FileExistsError if there is one."""
+    """Create a new file; raise FileExistsError if it exists."""
     sync: Callable[[int], None]
-    """Bring a file (by its descriptor) to the disk itself."""
+    """Sync a file, by its descriptor, to the disk."""
     sync_folder: Callable[[Path], None]
-    """Bring the names in a folder to the disk itself."""
+    """Sync the names in a folder to the disk."""
     free_bytes: Callable[[Path], int]
-    """Room left for this user on the disk that holds a folder."""
+    """Free space for this user on the disk of a folder."""
 
 
 def write_all(file: RawFile, data: bytes) -> None:
-    """Write all of the data, in as many calls as it takes; OSError if the file takes no more."""
+    """Write all of the data, in as many calls as necessary; raise OSError if none is accepted."""
     view = memoryview(data)
     while view:
         taken = file.write(view)

@@ -1,4 +1,4 @@
-"""Where the router is unless somebody says otherwise; `--help` says it without loading the bus."""
+"""The default endpoint of the router, known to `--help` without loading the bus."""
 
 from pathlib import Path
 from typing import Final
@@ -9,5 +9,5 @@ DEFAULT_TLS_ENDPOINT: Final = "tls/127.0.0.1:7447"
 
 
 def default_endpoint(tls: Path | None) -> str:
-    """Where a logger listens and the others connect, with and without credentials."""
+    """Return the default endpoint of a logger and its clients, with or without credentials."""
     return DEFAULT_ENDPOINT if tls is None else DEFAULT_TLS_ENDPOINT

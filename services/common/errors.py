@@ -1,15 +1,15 @@
-"""The ways in which a command ends badly: two with one line for the user, and an interruption."""
+"""Errors that end a command: two with one line for the user, and an interruption."""
 
 from schemas.errors import InputError, one_line
 
 __all__ = ["EXIT_INTERRUPTED", "FailureError", "InputError", "one_line"]
 
 EXIT_INTERRUPTED = 130
-"""What a shell reports of a program that SIGINT ended, and so do our own commands."""
+"""Exit code that a shell reports for a program ended by SIGINT, and that our commands return."""
 
 
 class FailureError(Exception):
-    """Something failed that was not bad input (disk full, nobody answers): exit code 1."""
+    """A failure that is not bad input (disk full, no answer): exit code 1."""
 
     def __init__(self, line: str) -> None:
         super().__init__(one_line(line))

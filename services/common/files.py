@@ -1,8 +1,8 @@
-"""Files that are whole or absent: written beside the target, synced, renamed.
+"""Files that are complete or absent: written beside the target, synced, renamed.
 
 An output replaces a file of its own kind only, never a site file, and never a file that the command
 reads (`services.common.outputs`). A recording is replaced only with `force`, and never while it is
-being written: its writer would continue into a file without a name.
+being written: its writer would continue into an unlinked file.
 """
 
 import errno
@@ -30,28 +30,28 @@ from services.common.outputs import check_no_input
 
 _RECORDING_SUFFIX = ".mcap"
 _LONGEST_NAME = 255
-"""Bytes of a name on the file systems of Linux and macOS."""
+"""Longest name in bytes on the file systems of Linux and macOS."""
 _RECORDING_MAGIC = b"\x89MCAP0\r\n"
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Replace `path` by `content` (text as UTF-8): readers see the old file or the whole new one.
+    """Replace `path` by `content` (text as UTF-8): readers see the old or the complete new file.
 
-    Raises InputError if nothing can be written there, FailureError if writing fails.
+    Raise InputError if the place is not writable, FailureError if writing fails.
     """
     with replaced_atomically(path) as temporary:
-        # The name of a file may stand in a text and need not be Unicode.
+        # A text may contain the name of a file, which need not be Unicode.
         encoded = content.encode(errors="backslashreplace") if isinstance(content, str) else content
         temporary.write_bytes(encoded)
 
 
 @contextmanager
 def replaced_atomically(path: Path, *, force: bool = False) -> Iterator[Path]:
-    """Give a temporary path beside `path` to write to; rename it when the block ends well.
+    """Yield a temporary path beside `path` to write to; rename it when the block succeeds.
 
     The temporary name keeps the suffix, because writers choose the format by it. If the block
     raises, or `path` must not be replaced (see `check_writable`), the temporary file is removed and
-    `path` stays as it was.
+    `path` is unchanged.
     """
     check_writable(path, force=force)
     temporary = _temporary(path)
@@ -59,7 +59,7 @@ def replaced_atomically(path: Path, *, force: bool = False) -> Iterator[Path]:
         try:
             yield temporary
             _sync(temporary)
-            check_writable(path, force=force)  # it took a while to get here
+            check_writable(path, force=force)  # check again: the block may have taken long
             _check_like(path, temporary)
             temporary.replace(path)
             _sync(path.parent)
@@ -70,9 +70,9 @@ def replaced_atomically(path: Path, *, force: bool = False) -> Iterator[Path]:
 
 
 def check_writable(path: Path, *, force: bool = False, kinds: tuple[Kind, ...] = ()) -> None:
-    """Raise InputError if a file cannot be put at `path`. For use before hours of work.
+    """Raise InputError if a file cannot be placed at `path`. For use before hours of work.
 
-    A file that is there must be of one of the `kinds`, where some are given; it must not be read by
+    An existing file must be of one of the `kinds`, if any are given, and must not be an input of
     the same command. A recording is replaced with `force` only, and never while it is being
     written.
     """
@@ -96,7 +96,7 @@ def check_writable(path: Path, *, force: bool = False, kinds: tuple[Kind, ...] =
 
 
 def is_unicode(name: str) -> bool:
-    """Return whether a name is UTF-8 on the disk; libraries cannot store or write another one."""
+    """Return whether a name is UTF-8 on the disk; libraries cannot handle others."""
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -105,7 +105,7 @@ def is_unicode(name: str) -> bool:
 
 
 def name_error(path: Path, error: OSError) -> InputError:
-    """Return the error that says why a name cannot be used, with the name cut to fit a line."""
+    """Return the error for an unusable name, cut to fit a line."""
     if error.errno == errno.ENAMETOOLONG:
         return InputError(
             f"{str(path)[:60]}...: the name is too long, file systems take {_LONGEST_NAME} bytes"
@@ -114,7 +114,7 @@ def name_error(path: Path, error: OSError) -> InputError:
 
 
 def _temporary(path: Path) -> Path:
-    """Return a free name beside `path` with its suffix, no longer than file systems take."""
+    """Return a free name beside `path` with its suffix, within the limit of file systems."""
     token = secrets.token_hex(4)
     name = f".{path.stem}.{token}.part{path.suffix}"
     if len(os.fsencode(name)) > _LONGEST_NAME:
@@ -123,7 +123,7 @@ def _temporary(path: Path) -> Path:
 
 
 def _head(path: Path) -> bytes:
-    """Return the first bytes of a file; none if it cannot be read."""
+    """Return the first bytes of a file; empty if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(HEAD_BYTES)
@@ -145,16 +145,16 @@ def check_kind(path: Path, kinds: tuple[Kind, ...]) -> None:
 
 
 def check_site_kept(path: Path, text: str) -> None:
-    """Raise InputError if there is a site file at `path` that says anything else than `text`."""
+    """Raise InputError if there is a site file at `path` whose content is not `text`."""
     if family_of(_head(path)) == SITE and path.read_bytes() != text.encode():
         raise InputError(f"{path}: is a site file, and none is replaced; give another name")
 
 
 def _check_like(path: Path, temporary: Path) -> None:
-    """Raise InputError if `path` holds another kind of file than the one that would replace it.
+    """Raise InputError if `path` holds another kind of file than its replacement.
 
-    A file that is damaged is not recognised and may be replaced; a site file may not, unless by the
-    same text.
+    A damaged file is not recognised and may be replaced; a site file may not, unless the text is
+    equal.
     """
     if not path.exists():
         return
@@ -171,7 +171,7 @@ def _check_like(path: Path, temporary: Path) -> None:
 
 
 def is_held(file: BinaryIO) -> bool:
-    """Whether another process, or an earlier opening of this one, has an open file to itself."""
+    """Return whether another process, or an earlier opening of this one, locks an open file."""
     try:
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -191,7 +191,7 @@ def _check_replaceable(path: Path, *, force: bool) -> None:
                     f"{path}: is a recording that is being written at this moment, and never "
                     "replaced; give another name"
                 )
-    except OSError:  # what may not be read is not lightly replaced
+    except OSError:  # an unreadable file is not replaced
         if path.suffix != _RECORDING_SUFFIX:
             return
     if not force:
@@ -201,7 +201,7 @@ def _check_replaceable(path: Path, *, force: bool) -> None:
 
 
 def check_folder_writable(folder: Path) -> None:
-    """Raise InputError if nothing can be put into a folder, or into the first parent there is."""
+    """Raise InputError if a folder, or its first existing parent, is not writable."""
     there = folder
     while not os.path.lexists(there) and there != there.parent:
         there = there.parent
@@ -213,9 +213,9 @@ def check_folder_writable(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it; raise InputError if nothing can be written there.
+    """Create a folder and its parents; raise InputError if nothing can be written there.
 
-    For use before hours of work, as `check_writable` is.
+    For use before hours of work, like `check_writable`.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -225,21 +225,21 @@ def make_folder(folder: Path) -> None:
 
 
 def check_ordinary(path: Path) -> None:
-    """Raise InputError if there is something at `path` that is neither a file nor a folder.
+    """Raise InputError if `path` is neither a file nor a folder.
 
-    A pipe to which nobody writes would be waited for without end.
+    Opening a pipe without a writer would block for ever.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         raise InputError(f"{path}: is no ordinary file (a pipe or a device), give one that is")
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a UTF-8 file; raise InputError if that is not possible."""
+    """Return the text of a UTF-8 file; raise InputError if it is not readable."""
     return decode_text(path, read_bytes(path))
 
 
 def decode_text(path: Path, content: bytes) -> str:
-    """Return the text of UTF-8 bytes that came from `path`."""
+    """Return the text of UTF-8 bytes from `path`."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

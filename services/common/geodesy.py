@@ -1,8 +1,8 @@
-"""Positions along the road: WGS 84 latitude and longitude to chainage at a bridge, and back.
+"""Coordinates along the road: WGS 84 latitude and longitude to chainage at a bridge, and back.
 
-The plane touches the ellipsoid midway between the bridge's ends. Points are taken at the height
-of the ellipsoid, so that an altitude error cannot move them. Within a kilometre the plane is
-shorter than the ground by less than 0.01 mm.
+The plane touches the ellipsoid midway between the bridge's ends. Points are placed at the height of
+the ellipsoid, so that an altitude error cannot move them. Within a kilometre the plane is shorter
+than the ground by less than 0.01 mm.
 """
 
 from math import cos, hypot, radians, sin, sqrt
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 class BridgeEnds(Protocol):
-    """What is needed of a bridge; `schemas.site.Bridge` has it."""
+    """The part of a bridge that a frame needs; `schemas.site.Bridge` has it."""
 
     @property
     def start_latitude_deg(self) -> float: ...  # noqa: D102
@@ -39,7 +39,7 @@ class BridgeFrame(NamedTuple):
     left: Floats  # (3,) unit vector
     up: Floats  # (3,) unit vector, normal of the ellipsoid midway between the ends
     ground_length_m: float  # distance of the ends by their coordinates
-    span_m: float  # what that distance is called in chainage
+    span_m: float  # that distance in chainage
 
 
 def bridge_frame(bridge: BridgeEnds) -> BridgeFrame:
@@ -63,7 +63,7 @@ def bridge_frame(bridge: BridgeEnds) -> BridgeFrame:
 def to_chainage(
     frame: BridgeFrame, latitude_deg: ArrayLike, longitude_deg: ArrayLike
 ) -> tuple[Floats, Floats]:
-    """Return chainage and lateral offset in m (left of the direction start to end is positive).
+    """Return chainage and lateral offset in m (positive to the left of start to end).
 
     Chainage is scaled so that the bridge's end is at exactly `span_m`; the lateral offset is not.
     """
@@ -73,7 +73,7 @@ def to_chainage(
 
 
 class _North(NamedTuple):
-    """A line of some 100 m to the north, as `bridge_frame` takes it."""
+    """A line of some 100 m to the north, in the form that `bridge_frame` accepts."""
 
     start_latitude_deg: float
     start_longitude_deg: float
@@ -90,8 +90,10 @@ def on_plane_m(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Flo
 
 
 def chainage_of(frame: BridgeFrame, latitude_deg: float, longitude_deg: float) -> float:
-    """Return the chainage of one place, to a micrometre what `to_chainage` says, in a tenth of the
-    time that arrays take."""
+    """Return the chainage of one place in m.
+
+    It equals `to_chainage` to a micrometre, in a tenth of the time that arrays take.
+    """
     latitude, longitude = radians(latitude_deg), radians(longitude_deg)
     sine, cosine = sin(latitude), cos(latitude)
     normal = SEMI_MAJOR_AXIS_M / sqrt(1 - ECCENTRICITY_SQUARED * sine * sine)

@@ -1,21 +1,21 @@
-"""A growing set of sequence numbers, as few intervals: what came, what is missing."""
+"""A growing set of sequence numbers, stored as intervals: received and missing messages."""
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 
 
 class Intervals:
-    """A set of integers that takes memory by its number of holes, not by its size."""
+    """A set of integers whose memory depends on the number of gaps, not on its size."""
 
     def __init__(self) -> None:
         self._first: list[int] = []
         self._last: list[int] = []
         self.size = 0
-        """How many numbers are in the set."""
+        """Number of elements of the set."""
 
     def add(self, number: int) -> bool:
-        """Put a number in; False if it was there."""
-        if self._last and number == self._last[-1] + 1:  # as nearly all are
+        """Add a number; return False if it was present."""
+        if self._last and number == self._last[-1] + 1:  # the usual case
             self._last[-1] = number
             self.size += 1
             return True
@@ -38,10 +38,10 @@ class Intervals:
         return True
 
     def add_range(self, first: int, last: int) -> int:
-        """Put all numbers from first to last in; how many of them were new."""
+        """Add all numbers from first to last; return how many were new."""
         if last < first:
             return 0
-        # Every interval that overlaps or touches the new one becomes part of it.
+        # Merge every interval that overlaps or touches the new one.
         low = bisect_left(self._last, first - 1)
         high = bisect_right(self._first, last + 1)
         there = sum(
@@ -59,7 +59,7 @@ class Intervals:
         return new
 
     def remove_range(self, first: int, last: int) -> int:
-        """Take all numbers from first to last out; how many of them were there."""
+        """Remove all numbers from first to last; return how many were present."""
         low, high = bisect_left(self._last, first), bisect_right(self._first, last)
         if last < first or low >= high:
             return 0
@@ -80,7 +80,7 @@ class Intervals:
 
     @property
     def contiguous_from_zero(self) -> int | None:
-        """The highest number with nothing missing from 0 to it; None if 0 is missing."""
+        """The highest number without a gap from 0; None if 0 is missing."""
         return self._last[0] if self._first and self._first[0] == 0 else None
 
     @property
@@ -89,7 +89,7 @@ class Intervals:
         return self._last[-1] if self._last else None
 
     def ranges(self) -> list[tuple[int, int]]:
-        """Return (first, last) of every run of numbers that are there."""
+        """Return (first, last) of every run of numbers in the set."""
         return list(zip(self._first, self._last, strict=True))
 
     def missing_of(self, ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -108,17 +108,17 @@ class Intervals:
 
     @property
     def runs(self) -> int:
-        """How many runs of numbers there are: what the set takes in memory."""
+        """The number of runs, which determines the memory of the set."""
         return len(self._first)
 
     def holes(self) -> list[tuple[int, int]]:
-        """Return (first, last) of every run of missing numbers between numbers that are there."""
+        """Return (first, last) of every gap between numbers in the set."""
         return [
             (last + 1, first - 1)
             for last, first in zip(self._last[:-1], self._first[1:], strict=True)
         ]
 
     def holes_from_zero(self) -> list[tuple[int, int]]:
-        """Return the holes, and what is missing from 0 to the lowest number that is there."""
+        """Return the gaps, and the one from 0 to the lowest number in the set."""
         before = [(0, self._first[0] - 1)] if self._first and self._first[0] > 0 else []
         return before + self.holes()

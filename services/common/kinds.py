@@ -31,13 +31,13 @@ _FIRST_KEY: Final = re.compile(r'[\[{\s]*"((?:[^"\\]|\\.)*)"')
 
 
 class Kind(NamedTuple):
-    """What an output may replace: a family of files and how the text of such a file begins."""
+    """A kind of file that an output may replace: its family and the beginning of its text."""
 
     name: str
-    """As in "is replaced by NAME only"."""
+    """Name in "is replaced by NAME only"."""
     family: str
     begins: str = ""
-    """The first key of a JSON file, the beginning of the first line of a text."""
+    """The first key of a JSON file, or the beginning of the first line of a text."""
 
     def matches(self, head: bytes) -> bool:
         """Return whether a file that begins with `head` is of this kind; an empty one always is."""
@@ -53,6 +53,7 @@ SURVEY_JSON: Final = Kind("the JSON of a survey", JSON, "vehicle")
 VALIDATION_JSON: Final = Kind("the JSON of a validation", JSON, "scenarios")
 AIMS_JSON: Final = Kind("the JSON of a validation", JSON, "aims")
 RECORDS: Final = Kind("records of a validation", JSON)
+IMPORT_MAP: Final = Kind("a map of an import", TEXT, "# How driveby import reads")
 HISTORY_CSV: Final = Kind("the CSV of a history", TEXT, "begin_time,end_time,element")
 CATALOG_CSV: Final = Kind("the CSV of a catalogue", TEXT, "recording,vehicles,first_time")
 CROSSINGS_CSV: Final = Kind("the CSV of a catalogue", TEXT, "realm,vehicle,bridge")
@@ -100,14 +101,14 @@ def beginning_of(head: bytes) -> str:
 
 
 def described(head: bytes) -> str:
-    """Return what a file is, in words, with how it begins."""
+    """Return what a file is, in words, with its beginning."""
     beginning = beginning_of(head)
     shown = beginning if len(beginning) <= 40 else f"{beginning[:37]}..."
     return family_of(head) + (f' that begins with "{shown}"' if shown else "")
 
 
 def _text(head: bytes) -> str | None:
-    """Return the head of a text, whose last character may be cut; None if it is no text."""
+    """Return the head of a text, whose last character may be cut; None if it is not text."""
     if b"\x00" in head:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Names that people and files give, as identifiers of keys."""
+"""Names that users and files give, as identifiers of keys."""
 
 import re
 
@@ -7,12 +7,12 @@ from services.common.errors import InputError
 
 
 def identifier_from(text: str) -> str:
-    """Return an identifier made of any text, e.g. of a file's name: `Run 3.mcap` → `run-3-mcap`."""
+    """Return an identifier for any text, e.g. for a file name: `Run 3.mcap` → `run-3-mcap`."""
     return re.sub(r"[^a-z0-9_-]+", "-", text.lower()).strip("-_")[:63] or "unnamed"
 
 
 def checked_identifier(text: str, option: str) -> str:
-    """Return the text if it is an identifier; else InputError that names the option."""
+    """Return the text if it is an identifier; raise an InputError that names the option if not."""
     try:
         return check_identifier(text)
     except ValueError as error:

@@ -1,7 +1,7 @@
 """The files that a command reads and writes: none that it reads is ever replaced.
 
-The command line declares both; a reader that finds a further input in a file, as the baseline that
-a site file names, adds it. Every writer asks here (`services.common.files.check_writable`). Files
+The command line declares both; a reader that finds a further input in a file, such as the baseline
+of a site file, adds it. Every writer checks here (`services.common.files.check_writable`). Files
 are compared by device and inode, so another path, a link or a hard link makes no difference.
 """
 
@@ -22,9 +22,9 @@ _outputs: Final[list[Path]] = []
 
 @contextmanager
 def declared(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterator[None]:
-    """Keep the inputs of a command while the block runs; InputError if an output is one of them.
+    """Protect the inputs of a command during the block.
 
-    InputError too if two outputs have one name.
+    Raise InputError if an output is one of them, or if two outputs have one name.
     """
     _inputs.update(identity for identity in map(_identity, inputs) if identity is not None)
     named: dict[Path, Path] = {}
@@ -41,7 +41,7 @@ def declared(inputs: Iterable[Path], outputs: Iterable[Path]) -> Iterator[None]:
 
 
 def add_input(path: Path) -> None:
-    """Keep one more file from being replaced; InputError if it is an output of the command."""
+    """Protect one more file from replacement; raise InputError if it is an output as well."""
     identity = _identity(path)
     if identity is None:
         return
@@ -59,7 +59,7 @@ def check_no_input(path: Path) -> None:
 
 
 def _identity(path: Path) -> _Identity | None:
-    """Return device and inode of an ordinary file, None if there is none."""
+    """Return device and inode of an ordinary file, None if it does not exist."""
     try:
         status = path.stat()
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Tables as bytes of Parquet that say of which edition they are."""
+"""Tables as Parquet bytes with their format version."""
 
 import io
 from pathlib import Path
@@ -8,16 +8,16 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FILES: Final = "[!.]*.parquet"
-"""The files of a folder, for Python and DuckDB; none that is being written, or was when its writer
-died."""
+"""Pattern of the files of a folder, for Python and DuckDB, without incomplete ones of running or
+crashed writers."""
 
 
 def encoded(table: "pa.Table", key: str, edition: str, *, compression: str = "zstd") -> bytes:
-    """The bytes of a file with a table in it, small as they are."""
+    """Return the bytes of a Parquet file with a table, optimised for small size."""
     import pyarrow.parquet as pq
 
     out = io.BytesIO()
-    # A file of few rows would be mostly statistics and dictionaries of one value.
+    # A file of few rows would consist mostly of statistics and dictionaries of one value.
     lean = {"use_dictionary": False, "write_statistics": False, "store_schema": False}
     with pq.ParquetWriter(out, table.schema, compression=compression, **lean) as writer:
         writer.add_key_value_metadata({key: edition})
@@ -25,12 +25,12 @@ def encoded(table: "pa.Table", key: str, edition: str, *, compression: str = "zs
     return out.getvalue()
 
 
-class Most(NamedTuple):
-    """What a file may hold; one that says it holds more is not read."""
+class ReadLimits(NamedTuple):
+    """Largest content of a file that is read."""
 
     rows: int
     bytes: int
-    """When it is no longer compressed."""
+    """Size after decompression."""
 
 
 def decoded(
@@ -38,23 +38,23 @@ def decoded(
     key: str,
     edition: str,
     columns: list[str] | None = None,
-    most: Most | None = None,
+    most: ReadLimits | None = None,
 ) -> "pa.Table":
-    """The table of a file; ValueError if it is none, of another edition, or larger than `most`."""
+    """Return the table of a file; raise ValueError if invalid, of another version or too large."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
         file = pq.ParquetFile(io.BytesIO(source) if isinstance(source, bytes) else source)
-        told = file.metadata.metadata or {}
-        theirs = told.get(key.encode(), b"").decode(errors="replace")
+        metadata = file.metadata.metadata or {}
+        theirs = metadata.get(key.encode(), b"").decode(errors="replace")
         if theirs != edition:
             raise ValueError(
                 f"is of edition {theirs[:20] or 'none'} of {key}, this program knows {edition}"
             )
         if most is not None:
             _check_size(file.metadata, most)
-        found: Any = file.read(columns=columns, use_threads=False)  # small files, and many
+        found: Any = file.read(columns=columns, use_threads=False)  # many small files
         missing = set(columns or ()) - set(found.column_names)
         if missing:
             raise ValueError(f"lacks the column {min(missing)}")
@@ -64,7 +64,7 @@ def decoded(
         raise ValueError(f"is no file of {key} ({why})") from None
 
 
-def _check_size(metadata: Any, most: Most) -> None:
+def _check_size(metadata: Any, most: ReadLimits) -> None:
     size = sum(metadata.row_group(n).total_byte_size for n in range(metadata.num_row_groups))
     if metadata.num_rows > most.rows or size > most.bytes:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The bar of all work that takes longer than a second or two."""
+"""Progress bars for work that takes longer than a second or two."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -10,27 +10,27 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 Offset = Callable[[int], object]
-"""Is told how many bytes of a file have been read."""
+"""Callback with the number of bytes read from a file."""
 
 
 Steps = Callable[[int, int], object]
-"""Is told how many of how many steps have been done."""
+"""Callback with the number of completed and of all steps."""
 
 
 Parts = Callable[[str, str, float], None]
-"""Is told which part of the work, its stage in words, and how much of it is done, 0 to 1."""
+"""Callback with the part of the work, its stage in words, and the completed fraction, 0 to 1."""
 
 
-def unwatched(offset: int) -> None:
-    """For who does not want to know."""
+def no_progress(offset: int) -> None:
+    """Ignore progress."""
 
 
-def unwatched_steps(done: int, steps: int) -> None:
-    """For who does not want to know either."""
+def no_step_progress(done: int, steps: int) -> None:
+    """Ignore progress in steps."""
 
 
 def progress_bar(console: "Console") -> "Progress":
-    """A bar with a description and the time that is left; nothing where there is no terminal."""
+    """Return a bar with a description and the remaining time; invisible without a terminal."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     return Progress(
@@ -45,7 +45,7 @@ def progress_bar(console: "Console") -> "Progress":
 
 @contextlib.contextmanager
 def steps_bar(description: str, console: "Console | None" = None) -> Iterator[Steps]:
-    """A bar over steps of which each takes about as long; on standard error by default."""
+    """Yield a callback for a bar over steps of equal duration; on standard error by default."""
     from rich.console import Console
 
     with progress_bar(console or Console(stderr=True)) as bar:
@@ -59,10 +59,10 @@ def steps_bar(description: str, console: "Console | None" = None) -> Iterator[St
 
 @contextlib.contextmanager
 def parts_bar(description: str, parts: int, console: "Console | None" = None) -> Iterator[Parts]:
-    """A bar over parts of work that each take about as long: "crossing 2 of 4: stage".
+    """Yield a callback for a bar over parts of equal duration: "crossing 2 of 4: stage".
 
-    It moves within a part too, and never back, for some work is begun again in another way. Where
-    it is not known how many `parts` there are (0) it shows that something is done, and no time.
+    It moves within a part too, and never back, because some work is restarted in another way. For
+    an unknown number of `parts` (0) it shows activity, without a time.
     """
     from rich.console import Console
 
@@ -82,9 +82,9 @@ def parts_bar(description: str, parts: int, console: "Console | None" = None) ->
 def reading_bar(
     description: str, paths: Sequence[Path], console: "Console | None" = None
 ) -> Iterator[Callable[[], Offset]]:
-    """A bar over all bytes of files that are read one after another; on standard error by default.
+    """Yield a callback for a bar over all bytes of files in order; on standard error by default.
 
-    What is yielded is called at the beginning of each file, in their order.
+    Call it at the beginning of each file, in their order.
     """
     from rich.console import Console
 

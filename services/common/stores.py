@@ -1,7 +1,7 @@
 """Folders on the local disk or in object storage, through fsspec: listing, ranges, whole files.
 
-A file appears whole or not at all: locally it is written beside and renamed, an object store shows
-an object when all of it has come. Nothing is ever changed in place.
+A file appears completely or not at all: locally it is written beside and renamed, an object store
+shows an object once its upload is complete. Nothing is ever changed in place.
 """
 
 import errno
@@ -13,20 +13,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple
 
 from services.common.errors import FailureError, InputError
+from services.common.extras import check_installed
 from services.common.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
 READ_AHEAD_BYTES: Final = 64 * 1024
-"""As long as a chunk of a recording: more would be fetched for nothing where chunks are skipped."""
+"""Read-ahead of the length of a recording's chunk; more is wasted where chunks are skipped."""
 _EXTRAS: Final = {"s3": ("s3fs", "s3"), "s3a": ("s3fs", "s3")}
-"""By protocol: what it needs, and which extra of the program brings it."""
+"""Required package and extra of the program, by protocol."""
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Folder(NamedTuple):
-    """A folder, as it was named and as it is reached."""
+    """A folder with its name and its file system."""
 
     name: str
     files: "AbstractFileSystem"
@@ -34,11 +35,11 @@ class Folder(NamedTuple):
 
     @property
     def is_local(self) -> bool:
-        """Whether it is on a disk of this machine."""
+        """Whether the folder is on a disk of this machine."""
         return "file" in _protocols(self.files)
 
     def path(self, name: str) -> str:
-        """Where a file of the folder is."""
+        """Return the path of a file in the folder."""
         return f"{self.root}/{name}" if name else self.root
 
 
@@ -46,17 +47,18 @@ class Entry(NamedTuple):
     """A file in a folder."""
 
     name: str
-    """Relative to the folder, with forward slashes."""
+    """Path relative to the folder, with forward slashes."""
     size_bytes: int
     modified_ns: int
-    """0 where the store does not say."""
+    """Time of the last change; 0 where the store does not provide it."""
 
 
 def folder_at(name: str) -> Folder:
-    """The folder of a path or of a URL such as s3://bucket/fleet.
+    """Return the folder of a path or of a URL such as s3://bucket/fleet.
 
-    InputError if the kind of store is not known, or what it needs is not installed.
+    Raise InputError if the kind of store is unknown or its packages are not installed.
     """
+    check_installed(name, "fsspec", extra="history")
     from fsspec.core import url_to_fs  # slow to import, seldom needed
 
     protocol = name.split("://", 1)[0] if "://" in name else "file"
@@ -74,22 +76,22 @@ def folder_at(name: str) -> Folder:
 
 
 def check_folder(folder: Folder) -> None:
-    """InputError if there is no such folder."""
+    """Raise InputError if the folder does not exist."""
     if not is_folder(folder):
         raise InputError(f"{folder.name}: no such folder")
 
 
 def is_folder(folder: Folder) -> bool:
-    """Whether there is one. InputError if the store cannot be reached."""
-    with _told(folder, ""):
+    """Return whether the folder exists; raise InputError if the store cannot be reached."""
+    with _one_line_error(folder, ""):
         return bool(folder.files.isdir(folder.root))
 
 
 def files_below(folder: Folder, suffix: str, below: str = "") -> list[Entry]:
-    """The files below a folder whose names end so, in the order of their names; no hidden ones."""
-    with _told(folder, below):
+    """Return the files below a folder with a suffix, in the order of their names; none hidden."""
+    with _one_line_error(folder, below):
         top = folder.path(below)
-        # An object store may hold on to an older listing.
+        # An object store may cache an older listing.
         folder.files.invalidate_cache(top)
         try:
             found = folder.files.find(top, detail=True)
@@ -99,7 +101,7 @@ def files_below(folder: Folder, suffix: str, below: str = "") -> list[Entry]:
     for path, info in sorted(found.items()):
         name = str(path)[len(folder.root) + 1 :]
         if name.endswith(suffix) and not any(part[0] == "." for part in name.split("/") if part):
-            # A float, as fsspec gives it, does not hold a time in ns.
+            # A float, which fsspec returns, cannot represent a time in ns.
             is_local = folder.is_local
             when_ns = Path(path).stat().st_mtime_ns if is_local else _modified_ns(info)
             entries.append(Entry(name, int(info.get("size") or 0), when_ns))
@@ -108,45 +110,45 @@ def files_below(folder: Folder, suffix: str, below: str = "") -> list[Entry]:
 
 @contextmanager
 def opened(folder: Folder, name: str) -> Iterator[BinaryIO]:
-    """A file of the folder to read in ranges. InputError if it cannot be read."""
+    """Yield a file of the folder for reading ranges; raise InputError if it cannot be read."""
     kind: dict[str, Any] = {} if folder.is_local else {"cache_type": "readahead"}
     with (
-        _told(folder, name),
+        _one_line_error(folder, name),
         folder.files.open(folder.path(name), "rb", block_size=READ_AHEAD_BYTES, **kind) as file,
     ):
         yield file
 
 
 def read(folder: Folder, name: str) -> bytes:
-    """The content of a file. InputError if it cannot be read."""
-    with _told(folder, name):
+    """Return the content of a file; raise InputError if it cannot be read."""
+    with _one_line_error(folder, name):
         content: bytes = folder.files.cat_file(folder.path(name))
         return content
 
 
 def read_head(folder: Folder, name: str, most: int) -> bytes:
-    """The first bytes of a file, `most` of them. InputError if it cannot be read."""
-    with _told(folder, name):
+    """Return the first `most` bytes of a file; raise InputError if it cannot be read."""
+    with _one_line_error(folder, name):
         content: bytes = folder.files.cat_file(folder.path(name), start=0, end=most)
         return content
 
 
 def size_of(folder: Folder, name: str) -> int:
-    """How many bytes a file has. InputError if it cannot be read."""
-    with _told(folder, name):
+    """Return the size of a file in bytes; raise InputError if it cannot be read."""
+    with _one_line_error(folder, name):
         return int(folder.files.size(folder.path(name)) or 0)
 
 
 def fetch(folder: Folder, name: str, to: Path) -> None:
     """Copy a file of the folder to this machine.
 
-    InputError if it cannot be read, or changes meanwhile; FailureError if there is no room.
+    Raise InputError if it cannot be read or changes meanwhile; FailureError if there is no space.
     """
     size, where = size_of(folder, name), f"{folder.name.rstrip('/')}/{name}"
     free = shutil.disk_usage(to.parent).free
     if size > free:
         raise FailureError(_no_room(where, size, to) + f", which has {free / 1e6:.1f} MB left")
-    with _told(folder, name):
+    with _one_line_error(folder, name):
         try:
             folder.files.get_file(folder.path(name), str(to))
         except OSError as error:
@@ -162,9 +164,9 @@ def _no_room(where: str, size: int, to: Path) -> str:
 
 
 def put(folder: Folder, name: str, content: bytes) -> bool:
-    """Write a file whole, unless there is one of that name: then False, and it stays.
+    """Write a file completely; return False, without writing, if one of that name exists.
 
-    InputError if it cannot be written there, FailureError if writing fails.
+    Raise InputError if the place is not writable, FailureError if writing fails.
     """
     path = folder.path(name)
     if folder.is_local:
@@ -174,7 +176,7 @@ def put(folder: Folder, name: str, content: bytes) -> bool:
         make_folder(local.parent)
         write_atomically(local, content)
         return True
-    with _told(folder, name, is_written=True):
+    with _one_line_error(folder, name, is_written=True):
         if folder.files.exists(path):
             return False
         folder.files.pipe_file(path, content)
@@ -182,8 +184,8 @@ def put(folder: Folder, name: str, content: bytes) -> bool:
 
 
 def remove(folder: Folder, name: str) -> None:
-    """Remove a file; one that somebody else has removed is none."""
-    with _told(folder, name, is_written=True):
+    """Remove a file; ignore one that is already gone."""
+    with _one_line_error(folder, name, is_written=True):
         try:
             folder.files.rm_file(folder.path(name))
         except FileNotFoundError:
@@ -191,8 +193,8 @@ def remove(folder: Folder, name: str) -> None:
 
 
 @contextmanager
-def _told(folder: Folder, name: str, *, is_written: bool = False) -> Iterator[None]:
-    """Say in one line what a store refuses: every kind has errors of its own."""
+def _one_line_error(folder: Folder, name: str, *, is_written: bool = False) -> Iterator[None]:
+    """Convert the errors of any store to one line."""
     where = f"{folder.name.rstrip('/')}/{name}" if name else folder.name
     try:
         yield
@@ -208,7 +210,7 @@ def _told(folder: Folder, name: str, *, is_written: bool = False) -> Iterator[No
     except Exception as error:
         if folder.is_local:
             raise
-        # What botocore raises (no credentials, no such endpoint) is no OSError.
+        # Errors of botocore (no credentials, no such endpoint) are not OSErrors.
         raise InputError(f"{where}: cannot be reached: {error}") from error
 
 

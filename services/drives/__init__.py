@@ -1,1 +1,1 @@
-"""What a truck measured, from CSV files, other people's recordings or a simulation."""
+"""Measurements of a truck, from CSV files, other recordings or a simulation."""

@@ -1,14 +1,14 @@
 """A minute of the comma2k19 data set (MIT licence): a real car, one body sensor, one receiver.
 
-The arrays share the clock of the logging computer, which counts from its start. Three things make
-them a truck's messages:
+The arrays share the clock of the logging computer, which counts from its start. Three steps convert
+them to a truck's messages:
 
-- the accelerometer's axes are forward, right, down, and gravity is in it: up = −down − g;
-- its samples come at about 104 Hz and leave an even grid by a hundredth of a step (the sensor's
-  clock against the computer's): cubic splines put them on the grid;
-- the receiver says the UTC time of each fix itself, a fifth of a second before the fix is logged.
+- the accelerometer's axes are forward, right, down, and include gravity: up = −down − g;
+- its samples arrive at about 104 Hz and deviate from an even grid by a hundredth of a step (the
+  sensor's clock against the computer's): cubic splines interpolate them onto the grid;
+- the receiver gives the UTC time of each fix, a fifth of a second before the fix is logged.
   Fixes keep their own time. The computer's clock is set by the data set's own pairs of computer
-  and GPS time where they are there, else by the fix that was logged with the least delay.
+  and GPS time where they exist, otherwise by the fix that was logged with the least delay.
 """
 
 from pathlib import Path
@@ -36,12 +36,12 @@ _LEAP_SECONDS = 18  # GPS ahead of UTC, since 2017
 
 
 def is_comma2k19(folder: Path) -> bool:
-    """Whether the folder looks like a segment of the data set."""
+    """Return whether the folder looks like a segment of the data set."""
     return (folder / f"{_ACCELEROMETER}_value.npy").is_file()
 
 
 def read_comma2k19(folder: Path) -> Run:
-    """Read a segment; its body sensor is the front one. InputError if an array is not right."""
+    """Read a segment; its body sensor is the front one. InputError if an array is invalid."""
     clock_s = _array(folder, f"{_ACCELEROMETER}_t", 1)
     forward_right_down = _array(folder, f"{_ACCELEROMETER}_value", 3)
     logged_s = _array(folder, f"{_RECEIVER}_t", 1)
@@ -49,7 +49,7 @@ def read_comma2k19(folder: Path) -> Run:
     _check(folder, _ACCELEROMETER, clock_s, forward_right_down)
     _check(folder, _RECEIVER, logged_s, fixes)
 
-    # The data set says seconds and holds milliseconds.
+    # The data set declares seconds and holds milliseconds.
     utc_s = fixes[:, 3] / 1000 if fixes[0, 3] > 1e11 else fixes[:, 3]
     if not np.all(np.diff(utc_s) > 0):
         raise InputError(f"{folder / _RECEIVER}_value.npy: column 3 (UTC) must increase")
@@ -77,7 +77,7 @@ def read_comma2k19(folder: Path) -> Run:
 
 
 def _clock_offset_s(folder: Path, logged_s: Floats, utc_s: Floats) -> float:
-    """Return UTC minus the computer's clock."""
+    """Return UTC minus the computer's clock, s."""
     if (folder / "global_pose_frame_gps_times.npy").is_file():
         week, second_of_week = _array(folder, "global_pose_frame_gps_times", 2).T
         clock_s = _array(folder, "global_pose_frame_times", 1)

@@ -1,7 +1,7 @@
 """CSV files of a drive: pairs `accel_NN.csv` and `gps_NN.csv` (docs/contract.md).
 
 Every error names the file, the line and the field. The whole file is parsed at once; only if that
-fails, or the numbers are not acceptable, is it read line by line to find out where.
+fails, or the numbers are not acceptable, is it read line by line to locate the error.
 """
 
 import re
@@ -23,7 +23,7 @@ from schemas.signals import (
 from schemas.topics import IDENTIFIER
 from services.common.errors import InputError
 from services.common.files import read_text
-from services.common.progress import Steps, unwatched_steps
+from services.common.progress import Steps, no_step_progress
 from services.drives.runs import GnssTrack, Run, sampling_rate_hz
 
 Floats = NDArray[np.float64]
@@ -49,17 +49,17 @@ _LIMITS: Final[dict[str, _Limits]] = {
     "altitude_m": _Limits(-1000, 20_000, "an altitude in m"),
     "speed_mps": _Limits(-200, 200, "a speed in m/s"),
 }
-"""Columns that are not of an accelerometer."""
+"""Limits of the columns other than accelerations."""
 
 
 def read_folder(
     folder: Path,
-    progress: Steps = unwatched_steps,
+    progress: Steps = no_step_progress,
     channels: tuple[str, ...] | None = CHANNELS,
 ) -> list[Run]:
     """Read every pair of files in a folder, in order of time; InputError if there is none.
 
-    `channels` are the columns that there may be, None any names of channels. `progress` is told of
+    `channels` are the permitted columns, None for any names of channels. `progress` is called for
     each pair.
     """
     if not folder.is_dir():
@@ -88,7 +88,7 @@ def read_folder(
 
 
 def read_pair(accel: Path, gps: Path, channels: tuple[str, ...] | None = CHANNELS) -> Run:
-    """Read one run. Times in s since 1970 UTC; accelerations in m/s² as they are in the file."""
+    """Read one run; times in s since 1970 UTC, accelerations in m/s² as in the file."""
     columns = _read_accel(accel, channels)
     track = _read_gps(gps, accel)
     time_s = columns.pop("time_s")
@@ -156,7 +156,7 @@ def _columns(path: Path, header: list[str], lines: list[str]) -> dict[str, Float
             np.loadtxt(lines, delimiter=",", comments=None, ndmin=2) if lines else np.empty((0, 0))
         )
     except ValueError as error:
-        raise _complaint(path, header, lines) from error
+        raise _first_error(path, header, lines) from error
     limits = [_LIMITS.get(name, _ACCELERATION) for name in header]
     low, high = (np.array([one[side] for one in limits]) for side in (0, 1))
     if (
@@ -165,12 +165,12 @@ def _columns(path: Path, header: list[str], lines: list[str]) -> dict[str, Float
         or not np.all((table >= low) & (table <= high))  # false for NaN too
         or not np.all(np.diff(table[:, header.index("time_s")]) > 0)
     ):
-        raise _complaint(path, header, lines)
+        raise _first_error(path, header, lines)
     return {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(header)}
 
 
-def _complaint(path: Path, header: list[str], lines: list[str]) -> InputError:
-    """Say what is wrong with the first bad line."""
+def _first_error(path: Path, header: list[str], lines: list[str]) -> InputError:
+    """Return the error of the first bad line."""
     before = -np.inf
     rows = 0
     for number, line in enumerate(lines, start=2):

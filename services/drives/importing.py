@@ -1,4 +1,4 @@
-"""`driveby import`: files of a drive become a recording."""
+"""Conversion of a drive's files to a recording: `driveby import`."""
 
 import logging
 from bisect import bisect_right
@@ -6,23 +6,30 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from schemas.site import Site
-from schemas.site_file import parse_site, read_site_text
+from schemas.site_file import load_site, parse_site, read_site_text
+from schemas.topics import Message
 from services.common.errors import InputError
 from services.common.files import check_writable
 from services.common.naming import checked_identifier, identifier_from
-from services.common.progress import Steps, unwatched_steps
+from services.common.progress import Steps, no_step_progress
 from services.drives.comma2k19 import is_comma2k19, read_comma2k19
-from services.drives.csv_import import read_folder, read_pair
-from services.drives.plausible import check_plausible
+from services.drives.csv_runs import (
+    AS_WRITTEN,
+    HowToRead,
+    csv_runs,
+    exact_runs,
+    understood_runs,
+)
 from services.drives.ros2_recording import is_ros2, messages_of_ros2
 from services.drives.runs import Run, normalised, run_to_messages
-from services.identification.placed import middle_sensor, rates_hz
-from services.recordings.recording import Message
+from services.drives.tables.reading import Understood
+from services.finding.placed import middle_sensor, rates_hz
 from services.recordings.writer import write_recording
 
 _log = logging.getLogger(__name__)
+_REALM = "import-"
 _LARGEST_RATE_ERROR = 0.05
-"""Clocks of sensors are right to far less; wrong units and wrong site files are off by far more."""
+"""Largest relative error of a rate; wrong units and wrong site files exceed it by far."""
 
 
 def import_command(
@@ -33,25 +40,25 @@ def import_command(
     vehicle: str | None,
     name: str | None,
     force: bool = False,
-    reading: Steps = unwatched_steps,
-    writing: Steps = unwatched_steps,
+    how: HowToRead = AS_WRITTEN,
+    writing: Steps = no_step_progress,
 ) -> str:
-    """Write the recording of a folder, a pair of CSV files, or of ROS 2; return what was written.
+    """Write the recording of a folder, a pair of CSV files, or of ROS 2; return a summary.
 
-    Nothing is written if anything is wrong (InputError). `reading` is told of the files that have
-    been read, `writing` of the seconds of the drive that have been written.
+    Nothing is written if anything is wrong (InputError). `writing` is called with the seconds of
+    the drive that have been written.
     """
     check_writable(output, force=force)
     text = read_site_text(site)
     parsed = parse_site(text, str(site))
     vehicle_id = vehicle_of(parsed, str(site), vehicle)
-    realm = _realm(sources, name)
+    realm = _realm(sources, parsed, name)
     if len(sources) == 1 and is_ros2(sources[0]):
         return _import_ros2(sources[0], text, parsed, str(site), output, realm, vehicle_id, force)
-    runs = normalised_runs(sources, parsed, str(site), vehicle_id, reading)
+    runs = normalised_runs(sources, parsed, str(site), vehicle_id, how)
     messages = write_recording(
         output,
-        _watched(run_to_messages(runs, parsed, realm, vehicle_id), runs, writing),
+        _with_progress(run_to_messages(runs, parsed, realm, vehicle_id), runs, writing),
         site_toml=text,
         reason="import complete",
         force=force,
@@ -61,6 +68,14 @@ def import_command(
     return (
         f"{output}: {drives} of {vehicle_id}, {seconds:.1f} s, {messages} messages, realm {realm}"
     )
+
+
+def understood_drive(
+    sources: list[Path], site: Path, vehicle: str | None, how: HowToRead
+) -> Understood:
+    """Return a drive of CSV files as it is read, with all guesses; nothing is written."""
+    parsed = load_site(site)
+    return understood_runs(sources, parsed, vehicle_of(parsed, str(site), vehicle), how)
 
 
 def _import_ros2(
@@ -79,13 +94,13 @@ def _import_ros2(
     written = write_recording(
         output, messages, site_toml=site_text, reason="import complete", force=force
     )
-    for line in truck.complaints.news():
+    for line in truck.anomalies.news():
         _log.warning("%s: %s", source, line)
     return f"{output}: a drive of {vehicle_id} with ROS 2, {written} messages, realm {realm}"
 
 
 def messages_of(folder: Path, site: Path, vehicle: str | None) -> Iterator[Message]:
-    """Return what `import_command` would write of a folder of CSV files or of comma2k19."""
+    """Return the messages that `import_command` would write for a folder of CSV or comma2k19."""
     return messages_of_folder(
         folder, parse_site(read_site_text(site), str(site)), str(site), vehicle
     )
@@ -94,14 +109,16 @@ def messages_of(folder: Path, site: Path, vehicle: str | None) -> Iterator[Messa
 def messages_of_folder(
     folder: Path, site: Site, site_name: str, vehicle: str | None
 ) -> Iterator[Message]:
-    """The same of a site that was read already; errors call it `site_name`."""
+    """Return the same for a site that was read already; errors name it `site_name`."""
     vehicle_id = vehicle_of(site, site_name, vehicle)
     runs = normalised_runs([folder], site, site_name, vehicle_id)
-    return run_to_messages(runs, site, _realm([folder], None), vehicle_id)
+    return run_to_messages(runs, site, _realm([folder], site, None), vehicle_id)
 
 
-def _watched(messages: Iterable[Message], runs: list[Run], writing: Steps) -> Iterator[Message]:
-    """The messages; of each whole second of the drive it is told how many there have been."""
+def _with_progress(
+    messages: Iterable[Message], runs: list[Run], writing: Steps
+) -> Iterator[Message]:
+    """Yield the messages; report each whole second of the drive."""
     lengths = [float(run.accel_time_s[-1] - run.accel_time_s[0]) for run in runs]
     begins = [float(run.accel_time_s[0]) for run in runs]
     total, last = int(sum(lengths)), -1
@@ -120,44 +137,35 @@ def normalised_runs(
     site: Site | None,
     site_name: str,
     vehicle_id: str,
-    reading: Steps = unwatched_steps,
+    how: HowToRead = AS_WRITTEN,
 ) -> list[Run]:
-    """The runs of a folder or of a pair of CSV files, upward and without gravity.
+    """Return the runs of a folder or of a pair of CSV files, upward and without gravity.
 
-    Without a site nobody knows how a CSV file was measured: then it is as in the file.
+    Without a site the form of the measurements is unknown, and they stay as in the file.
     """
-    vehicle = None if site is None else site.vehicle(vehicle_id)
-    channels = None if vehicle is None else vehicle.channels
-    if len(sources) == 1 and sources[0].suffix == ".csv":
-        raise InputError(f"{sources[0]}: the positions are missing, give accel.csv and gps.csv")
     if len(sources) == 1 and is_comma2k19(sources[0]):
-        return [read_comma2k19(sources[0])]  # knows its axes and its rate itself
-    if len(sources) == 1:
-        runs = read_folder(sources[0], reading, channels)
-    elif len(sources) == 2:
-        runs = [read_pair(sources[0], sources[1], channels)]
-    else:
-        raise InputError(f"{len(sources)} files given, a folder or accel.csv gps.csv expected")
-    if site is None or vehicle is None:
-        return runs
+        return [read_comma2k19(sources[0])]  # its axes and its rate are known
+    if site is None:
+        return exact_runs(sources, None)
+    vehicle = site.vehicle(vehicle_id)
+    runs = csv_runs(sources, site, vehicle_id, how)
     declared = tuple(rates_hz(site.sensor, vehicle).values())
     for run in runs:
         _check_rate(run, declared, site_name)
-        check_plausible(run, site)
     return [normalised(run, middle_sensor(site.sensor, vehicle)) for run in runs]
 
 
 def _check_rate(run: Run, declared: tuple[float, ...], site_name: str) -> None:
-    """Times in the wrong unit and the wrong site file show in the rate."""
+    """Check the rate, which shows times in the wrong unit and the wrong site file."""
     if not any(abs(run.rate_hz / rate - 1) <= _LARGEST_RATE_ERROR for rate in declared):
         raise InputError(
             f"{run.source}: time_s gives a rate of {run.rate_hz:g} Hz, but sensor.rate_hz of "
-            f"{site_name} is {declared[0]:g} Hz, one of them must be mended"
+            f"{site_name} is {declared[0]:g} Hz, correct one of them"
         )
 
 
 def vehicle_of(site: Site, site_name: str, wanted: str | None) -> str:
-    """The identifier of the truck meant; InputError if the site leaves it open or lacks it."""
+    """Return the truck's identifier; InputError if the site has several or lacks it."""
     known = [vehicle.id for vehicle in site.vehicles]
     if wanted is None and len(known) == 1:
         return known[0]
@@ -167,10 +175,13 @@ def vehicle_of(site: Site, site_name: str, wanted: str | None) -> str:
     raise InputError(f"{site_name}: {problem}, choose with --vehicle one of {', '.join(known)}")
 
 
-def _realm(sources: list[Path], name: str | None) -> str:
+def _realm(sources: list[Path], site: Site, name: str | None) -> str:
+    """Return the realm of a drive: as named, else that of the site file, else of the folder."""
     if name is not None:
-        return f"import-{checked_identifier(name, '--name')}"
+        return f"{_REALM}{checked_identifier(name.removeprefix(_REALM), '--realm')}"
+    if site.imports is not None:
+        return f"{_REALM}{site.imports.name}"
     first = sources[0].resolve()
     if first.suffix in (".mcap", ".db3"):
-        return f"import-{identifier_from(first.stem)}"
-    return f"import-{identifier_from((first.parent if first.suffix == '.csv' else first).name)}"
+        return f"{_REALM}{identifier_from(first.stem)}"
+    return f"{_REALM}{identifier_from((first.parent if first.suffix == '.csv' else first).name)}"

@@ -1,7 +1,7 @@
-"""Messages of ROS 2 that say what a truck measures, out of their CDR encoding (by rosbags).
+"""ROS 2 messages of a truck's sensors, decoded from CDR by rosbags.
 
-Their definitions have not changed since ROS 2 Humble: one hash each (REP 2016) stands for all
-distributions, and whatever has another hash is another message.
+Their definitions have not changed since ROS 2 Humble: one hash each (REP 2016) represents all
+distributions, and any other hash is another message.
 """
 
 import math
@@ -15,24 +15,24 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 MAX_PAYLOAD_BYTES: Final = 4096
-"""Of these messages only the name of the frame has no fixed length."""
+"""Maximum size: the frame's name is the only part of these messages with variable length."""
 NO_HASH: Final = "TypeHashNotSupported"
-"""What ROS 2 Humble says for the hash, as it has none."""
+"""Hash that ROS 2 Humble sends, as it has none."""
 _NO_FIX: Final = 0
-"""NavSatStatus: what is less is no fix."""
+"""Lowest NavSatStatus of a fix."""
 
 
 class Imu(NamedTuple):
-    """sensor_msgs/Imu: what the accelerometer said, by its own axes."""
+    """Readings of an accelerometer in its own axes, from sensor_msgs/Imu."""
 
     stamp_ns: int
     frame: str
     acceleration_m_per_s2: dict[str, float] | None
-    """By axis; None: the sensor has no accelerometer."""
+    """Accelerations by axis; None if the sensor has no accelerometer."""
 
 
 class Fix(NamedTuple):
-    """sensor_msgs/NavSatFix. Accuracies are one standard deviation, None where unknown."""
+    """A fix from sensor_msgs/NavSatFix; accuracies are standard deviations, None if unknown."""
 
     stamp_ns: int
     is_fix: bool
@@ -44,20 +44,20 @@ class Fix(NamedTuple):
 
 
 class Velocity(NamedTuple):
-    """geometry_msgs/TwistStamped or TwistWithCovarianceStamped of a receiver."""
+    """A receiver's velocity, from geometry_msgs/TwistStamped or TwistWithCovarianceStamped."""
 
     stamp_ns: int
     speed_m_per_s: float
-    """Over ground, whatever the horizontal axes are."""
+    """Speed over ground, for any horizontal axes."""
 
 
 class RosType(NamedTuple):
     """A type of message: its names and its hash."""
 
     name: str
-    """As recordings have it."""
+    """Name in recordings."""
     dds_name: str
-    """As keys of Zenoh have it."""
+    """Name in keys of Zenoh."""
     hash: str
 
 
@@ -85,17 +85,17 @@ VELOCITIES: Final = (TWIST, TWIST_WITH_COVARIANCE)
 
 
 def check_rosbags() -> None:
-    """InputError that says how to install what decodes ROS 2, if it is not there."""
+    """Raise InputError with the command of installation if the ROS 2 decoder is not installed."""
     check_installed("ROS 2", "rosbags", extra="ros2")
 
 
 def decode(of: RosType, payload: bytes) -> Imu | Fix | Velocity:
-    """Return what a message says; ValueError if it is not of that type or impossible."""
+    """Return the content of a message; ValueError if it is of another type or impossible."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"has {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are expected")
     try:
         message: Any = _types().deserialize_cdr(payload, of.name)
-    except Exception as error:  # bytes of a stranger: whatever the decoder stumbles over
+    except Exception as error:  # bytes of unknown origin may break the decoder in any way
         raise ValueError(f"is no {of.name}: {error}") from None
     stamp_ns = _stamp_ns(message.header.stamp)
     if of == IMU:
@@ -109,11 +109,11 @@ def decode(of: RosType, payload: bytes) -> Imu | Fix | Velocity:
     return Velocity(stamp_ns, speed)
 
 
-def unknown_hash(of: RosType, told: str) -> str | None:
-    """What is wrong with the hash that somebody tells of a type; None: nothing."""
-    if told in (of.hash, NO_HASH):
+def unknown_hash(of: RosType, declared: str) -> str | None:
+    """Return what is wrong with a type's declared hash; None if nothing is."""
+    if declared in (of.hash, NO_HASH):
         return None
-    return f"{of.name} has the type hash {told[:80]}, known is {of.hash}"
+    return f"{of.name} has the type hash {declared[:80]}, known is {of.hash}"
 
 
 @cache
@@ -132,7 +132,7 @@ def _stamp_ns(stamp: Any) -> int:
 
 
 def _imu(stamp_ns: int, message: Any) -> Imu:
-    # REP 145: -1 as the first covariance says that there is no such estimate.
+    # REP 145: -1 as the first covariance declares that there is no such estimate.
     if message.linear_acceleration_covariance[0] == -1.0:
         return Imu(stamp_ns, message.header.frame_id, None)
     measured = message.linear_acceleration
@@ -156,5 +156,5 @@ def _fix(stamp_ns: int, message: Any) -> Fix:
 
 
 def _deviation(variance: float) -> float | None:
-    """None of what cannot be a variance, and where none is given."""
+    """Return the deviation; None for an impossible variance, and without one."""
     return math.sqrt(variance) if 0.0 < variance < 1e12 else None

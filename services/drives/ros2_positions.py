@@ -1,7 +1,7 @@
-"""Fixes of ROS 2 have no speed: it comes from the receiver's velocities, or from the fixes.
+"""Speeds of ROS 2 fixes, which have none: from the receiver's velocities, or from the fixes.
 
-What is given depends on stamps alone, not on which topic's message came first, as long as none
-comes more than `_PATIENCE_S` late.
+The results depend on stamps alone, not on the order of topics, as long as no message is more than
+`_PATIENCE_S` late.
 """
 
 from collections import deque
@@ -10,51 +10,52 @@ from typing import Final, NamedTuple
 
 from schemas.signals import NS_PER_S
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
-from services.drives.ros2_complaints import Complaints
+from services.drives.ros2_anomalies import AnomalyCounts
 from services.drives.ros2_messages import Fix, Velocity
 
 _PATIENCE_S: Final = 30.0
-"""A fix waits for a velocity until fixes come that are so much newer: of a burst all of one topic
-may be heard before the other."""
+"""Time in s by which newer fixes arrive before a fix stops waiting for a velocity.
+
+In a burst all messages of one topic may arrive before those of the other.
+"""
 _LARGEST_HOLE_S: Final = 1.1
-"""Between two velocities, from which the speed between them is told: receivers give one a second
-or more."""
+"""Longest time in s between two velocities for interpolation; receivers send one a second."""
 _HALF_WINDOW_S: Final = 1.0
-"""Speeds are slopes of positions over so long before and behind a fix."""
+"""Time in s before and behind a fix over which its speed is a slope of positions."""
 _MOST_WAITING: Final = 1000
 _BACK: Final = 20
-"""After so many stamps in the past the clock has gone back."""
+"""Number of past stamps after which the clock has been set back."""
 
 
 class FixWithSpeed(NamedTuple):
-    """A fix, and how fast the truck was, m/s."""
+    """A fix with the truck's speed, m/s."""
 
     fix: Fix
     speed_m_per_s: float
 
 
-class Positions:
-    """Gives fixes their speeds."""
+class SpeedEstimator:
+    """Estimator of the speeds of fixes."""
 
-    def __init__(self, topic: str, velocity_topic: str | None, complaints: Complaints) -> None:
+    def __init__(self, topic: str, velocity_topic: str | None, anomalies: AnomalyCounts) -> None:
         self._topic = topic
         self._velocity_topic = velocity_topic
-        self._complaints = complaints
+        self._anomalies = anomalies
         self._waiting: deque[Fix] = deque()
         self._past: deque[Fix] = deque()
-        """Fixes that have been given, as far as slopes need them."""
+        """Fixes already returned, as far as slopes need them."""
         self._velocities: deque[Velocity] = deque()
         self._latest_ns = self._latest_velocity_ns = -1
         self._behind = self._velocities_behind = 0
 
     def add_fix(self, fix: Fix) -> list[FixWithSpeed]:
-        """Take a fix; return those of which the speed is known now."""
+        """Add a fix; return those whose speed is known now."""
         if fix.stamp_ns <= self._latest_ns:
-            self._complaints.add(self._topic, "stamps repeated or in the past, left out")
+            self._anomalies.add(self._topic, "stamps repeated or in the past, left out")
             self._behind += 1
             if self._behind <= _BACK:
                 return []
-            self._complaints.add(self._topic, "times that the clock went back")
+            self._anomalies.add(self._topic, "times that the clock went back")
             found = self.finish()
         else:
             found = []
@@ -64,10 +65,10 @@ class Positions:
         return found + self._ready()
 
     def add_velocity(self, velocity: Velocity) -> list[FixWithSpeed]:
-        """Take a velocity; return those fixes of which the speed is known now."""
+        """Add a velocity; return those fixes whose speed is known now."""
         if velocity.stamp_ns <= self._latest_velocity_ns:
             if self._velocity_topic is not None:
-                self._complaints.add(
+                self._anomalies.add(
                     self._velocity_topic, "stamps repeated or in the past, left out"
                 )
             self._velocities_behind += 1
@@ -82,7 +83,7 @@ class Positions:
         return self._ready()
 
     def finish(self) -> list[FixWithSpeed]:
-        """What is left when nothing comes any more."""
+        """Return the remaining fixes at the end of the input."""
         found = self._ready(is_end=True)
         self._past.clear()
         return found
@@ -96,7 +97,7 @@ class Positions:
             speed = self._slope(fix) if self._velocity_topic is None else self._measured(fix)
             if speed is None:
                 why = "a velocity" if self._velocity_topic else "another near enough for a speed"
-                self._complaints.add(self._topic, f"fixes without {why}, left out")
+                self._anomalies.add(self._topic, f"fixes without {why}, left out")
             else:
                 found.append(FixWithSpeed(fix, speed))
             self._past.append(self._waiting.popleft())
@@ -114,7 +115,7 @@ class Positions:
         )
 
     def _measured(self, fix: Fix) -> float | None:
-        """The speed at a fix's time, linear between the velocities round it."""
+        """Return the speed at a fix's time, linear between the velocities around it."""
         before: Velocity | None = None
         for after in self._velocities:
             if after.stamp_ns == fix.stamp_ns:
@@ -130,7 +131,7 @@ class Positions:
         return before.speed_m_per_s + share * (after.speed_m_per_s - before.speed_m_per_s)
 
     def _slope(self, fix: Fix) -> float | None:
-        """The slope of the straight line through the fixes near one; None if it is alone."""
+        """Return the slope of the line through the fixes near one; None without others."""
         window_ns = _HALF_WINDOW_S * NS_PER_S
         near = [
             other
@@ -152,7 +153,7 @@ class Positions:
 
 
 def _offset_m(origin: Fix, place: Fix) -> tuple[float, float]:
-    """How far east and north one place is of another that is some metres away."""
+    """Return the offset of one position from another some metres away, to the east and north, m."""
     latitude = radians(origin.latitude_deg)
     w = 1 - ECCENTRICITY_SQUARED * sin(latitude) ** 2
     meridian_m = SEMI_MAJOR_AXIS_M * (1 - ECCENTRICITY_SQUARED) / w**1.5

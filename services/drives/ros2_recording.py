@@ -1,7 +1,7 @@
 """Recordings of ROS 2, read by rosbags: MCAP files, SQLite files, and folders of rosbag2.
 
-They may be anybody's: rosbags is believed to be right about files that are, and what it hands over
-is looked at before it is used.
+Their origin may be unknown: rosbags is trusted with valid files, and its output is checked before
+use.
 """
 
 from collections.abc import Iterator
@@ -19,26 +19,25 @@ from schemas.signals import (
 )
 from schemas.site import Site
 from schemas.site_file import vehicle_toml
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.common.errors import InputError
 from services.common.files import check_ordinary, read_text
+from services.drives.ros2_decompression import limit_decompression
 from services.drives.ros2_messages import RosType, check_rosbags, unknown_hash
 from services.drives.ros2_truck import Accel, Ros2Truck
-from services.drives.ros2_unpacking import bound_unpacking
-from services.recordings.recording import Message
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Reader
 
 _MOST_DEFINITION_CHARACTERS: Final = 65_536
-"""Ten times as long as that of any message that is known here, with all its comments."""
+"""Maximum length of a definition, ten times the longest known one with all comments."""
 _MEANS_SOMETHING = "?#%"
-"""In the name under which rosbags opens an SQLite file: it would open another one."""
+"""Special characters in the name by which rosbags opens an SQLite file: it would open another."""
 
 
 class RosMessage(NamedTuple):
-    """One message as it was recorded."""
+    """One message as recorded."""
 
     topic: str
     type: RosType
@@ -47,16 +46,16 @@ class RosMessage(NamedTuple):
 
 
 def is_ros2(source: Path) -> bool:
-    """Whether that looks like a recording of ROS 2."""
+    """Return whether that looks like a recording of ROS 2."""
     return source.suffix in (".mcap", ".db3") or (source / "metadata.yaml").is_file()
 
 
 def messages_of_ros2(
     source: Path, site: Site, site_name: str, realm: str, vehicle: str
 ) -> tuple[Ros2Truck, Iterator[Message]]:
-    """The messages that the truck would have sent, and who counts what was wrong with its own.
+    """Return the messages that the truck would have sent, and the counter of invalid ones.
 
-    The boot is numbered by the first time in ns. InputError, also while they are iterated over.
+    The boot is numbered by the first time in ns. InputError may also be raised during iteration.
     """
     check_rosbags()
     truck = Ros2Truck(site, site_name, vehicle)
@@ -64,7 +63,7 @@ def messages_of_ros2(
 
 
 def read_ros2(source: Path, truck: Ros2Truck) -> Iterator[RosMessage]:
-    """The messages of a truck's topics in the order of the recording.
+    """Yield the messages of a truck's topics in the order of the recording.
 
     InputError: it cannot be read, lacks a topic, or has it with another type.
     """
@@ -74,11 +73,11 @@ def read_ros2(source: Path, truck: Ros2Truck) -> Iterator[RosMessage]:
         _check_file(path)
     if source.is_dir():
         _check_metadata(source / "metadata.yaml")
-    bound_unpacking()
+    limit_decompression()
     try:
         reader = Reader(source)
         reader.open()
-    except Exception as error:  # rosbags raises what it stumbles over
+    except Exception as error:  # rosbags raises any exception
         raise _unreadable(source, error) from None
     try:
         types = _connections(source, reader, truck)
@@ -91,7 +90,7 @@ def read_ros2(source: Path, truck: Ros2Truck) -> Iterator[RosMessage]:
             if found is None:
                 return
             connection, recorded_ns, payload = found
-            # SQLite keeps anything in any column.
+            # SQLite accepts anything in any column.
             if not isinstance(payload, bytes) or not isinstance(recorded_ns, int):
                 raise _unreadable(source, TypeError(f"{connection.topic} has no message in a row"))
             yield RosMessage(connection.topic, types[connection.id], payload, recorded_ns)
@@ -104,7 +103,7 @@ def _files_of(source: Path) -> list[Path]:
 
 
 def _check_file(path: Path) -> None:
-    """InputError if opening a file would wait for ever, open another one, or miss what is in it."""
+    """Raise InputError if opening a file would block, open another one, or miss its content."""
     check_ordinary(path)
     if path.suffix != ".db3":
         return
@@ -116,12 +115,12 @@ def _check_file(path: Path) -> None:
     if log.is_file() and log.stat().st_size:
         raise InputError(
             f"{path}: its last messages are in {log.name} beside it, as its writer did not end "
-            f"well; sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)' puts them into it"
+            f"normally; sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)' merges them"
         )
 
 
 def _check_metadata(path: Path) -> None:
-    """InputError if it has aliases: a few of them of each other are billions of words when told."""
+    """Raise InputError for aliases: a few nested ones expand to billions of words."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
     from ruamel.yaml.events import AliasEvent
@@ -132,7 +131,7 @@ def _check_metadata(path: Path) -> None:
     try:
         found = any(isinstance(e, AliasEvent) for e in YAML(typ="safe", pure=True).parse(text))
     except YAMLError:
-        return  # said where it is read
+        return  # reading it reports the error
     if found:
         raise InputError(f"{path}: has aliases (*NAME), which rosbag2 does not write")
 
@@ -143,13 +142,13 @@ def _unreadable(source: Path, error: Exception) -> InputError:
 
 
 def _connections(source: Path, reader: "Reader", truck: Ros2Truck) -> dict[int, RosType]:
-    """The types of those of a recording's connections that are a truck's topics, by their ids."""
+    """Return the types of a recording's connections for a truck's topics, by their ids."""
     found: dict[int, RosType] = {}
     for one in reader.connections:
-        if not all(isinstance(said, str) for said in (one.topic, one.msgtype)):
+        if not all(isinstance(names, str) for names in (one.topic, one.msgtype)):
             raise _unreadable(source, TypeError("a topic has no name or no type"))
     for topic in truck.table.topics():
-        # How many messages there are of each is not looked at: a recording need not say so truly.
+        # The message counts of the topics are ignored: a recording need not state them correctly.
         named = [one for one in reader.connections if one.topic == topic]
         if not named:
             there = sorted({one.topic for one in reader.connections})[:10]
@@ -162,7 +161,7 @@ def _connections(source: Path, reader: "Reader", truck: Ros2Truck) -> dict[int, 
 
 
 def _type_of(source: Path, connection: "Connection", types: tuple[RosType, ...]) -> RosType:
-    """The type of a topic, which both its hash and its definition must be of, where it has them."""
+    """Return the type of a topic, which its hash and its definition must match, if present."""
     for of in types:
         if connection.msgtype == of.name:
             break
@@ -171,15 +170,15 @@ def _type_of(source: Path, connection: "Connection", types: tuple[RosType, ...])
         raise InputError(
             f"{source}: {connection.topic} is of {connection.msgtype[:80]}, {wanted} is expected"
         )
-    for told in (connection.digest, _hash_of_definition(connection)):
-        problem = unknown_hash(of, str(told)) if told else None
+    for digest in (connection.digest, _hash_of_definition(connection)):
+        problem = unknown_hash(of, str(digest)) if digest else None
         if problem:
             raise InputError(f"{source}: {connection.topic}: {problem}")
     return of
 
 
 def _hash_of_definition(connection: "Connection") -> str:
-    """The hash of the definition that the recording carries; empty if it carries none."""
+    """Return the hash of the definition that the recording carries; empty without one."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -190,10 +189,11 @@ def _hash_of_definition(connection: "Connection") -> str:
         return "unreadable"
     try:
         types = get_typestore(Stores.EMPTY)
-        # `register` would make a program of the definition and run it, which a hash does not need.
+        # `register` would generate a program from the definition and run it, which a hash does not
+        # need.
         types.fielddefs.update(get_types_from_msg(definition.data, connection.msgtype))
         return types.hash_rihs01(connection.msgtype)
-    except Exception:  # a definition that cannot be read is none that is known
+    except Exception:  # an unreadable definition is not a known one
         return "unreadable"
 
 
@@ -222,14 +222,14 @@ def _encoded(
             yield Message(key, payload, boot_id, sequence, time_ns, time_ns)
     for stream, what in (("accel", "accelerations"), ("gnss", "positions")):
         if not numbers[stream]:
-            why = "; ".join(truck.complaints.news()[:3]) or "no message of theirs is in it"
+            why = "; ".join(truck.anomalies.news()[:3]) or "no message of theirs is in it"
             raise InputError(f"{source}: gives no {what}: {why}")
 
 
 def _measured(source: Path, truck: Ros2Truck) -> Iterator[Accel | GnssFix]:
     for message in read_ros2(source, truck):
         try:
-            yield from truck.take(*message)
+            yield from truck.convert(*message)
         except InputError as error:
             raise InputError(f"{source}: {error}") from None
     yield from truck.finish()

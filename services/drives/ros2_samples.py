@@ -1,9 +1,9 @@
-"""Single samples with stamps of their own become evenly sampled batches.
+"""Conversion of single stamped samples to evenly sampled batches.
 
-An accelerometer samples by its crystal; what jitters is when a driver gets to stamp a sample. So
-samples are numbered by their stamps and keep their values; the time of a batch is that of a line
-through the stamps, which follows the crystal slowly. What is missing is missing: a batch ends
-before a gap and the next one begins behind it.
+An accelerometer samples by its crystal; the jitter is that of the driver's stamps. So samples are
+numbered by their stamps and keep their values; the time of a batch is that of a line through the
+stamps, which follows the crystal slowly. Gaps stay: a batch ends before a gap and the next one
+begins behind it.
 """
 
 from typing import Final, NamedTuple
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 
 from schemas.signals import MAX_ACCELERATION_M_PER_S2, MAX_RATE_HZ, NS_PER_S
 from services.common.errors import InputError
-from services.drives.ros2_complaints import Complaints
+from services.drives.ros2_anomalies import AnomalyCounts
 from services.drives.runs import grid_index, sampling_rate_hz
 
 LARGEST_RATE_ERROR: Final = 0.05
-"""Clocks of sensors are right to far less; wrong site files are off by far more."""
+"""Largest relative error of a rate; wrong site files exceed it by far."""
 _BATCH_S: Final = 0.1
 _MEASURED_S: Final = 2.0
-"""The rate is measured over so long, at the begin."""
+"""Duration in s at the beginning over which the rate is measured."""
 _FEWEST: Final = 10
-"""Samples of which a rate can be told."""
+"""Fewest samples for the measurement of a rate."""
 _FOLLOWS: Final = 1 / 64
-"""The share of a stamp's error by which the line moves: noise of stamps becomes a tenth."""
+"""Share of a stamp's error by which the line moves: noise of stamps is reduced to a tenth."""
 _IRREGULAR: Final = 0.1
-"""In sampling intervals: a stamp that is off by more is told."""
+"""Deviation of a stamp, in sampling intervals, that counts as irregular."""
 _LONG_GAP_S: Final = 1.0
-"""After a longer one the line begins anew, as it does when stamps are in the past for so long."""
+"""Gap in s after which the line starts again, as after as long a time of past stamps."""
 
 
 class RateError(InputError):
@@ -41,69 +41,70 @@ class RateError(InputError):
         """Number of samples that were measured, and are left out."""
 
 
-class Piece(NamedTuple):
-    """Samples without a gap; the time is of the first."""
+class SampleBlock(NamedTuple):
+    """Samples without a gap; the time is that of the first."""
 
     wall_time_ns: int
     rate_hz: float
     samples: NDArray[np.float64]
 
 
-class EvenSamples:
-    """Takes samples of one topic in the order they came; gives batches."""
+class Resampler:
+    """Converter of one topic's samples, in order of arrival, to batches."""
 
     def __init__(
-        self, topic: str, declared_hz: float, site_name: str, complaints: Complaints
+        self, topic: str, declared_hz: float, site_name: str, anomalies: AnomalyCounts
     ) -> None:
         self._topic = topic
         self._declared_hz = declared_hz
         self._site_name = site_name
-        self._complaints = complaints
+        self._anomalies = anomalies
         self._early: list[tuple[int, float]] = []
-        """Until the rate is known."""
+        """Samples before the rate is known."""
         self._rate_hz = 0.0
         self._zero_ns = 0
         self._off_ns = 0.0
-        """How far the line is behind `_zero_ns` by now."""
+        """Present delay of the line after `_zero_ns`."""
         self._number = 0
-        """Of the next sample, from the line's beginning."""
+        """Number of the next sample, from the line's beginning."""
         self._samples: list[float] = []
         self._first_ns = 0
         self._behind = 0
 
-    def add(self, stamp_ns: int, value: float) -> list[Piece]:
-        """Take a sample in m/s²; return what is complete, which is nothing for most samples.
+    def add(self, stamp_ns: int, value: float) -> list[SampleBlock]:
+        """Add a sample in m/s²; return complete blocks, for most samples none.
 
-        RateError once the rate is known and is not the one that the site file declares; what has
-        come is forgotten then.
+        Raise RateError once the rate is known and differs from the declared one; the samples up to
+        then are dropped.
         """
         if self._rate_hz:
             return self._place(stamp_ns, value)
         if self._early and stamp_ns <= self._early[-1][0]:
-            self._complaints.add(self._topic, "stamps repeated or in the past, left out")
+            self._anomalies.add(self._topic, "stamps repeated or in the past, left out")
             self._behind += 1
             if self._behind > self._declared_hz * _LONG_GAP_S:
-                self._complaints.add(self._topic, "times that the clock went back")
+                self._anomalies.add(self._topic, "times that the clock went back")
                 self._early, self._behind = [(stamp_ns, value)], 0
             return []
         self._behind = 0
         self._early.append((stamp_ns, value))
         measured = stamp_ns - self._early[0][0] >= _MEASURED_S * NS_PER_S
-        # Twice a rate that is declared and wrong is seen in half the time, and memory is bounded.
+        # A wrong declared rate is detected in half the time at twice that rate, and memory is
+        # bounded.
         if len(self._early) < _FEWEST or not (measured or len(self._early) > self._most_early()):
             return []
         return self._begin()
 
-    def finish(self) -> list[Piece]:
-        """Return what is left when no more samples come; RateError as `add`."""
+    def finish(self) -> list[SampleBlock]:
+        """Return the remaining samples at the end of the input; RateError as for `add`."""
         if not self._rate_hz and len(self._early) >= _FEWEST:
             return self._begin() + self._flush()
-        self._complaints.add(self._topic, "samples, too few to tell their rate", len(self._early))
+        self._anomalies.add(self._topic, "samples, too few to measure their rate", len(self._early))
         self._early.clear()
         return self._flush()
 
-    def restart(self) -> list[Piece]:
-        """Measure the rate again, as another sensor goes on; RateError as `add`, of the first."""
+    def restart(self) -> list[SampleBlock]:
+        """Measure the rate again for another sensor; RateError as for `add`, of the first one."""
         try:
             return self.finish()
         finally:
@@ -112,8 +113,8 @@ class EvenSamples:
     def _most_early(self) -> float:
         return 2 * _MEASURED_S * self._declared_hz + _FEWEST
 
-    def _begin(self) -> list[Piece]:
-        """Measure the rate, and go through what has come."""
+    def _begin(self) -> list[SampleBlock]:
+        """Measure the rate, and convert the samples up to now."""
         first_ns = self._early[0][0]
         relative_s = np.array([stamp_ns - first_ns for stamp_ns, _ in self._early]) / NS_PER_S
         rate_hz = sampling_rate_hz(relative_s)
@@ -124,13 +125,13 @@ class EvenSamples:
                 self._topic,
                 samples,
                 f"{self._topic}: its stamps give a rate of {rate_hz:.4g} Hz, but sensor.rate_hz of "
-                f"{self._site_name} is {self._declared_hz:g} Hz, one of them must be mended",
+                f"{self._site_name} is {self._declared_hz:g} Hz, correct one of them",
             )
         self._rate_hz = rate_hz
         offset_s = float(np.mean(relative_s - grid_index(relative_s) / rate_hz))
         self._anchor(first_ns + round(offset_s * NS_PER_S))
         early, self._early = self._early, []
-        return [piece for sample in early for piece in self._place(*sample)]
+        return [block for sample in early for block in self._place(*sample)]
 
     def _anchor(self, zero_ns: int) -> None:
         self._zero_ns, self._off_ns, self._number, self._behind = zero_ns, 0.0, 0, 0
@@ -138,22 +139,22 @@ class EvenSamples:
     def _expected_ns(self) -> int:
         return self._zero_ns + round(self._number * NS_PER_S / self._rate_hz + self._off_ns)
 
-    def _place(self, stamp_ns: int, value: float) -> list[Piece]:
-        found: list[Piece] = []
+    def _place(self, stamp_ns: int, value: float) -> list[SampleBlock]:
+        found: list[SampleBlock] = []
         ahead = (stamp_ns - self._expected_ns()) * self._rate_hz / NS_PER_S
         if ahead < -0.5:
-            self._complaints.add(self._topic, "stamps repeated or in the past, left out")
+            self._anomalies.add(self._topic, "stamps repeated or in the past, left out")
             self._behind += 1
             if self._behind <= self._rate_hz * _LONG_GAP_S:
                 return []
-            self._complaints.add(self._topic, "times that the clock went back")
+            self._anomalies.add(self._topic, "times that the clock went back")
             found = self._flush()
             self._anchor(stamp_ns)
             ahead = 0.0
         self._behind = 0
         if ahead >= 0.5:
             missing = round(ahead)
-            self._complaints.add(self._topic, "samples missing, left as gaps", missing)
+            self._anomalies.add(self._topic, "samples missing, left as gaps", missing)
             found = self._flush()
             if missing > self._rate_hz * _LONG_GAP_S:
                 self._anchor(stamp_ns)
@@ -162,23 +163,23 @@ class EvenSamples:
                 self._number += missing
                 ahead -= missing
         if abs(ahead) > _IRREGULAR:
-            self._complaints.add(self._topic, "stamps off by over a tenth of the interval")
+            self._anomalies.add(self._topic, "stamps off by over a tenth of the interval")
         self._off_ns += _FOLLOWS * ahead * NS_PER_S / self._rate_hz
-        if abs(value) <= MAX_ACCELERATION_M_PER_S2:  # of a NaN it is false, too
+        if abs(value) <= MAX_ACCELERATION_M_PER_S2:  # it is false for NaN
             if not self._samples:
                 self._first_ns = self._expected_ns()
             self._samples.append(value)
         else:
-            self._complaints.add(self._topic, "samples not finite or too large, left as gaps")
+            self._anomalies.add(self._topic, "samples not finite or too large, left as gaps")
             found += self._flush()
         self._number += 1
         if len(self._samples) >= max(1, round(_BATCH_S * self._rate_hz)):
             found += self._flush()
         return found
 
-    def _flush(self) -> list[Piece]:
+    def _flush(self) -> list[SampleBlock]:
         if not self._samples:
             return []
-        piece = Piece(self._first_ns, self._rate_hz, np.array(self._samples))
+        block = SampleBlock(self._first_ns, self._rate_hz, np.array(self._samples))
         self._samples = []
-        return [piece]
+        return [block]

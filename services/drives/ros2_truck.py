@@ -1,7 +1,7 @@
-"""What a ROS 2 truck says, as one of ours would have said it: the same from a bus and from a file.
+"""Conversion of a ROS 2 truck's messages to ours, equally from a bus and from a file.
 
-Times are those of `header.stamp`: when something was measured. When it was sent is used for one
-thing: the two must be within `largest_delay_s` of each other, or the stamp is not believed.
+Times are those of `header.stamp`, the time of measurement. The time of sending serves one purpose:
+the two must be within `largest_delay_s` of each other, otherwise the message is refused.
 """
 
 from collections.abc import Callable
@@ -9,17 +9,17 @@ from functools import partial
 from typing import Final, NamedTuple, NoReturn
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
-from schemas.signals import NS_PER_S, Channel, GnssFix
+from schemas.signals import NS_PER_S, AccelChannel, GnssFix
 from schemas.site import Site
 from schemas.site_ros2 import Ros2, RosImu
 from services.common.errors import InputError
-from services.drives.ros2_complaints import (
+from services.drives.ros2_anomalies import (
     FAR_STAMPS,
     OTHER_FRAME,
     SECOND_SENSOR,
     UNREADABLE,
     WRONG_RATE,
-    Complaints,
+    AnomalyCounts,
 )
 from services.drives.ros2_messages import (
     FIX,
@@ -31,22 +31,24 @@ from services.drives.ros2_messages import (
     Velocity,
     decode,
 )
-from services.drives.ros2_positions import FixWithSpeed, Positions
-from services.drives.ros2_samples import EvenSamples, Piece, RateError
-from services.identification.placed import rates_hz
+from services.drives.ros2_positions import FixWithSpeed, SpeedEstimator
+from services.drives.ros2_samples import RateError, Resampler, SampleBlock
+from services.finding.placed import rates_hz
 
 _LEAST_SPEED_NOISE_M_PER_S: Final = 0.5
-"""Of speeds that are slopes of positions: their errors are those of the positions once more, and
-the same from fix to fix."""
+"""Smallest noise of speeds that are slopes of positions.
+
+Their errors are those of the positions again, and correlated from fix to fix.
+"""
 _FASTEST_M_PER_S: Final = 200.0
 _BEFORE_FIRST_NS: Final = 100 * NS_PER_S
-"""The truck's own clock shows so much at its first message: others may be stamped before it."""
+"""Reading of the truck's own clock at its first message: others may have earlier stamps."""
 _HANDOVER_S: Final = 1.0
-"""After so long without a message of a topic's sensor another one may speak there."""
+"""Silence in s of a topic's sensor after which another one may continue there."""
 _REFUSED_S: Final = 10.0
-"""A sensor with a wrong rate is left out for so long, by its stamps, and then measured again."""
+"""Time in s by stamps for which a sensor with a wrong rate is excluded before a new measurement."""
 _MOST_REFUSED: Final = 1000
-"""Sensors of a topic with a wrong rate that are remembered; beyond them the oldest is forgotten."""
+"""Maximum number of remembered sensors with a wrong rate; the oldest is dropped first."""
 
 
 class Accel(NamedTuple):
@@ -54,11 +56,11 @@ class Accel(NamedTuple):
 
     device_time_ns: int
     wall_time_ns: int
-    channels: dict[str, Channel]
+    channels: dict[str, AccelChannel]
 
 
-class _Source(NamedTuple):
-    """Who spoke on a topic, and the stamp of what it said last."""
+class _TopicPublisher(NamedTuple):
+    """Publisher of a topic, and the stamp of its last message."""
 
     publisher: bytes
     frame: str
@@ -66,7 +68,7 @@ class _Source(NamedTuple):
 
 
 class Ros2Truck:
-    """Takes messages of a truck's topics in the order in which each topic's came."""
+    """Converter of a truck's messages, in the order of each topic."""
 
     def __init__(
         self,
@@ -75,53 +77,53 @@ class Ros2Truck:
         vehicle: str,
         wrong_rate: Callable[[RateError], None] | None = None,
     ) -> None:
-        """InputError: the site has no `[ros2]` of that truck, or one that cannot be right.
+        """Prepare the conversion; InputError without a valid `[ros2]` of that truck in the site.
 
-        `wrong_rate` is called where the rate of a sensor is not the one that the site file
-        declares. Without it `take` and `finish` raise that RateError.
+        `wrong_rate` is called where the rate of a sensor differs from the site file's. Without it
+        `convert` and `finish` raise that RateError.
         """
         self._wrong_rate = _raise if wrong_rate is None else wrong_rate
         self.table = ros2_of(site, site_name, vehicle)
-        self.complaints = Complaints()
+        self.anomalies = AnomalyCounts()
         self._imus = {imu.topic: imu for imu in self.table.imu.by_channel().values()}
         self._channels = {imu.topic: name for name, imu in self.table.imu.by_channel().items()}
         declared_hz = rates_hz(site.sensor, site.vehicle(vehicle))
         self._samples = {
-            topic: EvenSamples(topic, declared_hz[name], site_name, self.complaints)
+            topic: Resampler(topic, declared_hz[name], site_name, self.anomalies)
             for topic, name in self._channels.items()
         }
-        self._positions = Positions(self.table.gnss, self.table.velocity, self.complaints)
-        self._sources: dict[str, _Source] = {}
+        self._positions = SpeedEstimator(self.table.gnss, self.table.velocity, self.anomalies)
+        self._sources: dict[str, _TopicPublisher] = {}
         self._refused: dict[str, dict[tuple[bytes, str], int]] = {}
-        """By topic: sensors with a wrong rate, each with the stamp at which that was found."""
+        """Sensors with a wrong rate by topic, each with the stamp of its detection."""
         self._zero_ns: int | None = None
         self._latest_device_ns = 0
 
     def types(self, topic: str) -> tuple[RosType, ...]:
-        """The types that the messages of a topic may have."""
+        """Return the types that the messages of a topic may have."""
         if topic in self._imus:
             return (IMU,)
         return (FIX,) if topic == self.table.gnss else VELOCITIES
 
-    def take(
+    def convert(
         self, topic: str, of: RosType, payload: bytes, sent_ns: int, publisher: bytes = b""
     ) -> list[Accel | GnssFix]:
-        """Take a message; return what can be published now. Identities are for others to set.
+        """Convert a message; return what can be published now, without identities.
 
-        `publisher` is who sent it, where that is known. What is wrong with a message is counted in
-        `complaints`.
+        `publisher` is its sender, where that is known. Invalid messages are counted in
+        `anomalies`.
         """
         try:
             message = decode(of, payload)
         except ValueError as error:
-            self.complaints.add(topic, UNREADABLE, example=f"the first {error}")
+            self.anomalies.add(topic, UNREADABLE, example=f"the first {error}")
             return []
         if abs(message.stamp_ns - sent_ns) > self.table.largest_delay_s * NS_PER_S:
             apart = f"the first by {(sent_ns - message.stamp_ns) / NS_PER_S:.3f} s"
-            self.complaints.add(topic, FAR_STAMPS, example=apart)
+            self.anomalies.add(topic, FAR_STAMPS, example=apart)
             return []
         frame = message.frame if isinstance(message, Imu) else ""
-        source = _Source(publisher, frame, message.stamp_ns)
+        source = _TopicPublisher(publisher, frame, message.stamp_ns)
         if not self._is_of_its_sensor(topic, source):
             return []
         left = self._handed_over(topic, source)
@@ -136,24 +138,24 @@ class Ros2Truck:
                 return self._fixes(self._positions.add_velocity(message))
 
     def finish(self) -> list[Accel | GnssFix]:
-        """Return what is left when no more messages come; RateError as `take`."""
+        """Return the remaining messages at the end of the input; RateError as for `convert`."""
         found: list[Accel | GnssFix] = []
         for topic, samples in self._samples.items():
             found += self._batches(topic, self._at_right_rate(samples.finish))
         return found + self._fixes(self._positions.finish())
 
-    def _is_of_its_sensor(self, topic: str, source: _Source) -> bool:
-        """Whether a message is of the sensor that has the topic; what others say is counted.
+    def _is_of_its_sensor(self, topic: str, source: _TopicPublisher) -> bool:
+        """Return whether a message is of the sensor that has the topic; count the others.
 
-        Samples of two are no signal. So a topic is the first one's, by publisher and frame, until
-        it has been silent for a while, as a node that was started again is another publisher, or
-        until its rate is known and is not the declared one.
+        Samples of two sensors are no signal. So a topic belongs to the first one, by publisher and
+        frame, until it has been silent for a while, as a restarted node is another publisher, or
+        until its rate is known and differs from the declared one.
         """
         publisher, frame, stamp_ns = source
         imu = self._imus.get(topic)
         if imu is not None and imu.frame is not None and frame != imu.frame:
             other = f"the first {frame[:60]!r}, not {imu.frame!r}"
-            self.complaints.add(topic, OTHER_FRAME, example=other)
+            self.anomalies.add(topic, OTHER_FRAME, example=other)
             return False
         before = self._sources.get(topic)
         if (
@@ -162,33 +164,33 @@ class Ros2Truck:
             and abs(stamp_ns - before.stamp_ns) <= _HANDOVER_S * NS_PER_S
         ):
             other = f"the first of frame {frame[:60]!r}" if frame != before.frame else ""
-            self.complaints.add(topic, SECOND_SENSOR, example=other)
+            self.anomalies.add(topic, SECOND_SENSOR, example=other)
             return False
         refused_ns = self._refused.get(topic, {}).get((publisher, frame))
         if refused_ns is not None and abs(stamp_ns - refused_ns) <= _REFUSED_S * NS_PER_S:
-            self.complaints.add(topic, WRONG_RATE)
+            self.anomalies.add(topic, WRONG_RATE)
             return False
         return True
 
-    def _handed_over(self, topic: str, source: _Source) -> list[Accel | GnssFix]:
-        """Note whose a topic is; return what is left of another sensor that had it before.
+    def _handed_over(self, topic: str, source: _TopicPublisher) -> list[Accel | GnssFix]:
+        """Record the sensor of a topic; return the remaining samples of its predecessor.
 
-        The rate of each sensor is measured, or samples of a stranger would be put on the grid of
-        the truck's own.
+        The rate of each sensor is measured; otherwise samples of another one would be put on the
+        grid of the truck's own.
         """
         left: list[Accel | GnssFix] = []
         before = self._sources.get(topic)
         if before is not None and source[:2] != before[:2]:
-            self.complaints.add(topic, "times that another sensor went on")
+            self.anomalies.add(topic, "times that another sensor went on")
             if topic in self._samples:
                 left = self._batches(topic, self._at_right_rate(self._samples[topic].restart))
         self._sources[topic] = source
         return left
 
-    def _at_right_rate(self, pieces_of: Callable[[], list[Piece]]) -> list[Piece]:
-        """Return the pieces; none, and the topic is free again, if the sensor's rate is wrong."""
+    def _at_right_rate(self, blocks_of: Callable[[], list[SampleBlock]]) -> list[SampleBlock]:
+        """Return the blocks; none, and free the topic, if the sensor's rate is wrong."""
         try:
-            return pieces_of()
+            return blocks_of()
         except RateError as error:
             source = self._sources.pop(error.topic, None)
             if source is not None:
@@ -197,41 +199,41 @@ class Ros2Truck:
                 if len(refused) > _MOST_REFUSED:
                     del refused[next(iter(refused))]
             reason = str(error).removeprefix(f"{error.topic}: ")
-            self.complaints.add(error.topic, WRONG_RATE, error.samples, example=reason)
+            self.anomalies.add(error.topic, WRONG_RATE, error.samples, example=reason)
             self._wrong_rate(error)
             return []
 
     def _accelerations(self, topic: str, message: Imu) -> list[Accel | GnssFix]:
         if message.acceleration_m_per_s2 is None:
-            self.complaints.add(topic, "messages that say they have no acceleration, left out")
+            self.anomalies.add(topic, "messages that say they have no acceleration, left out")
             return []
         up = _up(self._imus[topic], message.acceleration_m_per_s2)
         add = partial(self._samples[topic].add, message.stamp_ns, up)
         return self._batches(topic, self._at_right_rate(add))
 
-    def _batches(self, topic: str, pieces: list[Piece]) -> list[Accel | GnssFix]:
+    def _batches(self, topic: str, blocks: list[SampleBlock]) -> list[Accel | GnssFix]:
         name = self._channels[topic]
         return [
             Accel(
-                self._device_ns(piece.wall_time_ns),
-                piece.wall_time_ns,
-                {name: Channel(piece.rate_hz, piece.samples)},
+                self._device_ns(block.wall_time_ns),
+                block.wall_time_ns,
+                {name: AccelChannel(block.rate_hz, block.samples)},
             )
-            for piece in pieces
+            for block in blocks
         ]
 
     def _fix(self, fix: Fix) -> list[Accel | GnssFix]:
         if not fix.is_fix:
-            self.complaints.add(self.table.gnss, "messages without a fix, left out")
+            self.anomalies.add(self.table.gnss, "messages without a fix, left out")
             return []
-        # A receiver that sees three satellites gives no altitude (NaN), and a poor place.
+        # A receiver with three satellites gives no altitude (NaN), and a poor position.
         for what, value, low, high in (
             ("an altitude", fix.altitude_m, -1000.0, 20_000.0),
             ("a latitude", fix.latitude_deg, -90.0, 90.0),
             ("a longitude", fix.longitude_deg, -180.0, 180.0),
         ):
-            if not low <= value <= high:  # of a NaN it is false, too
-                self.complaints.add(self.table.gnss, f"fixes without {what}, left out")
+            if not low <= value <= high:  # it is true for NaN
+                self.anomalies.add(self.table.gnss, f"fixes without {what}, left out")
                 return []
         return self._fixes(self._positions.add_fix(fix))
 
@@ -239,7 +241,7 @@ class Ros2Truck:
         found: list[Accel | GnssFix] = []
         for fix, speed in fixes:
             if speed > _FASTEST_M_PER_S:
-                self.complaints.add(self.table.gnss, "fixes with an impossible speed, left out")
+                self.anomalies.add(self.table.gnss, "fixes with an impossible speed, left out")
                 continue
             device_ns = self._device_ns(fix.stamp_ns)
             found.append(
@@ -253,9 +255,9 @@ class Ros2Truck:
         return found
 
     def _device_ns(self, wall_time_ns: int) -> int:
-        """ROS stamps with one clock; the truck's own is that one from the first message on.
+        """Return the time on the truck's own clock: ROS time from the first message on.
 
-        Where that was set back to before the beginning, the truck's own goes on from where it was.
+        Where ROS time was set back to before the beginning, the truck's own clock continues.
         """
         zero_ns = wall_time_ns if self._zero_ns is None else self._zero_ns
         if wall_time_ns < zero_ns:
@@ -265,7 +267,7 @@ class Ros2Truck:
 
 
 def ros2_of(site: Site, site_name: str, vehicle: str) -> Ros2:
-    """The `[ros2]` of a truck; InputError if it has none, or its speeds would be overrated."""
+    """Return the `[ros2]` of a truck; InputError without one, or if its speeds are too precise."""
     for table in site.ros2:
         if table.vehicle == vehicle:
             break
@@ -288,7 +290,7 @@ def _raise(error: RateError) -> NoReturn:
 
 
 def _up(imu: RosImu, measured: dict[str, float]) -> float:
-    """The acceleration upward without gravity, m/s²."""
+    """Return the acceleration upward without gravity, m/s²."""
     value = measured[imu.axis[-1]]
     up = -value if imu.axis.startswith("-") else value
     return up - STANDARD_GRAVITY_M_PER_S2 if imu.gravity_included else up

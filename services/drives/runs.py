@@ -1,4 +1,4 @@
-"""One drive as arrays, whatever it was read from, and the messages a truck would have sent."""
+"""One drive as arrays, from any source, and the messages that a truck would have sent."""
 
 from collections.abc import Iterable, Iterator
 from heapq import merge
@@ -13,7 +13,7 @@ from schemas.signals import (
     CHANNELS,
     NS_PER_S,
     AccelBatch,
-    Channel,
+    AccelChannel,
     GnssFix,
     VehicleInfo,
     encode_accel,
@@ -23,13 +23,13 @@ from schemas.signals import (
 )
 from schemas.site import Sensor, Site
 from schemas.site_file import vehicle_toml
-from schemas.topics import Key
-from services.recordings.recording import Message
+from schemas.topics import Key, Message
+from services.common.extras import check_installed
 
 Floats = NDArray[np.float64]
 
 BATCH_S = 0.05
-"""A truck sends batches of this length: few messages, and still live."""
+"""Length of a truck's batches in s: few messages with a low delay."""
 
 # In sampling intervals: below it the jitter of time stamps is taken for rounding.
 _LARGEST_JITTER = 0.1
@@ -49,7 +49,7 @@ class GnssTrack(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One drive. Accelerations in m/s², (n,) each, at common times; some channels may be absent."""
+    """One run; accelerations in m/s², (n,) each, at common times; channels may be absent."""
 
     source: str
     accel_time_s: Floats  # since 1970 UTC, increasing; a jump is a gap
@@ -59,9 +59,9 @@ class Run(NamedTuple):
 
 
 def sampling_rate_hz(time_s: Floats) -> float:
-    """Return the rate of samples that are even but for gaps and jitter of the time stamps.
+    """Return the rate of samples (n,) that are even but for gaps and jitter of the time stamps.
 
-    A rate that cannot be told from a whole number of Hz is that number.
+    A rate that cannot be distinguished from a whole number of Hz is that number.
     """
     index = grid_index(time_s)
     slope = _slope(index, time_s - time_s[0])
@@ -72,7 +72,7 @@ def sampling_rate_hz(time_s: Floats) -> float:
 
 
 def normalised(run: Run, sensor: Sensor) -> Run:
-    """Return the run with accelerations upward and without gravity, as `sensor` says they are not.
+    """Return the run with accelerations upward and without gravity; `sensor` declares the input.
 
     Channels beside the four point up. An accelerometer at rest whose axis points up reads +g.
     """
@@ -90,7 +90,7 @@ def run_to_messages(
 ) -> Iterator[Message]:
     """Yield the messages of the runs as the truck would have sent them, by time within a run.
 
-    The site's vehicle says what it is at the start of every run. Each run is a boot of its own,
+    The site's vehicle describes itself at the start of every run. Each run is a boot of its own,
     numbered by its first time in ns, so that the same files always give the same messages.
     Accelerations must be upward and without gravity (`normalised`).
     """
@@ -120,7 +120,7 @@ def _accel_messages(run: Run, realm: str, vehicle_id: str, start_ns: int) -> Ite
             sequence,
             time_ns - start_ns,
             time_ns,
-            {name: Channel(run.rate_hz, values[a:b]) for name, values in channels.items()},
+            {name: AccelChannel(run.rate_hz, values[a:b]) for name, values in channels.items()},
         )
         sent_ns = time_ns + round((b - a) * NS_PER_S / run.rate_hz)
         yield Message(key, encode_accel(batch), start_ns, sequence, time_ns, sent_ns)
@@ -149,8 +149,8 @@ def _gnss_messages(run: Run, realm: str, vehicle_id: str, start_ns: int) -> Iter
 def _on_even_grid(run: Run) -> tuple[int, NDArray[np.int64], dict[str, Floats]]:
     """Return the time of grid point 0 in ns, and index and values of the samples on the grid.
 
-    Time stamps that leave the grid by little were rounded, and the samples are taken to be even.
-    By more: the clock is a real one that wanders, and the samples are interpolated.
+    Time stamps that deviate little from the grid were rounded, and the samples count as even. With
+    larger deviations the clock is a real one that wanders, and the samples are interpolated.
     """
     index = grid_index(run.accel_time_s)
     relative = run.accel_time_s - run.accel_time_s[0]
@@ -175,7 +175,7 @@ def _on_even_grid(run: Run) -> tuple[int, NDArray[np.int64], dict[str, Floats]]:
 def resample(
     position: Floats, channels: dict[str, Floats]
 ) -> tuple[NDArray[np.int64], dict[str, Floats]]:
-    """Interpolate samples at increasing positions, in grid steps, onto the whole numbers between.
+    """Interpolate samples at increasing positions (n,), in grid steps, onto the whole numbers.
 
     Cubic splines: for jitter of a few per cent of the step they follow a signal up to half the
     Nyquist frequency to better than the jitter's own effect.
@@ -183,16 +183,17 @@ def resample(
     grid = np.arange(np.ceil(position[0]), np.floor(position[-1]) + 1).astype(np.int64)
     if len(position) < 4:
         return grid, {name: np.interp(grid, position, v) for name, v in channels.items()}
+    check_installed("samples whose time stamps wander", "scipy", extra="identify")
     from scipy.interpolate import CubicSpline  # slow to import, seldom needed
 
     return grid, {name: CubicSpline(position, v)(grid) for name, v in channels.items()}
 
 
 def grid_index(time_s: Floats) -> NDArray[np.int64]:
-    """Number samples (n,) at increasing times; the numbers jump where samples are missing."""
+    """Return numbers of samples (n,) at increasing times, which jump at missing samples."""
     steps = np.diff(time_s)
     usual = float(np.median(steps))
-    # The mean of the steps that are none of a gap: the median of stamps rounded to ms is rounded.
+    # The mean of the steps outside gaps: the median of stamps rounded to ms is rounded.
     usual = float(np.mean(steps[steps < _GAP * usual]))
     missing = np.where(steps < _GAP * usual, 1, np.maximum(np.rint(steps / usual), 2))
     return np.concatenate([[0], np.cumsum(missing)]).astype(np.int64)
@@ -204,5 +205,5 @@ def _slope(x: NDArray[np.int64], y: Floats) -> float:
 
 
 def _nanoseconds(time_s: float) -> int:
-    # Seconds since 1970 carry a quarter of a microsecond: whole microseconds are what is known.
+    # Seconds since 1970 resolve a quarter of a microsecond: whole microseconds are certain.
     return round(time_s * 1e6) * 1000

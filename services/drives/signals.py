@@ -1,19 +1,20 @@
-"""What trucks measured, as arrays: of recordings and of folders of CSV files."""
+"""Measurements of trucks as arrays, from recordings and folders of CSV files."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.signals import AccelBatch, Channel, GnssFix, decode_accel, decode_gnss, in_order
+from schemas.signals import AccelBatch, AccelChannel, GnssFix, in_order
 from schemas.site import Site
 from services.common.extras import check_installed
-from services.common.progress import Offset, unwatched
+from services.common.progress import Offset, no_progress
 from services.drives.importing import normalised_runs
 from services.drives.runs import Run
+from services.finding.drive import drives_of
 from services.recordings.recording import read_messages
 
 if TYPE_CHECKING:
@@ -22,18 +23,16 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
-T = TypeVar("T")
 
-
-class Series(NamedTuple):
+class ChannelSeries(NamedTuple):
     """Samples of one accelerometer, both arrays (n,); a jump in the time is a gap."""
 
     time_ns: Nanoseconds  # since 1970 UTC
     acceleration_m_per_s2: Floats  # up positive, gravity removed
 
 
-class Track(NamedTuple):
-    """Fixes of a receiver in the order of time, all arrays (m,)."""
+class FixSeries(NamedTuple):
+    """Fixes of a receiver in order of time, all arrays (m,)."""
 
     time_ns: Nanoseconds  # since 1970 UTC
     latitude_deg: Floats
@@ -44,22 +43,30 @@ class Track(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """What one truck measured from one start of its computer to the next, or in one CSV run."""
+    """Measurements of one truck during one boot of its computer, or in one CSV run."""
 
     source: str
-    """The file it was read from."""
+    """Path of the source."""
     vehicle: str
-    """Its identifier; empty for CSV files without a site file."""
+    """Identifier of the truck; empty for CSV files without a site file."""
     run: int
     """Number of the run in its file, from 0, by time."""
-    channels: dict[str, Series]
-    """By name, those of `driveby.CHANNELS` first; a channel that the truck lacks is absent."""
-    fixes: Track
+    channels: dict[str, ChannelSeries]
+    """Series by name, `driveby.CHANNELS` first; a channel that the truck lacks is absent."""
+    fixes: FixSeries
+
+    def __repr__(self) -> str:
+        """Return one line: the arrays have 100,000 values."""
+        channels = ", ".join(self.channels) or "no channels"
+        return (
+            f"<Signals {self.source}, run {self.run} of {self.vehicle or 'an unnamed truck'}: "
+            f"{channels}; {self.fixes.time_ns.size} fixes>"
+        )
 
     def accelerations(self) -> "pd.DataFrame":
-        """One column for each channel in m/s², over the UTC time; needs pandas.
+        """Return one column for each channel in m/s², over the UTC time; needs pandas.
 
-        NaN stands where a channel has no sample at a time at which another one has.
+        NaN marks a time at which only another channel has a sample.
         """
         check_installed("a table of accelerations", "pandas")
         import pandas as pd
@@ -71,40 +78,30 @@ class Signals(NamedTuple):
         return pd.DataFrame(columns).rename_axis(index="time")
 
     def positions(self) -> "pd.DataFrame":
-        """One row for each fix, over the UTC time: degrees, m and m/s; needs pandas."""
+        """Return one row for each fix, over the UTC time: degrees, m and m/s; needs pandas."""
         check_installed("a table of positions", "pandas")
         import pandas as pd
 
         time_ns, *values = self.fixes
-        columns = dict(zip(Track._fields[1:], values, strict=True))
+        columns = dict(zip(FixSeries._fields[1:], values, strict=True))
         return pd.DataFrame(columns, index=_utc(time_ns)).rename_axis(index="time")
 
 
-def signals_of_recording(path: Path, progress: Offset = unwatched) -> list[Signals]:
-    """All runs of all trucks in a recording; InputError if it is none.
+def signals_of_recording(path: Path, progress: Offset = no_progress) -> list[Signals]:
+    """Return all runs of all trucks in a recording; InputError if it is none.
 
-    Messages that came twice are taken once, those that cannot be decoded are left out.
+    Duplicate messages count once, undecodable ones are skipped.
     """
-    accel: dict[tuple[str, str, int], dict[int, AccelBatch]] = {}
-    gnss: dict[tuple[str, str, int], dict[int, GnssFix]] = {}
-    for message in read_messages(path, progress):
-        whose = (message.key.realm, message.key.identifier, message.boot_id)
-        try:
-            if message.key.stream == "accel":
-                accel.setdefault(whose, {})[message.sequence] = decode_accel(message.payload)
-            elif message.key.stream == "gnss":
-                gnss.setdefault(whose, {})[message.sequence] = decode_gnss(message.payload)
-        except ValueError:
-            continue  # the logger has counted what cannot be read
     found = [
         Signals(
             str(path),
-            whose[1],
+            drive.vehicle,
             0,
-            series_of_batches(_in_order(accel.get(whose, {}))),
-            _track_of_fixes(_in_order(gnss.get(whose, {}))),
+            series_of_batches(drive.batches()),
+            _track_of_fixes(drive.fixes_in_order()),
         )
-        for whose in accel.keys() | gnss.keys()
+        for drive in drives_of(read_messages(path, progress))
+        if drive.accelerations or drive.fixes
     ]
     return _numbered(found)
 
@@ -112,21 +109,22 @@ def signals_of_recording(path: Path, progress: Offset = unwatched) -> list[Signa
 def signals_of_folder(
     folder: Path, site: Site | None, site_name: str, vehicle: str
 ) -> list[Signals]:
-    """All runs in a folder of CSV files (or of comma2k19), as upward accelerations without gravity.
+    """Return all runs in a folder of CSV files, upward and without gravity.
 
-    Without a site file nobody knows how they were measured: then they are as in the files.
+    comma2k19 counts as CSV. Without a site file the form of the measurements is unknown, and they
+    stay as in the files.
     """
     runs = normalised_runs([folder], site, site_name, vehicle)
     return _numbered([signals_of_run(run, vehicle) for run in runs])
 
 
 def signals_of_run(run: Run, vehicle: str) -> Signals:
-    """One run as signals."""
+    """Return one run as signals."""
     time_ns = _nanoseconds(run.accel_time_s)
-    channels = {name: Series(time_ns, values) for name, values in run.channels.items()}
+    channels = {name: ChannelSeries(time_ns, values) for name, values in run.channels.items()}
     gnss = run.gnss
     heading = np.full(gnss.time_s.size, np.nan) if gnss.heading_deg is None else gnss.heading_deg
-    track = Track(
+    track = FixSeries(
         _nanoseconds(gnss.time_s),
         gnss.latitude_deg,
         gnss.longitude_deg,
@@ -137,41 +135,37 @@ def signals_of_run(run: Run, vehicle: str) -> Signals:
     return Signals(run.source, vehicle, 0, channels, track)
 
 
-def series_of_batches(batches: Sequence[AccelBatch]) -> dict[str, Series]:
-    """Join batches, in their order, into one series for each channel that there is."""
+def series_of_batches(batches: Sequence[AccelBatch]) -> dict[str, ChannelSeries]:
+    """Join batches, in their order, into one series (n,) for each channel."""
     series = {}
     for name in in_order(name for batch in batches for name in batch.channels):
         parts = [(b.wall_time_ns, b.channels[name]) for b in batches if name in b.channels]
-        series[name] = Series(
+        series[name] = ChannelSeries(
             np.concatenate(list(_times_ns(parts))),
             np.concatenate([c.samples for _, c in parts]),
         )
     return series
 
 
-def _times_ns(parts: Iterable[tuple[int, Channel]]) -> Iterator[Nanoseconds]:
-    """Of all samples, of batches of one size at a time: an hour has 72,000."""
+def _times_ns(parts: Iterable[tuple[int, AccelChannel]]) -> Iterator[Nanoseconds]:
+    """Yield the times of all samples, for batches of one size at a time: an hour has 72,000."""
     for (size, rate_hz), alike in groupby(parts, lambda p: (p[1].samples.size, p[1].rate_hz)):
         offsets = np.rint(np.arange(size) * (1e9 / rate_hz)).astype(np.int64)
         starts = np.array([start_ns for start_ns, _ in alike], dtype=np.int64)
         yield np.add.outer(starts, offsets).reshape(-1)
 
 
-def _in_order(by_sequence: dict[int, T]) -> list[T]:
-    return [by_sequence[sequence] for sequence in sorted(by_sequence)]
-
-
-def _track_of_fixes(fixes: Sequence[GnssFix]) -> Track:
+def _track_of_fixes(fixes: Sequence[GnssFix]) -> FixSeries:
     rows = [
         (f.latitude_deg, f.longitude_deg, f.altitude_m, f.speed_m_per_s, f.heading_deg)
         for f in fixes
     ]
     table = np.array(rows, dtype=np.float64).reshape(-1, 5).T
-    return Track(np.array([f.wall_time_ns for f in fixes], dtype=np.int64), *table)
+    return FixSeries(np.array([f.wall_time_ns for f in fixes], dtype=np.int64), *table)
 
 
 def _numbered(found: Iterable[Signals]) -> list[Signals]:
-    """By time, numbered."""
+    """Return the signals by time, numbered."""
     in_order = sorted(found, key=lambda signals: (min(_starts(signals)), signals.vehicle))
     return [signals._replace(run=number) for number, signals in enumerate(in_order)]
 
@@ -183,7 +177,7 @@ def _starts(signals: Signals) -> Iterator[int]:
 
 
 def _nanoseconds(time_s: Floats) -> Nanoseconds:
-    # Seconds since 1970 carry a quarter of a microsecond: whole microseconds are what is known.
+    # Seconds since 1970 resolve a quarter of a microsecond: whole microseconds are certain.
     return np.rint(time_s * 1e6).astype(np.int64) * 1000
 
 

@@ -1,1 +1,1 @@
-"""Where identifications run: here, in processes, or elsewhere."""
+"""Executors of identifications: inline, in processes, or on a cluster."""

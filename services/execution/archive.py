@@ -1,10 +1,10 @@
-"""An archive of recordings becomes results in a folder: any number of crossings, gone on with.
+"""Identify an archive of recordings into a folder of results, for any number of crossings.
 
-Recordings that follow each other closely, or overlap, are one drive; drive after drive is read, and
-its crossings are given to an `Execution`, which may work on several drives at once. A result is on
-the disk before it is told. A crossing whose result is in the folder is not identified again, so
-who was killed is started again and goes on. What cannot be read is a problem, a line each, and
-costs nothing but itself.
+Recordings that follow each other closely, or overlap, are one drive. Drive after drive is read, and
+its crossings are submitted to a `CrossingExecutor`, which may work on several drives at once. A
+result is on the disk before it is reported. A crossing whose result is in the folder is not
+identified again, so a killed command is run again to resume. Unreadable input is a problem, one
+line each, and affects nothing else.
 """
 
 import logging
@@ -17,33 +17,37 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from schemas.accel_check import check_accel
-from schemas.certificates import Pair
 from schemas.reasons import Reason
-from schemas.results import BridgeResult, Crossing, Header
+from schemas.results import BridgeResult, CrossingResult, ResultHeader
 from schemas.settings import IdentificationSettings
 from schemas.signals import NS_PER_S, TRUCK_DECODERS
 from schemas.site import Site
+from schemas.topics import Message
+from schemas.validation_records import VehicleBridgePair
 from services.common.errors import InputError
 from services.common.stores import opened, size_of
 from services.execution.blas import one_blas_thread
-from services.execution.content import content_of
-from services.execution.dispatch import Execution
-from services.execution.kept import Kept, Result
+from services.execution.dispatch import CrossingExecutor
 from services.execution.offline import header_of
-from services.execution.overview import (
-    STREAMS,
-    as_they_were_made,
-    look_over,
-    remembered,
-)
 from services.execution.program import program
-from services.identification.bridge_state import Counted, Fusing, against, count_in, usable
-from services.identification.engine import Engine
-from services.identification.known import LONGEST_STAY_S
-from services.identification.outputs import Fuse, Said, Work
-from services.recordings.away import AtHand, Away, Recording, at_hand
+from services.execution.result_store import ResultStore, StoredResult
+from services.execution.task_hash import task_hash
+from services.finding.crossing_data import Complete
+from services.finding.finder import Finder, Found
+from services.finding.order import STREAMS, cached_reader, in_measurement_order, index_messages
+from services.finding.stays import LONGEST_STAY_S
+from services.identification.bridge_state import (
+    Fusing,
+    RecentCrossings,
+    add_crossings,
+    against,
+    usable,
+)
+from services.identification.outputs import FusionTask, IdentificationTask
+from services.identification.windows import window_of
 from services.recordings.mcap_ranges import ChunkIndexes, read_index
-from services.recordings.recording import Message, is_being_written, read_info, read_messages
+from services.recordings.recording import is_being_written, read_info, read_messages
+from services.recordings.remote import LocalRecording, Recording, RemoteRecording, fetched
 
 _log = logging.getLogger(__name__)
 APART_NS: Final = round((LONGEST_STAY_S + 60.0) * NS_PER_S)
@@ -52,89 +56,93 @@ _MOST_UNSAVED = 20
 _LONGEST_UNSAVED_S = 10.0
 _WAIT_S = 0.1
 _NAMES = 2
-"""So many recordings of a drive are named."""
+"""Maximum number of recordings of a drive that are listed by name."""
 
 
-class Asked(NamedTuple):
-    """What is to be identified, and how."""
+class ArchiveJob(NamedTuple):
+    """Recordings to identify, with the site and the settings."""
 
     recordings: tuple[Recording, ...]
     site: Site
     settings: IdentificationSettings
     fusing: Fusing
-    certificates: Mapping[Pair, str]
+    certificates: Mapping[VehicleBridgePair, str]
 
     @property
-    def header(self) -> Header:
-        """What every result says of how it came about."""
+    def header(self) -> ResultHeader:
+        """Return the header of every result."""
         return header_of(self.site, self.settings, time.time())
 
 
-class Archive(NamedTuple):
-    """What came of an archive."""
+class ArchiveResult(NamedTuple):
+    """Outcome of identifying an archive."""
 
     verdicts: Counter[str]
-    """How many crossings have each."""
+    """Number of crossings by verdict."""
     there: int
-    """Crossings whose results were in the folder before."""
+    """Number of crossings whose results were in the folder before."""
     failed: tuple[str, ...]
-    """Crossings that could not be identified for no reason of their own; tried anew next time."""
+    """Crossings whose identification failed unexpectedly; the next run tries them again."""
     problems: tuple[str, ...]
-    """Recordings, messages and results that cannot be read, a line each."""
+    """Unreadable recordings, messages and results, one line each."""
     bridges: dict[str, BridgeResult]
 
 
-class _Done(NamedTuple):
-    crossing: Crossing
+class _StoredCrossing(NamedTuple):
+    crossing: CrossingResult
     was_there: bool
 
 
 def identify_archive(
-    asked: Asked,
-    execution: Execution,
-    kept: Kept,
-    take: Callable[[Crossing], object] = lambda crossing: None,
+    job: ArchiveJob,
+    execution: CrossingExecutor,
+    store: ResultStore,
+    on_result: Callable[[CrossingResult], object] = lambda crossing: None,
     report: Callable[[int], object] = lambda crossings: None,
-) -> Archive:
-    """Identify all crossings of recordings that have no result in `kept`, and fuse all.
+) -> ArchiveResult:
+    """Identify all crossings of recordings that have no result in `store`, and fuse all.
 
-    `take` is given every result, in any order, after it is on the disk; `report` is told how many
-    there are. Of each bridge the newest crossings are fused, as for the state of a bridge.
+    `on_result` is called with every result, in any order, after it is on the disk; `report` with
+    their number. Of each bridge the newest crossings are fused, as for the state of a bridge.
     """
     problems: list[str] = []
     verdicts: Counter[str] = Counter()
     there, failed = 0, []
-    counted: dict[tuple[str, str], Counted] = {}
+    counted: dict[tuple[str, str], RecentCrossings] = {}
     with one_blas_thread():
-        for crossing, was_there in _identified(asked, problems, execution, kept):
-            told = against(crossing, asked.fusing.baselines.get(crossing.bridge))
-            verdicts[told.verdict] += 1
+        for crossing, was_there in _identified(job, problems, execution, store):
+            crossing = against(crossing, job.fusing.baselines.get(crossing.bridge))
+            verdicts[crossing.verdict] += 1
             there += was_there
-            if is_failed(told):
-                failed.append(told.crossing_id)
-            counts = usable(told)
+            if is_failed(crossing):
+                failed.append(crossing.crossing_id)
+            counts = usable(crossing)
             if counts is not None:
-                name = (told.realm, told.bridge)
-                counted[name] = count_in(counted.get(name, Counted()), [counts])
-            take(told)
+                name = (crossing.realm, crossing.bridge)
+                counted[name] = add_crossings(counted.get(name, RecentCrossings()), [counts])
+            on_result(crossing)
             report(verdicts.total())
-        bridges = _fused(counted, asked.fusing, execution)
-    return Archive(verdicts, there, tuple(sorted(failed)), (*problems, *kept.problems), bridges)
+        bridges = _fused(counted, job.fusing, execution)
+    return ArchiveResult(
+        verdicts, there, tuple(sorted(failed)), (*problems, *store.problems), bridges
+    )
 
 
-def is_failed(crossing: Crossing) -> bool:
-    """Whether its identification failed in a way that nobody foresaw."""
+def is_failed(crossing: CrossingResult) -> bool:
+    """Return whether the identification failed unexpectedly."""
     return Reason.FAILED in crossing.reasons
 
 
-def works_of(asked: Asked, problems: list[str]) -> Iterator[Work]:
-    """All crossings of the recordings, drive after drive; `problems` gets a line for each."""
-    for drive in drives_of(asked.recordings, problems):
-        yield from _works_of_drive(drive, asked, problems)
+def iter_tasks(job: ArchiveJob, problems: list[str]) -> Iterator[IdentificationTask]:
+    """Yield all crossings of the recordings, drive after drive; append problems, one line each."""
+    for drive in group_into_drives(job.recordings, problems):
+        yield from _tasks_of_drive(drive, job, problems)
 
 
-def drives_of(recordings: Iterable[Recording], problems: list[str]) -> Iterator[list[Recording]]:
-    """Recordings that overlap or follow each other within minutes, together, by time."""
+def group_into_drives(
+    recordings: Iterable[Recording], problems: list[str]
+) -> Iterator[list[Recording]]:
+    """Yield groups of recordings that overlap or follow each other within minutes, by time."""
     spans: list[tuple[int, int, Recording]] = []
     for recording in dict.fromkeys(recordings):
         try:
@@ -154,61 +162,63 @@ def drives_of(recordings: Iterable[Recording], problems: list[str]) -> Iterator[
 
 
 def _times_of(recording: Recording) -> tuple[int, int]:
-    """Between which times something stands in a recording, ns since 1970 UTC."""
+    """Return the first and last time in a recording, ns since 1970 UTC."""
     index = _index_of(recording)
     if index is not None and index.chunks:
         first_ns = min(chunk.message_start_time for chunk in index.chunks)
         return first_ns, max(chunk.message_end_time for chunk in index.chunks)
-    with at_hand(recording) as file, _named(file):
+    with fetched(recording) as file, _named(file):
         info = read_info(file.path)
     return info.first_time_ns, info.last_time_ns
 
 
 def _index_of(recording: Recording) -> ChunkIndexes | None:
-    """The index of a recording, read by ranges; None if it has none that holds."""
-    if isinstance(recording, Away):
+    """Return the index of a recording, read by ranges; None if it has no valid one."""
+    if isinstance(recording, RemoteRecording):
         size = size_of(recording.folder, recording.name)
         with opened(recording.folder, recording.name) as file:
             return read_index(file, size)
     try:
-        # A crossing that is not over would be identified now, and as another one later.
+        # A crossing that is not finished would be identified now, and again later as another one.
         if is_being_written(recording):
             raise InputError(f"{recording}: is being written; it is identified when it is closed")
         with recording.open("rb") as file:
             return read_index(file, recording.stat().st_size)
     except OSError:
-        return None  # what is wrong with it is said where it is read
+        return None  # reading it reports what is wrong
 
 
 @contextmanager
-def _named(file: AtHand) -> Iterator[None]:
-    """Let an InputError call a recording as the user does."""
+def _named(file: LocalRecording) -> Iterator[None]:
+    """Replace the path in an InputError by the name that the user gave."""
     try:
         yield
     except InputError as error:
-        raise InputError(file.told(str(error))) from None
+        raise InputError(file.relabel(str(error))) from None
 
 
-def _works_of_drive(drive: list[Recording], asked: Asked, problems: list[str]) -> Iterator[Work]:
+def _tasks_of_drive(
+    drive: list[Recording], job: ArchiveJob, problems: list[str]
+) -> Iterator[IdentificationTask]:
     with ExitStack() as stack:
         files = []
         for recording in drive:
             try:
-                files.append(stack.enter_context(at_hand(recording)))
+                files.append(stack.enter_context(fetched(recording)))
             except InputError as error:
                 problems.append(str(error))
         if files:
             before = [_state_of(file) for file in files]
-            yield from _works_of_files(files, asked, problems)
+            yield from _tasks_of_files(files, job, problems)
             problems += (
-                f"{file.name}: has changed while it was read; the same command again reads it anew"
+                f"{file.name}: changed while it was read; run the command again to read it again"
                 for file, was in zip(files, before, strict=True)
                 if _state_of(file) != was
             )
 
 
-def _state_of(file: AtHand) -> tuple[int, int, int] | None:
-    """By what it is told that a file has changed; None if it is gone."""
+def _state_of(file: LocalRecording) -> tuple[int, int, int] | None:
+    """Return the file's inode, size and time, which a change alters; None if it is gone."""
     try:
         status = file.path.stat()
     except OSError:
@@ -216,79 +226,76 @@ def _state_of(file: AtHand) -> tuple[int, int, int] | None:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def _works_of_files(files: list[AtHand], asked: Asked, problems: list[str]) -> Iterator[Work]:
+def _tasks_of_files(
+    files: list[LocalRecording], job: ArchiveJob, problems: list[str]
+) -> Iterator[IdentificationTask]:
     names = [file.name for file in files]
     name = ", ".join(names[:_NAMES]) + (" …" if len(names) > _NAMES else "")
-    reading = _Reading(files, problems)
+    reading = _DriveReader(files, problems)
     try:
-        drives = look_over(name, remembered(reading.messages), asked.site)
+        drives = index_messages(name, cached_reader(reading.messages), job.site)
     except InputError as error:
         problems.append(str(error))
         return
-    strangers = drives.drove - {vehicle.id for vehicle in asked.site.vehicles}
+    strangers = drives.drove - {vehicle.id for vehicle in job.site.vehicles}
     if strangers:
-        _log.warning("%s: the site has no vehicle %s", name, ", ".join(sorted(strangers)))
-    engine = Engine(
-        asked.site,
-        asked.settings,
-        asked.header,
-        certificates=asked.certificates,
-        tells_states=False,
-    )
+        _log.warning("%s: the site file has no vehicle %s", name, ", ".join(sorted(strangers)))
+    finder = Finder(job.site, window_of(job.settings.method))
     for message in drives.near:
-        engine.expect(message.key, message.payload, for_ever=True)
-    said = chain.from_iterable(
-        _said(engine, message, reading) for message in as_they_were_made(drives)
+        finder.expect(message.key, message.payload, for_ever=True)
+    found = chain.from_iterable(
+        _found(finder, message, reading) for message in in_measurement_order(drives)
     )
-    for one in chain(said, engine.finish()):
-        if isinstance(one, Work):
-            yield one
+    for one in chain(found, finder.finish()):
+        if isinstance(one, Complete):
+            pair = VehicleBridgePair(one.data.vehicle.id, one.data.bridge.id)
+            yield IdentificationTask(0, one.data, job.settings, job.certificates.get(pair))
     if reading.changed:
         number = f"{reading.changed} message{' has' if reading.changed == 1 else 's have'}"
         problems.append(f"{name}: {number} changed while it was read")
 
 
-def _said(engine: Engine, message: Message, reading: "_Reading") -> Iterator[Said]:
-    """What the engine says of a message; one that was sound at the first reading may not be now."""
+def _found(finder: Finder, message: Message, reading: "_DriveReader") -> Iterator[Found]:
+    """Feed a message; one that was valid at the first reading may be invalid now."""
     try:
-        return engine.feed(message.key, message.payload)
+        return finder.feed(message.key, message.payload)
     except ValueError:
         reading.changed += 1
         return iter(())
 
 
-class _Reading:
-    """Messages of a drive, without those that cannot be decoded: a line for each recording."""
+class _DriveReader:
+    """Messages of a drive, without undecodable ones: one problem line for each recording."""
 
-    def __init__(self, files: list[AtHand], problems: list[str]) -> None:
+    def __init__(self, files: list[LocalRecording], problems: list[str]) -> None:
         self._files = files
         self._problems = problems
         self.changed = 0
-        """Messages that could be decoded at the first reading only."""
+        """Number of messages that were decodable at the first reading only."""
         self._wrong: set[tuple[Path, int]] = set()
-        """Messages that cannot be decoded, by their numbers in their files."""
+        """Undecodable messages, by their numbers in their files."""
 
     def messages(self, is_again: bool) -> Iterator[Message]:
         for file in self._files:
             try:
                 yield from self._of_file(file, is_again)
             except InputError as error:
-                line = file.told(str(error))
+                line = file.relabel(str(error))
                 if line not in self._problems:
                     self._problems.append(line)
 
-    def _of_file(self, file: AtHand, is_again: bool) -> Iterator[Message]:
+    def _of_file(self, file: LocalRecording, is_again: bool) -> Iterator[Message]:
         wrong: list[str] = []
         path = file.path
 
         def warn(text: str) -> None:
             if not is_again:
-                _log.warning("%s", file.told(text))
+                _log.warning("%s", file.relabel(text))
 
         for number, message in enumerate(read_messages(path, warn=warn)):
             if message.key.owner != "vehicle" or message.key.stream not in STREAMS:
                 continue
-            if not is_again and (why := _what_is_wrong(message)):
+            if not is_again and (why := _decoding_error(message)):
                 wrong.append(f"{message.key.stream} {message.sequence}: {why}")
                 self._wrong.add((path, number))
             if (path, number) not in self._wrong:
@@ -301,7 +308,7 @@ class _Reading:
             )
 
 
-def _what_is_wrong(message: Message) -> str:
+def _decoding_error(message: Message) -> str:
     try:
         if message.key.stream == "accel":
             check_accel(message.payload)
@@ -313,85 +320,89 @@ def _what_is_wrong(message: Message) -> str:
 
 
 def _identified(
-    asked: Asked, problems: list[str], execution: Execution, kept: Kept
-) -> Iterator[_Done]:
-    """Every crossing once with its result, as they come, after that is on the disk."""
+    job: ArchiveJob, problems: list[str], execution: CrossingExecutor, store: ResultStore
+) -> Iterator[_StoredCrossing]:
+    """Yield every crossing once with its result, after that is on the disk."""
     ours = program()
     seen: set[str] = set()
-    under_way = _UnderWay(execution, kept, asked.header)
+    unsaved = _UnsavedResults(execution, store, job.header)
     try:
-        for number, work in enumerate(works_of(asked, problems), start=1):
-            content = content_of(work, ours)
+        for number, work in enumerate(iter_tasks(job, problems), start=1):
+            content = task_hash(work, ours)
             if content in seen:
                 continue  # the same recording by two names
             seen.add(content)
-            result = kept.result(content)
+            result = store.result(content)
             if result is not None:
-                yield _Done(result, was_there=True)
+                yield _StoredCrossing(result, was_there=True)
                 continue
-            under_way.start(work._replace(number=number), content)
-            yield from under_way.done(0.0)
+            unsaved.submit(work._replace(number=number), content)
+            yield from unsaved.done(0.0)
             while execution.is_full:
-                yield from under_way.done(_WAIT_S)
+                yield from unsaved.done(_WAIT_S)
         while execution.is_busy:
-            yield from under_way.done(_WAIT_S)
+            yield from unsaved.done(_WAIT_S)
     finally:
-        saved = under_way.saved()
+        saved = unsaved.saved()
     yield from saved
 
 
-class _UnderWay:
-    """Crossings between their start and the moment in which their results are on the disk."""
+class _UnsavedResults:
+    """Crossings between their submission and the moment when their results are on the disk."""
 
-    def __init__(self, execution: Execution, kept: Kept, header: Header) -> None:
+    def __init__(
+        self, execution: CrossingExecutor, store: ResultStore, header: ResultHeader
+    ) -> None:
         self._execution = execution
-        self._kept = kept
+        self._store = store
         self._header = header
         self._contents: dict[int, str] = {}
-        self._unsaved: list[Result] = []
+        self._unsaved: list[StoredResult] = []
         self._since_s = 0.0
 
-    def start(self, work: Work, content: str) -> None:
+    def submit(self, work: IdentificationTask, content: str) -> None:
         self._contents[work.number] = content
-        self._execution.start(work)
+        self._execution.submit(work)
 
-    def done(self, timeout_s: float) -> Iterator[_Done]:
-        """What is on the disk by now."""
-        for work, result in self._execution.finished(timeout_s):
+    def done(self, timeout_s: float) -> Iterator[_StoredCrossing]:
+        """Return the crossings whose results are on the disk by now."""
+        for work, result in self._execution.collect(timeout_s):
             content = self._contents.pop(work.number)
             if work.certificate is not None:
                 result = result.model_copy(update={"certificate": work.certificate})
             if is_failed(result):
-                yield _Done(result, was_there=False)
+                yield _StoredCrossing(result, was_there=False)
                 continue
             self._since_s = self._since_s if self._unsaved else time.monotonic()
-            self._unsaved.append(Result(content, result))
+            self._unsaved.append(StoredResult(content, result))
         is_late = self._unsaved and time.monotonic() - self._since_s > _LONGEST_UNSAVED_S
         if is_late or len(self._unsaved) >= _MOST_UNSAVED:
             yield from self.saved()
 
-    def saved(self) -> list[_Done]:
-        """Put on the disk what is not there yet."""
-        self._kept.put(self._unsaved, self._header)
-        done = [_Done(one.crossing, was_there=False) for one in self._unsaved]
+    def saved(self) -> list[_StoredCrossing]:
+        """Write the unsaved results to the disk."""
+        self._store.put(self._unsaved, self._header)
+        done = [_StoredCrossing(one.crossing, was_there=False) for one in self._unsaved]
         self._unsaved = []
         return done
 
 
 def _fused(
-    counted: Mapping[tuple[str, str], Counted], fusing: Fusing, execution: Execution
+    counted: Mapping[tuple[str, str], RecentCrossings], fusing: Fusing, execution: CrossingExecutor
 ) -> dict[str, BridgeResult]:
-    """The states of all bridges, those in several realms by the last one."""
+    """Return the states of all bridges; of a bridge in several realms the last one."""
     states: dict[str, BridgeResult] = {}
     for (realm, bridge), crossings in sorted(counted.items()):
         baseline = fusing.baselines.get(bridge)
         with_one = fusing._replace(baselines={} if baseline is None else {bridge: baseline})
-        execution.fuse(Fuse(realm, bridge, crossings, with_one, crossings.newest[-1].exit_time))
+        execution.submit_fusion(
+            FusionTask(realm, bridge, crossings, with_one, crossings.newest[-1].exit_time)
+        )
     while execution.is_busy:
-        execution.finished(_WAIT_S)
-        for fuse, state in execution.fused():
+        execution.collect(_WAIT_S)
+        for fuse, state in execution.collect_fusions():
             if state is None:
-                _log.warning("%s: its crossings could not be fused", fuse.bridge)
+                _log.warning("%s: fusing its crossings failed", fuse.bridge)
             else:
                 states[fuse.bridge] = state
     return dict(sorted(states.items()))

@@ -1,8 +1,8 @@
-"""One thread of BLAS while we compute.
+"""Restriction of BLAS to one thread during a computation.
 
-Our matrices are small: threads that wait for each other at every column cost several times the
-work itself. The commands say so by OPENBLAS_NUM_THREADS before numpy is imported; in a notebook
-numpy has long been there, and only the library itself can be told.
+Our matrices are small: threads that wait for each other at every column cost several times the work
+itself. The commands set OPENBLAS_NUM_THREADS before numpy is imported; in a notebook numpy is
+already loaded, and only the library itself can be limited.
 """
 
 from collections.abc import Iterator
@@ -11,9 +11,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit the BLAS of this process to one thread, and give back what it had before.
+    """Limit the BLAS of this process to one thread, and restore its previous limit.
 
-    The limit is the whole process's: what other threads multiply meanwhile is limited, too.
+    The limit applies to the whole process, including multiplications in other threads.
     """
     import scipy.linalg  # noqa: F401 - brings a BLAS of its own, which must be loaded to be limited
     from threadpoolctl import threadpool_limits

@@ -1,149 +1,144 @@
-"""Between the engine, which says what is to be identified and fused, and where that is done.
+"""Connection of the engine, which requests identifications and fusions, with an executor.
 
-The engine's messages come through in their order; a crossing is handed to an `Execution`, and what
-the engine says of its result follows when it has come. So are crossings that are to be fused.
+The engine's messages keep their order. A crossing is submitted to a `CrossingExecutor`, and the
+engine's messages about its result follow when it is received, as they do for fusions.
 """
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple, Protocol
 
-from schemas.certificates import Pair
 from schemas.reasons import Reason
-from schemas.results import BridgeResult, Crossing
-from schemas.topics import Key
-from services.identification.crossing_data import Passing, rejected
+from schemas.results import BridgeResult, CrossingResult
+from schemas.validation_records import VehicleBridgePair
 from services.identification.engine import Engine
-from services.identification.outputs import Fuse, Output, Said, Wanted, Work
+from services.identification.outputs import (
+    EngineOutput,
+    FusionTask,
+    IdentificationTask,
+    Output,
+    ValidationRequest,
+)
+from services.identification.result_parts import CrossingTimes, rejected
 
-_LOOK_AGAIN_S = 0.1
-"""A wait is cut into pieces, so that Python hears signals between them."""
+_POLL_S = 0.1
+"""Longest uninterrupted wait in s: Python handles signals between two waits."""
 
 
-class Finished(NamedTuple):
+class TaskResult(NamedTuple):
     """A crossing with its result."""
 
-    work: Work
-    result: Crossing
+    work: IdentificationTask
+    result: CrossingResult
 
 
-class Fused(NamedTuple):
-    """Crossings of a bridge with its state; None: they could not be fused."""
+class FusionResult(NamedTuple):
+    """A fusion with the bridge's state; None if it failed."""
 
-    fuse: Fuse
+    fuse: FusionTask
     state: BridgeResult | None
 
 
-class Begun(NamedTuple):
-    """A crossing that is being identified."""
+class RunningCrossing(NamedTuple):
+    """A crossing whose identification runs."""
 
     crossing_id: str
     seconds: float
-    """Since it was begun, this time."""
+    """Time in s since this attempt started."""
 
 
-class Execution(Protocol):
-    """Where crossings are identified and fused. To be used from one thread."""
+class CrossingExecutor(Protocol):
+    """Interface of executors, which identify and fuse crossings. To be used from one thread."""
 
     @property
     def is_busy(self) -> bool:
-        """Whether there is something that `finished` or `fused` has not given back yet."""
+        """Return whether a result or a state is still to be collected."""
 
     @property
     def is_full(self) -> bool:
-        """Whether more works should wait until some have been given back."""
+        """Return whether results should be collected before more crossings are submitted."""
 
     @property
     def has_room(self) -> bool:
-        """Whether it would not be full after one more work."""
+        """Return whether one more crossing would not make it full."""
 
     @property
     def is_idle(self) -> bool:
-        """Whether a work that is started now is begun at once, or as soon as an aside is over."""
+        """Return whether a crossing submitted now starts at once, or after a background task."""
 
     @property
     def waiting(self) -> int:
-        """How many works have been started and not begun."""
+        """Return the number of crossings submitted and not started."""
 
     @property
-    def under_way(self) -> list[Begun]:
-        """The crossings that are being identified, the one that was begun first first."""
+    def running(self) -> list[RunningCrossing]:
+        """Return the running crossings, the one that started first first."""
 
-    def start(self, work: Work) -> None:
-        """Take a work; it is done now, later or elsewhere."""
+    def submit(self, work: IdentificationTask) -> None:
+        """Submit a crossing; it is identified now, later or elsewhere."""
 
-    def finished(self, timeout_s: float = 0.0) -> list[Finished]:
-        """What has been done since the last call, each work once, in any order.
+    def collect(self, timeout_s: float = 0.0) -> list[TaskResult]:
+        """Return the crossings identified since the last call, each once, in any order.
 
-        If there is nothing yet, what has been done as soon as something has, or `timeout_s` is
-        over.
+        Without one it waits until there is one, or for `timeout_s`.
         """
 
-    def fuse(self, fuse: Fuse) -> None:
-        """Take crossings to be fused, in place of older ones of their bridge that still wait."""
+    def submit_fusion(self, fuse: FusionTask) -> None:
+        """Submit a fusion, in place of an older one of the same bridge that still waits."""
 
-    def fused(self) -> list[Fused]:
-        """The states that have been made since the last call, those of a bridge in their order.
+    def collect_fusions(self) -> list[FusionResult]:
+        """Return the states computed since the last call, those of a bridge in their order.
 
-        `finished` looks after them: it returns, too, as soon as there is one.
+        `collect` drives fusions too, and also returns as soon as there is a state.
         """
 
 
-def dispatched(
+def dispatch(
     engine: Engine,
-    execution: Execution,
-    said: Iterable[Said],
-    want: Callable[[Pair], None] = lambda pair: None,
+    execution: CrossingExecutor,
+    reported: Iterable[EngineOutput],
+    want: Callable[[VehicleBridgePair], None] = lambda pair: None,
 ) -> Iterator[Output]:
-    """What the engine says, its works executed; what comes back meanwhile is told, too.
+    """Yield the engine's messages, its tasks executed, and those that results lead to meanwhile.
 
-    `want` is told of the pairs whose certificates are wanted.
+    `want` is called with the pairs whose site validation is requested.
     """
-    for one in said:
+    for one in reported:
         if isinstance(one, Output):
             yield one
             continue
-        if isinstance(one, Wanted):
+        if isinstance(one, ValidationRequest):
             want(one.pair)
             continue
-        if isinstance(one, Fuse):
-            execution.fuse(one)
-            yield from collected(engine, execution)
+        if isinstance(one, FusionTask):
+            execution.submit_fusion(one)
+            yield from collect(engine, execution)
             continue
-        execution.start(one)
-        yield from collected(engine, execution)
+        execution.submit(one)
+        yield from collect(engine, execution)
         while execution.is_full:
-            yield from collected(engine, execution, _LOOK_AGAIN_S)
+            yield from collect(engine, execution, _POLL_S)
 
 
-def collected(engine: Engine, execution: Execution, timeout_s: float = 0.0) -> Iterator[Output]:
-    """What the engine says of the results and states that have come."""
-    for work, result in execution.finished(timeout_s):
-        yield from dispatched(engine, execution, engine.done(work, result))
-    for fuse, state in execution.fused():
+def collect(
+    engine: Engine, execution: CrossingExecutor, timeout_s: float = 0.0
+) -> Iterator[Output]:
+    """Yield the engine's messages about the results and states that are available."""
+    for work, result in execution.collect(timeout_s):
+        yield from dispatch(engine, execution, engine.done(work, result))
+    for fuse, state in execution.collect_fusions():
         yield from engine.fused(fuse, state)
 
 
-def awaited(engine: Engine, execution: Execution) -> Iterator[Output]:
-    """What the engine says of everything that is still being identified or fused."""
+def drain(engine: Engine, execution: CrossingExecutor) -> Iterator[Output]:
+    """Yield the engine's messages about everything that is still identified or fused."""
     while execution.is_busy:
-        yield from collected(engine, execution, _LOOK_AGAIN_S)
+        yield from collect(engine, execution, _POLL_S)
 
 
-def feed_all(
-    engine: Engine, execution: Execution, messages: Iterable[tuple[Key, bytes]]
-) -> Iterator[Output]:
-    """Feed a whole recording, and finish."""
-    for key, payload in messages:
-        engine.expect(key, payload)
-        yield from dispatched(engine, execution, engine.feed(key, payload))
-    yield from dispatched(engine, execution, engine.finish())
-    yield from awaited(engine, execution)
-
-
-def failed(work: Work) -> Crossing:
-    """The result of a crossing whose identification failed in a way that nobody foresaw."""
+def failed_result(work: IdentificationTask) -> CrossingResult:
+    """Return the result of a crossing whose identification failed unexpectedly."""
     data = work.data
-    stay, way_m = data.stay, data.bridge.span_m + data.vehicle.wheelbase_m
+    stay, way_m = data.stay, data.bridge.span_m + data.vehicle.length_m
     speed_m_per_s = way_m / (stay.exit_s - stay.entry_s) if stay.exit_s > stay.entry_s else 0.0
-    passing = Passing(stay.entry_s, stay.exit_s, speed_m_per_s)
+    passing = CrossingTimes(stay.entry_s, stay.exit_s, speed_m_per_s)
     return rejected(data, work.settings, passing, [Reason.FAILED])

@@ -1,42 +1,46 @@
-"""Recordings become results, offline, through the worker's own engine."""
+"""Offline identification of recordings, through the worker's own engine."""
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 
-from schemas.certificates import Pair
-from schemas.results import Header, Results, results
+from schemas.results import ResultHeader, Results, results
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site, site_hash
+from schemas.topics import Message
+from schemas.validation_records import VehicleBridgePair
 from services.common.errors import InputError
+from services.common.progress import Offset, no_progress
 from services.execution.blas import one_blas_thread
-from services.execution.dispatch import Execution, awaited, dispatched
-from services.execution.here import Here, Report
-from services.execution.overview import (
-    Overview,
-    as_they_were_made,
-    look_over,
+from services.execution.dispatch import CrossingExecutor, dispatch, drain
+from services.execution.inline import InlineExecutor, Report
+from services.finding.order import (
+    STREAMS,
+    MessageIndex,
+    Read,
+    cached_reader,
+    in_measurement_order,
+    index_messages,
     malformed,
-    messages_of_trucks,
 )
 from services.identification.bridge_state import NOTHING_STORED, Fusing, with_common_shares
 from services.identification.engine import Engine
 from services.identification.identify import Keep
-from services.identification.outputs import Said
-from services.recordings.recording import Message, program_version, read_site
+from services.identification.outputs import EngineOutput
+from services.recordings.recording import program_version, read_messages, read_site
 
 _log = logging.getLogger(__name__)
 
 
-def _unwatched(crossing_id: str, stage: str, fraction: float) -> None:
-    """For who does not want to know how far a crossing is."""
+def _ignore_progress(crossing_id: str, stage: str, fraction: float) -> None:
+    """Ignore the progress of a crossing."""
 
 
 def site_of(recordings: list[Path], site: Path | None) -> Site:
-    """The site file given, or else the one stored in the first recording that has one."""
+    """Return the given site file, or the one stored in the first recording that has one."""
     if site is not None:
         return load_site(site)
     for path in recordings:
@@ -46,9 +50,9 @@ def site_of(recordings: list[Path], site: Path | None) -> Site:
     raise InputError(f"{recordings[0]}: no site file is stored in it, give one with --site")
 
 
-def header_of(site: Site, settings: IdentificationSettings, created_s: float) -> Header:
-    """What results say of how they came about; `created_s` is in seconds since 1970 UTC."""
-    return Header(
+def header_of(site: Site, settings: IdentificationSettings, created_s: float) -> ResultHeader:
+    """Return the header of results; `created_s` is in seconds since 1970 UTC."""
+    return ResultHeader(
         version=program_version(),
         created=created_s,
         site_hash=site_hash(site),
@@ -57,57 +61,74 @@ def header_of(site: Site, settings: IdentificationSettings, created_s: float) ->
     )
 
 
+def messages_of_trucks(
+    recordings: Iterable[Path], next_file: Callable[[], Offset] = lambda: no_progress
+) -> Read:
+    """Return a reader of the trucks' messages; its first pass calls `next_file` at each file."""
+
+    def of_files(watch: Callable[[], Offset]) -> Iterator[Message]:
+        for path in recordings:
+            for message in read_messages(path, watch()):
+                if message.key.owner == "vehicle" and message.key.stream in STREAMS:
+                    yield message
+
+    return cached_reader(lambda again: of_files((lambda: no_progress) if again else next_file))
+
+
 def identify_recordings(
     recordings: list[Path],
     site: Site,
     settings: IdentificationSettings,
-    report: Report = _unwatched,
+    report: Report = _ignore_progress,
     keep: Keep = lambda crossing_id, draws: None,
     fusing: Fusing = NOTHING_STORED,
-    certificates: Mapping[Pair, str] | None = None,
+    certificates: Mapping[VehicleBridgePair, str] | None = None,
 ) -> Results:
-    """Results of all crossings in the recordings, in order of time; `keep` is given their draws.
+    """Identify all crossings in the recordings, in order of time; pass their draws to `keep`.
 
-    They name the `certificates` of their vehicles and bridges, where there are such.
+    The results name the `certificates` of their vehicles and bridges, where there are any.
     """
     name = ", ".join(str(path) for path in recordings)
-    overview = look_over(name, messages_of_trucks(recordings), site)
+    overview = index_messages(name, messages_of_trucks(recordings), site)
     return identify_drives(overview, site, settings, report, keep, fusing, certificates)
 
 
 def identify_drives(
-    drives: Overview,
+    drives: MessageIndex,
     site: Site,
     settings: IdentificationSettings,
-    report: Report = _unwatched,
+    report: Report = _ignore_progress,
     keep: Keep = lambda crossing_id, draws: None,
     fusing: Fusing = NOTHING_STORED,
-    certificates: Mapping[Pair, str] | None = None,
-    execution: Execution | None = None,
+    certificates: Mapping[VehicleBridgePair, str] | None = None,
+    execution: CrossingExecutor | None = None,
 ) -> Results:
-    """Results of all crossings in the drives, which are read again, message by message.
+    """Identify all crossings in the drives, which are read again, message by message.
 
-    `report` is told of every crossing how far it is, and in the end that all of it is done; how far
-    and with which draws an `execution` elsewhere (None: here) tells by itself.
-    InputError if the site knows none of the trucks.
+    `report` is called with the progress of every crossing and, at the end, with its completion. An
+    `execution` elsewhere (None: inline) reports progress and draws itself.
+
+    Raise InputError if the site has none of the trucks.
     """
     header = header_of(site, settings, time.time())
     fusing = fusing._replace(threads=settings.threads)
-    engine = Engine(site, settings, header, fusing, certificates=certificates, tells_states=False)
-    execution = Here(report=report, keep=keep) if execution is None else execution
+    engine = Engine(
+        site, settings, header, fusing, certificates=certificates, publishes_states=False
+    )
+    execution = InlineExecutor(report=report, keep=keep) if execution is None else execution
     _check_vehicles(drives.name, site, drives.drove)
     for message in drives.near:
         engine.expect(message.key, message.payload, for_ever=True)
     with one_blas_thread():
         outputs = chain(
             chain.from_iterable(
-                dispatched(engine, execution, _said(drives.name, engine, message))
-                for message in as_they_were_made(drives)
+                dispatch(engine, execution, _reported(drives.name, engine, message))
+                for message in in_measurement_order(drives)
             ),
-            dispatched(engine, execution, engine.finish()),
-            awaited(engine, execution),
-            dispatched(engine, execution, engine.fuse_all()),
-            awaited(engine, execution),
+            dispatch(engine, execution, engine.finish()),
+            drain(engine, execution),
+            dispatch(engine, execution, engine.fuse_all()),
+            drain(engine, execution),
         )
         found = []
         for output in outputs:
@@ -120,21 +141,21 @@ def identify_drives(
 
 
 def _check_vehicles(name: str, site: Site, drove: set[str]) -> None:
-    """InputError if the site knows none of the trucks; a warning for each that it does not know."""
+    """Raise InputError if the site has none of the trucks; warn of each one that it lacks."""
     known = {vehicle.id for vehicle in site.vehicles}
     strangers = ", ".join(sorted(drove - known))
     if drove and not drove & known:
         raise InputError(f"{name}: {strangers} drove, but the site has no such vehicle")
     if strangers:
-        _log.warning("%s drove too, but the site has no such vehicle", strangers)
+        _log.warning("%s also drove, but the site file has no such vehicle", strangers)
 
 
-def _said(name: str, engine: Engine, message: Message) -> Iterator[Said]:
+def _reported(name: str, engine: Engine, message: Message) -> Iterator[EngineOutput]:
     try:
         return engine.feed(message.key, message.payload)
     except ValueError as error:
         wrong = malformed(name, message, error)
-        if message.key.stream == "info":  # nothing that it could say is needed
+        if message.key.stream == "info":  # it is not needed here
             _log.warning("%s", wrong)
             return iter(())
         raise wrong from error

@@ -1,20 +1,18 @@
-"""Identifies and fuses crossings in processes of their own, so that who finds them can listen.
+"""Identification and fusion in processes of their own, so that the caller can listen meanwhile.
 
 Every process is warm (its kernels are loaded before its first crossing) and works on one crossing
 at a time. If it dies, for want of memory or in a library, its crossing is tried once more in a new
-one and then rejected as `failed`: no crossing can end who asked for it, nor another crossing. One
-that is hung (`watch`), at its work or while it is started, is killed, so it dies as well.
+process and then rejected as `failed`: no crossing can end the caller, nor another crossing. A hung
+process (`hang_watchdog`), at its work or during its start, is killed, so it dies as well.
 
-Crossings that are to be fused come before those that are to be identified: the state of a bridge
-is due when its result is told, and takes a second. Of one bridge only the newest set waits, and
-while one is being fused the next waits for it: so states come in their order, and however many
-results a bridge has, it takes no more than its place. Who dies twice over it has no state.
+Fusions come before identifications: the state of a bridge is due when its result is published, and
+takes a second. Of one bridge only the newest set waits, and while one is being fused the next waits
+for it. So states keep their order, and a bridge with many results occupies one slot at most. A
+fusion whose process dies twice gives no state.
 
-What else is to be computed (`Aside`) is computed in the same processes, when no crossing waits for
-one: so a crossing waits for one aside at most.
-
-They are spawned: numba's and OpenBLAS's threads would not survive a fork. Signals are for the
-process that started them, and they end with it, however it ends.
+Background tasks run in the same processes while no crossing waits for one, so a crossing waits for
+one of them at most. The processes are spawned: the threads of numba and OpenBLAS would not survive
+a fork. Signals are handled by the process that started them; they end with it, however it ends.
 """
 
 import contextlib
@@ -31,54 +29,54 @@ from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
-from schemas.results import BridgeResult, Crossing
+from schemas.results import BridgeResult, CrossingResult
 from services.common.errors import FailureError
-from services.execution.dispatch import Begun, Finished, Fused, failed
-from services.execution.here import Here, Report
+from services.execution.dispatch import FusionResult, RunningCrossing, TaskResult, failed_result
+from services.execution.hang_watchdog import HangWatchdog, TaskLimits
+from services.execution.inline import InlineExecutor, Report
 from services.execution.warm_up import warm_up
-from services.execution.watch import Limits, Watch
-from services.identification.bridge_state import Counted, Fusing, state_of
+from services.identification.bridge_state import Fusing, RecentCrossings, state_of
 from services.identification.identify import Identify, identify
-from services.identification.outputs import Fuse, Work
+from services.identification.outputs import FusionTask, IdentificationTask
 
 _log = logging.getLogger(__name__)
 _SPAWN = get_context("spawn")
 _STARTING = threading.Lock()
-"""Which process is new is told by which was not there before: one is started at a time."""
+"""Lock of process starts: a new process is recognised as the one that was absent before."""
 _TRIES = 2
-"""A process may be ended for what others do to the machine's memory; twice is no accident."""
+"""Attempts per task: another program may exhaust the memory once; twice is no accident."""
 _WAITING_PER_PROCESS = 2
-"""What waits here is finished even after a signal, and a service has a minute to end."""
-_USUAL = Limits()
-_WATCH_EVERY_S = 0.5
-"""So often it is looked whether a process is hung."""
+"""Queued crossings per process: they are finished after a signal, within a minute."""
+_USUAL = TaskLimits()
+_CHECK_EVERY_S = 0.5
+"""Interval in s at which a process is checked for a hang."""
 _LONGEST_END_S = 5.0
-"""A process ends as soon as its interpreter has a turn, which a kernel may hold up for a while."""
+"""Longest wait in s for the end of a process, which a running kernel may delay."""
 
 
-class Aside(NamedTuple):
-    """What is computed when no crossing waits. To be pickled: a function of a module, applied."""
+class BackgroundTask(NamedTuple):
+    """A task for times when no crossing waits; picklable: a module's function, applied."""
 
     name: str
     run: Callable[[], object]
 
 
-class Aftermath(NamedTuple):
-    """An aside that is over, and what it gave; None if it raised or its process died twice."""
+class BackgroundResult(NamedTuple):
+    """A background task with its outcome; None if it raised or its process died twice."""
 
-    aside: Aside
+    task: BackgroundTask
     outcome: object | None
 
 
-StateOf = Callable[[Counted, str, Fusing], BridgeResult | None]
-"""Makes the state of a bridge; as `state_of`."""
-_Task = Work | Fuse | Aside
+StateOf = Callable[[RecentCrossings, str, Fusing], BridgeResult | None]
+"""Type of `estimate_bridge_state`."""
+_Task = IdentificationTask | FusionTask | BackgroundTask
 _BridgeName = tuple[str, str]
 """Realm and bridge."""
 
 
-class _Begin(NamedTuple):
-    """What a process does, and what it does before."""
+class _ProcessSetup(NamedTuple):
+    """The functions of a process, and its preparation."""
 
     identify: Identify
     state_of: StateOf
@@ -92,20 +90,20 @@ class _Job(NamedTuple):
     @property
     def name(self) -> str:
         match self.task:
-            case Work():
+            case IdentificationTask():
                 return self.task.crossing_id
-            case Fuse():
+            case FusionTask():
                 return f"the state of {self.task.bridge}"
-            case Aside():
+            case BackgroundTask():
                 return self.task.name
 
 
-class Processes:
-    """The `Execution` in `number` processes; `report` may be told from another thread.
+class ProcessExecutor:
+    """The executor in `number` processes; it may call `report` from another thread.
 
-    Each takes its share of the settings' `threads`, at least one. It keeps no draws. One that takes
-    more than the `limits` for a piece of work is killed. To be closed, or used as a context
-    manager: what is under way then is given up.
+    Each process takes its share of the settings' `threads`, at least one. Draws are not kept. A
+    process that exceeds the `limits` for a task is killed. To be closed, or used as a context
+    manager: running tasks are then given up.
     """
 
     def __init__(
@@ -116,28 +114,28 @@ class Processes:
         identify: Identify = identify,
         state_of: StateOf = state_of,
         prepare: Callable[[], None] = warm_up,
-        limits: Limits = _USUAL,
+        limits: TaskLimits = _USUAL,
     ) -> None:
-        # Read when a process loads numpy: its threads would fight with those of its neighbours.
+        # Read when a process loads numpy: its threads would compete with those of its neighbours.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._report = report
-        begin = _Begin(identify, state_of, prepare)
-        self._places = [_Place(report, begin, limits) for _ in range(number)]
+        begin = _ProcessSetup(identify, state_of, prepare)
+        self._slots = [_Slot(report, begin, limits) for _ in range(number)]
         self._waiting: deque[_Job] = deque()
-        self._finished: list[Finished] = []
+        self._finished: list[TaskResult] = []
         self._to_fuse: dict[_BridgeName, _Job] = {}
-        """The newest of each bridge, in the order in which the bridges came."""
-        self._fused: list[Fused] = []
-        self._asides: deque[_Job] = deque()
-        self._aftermaths: list[Aftermath] = []
+        """The newest fusion of each bridge, in the order of submission."""
+        self._fused: list[FusionResult] = []
+        self._background: deque[_Job] = deque()
+        self._background_results: list[BackgroundResult] = []
 
     def wait_until_warm(self) -> None:
-        """Wait until all processes can begin. FailureError if one of them cannot, or is hung."""
+        """Wait until all processes are ready. Raise FailureError if one dies or hangs."""
         try:
-            for place in self._places:
-                while not wait([place.is_warm], _WATCH_EVERY_S).done:
-                    place.end_if_hung()
-                place.is_warm.result()
+            for slot in self._slots:
+                while not wait([slot.is_warm], _CHECK_EVERY_S).done:
+                    slot.end_if_hung()
+                slot.is_warm.result()
         except BrokenExecutor as error:
             raise FailureError(
                 "a process for identifications died while it was started, see the log"
@@ -145,243 +143,243 @@ class Processes:
 
     @property
     def is_busy(self) -> bool:
-        """Whether there is something that `finished` or `fused` has not given back yet."""
+        """Return whether a result or a state is still to be collected."""
         waiting = self._waiting or self._to_fuse
-        return bool(waiting or self._finished or self._fused or self._wanted_at)
+        return bool(waiting or self._finished or self._fused or self._in_use)
 
     @property
     def is_full(self) -> bool:
-        """Whether enough works wait for a process."""
-        return len(self._waiting) >= _WAITING_PER_PROCESS * len(self._places)
+        """Return whether enough crossings wait for a process."""
+        return len(self._waiting) >= _WAITING_PER_PROCESS * len(self._slots)
 
     @property
     def has_room(self) -> bool:
-        """Whether one more may wait for a process, and then it is not full."""
-        return len(self._waiting) + 1 < _WAITING_PER_PROCESS * len(self._places)
+        """Return whether one more crossing would not make it full."""
+        return len(self._waiting) + 1 < _WAITING_PER_PROCESS * len(self._slots)
 
     @property
     def is_idle(self) -> bool:
-        """Whether a work that is started now is begun at once, or as soon as an aside is over."""
-        return not self._waiting and len(self._wanted_at) < len(self._places)
+        """Return whether a crossing submitted now starts at once, or after a background task."""
+        return not self._waiting and len(self._in_use) < len(self._slots)
 
     @property
     def waiting(self) -> int:
-        """How many works wait for a process."""
+        """Return the number of crossings that wait for a process."""
         return len(self._waiting)
 
     @property
-    def under_way(self) -> list[Begun]:
-        """The crossings that are being identified, the one that was begun first first."""
+    def running(self) -> list[RunningCrossing]:
+        """Return the running crossings, the one that started first first."""
         now_s = time.monotonic()
         found = [
-            Begun(place.job.name, now_s - place.began_s)
-            for place in self._places
-            if place.job and isinstance(place.job.task, Work)
+            RunningCrossing(slot.job.name, now_s - slot.began_s)
+            for slot in self._slots
+            if slot.job and isinstance(slot.job.task, IdentificationTask)
         ]
         return sorted(found, key=lambda one: -one.seconds)
 
-    def start(self, work: Work) -> None:
-        """Give a work to a process, as soon as one is free."""
+    def submit(self, work: IdentificationTask) -> None:
+        """Pass a crossing to a process, as soon as one is free."""
         self._waiting.append(_Job(work))
         self._fill()
         if self._waiting:
             self._report(work.crossing_id, "waiting for a process", 0.0)
 
-    def finished(self, timeout_s: float = 0.0) -> list[Finished]:
-        """What has been done since the last call; see `Execution`."""
+    def collect(self, timeout_s: float = 0.0) -> list[TaskResult]:
+        """Return the crossings identified since the last call; see `CrossingExecutor`."""
         self._fill()
-        under_way = [place.future for place in self._places if place.future is not None]
-        if under_way and timeout_s > 0.0:  # asked after every message: no time for nothing
-            wait(under_way, timeout_s, FIRST_COMPLETED)
-        for place in self._places:
-            if place.future is not None and place.future.done():
-                self._take(place, place.future)
-            elif place.job is not None:
-                place.end_if_hung()
+        running = [slot.future for slot in self._slots if slot.future is not None]
+        if running and timeout_s > 0.0:  # called after every message: must cost nothing
+            wait(running, timeout_s, FIRST_COMPLETED)
+        for slot in self._slots:
+            if slot.future is not None and slot.future.done():
+                self._collect_result(slot, slot.future)
+            elif slot.job is not None:
+                slot.end_if_hung()
         finished, self._finished = self._finished, []
-        if not finished:  # else the states that the results lead to come first
+        if not finished:  # otherwise the states that the results lead to come first
             self._fill()
         return finished
 
-    def fuse(self, fuse: Fuse) -> None:
-        """Give crossings to the next process that is free; see `Execution`."""
+    def submit_fusion(self, fuse: FusionTask) -> None:
+        """Pass a fusion to the next free process; see `CrossingExecutor`."""
         self._to_fuse[_bridge_of(fuse)] = _Job(fuse)
         self._fill()
 
-    def fused(self) -> list[Fused]:
-        """The states that have been made since the last call; see `Execution`."""
+    def collect_fusions(self) -> list[FusionResult]:
+        """Return the states computed since the last call; see `CrossingExecutor`."""
         self._fill()
         fused, self._fused = self._fused, []
         return fused
 
-    def start_aside(self, aside: Aside) -> None:
-        """Compute something in a process that no crossing waits for."""
-        self._asides.append(_Job(aside))
+    def submit_background(self, task: BackgroundTask) -> None:
+        """Compute a task in a process that no crossing waits for."""
+        self._background.append(_Job(task))
         self._fill()
 
     @property
-    def wants_aside(self) -> bool:
-        """Whether a process may be free for an aside that is not waiting yet."""
-        begun = sum(1 for p in self._places if p.job and isinstance(p.job.task, Aside))
-        return len(self._asides) + begun < len(self._places)
+    def wants_background(self) -> bool:
+        """Return whether a process may be free for one more background task."""
+        begun = sum(1 for p in self._slots if p.job and isinstance(p.job.task, BackgroundTask))
+        return len(self._background) + begun < len(self._slots)
 
-    def aftermaths(self) -> list[Aftermath]:
-        """The asides that have been over since the last call; `finished` looks after them."""
+    def collect_background(self) -> list[BackgroundResult]:
+        """Return the background tasks finished since the last call; `collect` drives them."""
         self._fill()
-        aftermaths, self._aftermaths = self._aftermaths, []
-        return aftermaths
+        collect_background, self._background_results = self._background_results, []
+        return collect_background
 
-    def forget_asides(self) -> None:
-        """Begin no more of those that wait."""
-        self._asides.clear()
+    def cancel_background(self) -> None:
+        """Remove the background tasks that still wait."""
+        self._background.clear()
 
     def close(self) -> None:
-        """End the processes, in the middle of whatever they do."""
-        for place in self._places:
-            place.close()
+        """End the processes, whatever they compute."""
+        for slot in self._slots:
+            slot.close()
 
-    def __enter__(self) -> "Processes":
+    def __enter__(self) -> "ProcessExecutor":
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
-    def _wanted_at(self) -> list["_Place"]:
-        """Where something is done that somebody waits for."""
-        return [p for p in self._places if p.job and not isinstance(p.job.task, Aside)]
+    def _in_use(self) -> list["_Slot"]:
+        """Return the slots that work on something other than a background task."""
+        return [p for p in self._slots if p.job and not isinstance(p.job.task, BackgroundTask)]
 
     def _fill(self) -> None:
-        for place in self._places:
-            job = self._next() if place.job is None else None
+        for slot in self._slots:
+            job = self._next() if slot.job is None else None
             if job is not None:
-                place.begin(job, len(self._places))
+                slot.begin(job, len(self._slots))
 
     def _next(self) -> _Job | None:
-        under_way = {
-            _bridge_of(place.job.task)
-            for place in self._places
-            if place.job and isinstance(place.job.task, Fuse)
+        running = {
+            _bridge_of(slot.job.task)
+            for slot in self._slots
+            if slot.job and isinstance(slot.job.task, FusionTask)
         }
         for name in self._to_fuse:
-            if name not in under_way:
+            if name not in running:
                 return self._to_fuse.pop(name)
-        first = self._waiting or self._asides
+        first = self._waiting or self._background
         return first.popleft() if first else None
 
-    def _take(self, place: "_Place", future: Future[Any]) -> None:
-        job = place.job
+    def _collect_result(self, slot: "_Slot", future: Future[Any]) -> None:
+        job = slot.job
         assert job is not None  # noqa: S101 - it has a future
-        place.job = place.future = None
+        slot.job = slot.future = None
         try:
             self._is_over(job.task, future.result())
         except BrokenExecutor:
-            place.renew()
+            slot.renew()
             if job.tries + 1 < _TRIES:
-                _log.warning("the process that worked on %s died; tried once more", job.name)
+                _log.warning("the process that worked on %s died; retrying once", job.name)
                 self._put_back(_Job(job.task, job.tries + 1))
             else:
-                _log.error("the process that worked on %s died again; it has failed", job.name)
+                _log.error("the process that worked on %s died again; giving up", job.name)
                 self._is_over(job.task, None)
-        except Exception:  # whatever it is, another process would meet it, too
-            _log.exception("work on %s failed", job.name)
+        except Exception:  # whatever it is, another process would fail alike
+            _log.exception("%s failed", job.name)
             self._is_over(job.task, None)
 
     def _put_back(self, job: _Job) -> None:
-        """Let it be the next of its kind; crossings to fuse only if no newer ones have come."""
+        """Put a job first in its queue; a fusion only if no newer one has been submitted."""
         match job.task:
-            case Work():
+            case IdentificationTask():
                 self._waiting.appendleft(job)
-            case Fuse():
+            case FusionTask():
                 self._to_fuse = {_bridge_of(job.task): job} | self._to_fuse
-            case Aside():
-                self._asides.appendleft(job)
+            case BackgroundTask():
+                self._background.appendleft(job)
 
     def _is_over(self, task: _Task, outcome: Any) -> None:
-        """Keep what a task gave; None: nothing."""
+        """Store the outcome of a task; None if it failed."""
         match task:
-            case Work():
-                result = failed(task) if outcome is None else outcome
-                self._finished.append(Finished(task, result))
-            case Fuse():
-                self._fused.append(Fused(task, outcome))
-            case Aside():
-                self._aftermaths.append(Aftermath(task, outcome))
+            case IdentificationTask():
+                result = failed_result(task) if outcome is None else outcome
+                self._finished.append(TaskResult(task, result))
+            case FusionTask():
+                self._fused.append(FusionResult(task, outcome))
+            case BackgroundTask():
+                self._background_results.append(BackgroundResult(task, outcome))
 
 
-def _bridge_of(fuse: Fuse) -> _BridgeName:
+def _bridge_of(fuse: FusionTask) -> _BridgeName:
     return fuse.realm, fuse.bridge
 
 
-class _Place:
-    """One process after the other, and what it works on."""
+class _Slot:
+    """A slot for one process after the other, and for its task."""
 
-    def __init__(self, report: Report, begin: _Begin, limits: Limits) -> None:
+    def __init__(self, report: Report, begin: _ProcessSetup, limits: TaskLimits) -> None:
         self._report = report
         self._begin = begin
         self._limits = limits
-        self._watch: Watch | None = None
+        self._watchdog: HangWatchdog | None = None
         self.began_s = 0.0
-        """When the job was given to the process."""
+        """Time at which the job was passed to the process."""
         self.job: _Job | None = None
         self.future: Future[Any] | None = None
         self._open()
 
-    def begin(self, job: _Job, places: int) -> None:
-        """Work on a crossing, with the share of its threads that one of `places` has; or aside."""
+    def begin(self, job: _Job, slots: int) -> None:
+        """Start a job; a crossing gets the share of its threads that one of `slots` slots has."""
         self.job = job
-        self._watch = None
-        self._next_look_s = 0.0
+        self._watchdog = None
+        self._next_check_s = 0.0
         self.began_s = time.monotonic()
         task = job.task
         try:
-            if isinstance(task, Aside):
+            if isinstance(task, BackgroundTask):
                 self.future = self._executor.submit(task.run)
-            elif isinstance(task, Fuse):
-                threads = max(1, task.fusing.threads // places)
+            elif isinstance(task, FusionTask):
+                threads = max(1, task.fusing.threads // slots)
                 made_of = (task.counted, task.bridge, task.fusing._replace(threads=threads))
                 self.future = self._executor.submit(self._begin.state_of, *made_of)
             else:
-                threads = max(1, task.settings.threads // places)
+                threads = max(1, task.settings.threads // slots)
                 settings = task.settings.model_copy(update={"threads": threads})
                 self.future = self._executor.submit(_identified, task._replace(settings=settings))
-        except BrokenExecutor as error:  # it died while it had nothing to do
+        except BrokenExecutor as error:  # it died while idle
             self.future = Future()
             self.future.set_exception(error)
 
     def end_if_hung(self) -> None:
-        """Kill the process if it takes too much for its job, or to be started.
+        """Kill the process if it exceeds the limits for its job or its start.
 
-        Its job then is as if it had died.
+        Its job then counts as one whose process died.
         """
         now_s = time.monotonic()
-        if now_s < self._next_look_s:
+        if now_s < self._next_check_s:
             return
-        self._next_look_s = now_s + _WATCH_EVERY_S
-        if self._watch is None:
-            self._watch = Watch(self._pid, self._limits, now_s)
-        why = self._watch.why_hung(now_s)
+        self._next_check_s = now_s + _CHECK_EVERY_S
+        if self._watchdog is None:
+            self._watchdog = HangWatchdog(self._pid, self._limits, now_s)
+        why = self._watchdog.why_hung(now_s)
         if why:
-            self._next_look_s = math.inf
+            self._next_check_s = math.inf
             starts = self.job is None or not self.is_warm.done()
             what = "is being started" if starts else f"works on {self.job and self.job.name}"
-            _log.warning("the process that %s %s and is ended", what, why)
+            _log.warning("the process that %s %s; ending it", what, why)
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self._pid, signal.SIGKILL)
 
     def renew(self) -> None:
-        """Put a new process in the place of one that has died."""
+        """Start a new process in place of a dead one."""
         self.close()
         self._open()
 
     def close(self) -> None:
-        """End the process: it ends itself when it sees that nobody holds its lifeline."""
+        """End the process: it exits when the other end of its lifeline is closed."""
         self._executor.shutdown(wait=False, cancel_futures=True)
         self._lifeline.close()
         self._send.close()
         # A thread that is still publishing when the interpreter ends would abort the process.
         self._reader.join(_LONGEST_END_S)
-        if self._reader.is_alive():  # it is frozen, and who started it would wait for its end
+        if self._reader.is_alive():  # it is frozen, and the caller would wait for its end
             self._process.kill()
             self._reader.join(_LONGEST_END_S)
 
@@ -395,9 +393,9 @@ class _Place:
             others = set(active_children())
             self.is_warm = self._executor.submit(os.getpid)  # which starts the process
             (self._process,) = set(active_children()) - others
-        assert self._process.pid is not None  # noqa: S101 - it has been started
+        assert self._process.pid is not None  # noqa: S101 - it was started
         self._pid = self._process.pid
-        self._watch, self._next_look_s = None, 0.0
+        self._watchdog, self._next_check_s = None, 0.0
         its_end.close()
         self._reader = threading.Thread(
             target=self._read, args=(receive,), name="progress", daemon=True
@@ -405,7 +403,7 @@ class _Place:
         self._reader.start()
 
     def _read(self, receive: "Connection") -> None:
-        """Pass on how far an identification is, until the process and this place have ended."""
+        """Forward the progress of identifications, until the process and this slot have ended."""
         with receive:
             while True:
                 try:
@@ -414,36 +412,38 @@ class _Place:
                     return
                 try:
                     self._report(*progress)
-                except Exception as error:  # who cannot be told of it still gets the result
-                    _log.debug("progress was not told: %s", error)
+                except Exception as error:  # progress may be lost, the result is not
+                    _log.debug("cannot report progress: %s", error)
 
 
 # In the process itself
 
 
-_HERE: list[Here] = []
-"""The process's own execution, once it is prepared."""
+_HERE: list[InlineExecutor] = []
+"""The process's own executor, once it is prepared."""
 
 
-def _prepare(lifeline: Connection, send: Connection, begin: _Begin) -> None:
-    # A signal to the whole group is for who started this; it says what is to be done.
+def _prepare(lifeline: Connection, send: Connection, begin: _ProcessSetup) -> None:
+    # A signal to the whole group is for the parent, which decides what to do.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(lifeline,), name="lifeline", daemon=True).start()
-    _HERE.append(Here(report=lambda *progress: send.send(progress), identify=begin.identify))
+    _HERE.append(
+        InlineExecutor(report=lambda *progress: send.send(progress), identify=begin.identify)
+    )
     begin.prepare()
 
 
 def _end_with(lifeline: Connection) -> None:
-    """End at once when the other end has been closed, or who held it is dead."""
+    """Exit at once when the other end is closed, or its owner is dead."""
     try:
         lifeline.recv_bytes()
     except (EOFError, OSError):
         os._exit(1)
 
 
-def _identified(work: Work) -> Crossing:
+def _identified(work: IdentificationTask) -> CrossingResult:
     (here,) = _HERE
-    here.start(work)
-    (finished,) = here.finished()
+    here.submit(work)
+    (finished,) = here.collect()
     return finished.result

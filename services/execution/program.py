@@ -1,7 +1,7 @@
-"""Which program this is: what two processes must have in common to give the same last digits.
+"""Identity of the program: two processes that agree in it give the same last digits.
 
-Version and code of ours, Python, and the packages that compute. The kind of processor is told
-beside it: another one may round otherwise, and is no other program.
+It covers driveby's version and code, Python, and the packages that compute. The kind of processor
+is separate: another one may round differently, and is not another program.
 """
 
 import hashlib
@@ -13,8 +13,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final
 
-from pre_core import unknowns
+from pre_core import parameters
 from schemas import topics
+from services.finding import crossing_data
 from services.identification import identify
 from services.recordings.recording import program_version
 
@@ -24,13 +25,13 @@ PYTHON: Final = "Python"
 
 
 def program() -> dict[str, str]:
-    """This process's program: a version by name, `driveby` first."""
+    """Return this process's program: a version by name, `driveby` first."""
     found = {"driveby": f"{program_version()} (code {_code()})", PYTHON: platform.python_version()}
     return found | {name: metadata.version(name) for name in COMPUTING}
 
 
-def another_program(theirs: Mapping[str, str], ours: Mapping[str, str]) -> str:
-    """In what another process's program differs from this one's, in words; empty if in nothing."""
+def version_difference(theirs: Mapping[str, str], ours: Mapping[str, str]) -> str:
+    """Return how another process's program differs from this one's, in words; empty if equal."""
     names = [name for name in ours if theirs.get(name) != ours[name]]
     if not names:
         return ""
@@ -40,7 +41,7 @@ def another_program(theirs: Mapping[str, str], ours: Mapping[str, str]) -> str:
 
 
 def processor() -> str:
-    """The kind of processor that numba compiles for."""
+    """Return the kind of processor that numba compiles for."""
     from llvmlite import binding
 
     return str(binding.get_host_cpu_name())
@@ -48,7 +49,7 @@ def processor() -> str:
 
 @cache
 def _code() -> str:
-    """What the sources that decide about a result are: versions do not tell two checkouts apart."""
+    """Return a hash of the sources that determine a result: two checkouts may share a version."""
     digest = hashlib.sha256()
     for module in _DECIDING:
         folder = Path(str(module.__file__)).parent
@@ -58,5 +59,5 @@ def _code() -> str:
     return digest.hexdigest()[:10]
 
 
-_DECIDING: Final[tuple[ModuleType, ...]] = (unknowns, topics, identify)
+_DECIDING: Final[tuple[ModuleType, ...]] = (parameters, topics, crossing_data, identify)
 """A module of each package whose sources count."""

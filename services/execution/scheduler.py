@@ -1,7 +1,7 @@
-"""Dask, as far as crossings need it: a connection to a scheduler, and who its workers are.
+"""Access to Dask: a connection to a scheduler, and a check of its workers.
 
-Dask runs whatever it is sent. So a scheduler elsewhere is spoken to by TLS only, and workers of
-another program, of another Python or of packages that compute otherwise are refused by name.
+Dask runs whatever it is sent. So a remote scheduler is accepted with TLS only, and workers of
+another program, of another Python or of packages that compute differently are refused by name.
 """
 
 import contextlib
@@ -15,37 +15,37 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from services.common.errors import FailureError, InputError
-from services.execution.cluster_worker import About, about, identify_batch
-from services.execution.program import PYTHON, another_program, processor
+from services.execution.cluster_worker import WorkerInfo, identify_batch, worker_info
+from services.execution.program import PYTHON, processor, version_difference
 
 _log = logging.getLogger(__name__)
 CALL_S = 20.0
-"""A scheduler that answers nothing for so long is taken to be gone."""
+"""Time in s without an answer after which a scheduler counts as lost."""
 _RETRY_S: Final = 1.0
 _SOON_S: Final = 5.0
 _SCHEMES: Final = ("tcp", "tls")
 
 
 class Credentials(NamedTuple):
-    """Files in PEM form: whom to believe, and who one is."""
+    """Paths of PEM files: the trusted authority, and one's own certificate and key."""
 
     authority: Path
     certificate: Path
     key: Path
 
 
-class AwayError(FailureError):
-    """A scheduler, or one of its workers, has gone while it was asked, or is frozen."""
+class SchedulerUnavailableError(FailureError):
+    """A scheduler or one of its workers is lost or frozen."""
 
 
-class Gone(NamedTuple):
-    """The future of a batch that could not be given to a scheduler."""
+class UnsentFuture(NamedTuple):
+    """The future of a batch that could not be submitted."""
 
     status: str = "cancelled"
-    """As Dask calls that of all batches of a scheduler that is gone."""
+    """State in Dask's terms, as of all batches of a lost scheduler."""
 
     def release(self) -> None:
-        """Nobody keeps it."""
+        """Do nothing: nobody holds it."""
 
 
 class Scheduler:
@@ -57,68 +57,70 @@ class Scheduler:
 
     @property
     def threads(self) -> int | None:
-        """How many batches its workers take at once; None if it does not answer in time."""
+        """Return the number of batches its workers run at once; None without a timely answer."""
         if self._client.status != "running":
             return None
         try:
-            said = self._in_time(self._client.scheduler.identity)
+            described = self._in_time(self._client.scheduler.identity)
         except Exception as error:  # whatever it is, there is no answer
             _log.debug("the scheduler does not answer: %s", error)
             return None
-        return sum(int(worker["nthreads"]) for worker in said["workers"].values())
+        return sum(int(worker["nthreads"]) for worker in described["workers"].values())
 
     def submit(self, key: str, batch: bytes, program: dict[str, str]) -> Any:
-        """Have a batch identified; its future."""
+        """Submit a batch for identification; return its future."""
         try:
             return self._client.submit(identify_batch, batch, program, key=key, pure=False)
-        except Exception as error:  # whatever it is, the batch has not been given away
-            _log.debug("a batch could not be sent: %s", error)
-            return Gone()
+        except Exception as error:  # whatever it is, the batch was not submitted
+            _log.debug("cannot submit a batch: %s", error)
+            return UnsentFuture()
 
     def answer(self, future: Any) -> Any:
-        """What a batch gave. Raises what its task has raised, or that it does not come."""
+        """Return a batch's result. Raise what its task raised, or TimeoutError."""
         return future.result(timeout=CALL_S)
 
-    def send_away(self, worker: str) -> None:
-        """Have a worker end: it would take a batch after the other, and give all back."""
+    def retire_worker(self, worker: str) -> None:
+        """Ask a worker to end: it would accept one batch after the other, and refuse all."""
         try:
             self._in_time(self._client.retire_workers, [worker], close_workers=True)
-        except Exception as error:  # it may have gone by itself, or the scheduler has
-            _log.debug("worker %s could not be sent away: %s", worker, error)
+        except Exception as error:  # it may have ended itself, or the scheduler has
+            _log.debug("cannot retire worker %s: %s", worker, error)
 
     def wait_for_workers(self, longest_s: float) -> None:
-        """FailureError if there are none for so long; AwayError if the scheduler goes meanwhile."""
+        """Wait for workers; FailureError without any, AwayError if the scheduler is lost."""
         deadline = time.monotonic() + longest_s
-        is_told = False
+        is_logged = False
         while not (threads := self.threads):
             if threads is None:
-                raise AwayError(f"{self._address}: the scheduler is gone again")
+                raise SchedulerUnavailableError(f"{self._address}: the scheduler is lost again")
             if time.monotonic() > deadline:
                 raise FailureError(
                     f"{self._address}: has no worker; start some (dask worker {self._address}), "
-                    "and the same command again"
+                    "and run the same command again"
                 )
-            if not is_told:
-                is_told = True
+            if not is_logged:
+                is_logged = True
                 _log.warning(
-                    "the scheduler at %s has no worker; waiting %.0f s for one",
+                    "scheduler %s has no worker; waiting up to %.0f s for one",
                     *(self._address, longest_s),
                 )
             time.sleep(_RETRY_S)
 
     def check_workers(self, program: dict[str, str]) -> None:
-        """FailureError that names those of another program, if there are any.
+        """Raise FailureError with the names of the workers of another program, if there are any.
 
-        AwayError if they do not answer. Versions are asked for first, which runs nothing that is
-        sent: what one Python has packed may end another one.
+        Raise AwayError if they do not answer. Versions are requested first, which executes nothing
+        that is sent: a pickle of one Python version may end a process of another.
         """
         packages = [name for name in program if name != PYTHON]
-        told = self._asked("its workers' versions", self._client.get_versions, packages=packages)
+        versions = self._asked(
+            "its workers' versions", self._client.get_versions, packages=packages
+        )
         plain = {name: text.partition(" ")[0] for name, text in program.items()}
         wrong = []
-        for worker, said in told["workers"].items():
-            python = ".".join(str(said["host"]["python"]).split(".")[:3])
-            why = another_program(said["packages"] | {PYTHON: python}, plain)
+        for worker, described in versions["workers"].items():
+            python = ".".join(str(described["host"]["python"]).split(".")[:3])
+            why = version_difference(described["packages"] | {PYTHON: python}, plain)
             if why:
                 wrong.append(f"worker {worker}: {why}")
         wrong = wrong or self._of_other_code(program)
@@ -126,17 +128,17 @@ class Scheduler:
             raise FailureError(f"{'; '.join(sorted(wrong))}; all must run the same program")
 
     def close(self) -> None:
-        """Leave; what is under way for this one is given up."""
-        with contextlib.suppress(Exception):  # it may be gone
+        """Disconnect; unfinished work for this process is given up."""
+        with contextlib.suppress(Exception):  # it may be lost
             self._client.close(timeout=_RETRY_S)
 
     def _of_other_code(self, program: dict[str, str]) -> list[str]:
-        said = self._asked("its workers", self._client.run, about, on_error="return")
+        described = self._asked("its workers", self._client.run, worker_info, on_error="return")
         wrong = []
-        for worker, one in sorted(said.items()):
-            if not isinstance(one, About):
+        for worker, one in sorted(described.items()):
+            if not isinstance(one, WorkerInfo):
                 wrong.append(f"worker {worker}: does not know this program: {reason(one)}")
-            elif why := another_program(one.program, program) or one.cannot:
+            elif why := version_difference(one.program, program) or one.cannot:
                 wrong.append(f"worker {worker}: {why}")
             elif one.processor != processor():
                 _log.warning(
@@ -149,10 +151,12 @@ class Scheduler:
         try:
             return self._in_time(ask, *arguments, **named)
         except Exception as error:
-            raise AwayError(f"{self._address}: could not ask for {what}: {reason(error)}") from None
+            raise SchedulerUnavailableError(
+                f"{self._address}: could not ask for {what}: {reason(error)}"
+            ) from None
 
     def _in_time(self, ask: Any, *arguments: Any, **named: Any) -> Any:
-        """What a question to the scheduler gives; by itself it would wait for a frozen one."""
+        """Return an answer of the scheduler in time; Dask itself would wait for a frozen one."""
 
         async def asking() -> Any:
             return await ask(*arguments, **named)
@@ -160,8 +164,8 @@ class Scheduler:
         return self._client.sync(asking, callback_timeout=CALL_S)
 
 
-def connected(address: str, credentials: Credentials | None, longest_s: float) -> Scheduler:
-    """A connection to the scheduler. FailureError if none answers for so long."""
+def connect(address: str, credentials: Credentials | None, longest_s: float) -> Scheduler:
+    """Return a connection to the scheduler. Raise FailureError if none answers in time."""
     deadline = time.monotonic() + longest_s
     while True:
         left_s = max(deadline - time.monotonic(), _RETRY_S)
@@ -170,17 +174,17 @@ def connected(address: str, credentials: Credentials | None, longest_s: float) -
         except Exception as error:  # a refused connection, a handshake, a time-out
             if time.monotonic() + _RETRY_S > deadline:
                 raise FailureError(
-                    f"{address}: no scheduler answers ({reason(error)}); start one, and the same "
-                    "command again"
+                    f"{address}: no scheduler answers ({reason(error)}); start one, and run "
+                    "the same command again"
                 ) from None
         time.sleep(_RETRY_S)
 
 
 def threads_of(address: str, credentials: Credentials | None) -> int:
-    """How many batches the workers of a scheduler take at once; 0 if none answers."""
+    """Return the number of batches a scheduler's workers run at once; 0 if none answers."""
     try:
         scheduler = Scheduler(address, _client(address, credentials, _SOON_S))
-    except Exception as error:  # not there yet
+    except Exception as error:  # it is not reachable yet
         _log.debug("%s: %s", address, error)
         return 0
     try:
@@ -190,7 +194,7 @@ def threads_of(address: str, credentials: Credentials | None) -> int:
 
 
 def check_address(address: str, credentials: Credentials | None) -> None:
-    """InputError unless it is tcp:// on this machine, or tls:// with credentials."""
+    """Raise InputError unless it is tcp:// on this machine, or tls:// with credentials."""
     try:
         parts = urlsplit(address)
         is_one = parts.scheme in _SCHEMES and parts.hostname and parts.port
@@ -204,16 +208,16 @@ def check_address(address: str, credentials: Credentials | None) -> None:
     if parts.scheme == "tls" and credentials is None:
         raise InputError(f"--scheduler: {address} needs --tls FOLDER, credentials of a client")
     if parts.scheme == "tcp" and credentials is not None:
-        raise InputError(f"--tls: {address} is spoken to without TLS; tls://… is meant")
+        raise InputError(f"--tls: {address} is an address without TLS; write tls://…")
     if parts.scheme == "tcp" and not is_loopback(str(parts.hostname)):
         raise InputError(
-            f"--scheduler: {address} is another machine: without TLS whoever reaches it runs "
+            f"--scheduler: {address} is another machine: without TLS anyone who reaches it runs "
             "programs there; use tls:// with --tls"
         )
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host is this machine, and nobody else reaches it."""
+    """Return whether a host is this machine, so that no other one reaches it."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -221,14 +225,14 @@ def is_loopback(host: str) -> bool:
 
 
 def reason(error: BaseException) -> str:
-    """The first line of what is said, or of what it was caused by."""
+    """Return the first line of an exception's message, or of its cause's."""
     cause = error.__cause__ or error
     lines = str(cause).splitlines() or [type(cause).__name__]
     return lines[0][:160]
 
 
 def _client(address: str, credentials: Credentials | None, timeout_s: float) -> Any:
-    _quieten()
+    _silence_dask_logs()
     from distributed import Client, Security
 
     security = None
@@ -241,7 +245,7 @@ def _client(address: str, credentials: Credentials | None, timeout_s: float) -> 
         )
     _check_that_it_answers(address, security, timeout_s)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of versions: they are told by name
+        warnings.simplefilter("ignore")  # about versions: they are compared by name
         return Client(
             address,
             loop=_loop(),
@@ -253,10 +257,10 @@ def _client(address: str, credentials: Credentials | None, timeout_s: float) -> 
 
 
 def _check_that_it_answers(address: str, security: Any, timeout_s: float) -> None:
-    """Raise what Dask does, or TimeoutError, if nobody answers.
+    """Raise Dask's exception, or TimeoutError, if no scheduler answers.
 
-    Its client limits the time to reach a port, and then waits without end for a scheduler that is
-    frozen: the port of that one is still open.
+    Its client limits the time to reach a port, and then waits without end for a frozen scheduler,
+    whose port is still open.
     """
     from distributed.comm import connect
     from distributed.utils import sync
@@ -272,7 +276,7 @@ def _check_that_it_answers(address: str, security: Any, timeout_s: float) -> Non
 
 @cache
 def _loop() -> Any:
-    """The loop of all connections, in a thread of its own.
+    """Return the loop of all connections, in a thread of its own.
 
     A client without one starts another such thread, and leaves it behind if it cannot connect.
     """
@@ -283,13 +287,13 @@ def _loop() -> Any:
     return runner.loop
 
 
-def _quieten() -> None:
-    """Dask tells in its own logs, with tracebacks, what is told here in a line."""
+def _silence_dask_logs() -> None:
+    """Silence Dask's own logs of tracebacks; a line here reports the same."""
     import dask
     import distributed  # noqa: F401 - it sets up its logs when it is imported
 
     for name in list(logging.root.manager.loggerDict):
         if name.split(".")[0] in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-    # A batch is a large one, and meant to be.
+    # A batch is large on purpose.
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GiB"})

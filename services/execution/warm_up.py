@@ -1,8 +1,8 @@
-"""Compiles the numerical kernels ahead of time: `python -m services.execution.warm_up`.
+"""Compile the numerical kernels ahead of time: `python -m services.execution.warm_up`.
 
-numba keeps the compiled form beside the sources, for every later start of any command. It notices
-that a kernel's own file has changed, but not that another kernel, which it has inlined, has: so
-everything is compiled anew when any source is newer than what was compiled from it.
+numba stores the compiled form beside the sources, for every later start of any command. It notices
+a change of a kernel's own file, but not of another kernel that it has inlined: so everything is
+compiled again when any source is newer than its compiled form.
 
 `make install` ends with this. An installation must not fail for want of a cache (a read-only
 folder, a processor that the compiler does not know): the first command then compiles for itself.
@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pre_core import unknowns
+from pre_core import parameters
 from pre_core.crossing import posterior
-from pre_core.crossing.compliances import draws, of_normal
-from pre_core.crossing.preparation import Inputs, prepare
+from pre_core.crossing.compliances import draws, from_normal
+from pre_core.crossing.preparation import CrossingInputs, build_problem
 from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.integrate import spline_integrate
@@ -28,18 +28,18 @@ from pre_core.physics.simulate import constant_speed
 from pre_core.physics.vehicle import total_mass_kg
 from pre_core.search import loop
 
-PACKAGE = Path(unknowns.__file__).parent
+PACKAGE = Path(parameters.__file__).parent
 _SOUND = experiment.beam(np.ones(experiment.ELEMENTS))
 
 
 def main(*, strict: bool = False) -> int:
-    """Compile what is not compiled yet and say so in one line; return 0, if `strict` 1 on failure.
+    """Compile missing kernels and print one line; return 0, or 1 on failure if `strict`.
 
-    Strict is who builds an image: there every start would compile anew.
+    An image is built with `strict`: otherwise every start of a container would compile again.
     """
     began = time.perf_counter()
     try:
-        _forget_stale(PACKAGE)
+        _remove_stale(PACKAGE)
         warm_up()
         _warm_up_validation()
     except Exception as error:  # noqa: BLE001, RUF100 - see the module's docstring
@@ -52,9 +52,9 @@ def main(*, strict: bool = False) -> int:
 
 
 def warm_up() -> None:
-    """Run every kernel of an identification once, whatever its method, on crossings of noise.
+    """Run every kernel of an identification once, for all methods, on crossings of noise.
 
-    For who must not wait for a compiler when the first truck comes.
+    It is for processes that must not wait for a compiler when the first truck arrives.
     """
     _warm_up_pre()
     _warm_up_fusing()
@@ -62,23 +62,23 @@ def warm_up() -> None:
 
 
 def _warm_up_fusing() -> None:
-    """The sampler of a bridge of one element, without supports that might be absent."""
+    """Run the sampler of a bridge of one element, without supports that might be absent."""
     one, nowhere = np.ones(1), np.zeros(0, dtype=np.int64)
-    density = of_normal(
+    density = from_normal(
         np.eye(2), np.ones(2), np.ones(1, dtype=np.int64), nowhere, one, np.zeros(2), 1.0, one, one
     )
     draws(density, 1, 0, 0)
 
 
 def _warm_up_pre() -> None:
-    """The kernels of method `pre`, on four seconds of noise at 10 m/s."""
+    """Run the kernels of method `pre`, on four seconds of noise at 10 m/s."""
     nominal = from_models(experiment.TRUCK, _SOUND)
     step_s, count = 0.002, 2700
     time_s = step_s * np.arange(0, count, 50, dtype=np.float64)
-    fixes = posterior.Fixes(
+    fixes = posterior.ChainageFixes(
         time_s, experiment.SPEED_M_PER_S * time_s - 10.0, np.full(time_s.size, 10.0), 0.4, 0.07, 1.5
     )
-    inputs = Inputs(
+    inputs = CrossingInputs(
         np.random.default_rng(0).standard_normal((4, count)),
         0.0,
         step_s,
@@ -107,14 +107,14 @@ def _warm_up_pre() -> None:
         1,
         torsional_wave_speed_m_per_s=400.0,
     )
-    problem, y = prepare(inputs)
+    problem, y = build_problem(inputs)
     posterior.all_rows(problem, y[None, :])
     posterior.filtered_rows(problem, y)
-    posterior.roads(problem, y)
+    posterior.wheel_profiles(problem, y)
 
 
 def _warm_up_paper() -> None:
-    """The kernels of the paper's residual and of its searches, on noise from five metres before."""
+    """Run the kernels of the paper's residual and searches, on noise from five metres before."""
     step_s = 0.01
     motion = constant_speed(-5.0, experiment.SPEED_M_PER_S, 450, step_s)
     window = residual.build_window(
@@ -130,10 +130,10 @@ def _warm_up_paper() -> None:
         bias_known=False,
     )
     theta = from_models(experiment.TRUCK, _SOUND)
-    free = unknowns.paper_subset(experiment.ELEMENTS)
-    problem = least_squares.Problem(window, theta, free)
+    free = parameters.paper_subset(experiment.ELEMENTS)
+    problem = least_squares.LeastSquaresProblem(window, theta, free)
     work = residual.workspace(window)
-    loop.run(
+    loop.run_search(
         partial(least_squares.init, problem, work, theta[free]),
         partial(least_squares.step, problem, work),
         1,
@@ -144,11 +144,11 @@ def _warm_up_paper() -> None:
 
 
 def _warm_up_validation() -> None:
-    """What else a simulation and a reproduction of the paper call."""
+    """Run the remaining kernels of a simulation and a reproduction of the paper."""
     paper_window(experiment.TRUCK, _SOUND, 0.0, 0)
 
 
-def _forget_stale(package: Path) -> None:
+def _remove_stale(package: Path) -> None:
     newest = max(source.stat().st_mtime for source in package.rglob("*.py"))
     compiled = [*package.rglob("__pycache__/*.nbi"), *package.rglob("__pycache__/*.nbc")]
     if any(file.stat().st_mtime < newest for file in compiled):

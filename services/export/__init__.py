@@ -1,1 +1,1 @@
-"""Writes what was measured and found in forms that other programs read: CSV, Parquet, GeoJSON."""
+"""Export of measurements and results for other programs: CSV, Parquet, GeoJSON."""

@@ -5,31 +5,33 @@ from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from typing import Any
 
-from schemas.results import Crossing, Results
+from schemas.results import CrossingResult, Results
 from schemas.site import Bridge, Site
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.export.found import places_of
-from services.identification.bridges import Passing
+from services.export.result_tables import element_bounds_m
+from services.finding.bridges import DetectedCrossing
 
 _DECIMALS = 9
-"""A tenth of a millimetre."""
+"""Decimal places of coordinates in degrees: a tenth of a millimetre."""
 
 
 def elements_geojson(site: Site, results: Results | None) -> str:
-    """A line for each element of each bridge, with the bridge's latest state where there is one."""
+    """Return a line for each element of each bridge, with the bridge's latest state if any."""
     return _collection(f for bridge in site.bridges for f in _elements(bridge, results))
 
 
-def crossings_geojson(site: Site, crossings: Iterable[Crossing], seen: Iterable[Passing]) -> str:
-    """A line for each crossing, in the direction of travel.
+def crossings_geojson(
+    site: Site, crossings: Iterable[CrossingResult], detected: Iterable[DetectedCrossing]
+) -> str:
+    """Return a line for each crossing, in the direction of travel.
 
-    `crossings` have a result; those that were only `seen` in positions have none.
+    `crossings` have a result; those `detected` in positions only have none.
     """
     bridges = {bridge.id: bridge for bridge in site.bridges}
     return _collection(
         [
             *(_crossing(bridges[crossing.bridge], crossing) for crossing in crossings),
-            *(_seen(bridges[passing.bridge], passing) for passing in seen),
+            *(_detected(bridges[passing.bridge], passing) for passing in detected),
         ]
     )
 
@@ -47,7 +49,7 @@ def _line(
 
 
 def geometry_of(bridge: Bridge, begin_m: float, end_m: float) -> dict[str, Any]:
-    """A line along a bridge, between two chainages."""
+    """Return a line along a bridge, between two chainages."""
     latitude, longitude = to_lat_lon(bridge_frame(bridge), [begin_m, end_m])
     places = zip(longitude.tolist(), latitude.tolist(), strict=True)
     coordinates = [[round(lon, _DECIMALS), round(lat, _DECIMALS)] for lon, lat in places]
@@ -57,7 +59,7 @@ def geometry_of(bridge: Bridge, begin_m: float, end_m: float) -> dict[str, Any]:
 def _elements(bridge: Bridge, results: Results | None) -> Iterator[dict[str, Any]]:
     state = None if results is None else results.bridges.get(bridge.id)
     found = {} if state is None else state.elements
-    for number, (begin_m, end_m) in enumerate(places_of(bridge, bridge.elements), start=1):
+    for number, (begin_m, end_m) in enumerate(element_bounds_m(bridge, bridge.elements), start=1):
         assert begin_m is not None  # noqa: S101 - the bridge is known
         assert end_m is not None  # noqa: S101
         name = f"EI_{number}"
@@ -79,7 +81,7 @@ def _elements(bridge: Bridge, results: Results | None) -> Iterator[dict[str, Any
         yield _line(bridge, begin_m, end_m, properties)
 
 
-def _crossing(bridge: Bridge, crossing: Crossing) -> dict[str, Any]:
+def _crossing(bridge: Bridge, crossing: CrossingResult) -> dict[str, Any]:
     names = ("vehicle", "bridge", "direction", "speed_m_per_s", "method", "verdict", "chi2_per_dof")
     properties = {
         "crossing": crossing.crossing_id,
@@ -90,7 +92,7 @@ def _crossing(bridge: Bridge, crossing: Crossing) -> dict[str, Any]:
     return _along(bridge, properties, forward=crossing.direction == "start_to_end")
 
 
-def _seen(bridge: Bridge, passing: Passing) -> dict[str, Any]:
+def _detected(bridge: Bridge, passing: DetectedCrossing) -> dict[str, Any]:
     properties = {
         "crossing": None,
         "entry_time": utc(passing.entry_ns * 1e-9),
@@ -109,6 +111,6 @@ def _along(bridge: Bridge, properties: dict[str, Any], *, forward: bool) -> dict
 
 
 def utc(seconds: float) -> str:
-    """A time since 1970 as RFC 3339 writes it."""
+    """Return a Unix time in the format of RFC 3339."""
     moment = datetime.fromtimestamp(seconds, UTC)
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,8 +1,8 @@
 """Results as entities of OGC SensorThings API 1.1 (18-088), part 1: sensing.
 
-A bridge is a Thing at its Location, an element a FeatureOfInterest. For each element there are two
-Datastreams, of what single crossings say and of what all say together; a rejected crossing gives no
-Observation. Entities refer to each other by `@iot.id`.
+A bridge is a Thing at its Location, an element a FeatureOfInterest. Each element has two
+Datastreams, of single crossings and of the fused state; a rejected crossing gives no Observation.
+Entities refer to each other by `@iot.id`.
 """
 
 import json
@@ -34,7 +34,7 @@ _HOW = {_SINGLE: "each crossing alone", _FUSED: "all crossings together"}
 
 
 def sensorthings(site: Site, results: Results) -> str:
-    """All entities of the bridges that were crossed, as sets by the names of the standard."""
+    """Return all entities of the crossed bridges, as sets by the names of the standard."""
     crossed = {crossing.bridge for crossing in results.crossings}
     bridges = [bridge for bridge in site.bridges if bridge.id in crossed]
     sets: dict[str, list[Entity]] = {

@@ -1,4 +1,4 @@
-"""Tables as CSV and Parquet files. Units stand in the columns' names."""
+"""Tables as CSV and Parquet files, with units in the columns' names."""
 
 import csv
 import io
@@ -16,18 +16,18 @@ Format = Literal["csv", "parquet"]
 Column = Sequence[Any] | NDArray[Any]
 
 
-class Table(NamedTuple):
-    """Columns of one length, by name. None, and NaN of floating-point arrays, is an empty cell.
+class NamedTable(NamedTuple):
+    """Columns of one length, by name; None, and NaN of floating-point arrays, is an empty cell.
 
-    A column `…_ns` of whole numbers is a time since 1970 UTC: in CSV seconds, exactly, called
-    `…_s`; in Parquet a timestamp called without the unit.
+    A column `…_ns` of whole numbers is a time since 1970 UTC: in CSV seconds, exactly, named `…_s`;
+    in Parquet a timestamp named without the unit.
     """
 
     name: str
     columns: Mapping[str, Column]
 
 
-def write_table(folder: Path, table: Table, form: Format) -> Path:
+def write_table(folder: Path, table: NamedTable, form: Format) -> Path:
     """Write a table into a folder and return its file; an existing one is replaced."""
     path = folder / f"{table.name}.{form}"
     if form == "parquet":
@@ -38,7 +38,7 @@ def write_table(folder: Path, table: Table, form: Format) -> Path:
     return path
 
 
-def _csv_text(table: Table) -> str:
+def _csv_text(table: NamedTable) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(f"{name[:-3]}_s" if name.endswith("_ns") else name for name in table.columns)
@@ -56,7 +56,7 @@ def _cells(name: str, column: Column) -> list[Any]:
     return ["" if value is None else value for value in values]
 
 
-def _write_parquet(path: Path, table: Table) -> None:
+def _write_parquet(path: Path, table: NamedTable) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 

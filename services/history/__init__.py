@@ -1,1 +1,1 @@
-"""What is known of crossings: results on the disk, what was told, draws."""
+"""The history of a bridge over years: results, periods, alarms."""

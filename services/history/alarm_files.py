@@ -1,9 +1,9 @@
-"""Alarms of a history as files: read, and acknowledged.
+"""Files of alarms in a history: reading and acknowledging.
 
 An alarm is a file `alarms/realm=R/bridge=B/ID.json` that is written once; its acknowledgement is
-`ID.ack.json` beside it. Nothing removes either: an alarm stands until somebody acknowledges it,
-whatever later crossings say, and over any restart. An alarm is called by what it says, so that two
-programs that find it write one file.
+`ID.ack.json` beside it. Nothing removes either: an alarm stands until it is acknowledged, whatever
+later crossings show, and over any restart. An alarm's id is a hash of its content, so two programs
+that raise it write one file.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ _ACKNOWLEDGED: Final = ".ack.json"
 
 
 def alarms_of(folder: Path, realm: str, bridge: str) -> tuple[list[Alarm], list[str]]:
-    """All alarms of a bridge in the order of their times; and files that are none, a line each."""
+    """Return all alarms of a bridge in order of time, and the invalid files, one line each."""
     where = alarms_folder(folder, realm, bridge)
     found, problems = [], []
     for path in sorted(where.glob("*.json")):
@@ -34,7 +34,7 @@ def alarms_of(folder: Path, realm: str, bridge: str) -> tuple[list[Alarm], list[
                 try:
                     note = load_json(Acknowledgement, noted, "an acknowledgement")
                     alarm = alarm.model_copy(update={"acknowledged": note})
-                except InputError as error:  # then it stands: nobody knows that it does not
+                except InputError as error:  # the alarm then stands
                     problems.append(str(error))
             found.append(alarm)
         except InputError as error:
@@ -43,7 +43,7 @@ def alarms_of(folder: Path, realm: str, bridge: str) -> tuple[list[Alarm], list[
 
 
 def _load(path: Path, realm: str, bridge: str) -> Alarm:
-    """The alarm of a file; InputError if it is none, or another one than the file is called by."""
+    """Return the alarm of a file; InputError if it is none, or another one than its name says."""
     alarm = load_json(Alarm, path, "an alarm")
     if (alarm.realm, alarm.bridge, alarm.alarm_id) != (realm, bridge, path.stem):
         raise InputError(
@@ -54,15 +54,15 @@ def _load(path: Path, realm: str, bridge: str) -> Alarm:
 
 
 def bridges_with_alarms(folder: Path) -> list[tuple[str, str]]:
-    """Realm and name of all bridges of which there are files of alarms."""
+    """Return realm and name of all bridges that have files of alarms."""
     return [
         (path.parent.name.removeprefix("realm="), path.name.removeprefix("bridge="))
         for path in sorted((folder / ALARMS).glob("realm=*/bridge=*"))
     ]
 
 
-def standing(folder: Path) -> tuple[list[Alarm], list[str]]:
-    """All alarms of a history that nobody has acknowledged, and files that are none."""
+def standing_alarms(folder: Path) -> tuple[list[Alarm], list[str]]:
+    """Return the alarms of a history without an acknowledgement, and the invalid files."""
     found, problems = [], []
     for realm, bridge in bridges_with_alarms(folder):
         alarms, wrong = alarms_of(folder, realm, bridge)
@@ -72,8 +72,8 @@ def standing(folder: Path) -> tuple[list[Alarm], list[str]]:
 
 
 def acknowledged_since(folder: Path, time_s: float) -> list[Alarm]:
-    """The last alarm of each bridge, if somebody has taken note of it since then."""
-    last = [alarms_of(folder, *whose)[0][-1:] for whose in bridges_with_alarms(folder)]
+    """Return the last alarm of each bridge, if it was acknowledged since a time."""
+    last = [alarms_of(folder, *name)[0][-1:] for name in bridges_with_alarms(folder)]
     return [
         alarm
         for some in last
@@ -83,10 +83,10 @@ def acknowledged_since(folder: Path, time_s: float) -> list[Alarm]:
 
 
 def acknowledge(folder: Path, alarm: Alarm, by: str, note: str, time_s: float) -> Alarm:
-    """Write down that somebody has taken note of an alarm; the first who does so counts.
+    """Write the acknowledgement of an alarm; the first one counts.
 
-    InputError if it is acknowledged already, a file that is damaged stands where its
-    acknowledgement would, or what is said is too long.
+    Raise InputError if it is acknowledged already, if a damaged file is in the place of its
+    acknowledgement, or if a text is too long.
     """
     where = alarms_folder(folder, alarm.realm, alarm.bridge)
     path = where / f"{alarm.alarm_id}{_ACKNOWLEDGED}"
@@ -98,14 +98,14 @@ def acknowledge(folder: Path, alarm: Alarm, by: str, note: str, time_s: float) -
     if alarm.acknowledged is not None or path.exists():
         raise InputError(f"{path}: {alarm.bridge} {alarm.alarm_id} is acknowledged already")
     try:
-        said = Acknowledgement(by=one_line(by), time=time_s, note=one_line(note))
+        acknowledgement = Acknowledgement(by=one_line(by), time=time_s, note=one_line(note))
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         raise InputError(f"--{problem['loc'][0]}: {problem['msg']}") from None
-    write_atomically(path, said.model_dump_json(indent=1) + "\n")
-    return alarm.model_copy(update={"acknowledged": said})
+    write_atomically(path, acknowledgement.model_dump_json(indent=1) + "\n")
+    return alarm.model_copy(update={"acknowledged": acknowledgement})
 
 
 def alarms_folder(folder: Path, realm: str, bridge: str) -> Path:
-    """Where the alarms of a bridge lie."""
+    """Return the folder of a bridge's alarms."""
     return folder / ALARMS / f"realm={realm}" / f"bridge={bridge}"

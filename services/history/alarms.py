@@ -1,6 +1,6 @@
-"""Alarms of a history: raised where the periods of a bridge are unlike those before.
+"""Alarms of a history, raised where the periods of a bridge differ from earlier ones.
 
-While an alarm stands, no other of that bridge is raised. Its file is `alarm_files`' matter.
+While an alarm stands, no other of that bridge is raised. `alarm_files` holds its file.
 """
 
 import json
@@ -13,76 +13,94 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from pre_core.monitoring.baseline import Period
-from pre_core.monitoring.observation import Observation, fused
-from pre_core.monitoring.watch import AT_LEAST, SEASON_DAYS, Noted, Rules, Watched, watch
+from pre_core.monitoring.change_detection import (
+    SEASON_DAYS,
+    SMALLEST_CHANGE,
+    AcknowledgedChange,
+    AlarmRules,
+    MonitoringResult,
+    detect_change,
+)
+from pre_core.monitoring.observation import Observation, combine_observations
 from schemas.alarms import Alarm
+from services.common.child_process import end_with_parent
 from services.common.files import make_folder, write_atomically
-from services.history.alarm_files import ALARMS, alarms_folder, alarms_of, standing
-from services.history.archive import (
-    Kept,
+from services.history.alarm_files import ALARMS, alarms_folder, alarms_of, standing_alarms
+from services.history.history_store import (
+    HistoryRow,
     bridges_of,
     partition,
     read_partition,
     unpacked_observation,
 )
 from services.history.periods import PER_YEAR, Unit, begin_of, by_period, end_of, mean_temperature
-from services.history.watch_files import Watch, WatchRecord, record_path, watch_of, write_record
+from services.history.watch_files import (
+    MonitoringState,
+    WatchRecord,
+    monitoring_state,
+    record_path,
+    write_record,
+)
 
 _log = logging.getLogger(__name__)
 _CHECKED: Final = "checked.json"
 DEFAULT_UNIT: Final[Unit] = "week"
 DEFAULT_FALSE_ALARMS: Final = 0.01
-"""Of one bridge in a year."""
+"""Tolerated false alarms per bridge and year."""
 DAY_S: Final = 86_400.0
 _CLOCK_S: Final = 60.0
-"""A check takes less than that from reading a bridge to writing down what was judged of it."""
+"""Longest time in s between reading a bridge and writing its record."""
 _BATCH = 50
-"""Bridges that a process takes at a time."""
+"""Number of bridges that a process checks at a time."""
 
 
-class Settings(NamedTuple):
-    """What is asked of the alarms of a history."""
+class AlarmSettings(NamedTuple):
+    """Settings of a history's alarms."""
 
     unit: Unit = DEFAULT_UNIT
     false_alarms_per_year: float = DEFAULT_FALSE_ALARMS
     learning: int = 8
-    """Training periods."""
-    at_least: float = AT_LEAST
-    """Smallest change of interest, of EI."""
+    """Number of training periods."""
+    at_least: float = SMALLEST_CHANGE
+    """Smallest change of interest, relative to EI."""
 
-    def rules(self) -> Rules:
-        """The same for `watch`."""
-        return Rules(self.false_alarms_per_year, PER_YEAR[self.unit], self.learning, self.at_least)
+    def rules(self) -> AlarmRules:
+        """Return these settings for `detect_change`."""
+        return AlarmRules(
+            self.false_alarms_per_year, PER_YEAR[self.unit], self.learning, self.at_least
+        )
 
 
-class WatchedBridge(NamedTuple):
-    """A bridge as it was watched; times in s since 1970 UTC."""
+class MonitoredBridge(NamedTuple):
+    """Result of monitoring one bridge; times in s since 1970 UTC."""
 
     begins_s: tuple[float, ...]
-    """Of the periods."""
-    watched: Watched | None
-    """None without crossings that could be watched."""
+    """Beginnings of the periods."""
+    result: MonitoringResult | None
+    """Result of the detection; None without usable crossings."""
     alarm: Alarm | None
-    """That the periods raise, whether it is written down or not."""
+    """Alarm that the periods raise, whether it is written or not."""
     record: WatchRecord
-    """What was judged."""
+    """Summary of the judged periods."""
     problems: tuple[str, ...]
 
 
-class Checked(NamedTuple):
-    """What came of looking at all bridges."""
+class AlarmCheck(NamedTuple):
+    """Outcome of a check of all bridges."""
 
     raised: tuple[Alarm, ...]
-    """New ones."""
+    """Alarms that are new."""
     standing: tuple[Alarm, ...]
-    """All that nobody has acknowledged, the new ones among them."""
+    """Alarms without an acknowledgement, new ones included."""
     bridges: int
-    """That were looked at."""
+    """Number of bridges checked."""
     problems: tuple[str, ...]
 
 
-def watches(folder: Path, now_s: float) -> tuple[dict[tuple[str, str], Watch], list[str]]:
-    """Return by realm and bridge whether each is watched; and lines of what cannot be read.
+def monitoring_states(
+    folder: Path, now_s: float
+) -> tuple[dict[tuple[str, str], MonitoringState], list[str]]:
+    """Return the state of monitoring by realm and bridge, and lines of what is unreadable.
 
     Crossings are read only of bridges to which some may have been added since the last check.
     """
@@ -92,15 +110,17 @@ def watches(folder: Path, now_s: float) -> tuple[dict[tuple[str, str], Watch], l
         path = record_path(folder, realm, bridge)
         is_unchanged = path.exists() and where.stat().st_mtime < path.stat().st_mtime - _CLOCK_S
         crossings = None if is_unchanged else read_partition(where).crossings
-        found[(realm, bridge)], wrong = watch_of(folder, realm, bridge, crossings, alarms, now_s)
+        found[(realm, bridge)], wrong = monitoring_state(
+            folder, realm, bridge, crossings, alarms, now_s
+        )
         problems += wrong
     return found, problems
 
 
-def watch_bridge(
-    folder: Path, realm: str, bridge: str, settings: Settings, now_s: float
-) -> WatchedBridge:
-    """Compare the periods of a bridge that are over with each other, and raise what they raise."""
+def monitor_bridge(
+    folder: Path, realm: str, bridge: str, settings: AlarmSettings, now_s: float
+) -> MonitoredBridge:
+    """Compare the completed periods of a bridge with each other; return the alarm they raise."""
     read = read_partition(partition(folder, realm, bridge), ("observation",))
     problems = list(read.problems)
     alarms, wrong = alarms_of(folder, realm, bridge)
@@ -108,9 +128,9 @@ def watch_bridge(
     begins, periods = _periods(read.crossings, settings.unit, now_s, problems)
     record = _record(read.crossings, begins, settings, now_s)
     if not periods:
-        return WatchedBridge((), None, None, record, tuple(problems))
+        return MonitoredBridge((), None, None, record, tuple(problems))
     notes = [
-        Noted(
+        AcknowledgedChange(
             since=sum(begin < alarm.since for begin in begins),
             at=sum(end_of(begin, settings.unit) <= alarm.acknowledged.time for begin in begins),
         )
@@ -118,16 +138,16 @@ def watch_bridge(
         if alarm.acknowledged is not None
     ]
     try:
-        watched = watch(periods, settings.rules(), sorted(notes, key=lambda note: note.at))
+        result = detect_change(periods, settings.rules(), sorted(notes, key=lambda note: note.at))
     except ArithmeticError as error:
         problem = f"cannot be watched: {error}"
         problems.append(f"{partition(folder, realm, bridge)}: {problem}")
         record = record.model_copy(update={"problem": problem})
-        return WatchedBridge(tuple(begins), None, None, record, tuple(problems))
-    record = _judged(record, periods, begins, watched, settings)
+        return MonitoredBridge(tuple(begins), None, None, record, tuple(problems))
+    record = _judged(record, periods, begins, result, settings)
     alarm = None
-    if watched.change is not None:
-        of = watched.change
+    if result.change is not None:
+        of = result.change
         raised = end_of(begins[of.raised_at], settings.unit)
         day = datetime.fromtimestamp(raised, UTC)
         alarm = Alarm(
@@ -139,24 +159,29 @@ def watch_bridge(
             since=begins[of.since],
             raised=raised,
             sum=of.sum,
-            threshold=watched.threshold,
+            threshold=result.threshold,
             ratio=float(of.ratio[of.element]),
             ratio_q025=float(of.low[of.element]),
             ratio_q975=float(of.high[of.element]),
         )
-    return WatchedBridge(tuple(begins), watched, alarm, record, tuple(problems))
+    return MonitoredBridge(tuple(begins), result, alarm, record, tuple(problems))
 
 
 def check(
-    folder: Path, settings: Settings, now_s: float, *, processes: int = 1, everything: bool = False
-) -> Checked:
-    """Look at all bridges of which something may have changed since the last time; write alarms.
+    folder: Path,
+    settings: AlarmSettings,
+    now_s: float,
+    *,
+    processes: int = 1,
+    everything: bool = False,
+) -> AlarmCheck:
+    """Check all bridges that may have changed since the last check; write their alarms.
 
-    A bridge is looked at again when crossings were added or another period is over; `everything`:
-    all of them.
+    A bridge is checked again when crossings were added or another period is over; with `everything`
+    all bridges are.
     """
     seen = {} if everything else _checked(folder)
-    marks = marks_of(folder, settings, now_s)
+    marks = change_markers(folder, settings, now_s)
     work = [
         name
         for name, mark in marks.items()
@@ -167,43 +192,45 @@ def check(
     problems: list[str] = []
     given = ((folder, batch, settings, now_s) for batch in batches)
     if processes > 1 and len(batches) > 1:
-        with ProcessPoolExecutor(processes, get_context("forkserver")) as pool:
+        with ProcessPoolExecutor(processes, get_context("forkserver"), end_with_parent) as pool:
             results = list(pool.map(_checked_batch, given))
     else:
         results = [_checked_batch(one) for one in given]
     for some, wrong in results:
         raised += some
         problems += wrong
-    remember(folder, marks)
-    now_standing, wrong = standing(folder)
-    return Checked(
+    save_markers(folder, marks)
+    now_standing, wrong = standing_alarms(folder)
+    return AlarmCheck(
         tuple(raised), tuple(now_standing), len(work), tuple(dict.fromkeys([*problems, *wrong]))
     )
 
 
-def marks_of(folder: Path, settings: Settings, now_s: float) -> dict[tuple[str, str], list[object]]:
-    """By realm and bridge: what is another as soon as the bridge has to be looked at again."""
+def change_markers(
+    folder: Path, settings: AlarmSettings, now_s: float
+) -> dict[tuple[str, str], list[object]]:
+    """Return by realm and bridge the values that change when it has to be checked again."""
     today = [settings.unit, begin_of(now_s, settings.unit)]
     rules = [settings.false_alarms_per_year, settings.learning, settings.at_least]
     bridges = bridges_of(folder).items()
     return {name: [where.stat().st_mtime_ns, *today, *rules] for name, where in bridges}
 
 
-def remember(folder: Path, marks: Mapping[tuple[str, str], list[object]]) -> None:
-    """Write down at what bridges were looked."""
+def save_markers(folder: Path, marks: Mapping[tuple[str, str], list[object]]) -> None:
+    """Write the markers of the bridges checked."""
     make_folder(folder / ALARMS)
-    told = {"/".join(name): mark for name, mark in marks.items()}
-    write_atomically(folder / ALARMS / _CHECKED, json.dumps(told))
+    entries = {"/".join(name): mark for name, mark in marks.items()}
+    write_atomically(folder / ALARMS / _CHECKED, json.dumps(entries))
 
 
 def _checked_batch(
-    given: tuple[Path, Sequence[tuple[str, str]], Settings, float],
+    given: tuple[Path, Sequence[tuple[str, str]], AlarmSettings, float],
 ) -> tuple[list[Alarm], list[str]]:
     folder, batch, settings, now_s = given
     raised: list[Alarm] = []
     problems: list[str] = []
     for realm, bridge in batch:
-        found = watch_bridge(folder, realm, bridge, settings, now_s)
+        found = monitor_bridge(folder, realm, bridge, settings, now_s)
         problems += found.problems
         write_record(folder, realm, bridge, found.record)
         if found.alarm is not None and _raise(folder, found.alarm):
@@ -212,7 +239,7 @@ def _checked_batch(
 
 
 def _raise(folder: Path, alarm: Alarm) -> bool:
-    """Write an alarm down, unless one of that bridge stands."""
+    """Write an alarm, unless one of that bridge stands; return whether it was written."""
     if any(one.acknowledged is None for one in alarms_of(folder, alarm.realm, alarm.bridge)[0]):
         return False
     path = alarms_folder(folder, alarm.realm, alarm.bridge) / f"{alarm.alarm_id}.json"
@@ -224,10 +251,10 @@ def _raise(folder: Path, alarm: Alarm) -> bool:
 
 
 def _periods(
-    crossings: Iterable[Kept], unit: Unit, now_s: float, problems: list[str]
+    crossings: Iterable[HistoryRow], unit: Unit, now_s: float, problems: list[str]
 ) -> tuple[list[float], list[Period]]:
-    """Periods that are over, of crossings that are good and of the elements of the latest."""
-    usable: list[tuple[Kept, Observation]] = []
+    """Return the completed periods of good crossings that have the latest one's elements."""
+    usable: list[tuple[HistoryRow, Observation]] = []
     for one in crossings:
         if one.verdict != "good" or one.observation is None:
             continue
@@ -243,7 +270,7 @@ def _periods(
     begins, periods = [], []
     for begin, some in by_period(kept, unit):
         if end_of(begin, unit) <= now_s:
-            together = fused([alike[one.crossing_id] for one in some], elements)
+            together = combine_observations([alike[one.crossing_id] for one in some], elements)
             middle_s = 0.5 * (begin + end_of(begin, unit))
             begins.append(begin)
             periods.append(Period(together, mean_temperature(some), middle_s / DAY_S))
@@ -251,9 +278,9 @@ def _periods(
 
 
 def _record(
-    crossings: Sequence[Kept], begins: Sequence[float], settings: Settings, now_s: float
+    crossings: Sequence[HistoryRow], begins: Sequence[float], settings: AlarmSettings, now_s: float
 ) -> WatchRecord:
-    """What there is to judge."""
+    """Return the record of a bridge before anything is judged."""
     until = begin_of(now_s, settings.unit)
     return WatchRecord(
         checked=now_s,
@@ -272,11 +299,11 @@ def _judged(
     record: WatchRecord,
     periods: Sequence[Period],
     begins: Sequence[float],
-    watched: Watched,
-    settings: Settings,
+    result: MonitoringResult,
+    settings: AlarmSettings,
 ) -> WatchRecord:
-    """The same, with what was judged."""
-    judged = [begin for begin, one in zip(begins, watched.judged, strict=True) if one]
+    """Return the record with the judged periods."""
+    judged = [begin for begin, one in zip(begins, result.judged, strict=True) if one]
     if judged:
         to = end_of(judged[-1], settings.unit)
         found = {"judged": len(judged), "judged_from": judged[0], "judged_to": to}
@@ -288,13 +315,13 @@ def _judged(
 
 
 def _checked(folder: Path) -> dict[str, list[object]]:
-    """What was looked at, as it was then; nothing where that is not known."""
+    """Return the markers of the last check; none where they are unknown."""
     path = folder / ALARMS / _CHECKED
     try:
         found = json.loads(path.read_bytes())
     except FileNotFoundError:
         return {}
     except (OSError, ValueError):
-        _log.warning("%s: cannot be read; all bridges are looked at", path)
+        _log.warning("%s: unreadable; checking all bridges", path)
         return {}
     return found if isinstance(found, dict) else {}

@@ -1,8 +1,8 @@
-"""The Markov chains of identifications as a file: `driveby identify --draws`.
+"""Files of posterior draws: `driveby identify --draws`.
 
 OUT.nc is NetCDF-4 in the convention of ArviZ's InferenceData, for `arviz.from_netcdf("OUT.nc")`: a
-group `posterior` in which every unknown is an array (chain, draw, crossing). It needs the extra
-`driveby[notebook]`. OUT.npz needs nothing but numpy and holds arrays (chain, draw) called NAME, or
+group `posterior` in which every parameter is an array (chain, draw, crossing). It needs the extra
+`driveby[notebook]`. OUT.npz needs nothing but numpy and holds arrays (chain, draw) named NAME, or
 CROSSING/NAME where there are several crossings.
 """
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Draws = dict[str, NDArray[np.float64]]
-"""(chains, draws) of every unknown, by name."""
+"""Draws (chains, draws) of every parameter, by name."""
 _SUFFIXES = (".npz", ".nc")
 
 
 class DrawsOfCrossing(NamedTuple):
-    """The draws of one crossing, and whose they are."""
+    """The draws of one crossing, with its names."""
 
     crossing_id: str
     vehicle: str
@@ -35,14 +35,14 @@ class DrawsOfCrossing(NamedTuple):
 
 
 def check_draws(path: Path, method: str) -> None:
-    """Refuse what cannot be written, before the work is done."""
+    """Refuse an invalid file or method before the work is done."""
     check_draws_file(path)
     if method != "pre":
         raise InputError(f"--draws: method {method} has no draws, pre has")
 
 
 def check_draws_file(path: Path) -> None:
-    """Refuse a kind of file that is not known, or for which something is not installed."""
+    """Refuse an unknown kind of file, or one that needs a package that is not installed."""
     if path.suffix not in _SUFFIXES:
         raise InputError(f"{path}: draws are written as {' or '.join(_SUFFIXES)}")
     if path.suffix == ".nc":
@@ -51,7 +51,7 @@ def check_draws_file(path: Path) -> None:
 
 
 def write_draws(path: Path, crossings: Iterable[DrawsOfCrossing]) -> None:
-    """Write the draws of every crossing that has some; an existing file is replaced."""
+    """Write the draws of the crossings that have some; an existing file is replaced."""
     some = [crossing for crossing in crossings if crossing.draws]
     if path.suffix == ".nc":
         _write_netcdf(path, some)
@@ -65,14 +65,14 @@ def write_draws(path: Path, crossings: Iterable[DrawsOfCrossing]) -> None:
 
 
 def posterior(crossings: Iterable[DrawsOfCrossing]) -> "xr.Dataset":
-    """The draws of several crossings in one dataset: arrays (chain, draw, crossing).
+    """Return the draws of several crossings in one dataset: arrays (chain, draw, crossing).
 
-    Chains that were run longer than the shortest are thinned evenly to its length: `draws_sampled`
-    says how many draws they had. Where the crossings have not all the same unknowns, as on bridges
-    of 5 and of 7 elements, the arrays of each vehicle on each bridge are called
-    VEHICLE.BRIDGE.NAME and have a dimension VEHICLE.BRIDGE.crossing of their own.
+    Chains longer than the shortest are thinned evenly to its length; `draws_sampled` is the number
+    of draws before. Where the crossings differ in their parameters, as on bridges of 5 and of 7
+    elements, the arrays of each vehicle on each bridge are named VEHICLE.BRIDGE.NAME and have a
+    dimension VEHICLE.BRIDGE.crossing of their own.
 
-    InputError if xarray is not installed.
+    Raise InputError if xarray is not installed.
     """
     check_installed("a dataset of draws", "xarray")
     import xarray as xr

@@ -1,7 +1,7 @@
-"""A bridge's history by periods: the crossings of each fused as `driveby fuse` does it.
+"""Periods of a bridge's history: the crossings of each, fused as by `driveby fuse`.
 
-What was fused of a period is kept in `fused/realm=R/bridge=B/HASH.json`, called by the crossings
-and the program that fused them: a period to which nothing was added is not fused again.
+The fused state of a period is stored in `fused/realm=R/bridge=B/HASH.json`, named by the crossings
+and the program that fused them, so an unchanged period is not fused again.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ from schemas.results import BridgeResult
 from schemas.settings import IdentificationSettings
 from services.common.errors import FailureError, InputError
 from services.common.files import make_folder, write_atomically
-from services.history.archive import EDITION, Kept, usable_of
+from services.history.history_store import EDITION, HistoryRow, fusable_of
 from services.recordings.recording import program_version
 
 Unit = Literal["day", "week", "month"]
@@ -31,16 +31,16 @@ class FusedPeriod(NamedTuple):
     begin_s: float
     end_s: float
     crossings: int
-    """That there were, whatever their verdicts."""
+    """Number of crossings, whatever their verdicts."""
     vehicles: tuple[str, ...]
     temperature_deg_c: float | None
-    """Mean of those crossings of which it is known."""
+    """Mean over the crossings with a known temperature."""
     state: BridgeResult | None
-    """None where no crossing gave numbers."""
+    """Fused state; None without usable crossings."""
 
 
 def begin_of(time_s: float, unit: Unit) -> float:
-    """When the period began in which a time is, UTC; weeks begin on Monday."""
+    """Return the beginning of the period of a time, UTC; weeks begin on Monday."""
     day = datetime.fromtimestamp(time_s, UTC).replace(hour=0, minute=0, second=0, microsecond=0)
     if unit == "week":
         day -= timedelta(days=day.weekday())
@@ -50,25 +50,25 @@ def begin_of(time_s: float, unit: Unit) -> float:
 
 
 def end_of(begin_s: float, unit: Unit) -> float:
-    """When the period that begins then is over."""
+    """Return the end of the period that begins at a time."""
     days = {"day": 1, "week": 7, "month": 32}[unit]
     later = datetime.fromtimestamp(begin_s, UTC) + timedelta(days=days)
     return later.replace(day=1).timestamp() if unit == "month" else later.timestamp()
 
 
 def period_name(begin_s: float, unit: Unit) -> str:
-    """Return how a period is called: its month, or the day on which it begins."""
+    """Return the name of a period: its month, or the day on which it begins."""
     return f"{datetime.fromtimestamp(begin_s, UTC):{'%Y-%m' if unit == 'month' else '%Y-%m-%d'}}"
 
 
-def by_period(crossings: Iterable[Kept], unit: Unit) -> list[tuple[float, list[Kept]]]:
-    """Crossings, in order of their entries, by the beginnings of their periods."""
+def by_period(crossings: Iterable[HistoryRow], unit: Unit) -> list[tuple[float, list[HistoryRow]]]:
+    """Group crossings, in order of their entries, by the beginnings of their periods."""
     grouped = groupby(crossings, key=lambda one: begin_of(one.entry_s, unit))
     return [(begin, list(some)) for begin, some in grouped]
 
 
-def mean_temperature(crossings: Iterable[Kept]) -> float | None:
-    """Of those of which it is known; None if of none."""
+def mean_temperature(crossings: Iterable[HistoryRow]) -> float | None:
+    """Return the mean of the known temperatures; None if none is known."""
     known = [one.temperature_deg_c for one in crossings if one.temperature_deg_c is not None]
     return sum(known) / len(known) if known else None
 
@@ -77,11 +77,11 @@ def fused_periods(
     folder: Path,
     realm: str,
     bridge: str,
-    crossings: Iterable[Kept],
+    crossings: Iterable[HistoryRow],
     unit: Unit,
-    say: Callable[[str], None] = lambda problem: None,
+    warn: Callable[[str], None] = lambda problem: None,
 ) -> list[FusedPeriod]:
-    """All periods that have crossings, in their order; `say` is told of crossings left out."""
+    """Return all periods that have crossings, in order; call `warn` with excluded crossings."""
     cache = folder / "fused" / f"realm={realm}" / f"bridge={bridge}"
     found = []
     for begin_s, some in by_period(crossings, unit):
@@ -92,37 +92,42 @@ def fused_periods(
                 len(some),
                 tuple(sorted({one.vehicle for one in some})),
                 mean_temperature(some),
-                _fused(cache, bridge, some, say),
+                _fused(cache, bridge, some, warn),
             )
         )
     return found
 
 
 def _fused(
-    cache: Path, bridge: str, crossings: list[Kept], say: Callable[[str], None]
+    cache: Path, bridge: str, crossings: list[HistoryRow], warn: Callable[[str], None]
 ) -> BridgeResult | None:
-    told = " ".join(one.content for one in crossings)
-    name = hashlib.sha256(f"{EDITION} {program_version()} {told}".encode()).hexdigest()[:20]
+    names = " ".join(one.content for one in crossings)
+    name = hashlib.sha256(f"{EDITION} {program_version()} {names}".encode()).hexdigest()[:20]
     path = cache / f"{name}.json"
     try:
         return BridgeResult.model_validate_json(path.read_bytes())
     except (OSError, ValidationError):
-        pass  # not fused yet, or what is there was cut off
-    # Kernels are slow to import, and mostly there is nothing to fuse.
-    from services.identification.bridge_state import Counted, Fusing, count_in, state_of
+        pass  # not fused yet, or the file was truncated
+    # Kernels are slow to import, and usually there is nothing to fuse.
+    from services.identification.bridge_state import (
+        Fusing,
+        RecentCrossings,
+        add_crossings,
+        state_of,
+    )
 
     some = []
     for one in crossings:
         try:
-            some.append(usable_of(one))
+            some.append(fusable_of(one))
         except ValueError as error:
-            say(f"{one.crossing_id}: left out: {' '.join(str(error).split())[:120]}")
-    counted = count_in(Counted(), [one for one in some if one is not None])
+            warn(f"{one.crossing_id}: left out: {' '.join(str(error).split())[:120]}")
+    counted = add_crossings(RecentCrossings(), [one for one in some if one is not None])
     state = state_of(counted, bridge, Fusing(threads=IdentificationSettings().threads))
     if state is not None:
         try:
             make_folder(cache)
             write_atomically(path, state.model_dump_json())
-        except (InputError, FailureError) as error:  # a history that one may only read
-            say(f"what was fused is not kept: {error}")
+        except (InputError, FailureError) as error:  # the history may be read-only
+            warn(f"cannot store the fused state: {error}")
     return state

@@ -1,4 +1,4 @@
-"""Temperatures beside crossings: a CSV file of a weather station or of a sensor on the bridge."""
+"""Temperatures of crossings, from a CSV file of a weather station or a sensor on the bridge."""
 
 import csv
 from bisect import bisect_left
@@ -8,20 +8,20 @@ from math import isfinite
 from pathlib import Path
 from typing import Final
 
-from schemas.results import Crossing
+from schemas.results import CrossingResult
 from services.common.errors import InputError
 from services.common.files import read_text
 
 _FARTHEST_S: Final = 3 * 3600.0
-"""A temperature of longer before or behind a crossing says nothing of it."""
+"""Longest time in s between a temperature and a crossing that it describes."""
 _LOWEST, _HIGHEST = -60.0, 80.0
 
 
-def temperatures_of(path: Path, crossings: Iterable[Crossing]) -> dict[str, float]:
-    """°C by crossing id, between the rows before and behind it, where both are near enough.
+def temperatures_of(path: Path, crossings: Iterable[CrossingResult]) -> dict[str, float]:
+    """Return °C by crossing id, interpolated between the rows around it, where both are near.
 
-    Columns `time_s` (Unix time) and `temperature_deg_c`, and `bridge` where rows are of one bridge
-    alone. InputError names the line that is none.
+    The columns are `time_s` (Unix time), `temperature_deg_c`, and `bridge` where rows belong to one
+    bridge only. Raise InputError with the number of an invalid line.
     """
     rows = _rows(path)
     found = {}

@@ -1,7 +1,7 @@
-"""What `alarm check` has judged of each bridge, as a file: an absent alarm means something by it.
+"""Records of `alarm check`, one file per bridge: they give the absence of an alarm a meaning.
 
 `alarms/checks/realm=R/bridge=B.json` is replaced at every check of the bridge. It may be deleted:
-then the bridge counts as not watched, and the next check looks at it again.
+the bridge then counts as unmonitored, and the next check covers it again.
 """
 
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ from schemas.json_file import load_json
 from services.common.errors import InputError
 from services.common.files import make_folder, write_atomically
 from services.history.alarm_files import ALARMS
-from services.history.archive import Kept
+from services.history.history_store import HistoryRow
 from services.history.periods import Unit, begin_of
 
 _CHECKS: Final = "checks"
@@ -25,7 +25,7 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class WatchRecord(BaseModel):
-    """What a check judged of a bridge; times in s since 1970 UTC."""
+    """Record of a bridge's last check; times in s since 1970 UTC."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
@@ -33,27 +33,27 @@ class WatchRecord(BaseModel):
     checked: Finite
     period: Unit
     until: Finite
-    """End of what was checked: beginning of the period that was not over."""
+    """End of the checked time: beginning of the period that was not complete."""
     crossings: Count
-    """All crossings before `until`, whatever their verdicts."""
+    """Number of crossings before `until`, whatever their verdicts."""
     newest: Finite | None = None
-    """Entry of the newest crossing, before `until` or behind it."""
+    """Entry of the newest crossing, before `until` or after it."""
     periods: Count
-    """Periods with good crossings that can be compared."""
+    """Number of periods with good crossings that can be compared."""
     judged: Count
-    """Periods that were compared with the baseline."""
+    """Number of periods that were compared with the baseline."""
     training: Count
-    """Periods that are wanted before any is judged."""
+    """Number of training periods before any is judged."""
     at_least: Finite
     """Smallest change of interest."""
     judged_from: Finite | None = None
     """Beginning of the first judged period."""
     judged_to: Finite | None = None
-    """End of the last one."""
+    """End of the last judged period."""
     year_ends: Finite | None = None
-    """End of the year in which the season is learned, where a temperature is missing before it."""
+    """End of the first year, which trains the season where a temperature is missing before it."""
     problem: str = ""
-    """Why the bridge could not be watched."""
+    """Reason why the bridge could not be monitored."""
 
 
 State = Literal[
@@ -62,8 +62,8 @@ State = Literal[
 ]  # fmt: skip
 
 
-class Watch(NamedTuple):
-    """Whether a bridge is watched."""
+class MonitoringState(NamedTuple):
+    """State of a bridge's monitoring."""
 
     state: State
     record: WatchRecord | None
@@ -71,42 +71,42 @@ class Watch(NamedTuple):
 
     @property
     def found_nothing(self) -> bool:
-        """Whether periods were judged, up to now, and none raised an alarm."""
+        """Return whether periods were judged, up to now, and none raised an alarm."""
         return self.state == "watched"
 
 
 def write_record(folder: Path, realm: str, bridge: str, record: WatchRecord) -> None:
-    """Write down what was judged of a bridge."""
+    """Write the record of a bridge."""
     path = record_path(folder, realm, bridge)
     make_folder(path.parent)
     write_atomically(path, record.model_dump_json(indent=1) + "\n")
 
 
 def record_path(folder: Path, realm: str, bridge: str) -> Path:
-    """Return where the record of a bridge is."""
+    """Return the path of a bridge's record."""
     return folder / ALARMS / _CHECKS / f"realm={realm}" / f"bridge={bridge}.json"
 
 
 def record_of(folder: Path, realm: str, bridge: str) -> WatchRecord | None:
     """Return the record of a bridge; None where there is none.
 
-    InputError if the file is damaged.
+    Raise InputError if the file is damaged.
     """
     path = record_path(folder, realm, bridge)
     return load_json(WatchRecord, path, "a record of a check") if path.exists() else None
 
 
-def watch_of(
+def monitoring_state(
     folder: Path,
     realm: str,
     bridge: str,
-    crossings: Iterable[Kept] | None,
+    crossings: Iterable[HistoryRow] | None,
     alarms: Iterable[Alarm],
     now_s: float,
-) -> tuple[Watch, list[str]]:
-    """Return whether a bridge is watched, and a line where its record cannot be read.
+) -> tuple[MonitoringState, list[str]]:
+    """Return the state of a bridge's monitoring, and a line if its record is unreadable.
 
-    Without its crossings (None) nothing was added since the check.
+    Without its crossings (None) none counts as added since the check.
     """
     try:
         record = record_of(folder, realm, bridge)
@@ -118,11 +118,11 @@ def watch_of(
         return _never("driveby alarm check has not been run on this bridge"), []
     entries_s = None if crossings is None else [one.entry_s for one in crossings]
     state = _state(record, entries_s, tuple(alarms), now_s)
-    return Watch(state, record, _sentence(state, record)), []
+    return MonitoringState(state, record, _sentence(state, record)), []
 
 
-def _never(why: str) -> Watch:
-    return Watch("never_checked", None, f"Not watched: {why}.")
+def _never(why: str) -> MonitoringState:
+    return MonitoringState("never_checked", None, f"Not watched: {why}.")
 
 
 def _state(
@@ -187,5 +187,5 @@ def _of(unit: Unit, number: int) -> str:
 
 
 def day_of(time_s: float | None) -> str:
-    """Return the day (UTC) of a time; nothing of none."""
+    """Return the day (UTC) of a time; an empty text for None."""
     return "" if time_s is None else f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"

@@ -1,1 +1,1 @@
-"""From messages to crossings and from a crossing to a result. No I/O, no clock."""
+"""Identification of a detected crossing, up to its published result. No I/O, no clock."""

@@ -1,10 +1,9 @@
-"""What a bridge's crossings say of it together.
+"""Fused state of a bridge from its crossings.
 
-Only as much is kept as the state of a bridge is made of, so that the thousandth crossing costs what
-the first did.
+Only the data needed for the state are kept, so that the thousandth crossing costs as much as the
+first.
 """
 
-from bisect import insort
 from collections.abc import Hashable, Iterable, Mapping
 from typing import NamedTuple
 
@@ -17,68 +16,47 @@ from schemas.reasons import BridgeReason, LeftOutReason
 from schemas.results import (
     LOSSES_PERCENT,
     BridgeResult,
-    Crossing,
+    CrossingResult,
     ElementState,
     LeftOut,
     Parameter,
     ThirdsState,
-    Verdict,
 )
 from services.identification.comparison import (
     Comparison,
     compare,
+    describe_comparison,
     estimate_of_state,
-    told,
     unresolved_elements,
 )
-from services.identification.crossing_data import part_of_elements
-from services.identification.fusing import Floats, FusedBridge, Source, fused, source_of
+from services.identification.fusing import Floats, FusedBridge, fused
+from services.identification.result_parts import part_of_elements
+from services.identification.usable import LISTED_AT_MOST as LISTED_AT_MOST
+from services.identification.usable import RecentCrossings as RecentCrossings
+from services.identification.usable import add_crossings as add_crossings
+from services.identification.usable import usable as usable
 
-LISTED_AT_MOST = 100
-"""So many crossings are fused, the newest, and as many that are left out are named: the state stays
-below 20 kB, while a message on the bus may have 1 MiB. The others are counted."""
 _MANY = 1.0 / 3.0
 
 
-class Usable(NamedTuple):
-    """What a state needs to know of a crossing that gave parameters."""
-
-    entry_time: float
-    """Seconds since 1970 UTC, as `exit_time`."""
-    exit_time: float
-    crossing_id: str
-    verdict: Verdict
-    elements: dict[str, ElementState]
-    source: Source | None
-
-
-class Counted(NamedTuple):
-    """The usable crossings of a bridge."""
-
-    newest: tuple[Usable, ...] = ()
-    """In order of their entries, `LISTED_AT_MOST` and one more at most."""
-    number: int = 0
-    """How many there are, with those that are no longer kept."""
-
-
 class Fusing(NamedTuple):
-    """What is fused and compared."""
+    """Settings of fusion and comparison."""
 
     baselines: Mapping[str, BridgeResult] = {}
-    """By bridge: a stored state, with which probabilities of loss are told."""
+    """Stored states by bridge, to which probabilities of loss refer."""
     with_suspect: bool = False
     """Whether suspect crossings are fused too."""
     threads: int = 1
-    """The state does not depend on it."""
+    """Number of threads, on which the state does not depend."""
 
 
 NOTHING_STORED = Fusing()
 _SOUND = 0.9
-"""Of the baseline; see `Derived.probability_below_90_percent_of_baseline`."""
+"""Share of the baseline; see `Derived.probability_below_90_percent_of_baseline`."""
 
 
-def against(result: Crossing, baseline: BridgeResult | None) -> Crossing:
-    """The result with what it says against a stored state of the bridge."""
+def against(result: CrossingResult, baseline: BridgeResult | None) -> CrossingResult:
+    """Return the result with its probabilities of loss against a stored state of the bridge."""
     if baseline is None or result.derived is None or result.parameters is None:
         return result
     stored = baseline.elements
@@ -94,51 +72,22 @@ def against(result: Crossing, baseline: BridgeResult | None) -> Crossing:
 
 
 def _probability_below(share: float, now: Parameter, before: ElementState) -> float:
-    """Of two log-normals with independent errors."""
+    """Return the probability for two log-normals with independent errors."""
     spread = np.hypot(now.std / now.mean, before.std / before.mean)
     apart = np.log(share * before.mean / now.mean)
     return float(ndtr(apart / spread)) if spread > 0.0 else float(apart > 0.0)
 
 
-def usable(result: Crossing) -> Usable | None:
-    """What a state needs of a result; None if it gave no parameters."""
-    if result.parameters is None:
-        return None
-    elements = {
-        name: ElementState(mean=p.mean, std=p.std, q025=p.q025, q975=p.q975)
-        for name, p in result.parameters.items()
-        if name.startswith("EI_")
-    }
-    return Usable(
-        result.entry_time,
-        result.exit_time,
-        result.crossing_id,
-        result.verdict,
-        elements,
-        source_of(result),
-    )
-
-
-def count_in(counted: Counted, crossings: Iterable[Usable]) -> Counted:
-    """The same with more crossings; who entered last counts as the latest, not who came last."""
-    newest, number = list(counted.newest), counted.number
-    for crossing in crossings:
-        insort(newest, crossing, key=lambda one: (one.entry_time, one.crossing_id))
-        del newest[: -LISTED_AT_MOST - 1]
-        number += 1
-    return Counted(tuple(newest), number)
-
-
 def state_of(
-    counted: Counted,
+    counted: RecentCrossings,
     bridge: str,
     fusing: Fusing = NOTHING_STORED,
     report: Report = lambda stage, fraction: None,
 ) -> BridgeResult | None:
-    """The bridge by all its good crossings together; None without a crossing that gave numbers.
+    """Return the state of a bridge from all its good crossings; None without an estimate.
 
-    Of a method that leaves nothing to fuse it is the latest crossing alone, and `suspect`. Suspect
-    crossings by themselves are no state of a bridge: then it is `rejected`, without numbers.
+    With a method that provides no likelihood it is the latest crossing alone, and `suspect`.
+    Suspect crossings alone are no state of a bridge: it is then `rejected`, without values.
     """
     if not counted.newest:
         return None
@@ -201,14 +150,14 @@ def state_of(
 
 
 class States:
-    """States of bridges, each made only when crossings have come since: it costs up to a second."""
+    """States of bridges, recomputed only after new crossings: one takes up to a second."""
 
     def __init__(self, fusing: Fusing) -> None:
         self.fusing = fusing
-        self._made: dict[Hashable, tuple[Counted, BridgeResult | None]] = {}
+        self._made: dict[Hashable, tuple[RecentCrossings, BridgeResult | None]] = {}
 
-    def of(self, counted: Counted, bridge: str, key: Hashable) -> BridgeResult | None:
-        """As `state_of`; `key` tells apart bridges of one name."""
+    def of(self, counted: RecentCrossings, bridge: str, key: Hashable) -> BridgeResult | None:
+        """Return the state as `state_of` does; `key` distinguishes bridges of one name."""
         made = self._made.get(key)
         if made is None or made[0] is not counted:
             made = self._made[key] = (counted, state_of(counted, bridge, self.fusing))
@@ -216,13 +165,13 @@ class States:
 
 
 def with_common_shares(
-    crossings: Iterable[Crossing], bridges: Mapping[str, BridgeResult]
-) -> list[Crossing]:
-    """Crossings with the share of the mismatch that other runs in their track have too."""
+    crossings: Iterable[CrossingResult], bridges: Mapping[str, BridgeResult]
+) -> list[CrossingResult]:
+    """Return crossings with the share of the mismatch common to their wheel-path group."""
     return [_with_common_share(crossing, bridges.get(crossing.bridge)) for crossing in crossings]
 
 
-def _with_common_share(crossing: Crossing, bridge: BridgeResult | None) -> Crossing:
+def _with_common_share(crossing: CrossingResult, bridge: BridgeResult | None) -> CrossingResult:
     road = crossing.road
     if bridge is None or road is None or road.mismatch is None:
         return crossing
@@ -241,14 +190,14 @@ def compared(
     element_lengths_m: Floats,
     baseline: BridgeResult | None = None,
 ) -> Comparison | None:
-    """What a fused state says of each element, as its `finding` does; see `compare`."""
+    """Return the comparison of a fused state's elements, as for its `finding`; see `compare`."""
     edges = np.concatenate([[0.0], np.cumsum(element_lengths_m)])
     stored = None if baseline is None else estimate_of_state(baseline)
     now = estimate_of_state(state, element_lengths_m.tolist())
     return compare(now, nominal_nm2, edges, stored)
 
 
-def _latest(counted: Counted) -> BridgeResult:
+def _latest(counted: RecentCrossings) -> BridgeResult:
     *others, last = counted.newest
     return BridgeResult(
         **last.elements,  # type: ignore[arg-type]
@@ -267,10 +216,10 @@ def _named(left_out: Mapping[str, LeftOutReason]) -> tuple[LeftOut, ...]:
 
 
 def _reference(found: FusedBridge, baseline: BridgeResult | None) -> Floats:
-    """EI (n,), or draws of it (draws, n), with which elements are compared."""
+    """Return EI (n,), or its draws (draws, n), with which elements are compared."""
     if baseline is None or len(baseline.elements) != found.nominal_nm2.size:
         return found.nominal_nm2
-    # The baseline's errors, taken for log-normal and for independent of the new ones.
+    # The baseline's errors count as log-normal and independent of the new ones.
     rng = np.random.default_rng(found.ei_nm2.shape[0])
     of = estimate_of_state(baseline)
     spread = np.log(of.high / of.low) / (2.0 * NORMAL_975)
@@ -299,6 +248,8 @@ def _summary(draws: Floats) -> ElementState:
 
 
 def _finding(found: FusedBridge, state: BridgeResult, baseline: BridgeResult | None) -> str:
-    """The bridge in words: what is told of its elements, and what is not."""
+    """Return the state in words: resolved and unresolved elements."""
     comparison = compared(state, found.nominal_nm2, found.element_lengths_m, baseline)
-    return " ".join(told(comparison, unresolved_elements(state.elements.values()), state.level))
+    return " ".join(
+        describe_comparison(comparison, unresolved_elements(state.elements.values()), state.level)
+    )

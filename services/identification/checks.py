@@ -1,8 +1,8 @@
-"""Whether the answer of a fit can be trusted: the reasons against it.
+"""Checks of a fit: the reasons not to trust its estimate.
 
-What is measured is in `pre_core.diagnostics`; here are the thresholds, each with what it was
-measured to be on sound crossings and on broken ones (docs/verdicts.md). What signals alone say is
-in `signal_checks`.
+`pre_core.diagnostics` measures; this module holds the thresholds, each with the values measured on
+sound and on faulty crossings (studies/faults.md). `signal_checks` holds the checks that need the
+signals alone.
 """
 
 from typing import NamedTuple
@@ -16,119 +16,129 @@ from pre_core.diagnostics import quality, receiver
 from pre_core.diagnostics.converter import converter_step
 from schemas.reasons import Reason
 from schemas.site import Vehicle
-from services.identification.crossing_data import CrossingData, Floats
+from schemas.site_vehicle import axle_loads_kg
+from services.finding.crossing_data import CrossingData
+from services.identification.result_parts import Floats
 from services.identification.signal_checks import body_constants
 
 _BANDS_HZ = np.array([0.0, 6.0, 12.0, 30.0, np.inf])
-"""What bridge, body and wheels do lies mostly in the first three; the rest is noise."""
+"""Frequency bands. The motion of bridge, body and wheels is mostly in the first three."""
 _FALSE_ALARM_Z = 4.5
-"""Chance brings one of 36 cells above it in 1e-4 of the crossings."""
+"""Threshold that one of 36 cells exceeds by chance in 1e-4 of the crossings."""
 _SLACK = (1.35, 1.35, 1.35, 1.15)
-"""So many times the declared noise power a band may have: its density is a data sheet's, and the
-1/f noise of a sensor is not declared."""
+"""Tolerated noise power of each band, relative to the declared one. The declared density comes from
+a data sheet, which leaves out the 1/f noise of the sensor."""
 _SLACK_OF_TWO_ROADS = 1.6
-"""The level of the roads' mismatch is read off some ten waves: so much is three deviations."""
+"""Tolerated power where the axles' profiles differ: three standard deviations of a mismatch level
+estimated from some ten waves."""
 SHORTEST_APPROACH_M = 12.0
-"""Fewer metres off the bridge tell the level no better than to a factor of 1.4."""
+"""Length of road off the bridge below which the mismatch level is uncertain by a factor of 1.4."""
 _NOISY = 1.2
-"""From here on a kind of residual is called noisier than declared, if it is white."""
+"""Noise power, relative to the declared one, above which white residuals are called noisy."""
 _GOOD_CHI2 = 1.25
-"""A larger one is a misfit of the model, where it is not only the noise."""
+"""Largest chi2 per degree of freedom without a misfit of the model, unless noise alone explains
+it."""
 _SMALLEST_CHI2 = 0.6
-"""A smaller one means that the noise is far below the declared, and intervals are too wide."""
+"""Smallest chi2 per degree of freedom without noise far below the declared, which makes intervals
+too wide."""
 _LARGEST_VEHICLE_Z = 4.0
-"""No unknown of a truck is by chance so many standard deviations from its prior."""
+"""Largest plausible distance of a truck's unknown from its prior, in standard deviations."""
 _MOST_NAMED = 3
 _LARGEST_POSITION_Z = 4.0
-"""Nor is the receiver's slow error."""
+"""Largest plausible slow error of the receiver, in standard deviations."""
 _LARGEST_STEP_Z = {slip.DELAY: 6.0, slip.GAIN: 7.0}
-"""Standard deviations of a step in a channel's delay or gain, for rows of the variance that they
-have. Sound: at most 3.5; one sample of 1 kHz lost: 6.8 to 38."""
+"""Largest tolerated step in the delay or gain of a channel, in standard deviations for rows of the
+estimated variance. Sound: at most 3.5; one lost sample of 1 kHz: 6.8 to 38."""
 _LARGEST_SPEED_SCALE_Z = 5.0
-"""Standard deviations by which a receiver's speeds differ from what its positions make of them.
-Sound: at most 2."""
+"""Largest tolerated difference between the receiver's speeds and the derivative of its positions,
+in standard deviations. Sound: at most 2."""
 _RECEIVER_ASIDE_S = 4.0
-"""Fixes are compared so far before and behind the bridge, as the fit uses them."""
+"""Time before and behind the bridge over which fixes are compared; the fit uses the same."""
 _SPEED_SCALE_SPREAD = 0.002
-"""Chainage is along the bridge's axis, and a road is not quite straight."""
+"""Standard deviation of the speed scale for a road that is not quite parallel to the bridge's
+axis."""
 _LARGEST_SPEED_BIAS, _LARGEST_SPEED_BIAS_Z = 1.0, 5.0
-"""Mean difference of the receiver's speeds from the fit's, in their noise, and in standard
-deviations of the mean. Sound: at most 0.3 of ten fixes a second; speeds 3 % high: 1.3 to 3.7."""
+"""Largest tolerated mean difference between the receiver's speeds and the fit's, in multiples of
+their noise and of the standard error of the mean. Sound: at most 0.3 at ten fixes a second; speeds
+3 % high: 1.3 to 3.7."""
 _COMMON = 0.7
-"""Coherence of both body equations' residuals, where these are more than the sensors' noise.
-Springs that rub, dampers that are not linear: -0.13 to 0.28; tilted sensors on a truck that shakes
-above 2 Hz: 0.95 to 0.97."""
+"""Largest tolerated coherence between the residuals of the body equations, where they exceed the
+sensors' noise. Dry friction and nonlinear dampers: -0.13 to 0.28; tilted sensors on a truck that
+shakes above 2 Hz: 0.95 to 0.97."""
 _COARSE = 1.4
-"""Noise of a converter's step over the declared one, from which on it is named."""
+"""Quantisation noise, relative to the declared noise, above which a converter is named."""
 _STIFFER = 1.5
-"""Age and a nominal value raise an element's EI over nominal by less, and never over that of all
-others: wrong signals do."""
+"""Ratio of an element's EI to its nominal value, and to the other elements, that only wrong signals
+exceed. Ageing and an inaccurate nominal value change it by less."""
 _CLEARLY = 0.025
-"""Quantile of the draws that must be above it."""
+"""Quantile of the draws that must exceed `_STIFFER`."""
 _UNDECLARED, _PLAINLY_UNDECLARED = 0.12, 0.3
 _REAR_OVER_FRONT = 2.5
-"""Part of the rear body's motion that its equation leaves over, and over the front's. Sixteen
-semitrailers and tandems declared with two axles: 0.15 to 1.3, 1.9 to 190 times the front's; sound
-trucks 0.05 at most, with springs that rub 0.21: below the second figure the first is a cause to
-name where something else is wrong, and no reason by itself."""
+"""Unexplained part of the rear body's motion, alone and relative to the front's. Sixteen
+semitrailers and tandems declared with two axles: 0.15 to 1.3, 1.9 to 190 times the front's. Sound
+trucks: at most 0.05, with dry friction 0.21. Between the first and the second threshold it is a
+cause to name where another check fails, and no reason by itself."""
 _LED_AWAY = 40.0
-"""Sound: at most 3; trailers and searches that ran away: 540 to 13,000."""
+"""Largest tolerated correction for the mismatch, in multiples of a prior's spread. Sound: at most
+3; trailers and searches that diverged: 540 to 13,000."""
 _MISMATCH_EXCESS = 30.0
-"""In power: tyres twice as wide, or tracks that differ by 20 cm where they are declared alike."""
+"""Largest tolerated ratio of measured to declared mismatch power: tyres twice as wide as declared,
+or tracks that differ by 20 cm where they are declared equal."""
 ALIKE_LOADS = 0.1
-"""Axles whose loads differ by less than this share of their sum press the bridge alike: what the
-road does to both cannot be told from what the bridge does."""
+"""Share of the total load below which a difference between the axle loads counts as none. Equal
+loads make the effect of the road indistinguishable from that of the bridge."""
 _UNINFORMED = 0.8
-"""Where the narrowest posterior of an element is wider than this part of its prior, nothing was
-learnt."""
+"""Posterior spread of the best-known element, relative to its prior, above which the crossing was
+uninformative."""
 
 ROAD, BODY_FRONT, BODY_REAR = range(3)
 BEFORE, ON, AFTER = range(3)
 
 
 class Fit(NamedTuple):
-    """What is left over by a fit of method `pre`."""
+    """Residuals and implied corrections of a fit by method `pre`."""
 
     white: Floats
-    """(m, 3): mismatch of the roads, front and rear body equation, of unit variance by the noise
-    that the site file declares. Not inflated."""
+    """Whitened residuals (m, 3): profile mismatch, front and rear body equation. Their variance is
+    one for the noise that the site file declares; not inflated."""
     step_s: float
-    """Between rows."""
+    """Time between rows."""
     place_m: Floats
-    """(m,) chainage at which a row compares the roads: the rear axle's at the row's middle."""
+    """Chainage (m,) at which a row compares the profiles: the rear axle's at the middle of the
+    row."""
     chi2_per_dof: float
     prior_z: dict[str, float]
-    """Unknowns of the truck in multiples of their prior's spread: c_s1 … kappa, wheelbase."""
+    """Unknowns of the truck, c_s1 … kappa and wheelbase, in multiples of their prior's spread."""
     position_z: float
-    """The receiver's slow error in multiples of its spread."""
+    """Slow error of the receiver in multiples of its spread."""
     rigidity_spread: Floats
-    """(elements,) standard deviation of ln EI, over the prior's."""
+    """Standard deviation of ln EI (elements,), relative to the prior's."""
     has_two_roads: bool
-    """Whether the axles' roads were taken to differ, by what the rows off the bridge say."""
+    """Whether the rows off the bridge showed that the axles' profiles differ."""
     off_bridge_m: float
-    """How much road off the bridge there was to tell that from."""
+    """Length of road off the bridge from which the mismatch was estimated."""
     speed_bias: float = 0.0
-    """Mean difference of the receiver's speeds from the fit's, in multiples of their noise."""
+    """Mean difference between the receiver's speeds and the fit's, in multiples of their noise."""
     coherence: float = 0.0
-    """That of the body equations' residuals, where springs are doubted for them."""
+    """Coherence between the residuals of the body equations, where their weight is reduced."""
     step: slip.Step | None = None
     """The most significant step in the delay or the gain of a channel."""
     mismatch_excess: float = 0.0
-    """Power of the mismatch off the bridge over what the declared axles would have."""
+    """Power of the mismatch off the bridge, relative to that of the declared axles."""
     led_by_mismatch: float = 0.0
     """Largest correction of a truck's unknown for the mismatch, in multiples of its prior's
     spread."""
 
 
 def reasons_after_fit(data: CrossingData, fit: Fit) -> list[Reason]:
-    """What the fit says against its own answer, the most telling first; empty if nothing does."""
+    """Return the reasons not to trust a fit, the most significant first; none if it is sound."""
     reasons = _of_the_rows(data, fit)
     is_unexplained = bool({Reason.MODEL_MISFIT, Reason.RESIDUALS_COLOURED} & set(reasons))
     if fit.off_bridge_m < SHORTEST_APPROACH_M and (fit.has_two_roads or is_unexplained):
         reasons.append(Reason.APPROACH_TOO_SHORT)
     if fit.prior_z and max(abs(z) for z in fit.prior_z.values()) > _LARGEST_VEHICLE_Z:
         reasons.append(Reason.IMPLAUSIBLE_VEHICLE)
-    if fit.mismatch_excess > _MISMATCH_EXCESS or is_led_away(fit):
+    if fit.mismatch_excess > _MISMATCH_EXCESS or is_misled_by_mismatch(fit):
         reasons.append(Reason.MISMATCH_IMPLAUSIBLE)
     if abs(fit.position_z) > _LARGEST_POSITION_Z:
         reasons.append(Reason.POSITION_INCONSISTENT)
@@ -147,9 +157,9 @@ def coarse_converters(
     acceleration: Floats,
     step_s: float,
 ) -> str:
-    """Return the channels (4, n) whose converter alone is plainly noisier than declared, or "".
+    """Return the channels (4, n) whose quantisation noise alone exceeds the declared one, or "".
 
-    Rounding to a step adds noise of the step over the root of twelve.
+    Rounding to steps of size q adds noise of standard deviation q/√12.
     """
     found = []
     for name, density, values in zip(names, density_ug_per_rthz, acceleration, strict=True):
@@ -181,9 +191,9 @@ def _speeds_differ(data: CrossingData, fit: Fit) -> bool:
 
 
 def steps_of_channels(names: tuple[str, ...], fit: Fit) -> dict[Reason, str]:
-    """Return the reason, and the channel's name, where a channel's delay or gain changes.
+    """Return the reason and the channel's name where a channel's delay or gain changes.
 
-    The fit has spread the step over truck and bridge, so that no number of it can be used.
+    The fit has spread the step over truck and bridge, so none of its numbers can be used.
     """
     step = fit.step
     if step is None:
@@ -197,10 +207,11 @@ def steps_of_channels(names: tuple[str, ...], fit: Fit) -> dict[Reason, str]:
 
 
 def stiffer_elements(ratio: Floats) -> list[int]:
-    """Return the elements whose EI over nominal, draws (k, n), no damage explains.
+    """Return the elements whose draws (k, n) of EI over nominal no damage explains.
 
-    Each is stiffer than nominal and than the median of the others by more than a factor, clearly.
-    Low values alone, however low, never make another element implausible.
+    Such an element exceeds both its nominal value and the median of the others by `_STIFFER`, with
+    a probability of at least 1 - `_CLEARLY`. Low values alone, however low, never make another
+    element implausible.
     """
     count = ratio.shape[1]
     if count < 2:
@@ -217,7 +228,7 @@ def stiffer_elements(ratio: Floats) -> list[int]:
 
 def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
     stretch = _stretches(data, fit)
-    found = quality.cells(fit.white, stretch, fit.step_s, _BANDS_HZ)
+    found = quality.residual_bins(fit.white, stretch, fit.step_s, _BANDS_HZ)
     suspicious = {
         key: cell
         for key, cell in found.items()
@@ -237,28 +248,28 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
 
 
 def _slack(fit: Fit, kind: int, stretch: int, band: int) -> float:
-    """So many times its expected power a cell may have."""
+    """Return the tolerated power of a cell, relative to the expected one."""
     return _SLACK[band] * (_SLACK_OF_TWO_ROADS if fit.has_two_roads and kind == ROAD else 1.0)
 
 
 def _stretches(data: CrossingData, fit: Fit) -> NDArray[np.int64]:
-    """Whether a row compares the roads before, on or behind the bridge (m,)."""
+    """Return for each row (m,) whether it lies before, on or behind the bridge."""
     span = data.bridge.span_m
     travelled = fit.place_m if data.stay.direction > 0 else span - fit.place_m
     return np.where(travelled < 0.0, BEFORE, np.where(travelled > span, AFTER, ON)).astype(np.int64)
 
 
-def _is_only_noise(fit: Fit, found: dict[tuple[int, int, int], quality.Cell]) -> bool:
-    """Whether the rows are like noise of more power than declared, and of nothing else.
+def _is_only_noise(fit: Fit, found: dict[tuple[int, int, int], quality.ResidualBin]) -> bool:
+    """Return whether noise of more than the declared power alone explains the rows.
 
-    That power is read off the highest band, where there is nothing but noise; it may differ from
-    kind to kind, as the sensors do, and must be found everywhere else.
+    The power is estimated from the highest band, which holds nothing but noise. It may differ
+    between the kinds of residuals, as the sensors do, and must fit all other cells.
     """
     top = _BANDS_HZ.size - 2
     powers = []
     for kind in (ROAD, BODY_FRONT, BODY_REAR):
         parts = {key: cell for key, cell in found.items() if key[0] == kind}
-        noise = quality.joined([cell for key, cell in parts.items() if key[2] == top])
+        noise = quality.merge_bins([cell for key, cell in parts.items() if key[2] == top])
         power = max(noise.mean_square, 1.0)
         powers.append(power)
         for key, cell in parts.items():
@@ -267,34 +278,30 @@ def _is_only_noise(fit: Fit, found: dict[tuple[int, int, int], quality.Cell]) ->
     return max(powers) > _NOISY
 
 
-def axle_loads_kg(vehicle: Vehicle) -> tuple[float, float]:
-    """Static loads of the front and the rear axle, nominally."""
-    share = vehicle.front_axle_to_cg_m / vehicle.wheelbase_m
-    return (
-        vehicle.sprung_mass_kg * (1.0 - share) + vehicle.unsprung_mass_kg[0],
-        vehicle.sprung_mass_kg * share + vehicle.unsprung_mass_kg[1],
-    )
-
-
 def loads_are_alike(vehicle: Vehicle) -> bool:
-    """Whether both axles press the bridge alike."""
+    """Return whether both axle loads are equal within `ALIKE_LOADS`."""
     front, rear = axle_loads_kg(vehicle)
     return abs(front - rear) < ALIKE_LOADS * (front + rear)
 
 
-def is_led_away(fit: Fit) -> bool:
-    """Return whether the correction for the mismatch is beyond any truck: no number can be used."""
+def is_misled_by_mismatch(fit: Fit) -> bool:
+    """Return whether the correction for the mismatch exceeds that of any truck.
+
+    None of the fit's numbers can be used then.
+    """
     return fit.led_by_mismatch > _LED_AWAY
 
 
 def undeclared_axles(
     vehicle: Vehicle, acceleration: Floats, step_s: float, *, is_doubted: bool
 ) -> dict[Reason, str]:
-    """Return the reason why the rear of the body follows a force that no declared axle has.
+    """Return the reason if an undeclared axle acts on the rear of the body, else nothing.
 
-    By the body equations of the middle readings (4, n). Where `is_doubted` for other reasons, less
-    is enough.
+    The body equations are evaluated with the middle readings (4, n). Where other checks have failed
+    (`is_doubted`), a lower threshold holds.
     """
+    if vehicle.tandem is not None:  # whose front axle has no reading
+        return {}
     front, rear = quality.unexplained_by_axle(acceleration, step_s, *body_constants(vehicle))
     least = _UNDECLARED if is_doubted else _PLAINLY_UNDECLARED
     if rear < max(least, _REAR_OVER_FRONT * front):
@@ -306,7 +313,7 @@ def undeclared_axles(
 
 
 def odd_parameters(fit: Fit) -> str:
-    """Return the truck's parameters that are implausibly far from the site file, farthest first."""
+    """Return the names of implausible truck parameters, most deviating first, or ""."""
     far = {name: z for name, z in fit.prior_z.items() if abs(z) > _LARGEST_VEHICLE_Z}
     named = sorted(far, key=lambda name: -abs(far[name]))[:_MOST_NAMED]
     if not named:

@@ -1,8 +1,8 @@
-"""Which element is weak: each against a baseline, or where there is none, against the others.
+"""Detection of weak elements: against a baseline, or otherwise against the other elements.
 
-The nominal value of a site file is often a guess, and one that is 14 % too high makes every sound
-element look 14 % weak. So it is never what an element is judged by; only its pattern along the
-bridge is used, to make elements comparable that are not built alike.
+The nominal value of a site file is often a guess, and one that is 14 % too high makes every
+undamaged element look 14 % weak. So no element is judged by it; only its pattern along the bridge
+is used, to make elements of different design comparable.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from pre_core.constants import NORMAL_975
 from schemas.results import RESOLVED, BridgeResult, ElementState, Parameter
+from services.common.language import ENGLISH, Language
 
 Floats = NDArray[np.float64]
 
 CLEAR_LOSS = 0.1
-"""An element is called weak if its whole interval lies below 1 less this."""
+"""Smallest stiffness loss that the whole 95 % interval of a weak element must exceed."""
 _FEWEST_ELEMENTS = 3
-"""With two elements nobody can say which one is the sound one."""
+"""Fewest elements: of two the undamaged one cannot be identified."""
 
 
 class Estimate(NamedTuple):
@@ -31,11 +32,11 @@ class Estimate(NamedTuple):
     low: Floats
     high: Floats
     scale_error: float = 0.0
-    """Relative standard deviation that all elements have in common (mass, gain)."""
+    """Relative standard deviation common to all elements (mass, gain)."""
 
 
 class Element(NamedTuple):
-    """One element as a ratio to what it is compared with; the limits are those of 95 %."""
+    """Ratio of one element to its reference, with 95 % limits."""
 
     number: int
     from_m: float
@@ -46,54 +47,53 @@ class Element(NamedTuple):
 
     @property
     def is_weak(self) -> bool:
-        """Whether it has clearly lost stiffness."""
+        """Return whether it has clearly lost stiffness."""
         return self.high < 1.0 - CLEAR_LOSS
 
     @property
     def is_stiff(self) -> bool:
-        """Whether it is clearly stiffer."""
+        """Return whether it is clearly stiffer."""
         return self.low > 1.0 + CLEAR_LOSS
 
     @property
     def visible_loss(self) -> float:
-        """The smallest loss of this element that would have been called clear."""
+        """Return the smallest loss of this element that would have been clear."""
         return 1.0 - (1.0 - CLEAR_LOSS) * self.ratio / self.high
 
 
 class Comparison(NamedTuple):
-    """All elements of a bridge against one reference."""
+    """Comparison of a bridge's elements with one reference."""
 
     reference: Literal["baseline", "others"]
     level: float
-    """Middle of EI over its nominal value: says something only where the nominal value does."""
+    """Median of EI over its nominal value, meaningful only with a meaningful nominal value."""
     elements: tuple[Element, ...]
 
     @property
     def weak(self) -> tuple[Element, ...]:
-        """The elements that have clearly lost stiffness, the weakest first."""
+        """Return the elements that have clearly lost stiffness, the weakest first."""
         return tuple(sorted((e for e in self.elements if e.is_weak), key=lambda e: e.ratio))
 
     @property
     def stiff(self) -> tuple[Element, ...]:
-        """Those that are clearly stiffer."""
+        """Return the clearly stiffer elements."""
         return tuple(element for element in self.elements if element.is_stiff)
 
     @property
     def rest(self) -> tuple[Element, ...]:
-        """All others."""
+        """Return all other elements."""
         return tuple(e for e in self.elements if not e.is_weak and not e.is_stiff)
 
 
 def compare(
     estimate: Estimate, nominal: Floats, edges_m: Floats, baseline: Estimate | None = None
 ) -> Comparison | None:
-    """Compare elements with a baseline, or each with the middle (median) of all others.
+    """Compare elements with a baseline, or each with the median of all others.
 
-    `nominal` (n,) in N·m², `edges_m` (n + 1,). Errors are taken as log-normal. Against a baseline
-    those of both add up. Among elements of one measurement what they have in common drops out, and
-    the error of the middle comes in: that of a median of n - 1 is 1.25 times a mean's. None where
-    there is nothing to compare: fewer than three elements and no baseline, or a value that no
-    stiffness has.
+    `nominal` (n,) in N·m², `edges_m` (n + 1,). Errors count as log-normal. Against a baseline those
+    of both add up. Among elements of one measurement the common error cancels, and the error of the
+    median is added: that of a median of n - 1 is 1.25 times a mean's. Return None without a
+    reference: fewer than three elements and no baseline, or an impossible value.
     """
     values = np.concatenate((*estimate[:3], nominal, *(baseline[:3] if baseline else ())))
     if not np.all(values > 0.0) or not np.all(np.isfinite(values)):
@@ -127,7 +127,7 @@ def compare(
 
 
 def estimate_of_state(state: BridgeResult, lengths_m: Sequence[float] | None = None) -> Estimate:
-    """The stiffness of a bridge's elements by its latest state, with what they have in common.
+    """Return the stiffness of a bridge's elements in its latest state, with the common error.
 
     `lengths_m` are the elements' (default: all alike).
     """
@@ -137,12 +137,11 @@ def estimate_of_state(state: BridgeResult, lengths_m: Sequence[float] | None = N
 
 
 def _common_error(state: BridgeResult, lengths_m: Sequence[float] | None) -> float:
-    """Relative standard deviation that all elements have in common, by how sure their level is.
+    """Return the relative standard deviation common to all elements, from that of their level.
 
     The level is the mean of ln EI, weighted by lengths w that sum to one. With errors of standard
-    deviation s_i, of which c is common, its variance is c² (1 - Σ w_i²) + Σ w_i² s_i². So only what
-    is above the second part is common; the whole of it is not, for elements that err each on their
-    own move their mean too.
+    deviation s_i, of which c is common, its variance is c² (1 - Σ w_i²) + Σ w_i² s_i². So only the
+    excess over the second part is common: independent errors of elements move their mean too.
     """
     of = [e for e in state.elements.values() if e.mean > 0.0]
     if state.level is None or not state.level.mean > 0.0 or len(of) < _FEWEST_ELEMENTS:
@@ -157,101 +156,101 @@ def _common_error(state: BridgeResult, lengths_m: Sequence[float] | None) -> flo
 
 
 def unresolved_elements(elements: Iterable[Parameter | ElementState]) -> frozenset[int]:
-    """Numbers of those whose standard deviation is too large to tell a loss of half of them."""
+    """Return the numbers of elements too uncertain to resolve a loss of half their EI."""
     counted = enumerate(elements, start=1)
     return frozenset(n for n, one in counted if one.std > RESOLVED * abs(one.mean))
 
 
-def elsewhere(found: Comparison | None, unresolved: Set[int]) -> tuple[int, ...]:
-    """Numbers of the unresolved neighbours of weak elements: the loss may be theirs.
+def ambiguous_neighbours(found: Comparison | None, unresolved: Set[int]) -> tuple[int, ...]:
+    """Return the unresolved neighbours of weak elements, where the loss may be instead.
 
-    What bends under an axle is the sum of what elements that lie side by side do, and between them
-    rigidity is traded.
+    The deflection under an axle is the sum over adjacent elements, whose rigidities compensate each
+    other.
     """
     weak = set() if found is None else {one.number for one in found.weak}
     beside = {n + side for n in weak for side in (-1, 1)} - weak
     return tuple(sorted(beside & unresolved))
 
 
-def told(
-    found: Comparison | None, unresolved: Set[int] = frozenset(), level: ElementState | None = None
-) -> list[str]:
-    """What was found, in words: only of elements that are resolved is said that they agree.
+def origin_of_state(state: BridgeResult) -> str:
+    """Return in a sentence which crossings the numbers of a state are of.
 
-    `unresolved` are the numbers of the others; with them the `level` of the bridge is told.
+    The intervals of a single crossing are narrower than those of the state: they do not have the
+    variability between crossings.
+    """
+    used = len(state.crossings_used)
+    if used > 1:
+        return f"Numbers of {used} crossings fused."
+    if state.between_crossing_std is not None:
+        return "Numbers of one crossing, with between-crossing variability."
+    return "Numbers of one crossing."
+
+
+def describe_comparison(
+    found: Comparison | None,
+    unresolved: Set[int] = frozenset(),
+    level: ElementState | None = None,
+    language: Language = ENGLISH,
+) -> list[str]:
+    """Return sentences on the comparison; only resolved elements are said to agree.
+
+    `unresolved` are the numbers of the others; with them the `level` of the bridge is stated.
     """
     if found is None or not unresolved:
-        return sentences(found)
-    said = of_clear_elements(found)
-    others = elsewhere(found, unresolved)
+        return sentences(found, language)
+    wordings = describe_clear_elements(found, language)
+    others = ambiguous_neighbours(found, unresolved)
     if others:
-        either = " or ".join(map(str, others))
-        said.append(f"The loss may as well be in element {either}, beside it and not resolved.")
-    which = _not_resolved(len(found.elements), unresolved)
-    said.append(f"{which} (standard deviation above {100.0 * RESOLVED:.0f} %).")
+        either = f" {language.text('or')} ".join(map(str, others))
+        wordings.append(language.text("may_be_beside", numbers=either))
+    wordings.append(_not_resolved(len(found.elements), unresolved, language))
     if level is not None:
-        said.append(
-            f"As a whole the bridge is at {level.mean:.2f} of nominal "
-            f"± {100.0 * level.std / level.mean:.0f} %."
-        )
-    return said
+        std = 100.0 * level.std / level.mean
+        wordings.append(language.text("level", mean=level.mean, std=std))
+    return wordings
 
 
-def of_clear_elements(found: Comparison) -> list[str]:
-    """What is said of elements that differ clearly, and nothing of the others."""
+def describe_clear_elements(found: Comparison, language: Language = ENGLISH) -> list[str]:
+    """Return sentences on elements that differ clearly, and none on the others."""
     clear = tuple(one for one in found.elements if one.is_weak or one.is_stiff)
-    return sentences(found._replace(elements=clear)) if clear else []
+    return sentences(found._replace(elements=clear), language) if clear else []
 
 
-def _not_resolved(count: int, unresolved: Set[int]) -> str:
-    if len(unresolved) == count:
-        return "No single element is resolved"
+def _not_resolved(count: int, unresolved: Set[int], language: Language) -> str:
     *others, last = sorted(unresolved)
-    if not others:
-        return f"Element {last} is not resolved"
-    return f"Elements {', '.join(map(str, others))} and {last} are not resolved"
+    values = {"limit": 100.0 * RESOLVED, "last": last, "others": ", ".join(map(str, others))}
+    if len(unresolved) == count:
+        return language.text("unresolved.all", **values)
+    return language.choice("unresolved", len(unresolved), **values)
 
 
-def sentences(found: Comparison | None) -> list[str]:
-    """What was found, in words for who knows the bridge and not the method."""
+def sentences(found: Comparison | None, language: Language = ENGLISH) -> list[str]:
+    """Return sentences on the comparison for readers who know the bridge and not the method."""
     if found is None:
-        return ["The elements cannot be compared with each other, and there is no baseline."]
-    than = "than the baseline" if found.reference == "baseline" else "than the other elements"
-    said = [
-        f"{_place(e)}: {_percent(1.0 - e.ratio)} less stiff {than}, "
-        f"interval {_range(1.0 - e.high, 1.0 - e.low)}."
-        for e in found.weak
-    ]
-    said += [
-        f"{_place(e)}: {_percent(e.ratio - 1.0)} stiffer {than}, "
-        f"interval {_range(e.low - 1.0, e.high - 1.0)}."
-        for e in found.stiff
-    ]
-    rest = found.rest
-    if not rest:
-        return said
-    within = max(1, int(np.ceil(100.0 * max(abs(1.0 - e.ratio) for e in rest) - 1e-6)))
-    if found.reference == "baseline":
-        which = "All others are" if said else "No element has clearly changed: all are"
-        said.append(f"{which} unchanged within {within} %.")
-    else:
-        which = "All others agree" if said else "No element stands out: all agree"
-        said.append(f"{which} within {within} %.")
-    return said
+        return [language.text("not_comparable")]
+    wordings = [_change("weaker", found, e, language) for e in found.weak]
+    wordings += [_change("stiffer", found, e, language) for e in found.stiff]
+    if found.rest:
+        farthest = max(abs(1.0 - e.ratio) for e in found.rest)
+        within = max(1, int(np.ceil(100.0 * farthest - 1e-6)))
+        which = "rest" if wordings else "all"
+        wordings.append(language.text(f"{which}.{found.reference}", within=within))
+    return wordings
+
+
+def _change(how: str, found: Comparison, element: Element, language: Language) -> str:
+    """Return the sentence on one clear element; a loss is positive, and so is a gain."""
+    place = language.text("element", **element._asdict())
+    change = sorted(100.0 * abs(1.0 - end) for end in (element.low, element.high))
+    return language.text(
+        f"{how}.{found.reference}",
+        element=place,
+        ratio=100.0 * abs(1.0 - element.ratio),
+        low=change[0],
+        high=change[1],
+    )
 
 
 def _without(width: Floats, common: float) -> Floats:
-    """A half width in logarithms without the part that all have in common; never below a tenth."""
+    """Return a half width in logarithms without the common part; at least a tenth of it."""
     return np.sqrt(np.maximum(width**2 - common**2, (0.1 * width) ** 2))
-
-
-def _place(element: Element) -> str:
-    return f"Element {element.number}, {element.from_m:.1f} to {element.to_m:.1f} m"
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.0f} %"
-
-
-def _range(low: float, high: float) -> str:
-    return f"{100.0 * low:.0f} to {100.0 * high:.0f} %"

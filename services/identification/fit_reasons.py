@@ -1,6 +1,6 @@
-"""What the fit of method `pre` says against its own answer, and of what.
+"""Reasons against a fit of method `pre`, with their subjects.
 
-The rows and diagnostics that `checks` judges are gathered here from the optimum.
+The residuals and diagnostics that `checks` judges are collected here from the optimum.
 """
 
 from collections.abc import Mapping
@@ -8,39 +8,41 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pre_core import unknowns
-from pre_core.crossing import optimum, posterior, shaking, slip, speeds
-from pre_core.crossing.compliances import LEANING_SPREAD, led_by_mismatch
-from pre_core.crossing.preparation import mismatch_excess, off_bridge_m, rear_at_rows_m
-from pre_core.crossing.whitening import RESIDUALS
-from pre_core.search.loop import Ending
+from pre_core import parameters
+from pre_core.crossing import posterior, shaking, slip, speeds
+from pre_core.crossing.compliances import LEANING_SPREAD, mismatch_bias
+from pre_core.crossing.fit import Optimum, normal_approximation
+from pre_core.crossing.preparation import compared_length_m, mismatch_excess, rear_axle_chainage_m
+from pre_core.crossing.rows import RESIDUALS
+from pre_core.search.loop import Termination
 from schemas.reasons import Reason
+from services.finding.crossing_data import CrossingData
+from services.finding.placed import first_axle, middle_names
 from services.identification.checks import (
     Fit,
     coarse_converters,
-    is_led_away,
+    is_misled_by_mismatch,
     odd_parameters,
     reasons_after_fit,
     steps_of_channels,
     undeclared_axles,
 )
-from services.identification.crossing_data import CrossingData, Floats
-from services.identification.placed import middle_names
+from services.identification.result_parts import Floats
 
 
-class Against(NamedTuple):
-    """Reasons against a fit; those about something name it."""
+class ReasonsOfFit(NamedTuple):
+    """Reasons against a fit, with the parameters or channels concerned."""
 
     reasons: tuple[Reason, ...]
     about: Mapping[Reason, str]
     forbids: bool
-    """Whether no number of the fit can be used."""
+    """Whether no value of the fit is usable."""
 
 
 def reasons_of_fit(
-    data: CrossingData, found: optimum.Optimum, acceleration: Floats, step_s: float
-) -> Against:
-    """Return the reasons against an optimum, the most telling first.
+    data: CrossingData, found: Optimum, acceleration: Floats, step_s: float
+) -> ReasonsOfFit:
+    """Return the reasons against an optimum, the strongest first.
 
     `acceleration` (4, n) are the middle readings, `step_s` apart.
     """
@@ -48,7 +50,7 @@ def reasons_of_fit(
     names, densities = middle_names(data.vehicle), data.sensor.noise_density_ug_per_rthz
     slipped = steps_of_channels(names, fit)
     reasons = [*slipped, *reasons_after_fit(data, fit)]
-    if found.ending is not Ending.CONVERGED:
+    if found.ending is not Termination.CONVERGED:
         reasons.append(Reason.NOT_CONVERGED)
     axles = undeclared_axles(data.vehicle, acceleration, step_s, is_doubted=bool(reasons))
     coarse = coarse_converters(names, densities, acceleration, step_s)
@@ -60,35 +62,35 @@ def reasons_of_fit(
         Reason.NOISE_ABOVE_DECLARED: coarse,
         Reason.IMPLAUSIBLE_VEHICLE: odd_parameters(fit),
     }
-    return Against((*axles, *reasons), about, bool(slipped) or is_led_away(fit))
+    return ReasonsOfFit((*axles, *reasons), about, bool(slipped) or is_misled_by_mismatch(fit))
 
 
-def _fit(data: CrossingData, found: optimum.Optimum) -> Fit:
-    """What the checks after the fit look at."""
+def _fit(data: CrossingData, found: Optimum) -> Fit:
+    """Return the input of the checks after the fit."""
     problem, y = found.problem, found.state.y
     where, rows = posterior.layout(problem), problem.rows
     white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
-    rows_of = unknowns.table(data.bridge.elements)
+    rows_of = parameters.table(data.bridge.elements, first_axle(data.vehicle))
     estimated = [rows_of[i] for i in np.flatnonzero(problem.priors.estimated)]
-    # Where the axles' roads differ that leads the truck as far as it is known.
-    moved = led_by_mismatch(found)
+    # A profile mismatch biases the truck as far as it is known.
+    moved = mismatch_bias(found)
     led = np.hypot(1.0, LEANING_SPREAD * moved)
     prior_z = {
         row.name: float(y[k] / led[k])
         for k, row in enumerate(estimated)
-        if row.part == unknowns.TRUCK
+        if row.part == parameters.TRUCK
     }
-    _, covariance = optimum.normal_approximation(found)
+    _, covariance = normal_approximation(found)
     return Fit(
         white,
         rows.every * rows.step_s,
-        rear_at_rows_m(problem, y),
+        rear_axle_chainage_m(problem, y),
         found.chi2_per_dof,
         prior_z | {"wheelbase": float(y[where.wheelbase])},
         float(problem.receiver_rows[-1, -1] * y[where.offset]),
         np.sqrt(np.diag(covariance)[where.elements]),
         bool(problem.mismatch.level_m3.any()),
-        off_bridge_m(problem, y),
+        compared_length_m(problem, y),
         speeds.speed_bias(problem, y),
         shaking.coherence(problem, y) if problem.force.any() else 0.0,
         slip.largest_step(problem, found.state, covariance),

@@ -1,13 +1,30 @@
-"""Where a truck's axles stand on the road, as far as its site file tells."""
+"""Positions of a truck's axles on the road, as far as its site file declares them."""
+
+from typing import Final
 
 from pre_core.physics.surface import COMMON_LORRY, Footprint
+from pre_core.physics.tandem import NO_LEAD, Lead
 from schemas.site import Vehicle
+from schemas.site_axle_tables import TYRES, Axle
+
+SPRINGS: Final = ("suspension_stiffness_n_per_m", "suspension_damping_ns_per_m")
+"""Keys of the springs and dampers, which identification with a tandem does not use."""
+_TRACK_M: Final = 1.83
+"""Track of axles with twin tyres."""
 
 
 def footprints_of(
     vehicle: Vehicle, usual: tuple[Footprint, Footprint] = COMMON_LORRY
 ) -> tuple[Footprint, Footprint]:
-    """Front and rear axle: as the site file says, else as `usual`; the rear one's offset too."""
+    """Return the footprints of the compared axles, as `usual` where the site file has no value.
+
+    These are the front and the rear axle, or both of a tandem; the second one has the offset.
+    """
+    if vehicle.tandem is not None:
+        first, second = (_of_axle(axle) for axle in vehicle.tandem.axles)
+        return first._replace(offset_m=0.0), second._replace(
+            offset_m=second.offset_m - first.offset_m
+        )
     pairs = {
         "width_m": vehicle.tyre_width_m,
         "length_m": vehicle.tyre_contact_length_m,
@@ -17,7 +34,35 @@ def footprints_of(
     axles = []
     for axle, common in enumerate(usual):
         stated = {name: pair[axle] for name, pair in pairs.items() if pair is not None}
-        if stated.get("twin_distance_m") == 0.0:  # single tyres, as wide as such are
+        if stated.get("twin_distance_m") == 0.0:  # single tyres, with their usual width
             common = Footprint()
         axles.append(common._replace(**stated))
     return axles[0], axles[1]._replace(offset_m=vehicle.rear_axle_offset_m or 0.0)
+
+
+def lead_of(vehicle: Vehicle) -> Lead:
+    """Return the axle ahead of a tandem, `NO_LEAD` for a truck of two axles."""
+    tandem = vehicle.tandem
+    if tandem is None:
+        return NO_LEAD
+    return Lead(
+        tandem.first.position_m,
+        vehicle.wheelbase_m,
+        tandem.lead.unsprung_mass_kg,
+        tandem.lead.tyre_stiffness_n_per_m,
+        tandem.lead.tyre_damping_ns_per_m,
+    )
+
+
+def _of_axle(axle: Axle) -> Footprint:
+    """Return the footprint of one axle of a tandem; twin tyres where the site file has no value."""
+    kind = axle.tyres or ("single" if axle.twin_tyre_distance_m == 0.0 else "twin")
+    usual = TYRES[kind]
+    distance, length = axle.twin_tyre_distance_m, axle.tyre_contact_length_m
+    return Footprint(
+        axle.tyre_width_m or usual.width_m,
+        usual.twin_distance_m if distance is None else distance,
+        length or usual.contact_length_m,
+        axle.track_m or _TRACK_M,
+        axle.lateral_offset_m or 0.0,
+    )

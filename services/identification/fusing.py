@@ -1,4 +1,4 @@
-"""Likelihoods of crossings between results and `pre_core.fusion`, and a bridge fused from them."""
+"""Conversion of stored likelihoods for `pre_core.fusion`, and fusion of a bridge."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -6,44 +6,36 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core import unknowns
-from pre_core.crossing.optimum import Optimum
+from pre_core import parameters
+from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import log_odds
 from pre_core.fusion import likelihood as of_crossing
-from pre_core.fusion.bends import Bends
-from pre_core.fusion.disagreement import judge
-from pre_core.fusion.joint import Fused, fuse_joined, join
-from pre_core.fusion.sums import BridgePriors
-from pre_core.fusion.tracks import Part
-from pre_core.fusion.trucks import compare_trucks
+from pre_core.fusion.crossing_consistency import select_consistent
+from pre_core.fusion.curvature import CurvatureTerms
+from pre_core.fusion.information import BridgePriors
+from pre_core.fusion.joint import FusedDraws, build_joint, sample_joint
+from pre_core.fusion.path_groups import FusionInput
+from pre_core.fusion.vehicle_consistency import find_misattributed
 from pre_core.physics.surface import Footprint
 from pre_core.search.loop import Report
 from schemas import fusion
-from schemas.results import Crossing, Track
-from services.identification.crossing_data import CrossingData
+from schemas.results import Track
+from services.finding.crossing_data import CrossingData
+from services.identification.usable import Source
 
 Floats = NDArray[np.float64]
 
 _DIGITS = 9
-"""Of a likelihood's numbers: what is left out moves an estimate by 1e-6 of its uncertainty."""
+"""Significant digits of a likelihood: rounding moves an estimate by 1e-6 of its uncertainty."""
 _DIGITS_OF_BENDS = 4
 _DRAWS_PER_CHAIN = 250
 _SEED = 1
 _COMPARED, _JOINED = 0.1, 0.4
-"""How much is done of a bridge of many crossings when trucks are compared, crossings together."""
-
-
-class Source(NamedTuple):
-    """What fusion needs of a crossing."""
-
-    crossing_id: str
-    vehicle: str
-    direction: int
-    likelihood: fusion.FusionLikelihood
+"""Progress of a fusion at the comparison of trucks, and at the joint estimate."""
 
 
 class FusedBridge(NamedTuple):
-    """A bridge by all crossings that agree."""
+    """Fused estimate of a bridge from its consistent crossings."""
 
     ei_nm2: Floats  # (draws, n)
     nominal_nm2: Floats  # (n,)
@@ -57,40 +49,34 @@ class FusedBridge(NamedTuple):
     disagree: bool
 
 
-def source_of(result: Crossing) -> Source | None:
-    """What a result left for fusion; None if nothing."""
-    if result.fusion_likelihood is None:
-        return None
-    direction = 1 if result.direction == "start_to_end" else -1
-    return Source(result.crossing_id, result.vehicle, direction, result.fusion_likelihood)
-
-
 def stored(data: CrossingData, found: Optimum) -> fusion.FusionLikelihood:
-    """The likelihood of a crossing as a part of its result."""
-    told = of_crossing.likelihood(found)
+    """Return the likelihood of a crossing as a part of its result."""
+    likelihood = of_crossing.likelihood(found)
     priors = found.problem.priors
-    absence = dict(zip(unknowns.names(data.bridge.elements), priors.absence.tolist(), strict=True))
-    m = told.target.size
+    absence = dict(
+        zip(parameters.names(data.bridge.elements), priors.absence.tolist(), strict=True)
+    )
+    m = likelihood.target.size
     front, rear = (
-        fusion.Axle(**axle._asdict()) for axle in found.problem.mismatch.shapes.footprints
+        fusion.AxleFootprint(**axle._asdict()) for axle in found.problem.mismatch.shapes.footprints
     )
     return fusion.FusionLikelihood(
-        bridge=_coordinates(told.bridge, absence),
-        truck=_coordinates(told.truck, {}),
-        root=_rounded(told.root[np.triu_indices(m)]),
-        target=_rounded(told.target),
+        bridge=_coordinates(likelihood.bridge, absence),
+        truck=_coordinates(likelihood.truck, {}),
+        root=_rounded(likelihood.root[np.triu_indices(m)]),
+        target=_rounded(likelihood.target),
         element_lengths_m=tuple(data.bridge.lengths_m),
         mass_spread=data.vehicle.spread("total_mass_kg"),
         footprints=(front, rear),
-        first_knot_m=float(told.knots_m[0]) if told.knots_m.size else None,
+        first_knot_m=float(likelihood.knots_m[0]) if likelihood.knots_m.size else None,
         knot_spacing_m=of_crossing.knot_spacing_m(found.problem.mismatch),
-        level_m3=_rounded(told.level_m3),
-        off_bridge_m=_stretches(told.off_bridge),
-        bends=_stored_bends(told.bends),
+        level_m3=_rounded(likelihood.level_m3),
+        off_bridge_m=_stretches(likelihood.off_bridge),
+        bends=_stored_bends(likelihood.bends),
     )
 
 
-def _stored_bends(of: Bends | None) -> fusion.Bends | None:
+def _stored_bends(of: CurvatureTerms | None) -> fusion.Bends | None:
     if of is None:
         return None
     shapes = tuple(float(f"{value:.{_DIGITS_OF_BENDS}e}") for value in of.shapes.ravel())
@@ -116,8 +102,8 @@ def _coordinates(
     )
 
 
-def _stretches(off: of_crossing.OffBridge | None) -> tuple[fusion.Stretch, ...]:
-    """Values that are there, as stretches without holes."""
+def _stretches(off: of_crossing.OffBridgeMismatch | None) -> tuple[fusion.Stretch, ...]:
+    """Return the values present, as segments without gaps."""
     if off is None:
         return ()
     step = of_crossing.OFF_BRIDGE_STEP_M
@@ -140,9 +126,9 @@ def fused(
     report: Report = lambda stage, fraction: None,
     threads: int = 1,
 ) -> FusedBridge:
-    """A bridge by crossings, of which the last says what the bridge's unknowns are.
+    """Fuse crossings to one estimate; the last one defines the bridge's parameters.
 
-    ValueError without crossings.
+    Raise ValueError without crossings.
     """
     if not sources:
         raise ValueError("no crossings to fuse")
@@ -153,19 +139,19 @@ def fused(
     parts = [_part(one, priors.coordinates) for one in alike]
     vehicles = {part.truck: one.vehicle for part, one in zip(parts, alike, strict=True)}
     report("comparing trucks", 0.0)
-    compared = compare_trucks(parts, priors)
+    compared = find_misattributed(parts, priors)
     parts = [part for part in parts if part.name not in compared.strangers]
     report("putting crossings together", _COMPARED)
-    joint = join(parts, priors)
-    judged = judge(parts, joint, priors)
+    joint = build_joint(parts, priors)
+    judged = select_consistent(parts, joint, priors)
     if judged.left_out:
         parts = [part for part in parts if part.name in judged.agree]
-        joint = join(parts, priors)
+        joint = build_joint(parts, priors)
 
     def drawing(stage: str, fraction: float) -> None:
         report(stage, _JOINED + (1.0 - _JOINED) * fraction)
 
-    found = fuse_joined(joint, priors, _DRAWS_PER_CHAIN, _SEED, drawing, threads)
+    found = sample_joint(joint, priors, _DRAWS_PER_CHAIN, _SEED, drawing, threads)
     nominal = priors.coordinates.location[-priors.elements :]
     spread = priors.coordinates.scale[-priors.elements :]
     y = found.draws.reshape(-1, found.draws.shape[2])[:, -priors.elements :]
@@ -183,14 +169,14 @@ def fused(
     )
 
 
-def part_of(source: Source) -> tuple[Part, BridgePriors]:
-    """A crossing as fusion takes it, in its own coordinates."""
+def part_of(source: Source) -> tuple[FusionInput, BridgePriors]:
+    """Return a crossing as input of the fusion, in its own coordinates."""
     priors = _priors(source.likelihood)
     return _part(source, priors.coordinates), priors
 
 
-def _tracks(found: Fused, vehicles: Mapping[str, str]) -> tuple[Track, ...]:
-    """What runs share; `vehicles` are the trucks' names by their keys in the fusion."""
+def _tracks(found: FusedDraws, vehicles: Mapping[str, str]) -> tuple[Track, ...]:
+    """Return the wheel-path groups; `vehicles` are the trucks' names by their keys."""
     return tuple(
         Track(
             vehicle=vehicles[one.truck],
@@ -204,7 +190,7 @@ def _tracks(found: Fused, vehicles: Mapping[str, str]) -> tuple[Track, ...]:
 
 
 def _is_like(one: fusion.FusionLikelihood, other: fusion.FusionLikelihood) -> bool:
-    """Whether they are about the same unknowns of a bridge."""
+    """Return whether they have the same parameters of a bridge."""
 
     def what(of: fusion.FusionLikelihood) -> object:
         names = tuple((c.name, c.is_log) for c in of.bridge)
@@ -215,8 +201,8 @@ def _is_like(one: fusion.FusionLikelihood, other: fusion.FusionLikelihood) -> bo
 
 def _priors(of: fusion.FusionLikelihood) -> BridgePriors:
     elements = len(of.element_lengths_m)
-    names = unknowns.names(elements)
-    power = dict(zip(names, unknowns.mass_powers(elements).tolist(), strict=True))
+    names = parameters.names(elements)
+    power = dict(zip(names, parameters.mass_powers(elements).tolist(), strict=True))
     return BridgePriors(
         _from_stored(of.bridge),
         np.array([power[c.name] for c in of.bridge]),
@@ -234,12 +220,12 @@ def _from_stored(coordinates: Sequence[fusion.Coordinate]) -> of_crossing.Coordi
     )
 
 
-def _part(source: Source, coordinates: of_crossing.Coordinates) -> Part:
+def _part(source: Source, coordinates: of_crossing.Coordinates) -> FusionInput:
     of = source.likelihood
     m = len(of.target)
     root = np.zeros((m, m))
     root[np.triu_indices(m)] = of.root
-    told = of_crossing.Likelihood(
+    likelihood = of_crossing.CrossingLikelihood(
         root,
         np.array(of.target),
         _from_stored(of.bridge),
@@ -249,12 +235,14 @@ def _part(source: Source, coordinates: of_crossing.Coordinates) -> Part:
         _off_bridge(of),
         _bends(of),
     )
-    told = of_crossing.in_coordinates(told, coordinates, len(of.element_lengths_m))
-    # Of a truck whose site file has changed nobody knows whether it is the same.
+    likelihood = of_crossing.in_coordinates(likelihood, coordinates, len(of.element_lengths_m))
+    # A truck whose site file has changed may be another one.
     key = [[c.name, c.location, c.scale] for c in of.truck]
     truck = f"{source.vehicle} {key} {of.footprints} {of.mass_spread}"
     front, rear = (Footprint(**axle.model_dump()) for axle in of.footprints)
-    return Part(source.crossing_id, told, truck, source.direction, (front, rear), of.mass_spread)
+    return FusionInput(
+        source.crossing_id, likelihood, truck, source.direction, (front, rear), of.mass_spread
+    )
 
 
 def _knots(of: fusion.FusionLikelihood, m: int) -> Floats:
@@ -267,15 +255,15 @@ def _knots(of: fusion.FusionLikelihood, m: int) -> Floats:
     return of.first_knot_m + of.knot_spacing_m * np.arange(count, dtype=np.float64)
 
 
-def _bends(of: fusion.FusionLikelihood) -> Bends | None:
+def _bends(of: fusion.FusionLikelihood) -> CurvatureTerms | None:
     if of.bends is None:
         return None
     moves = len(of.bends.size)
     shapes = np.array(of.bends.shapes).reshape(-1, moves * (moves + 1) // 2)
-    return Bends(np.array(of.bends.about), np.array(of.bends.size), shapes)
+    return CurvatureTerms(np.array(of.bends.about), np.array(of.bends.size), shapes)
 
 
-def _off_bridge(of: fusion.FusionLikelihood) -> of_crossing.OffBridge | None:
+def _off_bridge(of: fusion.FusionLikelihood) -> of_crossing.OffBridgeMismatch | None:
     if not of.off_bridge_m:
         return None
     step = of_crossing.OFF_BRIDGE_STEP_M
@@ -285,4 +273,4 @@ def _off_bridge(of: fusion.FusionLikelihood) -> of_crossing.OffBridge | None:
     for one in of.off_bridge_m:
         first = round((one.begin_m - begin) / step)
         values[first : first + len(one.values)] = one.values
-    return of_crossing.OffBridge(begin, values)
+    return of_crossing.OffBridgeMismatch(begin, values)

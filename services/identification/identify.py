@@ -1,7 +1,7 @@
-"""One crossing: from samples and fixes to a result with a verdict. No I/O, no clock.
+"""Identification of one crossing: from samples and fixes to a result with a verdict.
 
-`identify` checks what can be checked before any fitting (a missing channel, a gap, no position, too
-slow), fits, and says what the answer is worth. Every way to fail is a verdict, not an exception.
+`identify` checks conditions before any fit (a missing channel, a gap, no position, too slow), fits,
+and judges the answer. Every failure is a verdict, not an exception. No I/O, no clock.
 """
 
 import logging
@@ -13,36 +13,35 @@ import numpy as np
 from pydantic import ValidationError
 
 from pre_core.crossing.splines import value_at
-from pre_core.crossing.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
+from pre_core.crossing.trajectory import Trajectory, arrival_time_s, fit_trajectory, motion_at
 from pre_core.physics.simulate import Motion
 from pre_core.search.loop import Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
-from services.identification.crossing_data import (
-    LONGEST_SURE_OUTAGE_S,
-    CrossingData,
-    Floats,
-    Passing,
-    Window,
-    longest_outage_s,
-    rejected,
-    window,
-)
+from services.finding.crossing_data import CrossingData, Window
+from services.finding.placed import Spreads, middle_of, one_sided_channels
+from services.finding.stays import STANDING_M_PER_S, Passage
+from services.finding.streams import Samples
 from services.identification.paper_method import identify_paper
-from services.identification.placed import Spreads, hidden, middle_of
 from services.identification.pre_method import Keep as Keep
 from services.identification.pre_method import identify_pre
+from services.identification.result_parts import (
+    LONGEST_SURE_OUTAGE_S,
+    CrossingTimes,
+    Floats,
+    longest_outage_s,
+    rejected,
+)
 from services.identification.signal_checks import reasons_before_fit, unmeasured
-from services.identification.stays import STANDING_M_PER_S, Passage
-from services.identification.streams import Samples
+from services.identification.windows import window_of
 
 _log = logging.getLogger(__name__)
 Stopwatch = Callable[[], float]
 
 
 class Identify(Protocol):
-    """What `identify` is: from one crossing to its result."""
+    """Type of `identify`, from one crossing to its result."""
 
     def __call__(  # noqa: D102
         self,
@@ -52,20 +51,20 @@ class Identify(Protocol):
         stopwatch: Stopwatch,
         report: Report = ...,
         keep: Keep = ...,
-    ) -> results.Crossing: ...
+    ) -> results.CrossingResult: ...
 
 
 SLOWEST_M_PER_S = 3.0
-"""Below this the wheels feel next to nothing of the bridge's stiffness."""
+"""Speed below which the wheels are hardly affected by the bridge's stiffness."""
 _JUDGED_ASIDE_S = 1.0
-"""Signals are judged so far before and behind the bridge, where thresholds were found."""
+"""Time in s before and behind the bridge over which signals are judged, as for thresholds."""
 _SLOW_SHARE = 0.4
-"""Slower than this share of the speed on the bridge the road on either side is not looked at."""
+"""Share of the speed on the bridge below which the road on either side is not used."""
 _LONGEST_OUTAGE_S = 8.0
-"""So long without a fix the trajectory may be found from the axles' signals, by method `pre`."""
+"""Longest time in s without a fix for which method `pre` finds the trajectory by the axles."""
 
 
-# A search tries values beyond what floats hold, and sees by itself that an objective is not finite.
+# A search tries values beyond the range of floats, and detects an infinite objective itself.
 @np.errstate(all="ignore")
 def identify(
     data: CrossingData,
@@ -74,13 +73,13 @@ def identify(
     stopwatch: Stopwatch,
     report: Report = lambda stage, fraction: None,
     keep: Keep = lambda crossing_id, draws: None,
-) -> results.Crossing:
-    """The result of one crossing, whatever its data are; `keep` is given its draws, if any."""
+) -> results.CrossingResult:
+    """Return the result of one crossing, whatever its data; pass its draws, if any, to `keep`."""
     began = stopwatch()
-    around = window(data.stay, data.bridge, data.vehicle, settings.method)
+    around = window_of(settings.method)(data.stay, data.bridge, data.vehicle)
     trajectory = _trajectory(data, around)
     entry_s, exit_s = _entry_and_exit(data, trajectory, around)
-    passing = Passing(entry_s, exit_s, _speed_m_per_s(data, entry_s, exit_s))
+    passing = CrossingTimes(entry_s, exit_s, _speed_m_per_s(data, entry_s, exit_s))
     reject = partial(rejected, data, settings, passing)
     reasons = _unusable(data, settings.method, trajectory, entry_s, exit_s)
     if reasons or trajectory is None or data.samples is None:
@@ -116,7 +115,7 @@ def identify(
             report,
             lambda: stopwatch() - began,
         )
-    except Exception as error:  # whatever the data are, the answer is a verdict
+    except Exception as error:  # whatever the data, the answer is a verdict
         if is_not_finite(error):
             _log.info("%s: %s: %s", data.crossing_id, type(error).__name__, error)
             return reject([Reason.NOT_FINITE])
@@ -125,10 +124,10 @@ def identify(
 
 
 def is_not_finite(error: Exception) -> bool:
-    """Return whether an error says that numbers of a fit or a result are beyond what floats hold.
+    """Return whether an error indicates numbers beyond the range of floats.
 
-    Values at the edge of what a site file may say lead there: overflows, bridges without modes,
-    and fields of a result that only take finite numbers.
+    Extreme values of a site file lead there: overflows, bridges without modes, and fields of a
+    result that only accept finite numbers.
     """
     if isinstance(error, ValidationError):
         problems = error.errors(include_url=False, include_context=False, include_input=False)
@@ -137,18 +136,18 @@ def is_not_finite(error: Exception) -> bool:
 
 
 class _Cut(NamedTuple):
-    """The samples of a crossing and where the truck was at them."""
+    """Samples of a crossing, with the truck's positions at them."""
 
     acceleration: Floats
-    """(m, n) of all channels of the vehicle, in its order; (4, n) once they are reduced."""
+    """Accelerations (m, n) of the vehicle's channels, in its order; (4, n) once reduced."""
     start_s: float
     motion: Motion
 
 
 def _cut(
-    data: CrossingData, trajectory: Trajectory, samples: Samples, passing: Passing
+    data: CrossingData, trajectory: Trajectory, samples: Samples, passing: CrossingTimes
 ) -> _Cut | None:
-    """The unbroken samples around the crossing; None if some are missing in it."""
+    """Return the unbroken samples around the crossing; None if some are missing in it."""
     time_s = samples.start_s + np.arange(_size(samples)) / samples.rate_hz
     part = _covered(samples, time_s, passing.entry_s, passing.exit_s)
     if part is None:
@@ -162,16 +161,16 @@ def _cut(
     )
 
 
-def _near(cut: _Cut, passing: Passing, step_s: float) -> slice:
-    """The samples of the crossing itself: signals are judged where the thresholds were found."""
+def _near(cut: _Cut, passing: CrossingTimes, step_s: float) -> slice:
+    """Return the samples of the crossing itself, for which the thresholds were determined."""
     time_s = cut.start_s + step_s * np.arange(cut.acceleration.shape[1])
     edges = (passing.entry_s - _JUDGED_ASIDE_S, passing.exit_s + _JUDGED_ASIDE_S)
     first, last = np.searchsorted(time_s, edges)
     return slice(int(first), int(last))
 
 
-def _driving(time_s: Floats, motion: Motion, passing: Passing) -> slice:
-    """The samples around the crossing at which the truck does not nearly stand."""
+def _driving(time_s: Floats, motion: Motion, passing: CrossingTimes) -> slice:
+    """Return the samples around the crossing at which the truck does not nearly stand."""
     slow = np.abs(motion.speed_m_per_s) < _SLOW_SHARE * passing.speed_m_per_s
     before = np.flatnonzero(slow & (time_s < passing.entry_s))
     behind = np.flatnonzero(slow & (time_s > passing.exit_s))
@@ -179,7 +178,7 @@ def _driving(time_s: Floats, motion: Motion, passing: Passing) -> slice:
 
 
 def _trajectory(data: CrossingData, around: Window) -> Trajectory | None:
-    # No fixes later than those that are waited for: what came by chance must not matter.
+    # Use no fixes later than those awaited: later ones, present by chance, must not matter.
     near = (data.fixes.time_s > data.stay.entry_s - 10.0) & (data.fixes.time_s <= around.end_s)
     if near.sum() < 2 or data.stay.passage is not Passage.THROUGH:
         return None
@@ -200,25 +199,25 @@ def _trajectory(data: CrossingData, around: Window) -> Trajectory | None:
 def _entry_and_exit(
     data: CrossingData, trajectory: Trajectory | None, around: Window
 ) -> tuple[float, float]:
-    """When the front axle enters and the rear axle leaves, by the smooth curve if it says so."""
+    """Return entry of the front and exit of the rear axle, by the smooth curve if it has them."""
     stay = data.stay
     if trajectory is None:
         return stay.entry_s, stay.exit_s
     direction, span = stay.direction, data.bridge.span_m
     near, far = (0.0, span) if direction > 0 else (span, 0.0)
     begin, end = around
-    entry = passing_time_s(trajectory, near, direction, begin, end)
-    beyond = far + direction * data.vehicle.wheelbase_m
-    leave = passing_time_s(trajectory, beyond, direction, begin, end)
+    entry = arrival_time_s(trajectory, near, direction, begin, end)
+    beyond = far + direction * data.vehicle.length_m
+    leave = arrival_time_s(trajectory, beyond, direction, begin, end)
     if not (np.isfinite(entry) and np.isfinite(leave)):
         return stay.entry_s, stay.exit_s
     return entry, leave
 
 
 def _speed_m_per_s(data: CrossingData, entry_s: float, exit_s: float) -> float:
-    """Mean speed of a crossing; of what is none, the middle one of the receiver's speeds."""
+    """Return the mean speed of a crossing; otherwise the median of the receiver's speeds."""
     if data.stay.passage is Passage.THROUGH and exit_s > entry_s:
-        return (data.bridge.span_m + data.vehicle.wheelbase_m) / (exit_s - entry_s)
+        return (data.bridge.span_m + data.vehicle.length_m) / (exit_s - entry_s)
     near = (data.fixes.time_s >= data.stay.entry_s) & (data.fixes.time_s <= data.stay.exit_s)
     return float(np.median(np.abs(data.fixes.speed_m_per_s[near]))) if near.any() else 0.0
 
@@ -230,9 +229,11 @@ def _unusable(
     entry_s: float,
     exit_s: float,
 ) -> list[Reason]:
-    """Everything that forbids a fit before its samples are looked at."""
+    """Return all reasons that forbid a fit before its samples are checked."""
     if method != "pre" and data.bridge.interior_supports_m:
         return [Reason.CONTINUOUS_BRIDGE]
+    if method != "pre" and data.vehicle.tandem is not None:
+        return [Reason.TANDEM]
     reasons = list(data.against)
     match data.stay.passage:
         case Passage.TURNED_BACK:
@@ -261,14 +262,14 @@ def _unusable(
 
 
 def _missing(data: CrossingData) -> str:
-    """Names of the channels that the truck lacks."""
+    """Return the names of the channels that the truck lacks."""
     there = data.samples.channels if data.samples is not None else {}
     return ", ".join(name for name in data.vehicle.channels if name not in there)
 
 
 def _hidden(data: CrossingData) -> str:
-    """Names of the sensors that there are of parts that are measured on one side only."""
-    return hidden(data.vehicle, () if data.samples is None else data.samples.channels)
+    """Return the names of the sensors of parts that are measured on one side only."""
+    return one_sided_channels(data.vehicle, () if data.samples is None else data.samples.channels)
 
 
 def _size(samples: Samples) -> int:
@@ -276,7 +277,7 @@ def _size(samples: Samples) -> int:
 
 
 def _covered(samples: Samples, time_s: Floats, entry_s: float, exit_s: float) -> slice | None:
-    """The unbroken stretch of samples around the crossing; None if some are missing in it."""
+    """Return the unbroken samples around the crossing; None if some are missing in it."""
     first = int(np.searchsorted(time_s, entry_s))
     last = int(np.searchsorted(time_s, exit_s, side="right"))
     spare = 4  # for the interpolation at the ends

@@ -1,22 +1,22 @@
-"""How far a run was from the bridge's axis, against what the unknown of torsion is defined for."""
+"""Lateral distance of a run from the bridge's axis, for the parameter of torsion."""
 
 import numpy as np
 
 from services.common.geodesy import bridge_frame, to_chainage
-from services.identification.crossing_data import CrossingData
+from services.finding.crossing_data import CrossingData
 
 _SURE_OF_LANE_M = 0.3
-"""A receiver whose slow error is larger says less of the lane than the site file."""
+"""Slow error in m above which a receiver determines the lane less precisely than the site."""
 _FARTHEST_ASIDE = 3.0
-"""Standard deviations beyond which receiver and site file speak of different axes."""
+"""Standard deviations beyond which receiver and site file refer to different axes."""
 
 
 def lane_factor(data: CrossingData) -> float:
-    """Return the square of this run's distance from the axis over that of the torsion's prior.
+    """Return the squared ratio of this run's distance from the axis to that of torsion's prior.
 
-    Where the site file says how far the lane is off the axis, a receiver that is right to
-    decimetres and agrees with that shows the run's own distance; otherwise 1. Without such a
-    statement its distance from the line between the ends is no evidence: often that line was
+    Where the site file declares the lane's offset from the axis, a receiver with an error of
+    decimetres that agrees shows the run's own distance; otherwise the ratio is 1. Without a
+    declaration the distance from the line between the ends is no evidence: often that line was
     measured along the lane.
     """
     bridge, spread_m = data.bridge, data.receiver.position_spread_m

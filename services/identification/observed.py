@@ -1,16 +1,17 @@
-"""What a stored result says of ln EI, for the history of its bridge."""
+"""Observation of ln EI in a stored result, for the history of its bridge."""
 
 import hashlib
 
 import numpy as np
 
 from pre_core.monitoring.observation import Observation, observation
-from schemas.results import Crossing
-from services.identification.fusing import part_of, source_of
+from schemas.results import CrossingResult
+from services.identification.fusing import part_of
+from services.identification.usable import source_of
 
 
-def observation_of(result: Crossing) -> Observation | None:
-    """Of a result that left a likelihood; None of others, and where its numbers do not hold."""
+def observation_of(result: CrossingResult) -> Observation | None:
+    """Return the observation of a result with a valid likelihood; None for others."""
     source = source_of(result)
     if source is None or result.parameters is None:
         return None
@@ -32,7 +33,7 @@ def observation_of(result: Crossing) -> Observation | None:
 
 
 def _named_shortly(of: Observation) -> Observation:
-    """A truck's name holds all that tells it apart from another one of that name: 1 kB."""
+    """Return it with short names: a truck's key identifies it completely, in 1 kB."""
     shared = tuple(
         one._replace(name=f"{one.name.split(' ', 1)[0]}-{_digest(one.name)}") for one in of.shared
     )

@@ -1,6 +1,6 @@
-"""The paper's two methods on one crossing: their fits, and the results with what these are worth.
+"""The paper's two methods on one crossing: their fits, and results with verdicts.
 
-Neither knows of noise: no number of theirs is ever `good` (docs/contract.md).
+Neither has a noise model: no value of theirs is ever `good` (docs/contract.md).
 """
 
 from collections.abc import Callable
@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core import unknowns
+from pre_core import parameters
 from pre_core.constants import NORMAL_975
 from pre_core.paper import least_squares, random_walk, residual
 from pre_core.paper.integrate import spline_integrate
-from pre_core.paper.residual import Window
+from pre_core.paper.residual import PaperWindow
 from pre_core.physics.bridge import natural_frequencies_hz, strain_energy_shares
 from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
@@ -23,10 +23,10 @@ from pre_core.search.loop import Report
 from schemas import results
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
-from services.identification.crossing_data import (
-    CrossingData,
+from services.finding.crossing_data import CrossingData
+from services.identification.result_parts import (
+    CrossingTimes,
     Floats,
-    Passing,
     beam_of,
     caveats,
     detrended,
@@ -38,48 +38,50 @@ from services.identification.crossing_data import (
 )
 
 _LARGEST_MISFIT = 0.002
-"""Root mean square of R_1 - R_2 relative to the bridge's largest deflection under a wheel. Without
-noise a fit leaves 1e-5; from a few thousandths on the elements are not told apart."""
+"""Limit of the rms of R_1 - R_2 relative to the bridge's largest deflection under a wheel.
+
+Without noise a fit leaves 1e-5; from a few thousandths on elements cannot be distinguished.
+"""
 _LARGEST_FACTOR = 100.0
-"""Nothing of a truck or a bridge is a hundred times what its owner says."""
+"""Largest factor between a value and its declaration: nothing differs a hundredfold."""
 
 
 class _Fit(NamedTuple):
-    """What a method found: all parameters, their formal covariance, and how it went."""
+    """Fit of a method: all parameters, their formal covariance, and statistics."""
 
     theta: Floats  # (p,)
     free: NDArray[np.int64]  # (f,)
     covariance: Floats  # (f, f) in physical units
     spread: Floats | None  # (f, 3) quantiles where the method has a cloud instead of a curvature
-    ending: loop.Ending
+    ending: loop.Termination
     diagnostics: dict[str, float]
 
 
 def identify_paper(
     data: CrossingData,
     settings: IdentificationSettings,
-    passing: Passing,
+    passing: CrossingTimes,
     acceleration: Floats,
     motion: Motion,
     report: Report,
     elapsed: Callable[[], float],
-) -> results.Crossing:
-    """The crossing by `least_squares` or `random_walk`, and a verdict that is never `good`."""
+) -> results.CrossingResult:
+    """Return the result by `least_squares` or `random_walk`; its verdict is never `good`."""
     try:
         window = _window(data, settings, acceleration, motion)
     except residual.WindowError:
         return rejected(data, settings, passing, [Reason.STOPPED_ON_BRIDGE])
     fit = _METHODS[settings.method](data, settings, window, report)
-    if fit.ending is loop.Ending.NOT_FINITE:
+    if fit.ending is loop.Termination.NOT_FINITE:
         return rejected(data, settings, passing, [Reason.NOT_FINITE])
     return _result(data, settings, passing, window, fit, motion, elapsed())
 
 
 def _window(
     data: CrossingData, settings: IdentificationSettings, acceleration: Floats, motion: Motion
-) -> Window:
+) -> PaperWindow:
     vehicle = data.vehicle
-    assert data.samples is not None  # noqa: S101 - `_unusable` saw to it
+    assert data.samples is not None  # noqa: S101 - `_unusable` checked it
     return residual.build_window(
         acceleration,
         1.0 / data.samples.rate_hz,
@@ -98,25 +100,25 @@ def _window(
 
 
 def _least_squares(
-    data: CrossingData, settings: IdentificationSettings, window: Window, report: Report
+    data: CrossingData, settings: IdentificationSettings, window: PaperWindow, report: Report
 ) -> _Fit:
     nominal = nominal_parameters(data.vehicle, data.bridge)
-    free = unknowns.paper_subset(data.bridge.elements)
-    free = free[nominal[free] > 0.0]  # a site may say that a damping is exactly zero
-    problem = least_squares.Problem(window, nominal, free)
+    free = parameters.paper_subset(data.bridge.elements)
+    free = free[nominal[free] > 0.0]  # a site may declare a damping of exactly zero
+    problem = least_squares.LeastSquaresProblem(window, nominal, free)
     work = residual.workspace(window)
     rng = np.random.default_rng(settings.seed)
-    best: tuple[levenberg_marquardt.State, loop.Ending] | None = None
+    best: tuple[levenberg_marquardt.LMState, loop.Termination] | None = None
     steps = evaluations = 0
 
-    def progress(count: int, info: levenberg_marquardt.Info) -> None:
+    def progress(count: int, info: levenberg_marquardt.LMInfo) -> None:
         report(f"least squares, step {count}", min(0.95, count / least_squares.MAX_STEPS))
 
     for attempt in range(settings.starts):
         start = nominal[free]
         if attempt > 0:
             start = start * rng.uniform(random_walk.PRIOR_LOW, random_walk.PRIOR_HIGH, free.size)
-        state, infos, ending = loop.run(
+        state, infos, ending = loop.run_search(
             partial(least_squares.init, problem, work, start),
             partial(least_squares.step, problem, work),
             least_squares.MAX_STEPS,
@@ -126,14 +128,14 @@ def _least_squares(
         evaluations += sum(info.evaluations for info in infos)
         if best is None or state.objective < best[0].objective:
             best = state, ending
-        if ending is loop.Ending.CONVERGED:
+        if ending is loop.Termination.CONVERGED:
             break
     assert best is not None  # noqa: S101 - `starts` is at least 1
     state, ending = best
     return _Fit(
         least_squares.full_vector(problem, state.y),
         free,
-        least_squares.covariance(problem, work, state.y),
+        least_squares.formal_covariance(problem, work, state.y),
         None,
         ending,
         {"iterations": float(steps), "evaluations": float(evaluations)},
@@ -141,21 +143,21 @@ def _least_squares(
 
 
 def _random_walk(
-    data: CrossingData, settings: IdentificationSettings, window: Window, report: Report
+    data: CrossingData, settings: IdentificationSettings, window: PaperWindow, report: Report
 ) -> _Fit:
     nominal = nominal_parameters(data.vehicle, data.bridge)
-    free = unknowns.paper_subset(data.bridge.elements)
+    free = parameters.paper_subset(data.bridge.elements)
     free = free[nominal[free] > 0.0]
     problem = random_walk.problem(window, nominal, free, settings.seed)
 
-    def progress(count: int, info: random_walk.Info) -> None:
+    def progress(count: int, info: random_walk.RandomWalkInfo) -> None:
         report(f"random walk, step {count}", count / settings.steps)
 
-    state, infos, ending = loop.run(
+    state, infos, ending = loop.run_search(
         partial(random_walk.init, problem, settings.particles),
         partial(random_walk.step, problem),
         settings.steps,
-        at_the_end=loop.Ending.STEPS_DONE,
+        at_the_end=loop.Termination.STEPS_DONE,
         progress=progress,
     )
     values = state.ratios * nominal[free]
@@ -175,15 +177,15 @@ def _random_walk(
     )
 
 
-_METHODS: dict[str, Callable[[CrossingData, IdentificationSettings, Window, Report], _Fit]] = {
+_METHODS: dict[str, Callable[[CrossingData, IdentificationSettings, PaperWindow, Report], _Fit]] = {
     "least_squares": _least_squares,
     "random_walk": _random_walk,
 }
 
 
-def _ran_away(data: CrossingData, fit: _Fit) -> bool:
-    """Whether the search ended anywhere but at a minimum within reason."""
-    if fit.ending in (loop.Ending.STEPS_EXHAUSTED, loop.Ending.STUCK):
+def _has_diverged(data: CrossingData, fit: _Fit) -> bool:
+    """Return whether the search ended anywhere but at a plausible minimum."""
+    if fit.ending in (loop.Termination.STEPS_EXHAUSTED, loop.Termination.STUCK):
         return True
     nominal = nominal_parameters(data.vehicle, data.bridge)[fit.free]
     factors = np.abs(np.log(fit.theta[fit.free] / nominal))
@@ -193,12 +195,12 @@ def _ran_away(data: CrossingData, fit: _Fit) -> bool:
 def _result(
     data: CrossingData,
     settings: IdentificationSettings,
-    passing: Passing,
-    window: Window,
+    passing: CrossingTimes,
+    window: PaperWindow,
     fit: _Fit,
     motion: Motion,
     seconds: float,
-) -> results.Crossing:
+) -> results.CrossingResult:
     work = residual.workspace(window)
     roads = residual.road_profiles(window, work, fit.theta)
     objective = residual.objective(window, work, fit.theta)
@@ -211,8 +213,8 @@ def _result(
         "road_rms_m": road_m,
         "relative_misfit": misfit_m / max(road_m, 1e-12),
     }
-    if _ran_away(data, fit):
-        # Under noise the plain residual has no minimum to speak of: no number is an estimate.
+    if _has_diverged(data, fit):
+        # Under noise the plain residual has no useful minimum: no value is an estimate.
         return rejected(data, settings, passing, [Reason.NOT_CONVERGED], diagnostics=diagnostics)
     reasons = [Reason.NO_NOISE_MODEL]
     deflection_m = float(residual.deflections_m(window, fit.theta).max())
@@ -221,10 +223,10 @@ def _result(
         reasons.append(Reason.MODEL_MISFIT)
     reasons += caveats(data, motion)
     values = _parameters(data, fit, settings)
-    names = tuple(unknowns.names(data.bridge.elements)[i] for i in fit.free)
-    return results.Crossing(
+    names = tuple(parameters.names(data.bridge.elements)[i] for i in fit.free)
+    return results.CrossingResult(
         **header(data, settings, passing),
-        verdict="suspect",  # without a noise model nothing can be shown to be good
+        verdict="suspect",  # without a noise model no result can be shown to be good
         reasons=tuple(reasons),
         diagnostics=diagnostics,
         parameters=values,
@@ -240,7 +242,7 @@ def _parameters(
     data: CrossingData, fit: _Fit, settings: IdentificationSettings
 ) -> dict[str, results.Parameter]:
     nominal = nominal_parameters(data.vehicle, data.bridge)
-    names = unknowns.names(data.bridge.elements)
+    names = parameters.names(data.bridge.elements)
     std = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     values: dict[str, results.Parameter] = {}
     for k, i in enumerate(fit.free):
@@ -251,7 +253,7 @@ def _parameters(
             else (mean - NORMAL_975 * std[k], mean, mean + NORMAL_975 * std[k])
         )
         values[names[i]] = results.Parameter(
-            unit=unknowns.unit(names[i]),
+            unit=parameters.unit(names[i]),
             mean=mean,
             std=float(std[k]),
             q025=float(low),
@@ -263,7 +265,7 @@ def _parameters(
 
 
 def _start_of_search(nominal: float, settings: IdentificationSettings) -> results.Prior | None:
-    """The random walk starts uniformly around the nominal value; least squares has no prior."""
+    """Return the random walk's uniform start around the nominal value; least squares has none."""
     if settings.method != "random_walk":
         return None
     half_width = 0.5 * (random_walk.PRIOR_HIGH - random_walk.PRIOR_LOW) * abs(nominal)
@@ -271,7 +273,7 @@ def _start_of_search(nominal: float, settings: IdentificationSettings) -> result
 
 
 def _derived_masses(data: CrossingData, fit: _Fit) -> dict[str, results.Parameter]:
-    """m_s, m_s1, m_s2 and their formal spread to first order."""
+    """Return m_s, m_s1, m_s2 and their formal spread to first order."""
     vehicle = data.vehicle
     masses = partial(
         body_masses,
@@ -286,44 +288,44 @@ def _derived_masses(data: CrossingData, fit: _Fit) -> dict[str, results.Paramete
 
 
 def _propagated(fit: _Fit, quantity: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
-    """A quantity (q,) of the parameters and its standard deviation to first order."""
+    """Return a quantity (q,) of the parameters and its standard deviation to first order."""
 
     def moved(changes: Floats) -> Floats:
         values = np.repeat(fit.theta[None, :], len(changes), axis=0)
         values[:, fit.free] *= 1.0 + changes
         return np.array([quantity(theta) for theta in values])
 
-    slopes = levenberg_marquardt.slopes(moved, np.zeros(fit.free.size))
+    slopes = levenberg_marquardt.sixth_order_jacobian(moved, np.zeros(fit.free.size))
     return quantity(fit.theta), _spread(fit, slopes)
 
 
 def _spread(fit: _Fit, slopes: Floats) -> Floats:
-    """Standard deviations (q,) of what has `slopes` (q, f) in the parameters' logarithms."""
+    """Return standard deviations (q,) for `slopes` (q, f) in the parameters' logarithms."""
     by_values = slopes / fit.theta[fit.free]
     variance = np.einsum("qi,ij,qj->q", by_values, fit.covariance, by_values)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _first_frequency(data: CrossingData, fit: _Fit) -> tuple[float, float]:
-    """f_1 in Hz and its standard deviation.
+    """Return f_1 in Hz and its standard deviation.
 
-    An eigenvalue is right to twelve digits and its differences over thousandths to nine, also those
-    for what it does not depend on: where that is spread hundreds of times as wide as f_1, as the
-    damping of the bridge and its outermost elements are, a millionth of the spread is made up.
+    An eigenvalue has twelve correct digits and its differences over thousandths nine, also for
+    parameters without influence: where their spread is hundreds of times that of f_1, as for the
+    damping of the bridge and its outermost elements, a millionth of the spread is rounding.
     """
     beam = beam_of(data, fit.theta)
     f1_hz = float(natural_frequencies_hz(beam, 1)[0])
     relative = np.zeros(fit.theta.size)
-    relative[unknowns.EI_1 :] = 0.5 * strain_energy_shares(beam)[: data.bridge.elements]
-    relative[unknowns.RHO_A] = -0.5
+    relative[parameters.EI_1 :] = 0.5 * strain_energy_shares(beam)[: data.bridge.elements]
+    relative[parameters.RHO_A] = -0.5
     return f1_hz, float(_spread(fit, f1_hz * relative[None, fit.free])[0])
 
 
-def _largest_deflection(window: Window, fit: _Fit) -> tuple[float, float]:
-    """Largest deflection under a wheel, in metres, and its standard deviation.
+def _largest_deflection(window: PaperWindow, fit: _Fit) -> tuple[float, float]:
+    """Return the largest deflection under a wheel, in metres, and its standard deviation.
 
-    Its slopes are those of the deflection where it is largest. Over steps of some thousandths the
-    largest sample is another one, and differences of the largest have kinks.
+    Its slopes are those of the deflection at its maximum. Over steps of some thousandths another
+    sample is the largest one, and differences of the maximum have kinks.
     """
     deflections_m = residual.deflections_m(window, fit.theta)
     at = np.unravel_index(deflections_m.argmax(), deflections_m.shape)
@@ -333,7 +335,7 @@ def _largest_deflection(window: Window, fit: _Fit) -> tuple[float, float]:
     return float(means[0]), float(spread[0])
 
 
-def _derived(data: CrossingData, window: Window, fit: _Fit) -> results.Derived:
+def _derived(data: CrossingData, window: PaperWindow, fit: _Fit) -> results.Derived:
     return results.Derived(
         f1_hz=gaussian("Hz", *_first_frequency(data, fit)),
         max_deflection_m=gaussian("m", *_largest_deflection(window, fit)),

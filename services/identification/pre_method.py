@@ -1,7 +1,7 @@
 """Method `pre` on one crossing: posterior, verdict, and the result with its uncertainty.
 
-What the numbers are is in `pre_core.crossing.optimum` and `pre_core.crossing.sampling`; this is
-where a site file becomes priors, draws become parameters, and diagnostics become a verdict
+`pre_core.crossing.optimum` and `pre_core.crossing.sampling` compute the numbers. This module
+converts a site file into priors, draws into parameters, and diagnostics into a verdict
 (docs/contract.md).
 """
 
@@ -11,25 +11,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core import unknowns
+from pre_core import parameters
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing import optimum, posterior
-from pre_core.crossing.mismatch import as_two_numbers
-from pre_core.crossing.preparation import Inputs
-from pre_core.crossing.sampling import Sampled, sample
+from pre_core.crossing.fit import Optimum
+from pre_core.crossing.mismatch import two_parameter_spectrum
+from pre_core.crossing.preparation import CrossingInputs, lines_hz
+from pre_core.crossing.sampling import PosteriorDraws, sample
 from pre_core.physics.beam_basis import first_frequencies_hz
 from pre_core.physics.models import body_masses
 from pre_core.physics.simulate import Motion
-from pre_core.search.loop import Ending, Report
+from pre_core.search.loop import Report, Termination
 from schemas import results
 from schemas.reasons import Reason, texts
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge
+from services.finding.crossing_data import CrossingData
+from services.finding.placed import first_axle
 from services.identification.checks import stiffer_elements, undeclared_axles
-from services.identification.crossing_data import (
-    CrossingData,
+from services.identification.fit_reasons import reasons_of_fit
+from services.identification.footprints import SPRINGS, footprints_of, lead_of
+from services.identification.fusing import stored
+from services.identification.lane import lane_factor
+from services.identification.result_parts import (
+    CrossingTimes,
     Floats,
-    Passing,
     caveats,
     detrended,
     header,
@@ -38,55 +44,59 @@ from services.identification.crossing_data import (
     rejected,
     road_result,
 )
-from services.identification.fit_reasons import reasons_of_fit
-from services.identification.footprints import footprints_of
-from services.identification.fusing import stored
-from services.identification.lane import lane_factor
 
 _FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN = 14, 8
-"""At least so many in all, and in each of several spans on average, whatever the number of
-elements: quicker sensors would see a coarser mesh. A load between nodes sags by 1/(4 n^3) less of a
-span's deflection on n elements than it should: 1 % on three, 0.05 % on eight. Five spans on three
-elements each: chi2 1.16 and an EI 3.3 standard deviations off; on nine: 0.96 and 1.9."""
+"""Smallest number of finite elements, in all and on average for each of several spans, whatever the
+number of elements of the site file; fast sensors resolve a coarser mesh. With n elements the
+deflection under a load between nodes is too small by 1/(4 n^3) of the span's: 1 % on three, 0.05 %
+on eight. Five spans of three elements each: chi2 1.16 and an EI off by 3.3 standard deviations; of
+nine: 0.96 and 1.9."""
 _SMALLEST_NOISE_UG = 0.1
-"""A declared noise of zero cannot whiten anything; below this, model error dominates."""
+"""Smallest noise density used. Zero would make whitening impossible; below this value the error of
+the model dominates."""
 _SMALLEST_SPREAD = 1e-6
-"""Of a prior, relative: what a site file says is known exactly is a coordinate all the same."""
+"""Smallest relative spread of a prior. A value that a site file declares exact remains a
+coordinate."""
 _SMALLEST_DELAY_S = 1e-9
 _USABLE_CHI2 = 2.0
-"""Intervals that are widened by the square root of this are wide; a model that fits worse is wrong,
-unless it is only the noise that is larger than declared."""
+"""Largest chi2 per degree of freedom of a fit whose numbers are published, with intervals widened
+by its square root. A model that fits worse is wrong, unless noise alone explains it."""
 _LARGEST_CHI2 = 25.0
-"""Whatever the pattern: noise five times the declared is another sensor, or a broken one, and how
-far an interval that is widened by so much can be trusted nobody has measured."""
+"""Limit where noise alone explains the residuals. Noise of five times the declared comes from
+another sensor, or a broken one, and no measurement supports intervals widened by more."""
 _EVEN = 0.5
-"""Probability before the crossing that a support has no spring, or that a bearing is rigid."""
+"""Prior probability that a support has no spring, or that a bearing is rigid."""
 _ROAD_DRAWS = 80
-"""Standard deviations of a road from so many are right to 8 %, and each draw is an evaluation."""
+"""Draws from which the road's standard deviation is computed, to 8 %; each costs an evaluation."""
 _DEFLECTION_DRAWS = 400
-"""Ends of a 95 % interval rest on ten draws at either side; each draw is an evaluation."""
+"""Draws for deflections: ten beyond each end of a 95 % interval; each costs an evaluation."""
 _FREQUENCY_DRAWS = 1000
-"""An eigenvalue problem each: cheap enough for 25 draws beyond each end of the interval."""
+"""Draws for frequencies: 25 beyond each end of the interval; each costs an eigenvalue problem."""
 
 Keep = Callable[[str, dict[str, Floats]], None]
-"""Takes the draws of a crossing: its identifier, and (chains, draws) of every unknown by name."""
+"""Receiver of the draws of a crossing: its identifier and, by name, each unknown's (chains,
+draws)."""
 
 
 def inputs_of(
     data: CrossingData, settings: IdentificationSettings, acceleration: Floats, start_s: float
-) -> Inputs:
-    """The crossing and the site's knowledge as method `pre` takes them."""
+) -> CrossingInputs:
+    """Return the crossing and the site file's knowledge as inputs of method `pre`.
+
+    `acceleration` is (4, n) in m/s², `start_s` the time of its first sample.
+    """
     vehicle, bridge, sensor, receiver = data.vehicle, data.bridge, data.sensor, data.receiver
     assert data.samples is not None  # noqa: S101 - it was checked before
     step_s = 1.0 / data.samples.rate_hz
     stop_s = start_s + step_s * (acceleration.shape[1] - 1)
+    lead = lead_of(vehicle)
     time_s = data.fixes.time_s - receiver.latency_s
     near = (time_s > start_s - 1.0) & (time_s < stop_s + 1.0)
     direction = data.stay.direction
     speed = np.abs(data.fixes.speed_m_per_s[near])
-    fixes = posterior.Fixes(
+    fixes = posterior.ChainageFixes(
         time_s[near],
-        data.chainage_m[near] + direction * vehicle.gps_antenna_to_front_axle_m,
+        data.chainage_m[near] + direction * (vehicle.gps_antenna_to_front_axle_m - lead.ahead_m),
         direction * speed,
         max(receiver.position_noise_m, 0.01),
         max(receiver.speed_noise_m_per_s, 0.003),
@@ -100,7 +110,7 @@ def inputs_of(
         np.maximum(np.array(sensor.noise_density_ug_per_rthz), _SMALLEST_NOISE_UG)
         * MICRO_G_M_PER_S2
     )
-    return Inputs(
+    return CrossingInputs(
         acceleration,
         start_s,
         step_s,
@@ -119,22 +129,26 @@ def inputs_of(
         footprints_of(vehicle),
         bridge.torsional_wave_speed_m_per_s,
         lane_factor(data),
+        lead,
     )
 
 
 def _parts(bridge: Bridge) -> int:
-    """Into how many finite elements each element is cut."""
+    """Return the number of finite elements in each element of the site file."""
     spans = len(bridge.lengths_of_spans_m)
     wanted = max(_FINITE_ELEMENTS, _FINITE_ELEMENTS_OF_SPAN * spans if spans > 1 else 0)
     return max(1, -(-wanted // bridge.elements))
 
 
 def _priors(data: CrossingData) -> posterior.Priors:
-    """What the site file knows of every unknown of the table."""
+    """Return the priors of all unknowns of the parameter table."""
     vehicle, bridge = data.vehicle, data.bridge
-    of = {unknowns.TRUCK: vehicle, unknowns.BRIDGE: bridge}
-    rows = unknowns.table(bridge.elements)
+    of = {parameters.TRUCK: vehicle, parameters.BRIDGE: bridge}
+    rows = parameters.table(bridge.elements)
     nominal = nominal_parameters(vehicle, bridge)
+    tandem = vehicle.tandem
+    # No equation contains the springs of a truck with a tandem.
+    unused = np.array([tandem is not None and row.key in SPRINGS for row in rows])
     at_zero = (nominal == 0.0) & np.array([row.may_be_zero for row in rows])
     spread = [
         of[row.part].scale_at_zero(row.key) if zero else of[row.part].spread(row.key)
@@ -145,9 +159,9 @@ def _priors(data: CrossingData) -> posterior.Priors:
         nominal,
         np.where(at_zero, spreads, np.maximum(spreads, _SMALLEST_SPREAD)),
         at_zero,
-        (at_zero & (spreads > 0.0)) | (nominal > 0.0),
+        ((at_zero & (spreads > 0.0)) | (nominal > 0.0)) & ~unused,
         np.array([absence(bridge, row) for row in rows]),
-        vehicle.wheelbase_m,
+        vehicle.wheelbase_m if tandem is None else tandem.gap_m,
         max(vehicle.spread("wheelbase_m"), _SMALLEST_SPREAD),
         max(data.sensor.gain_spread, _SMALLEST_SPREAD),
         max(data.sensor.common_gain_spread, _SMALLEST_SPREAD),
@@ -155,8 +169,8 @@ def _priors(data: CrossingData) -> posterior.Priors:
     )
 
 
-def absence(bridge: Bridge, row: unknowns.Unknown) -> float:
-    """Probability before the crossing that an unknown is nothing: the site file may know."""
+def absence(bridge: Bridge, row: parameters.ParameterSpec) -> float:
+    """Return the prior probability that a parameter is exactly zero; a site file may fix it."""
     if not row.may_be_absent:
         return 0.0
     if row.key == "support_rotational_stiffness_nm_per_rad":
@@ -169,15 +183,15 @@ def absence(bridge: Bridge, row: unknowns.Unknown) -> float:
 def identify_pre(
     data: CrossingData,
     settings: IdentificationSettings,
-    passing: Passing,
+    passing: CrossingTimes,
     acceleration: Floats,
     start_s: float,
     motion: Motion,
     report: Report,
     elapsed: Callable[[], float],
     keep: Keep,
-) -> results.Crossing:
-    """The posterior of one crossing as a result; a fit that explains nothing is rejected."""
+) -> results.CrossingResult:
+    """Return the posterior of one crossing as a result; a fit that explains nothing is rejected."""
     inputs = inputs_of(data, settings, acceleration, start_s)
     found = optimum.find_optimum(inputs, report)
     if found.noise_power > optimum.HOPELESS_NOISE:
@@ -193,20 +207,16 @@ def identify_pre(
                 "seconds": elapsed(),
             },
         )
-    if found.ending is Ending.NOT_FINITE:
+    if found.ending is Termination.NOT_FINITE:
         named = undeclared_axles(data.vehicle, acceleration, inputs.step_s, is_doubted=True)
         return rejected(data, settings, passing, [Reason.NOT_FINITE, *named], named)
-    problem, y = found.problem, found.state.y
-    diagnostics = {
-        "iterations": float(found.evaluations),
-        "starts": float(found.starts),
-        "position_shift_m": float(y[posterior.layout(problem).offset]),
-    }
+    problem = found.problem
+    diagnostics = _diagnostics_of_search(found)
     against = reasons_of_fit(data, found, acceleration, inputs.step_s)
     reasons, about = list(against.reasons), against.about
     usable = _LARGEST_CHI2 if Reason.NOISE_ABOVE_DECLARED in reasons else _USABLE_CHI2
-    # Elsewhere than at the optimum neither values nor widths mean anything.
-    if against.forbids or found.ending is not Ending.CONVERGED or found.chi2_per_dof > usable:
+    # Away from the optimum neither values nor widths have a meaning.
+    if against.forbids or found.ending is not Termination.CONVERGED or found.chi2_per_dof > usable:
         diagnostics["seconds"] = elapsed()
         return rejected(
             data,
@@ -228,7 +238,7 @@ def identify_pre(
     }
     if chain.pareto_k is not None:
         diagnostics["pareto_k"] = chain.pareto_k
-    if chain.ending is not Ending.STEPS_DONE:
+    if chain.ending is not Termination.STEPS_DONE:
         reasons.append(Reason.SAMPLER_DIAGNOSTICS)
     implausible = _implausible_elements(data.bridge, problem, chain)
     if implausible:
@@ -237,7 +247,7 @@ def identify_pre(
     values = _values(data, problem, chain, settings, keep)
     diagnostics["seconds"] = elapsed()
     once = tuple(dict.fromkeys(reasons))
-    return results.Crossing(
+    return results.CrossingResult(
         **header(data, settings, passing),
         verdict="suspect" if once else "good",
         reasons=once,
@@ -249,18 +259,30 @@ def identify_pre(
     )
 
 
-def _implausible_elements(bridge: Bridge, problem: posterior.Problem, chain: Sampled) -> str:
+def _diagnostics_of_search(found: Optimum) -> dict[str, float]:
+    shift_m = found.state.y[posterior.layout(found.problem).offset]
+    return {
+        "iterations": float(found.evaluations),
+        "starts": float(found.starts),
+        "position_shift_m": float(shift_m),
+        **dict(zip(results.HUM, lines_hz(found.problem), strict=False)),
+    }
+
+
+def _implausible_elements(
+    bridge: Bridge, problem: posterior.PosteriorProblem, chain: PosteriorDraws
+) -> str:
     """Return the names of the elements that are stiffer than damage of the others explains."""
     flat = chain.draws.reshape(-1, chain.draws.shape[2])
-    rigidity = posterior.values_of(problem, flat).theta[:, unknowns.EI_1 :]
+    rigidity = posterior.values_of(problem, flat).theta[:, parameters.EI_1 :]
     found = stiffer_elements(rigidity / np.array(bridge.nominal_flexural_rigidity_nm2))
     return ", ".join(f"EI_{e + 1}" for e in found)
 
 
 def _values(
     data: CrossingData,
-    problem: posterior.Problem,
-    chain: Sampled,
+    problem: posterior.PosteriorProblem,
+    chain: PosteriorDraws,
     settings: IdentificationSettings,
     keep: Keep,
 ) -> dict[str, Any]:
@@ -272,14 +294,15 @@ def _values(
     # its error. That of the common gain is among the unknowns.
     mass_spread = data.vehicle.spread("total_mass_kg")
     scale = np.exp(mass_spread * rng.standard_normal(flat.shape[0]))
-    names = unknowns.names(data.bridge.elements)
-    theta = at.theta * scale[:, None] ** unknowns.mass_powers(data.bridge.elements)
+    names = parameters.names(data.bridge.elements, first_axle(data.vehicle))
+    theta = at.theta * scale[:, None] ** parameters.mass_powers(data.bridge.elements)
     kept = np.flatnonzero(problem.priors.estimated)
     values = {
-        names[i]: _parameter(unknowns.unit(names[i]), theta[:, i], _prior(problem, int(i)))
+        names[i]: _parameter(parameters.unit(names[i]), theta[:, i], _prior(problem, int(i)))
         for i in kept
     }
-    masses = body_masses(at.theta, data.vehicle.total_mass_kg, data.vehicle.wheelbase_m)
+    behind_kg = data.vehicle.total_mass_kg - problem.crossing.lead.unsprung_mass_kg
+    masses = body_masses(at.theta, behind_kg, data.vehicle.wheelbase_m)
     for k, name in enumerate(("m_s", "m_s1", "m_s2")):
         values[name] = _parameter("kg", masses[:, k] * scale, None)
     covariance = np.cov(theta[:, kept].T)
@@ -318,7 +341,7 @@ def _parameter(unit: str, draws: Floats, prior: results.Prior | None) -> results
     )
 
 
-def _prior(problem: posterior.Problem, i: int) -> results.Prior:
+def _prior(problem: posterior.PosteriorProblem, i: int) -> results.Prior:
     priors = problem.priors
     if priors.half_normal[i]:
         return results.Prior(
@@ -335,13 +358,16 @@ def _chosen(count: int, wanted: int, rng: np.random.Generator) -> NDArray[np.int
 
 def _derived(
     data: CrossingData,
-    problem: posterior.Problem,
+    problem: posterior.PosteriorProblem,
     theta: Floats,
     scaled: Floats,
     flat: Floats,
     rng: np.random.Generator,
 ) -> results.Derived:
-    """What follows from draws of truck and bridge; `scaled` (k, p) has the total mass's error."""
+    """Return the quantities derived from draws of truck and bridge, `theta` (k, p).
+
+    `scaled` (k, p) includes the error of the total mass.
+    """
     some = _chosen(theta.shape[0], _FREQUENCY_DRAWS, rng)
     frequencies = first_frequencies_hz(problem.crossing.basis, theta[some])
     few = _chosen(flat.shape[0], _DEFLECTION_DRAWS, rng)
@@ -349,10 +375,10 @@ def _derived(
     return results.Derived(
         f1_hz=_parameter("Hz", frequencies, None),
         max_deflection_m=_parameter("m", deflections, None),
-        probability_sprung=_probability_of(theta, unknowns.K_ROT),
-        probability_giving=_probability_of(theta, unknowns.F),
-        probability_torsion=float((theta[:, unknowns.TORSION] > 0.0).mean()),
-        springs_believed=posterior.belief_in_springs(problem, flat.mean(axis=0)),
+        probability_sprung=_probability_of(theta, parameters.K_ROT),
+        probability_giving=_probability_of(theta, parameters.F),
+        probability_torsion=float((theta[:, parameters.TORSION] > 0.0).mean()),
+        springs_believed=posterior.suspension_weight(problem, flat.mean(axis=0)),
         ei_level=_parameter("1", _level(data.bridge, scaled, 0.0, 1.0), None),
         ei_thirds=results.Thirds(
             **{
@@ -364,42 +390,45 @@ def _derived(
 
 
 def _level(bridge: Bridge, theta: Floats, begin: float, end: float) -> Floats:
-    """Geometric mean of EI over nominal, by length, between two parts of the bridge: (k,)."""
+    """Return the geometric mean (k,) of EI over nominal, weighted by length, between two places.
+
+    `begin` and `end` are fractions of the span.
+    """
     share = part_of_elements(np.array(bridge.lengths_m), begin, end)
-    ratio = theta[:, unknowns.EI_1 :] / np.array(bridge.nominal_flexural_rigidity_nm2)
+    ratio = theta[:, parameters.EI_1 :] / np.array(bridge.nominal_flexural_rigidity_nm2)
     return np.asarray(np.exp(np.log(ratio) @ share))
 
 
 def _probability_of(theta: Floats, place: int) -> results.AtEnds:
-    """How often a pair of unknowns, one for each end, is there at all in the draws (k, p)."""
+    """Return the share of draws (k, p) in which each of a pair of unknowns is not zero."""
     start, end = (theta[:, place : place + 2] > 0.0).mean(axis=0)
     return results.AtEnds(start=float(start), end=float(end))
 
 
 def _road(
-    data: CrossingData, problem: posterior.Problem, flat: Floats, rng: np.random.Generator
-) -> results.Road:
-    """The profile at the posterior's mean point, and its spread over some draws.
+    data: CrossingData, problem: posterior.PosteriorProblem, flat: Floats, rng: np.random.Generator
+) -> results.RoadResult:
+    """Return the profile at the posterior's mean point, and its spread over some draws.
 
-    Both wheels feel the same road with errors of their own. The posterior knows of their difference
-    alone; their mean's is drawn from the sensors' noise.
+    Both wheels follow the same profile with separate errors. The posterior constrains only their
+    difference; the error of their mean is drawn from the sensors' noise.
     """
     few = _chosen(flat.shape[0], _ROAD_DRAWS, rng)
     centre = flat.mean(axis=0)
-    x, front, rear = posterior.roads(problem, centre)
+    x, front, rear = posterior.wheel_profiles(problem, centre)
     road = road_result(data, x, front, rear)
     grid = np.array(road.x_m)
     noise = posterior.road_noise(problem, centre, few.size, rng)
     profiles = []
     for i, error in zip(few, noise, strict=True):
-        own_x, own_front, own_rear = posterior.roads(problem, flat[i])
+        own_x, own_front, own_rear = posterior.wheel_profiles(problem, flat[i])
         mean = np.interp(grid, *_rising(own_x, 0.5 * (own_front + own_rear)))
         error = np.interp(grid, *_rising(x, error))
         profiles.append(detrended(grid, mean + error))
     spread = np.std(profiles, axis=0)
     mismatch = None
     if problem.mismatch.level_m3.any():
-        level, corner = as_two_numbers(problem.mismatch)
+        level, corner = two_parameter_spectrum(problem.mismatch)
         mismatch = results.RoadMismatch(A_m3=level, n_0_per_m=corner)
     return road.model_copy(update={"std_m": tuple(spread.tolist()), "mismatch": mismatch})
 

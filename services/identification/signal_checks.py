@@ -1,7 +1,7 @@
-"""Whether signals can be trusted before any fit, by the physics that any truck obeys.
+"""Checks of signals before any fit, by physics that holds for every truck.
 
-What is measured is in `pre_core.diagnostics`; here are the thresholds, each with what it was
-measured to be on sound crossings and on broken ones (docs/verdicts.md).
+`pre_core.diagnostics` computes the measures; here are the thresholds, each with its values on
+fault-free and on faulty crossings (studies/faults.md).
 """
 
 from collections.abc import Callable, Mapping
@@ -15,31 +15,42 @@ from pre_core.diagnostics import frozen, quality
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
 from schemas.site import Vehicle
-from services.identification import placed
+from services.finding import placed
 
 Floats = NDArray[np.float64]
 
-# Sound: 300 drawn crossings, none accused (docs/verdicts.md).
+# Fault-free: 300 simulated crossings, no false accusation (studies/faults.md).
 LONGEST_HOLD_S = 0.2
-"""Noise and motion change every sample; a coarse converter (12 bits) holds one for 0.03 s."""
+"""Longest constant signal in s; a coarse converter (12 bits) holds a value for 0.03 s."""
 ALIKE = 1e-3
-"""Two channels that differ by less than this part of what they show are one."""
+"""Relative difference below which two channels are identical."""
 _PILE_UP = 8.0
 _PILE_VISITS = 3
-"""Sound: at most 5.8 over three visits; a range of half of what is needed: 12 to 67."""
+"""Fault-free: at most 5.8 over three visits; a range of half the required one: 12 to 67."""
 _REPEATS = 4
-"""An extreme that comes exactly so often is the end of a range: noise repeats none."""
+"""Number of exact repetitions of an extreme at the end of a range: noise repeats none."""
 SPIKE_HEIGHT = 20.0
-"""Over the typical distance from the neighbours. Sound: at most 7."""
+"""Height over the typical distance from the neighbours; fault-free at most 7."""
 LARGEST_MEAN_M_PER_S2 = 0.3 * STANDARD_GRAVITY_M_PER_S2
-"""No truck falls for seconds: a mean of this size is gravity or a broken sensor."""
-UNEXPLAINED = 0.3
+"""Mean that indicates gravity or a broken sensor: no truck falls for seconds."""
+MAX_UNEXPLAINED = 0.3
 _BETTER = 0.5
-"""Part of the body's motion that the body equations leave over. Sound: at most 0.10; two channels
-exchanged or one inverted: at least 0.36, and then at most 0.10 once they are put right."""
+"""Share of the body's motion that the body equations leave unexplained.
+
+Fault-free: at most 0.10; two channels exchanged or one inverted: at least 0.36, and then at most
+0.10 after correction.
+"""
 _LEAD = 0.6
-"""Correlation of what both axles feel at one place. Sound: 0.71 to 0.99 (with the axles exchanged:
--0.72 to 0.49)."""
+"""Correlation of the axles' motions at one chainage.
+
+Fault-free: 0.71 to 0.99 (with the axles exchanged: -0.72 to 0.49).
+"""
+
+
+_FOLLOWS = 0.25
+"""Correlation of a tandem's axles, and of the body in front and behind, at one place. Sound: 0.34
+to 0.77; axles exchanged -0.30 to 0.15, the front reading inverted -0.68 to -0.34. What the bogie's
+equation leaves over: sound 0.04 to 0.16, another reading inverted or exchanged 0.37 to 0.98."""
 
 
 def reasons_before_fit(
@@ -50,10 +61,10 @@ def reasons_before_fit(
     direction: int,
     spreads: placed.Spreads = placed.USUAL_SPREADS,
 ) -> Mapping[Reason, str]:
-    """What the accelerations (m, n) alone say against the crossing, and of which channels.
+    """Return reasons in the accelerations (m, n) alone, with their channels.
 
-    They are those of the vehicle's channels in their order. All of it forbids a fit. `motion` is
-    where the front axle was at every sample.
+    The channels are the vehicle's in their order. Each reason forbids a fit. `motion` is the
+    position of the front axle at every sample.
     """
     broken = _broken(vehicle.channels, acceleration, step_s)
     if broken:
@@ -62,22 +73,24 @@ def reasons_before_fit(
     if disagreeing:
         return disagreeing
     readings = placed.middle_of(vehicle, acceleration)
+    if vehicle.tandem is not None:
+        return of_tandem(vehicle, readings, step_s, motion, direction)
     one = of_one_sensor(vehicle, acceleration, readings, step_s)
     if one:
         return one
     reasons = order_and_signs(vehicle, readings, step_s, motion, direction)
     if not reasons:
         return {}
-    found = quality.pairing(readings, step_s, *body_constants(vehicle))
+    found = quality.assign_channels(readings, step_s, *body_constants(vehicle))
     named = {Reason.CHANNEL_INVERTED: _inverted, Reason.CHANNEL_SWAPPED: _exchanged}
     names = placed.middle_names(vehicle)
     return {reason: named[reason](found, names) for reason in reasons}
 
 
 def unmeasured(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> dict[Reason, str]:
-    """Return the reason, and the channels (m, n), of stretches that no sensor measured.
+    """Return the reason, and the channels (m, n), of segments that no sensor measured.
 
-    Anywhere in the record, for all of it is fitted.
+    The whole record is checked, as all of it is fitted.
     """
     of_each = {
         Reason.CHANNEL_STUCK: frozen.longest_hold_s,
@@ -98,15 +111,15 @@ def unmeasured(channels: tuple[str, ...], acceleration: Floats, step_s: float) -
 def of_one_sensor(
     vehicle: Vehicle, acceleration: Floats, readings: Floats, step_s: float
 ) -> dict[Reason, str]:
-    """Whether one sensor turned round, or two exchanged, explain a body that does not follow.
+    """Return the reason and the sensors whose inversion or exchange explains an inconsistent body.
 
-    Where several sensors make a middle reading: one inverted among them makes it a roll.
+    Where several sensors form a middle reading, one inverted among them makes it a roll.
     """
     if not vehicle.sensors:
         return {}
     constants = body_constants(vehicle)
     recorded = max(quality.unexplained_by_axle(readings, step_s, *constants))
-    if recorded <= UNEXPLAINED:
+    if recorded <= MAX_UNEXPLAINED:
         return {}
     best, found = _BETTER * recorded, dict[Reason, str]()
     names = vehicle.channels
@@ -126,7 +139,7 @@ def of_one_sensor(
 
 
 def _broken(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> dict[Reason, str]:
-    """The most plain of what is wrong with single channels: it makes the others show as well."""
+    """Return the most evident fault of single channels, which also causes the others."""
 
     def those(is_wrong: Callable[[Floats], bool]) -> str:
         each = zip(channels, acceleration, strict=True)
@@ -150,7 +163,7 @@ def _broken(channels: tuple[str, ...], acceleration: Floats, step_s: float) -> d
 
 
 def _alike(channels: tuple[str, ...], acceleration: Floats) -> str:
-    """Names of channels (m, n) that show the same."""
+    """Return the names of channels (m, n) with identical signals."""
     pairs = combinations(range(len(channels)), 2)
     return ", ".join(
         f"{channels[i]} and {channels[k]}"
@@ -159,21 +172,21 @@ def _alike(channels: tuple[str, ...], acceleration: Floats) -> str:
     )
 
 
-def _inverted(found: quality.Pairing, names: tuple[str, ...]) -> str:
-    """Names of channels of which one is inverted."""
-    ends = [end for end, upright in enumerate(found.upright) if upright > UNEXPLAINED]
+def _inverted(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
+    """Return the names of channels of which one is inverted."""
+    ends = [end for end, upright in enumerate(found.upright) if upright > MAX_UNEXPLAINED]
     if not ends:
         return "both of one axle"
     return " and ".join(f"{names[end]} or {names[2 + end]}" for end in ends)
 
 
-def _exchanged(found: quality.Pairing, names: tuple[str, ...]) -> str:
-    """Names of channels that are exchanged; with "or" where the body's equations know no better.
+def _exchanged(found: quality.ChannelAssignment, names: tuple[str, ...]) -> str:
+    """Return the names of exchanged channels; with "or" where the equations are ambiguous.
 
-    To them front and rear are alike: if both pairs change places as well, they hold as before. So
-    of both ways the one that moves fewer channels is told.
+    Front and rear are alike to them: with both pairs exchanged as well they hold as before. So of
+    both corrections the one that moves fewer channels is named.
     """
-    if found.recorded <= UNEXPLAINED:
+    if found.recorded <= MAX_UNEXPLAINED:
         return "front and rear, of body and axle alike"
     order = found.best_order
     ways = [order, (order[1], order[0], order[3], order[2])]
@@ -184,15 +197,63 @@ def _exchanged(found: quality.Pairing, names: tuple[str, ...]) -> str:
     )
 
 
+def of_tandem(
+    vehicle: Vehicle, readings: Floats, step_s: float, motion: Motion, direction: int
+) -> dict[Reason, str]:
+    """Return the reason, and the channels, if readings (4, n) of a tandem are mixed up or inverted.
+
+    The body above the tandem follows from the mean of both axles; the second axle and the body
+    behind meet the road after the first axle and the body in front.
+    """
+    tandem = vehicle.tandem
+    assert tandem is not None  # noqa: S101 - the caller saw to it
+    names, constants = placed.middle_names(vehicle), body_constants(vehicle)
+
+    def unexplained(of: Floats) -> float:
+        shares = (tandem.share, 1.0 - tandem.share)
+        axles = shares[0] * of[2] + shares[1] * of[3]
+        return quality.unexplained_by_axle(
+            np.stack([of[0], of[1], axles, axles]), step_s, *constants
+        )[1]
+
+    recorded = unexplained(readings)
+    if recorded > MAX_UNEXPLAINED:
+        best, found = _BETTER * recorded, dict[Reason, str]()
+        for k in (1, 2, 3):
+            other = readings.copy()
+            other[k] *= -1.0
+            if unexplained(other) < best:
+                best, found = unexplained(other), {Reason.CHANNEL_INVERTED: names[k]}
+        for i, k in combinations(range(4), 2):
+            other = readings.copy()
+            other[[i, k]] = readings[[k, i]]
+            if unexplained(other) < best:
+                pair = f"{names[i]} and {names[k]}"
+                best, found = unexplained(other), {Reason.CHANNEL_SWAPPED: pair}
+        return found
+    travelled = direction * (motion.position_m - motion.position_m[0])
+    if np.any(np.diff(travelled) <= 0.0):
+        return {}
+    right, exchanged = quality.axle_correlation(
+        readings[2], readings[3], step_s, travelled, tandem.gap_m
+    )
+    if exchanged > _FOLLOWS and right < 0.5 * exchanged:
+        return {Reason.CHANNEL_SWAPPED: f"{names[2]} and {names[3]}"}
+    follows = quality.axle_correlation(
+        readings[0], readings[1], step_s, travelled, vehicle.wheelbase_m
+    )[0]
+    return {Reason.CHANNEL_INVERTED: names[0]} if follows < -_FOLLOWS else {}
+
+
 def is_saturated(values: Floats) -> bool:
-    """Whether a signal (n,) stays where a sensor's range ends."""
+    """Return whether a signal (n,) stays at the end of a sensor's range."""
     rail = quality.pile_up(values)
     piled_up = rail.ratio > _PILE_UP and rail.visits >= _PILE_VISITS
     return piled_up or quality.repeated_extremes(values) >= _REPEATS
 
 
 def body_constants(vehicle: Vehicle) -> tuple[Floats, Floats]:
-    """Springs and dampers over the masses that they carry, front and rear: (2,) each, nominally."""
+    """Return nominal springs and dampers over their masses, front and rear: (2,) each."""
     d_1, wheelbase = vehicle.front_axle_to_cg_m, vehicle.wheelbase_m
     body = vehicle.sprung_mass_kg * np.array([wheelbase - d_1, d_1]) / wheelbase
     return (
@@ -204,23 +265,23 @@ def body_constants(vehicle: Vehicle) -> tuple[Floats, Floats]:
 def order_and_signs(
     vehicle: Vehicle, acceleration: Floats, step_s: float, motion: Motion, direction: int
 ) -> list[Reason]:
-    """Whether channels (4, n) are exchanged or inverted; `motion` is the front axle's."""
-    found = quality.pairing(acceleration, step_s, *body_constants(vehicle))
-    if found.recorded > UNEXPLAINED:
+    """Return the reason if channels (4, n) are exchanged or inverted; else an empty list."""
+    found = quality.assign_channels(acceleration, step_s, *body_constants(vehicle))
+    if found.recorded > MAX_UNEXPLAINED:
         turned = [
             reversed_ < _BETTER * upright
             for upright, reversed_ in zip(found.upright, found.reversed_, strict=True)
-            if upright > UNEXPLAINED
+            if upright > MAX_UNEXPLAINED
         ]
         if all(turned) and min(found.reversed_) < found.best:
             return [Reason.CHANNEL_INVERTED]
         if found.best < _BETTER * found.recorded:
             return [Reason.CHANNEL_SWAPPED]
-        return []  # something else is wrong, which the fit will show
+        return []  # another fault, which the fit will show
     travelled = direction * (motion.position_m - motion.position_m[0])
     if np.any(np.diff(travelled) <= 0.0):
         return []
-    right, exchanged = quality.lead(
+    right, exchanged = quality.axle_correlation(
         acceleration[2], acceleration[3], step_s, travelled, vehicle.wheelbase_m
     )
     if right < -_LEAD:

@@ -1,1 +1,1 @@
-"""Is truck, site file and recording fit for a survey? Looked at before it is too late."""
+"""Checks of truck, site file and recordings before a survey."""

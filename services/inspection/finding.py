@@ -1,30 +1,34 @@
-"""One thing that was looked at, and what is to be done about it."""
+"""Findings of a check, with advice."""
 
 from enum import Enum
 from typing import NamedTuple
 
 
-class State(Enum):
-    """How it is with it."""
+class CheckStatus(Enum):
+    """Status of a checked item."""
 
     OK = "ok"
     WRONG = "wrong"
     OPEN = "open"
-    """What was given does not tell."""
+    """Status of an item that the input does not determine."""
 
 
-class Finding(NamedTuple):
+class CheckFinding(NamedTuple):
     """A line of `driveby check`."""
 
     name: str
-    """In snake_case, for programs."""
-    state: State
+    """Name in snake_case, for programs."""
+    state: CheckStatus
     text: str
-    """What was measured, against what is declared or needed."""
+    """Measured value, against the declared or required one."""
     advice: str = ""
-    """What to do; empty where it is in order."""
+    """Advice; empty where the item is in order."""
 
 
-def judged(name: str, text: str, advice: str, *, is_wrong: bool) -> Finding:
-    """Wrong, with its advice, or in order."""
-    return Finding(name, State.WRONG, text, advice) if is_wrong else Finding(name, State.OK, text)
+def check_finding(name: str, text: str, advice: str, *, is_wrong: bool) -> CheckFinding:
+    """Return a finding that is wrong, with its advice, or in order."""
+    return (
+        CheckFinding(name, CheckStatus.WRONG, text, advice)
+        if is_wrong
+        else CheckFinding(name, CheckStatus.OK, text)
+    )

@@ -1,4 +1,4 @@
-"""Everything that is looked at before a survey: the site file, and what a truck has recorded."""
+"""Checks before a survey: of the site file, and of a truck's recordings."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -7,28 +7,30 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pre_core.diagnostics.noise_floor import NoiseSegment
 from pre_core.physics.simulate import Motion
 from schemas.site import Site, Vehicle
 from schemas.site_file import load_site, parse_site
 from services.common.errors import InputError
-from services.common.progress import Offset, unwatched
-from services.identification.placed import densities_ug_per_rthz, middle_of
-from services.identification.streams import Samples
+from services.common.progress import Offset, no_progress
+from services.finding.placed import densities_ug_per_rthz, middle_of
+from services.finding.streams import Samples
 from services.inspection.channels import (
     agreement,
-    alive,
+    check_assignment,
+    check_presence,
+    check_signals,
     gaps,
-    in_place,
     masses,
-    present,
     rates,
+    tandem_in_place,
     wheelbase,
 )
-from services.inspection.finding import Finding, State
-from services.inspection.noise import Still, noise_of
-from services.inspection.place import place_of
-from services.inspection.receiver import clocks, receiver_of, standing
-from services.inspection.recorded import Recorded, recorded_runs
+from services.inspection.finding import CheckFinding, CheckStatus
+from services.inspection.noise import noise_of
+from services.inspection.place import bridge_findings
+from services.inspection.receiver import clocks, longest_standstill, receiver_of
+from services.inspection.recorded import InspectedRun, recorded_runs
 from services.inspection.site import findings_of_site
 from services.recordings.recording import read_info
 
@@ -37,32 +39,32 @@ Floats = NDArray[np.float64]
 _SHORTEST_STANDSTILL_S: Final = 10.0
 _SHORTEST_DRIVE_S: Final = 6.0
 _DRIVE_S: Final = 12.0
-"""Signals are judged over about as long as a crossing takes, where thresholds were found."""
+"""Duration in s over which signals are judged, that of a crossing, as for the thresholds."""
 _DRIVING_M_PER_S: Final = 3.0
 _SLOW: Final = 0.9
-_SETTLE_S: Final = 1.0
-"""After stopping a body swings on its springs."""
+_DECAY_S: Final = 1.0
+"""Time in s for which a body swings on its springs after a stop."""
 
 
-class Report(NamedTuple):
-    """What was found of one source: a site file, or a run of a recording."""
+class CheckReport(NamedTuple):
+    """Findings on one source: a site file, or a run of a recording."""
 
     source: str
-    findings: tuple[Finding, ...]
+    findings: tuple[CheckFinding, ...]
     is_run: bool = True
 
     @property
     def is_wrong(self) -> bool:
-        """Whether anything is."""
+        """Return whether any finding is wrong."""
         return any(_is_wrong(finding) for finding in self.findings)
 
 
 def inspect(
-    paths: list[Path], next_file: Callable[[], Offset] = lambda: unwatched
-) -> Iterator[Report]:
-    """Check a site file and recordings; InputError if one cannot be read, or none names a site.
+    paths: list[Path], next_file: Callable[[], Offset] = lambda: no_progress
+) -> Iterator[CheckReport]:
+    """Check a site file and recordings; InputError for an unreadable one, or without a site.
 
-    `next_file` is called before each recording, for who is told how far that has been read.
+    `next_file` is called before each recording and returns its callback for progress.
     """
     sites = [path for path in paths if path.suffix == ".toml"]
     recordings = [path for path in paths if path.suffix != ".toml"]
@@ -76,16 +78,18 @@ def inspect(
         if given is None:
             yield _of_site(name, site)
         for number, run in enumerate(recorded_runs(path, site, name, next_file())):
-            yield Report(f"{path}, run {number + 1} of {run.vehicle}", tuple(of_run(run, site)))
+            yield CheckReport(
+                f"{path}, run {number + 1} of {run.vehicle}", tuple(findings_of_run(run, site))
+            )
 
 
 def site_beside(path: Path) -> tuple[Site, str]:
-    """The site file in a recording or a folder, and its name; InputError if there is none."""
+    """Return the site file of a recording or folder, and its name; InputError without one."""
     if path.is_dir():
-        beside = path / "site.toml"
-        if not beside.is_file():
+        site_path = path / "site.toml"
+        if not site_path.is_file():
             raise InputError(f"{path}: holds no site.toml, give a site file before it")
-        return load_site(beside), str(beside)
+        return load_site(site_path), str(site_path)
     text = read_info(path, lambda message: None).site_toml
     if text is None:
         raise InputError(f"{path}: holds no site file, give one before it")
@@ -93,24 +97,24 @@ def site_beside(path: Path) -> tuple[Site, str]:
     return parse_site(text, name), name
 
 
-def _of_site(name: str, site: Site) -> Report:
+def _of_site(name: str, site: Site) -> CheckReport:
     found = [finding for vehicle in site.vehicles for finding in findings_of_site(site, vehicle)]
-    return Report(name, tuple(dict.fromkeys(found)), is_run=False)
+    return CheckReport(name, tuple(dict.fromkeys(found)), is_run=False)
 
 
-def of_run(run: Recorded, site: Site) -> Iterator[Finding]:
-    """Everything that one run says."""
+def findings_of_run(run: InspectedRun, site: Site) -> Iterator[CheckFinding]:
+    """Yield all findings on one run."""
     known = {vehicle.id: vehicle for vehicle in site.vehicles}
     if run.vehicle not in known:
-        yield Finding(
+        yield CheckFinding(
             "vehicle",
-            State.WRONG,
+            CheckStatus.WRONG,
             f"{run.vehicle} is not in the site file",
             f"it knows {', '.join(known)}: name the truck as there",
         )
         return
     vehicle = known[run.vehicle]
-    yield from present(run, vehicle)
+    yield from check_presence(run, vehicle)
     run = run.of_channels(vehicle.channels)
     if run.samples is not None and run.samples.channels:
         yield from rates(run, site.sensor, vehicle)
@@ -120,21 +124,23 @@ def of_run(run: Recorded, site: Site) -> Iterator[Finding]:
     yield from clocks(run)
     if run.fixes.time_s.size > 1:
         for bridge in site.bridges:
-            yield from place_of(run, bridge, vehicle, site.receiver)
+            yield from bridge_findings(run, bridge, vehicle, site.receiver)
     if run.is_cut:
-        yield Finding(
-            "length", State.OPEN, "accelerations of the first half hour were looked at", ""
+        yield CheckFinding(
+            "length", CheckStatus.OPEN, "only accelerations of the first half hour were checked", ""
         )
 
 
-def _of_signals(run: Recorded, site: Site, vehicle: Vehicle, samples: Samples) -> Iterator[Finding]:
+def _of_signals(
+    run: InspectedRun, site: Site, vehicle: Vehicle, samples: Samples
+) -> Iterator[CheckFinding]:
     stood, drove = _standstill(run, samples), _drive(run, samples)
     names = tuple(name for name in vehicle.channels if name in samples.channels)
     part = np.stack([samples.channels[name][drove or stood or slice(0, None)] for name in names])
     part = part[:, np.isfinite(part).all(axis=0)]
     broken: set[str] = set()
     if part.shape[1] > 2:
-        for finding in alive(names, part, 1.0 / samples.rate_hz):
+        for finding in check_signals(names, part, 1.0 / samples.rate_hz):
             if finding.name == "channels_alike":
                 broken |= set(names)
             elif _is_wrong(finding):
@@ -145,9 +151,9 @@ def _of_signals(run: Recorded, site: Site, vehicle: Vehicle, samples: Samples) -
         if name in broken:
             continue
         quiet = samples.channels[name][stood or drove or slice(0, None)]
-        # Of a channel that was interpolated nothing is left where its noise is.
+        # Interpolation removes the band in which the noise is measured.
         is_slow = run.rates_hz.get(name, samples.rate_hz) < _SLOW * samples.rate_hz
-        still = Still(quiet, samples.rate_hz, stood is not None)
+        still = NoiseSegment(quiet, samples.rate_hz, stood is not None)
         yield noise_of(name, None if is_slow else still, declared[name])
     if len(names) < len(vehicle.channels) or broken:
         return
@@ -157,9 +163,9 @@ def _of_signals(run: Recorded, site: Site, vehicle: Vehicle, samples: Samples) -
         if _is_wrong(agreed):
             return
     if drove is None:
-        yield Finding(
+        yield CheckFinding(
             "channels_in_place",
-            State.OPEN,
+            CheckStatus.OPEN,
             f"order and signs of the channels: no {_SHORTEST_DRIVE_S:g} s of driving without gaps",
             "check again with ten seconds of driving",
         )
@@ -167,38 +173,41 @@ def _of_signals(run: Recorded, site: Site, vehicle: Vehicle, samples: Samples) -
         yield from _of_motion(run, vehicle, samples, drove, middle_of(vehicle, part))
 
 
-def _is_wrong(finding: Finding) -> bool:
-    return finding.state is State.WRONG
+def _is_wrong(finding: CheckFinding) -> bool:
+    return finding.state is CheckStatus.WRONG
 
 
 def _of_motion(
-    run: Recorded, vehicle: Vehicle, samples: Samples, drove: slice, part: Floats
-) -> Iterator[Finding]:
-    """What a drive without gaps says of order, signs, wheelbase and masses."""
+    run: InspectedRun, vehicle: Vehicle, samples: Samples, drove: slice, part: Floats
+) -> Iterator[CheckFinding]:
+    """Yield findings of a drive without gaps on order, signs, wheelbase and masses."""
     step_s = 1.0 / samples.rate_hz
     time_s = samples.start_s + step_s * np.arange(drove.start, drove.stop)
     speed = np.interp(time_s, run.fixes.time_s, run.fixes.speed_m_per_s)
     travelled = np.concatenate([[0.0], np.cumsum(0.5 * step_s * (speed[1:] + speed[:-1]))])
     motion = Motion(travelled, speed, np.gradient(speed, step_s))
-    place = in_place(vehicle, part, step_s, motion)
+    if vehicle.tandem is not None:
+        yield tandem_in_place(vehicle, part, step_s, motion)
+        return
+    place = check_assignment(vehicle, part, step_s, motion)
     yield place
-    if place.state is State.OK:
+    if place.state is CheckStatus.OK:
         yield wheelbase(vehicle, part, step_s, travelled)
         yield from masses(vehicle, part, step_s)
 
 
-def _standstill(run: Recorded, samples: Samples) -> slice | None:
-    """Samples of the longest standstill."""
+def _standstill(run: InspectedRun, samples: Samples) -> slice | None:
+    """Return the samples of the longest standstill."""
     if run.fixes.time_s.size < 2:
         return None
-    stood = standing(run)
+    stood = longest_standstill(run)
     if stood is None or stood[1] - stood[0] < _SHORTEST_STANDSTILL_S:
         return None
-    return _between(samples, stood[0] + _SETTLE_S, stood[1] - _SETTLE_S)
+    return _between(samples, stood[0] + _DECAY_S, stood[1] - _DECAY_S)
 
 
-def _drive(run: Recorded, samples: Samples) -> slice | None:
-    """Samples of the stretch, as long as a crossing, that is driven most steadily."""
+def _drive(run: InspectedRun, samples: Samples) -> slice | None:
+    """Return the samples of the steadiest segment that is as long as a crossing."""
     time_s, speed = run.fixes.time_s, run.fixes.speed_m_per_s
     holes = _holes(samples)
     best: tuple[float, slice] | None = None

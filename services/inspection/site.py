@@ -1,49 +1,66 @@
-"""What a site file alone says for and against a survey with this truck and these sensors."""
+"""Checks of a site file alone, for a survey with its truck and sensors."""
 
 from collections.abc import Iterator
 from typing import Final
 
 from schemas.site import Bridge, Site, Vehicle
-from services.identification.checks import ALIKE_LOADS, axle_loads_kg
+from schemas.site_usual import implied_by
+from schemas.site_vehicle import axle_loads_kg
+from services.finding.placed import densities_ug_per_rthz, rates_hz, sensors_in_words
+from services.identification.checks import ALIKE_LOADS
 from services.identification.identify import SLOWEST_M_PER_S
-from services.identification.placed import densities_ug_per_rthz, rates_hz, sensors_in_words
-from services.inspection.finding import Finding, State, judged
+from services.inspection.finding import CheckFinding, CheckStatus, check_finding
 
 SLOWEST_RATE_HZ: Final = 100.0
-"""The method's rows need 25 Hz: sensors of fewer samples a second were never tried."""
+"""Lowest rate in Hz: the residuals need 25 Hz, and slower sensors were never tried."""
 _LARGEST_MASS_SPREAD: Final = 0.03
-"""A weighbridge is right to 1 %; a guess of the load is worth 10 %."""
+"""Largest relative spread: a weighbridge has 1 %, an estimated load 10 %."""
 _AXLE_LOADS_KG: Final = (500.0, 20_000.0)
-"""Of an axle: less is no truck, more no road allows."""
+"""Plausible loads of an axle in kg: less is no truck, more is not permitted on a road."""
 _WHEELBASE_M: Final = (1.5, 12.0)
 
 
-def findings_of_site(site: Site, vehicle: Vehicle) -> Iterator[Finding]:
-    """Loads, masses, tyres, sampling, and the bridges' places."""
+def findings_of_site(site: Site, vehicle: Vehicle) -> Iterator[CheckFinding]:
+    """Yield findings on loads, masses, tyres, sampling, and the bridges' coordinates."""
     yield from findings_of_truck(vehicle)
     yield from sensors_of(site, vehicle)
     yield sampling(tuple(rates_hz(site.sensor, vehicle).values()))
     yield noise_declared(site, vehicle)
     for bridge in site.bridges:
         yield from findings_of_bridge(bridge)
+    yield from findings_of_implied(site, vehicle)
 
 
-def findings_of_truck(vehicle: Vehicle) -> Iterator[Finding]:
-    """What the site file says of one truck."""
+def findings_of_implied(site: Site, vehicle: Vehicle) -> Iterator[CheckFinding]:
+    """Yield frequencies, damping and deflections; open where unusual, wrong where far from that."""
+    for one in implied_by(site, vehicle):
+        state = (
+            CheckStatus.WRONG
+            if one.is_far
+            else CheckStatus.OPEN
+            if one.is_unusual
+            else CheckStatus.OK
+        )
+        advice = one.advice if one.is_unusual else ""
+        yield CheckFinding(one.name, state, one.text, advice)
+
+
+def findings_of_truck(vehicle: Vehicle) -> Iterator[CheckFinding]:
+    """Yield findings on one truck of the site file."""
     front, rear = axle_loads_kg(vehicle)
     name = vehicle.id
     share = abs(front - rear) / (front + rear)
-    yield judged(
+    yield check_finding(
         "axle_loads",
         f"{name}: axles carry {front / 1e3:.2f} and {rear / 1e3:.2f} t, "
         f"they differ by {share:.0%} of the total",
-        f"load one axle more: with less than {ALIKE_LOADS:.0%} both press the bridge nearly alike, "
-        "and what the road does can hardly be told from what the bridge does",
+        f"load one axle more: below {ALIKE_LOADS:.0%} both deflect the bridge nearly alike, and "
+        "the profile can hardly be separated from the deflection",
         is_wrong=share < ALIKE_LOADS,
     )
     low, high = _AXLE_LOADS_KG
     is_mass_odd = not low <= min(front, rear) <= max(front, rear) <= high
-    yield judged(
+    yield check_finding(
         "total_mass",
         f"{name}: total mass {vehicle.total_mass_kg / 1e3:.2f} t, known to "
         f"{vehicle.spread('total_mass_kg'):.1%}",
@@ -54,27 +71,27 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[Finding]:
         is_wrong=is_mass_odd or vehicle.spread("total_mass_kg") > _LARGEST_MASS_SPREAD,
     )
     shortest, longest = _WHEELBASE_M
-    yield judged(
+    yield check_finding(
         "wheelbase_declared",
         f"{name}: wheelbase {vehicle.wheelbase_m:g} m",
         f"measure it: trucks have {shortest:g} to {longest:g} m",
         is_wrong=not shortest <= vehicle.wheelbase_m <= longest,
     )
     is_known = vehicle.twin_tyre_distance_m is not None
-    yield Finding(
+    yield CheckFinding(
         "tyres",
-        State.OK if is_known else State.OPEN,
+        CheckStatus.OK if is_known else CheckStatus.OPEN,
         f"{name}: {tyres_in_words(vehicle)}",
         ""
         if is_known
-        else "give twin_tyre_distance_m (0 for single tyres) and tyre_width_m: they decide how "
-        "much of a single element can be told",
+        else "declare twin_tyre_distance_m (0 for single tyres) and tyre_width_m: they determine "
+        "how well a single element can be resolved",
     )
 
     is_measured = vehicle.cg_height_m is not None
-    yield Finding(
+    yield CheckFinding(
         "cg_height",
-        State.OK if is_measured else State.OPEN,
+        CheckStatus.OK if is_measured else CheckStatus.OPEN,
         f"{name}: centre of gravity "
         + (f"{vehicle.cg_height_m:g} m above the road" if is_measured else "of unknown height"),
         "" if is_measured else "give cg_height_m, or do not brake or accelerate on the bridge",
@@ -82,18 +99,18 @@ def findings_of_truck(vehicle: Vehicle) -> Iterator[Finding]:
 
 
 def tyres_in_words(vehicle: Vehicle) -> str:
-    """What the site file says of the tyres, and what is taken for granted."""
+    """Return the tyres of the site file in words, with the assumed ones."""
     distance = vehicle.twin_tyre_distance_m
     if distance is None:
-        return "nothing is known of the tyres, twin ones are assumed behind"
+        return "the tyres are not declared, twin ones are assumed behind"
     kinds = ["twin" if apart > 0.0 else "single" for apart in distance]
     return f"{kinds[0]} tyres in front, {kinds[1]} behind"
 
 
-def sampling(rates_hz: tuple[float, ...]) -> Finding:
-    """Whether the sensors are quick enough."""
+def sampling(rates_hz: tuple[float, ...]) -> CheckFinding:
+    """Check whether the sensors are fast enough."""
     slowest = min(rates_hz)
-    return judged(
+    return check_finding(
         "sampling_rate",
         f"slowest sensor {slowest:g} Hz",
         f"sample at {SLOWEST_RATE_HZ:g} Hz or more, better 500",
@@ -101,18 +118,18 @@ def sampling(rates_hz: tuple[float, ...]) -> Finding:
     )
 
 
-def sensors_of(site: Site, vehicle: Vehicle) -> Iterator[Finding]:
-    """The sensors of a truck that names its own, with their places."""
+def sensors_of(site: Site, vehicle: Vehicle) -> Iterator[CheckFinding]:
+    """Yield the sensors of a truck that names its own, with their positions."""
     for line in sensors_in_words(site.sensor, vehicle):
-        yield Finding("sensor", State.OK, line)
+        yield CheckFinding("sensor", CheckStatus.OK, line)
 
 
-def noise_declared(site: Site, vehicle: Vehicle) -> Finding:
-    """Whether a noise is declared at all."""
+def noise_declared(site: Site, vehicle: Vehicle) -> CheckFinding:
+    """Check whether a noise is declared at all."""
     declared = densities_ug_per_rthz(site.sensor, vehicle)
     densities = declared.values()
     silent = [name for name, density in declared.items() if density == 0.0]
-    return judged(
+    return check_finding(
         "noise_declared",
         f"noise declared {' '.join(f'{density:g}' for density in densities)} µg/√Hz"
         + (f", none for {', '.join(silent)}" if silent else ""),
@@ -121,12 +138,13 @@ def noise_declared(site: Site, vehicle: Vehicle) -> Finding:
     )
 
 
-def findings_of_bridge(bridge: Bridge) -> Iterator[Finding]:
-    """What the site file says of one bridge."""
+def findings_of_bridge(bridge: Bridge) -> Iterator[CheckFinding]:
+    """Yield findings on one bridge of the site file."""
     yield _ends(bridge)
+    yield from _lane(bridge)
     speed = bridge.survey_speed_m_per_s
     if speed is not None:
-        yield judged(
+        yield check_finding(
             "survey_speed",
             f"{bridge.id}: to be crossed at {speed:g} m/s",
             f"below {SLOWEST_M_PER_S:g} m/s a crossing is rejected, drive at 5 m/s or more",
@@ -134,12 +152,37 @@ def findings_of_bridge(bridge: Bridge) -> Iterator[Finding]:
         )
 
 
-def _ends(bridge: Bridge) -> Finding:
-    """Whether the coordinates of the ends are as far apart as the bridge is long."""
+def _ends(bridge: Bridge) -> CheckFinding:
+    """Check whether the distance of the ends' coordinates is the span."""
     apart, span = bridge.ends_distance_m, bridge.span_m
-    return judged(
+    return check_finding(
         "bearings_distance",
         f"{bridge.id}: ends {apart:.2f} m apart by their coordinates, span_m {span:g}",
         "take the coordinates where the bearings are, and measure the span with a tape",
         is_wrong=abs(apart - span) > max(1.0, 0.02 * span),
     )
+
+
+def _lane(bridge: Bridge) -> Iterator[CheckFinding]:
+    """Yield the lane and the torsion of the deck, a line each, where the site file has them."""
+    if bridge.lane_offset_m is not None:
+        side = "left" if bridge.lane_offset_m >= 0.0 else "right"
+        effect = "the deck twists" if bridge.is_lane_off_axis else "not known to be off it"
+        yield CheckFinding(
+            "lane",
+            CheckStatus.OK,
+            f"{bridge.id}: lane {abs(bridge.lane_offset_m):g} ± {bridge.lane_offset_m_spread:g} m "
+            f"{side} of the axis: {effect}",
+        )
+    declared = [
+        f"{what} {value:g}{unit}"
+        for what, value, unit in (
+            ("frequency ratio", bridge.torsional_frequency_ratio, ""),
+            ("radius of gyration", bridge.deck_gyration_m, " m"),
+        )
+        if value is not None
+    ]
+    if declared:
+        yield CheckFinding(
+            "torsion", CheckStatus.OK, f"{bridge.id}: torsion with {', '.join(declared)}"
+        )

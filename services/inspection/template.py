@@ -1,4 +1,4 @@
-"""A site file to start from: what is needed is `nan` and is asked for, the rest has its default."""
+"""Template of a site file: required values are `nan`, the others have their defaults."""
 
 from typing import Final
 
@@ -22,7 +22,7 @@ gps_antenna_to_front_axle_m = nan     # how far behind the front axle, negative 
 # cg_height_m = 1.1                   # wanted where the truck brakes or accelerates on the bridge
 # pitch_inertia_ratio = 1.0           # over mass times both distances of the axles from the centre
 # tyre_damping_ns_per_m = [0.0, 0.0]  # 0 is unknown
-# What decides how much of a single element can be told, where axles feel different roads:
+# What decides how well a single element is resolved, where axles follow different profiles:
 # twin_tyre_distance_m = [0.0, 0.33]  # middle to middle of twin tyres, 0 for single ones
 # tyre_width_m = [0.25, 0.22]         # of the tread
 # tyre_contact_length_m = [0.2, 0.2]
@@ -32,6 +32,10 @@ gps_antenna_to_front_axle_m = nan     # how far behind the front axle, negative 
 # Accelerometers by name and place, where they are not four in the middle: as [[vehicle.sensors]]
 # with channel, on, axle or position_m, lateral_m, noise_density_ug_per_rthz, rate_hz.
 # sensors = []
+# A front axle and an equalised tandem: as [[vehicle.axles]] and [[vehicle.bogies]] in place of the
+# wheelbase and the pairs.
+# axles = []
+# bogies = []
 # total_mass_kg_spread = 0.01
 # wheelbase_m_spread = 0.002
 # front_axle_to_cg_m_spread = 0.15
@@ -51,7 +55,7 @@ start_latitude_deg = nan              # where the outer bearings are, to a metre
 start_longitude_deg = nan             # where elements are counted from
 end_latitude_deg = nan
 end_longitude_deg = nan
-elements = nan                        # how many pieces are told apart; 5 to 7 on 30 m
+elements = nan                        # number of elements of the span; 5 to 7 on 30 m
 flexural_rigidity_nm2 = nan           # E times I of deck and girders, sound; may be off by 2
 mass_per_length_kg_per_m = nan        # with pavement and parapets
 rayleigh_alpha_per_s = nan            # damping, of the bridge or of one like it: alpha M + beta K;
@@ -62,10 +66,10 @@ rayleigh_beta_s = nan                 # half as much or more is thought possible
 # bearings = "unknown"                # "free" to turn, "sprung", or a pair [start, end] of these
 # support_rotational_stiffness_spread_nm_per_rad = 5.0e8   # default: EI over the span
 # support_compliance_spread_m_per_n = 1.0e-9
-# start_altitude_m = 100.0            # tell the bridge from one under it
+# start_altitude_m = 100.0            # distinguish the bridge from one under it
 # end_altitude_m = 100.0
 # road_class = "A"                    # ISO 8608, for planning
-# survey_speed_m_per_s = 10.0         # for planning; below 3 m/s nothing is told
+# survey_speed_m_per_s = 10.0         # for planning; below 3 m/s crossings are rejected
 # baseline = "first-survey.json"      # results to compare with, beside this file
 # lane_offset_m = 1.6                 # middle of the lane left of the axis, from start to end
 # torsional_frequency_ratio = 2.0     # first frequency in torsion over that in bending

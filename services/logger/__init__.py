@@ -1,4 +1,4 @@
-"""Hosts the router and records everything that the topic table says is logged."""
+"""The logger: hosts the router and records every topic that the table marks as logged."""
 
 import contextlib
 import logging
@@ -18,62 +18,60 @@ from schemas.signals import Identity
 from schemas.topics import (
     HEALTH_PERIOD_S,
     PREFIX,
+    Message,
     check_identifier,
     check_realms,
     realm_chunk,
-    realm_within,
+    single_realm,
 )
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import leave_at_once, stopped_by_signals
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.bus.subscription import Received, Subscription
+from services.bus.subscription import RawSample, Subscription
 from services.common.disk import DISK
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
 from services.common.intervals import Intervals
-from services.logger.complaints import Complaints
 from services.logger.completeness import Completeness
 from services.logger.drops import QUEUE_IS_FULL, Drop
-from services.logger.housekeeping import House, Housekeeping
+from services.logger.file_layout import RecordingTarget
+from services.logger.housekeeping import Housekeeping, RetentionPolicy
 from services.logger.intake import Intake
 from services.logger.memory import give_back_memory
 from services.logger.own_events import OwnEvents
-from services.logger.places import Place
-from services.logger.writer import FileWriter, Limits, count_all
-from services.recordings.recording import Message
+from services.logger.rate_limited_log import RateLimitedLog
+from services.logger.writer import FileWriter, RotationLimits, count_all
 
 __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
 _ANNOUNCE_PERIOD_S = 0.1
-"""How soon an event reaches the bus."""
+"""Longest delay of an event to the bus."""
 _DURABLE_PERIOD_S = 1.0
-"""`durable` speaks of all trucks to each of them, over a mobile network perhaps."""
+"""Interval of `durable`, which covers all trucks and may travel over a mobile network."""
 _REPORT_PERIOD_S = 1.0
-"""How often it is counted what came and what is missing."""
+"""Interval of counting received and missing messages."""
 _DRAIN_S = 2.5
-"""Whoever stops a logger waits so long for what has come already; the rest is counted."""
+"""Time at the end for messages that have already arrived; the others are counted."""
 _COUNT_S = 1.0
-"""And so long for the counting, or a flood would keep the logger alive."""
+"""Time for that counting, because a flood would keep the logger alive."""
 _PAUSE_S = 0.05
-"""With nothing to do. Many messages one after the other cost a quarter less each than a few."""
+"""Pause without messages. Many messages in a row cost a quarter less each than a few."""
 _AT_ONCE_S = 0.02
-"""For so long messages are taken before anything else gets its turn."""
+"""Time of receiving before other work gets its turn."""
 _FETCH_ROOM = 32 << 20
-"""With less room in the writer's queue, bytes, trucks are not asked for what is missing."""
+"""Free bytes in the writer's queue below which trucks are not asked for missing messages."""
 _GOODBYE_S = 0.2
-"""A put only hands over: the connection has so long to send the last words."""
+"""Time for the connection to send the last messages, because a put only queues."""
 _DROPS_PERIOD_S = 60.0
-"""What a source loses otherwise than by a full queue is an event once in this time, with a
-count."""
+"""Interval of events on a source's losses other than by a full queue, with a count."""
 _LONG_LAG_S = 60.0
-"""A lag that is longer is explained: the network is seldom why."""
-_MAX_DROPS_TOLD = 1000
-"""So many sources are remembered as told of; with more, all are told of anew."""
+"""Shortest lag that is explained: the network is rarely the cause."""
+_MAX_DROPS_REPORTED = 1000
+"""Number of sources with remembered reports; beyond, all are reported again."""
 _EVENTS_LOGGED = 20
-"""So many events of a kind are lines of the log in a minute; all are in the recordings and on the
-bus."""
+"""Log lines for events of a kind per minute; recordings and bus have all of them."""
 
 
 def run(
@@ -87,31 +85,31 @@ def run(
     ready: Callable[[], None] | None = None,
     tls: Path | None = None,
     insecure: bool = False,
-    limits: Limits | None = None,
+    limits: RotationLimits | None = None,
     budget_bytes: int | None = None,
 ) -> int:
     """Record until SIGINT or SIGTERM, then finish the files; return 0, or 1 if anything was lost.
 
-    `listen` is where the Zenoh router that lives in this process listens, e.g.
-    `tcp/127.0.0.1:7447`. With `file` everything goes into that one file, else into
-    `folder/REALM/DATE/VEHICLE-TIME.mcap`; no file is ever overwritten. `realms` are those that are
-    recorded: names, or beginnings with a `*` behind them (`sim-*`; `*`: every one). The text of the
-    site file `site` is put into every recording. `tls` and `insecure` are those of `open_session`;
-    `limits` says when the next file of a truck is begun (SIGUSR1 asks for it at once) and how much
-    room the disk must have. Recordings that an earlier run left without END are recovered
-    meanwhile; with `budget_bytes` the oldest ones are deleted whose crossings have been identified.
-    `ready` is called once, when messages can be received. A second signal ends the process at
-    once; the files stay readable.
+    `listen` is the address of the Zenoh router in this process, e.g. `tcp/127.0.0.1:7447`. With
+    `file` everything goes into that one file, else into `folder/REALM/DATE/VEHICLE-TIME.mcap`; no
+    file is ever overwritten. `realms` are the recorded ones: names, or beginnings followed by `*`
+    (`sim-*`; `*`: every one). The text of the site file `site` is put into every recording. `tls`
+    and `insecure` are those of `open_session`; `limits` defines when the next file of a truck
+    begins (SIGUSR1 demands it at once) and how much space the disk must have. Recordings of an
+    earlier run without END are recovered meanwhile; with `budget_bytes` the oldest ones whose
+    crossings have been identified are deleted. `ready` is called once, when messages can be
+    received. A second signal ends the process at once; the files stay readable.
 
-    InputError: a file that exists or cannot be made, a malformed endpoint, realm or site file.
-    FailureError: the address is in use, the disk has too little room, or writing failed.
+    Raise InputError for a file that exists or cannot be created, a malformed endpoint, realm or
+    site file; FailureError if the address is in use, the disk has too little space, or writing
+    failed.
     """
-    limits = limits or Limits()
+    limits = limits or RotationLimits()
     if file is not None and budget_bytes is not None:
         raise InputError("--budget needs a folder of recordings, not --file")
     realms = _check_realms(realms)
-    realm = realm_within(realms)
-    place = Place(folder, file, realm, _read_site(site))
+    realm = single_realm(realms)
+    place = RecordingTarget(folder, file, realm, _read_site(site))
     _check_service(service_id)
     check_speaks_for(tls, "logger", service_id)
     check_folder_writable(file.parent if file is not None else folder)
@@ -138,7 +136,7 @@ def run(
 
 
 class _Logger(NamedTuple):
-    place: Place
+    place: RecordingTarget
     realms: Sequence[str]
     service_id: str
     writer: FileWriter
@@ -153,12 +151,12 @@ def _record(
     ready: Callable[[], None] | None,
     budget_bytes: int | None,
 ) -> int:
-    """Record until it is over; return how many messages were deleted under the logger for good."""
+    """Record until stopped; return the number of messages lost with files deleted meanwhile."""
     place = logger.place
     folder = place.folder if place.file is None else None
     completeness = Completeness(bus, folder, logger.realms, logger.intake, logger.writer)
     announcements = _Announcements(bus, logger, completeness)
-    house = House(
+    house = RetentionPolicy(
         place.folder,
         logger.realms,
         logger.writer.limits.min_free_bytes,
@@ -170,7 +168,7 @@ def _record(
         Subscription(bus, f"{PREFIX}/{realm_chunk(realm)}/**") for realm in logger.realms
     )
     if place.site_toml is None:
-        _log.info("no site file is put into the recordings (--site): `identify` will ask for one")
+        _log.info("recordings will contain no site file (--site): `identify` will ask for one")
     try:
         if ready is not None:
             ready()
@@ -196,7 +194,7 @@ def _record(
             subscription.close()
         _drain(logger, subscriptions)
         _report(logger, announcements, closing=True)
-        reason = "stopped by a signal"  # after a write error nothing is written any more
+        reason = "stopped by a signal"  # nothing is written after a write error
         logger.writer.finish(reason, count_all(logger.intake.counts, logger.writer))
         completeness.report(time.monotonic())  # a file may have been missing only now
         return completeness.gone()
@@ -209,8 +207,8 @@ def _record(
         announcements.close()
 
 
-def _receive(subscriptions: deque[Subscription]) -> Received | None:
-    """Return a message that has come, of each subscription in turn; None if there is none."""
+def _receive(subscriptions: deque[Subscription]) -> RawSample | None:
+    """Return a received message, of each subscription in turn; None if there is none."""
     for _ in range(len(subscriptions)):
         subscriptions.rotate(-1)
         received = subscriptions[-1].receive()
@@ -219,20 +217,20 @@ def _receive(subscriptions: deque[Subscription]) -> Received | None:
     return None
 
 
-def _take(logger: _Logger, received: Received) -> None:
+def _take(logger: _Logger, received: RawSample) -> None:
     if not logger.writer.has_room(len(received.payload)):
-        # Not even looked at: what has not been seen can be fetched from the truck later.
+        # Not even accepted, so that it can be fetched from the truck later.
         logger.writer.count_drop(None)
         return
-    message = logger.intake.take(received, time.time_ns())
+    message = logger.intake.accept(received, time.time_ns())
     if message is not None and not logger.writer.put(message):
         numbers = Intervals()
         numbers.add(message.sequence)
-        logger.intake.unsee(message.key, message.boot_id, numbers)
+        logger.intake.forget_seen(message.key, message.boot_id, numbers)
 
 
 def _drain(logger: _Logger, subscriptions: deque[Subscription]) -> None:
-    """Take what has come already, for as long as a user waits; count what is left then."""
+    """Process messages that have already arrived for a limited time; count the others."""
     deadline = time.monotonic() + _DRAIN_S
     while (received := _receive(subscriptions)) is not None:
         if time.monotonic() < deadline:
@@ -251,7 +249,7 @@ def _report(logger: _Logger, announcements: "_Announcements", *, closing: bool) 
 
 
 class _Announcements:
-    """What the logger itself says: `durable`, `event` and `health`, from a thread of its own.
+    """A thread that publishes `durable`, `event` and `health`.
 
     A put to a congested connection blocks, which must hold up neither receiving nor writing.
     """
@@ -265,8 +263,8 @@ class _Announcements:
         self._pending: list[Message] = []
         self._lock = threading.Lock()
         self._drops: dict[tuple[str, str], Drop] = {}
-        self._drops_told_s: dict[tuple[str, str], float] = {}
-        self._complaints = Complaints(_log, _EVENTS_LOGGED)
+        self._drops_reported_s: dict[tuple[str, str], float] = {}
+        self._complaints = RateLimitedLog(_log, _EVENTS_LOGGED)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="announce", daemon=True)
         self._thread.start()
@@ -281,9 +279,9 @@ class _Announcements:
             self._pending.append(message)
 
     def report_drops(self, now_ns: int, *, closing: bool = False) -> None:
-        """Write down how many messages were dropped and why: of each cause once a minute.
+        """Record the number and cause of dropped messages, each cause once a minute.
 
-        A full queue is told at once.
+        A full queue is reported at once.
         """
         for drop in self._logger.writer.drops():
             name = (drop.vehicle, drop.why)
@@ -292,20 +290,20 @@ class _Announcements:
         now_s = time.monotonic()
         for name, drop in list(self._drops.items()):
             is_queue = drop.why == QUEUE_IS_FULL
-            told_s = self._drops_told_s.get(name, -_DROPS_PERIOD_S)
-            if not (closing or is_queue or now_s - told_s >= _DROPS_PERIOD_S):
+            reported_s = self._drops_reported_s.get(name, -_DROPS_PERIOD_S)
+            if not (closing or is_queue or now_s - reported_s >= _DROPS_PERIOD_S):
                 continue
             del self._drops[name]
-            if len(self._drops_told_s) >= _MAX_DROPS_TOLD:
-                self._drops_told_s.clear()
-            self._drops_told_s[name] = now_s
+            if len(self._drops_reported_s) >= _MAX_DROPS_REPORTED:
+                self._drops_reported_s.clear()
+            self._drops_reported_s[name] = now_s
             kind = EventKind.QUEUE_FULL if is_queue else EventKind.DROPPED
             text = f"{drop.messages} messages {drop.why}"
             event = Event(kind, now_ns, text, vehicle=drop.vehicle, messages=drop.messages)
             self.event(drop.realm, event)
 
     def close(self) -> None:
-        """Say the last words and stop."""
+        """Publish the last messages and stop."""
         self._closing.set()
         self._thread.join(timeout=_GOODBYE_S * 5)
         time.sleep(_GOODBYE_S)  # a put only hands over; leave the connection time to send
@@ -316,7 +314,7 @@ class _Announcements:
     def _run(self) -> None:
         version = -1
         next_durable_s = 0.0
-        next_health_s = time.monotonic()  # at once: who starts it waits for that
+        next_health_s = time.monotonic()  # at once: whatever started the logger waits for it
         while True:
             closing = self._closing.wait(_ANNOUNCE_PERIOD_S)
             self._publish_events()
@@ -383,7 +381,7 @@ class _Announcements:
 
 
 def _health_line(figures: Mapping[str, float]) -> str:
-    """What a person wants to know once a minute; everything else is on `health`."""
+    """Return the figures for the log, once a minute; `health` has all others."""
     known = defaultdict(float, figures)
     why = ""
     if known["lag_s"] > _LONG_LAG_S:

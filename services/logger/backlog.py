@@ -1,25 +1,26 @@
-"""What has come and is not yet written: a queue bounded by messages and by bytes."""
+"""Received messages that are not yet written: a queue bounded by messages and by bytes."""
 
 import threading
 from collections import deque
 
-from services.recordings.recording import Message
+from schemas.topics import Message
 
 QUEUE_MESSAGES = 200_000
-"""A bound for messages that are so small that the one in bytes would let in millions."""
+"""Limit for messages so small that the limit in bytes would admit millions."""
 QUEUE_BYTES = 256 << 20
-"""At the rated load, 100 trucks, 4,000 messages and 4 MB a second: a disk may stall for 50 s."""
+"""Limit in bytes. At the rated load, 100 trucks, 4,000 messages and 4 MB a second, a disk may stall
+for 50 s."""
 _RESERVE_MESSAGES = 1000
-"""For what must be written down because the queue is full."""
+"""Reserve for messages that must be written because the queue is full."""
 _OVERHEAD_BYTES = 500
-"""What Python takes for a message besides its payload."""
+"""Memory of a message besides its payload."""
 
 
 class Backlog:
-    """A first-in first-out queue between two threads, which never makes the first one wait.
+    """A first-in first-out queue between two threads, which never blocks the first one.
 
-    Nor does a message wake the second one: at thousands of messages a second that would cost more
-    than all that is done with them. It looks again and again, `wait` says how often.
+    A message does not wake the second thread: at thousands of messages a second that would cost
+    more than all other work on them. It polls; `wait` defines how often.
     """
 
     def __init__(self, messages: int = QUEUE_MESSAGES, size: int = QUEUE_BYTES) -> None:
@@ -36,12 +37,12 @@ class Backlog:
         return len(self._queue)
 
     def has_room(self, payload_bytes: int) -> bool:
-        """Whether one more message can wait."""
+        """Return whether there is room for one more message."""
         needed = payload_bytes + _OVERHEAD_BYTES
         return len(self._queue) < self._limit and self.bytes + needed <= self._limit_bytes
 
     def put(self, message: Message, *, always: bool = False) -> bool:
-        """Add a message; False if there is no room. `always`: a small reserve may be used."""
+        """Add a message; return False if there is no room. `always` may use a small reserve."""
         with self._lock:
             has_room = self.has_room(len(message.payload))
             if not has_room and not (always and len(self._queue) < self._limit + _RESERVE_MESSAGES):
@@ -50,7 +51,7 @@ class Backlog:
             self.bytes += len(message.payload) + _OVERHEAD_BYTES
             return True
 
-    def take(self) -> Message | None:
+    def pop(self) -> Message | None:
         """Return the oldest message, or None if there is none."""
         with self._lock:
             if not self._queue:
@@ -60,7 +61,7 @@ class Backlog:
             return message
 
     def wait(self, timeout_s: float) -> None:
-        """Wait so long, or until `wake` or `close`."""
+        """Wait for the timeout, or until `wake` or `close`."""
         self._woken.wait(timeout_s)
         self._woken.clear()
 
@@ -69,11 +70,11 @@ class Backlog:
         self._woken.set()
 
     def close(self) -> None:
-        """Say that nothing will come any more."""
+        """Declare that no message will follow."""
         self._closed = True
         self._woken.set()
 
     @property
     def is_over(self) -> bool:
-        """Whether everything has been taken and nothing will come."""
+        """Whether everything has been popped and no message will follow."""
         return self._closed and not self._queue

@@ -1,6 +1,6 @@
-"""That nothing is missing and nothing written twice: what is on disk, what trucks still have.
+"""Completeness of recordings: nothing missing, nothing twice.
 
-The thread that receives calls `step` and `report`; nothing in them waits.
+The receiving thread calls `step` and `report`; nothing in them waits.
 """
 
 import logging
@@ -14,32 +14,32 @@ from typing import Any, NamedTuple, Protocol
 import zenoh
 from zenoh import handlers
 
-from schemas.topics import Key, is_replayed, parse_key, selector, topic
-from services.bus.subscription import Received
+from schemas.topics import Key, is_from_recording, parse_key, selector, topic
+from services.bus.subscription import RawSample
 from services.common.errors import InputError
 from services.common.intervals import Intervals
-from services.logger.complaints import Complaints
 from services.logger.intake import Intake
+from services.logger.rate_limited_log import RateLimitedLog
 from services.logger.spool_recovery import REALMS_OF_ONE, SpoolRecovery
 from services.recordings.recording import Identities, read_identities
 
-__all__ = ["Completeness", "Known", "known_on_disk"]
+__all__ = ["Completeness", "RecordedRange", "known_on_disk"]
 
 _log = logging.getLogger(__name__)
 KNOWN_AGE_S = 2 * 86_400.0
-"""Older recordings are not read at the start: what they hold trucks have long been told of."""
+"""Largest age of recordings that are read at the start: older messages are already confirmed."""
 _TRUCKS = 1000
-"""Trucks whose tokens are watched, one in two realms being two: memory is bounded whoever comes."""
+"""Largest number of watched tokens (trucks times realms), which bounds memory."""
 _TOKENS_WAITING = 1000
-"""Tokens that may come between two looks before the bus waits."""
+"""Tokens between two polls before the bus blocks."""
 _HISTORY = 60
-"""Reports over which rate and lag are taken; there is one a second."""
+"""Number of reports over which rate and lag are computed; one a second."""
 _KEPT_BY = ("vehicle", "bridge")
-"""Owners whose publishers, trucks and workers, outlive a logger and give the next one all again."""
+"""Owners whose publishers outlive a logger and send the next one everything again."""
 
 
-class Known(NamedTuple):
-    """Sequences that stand in a recording of an earlier run."""
+class RecordedRange(NamedTuple):
+    """Sequences in a recording of an earlier run."""
 
     where: Key
     boot_id: int
@@ -47,30 +47,31 @@ class Known(NamedTuple):
     last: int
 
 
-class Durable(Protocol):
-    """What a writer must be told, and tells."""
+class DurableSink(Protocol):
+    """The part of a writer that completeness needs."""
 
     withdrawn: deque[Identities]
     """Messages whose files are gone."""
     unwritten: deque[Identities]
     """Messages for which there was no file."""
 
-    def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
+    def mark_accounted(
+        self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool
+    ) -> None:
         """Note sequences that need not come: already on disk, or lost for ever."""
 
     def forget(self, names: Iterable[tuple[Key, int]]) -> None:
-        """Speak of these streams and boots no more."""
+        """Remove these streams and boots from `durable`."""
 
 
-def known_on_disk(folder: Path, realms: Sequence[str], now_s: float) -> Iterator[Known]:
-    """Yield what streams have in the recordings below a folder, one file after the other.
+def known_on_disk(folder: Path, realms: Sequence[str], now_s: float) -> Iterator[RecordedRange]:
+    """Yield the content of recordings below a folder by stream, file by file.
 
-    Only of the last two days (`now_s` is the wall clock) and, of these realms (or patterns of
-    them), of those in which trucks drive.
-    A recording that is recovered meanwhile, by whomever, is found under its new name.
+    Only those of the last two days (`now_s` is the wall clock) and of realms in which trucks drive.
+    A recording that is recovered meanwhile is found under its new name.
     """
     looked_at: set[Path] = set()
-    # What had another name when it was its turn is in the folder under that name by then.
+    # A file that has been renamed meanwhile is found under its new name.
     while found := sorted(
         {path for realm in realms for path in folder.glob(f"{realm}/*/[!.]*.mcap")} - looked_at
     ):
@@ -85,13 +86,13 @@ def known_on_disk(folder: Path, realms: Sequence[str], now_s: float) -> Iterator
                     _log.warning("%s: not read: %s", path, error)
                 continue
             for (where, boot_id), numbers in identities.items():
-                if where.owner in _KEPT_BY and not is_replayed(where.realm):
+                if where.owner in _KEPT_BY and not is_from_recording(where.realm):
                     for first, last in numbers.ranges():
-                        yield Known(where, boot_id, first, last)
+                        yield RecordedRange(where, boot_id, first, last)
 
 
 class Completeness:
-    """What is on disk, what trucks have, and which of them are there."""
+    """The messages on disk, those on trucks, and the trucks that are present."""
 
     def __init__(
         self,
@@ -99,9 +100,9 @@ class Completeness:
         folder: Path | None,
         realms: Sequence[str],
         intake: Intake,
-        writer: Durable,
+        writer: DurableSink,
     ) -> None:
-        """Read what earlier runs left in `folder`; None: this run has a file of its own."""
+        """Read the recordings of earlier runs in `folder`; None: this run has a file of its own."""
         self._intake = intake
         self._writer = writer
         self._latched: dict[tuple[Key, int], Intervals] = {}
@@ -123,21 +124,21 @@ class Completeness:
             )
             for realm in realms
         ]
-        self._complaints = Complaints(_log)
+        self._complaints = RateLimitedLog(_log)
         self._figures: dict[str, float] = {}
         self._history: deque[tuple[float, int, float]] = deque(maxlen=_HISTORY)
 
-    def step(self, now_s: float, *, hold: bool = False) -> list[Received]:
-        """Return messages that trucks gave again. `hold`: ask for no more of them now."""
+    def step(self, now_s: float, *, hold: bool = False) -> list[RawSample]:
+        """Return messages that trucks sent again. With `hold`, request no more of them now."""
         return self._recovery.step(now_s, hold=hold)
 
     def report(self, now_s: float) -> None:
-        """Tell the writer what need not come any more, and count."""
+        """Update the writer with sequences that need not come any more, and count."""
         intake = self._intake
         while self._writer.withdrawn:
             self._withdraw(self._writer.withdrawn.popleft())
         for where, boot_id, first, last in intake.settled:
-            self._writer.settle(where, boot_id, first, last, on_disk=False)
+            self._writer.mark_accounted(where, boot_id, first, last, on_disk=False)
         intake.settled.clear()
         if intake.forgotten:
             self._writer.forget(intake.forgotten)
@@ -146,14 +147,14 @@ class Completeness:
             intake.forgotten.clear()
         while self._writer.unwritten:
             for (where, boot_id), numbers in self._writer.unwritten.popleft().items():
-                intake.unsee(where, boot_id, numbers)
+                intake.forget_seen(where, boot_id, numbers)
                 self._recovery.pause(where, now_s)
         self._read_tokens(now_s)
         self._complaints.flush()
         self._figures = self._counted(now_s)
 
     def gone(self) -> int:
-        """Return how many messages were in files that are gone, and have not come again."""
+        """Return the number of messages in lost files that have not come again."""
         seen = self._intake.seen.streams
         return self._gone_for_ever + sum(
             last - first + 1
@@ -162,11 +163,11 @@ class Completeness:
         )
 
     def figures(self) -> dict[str, float]:
-        """Return what `report` counted last; may be called from another thread."""
+        """Return the last counts of `report`; thread-safe."""
         return self._figures
 
     def close(self) -> None:
-        """Ask nobody any more."""
+        """Stop all queries."""
         for tokens in self._tokens:
             tokens.undeclare()
         self._recovery.close()
@@ -174,17 +175,17 @@ class Completeness:
 
     def _on_disk(self, where: Key, boot_id: int, first: int, last: int) -> None:
         if topic(where.owner, where.stream).latched:
-            # Known, but to be written again when it comes: every file has its own copy.
+            # Known, but written again when it comes: every file has its own copy.
             known = self._latched.setdefault((where, boot_id), Intervals())
             if known.add_range(first, last):
-                self._writer.settle(where, boot_id, first, last, on_disk=True)
+                self._writer.mark_accounted(where, boot_id, first, last, on_disk=True)
         elif self._intake.adopt(where, boot_id, first, last, time.time_ns()):
-            self._writer.settle(where, boot_id, first, last, on_disk=True)
+            self._writer.mark_accounted(where, boot_id, first, last, on_disk=True)
 
     def _withdraw(self, identities: Identities) -> None:
         for (where, boot_id), numbers in identities.items():
             if (where.identifier, boot_id) != (self._intake.own_service, self._intake.own_boot_id):
-                self._intake.unsee(where, boot_id, numbers)
+                self._intake.forget_seen(where, boot_id, numbers)
                 gone = self._gone.setdefault((where, boot_id), Intervals())
                 for first, last in numbers.ranges():
                     gone.add_range(first, last)
@@ -193,7 +194,7 @@ class Completeness:
         gone = self._gone.get((where, boot_id))
         if gone is not None:
             self._gone_for_ever += gone.remove_range(first, last)
-        self._intake.lose(where, boot_id, first, last, time.time_ns())
+        self._intake.mark_lost(where, boot_id, first, last, time.time_ns())
 
     def _read_tokens(self, now_s: float) -> None:
         waiting = (islice(iter(one.try_recv, None), _TOKENS_WAITING) for one in self._tokens)
@@ -213,7 +214,12 @@ class Completeness:
             if self._alive.get(name, False) != is_here:
                 if is_here:
                     self._recovery.hurry(now_s)
-                _log.info("%s in realm %s %s", name[1], name[0], "came" if is_here else "left")
+                _log.info(
+                    "%s in realm %s %s",
+                    name[1],
+                    name[0],
+                    "connected" if is_here else "disconnected",
+                )
             self._alive[name] = is_here
 
     def _counted(self, now_s: float) -> dict[str, float]:

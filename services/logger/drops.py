@@ -1,4 +1,4 @@
-"""How many messages were not written, whom they concern, and why."""
+"""Counts of messages that were not written, by source and cause."""
 
 import threading
 from collections import Counter
@@ -9,11 +9,11 @@ from schemas.topics import Key
 QUEUE_IS_FULL = "found the writer's queue full"
 FAILED = "could not be written any more"
 _MAX_SOURCES = 100
-"""Sources with a count of their own until they are told; what others lose is counted together."""
+"""Sources with their own count until the next report; others are counted together."""
 
 
 class Drop(NamedTuple):
-    """Messages that were dropped: whom they concern, in which realm the first was, and why."""
+    """Dropped messages of one source and cause, with the realm of the first."""
 
     realm: str
     vehicle: str
@@ -22,10 +22,10 @@ class Drop(NamedTuple):
 
 
 class Drops:
-    """Counts, from any thread; takes a bounded amount of memory, as sources can be made up."""
+    """Thread-safe counts in bounded memory, because sources can be invented."""
 
     def __init__(self, realm: str) -> None:
-        """`realm` is where causes are told that concern no vehicle."""
+        """Create counts; `realm` is that of causes without a vehicle."""
         self.total = 0
         self._realm = realm
         self._of: Counter[tuple[str, str]] = Counter()
@@ -47,11 +47,11 @@ class Drops:
                 self._of[(where.realm, where.identifier)] += 1
 
     def of(self, realm: str, identifier: str) -> int:
-        """Return how many messages of one vehicle, bridge or service in a realm were dropped."""
+        """Return the number of dropped messages of a vehicle, bridge or service in a realm."""
         return self._of[(realm, identifier)]
 
-    def untold(self) -> list[Drop]:
-        """Return what was counted since the last call."""
+    def drain(self) -> list[Drop]:
+        """Return the counts since the last call."""
         with self._lock:
             untold, self._untold = self._untold, {}
         return list(untold.values())

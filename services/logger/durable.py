@@ -1,27 +1,27 @@
-"""What is on disk, as `durable` tells trucks and workers: what they may forget."""
+"""The messages on disk, for `durable`, by which trucks and workers free theirs."""
 
 import threading
 from collections.abc import Iterable
 from typing import NamedTuple
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.common.intervals import Intervals
-from services.recordings.recording import Identities, Message
+from services.recordings.recording import Identities
 
 _MAX_DURABLE_STREAMS = 8000
-"""Some 90 bytes each, and the message may have a MiB."""
+"""Largest number of streams, some 90 bytes each in a message of at most 1 MiB."""
 
 
 class _Stream(NamedTuple):
     stored: Intervals
-    """On disk."""
+    """Sequences on disk."""
     settled: Intervals
-    """On disk, or known to be lost or refused."""
+    """Sequences on disk, or known to be lost or refused."""
 
 
 class DurableStreams:
-    """What is on disk by stream and boot; the ones that changed last stand last."""
+    """The sequences on disk by stream and boot, in the order of the last change."""
 
     def __init__(self) -> None:
         self.version = 0
@@ -41,8 +41,10 @@ class DurableStreams:
                 stream.settled.add(message.sequence)
             self.version += 1
 
-    def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
-        """See `FileWriter.settle`."""
+    def mark_accounted(
+        self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool
+    ) -> None:
+        """Implement `FileWriter.mark_accounted`."""
         with self._lock:
             stream = self._stream((where, boot_id))
             stream.settled.add_range(first, last)
@@ -51,7 +53,7 @@ class DurableStreams:
             self.version += 1
 
     def withdraw(self, identities: Identities) -> int:
-        """Take back messages that are gone; how many of them had been noted."""
+        """Remove messages that are gone; return how many of them had been noted."""
         with self._lock:
             self.version += 1
             number = 0
@@ -64,13 +66,13 @@ class DurableStreams:
             return number
 
     def forget(self, names: Iterable[tuple[Key, int]]) -> None:
-        """See `FileWriter.forget`."""
+        """Implement `FileWriter.forget`."""
         with self._lock:
             for name in names:
                 self._streams.pop(name, None)
 
     def messages(self) -> tuple[int, dict[str, pb.Durable]]:
-        """See `FileWriter.durable`; of very many streams the ones that changed last."""
+        """Implement `FileWriter.durable`; of very many streams, those that changed last."""
         by_realm: dict[str, pb.Durable] = {}
         with self._lock:
             for (where, boot_id), stream in reversed(self._streams.items()):
@@ -87,7 +89,7 @@ class DurableStreams:
             return self.version, by_realm
 
     def _stream(self, name: tuple[Key, int]) -> _Stream:
-        """Return a stream and let it stand last."""
+        """Return a stream and move it to the end."""
         stream = self._streams.pop(name, None) or _Stream(Intervals(), Intervals())
         self._streams[name] = stream
         return stream

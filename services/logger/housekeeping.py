@@ -1,17 +1,14 @@
-"""What the logger does with recordings that it does not write any more.
+"""Housekeeping of closed recordings.
 
-Those that a run before left without END, because it was killed or the power went, are recovered:
-the damaged file is then called `….mcap.crashed`, so that `*.mcap` finds every message once. With a
-budget, the oldest recordings are deleted, of those whose crossings have all been identified. The
-work is done one file after the other in processes of low priority, while recording goes on.
+Recordings of an earlier run without END, after a kill or power cut, are recovered: the damaged file
+is then called `….mcap.crashed`, so that `*.mcap` finds every message once. With a budget, the
+oldest recordings whose crossings have all been identified are deleted. The work runs file by file
+in processes of low priority, while recording continues.
 """
 
 import json
 import logging
-import os
 import re
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,45 +16,42 @@ from pathlib import Path
 from typing import NamedTuple
 
 from schemas.events import Event, EventKind
-from schemas.topics import REALM, realm_within
+from schemas.topics import REALM, single_realm
+from services.common.child_process import run_gently
 from services.common.disk import DISK, Disk
-from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
+from services.common.errors import FailureError, InputError
 from services.recordings.recording import is_being_written, is_closed
 from services.recordings.recovery import ASIDE, put_aside, recovered_path
 
 _log = logging.getLogger(__name__)
 _BUDGET_PERIOD_S = 10.0
-"""How often it is looked whether the folder has outgrown its budget."""
+"""Interval of checks of the folder's size."""
 _ASK_AGAIN_S = 600.0
-"""A recording that may not go is not asked about again sooner: each question is a process."""
-_POLL_S = 0.1
-"""So late an end of the logger is seen while a child works."""
-_NICE = 15
-"""Children give way to what records."""
+"""Interval of checks of a recording that must stay, because each check is a process."""
 _REALM = re.compile(REALM)
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
 _EXIT_CLEAN, _EXIT_BAD_INPUT, _EXIT_LOSSY = 0, 2, 3
 
 
-class House(NamedTuple):
-    """Which recordings are kept, and who is told."""
+class RetentionPolicy(NamedTuple):
+    """The recordings to keep, and the recipient of events."""
 
     folder: Path
     realms: Sequence[str]
     min_free_bytes: int
     budget_bytes: int | None
-    tell: Callable[[str, Event], None]
-    """Takes a realm and an event."""
+    report: Callable[[str, Event], None]
+    """Callback with a realm and an event."""
     disk: Disk = DISK
 
 
 class Housekeeping:
-    """Keeps house in a thread of its own until it is closed."""
+    """A thread for housekeeping until it is closed."""
 
-    def __init__(self, house: House) -> None:
+    def __init__(self, house: RetentionPolicy) -> None:
         self._house = house
         self._closing = threading.Event()
-        # What crashed before this run; a file that is new is not looked at.
+        # Only files that crashed before this run.
         self._crashed = sorted(_recordings(house, ".mcap"))
         self._kept_until: dict[Path, float] = {}
         self._is_over_budget = False
@@ -67,7 +61,7 @@ class Housekeeping:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop; what was begun is ended, and begun again in the next run."""
+        """Stop; interrupted work is repeated in the next run."""
         self._closing.set()
         self._thread.join()
 
@@ -87,7 +81,7 @@ class Housekeeping:
                 self.is_busy = False
                 if self._closing.wait(_BUDGET_PERIOD_S):
                     return
-        except Exception:  # recording goes on without
+        except Exception:  # recording continues without it
             _log.exception("housekeeping ended")
         finally:
             self.is_busy = False
@@ -97,11 +91,11 @@ class Housekeeping:
         free_bytes = self._house.disk.free_bytes(path.parent)
         if free_bytes - size < self._house.min_free_bytes:
             text = f"{path.name} was cut off and stays so: too little room to recover it"
-            self._tell(path, EventKind.DISK_LOW, text)
+            self._report(path, EventKind.DISK_LOW, text)
             return
-        # What an earlier run recovered of it, and did not get to rename it, is replaced.
+        # A recovered file that an earlier run did not rename is replaced.
         options = ["--set-aside", "--json", "--force"]
-        done = self._run_gently(["services", "recover", str(path), *options])
+        done = run_gently(["services", "recover", str(path), *options], self._closing)
         if done is None:
             return
         code, out, log = done
@@ -112,12 +106,14 @@ class Housekeeping:
                 f"{path.name} was cut off; {found['messages']} messages recovered to "
                 f"{recovered_path(path).name}, {lost} lost, {found['damaged_bytes']} bytes damaged"
             )
-            self._tell(path, EventKind.RECORDING_RECOVERED, text, found["messages"])
+            self._report(path, EventKind.RECORDING_RECOVERED, text, found["messages"])
         elif code == _EXIT_BAD_INPUT and "holds nothing" in log:
             put_aside(path)
             text = f"{path.name} holds nothing that can be read, and was set aside"
-            self._tell(path, EventKind.RECORDING_RECOVERED, text)
-        elif path.exists():  # else somebody else has moved, deleted or recovered it meanwhile
+            self._report(path, EventKind.RECORDING_RECOVERED, text)
+        elif (
+            path.exists()
+        ):  # otherwise another process has moved, deleted or recovered it meanwhile
             _log.error("%s could not be recovered: %s", path, log.strip()[-300:])
 
     def _keep_budget(self, budget_bytes: int) -> None:
@@ -130,13 +126,13 @@ class Housekeeping:
                 path.unlink()
                 total -= sizes[path]
                 text = f"{path.name} ({sizes[path]} bytes) was deleted to keep the budget"
-                self._tell(path, EventKind.RECORDING_DELETED, text)
+                self._report(path, EventKind.RECORDING_DELETED, text)
         if total > budget_bytes and not self._is_over_budget:
             text = (
                 f"recordings take {total / 1e6:.0f} MB of {budget_bytes / 1e6:.0f} MB, and none "
                 "of them may be deleted: crossings in them are not identified"
             )
-            self._tell(None, EventKind.DISK_LOW, text)
+            self._report(None, EventKind.DISK_LOW, text)
         self._is_over_budget = total > budget_bytes
 
     def _may_go(self, path: Path) -> bool:
@@ -150,53 +146,21 @@ class Housekeeping:
         realm = path.relative_to(self._house.folder).parts[0]
         results = sorted((self._house.folder / realm).glob("*.mcap"))
         arguments = [str(p) for p in (path, *others, *results)]
-        done = self._run_gently(["services.history.processed", *arguments])
-        may_go = done is not None and done[0] == 0
+        done = run_gently(["services.ledger.processed", *arguments], self._closing)
+        may_go = done is not None and done.code == 0
         if not may_go:
             self._kept_until[path] = time.monotonic() + _ASK_AGAIN_S
         return may_go
 
-    def _run_gently(self, arguments: list[str]) -> tuple[int, str, str] | None:
-        """Run a module of ours at low priority; None if it was not let finish.
-
-        It ends with this process, even if this one is killed (`services.common.leash`).
-        """
-        its_end, our_end = os.pipe()
-        try:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "services.common.leash", *arguments],
-                stdin=its_end,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-        finally:
-            os.close(its_end)
-        with process, os.fdopen(our_end, "wb") as leash:
-            os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
-            while True:
-                try:
-                    out, log = process.communicate(timeout=_POLL_S)
-                    return (
-                        None
-                        if process.returncode == EXIT_INTERRUPTED
-                        else (process.returncode, out, log)
-                    )
-                except subprocess.TimeoutExpired:
-                    if self._closing.is_set():
-                        leash.close()
-                        process.communicate()
-                        return None
-
-    def _tell(self, path: Path | None, kind: EventKind, text: str, messages: int = 0) -> None:
-        realm = realm_within(self._house.realms) or "live"
+    def _report(self, path: Path | None, kind: EventKind, text: str, messages: int = 0) -> None:
+        realm = single_realm(self._house.realms) or "live"
         if path is not None:
             realm = path.relative_to(self._house.folder).parts[0]
-        self._house.tell(realm, Event(kind, time.time_ns(), text, messages=messages))
+        self._house.report(realm, Event(kind, time.time_ns(), text, messages=messages))
 
 
-def _recordings(house: House, *endings: str) -> Iterator[Path]:
-    """Yield what a logger has written below its folder: REALM/DATE/NAME."""
+def _recordings(house: RetentionPolicy, *endings: str) -> Iterator[Path]:
+    """Yield a logger's files below its folder: REALM/DATE/NAME."""
     for path in {path for one in house.realms for path in house.folder.glob(f"{one}/*/*")}:
         realm, date = path.relative_to(house.folder).parts[:2]
         named = _REALM.fullmatch(realm) and _DATE.fullmatch(date)

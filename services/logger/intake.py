@@ -1,9 +1,9 @@
-"""What the logger does with a message before it is written: checks, counts, tells duplicates.
+"""Intake of messages before they are written: checks, counts, duplicates.
 
-No I/O and no clock of its own: messages go in, messages and events come out. What strangers send
-takes a bounded amount of memory: so many streams, boots of each, holes, and sources of refusals.
-Nobody can use up what others need: the limits that count are those of one vehicle, which is what
-access control ties to a certificate, in whatever realms it shows itself.
+No I/O and no clock of its own: messages go in, messages and events come out. Hostile senders cannot
+exhaust memory: streams, boots of each, gaps, and sources of refusals are bounded. One vehicle
+cannot use up the limits of others: they apply to one vehicle in all realms, because access control
+ties it to a certificate.
 """
 
 import zlib
@@ -15,75 +15,74 @@ from typing import NamedTuple
 from schemas.events import Event, EventKind
 from schemas.messages import check_stamp
 from schemas.signals import NS_PER_S, Identity, Stamp
-from schemas.topics import Key, Topic, is_replayed, topic
-from services.bus.subscription import Received, Seen
+from schemas.topics import Key, Message, Topic, is_from_recording, topic
+from services.bus.subscription import RawSample, SeenSequences
 from services.common.intervals import Intervals
 from services.logger.clocks import TruckClock, clock_step_ns
-from services.logger.known_streams import KnownStreams, Stream
-from services.recordings.recording import Message
+from services.logger.known_streams import StreamCache, StreamRecord
 
 GAP_PATIENCE_S = 5.0
-"""How long a missing message may take to be fetched before a gap is written down."""
+"""Time to fetch a missing message before a gap is recorded."""
 MAX_RUNS = 10_000
-"""Runs of sequences of one stream and boot: holes, one more."""
+"""Largest number of contiguous ranges of one stream and boot, one more than gaps."""
 RATE_FACTOR = 50
-"""More than so many times the nominal rate, for longer than a cache lasts, is no sensor."""
+"""Largest rate relative to nominal, for longer than a cache lasts; no sensor exceeds it."""
 _RATE_ON_OCCASION_HZ = 100.0
-"""Limit of a stream without a nominal rate: what comes on occasion does not come so often."""
+"""Limit of a stream without a nominal rate."""
 _LEAST_BURST = 1000
-"""A link that was away brings so many messages at once, whatever the stream."""
+"""Number of messages that a restored link may bring at once, whatever the stream."""
 _MAX_REFUSED_SOURCES = 100
-"""Sources with a count of their own until they are told; what of others is refused is counted
-together."""
+"""Sources with their own count until the next report; refusals of others are counted together."""
 _REFUSALS_PERIOD_S = 60.0
-"""What is refused of one source is an event once in this time, with a count."""
+"""Interval of events on refusals of one source, with a count."""
 _RECENT = 256
-"""Check sums kept of a stream, to tell a message that comes again from another one of its
-number."""
+"""Number of checksums of a stream, to distinguish a repeated message from another of its number."""
 
 
 class Refusals(NamedTuple):
-    """Messages refused since the last report, of one vehicle or of nobody known."""
+    """Messages refused since the last report, of one vehicle or of unknown source."""
 
     realm: str
-    """The realm of the first that was refused."""
+    """The realm of the first one."""
     first_reason: str
     number: int
 
 
 @dataclass
 class Intake:
-    """What has come so far, and what is to be reported about it."""
+    """The messages received so far, and events to report."""
 
     realm: str | None
-    """Realm to which events belong that concern no known key; None: live."""
+    """Realm of events without a known key; None: live."""
     own_service: str
     own_boot_id: int
-    """What this logger says itself comes back from the bus, and has been written already."""
-    seen: Seen = field(default_factory=Seen)
+    """Boot of this logger's own messages, which come back from the bus and are already written."""
+    seen: SeenSequences = field(default_factory=SeenSequences)
     counts: Counter[str] = field(default_factory=Counter)
-    """received (of logged topics), accepted, refused, duplicates, recovered, missing, lost."""
+    """Counts: received (of logged topics), accepted, refused, duplicates, recovered, missing, lost.
+    """
     forgotten: list[tuple[Key, int]] = field(default_factory=list)
-    """Streams and boots of which nothing is remembered any more; the caller empties it."""
+    """Streams and boots without memory any more; the caller empties it."""
     settled: list[tuple[Key, int, int, int]] = field(default_factory=list)
-    """Stream, boot, first and last of what will never be written; the caller empties it."""
-    _streams: KnownStreams = field(init=False)
+    """Stream, boot, first and last of messages that will never be written; the caller empties it.
+    """
+    _streams: StreamCache = field(init=False)
     _clocks: dict[tuple[str, str], TruckClock] = field(default_factory=dict)
     _clock_stream: dict[tuple[str, str], tuple[str, int]] = field(default_factory=dict)
     _own_clock_ns: int | None = None
     _lag_ns: int = 0
     _due: list[tuple[Key, Event]] = field(default_factory=list)
     _refused: dict[str, Refusals] = field(default_factory=dict)
-    _refused_told_s: dict[str, float] = field(default_factory=dict)
+    _refused_reported_s: dict[str, float] = field(default_factory=dict)
     _late: Counter[tuple[Key, int]] = field(default_factory=Counter)
     _lost: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
     _holes: dict[tuple[Key, int], dict[tuple[int, int], float]] = field(default_factory=dict)
     _reported: dict[tuple[Key, int], Intervals] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._streams = KnownStreams(self._forget)
+        self._streams = StreamCache(self._forget)
 
-    def take(self, received: Received, now_ns: int) -> Message | None:
+    def accept(self, received: RawSample, now_ns: int) -> Message | None:
         """Return the message to write, or None if it is refused, not logged or a duplicate."""
         where: Key | None = None
         identity: Identity | None = None
@@ -109,7 +108,7 @@ class Intake:
         except ValueError as error:
             self._refuse(where, str(error))
             if received.spooled and where is not None and identity is not None:
-                # There is no better copy: to ask for it again would be for ever.
+                # There is no better copy: it would be requested for ever.
                 self._settle(where, *identity)
             return None
         if not is_new:
@@ -121,10 +120,7 @@ class Intake:
         return Message(where, received.payload, *identity, stamp.wall_time_ns, now_ns)
 
     def adopt(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> bool:
-        """Note messages that an earlier run has on disk, so that they are not written again.
-
-        False (and a refusal) if that would be more than can be remembered.
-        """
+        """Note messages on disk from an earlier run; return False (a refusal) beyond the limits."""
         try:
             self._streams.of(where, Identity(boot_id, first), now_ns)
         except ValueError as error:
@@ -133,15 +129,15 @@ class Intake:
         self.seen.numbers(where, boot_id).add_range(first, last)
         return True
 
-    def unsee(self, where: Key, boot_id: int, numbers: Intervals) -> None:
-        """Take messages for new when they come again: what was written of them is gone."""
+    def forget_seen(self, where: Key, boot_id: int, numbers: Intervals) -> None:
+        """Treat messages as new when they come again, because their file is gone."""
         seen = self.seen.streams.get((where, boot_id))
         if seen is not None:
             for first, last in numbers.ranges():
                 seen.remove_range(first, last)
 
-    def lose(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> None:
-        """Give up messages that nobody has any more."""
+    def mark_lost(self, where: Key, boot_id: int, first: int, last: int, now_ns: int) -> None:
+        """Give up messages that no publisher holds any more."""
         try:
             self._streams.of(where, Identity(boot_id, first), now_ns)
         except ValueError as error:
@@ -158,7 +154,7 @@ class Intake:
     ) -> list[tuple[Key, Event]]:
         """Return the events that are due, each with a key of the realm and vehicle concerned.
 
-        `now_s` is a monotonic clock. When `closing`, what is missing now is reported at once.
+        `now_s` is a monotonic clock. When `closing`, current gaps are reported at once.
         """
         events = self._own_clock(now_ns, now_s) + self._due
         self._due = []
@@ -180,15 +176,16 @@ class Intake:
         return events
 
     def lag_s(self) -> float:
-        """Return how long live messages took at most since the last call.
+        """Return the longest delay of live messages since the last call.
 
-        The clocks' difference is in it, and the length of a batch: its time is that of its start.
+        It includes the clocks' difference and the length of a batch, whose time is that of its
+        start.
         """
         lag_ns, self._lag_ns = self._lag_ns, 0
         return lag_ns * 1e-9
 
     def clock_figures(self) -> dict[str, float]:
-        """Return by name how far each truck's clock is behind the logger's, and its drift."""
+        """Return each truck's lag behind the logger's clock, and its drift, by name."""
         figures = {}
         for (_, vehicle), clock in self._clocks.items():
             drift = clock.drift()
@@ -209,7 +206,7 @@ class Intake:
         if clock is not None and clock.boot_id == boot_id and is_its:
             del self._clocks[truck], self._clock_stream[truck]
 
-    def _is_new(self, where: Key, identity: Identity, stream: Stream, payload: bytes) -> bool:
+    def _is_new(self, where: Key, identity: Identity, stream: StreamRecord, payload: bytes) -> bool:
         name = (where, identity.boot_id)
         numbers = self.seen.numbers(where, identity.boot_id)
         highest = numbers.highest
@@ -238,23 +235,23 @@ class Intake:
         self.counts["refused"] += 1
         realm = where.realm if where else self.realm or "live"
         vehicle = where.identifier if where and where.owner == "vehicle" else ""
-        # In how many realms a vehicle shows itself is nothing to the others.
-        name = vehicle or _nobody(realm)
+        # The number of realms of a vehicle must not affect others.
+        name = vehicle or _no_vehicle(realm)
         if name not in self._refused and len(self._refused) >= _MAX_REFUSED_SOURCES:
-            name = _nobody(self.realm or "live")
+            name = _no_vehicle(self.realm or "live")
         before = self._refused.get(name, Refusals(realm, reason, 0))
         self._refused[name] = before._replace(number=before.number + 1)
 
     def _refusals(self, now_ns: int, now_s: float, *, closing: bool) -> list[tuple[Key, Event]]:
         events: list[tuple[Key, Event]] = []
-        told = self._refused_told_s
-        for name in [name for name, at_s in told.items() if now_s - at_s >= _REFUSALS_PERIOD_S]:
-            del told[name]
+        reported = self._refused_reported_s
+        for name in [name for name, at_s in reported.items() if now_s - at_s >= _REFUSALS_PERIOD_S]:
+            del reported[name]
         for name, refusals in list(self._refused.items()):
-            if not closing and (name in told or len(told) >= _MAX_REFUSED_SOURCES):
+            if not closing and (name in reported or len(reported) >= _MAX_REFUSED_SOURCES):
                 continue
-            vehicle = "" if name == _nobody(refusals.realm) else name
-            told[name] = now_s
+            vehicle = "" if name == _no_vehicle(refusals.realm) else name
+            reported[name] = now_s
             del self._refused[name]
             event = Event(
                 EventKind.REFUSED,
@@ -291,13 +288,13 @@ class Intake:
         return events
 
     def _watch_clock(self, where: Key, identity: Identity, stamp: Stamp, now_ns: int) -> None:
-        """Compare a live message's times with those before it, and with when it came."""
-        if stamp.device_time_ns is None or is_replayed(where.realm):
+        """Compare a live message's times with earlier ones, and with its arrival."""
+        if stamp.device_time_ns is None or is_from_recording(where.realm):
             return
         truck = (where.realm, where.identifier)
         stream, highest = self._clock_stream.get(truck, (where.stream, -1))
         if stream != where.stream and where.stream != "accel":
-            return  # one stream is enough, and accelerations come most often
+            return  # one stream is enough; accelerations are the most frequent
         clock = self._clocks.get(truck)
         if clock is None or stream != where.stream or identity.boot_id > clock.boot_id:
             clock = self._clocks[truck] = TruckClock(identity.boot_id)
@@ -347,15 +344,16 @@ class Intake:
         return events
 
 
-def _nobody(realm: str) -> str:
-    """Return the name under which refusals are counted that concern no vehicle."""
+def _no_vehicle(realm: str) -> str:
+    """Return the name under which refusals without a vehicle are counted."""
     return f"/{realm}"  # no vehicle can be called that
 
 
-def _check_rate(row: Topic, stream: Stream, log_time_ns: int, now_ns: int) -> None:
-    """ValueError if a stream comes faster than any sensor, by the clock and by its own times.
+def _check_rate(row: Topic, stream: StreamRecord, log_time_ns: int, now_ns: int) -> None:
+    """Raise ValueError if a stream is faster than any sensor, by the clock and by its own times.
 
-    By both: a replay is fast by the clock, a truck whose wall clock stands still by its times.
+    Both are necessary: a replay is fast by the clock, a truck with a stopped wall clock by its
+    times.
     """
     nominal_hz = row.nominal_rate_hz
     limit_hz = RATE_FACTOR * nominal_hz if nominal_hz is not None else _RATE_ON_OCCASION_HZ
@@ -375,7 +373,7 @@ def _touches(numbers: Intervals, sequence: int) -> bool:
 
 
 def _since(before: dict[tuple[int, int], float], hole: tuple[int, int], now_s: float) -> float:
-    """Return since when a hole has been there, also if it was part of a larger one."""
+    """Return the start of a gap, also if it was part of a larger one."""
     if hole in before:
         return before[hole]
     larger = list(before)

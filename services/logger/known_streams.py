@@ -1,6 +1,6 @@
-"""Which streams and boots the logger remembers: as many as have room, the quiet ones go first.
+"""The streams and boots in the logger's memory: bounded, quiet ones are evicted first.
 
-The limit that protects others is that of one vehicle in all realms: access control ties a vehicle,
+The limit that protects others applies to one vehicle in all realms: access control ties a vehicle,
 and nothing else of a key, to a certificate.
 """
 
@@ -12,51 +12,51 @@ from schemas.signals import Identity
 from schemas.topics import Key
 
 MAX_STREAMS = 8000
-"""All vehicles together have no more, and again all bridges and all services."""
+"""Largest number of streams of all vehicles, of all bridges and of all services."""
 MAX_STREAMS_OF_ONE = 64
-"""One vehicle, bridge or service has no more in all realms: a vehicle has four in each."""
+"""Largest number of streams of one owner in all realms; a vehicle has four in each."""
 MAX_BOOTS = 64
-"""Boots remembered of one stream."""
+"""Largest number of boots of one stream."""
 _QUIET_NS = 3_600_000_000_000
-"""A stream or boot that was silent for so long makes room for another one."""
+"""Silence after which a stream or boot may be evicted."""
 _LOOK_AGAIN_NS = 60_000_000_000
-"""An owner that is full is not searched for silent streams more often than this."""
+"""Interval of searches for silent streams of a full owner."""
 
 
 @dataclass
-class Stream:
-    """What is remembered of a key beside the sequences that came."""
+class StreamRecord:
+    """Memory of a key besides its received sequences."""
 
     boots: dict[int, int] = field(default_factory=dict)
-    """By boot_id when it was last heard of; the longest silent one first."""
+    """Time of the last message by boot_id; the longest silent one first."""
     recent: dict[tuple[int, int], int] = field(default_factory=dict)
-    """By identity the CRC of the last payloads."""
+    """CRC of the last payloads by identity."""
     tokens: float = -1.0
     heard_ns: int = 0
     arrival_ns: int = 0
     log_time_ns: int = 0
 
 
-class KnownStreams:
-    """Streams by key; `forget` is called with each (key, boot_id) that goes."""
+class StreamCache:
+    """Stream records by key; `forget` is called with each evicted (key, boot_id)."""
 
     def __init__(self, forget: Callable[[Key, int], None]) -> None:
         self._forget = forget
-        self._streams: dict[Key, Stream] = {}
+        self._streams: dict[Key, StreamRecord] = {}
         self._of_one: dict[tuple[str, str], list[Key]] = {}
         self._number_of: Counter[str] = Counter()
         self._full_until_ns: dict[str, int] = {}
-        """By owner: no stream is old enough before, so that none need be looked for."""
+        """Time by owner before which no stream is old enough to be evicted."""
 
     def __len__(self) -> int:
         return len(self._streams)
 
-    def of(self, where: Key, identity: Identity, now_ns: int) -> Stream:
-        """Return what is remembered of a key; ValueError if it would be one too many."""
+    def of(self, where: Key, identity: Identity, now_ns: int) -> StreamRecord:
+        """Return the record of a key; raise ValueError beyond the limits."""
         stream = self._streams.get(where)
         if stream is None:
             self._make_room(where, now_ns)
-            stream = self._streams[where] = Stream()
+            stream = self._streams[where] = StreamRecord()
             self._of_one.setdefault((where.owner, where.identifier), []).append(where)
             self._number_of[where.owner] += 1
         stream.heard_ns = now_ns
@@ -68,12 +68,12 @@ class KnownStreams:
             del boots[oldest]
             self._forget(where, oldest)
         if len(boots) > 1:
-            boots.pop(boot_id, None)  # the one heard of last stands last
+            boots.pop(boot_id, None)  # the most recent one stands last
         boots[boot_id] = now_ns
         return stream
 
     def _make_room(self, where: Key, now_ns: int) -> None:
-        """Drop a stream that is quiet if there would be one too many; ValueError if none is."""
+        """Evict a quiet stream if there would be one too many; raise ValueError if none is."""
         owner = where.owner
         own = self._of_one.get((owner, where.identifier), [])
         if len(own) >= MAX_STREAMS_OF_ONE:
@@ -91,7 +91,7 @@ class KnownStreams:
             oldest = min((one for one in self._streams if one.owner == owner), key=self._heard_ns)
             heard_ns = self._heard_ns(oldest)
             if abs(now_ns - heard_ns) < _QUIET_NS:
-                # No longer than a minute: the clock may be set meanwhile.
+                # At most a minute: the clock may be set meanwhile.
                 until_ns = min(heard_ns + _QUIET_NS, now_ns + _LOOK_AGAIN_NS)
                 self._full_until_ns[owner] = until_ns
                 raise full

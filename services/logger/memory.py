@@ -1,14 +1,13 @@
-"""Memory that is free is given back to the system."""
+"""Return of free memory to the system."""
 
 import contextlib
 import ctypes
 
 
 def give_back_memory() -> None:
-    """Give back what a burst needed; does nothing where the C library cannot.
+    """Return the memory of a burst; do nothing where the C library cannot.
 
-    glibc keeps what was freed below what is still used: a service that runs for months would keep
-    as much as its worst moment took.
+    glibc keeps free memory below used blocks: a service that runs for months would keep its peak.
     """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,15 +1,14 @@
-"""Events that the logger itself tells: one numbering for all of its threads."""
+"""Events of the logger itself, with one numbering for all of its threads."""
 
 import threading
 from collections import Counter
 
 from schemas.events import Event, encode_event
-from schemas.topics import Key
-from services.recordings.recording import Message
+from schemas.topics import Key, Message
 
 
 class OwnEvents:
-    """Makes messages of the topic `event` with identities of this boot of the logger."""
+    """A source of messages of the topic `event` with identities of this boot of the logger."""
 
     def __init__(self, service_id: str, boot_id: int) -> None:
         self.service_id = service_id

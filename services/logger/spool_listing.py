@@ -1,8 +1,8 @@
-"""What trucks say that their spools hold, asked of all of them at once.
+"""Listing of the spools of all trucks, requested at once.
 
-Answers are read and decoded in a thread of their own, for a truck may list thousands of boots, and
-answer a query as often as it likes: of one round each stream's first answer counts, a vehicle has
-so many bytes, and what lies in the queue is bounded.
+Answers are read and decoded in a thread of their own, because a truck may list thousands of boots
+and answer a query any number of times. In each round only each stream's first answer counts, bytes
+per vehicle are limited, and the queue is bounded.
 """
 
 import logging
@@ -14,37 +14,38 @@ from typing import Any
 import zenoh
 from zenoh import handlers
 
-from schemas.spool import Held, decode_contents, parse_spool_key, spool_selector
+from schemas.spool import SpoolBoot, decode_contents, parse_spool_key, spool_selector
 from schemas.topics import Key
-from services.logger.complaints import Complaints
+from services.logger.rate_limited_log import RateLimitedLog
 
 _log = logging.getLogger(__name__)
 _TIMEOUT_S = 1.5
-"""Trucks that have not answered by then are asked again in the next round, which begins every two
-seconds."""
+"""Timeout of a round, after which trucks are asked again in the next, every two seconds."""
 _PAUSE_S = 0.005
-"""Between two looks when no answer waits."""
+"""Interval of polling for answers."""
 _REPLIES_WAITING = 200
-"""Answers that wait to be read before the bus holds back the others."""
+"""Capacity for unread answers before the bus blocks others."""
 _MAX_BYTES = 1 << 20
-"""More of one vehicle in one round is not read; 10,000 ranges take a sixth of it."""
+"""Largest answer of one vehicle in one round; 10,000 ranges take a sixth of it."""
 
 
 class SpoolListing:
-    """One round after the other; each ends when the next one begins."""
+    """Rounds of queries; each ends when the next one begins."""
 
-    def __init__(self, bus: zenoh.Session, realms: Sequence[str], complaints: Complaints) -> None:
+    def __init__(
+        self, bus: zenoh.Session, realms: Sequence[str], complaints: RateLimitedLog
+    ) -> None:
         self._bus = bus
         self._realms = realms
         self._complaints = complaints
-        self._answers: dict[Key, list[Held]] = {}
+        self._answers: dict[Key, list[SpoolBoot]] = {}
         self._lock = threading.Lock()
         self._is_over = threading.Event()
         """Set when the round that is going on is to end, each round having its own."""
         self._thread: threading.Thread | None = None
 
     def ask(self) -> None:
-        """Begin a round; who has not answered in the one before is asked again."""
+        """Begin a round; trucks without an answer in the previous one are asked again."""
         self._is_over.set()
         self._is_over = threading.Event()
         self._thread = threading.Thread(
@@ -52,8 +53,8 @@ class SpoolListing:
         )
         self._thread.start()
 
-    def next_answer(self) -> tuple[Key, list[Held]] | None:
-        """Return what a truck has of a stream, oldest boot first; None: nothing new now."""
+    def next_answer(self) -> tuple[Key, list[SpoolBoot]] | None:
+        """Return a truck's contents of a stream, oldest boot first; None if there is no news."""
         with self._lock:
             if not self._answers:
                 return None
@@ -61,7 +62,7 @@ class SpoolListing:
             return where, self._answers.pop(where)
 
     def close(self) -> None:
-        """Ask nobody any more."""
+        """Stop all queries."""
         self._is_over.set()
         if self._thread is not None:
             self._thread.join()

@@ -1,13 +1,13 @@
-"""Fetches from the trucks' own disks what the bus did not bring.
+"""Recovery of missing messages from the trucks' own disks.
 
-Every few seconds all trucks are asked what their spools hold (`schemas.spool`). What a logger lacks
-for longer than one such round is asked for, a page at a time, one query per truck and few in all,
-again and again with growing pauses until the truck answers. Only when a truck says that it has no
-more of it, is it lost.
+Every few seconds all trucks are asked for the contents of their spools (`schemas.spool`). Messages
+missing for longer than one such round are requested a page at a time, with one query per truck and
+few in all, and with growing pauses until the truck answers. A message is lost only when a truck
+declares that it no longer holds it.
 
-What trucks list is read and decoded by `SpoolListing` in a thread of its own. All else runs in the
-thread that calls `step`; nothing in it waits, and none of its calls takes long whatever a truck
-lists: a step looks at some answers, and of each at so many boots, the rest have their turn later.
+`SpoolListing` reads and decodes the lists in a thread of its own. Everything else runs in the
+thread that calls `step`; nothing in it waits, and no call takes long whatever a truck lists: a step
+processes a limited number of answers, and of boots in each; the others follow later.
 """
 
 import logging
@@ -27,67 +27,66 @@ from schemas.spool import (
     MAX_RANGES,
     PAGE_BYTES,
     PAGE_MESSAGES,
-    Held,
-    Query,
     Range,
+    SpoolBoot,
+    SpoolQuery,
     decode_page,
     spool_key,
 )
 from schemas.topics import Key, key
-from services.bus.subscription import Received, Seen
+from services.bus.subscription import RawSample, SeenSequences
 from services.common.intervals import Intervals
-from services.logger.complaints import Complaints
+from services.logger.rate_limited_log import RateLimitedLog
 from services.logger.spool_listing import SpoolListing
 
 __all__ = ["Shortfall", "SpoolRecovery", "shortfall"]
 
 _log = logging.getLogger(__name__)
 LIST_PERIOD_S = 2.0
-"""How often trucks are asked what they hold."""
+"""Interval of queries for contents."""
 _HURRY_S = 0.3
-"""Its token is there a moment before it answers."""
+"""Delay after a truck's token, which precedes its first answer."""
 _PAGE_TIMEOUT_S = 10.0
-"""A page may have to come over a slow mobile network."""
+"""Timeout of a page over a slow mobile network."""
 _QUERIES_AT_ONCE = 8
-"""Trucks that are asked for pages at a time: what is live goes first."""
+"""Number of trucks with a page query at a time; live messages have priority."""
 _MAX_REPLIES = 2 * PAGE_MESSAGES
-"""A page with more messages has no end; it is twice what a truck may put into one."""
+"""Largest number of messages in a page, twice the regular limit."""
 _MAX_BYTES = 2 * PAGE_BYTES
-"""A longer answer has no end: it is a page and its end, or one message that is larger, and here as
-much again."""
+"""Largest answer: twice a page and its end, or a single larger message."""
 _REPLIES_PER_STEP = 500
-"""So many answers are taken between two looks at what comes live."""
+"""Number of answers before live messages are received again."""
 _FIRST_PAUSE_S = 1.0
-"""A truck that did not answer is left alone for so long, and twice as long after each failure."""
+"""Pause after a truck did not answer; it doubles after each failure."""
 _LONGEST_PAUSE_S = 60.0
-"""No pause is longer: the truck may be back any minute."""
+"""Longest pause, because the truck may return any minute."""
 _TRUCKS = 1000
-"""Trucks whose spools are read, one in two realms being two: memory is bounded whoever comes."""
+"""Largest number of spools (trucks times realms), which bounds memory."""
 REALMS_OF_ONE = 16
-"""In which one vehicle is asked for what it has, or is noted as being there."""
+"""Largest number of realms in which one vehicle is asked or noted as present."""
 _BOOTS_AT_ONCE = 64
-"""An answer tells of the newest boot and is read for so many earlier ones, which take turns."""
+"""Number of earlier boots read from an answer besides the newest; others follow in turn."""
 _COMPARE_S = 0.01
-"""After so long a step leaves further answers to the next one."""
+"""Time after which a step leaves further answers to the next one."""
 _NEAR = 200
-"""Holes closer to each other than that are asked for at once: few queries rather than few bytes."""
+"""Distance of gaps that are requested together: few queries rather than few bytes."""
 
 
 class Shortfall(NamedTuple):
-    """What a logger lacks of one stream and boot, by what can be done about it."""
+    """Missing messages of one stream and boot, by the possible action."""
 
     fetch: list[Range]
-    """The truck has it."""
+    """Messages that the truck has."""
     confirmed: list[Range]
-    """It was on a logger's disk before; the truck was told so."""
+    """Messages that were confirmed on a logger's disk before."""
     lost: list[Range]
-    """Nobody has it."""
+    """Messages that are lost."""
 
 
-def shortfall(boot: Held, seen: Intervals, ripe: int, gone: Iterable[Range] = ()) -> Shortfall:
-    """Compare what came of a stream and boot with what its truck has, below sequence `ripe`.
+def shortfall(boot: SpoolBoot, seen: Intervals, ripe: int, gone: Iterable[Range] = ()) -> Shortfall:
+    """Compare the received messages of a boot with those of its truck, below sequence `ripe`.
 
-    `gone`: what this logger had on its disk, and said so, and has no more.
+    `gone` are messages that this logger had confirmed and lost again.
     """
     missing = seen.missing_of([(0, min(ripe, boot.next_sequence) - 1)])
     durable = Intervals()
@@ -104,10 +103,10 @@ def shortfall(boot: Held, seen: Intervals, ripe: int, gone: Iterable[Range] = ()
 
 @dataclass
 class _Task:
-    """A query under way."""
+    """A running query."""
 
     where: Key
-    query: Query
+    query: SpoolQuery
     handler: Any
     deadline_s: float
     got: Intervals = field(default_factory=Intervals)
@@ -118,32 +117,32 @@ class _Task:
 @dataclass
 class _Truck:
     ripe: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """For each stream the newest boot, and below which sequence all is at least a round old."""
+    """Newest boot of each stream, and the sequence below which all are at least a round old."""
     turn: Counter[str] = field(default_factory=Counter)
-    """For each stream how many earlier boots have had their turn."""
+    """Number of earlier boots of each stream that have had their turn."""
     unlisted: set[tuple[Key, int]] = field(default_factory=set)
-    todo: deque[tuple[Key, Query]] = field(default_factory=deque)
+    todo: deque[tuple[Key, SpoolQuery]] = field(default_factory=deque)
     task: _Task | None = None
     failures: int = 0
     not_before_s: float = 0.0
 
 
 class SpoolRecovery:
-    """What is asked of every truck, and how far that is."""
+    """The queries to all trucks and their progress."""
 
     def __init__(
         self,
         bus: zenoh.Session,
         realms: Sequence[str],
-        seen: Seen,
+        seen: SeenSequences,
         *,
         gone: Mapping[tuple[Key, int], Intervals] = MappingProxyType({}),
         confirmed: Callable[[Key, int, int, int], None],
         lost: Callable[[Key, int, int, int], None],
     ) -> None:
-        """`seen` and `gone` are read only. The callbacks get (stream's key, boot_id, first, last).
+        """Create the recovery; callbacks receive (stream's key, boot_id, first, last).
 
-        `gone` are messages that were on the disk, and that trucks may still have.
+        `seen` and `gone` are only read; `gone` were on the disk, and trucks may still have them.
         """
         self._bus = bus
         self._seen = seen
@@ -152,14 +151,14 @@ class SpoolRecovery:
         self._lost = lost
         self._trucks: dict[tuple[str, str], _Truck] = {}
         self._trucks_of: Counter[str] = Counter()
-        self._complaints = Complaints(_log)
+        self._complaints = RateLimitedLog(_log)
         self._listing = SpoolListing(bus, realms, self._complaints)
         self._next_list_s = 0.0
         self._with_holes: dict[Key, set[int]] | None = None
         self._busy = False
 
-    def step(self, now_s: float, *, hold: bool = False) -> list[Received]:
-        """Do what can be done without waiting; return what was fetched. `hold`: no new queries."""
+    def step(self, now_s: float, *, hold: bool = False) -> list[RawSample]:
+        """Advance without waiting; return fetched messages. With `hold`, start no queries."""
         if now_s >= self._next_list_s:
             self._next_list_s = now_s + LIST_PERIOD_S
             self._listing.ask()
@@ -170,7 +169,7 @@ class SpoolRecovery:
             self._compare(*answer)
         if not self._busy:
             return []
-        received: list[Received] = []
+        received: list[RawSample] = []
         running = 0
         for truck in self._trucks.values():
             if truck.task is not None:
@@ -186,7 +185,7 @@ class SpoolRecovery:
         return received
 
     def waiting(self) -> int:
-        """Return how many messages trucks are still to be asked for."""
+        """Return the number of messages still to be requested."""
         return sum(
             query.last - query.first + 1
             for truck in self._trucks.values()
@@ -194,21 +193,21 @@ class SpoolRecovery:
         )
 
     def hurry(self, now_s: float) -> None:
-        """Ask soon what spools hold: a truck has come, and may not stay long."""
+        """Request the contents soon: a new truck may not stay long."""
         self._next_list_s = min(self._next_list_s, now_s + _HURRY_S)
 
     def pause(self, where: Key, now_s: float) -> None:
-        """Ask a truck for nothing for a while, longer each time: what it gave had no room."""
+        """Pause a truck, longer each time, because there was no room for its messages."""
         truck = self._trucks.get((where.realm, where.identifier))
         if truck is not None and now_s >= truck.not_before_s:
             self._pause(truck, now_s)
 
     def close(self) -> None:
-        """Ask nobody any more."""
+        """Stop all queries."""
         self._listing.close()
         self._complaints.flush(closing=True)
 
-    def _compare(self, where: Key, boots: list[Held]) -> None:
+    def _compare(self, where: Key, boots: list[SpoolBoot]) -> None:
         truck = self._truck(where)
         if truck is None or not boots:
             return
@@ -224,7 +223,7 @@ class SpoolRecovery:
         ripe_boot, ripe = truck.ripe.get(where.stream, (newest, 0))
         for boot in turn:
             seen = self._seen.streams.get((where, boot.boot_id), Intervals())
-            # What was sent in this moment may still be on its way; an earlier boot sends nothing.
+            # A message just sent may still arrive; an earlier boot sends nothing.
             below = boot.next_sequence
             if boot.boot_id == newest:
                 below = ripe if ripe_boot == newest else 0
@@ -235,7 +234,7 @@ class SpoolRecovery:
             for first, last in missing.lost:
                 self._lost(where, boot.boot_id, first, last)
             for first, last in _joined(missing.fetch):
-                query = (where, Query(boot.boot_id, first, last))
+                query = (where, SpoolQuery(boot.boot_id, first, last))
                 if query not in _under_way(truck):
                     todo.append(query)
         truck.ripe[where.stream] = (newest, boots[-1].next_sequence)
@@ -264,8 +263,8 @@ class SpoolRecovery:
             self._trucks_of[where.identifier] += 1
         return truck
 
-    def _turn(self, truck: _Truck, stream: str, boots: list[Held]) -> list[Held]:
-        """Return the boots that are looked at this time: the newest one, and others in turn."""
+    def _turn(self, truck: _Truck, stream: str, boots: list[SpoolBoot]) -> list[SpoolBoot]:
+        """Return the boots to compare now: the newest one, and others in turn."""
         earlier = boots[:-1]
         if len(earlier) > _BOOTS_AT_ONCE:
             first = truck.turn[stream] % len(earlier)
@@ -274,7 +273,7 @@ class SpoolRecovery:
         return [*earlier, boots[-1]]
 
     def _forgotten(self, truck: _Truck, where: Key, listed: set[int], newest: int) -> None:
-        """Give up the holes of earlier boots of which the truck has not spoken for two rounds."""
+        """Give up the gaps of earlier boots that the truck has not listed for two rounds."""
         if self._with_holes is None:
             self._with_holes = {}
             for (one, boot_id), numbers in self._seen.streams.items():
@@ -309,7 +308,7 @@ class SpoolRecovery:
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_PAGE_TIMEOUT_S,
                 congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.DATA_LOW,  # the reply's, too: what is live goes first
+                priority=zenoh.Priority.DATA_LOW,  # the reply's, too: live messages have priority
             )
         except zenoh.ZError as error:
             _log.debug("spool query: %s", error)
@@ -317,7 +316,7 @@ class SpoolRecovery:
             return
         truck.task = _Task(where, query, handler, now_s + 2 * _PAGE_TIMEOUT_S)
 
-    def _read(self, truck: _Truck, task: _Task, now_s: float, received: list[Received]) -> None:
+    def _read(self, truck: _Truck, task: _Task, now_s: float, received: list[RawSample]) -> None:
         for _ in range(_REPLIES_PER_STEP):
             try:
                 reply = task.handler.try_recv()
@@ -334,7 +333,7 @@ class SpoolRecovery:
                 self._complaints.warn(
                     "long pages", "%s: spool: a page without end", task.where.identifier
                 )
-                self._failed(truck, task, now_s)  # what waits is dropped with the handler
+                self._failed(truck, task, now_s)  # waiting answers are dropped with the handler
                 return
             if reply.ok is None:
                 continue
@@ -354,17 +353,17 @@ class SpoolRecovery:
                 task.got.add(identity.sequence)
                 seen = self._seen.streams.get((task.where, boot_id))
                 if seen is None or identity.sequence not in seen:
-                    received.append(Received(key(*task.where), payload, attachment, True, True))
+                    received.append(RawSample(key(*task.where), payload, attachment, True, True))
 
     def _page_complete(self, truck: _Truck, task: _Task, next_sequence: int | None) -> None:
         truck.task = None
         truck.failures = 0
         where, (boot_id, first, last) = task.where, task.query
         if next_sequence is not None:
-            truck.todo.appendleft((where, Query(boot_id, next_sequence, last)))
+            truck.todo.appendleft((where, SpoolQuery(boot_id, next_sequence, last)))
             last = next_sequence - 1
         seen = self._seen.streams.get((where, boot_id), Intervals())
-        # Held by its own account, but not to be read any more: a damaged disk.
+        # Listed, but no longer readable: a damaged disk.
         for gap in task.got.missing_of([(first, last)]):
             for a, b in seen.missing_of([gap]):
                 self._lost(where, boot_id, a, b)
@@ -380,7 +379,7 @@ class SpoolRecovery:
         truck.not_before_s = now_s + pause_s
 
 
-def _under_way(truck: _Truck) -> list[tuple[Key, Query]]:
+def _under_way(truck: _Truck) -> list[tuple[Key, SpoolQuery]]:
     return [] if truck.task is None else [(truck.task.where, truck.task.query)]
 
 

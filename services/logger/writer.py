@@ -1,11 +1,11 @@
 """The logger's files: a thread that writes and syncs them, behind a bounded, counted queue.
 
-A file is closed, with END and the reason, when it is old or large enough, when asked, and when its
+A file is closed, with END and the reason, when it is old or large enough, on request, and when its
 truck has been quiet for long; the next message of that truck begins a new one. Only this thread
-writes, between two messages, so that none is lost or repeated by it.
+writes, and it rotates between two messages, so that none is lost or repeated.
 
-Longer than other modules, because what that thread holds does not come apart: whoever closes a
-file, for age, room, a failure or because it is gone, must know what of it was not yet synced.
+Longer than other modules, because the state of that thread is coupled: closing a file, for age,
+space, a failure or loss, requires the messages that were not yet synced.
 """
 
 import contextlib
@@ -21,53 +21,53 @@ from typing import NamedTuple
 
 from schemas.events import Event, EventKind
 from schemas.proto import driveby_pb2 as pb
-from schemas.topics import Key, topic
+from schemas.topics import Key, Message, topic
 from services.common.disk import DISK, Disk
 from services.common.errors import InputError
 from services.common.intervals import Intervals
-from services.history.catalog import catalog_closed
 from services.logger.backlog import Backlog
+from services.logger.cataloguing import Cataloguing
 from services.logger.drops import FAILED, QUEUE_IS_FULL, Drop, Drops
 from services.logger.durable import DurableStreams
-from services.logger.own_events import OwnEvents
-from services.logger.places import (
+from services.logger.file_layout import (
     SERVICE_FILE,
     FileName,
-    Place,
+    RecordingTarget,
     belongs_to,
     file_of,
+    file_slot,
     free_path,
-    room_for,
 )
-from services.recordings.recording import Identities, Message
+from services.logger.own_events import OwnEvents
+from services.recordings.recording import Identities
 from services.recordings.writer import Misplaced, RecordingWriter
 
 _log = logging.getLogger(__name__)
 SYNC_PERIOD_S = 0.5
-"""Half of what is promised, so that a slow disk does not break the promise."""
+"""Sync interval, half of the guarantee, so that a slow disk does not break it."""
 _SYNCS_AT_ONCE = 8
-"""A disk takes several syncs together, so that many open files are done within a period."""
+"""Number of parallel syncs, so that many open files are synced within a period."""
 _LOOK_S = 0.05
-"""How often the writer looks for messages when there were none."""
+"""Interval of polling for messages after an empty queue."""
 QUIET_S = 300.0
-"""A truck that has said nothing for so long gets a new file when it comes back."""
+"""Silence of a truck after which it gets a new file."""
 _DISK_CHECK_S = 1.0
-"""How often free space is asked for."""
+"""Interval of checks of free space."""
 _STOP_SHARE = 0.125
-"""Recording stops at this share of the floor of free space, while files can still be closed
-well."""
+"""Share of the minimum free space at which recording stops, while files can still be closed
+properly."""
 _MAX_LATCHED_BYTES = 16 << 20
-"""Latched messages begin every new file; beyond this the ones that were heard longest ago are left
-out."""
+"""Largest size of latched messages, which begin every new file; beyond, the oldest are omitted."""
 
 
-class Limits(NamedTuple):
-    """When a file is closed and the next one begun, and how much room is left on the disk."""
+class RotationLimits(NamedTuple):
+    """Limits for closing a file, and minimum free space."""
 
     age_s: float = 900.0
     bytes: int = 1 << 30
     min_free_bytes: int = 0
-    """Below it the logger does not start, and says so while it runs; at an eighth it stops."""
+    """Free space below which the logger does not start, and warns while it runs; it stops at an
+    eighth."""
 
 
 @dataclass
@@ -81,18 +81,18 @@ class _Open:
 
 
 class FileWriter:
-    """Writes messages in a thread of its own, so that a slow disk does not hold up the bus."""
+    """A thread that writes messages, so that a slow disk does not hold up the bus."""
 
     def __init__(
         self,
-        place: Place,
-        limits: Limits = Limits(),  # noqa: B008  # a tuple does not change
+        place: RecordingTarget,
+        limits: RotationLimits = RotationLimits(),  # noqa: B008  # a tuple does not change
         *,
         own: OwnEvents | None = None,
         disk: Disk = DISK,
         backlog: Backlog | None = None,
     ) -> None:
-        """Open the single file, if one is asked for; InputError if that cannot be done."""
+        """Open the single file, if requested; raise InputError if that fails."""
         self.failure: str | None = None
         """Set once when writing failed; nothing is written after that."""
         self.written = 0
@@ -122,20 +122,20 @@ class FileWriter:
         self._durable = DurableStreams()
         self._end: tuple[str, Mapping[str, int]] = ("", {})
         self._syncing = ThreadPoolExecutor(_SYNCS_AT_ONCE, "sync")
-        self._cataloguing = ThreadPoolExecutor(1, "catalogue")
+        self._cataloguing = Cataloguing(self._folder())
         if place.file is not None:
             self._open(("", ""), place.file, "logger started")
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
 
     def has_room(self, payload_bytes: int) -> bool:
-        """Whether `put` would take a message of that size."""
+        """Return whether `put` would accept a message of that size."""
         return self.failure is None and self._backlog.has_room(payload_bytes)
 
     def put(self, message: Message, *, always: bool = False) -> bool:
-        """Hand over a message; False (and counted) if the queue is full or writing failed.
+        """Queue a message; return False (and count) if the queue is full or writing failed.
 
-        `always` is for what must be written down because the queue is full.
+        `always` is for messages that must be written because the queue is full.
         """
         if self.failure is None and self._backlog.put(message, always=always):
             return True
@@ -144,57 +144,56 @@ class FileWriter:
 
     @property
     def dropped(self) -> int:
-        """Messages that found the queue full, came after a failure or had no file (`drops`)."""
+        """The number of messages without room or file, or after a failure (`drops`)."""
         return self._drops.total
 
     def count_drop(self, where: Key | None, why: str = QUEUE_IS_FULL) -> None:
-        """Count a message that is not written, and why."""
+        """Count a message that is not written, with its cause."""
         self._drops.count(where, why)
 
     def drops(self) -> list[Drop]:
-        """Return how many were dropped since the last call, by whom it concerns and why."""
-        return self._drops.untold()
+        """Return the drops since the last call, by source and cause."""
+        return self._drops.drain()
 
     def waiting(self) -> int:
-        """Return how many messages wait in the queue."""
+        """Return the number of messages in the queue."""
         return len(self._backlog)
 
     def waiting_bytes(self) -> int:
-        """Return how much memory they take."""
+        """Return the memory of the messages in the queue."""
         return self._backlog.bytes
 
     def open_files(self) -> int:
-        """Return how many files are being written."""
+        """Return the number of files being written."""
         return len(self._files)
 
     def rotate(self) -> None:
-        """Ask for all files to be closed; the next message of each truck begins a new one."""
+        """Request the closing of all files; the next message of each truck begins a new one."""
         self._rotation_asked.set()
         self._backlog.wake()
 
     def finish(self, reason: str, counts: Mapping[str, int]) -> None:
-        """Write what waits, then every file's END with its reason and counts; wait for that."""
+        """Write waiting messages, then every file's END with reason and counts; wait for that."""
         self._end = (reason, counts)
         self._backlog.close()
         self._thread.join()
 
-    def settle(self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool) -> None:
-        """Take numbers of a stream for settled, so that `durable` can pass them.
-
-        `on_disk`: an earlier run has them on disk. Otherwise they are lost or refused for good.
-        """
-        self._durable.settle(where, boot_id, first, last, on_disk=on_disk)
+    def mark_accounted(
+        self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool
+    ) -> None:
+        """Mark sequences as accounted for in `durable`: on disk earlier, or lost or refused."""
+        self._durable.mark_accounted(where, boot_id, first, last, on_disk=on_disk)
 
     def forget(self, names: Iterable[tuple[Key, int]]) -> None:
-        """Speak of these streams and boots no more: they have been silent for long."""
+        """Remove these streams and boots from `durable` after a long silence."""
         self._durable.forget(names)
 
     def durable(self) -> tuple[int, dict[str, pb.Durable]]:
-        """Return what is on disk as messages by realm, and a number that rises with changes."""
+        """Return the sequences on disk as messages by realm, and a version of the content."""
         return self._durable.messages()
 
     def durable_version(self) -> int:
-        """Return the number of `durable` alone, which costs nothing."""
+        """Return only the version of `durable`, which costs nothing."""
         return self._durable.version
 
     def _run(self) -> None:
@@ -205,18 +204,18 @@ class FileWriter:
                 self._close(name, reason, counts)
         except _WriteFailed as failed:
             self._stop(failed.name, f"recording stopped: {failed.reason}", failed.kind)
-        except Exception as error:  # whatever it was, it must be told and nobody left waiting
+        except Exception as error:  # any error must be reported, and no thread left waiting
             _log.exception("writer")
             self._stop(None, f"recording stopped: {error}", EventKind.WRITE_ERROR)
         finally:
             self._syncing.shutdown()
-            self._cataloguing.shutdown()
+            self._cataloguing.close()
 
     def _write_all(self) -> None:
         synced_s = time.monotonic()
         looked_s = 0.0
         while not self._backlog.is_over:
-            message = self._backlog.take()
+            message = self._backlog.pop()
             now_s = time.monotonic()
             if message is not None:
                 self._write(message, now_s)
@@ -238,7 +237,7 @@ class FileWriter:
         name = file_of(self._place, message, self._files)
         opened = self._files.get(name)
         if opened is None:
-            room = room_for(name, {one: self._files[one].last_s for one in self._files}, now_s)
+            room = file_slot(name, {one: self._files[one].last_s for one in self._files}, now_s)
             if room.why_not:
                 self.count_drop(message.key, room.why_not)
                 identity = (message.key, message.boot_id)
@@ -259,7 +258,7 @@ class FileWriter:
             self._close(name, "rotated: size")
 
     def _sync(self) -> None:
-        # At once, for a disk does many in little more time than one.
+        # In parallel: a disk syncs many in little more time than one.
         done = [self._syncing.submit(_synced, *item) for item in self._files.items()]
         wait(done)
         misplaced = {name: one.result() for name, one in zip(self._files, done, strict=True)}
@@ -285,7 +284,7 @@ class FileWriter:
                 free_path(self._place, *name),
                 "logger started" if previous is None else "rotated",
                 previous,
-                # The one that the file is begun for comes by itself.
+                # The message that begins the file follows by itself.
                 [m for k, m in self._latched.items() if k != where and belongs_to(k, name)],
             )
 
@@ -316,7 +315,7 @@ class FileWriter:
     def _close(self, name: FileName, reason: str, counts: Mapping[str, int] | None = None) -> None:
         opened = self._files[name]
         with _failing(name):
-            what = opened.file.misplaced()
+            what = opened.file.displacement()
         if what in ("deleted", "cut short"):
             self._replace(name, what)
             opened = self._files[name]
@@ -327,12 +326,11 @@ class FileWriter:
         del self._files[name]
         self._closed_names[name] = opened.file.path.name
         _log.info("closed %s: %s", opened.file.path, reason)
-        # Beside the writing: a file is read once more for its row, which nobody waits for.
-        if self._place.file is None:  # a file that somebody named belongs to no collection
-            self._cataloguing.submit(catalog_closed, self._folder(), opened.file.path)
+        if self._place.file is None:  # a single requested file belongs to no collection
+            self._cataloguing.add(opened.file.path)
 
     def _replace(self, name: FileName, what: Misplaced) -> None:
-        """Begin a new file for one that somebody has deleted, cut or moved, and say so."""
+        """Begin a new file for one that was deleted, cut or moved, and write an event."""
         file = self._files.pop(name).file
         latched = [
             message
@@ -348,15 +346,15 @@ class FileWriter:
         else:
             file.abandon()
             gone = file.identities
-            for message in latched:  # they stand in the next file, too
+            for message in latched:  # they are in the next file, too
                 gone[(message.key, message.boot_id)].remove_range(
                     message.sequence, message.sequence
                 )
             number = sum(numbers.size for numbers in gone.values())
-            told = self._durable.withdraw(gone)
+            confirmed = self._durable.withdraw(gone)
             self._unsynced = [(n, m) for n, m in self._unsynced if n != name]
             self.withdrawn.append(gone)
-            text += f": {number} messages are gone, {told} of them had been told to be durable"
+            text += f": {number} messages are gone, {confirmed} of them were confirmed as durable"
         with _failing(name):
             path = free_path(self._place, *name)
             self._open(name, path, f"the file before it was {what}", file.path.name, latched)
@@ -381,7 +379,7 @@ class FileWriter:
 
     def _rotate_on_request(self) -> None:
         if self._place.file is not None:
-            _log.warning("%s is the only file asked for and goes on", self._place.file)
+            _log.warning("%s is the only file (--file) and is not rotated", self._place.file)
             return
         for name in list(self._files):
             self._close(name, "rotated: on request")
@@ -411,10 +409,10 @@ class FileWriter:
             raise _WriteFailed(None, f"only {left}", EventKind.DISK_LOW)
         was_low, self.is_disk_low = self.is_disk_low, self.free_bytes < floor
         if self.is_disk_low and not was_low:
-            self._say(Event(EventKind.DISK_LOW, time.time_ns(), left))
+            self._write_event(Event(EventKind.DISK_LOW, time.time_ns(), left))
 
-    def _say(self, event: Event) -> None:
-        """Write an event to the file of every realm, and leave it to be published."""
+    def _write_event(self, event: Event) -> None:
+        """Write an event to the file of every realm, and queue it for publication."""
         _log.warning("%s: %s", event.kind, event.text)
         realms = {realm for realm, _ in self._files if realm} or {self._place.realm or "live"}
         for realm in sorted(realms):
@@ -423,31 +421,32 @@ class FileWriter:
             self._write(message, time.monotonic())
 
     def _stop(self, failed: FileName | None, failure: str, kind: EventKind) -> None:
-        """Close every file as well as can be, count what is lost and take nothing any more."""
+        """Close every file as well as possible, count the losses and accept nothing any more."""
         _log.error("%s", failure)
         try:
-            self._close_all_badly(failed, failure, Event(kind, time.time_ns(), failure))
+            self._close_all_after_failure(failed, failure, Event(kind, time.time_ns(), failure))
         finally:
             self.failure = failure
         while not self._backlog.is_over:
-            waited = self._backlog.take()
+            waited = self._backlog.pop()
             if waited is not None:
                 self.count_drop(waited.key, FAILED)
             else:
                 self._backlog.wait(SYNC_PERIOD_S)
 
-    def _close_all_badly(self, failed: FileName | None, failure: str, event: Event) -> None:
+    def _close_all_after_failure(self, failed: FileName | None, failure: str, event: Event) -> None:
         saved: list[Message] = []
         lost: list[Message] = []
         for name, opened in self._files.items():
             message = self._own.message(name[0] or self._place.realm or "live", event)
             self.said.append(message)
             mine = [m for n, m in self._unsynced if n == name]
-            number = self._close_badly(name, opened, failure, message, is_failed=name == failed)
+            at_fault = name == failed
+            number = self._close_after_failure(name, opened, failure, message, is_failed=at_fault)
             number = len(mine) if number is None else min(number, len(mine))
             saved += mine[: len(mine) - number]
             lost += mine[len(mine) - number :]
-        # What was on its way to a file that could not even be opened.
+        # Messages for a file that could not even be opened.
         lost += [m for n, m in self._unsynced if n not in self._files]
         self._files.clear()
         self._unsynced.clear()
@@ -456,10 +455,10 @@ class FileWriter:
         for dropped in lost:
             self.count_drop(dropped.key, FAILED)
 
-    def _close_badly(
+    def _close_after_failure(
         self, name: FileName, opened: _Open, failure: str, event: Message, *, is_failed: bool
     ) -> int | None:
-        """Close a file with an event; how many messages it lost, None if that is not known."""
+        """Close a file with an event; return its lost messages, None if unknown."""
         counts = {"dropped": self._drops.of(*name) - opened.dropped_before}
         try:
             if is_failed:
@@ -471,7 +470,7 @@ class FileWriter:
         try:
             opened.file.write(event)
             opened.file.finish(failure, counts)
-        except OSError as error:  # all but event and END is safe
+        except OSError as error:  # everything except event and END is safe
             _log.error("%s: %s", opened.file.path, error.strerror)
             opened.file.fail(failure, counts, [event])
         return 0
@@ -480,7 +479,7 @@ class FileWriter:
 def _synced(name: FileName, opened: _Open) -> Misplaced | None:
     with _failing(name):
         opened.file.sync()
-        return opened.file.misplaced()
+        return opened.file.displacement()
 
 
 class _WriteFailed(Exception):  # noqa: N818  # says what happened, as OSError does not
@@ -493,7 +492,7 @@ class _WriteFailed(Exception):  # noqa: N818  # says what happened, as OSError d
 
 @contextlib.contextmanager
 def _failing(name: FileName) -> Iterator[None]:
-    """Name the file that an error came from."""
+    """Add the name of the file to errors."""
     try:
         yield
     except (OSError, InputError) as error:

@@ -1,1 +1,1 @@
-"""What a notebook asks for, without a bus: read, identify, simulate (`import driveby`)."""
+"""Functions for notebooks, without a bus: read, identify, simulate (`import driveby`)."""

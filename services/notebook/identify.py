@@ -1,4 +1,4 @@
-"""All crossings of recordings, CSV folders or a simulation, identified here and now."""
+"""Identification of all crossings of recordings, CSV folders or a simulation."""
 
 from collections.abc import Callable, Sequence
 from os import PathLike
@@ -9,7 +9,7 @@ from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.common.errors import InputError
 from services.execution.offline import identify_drives
-from services.execution.overview import Read, look_over, remembered
+from services.finding.order import Read, cached_reader, index_messages
 from services.history.draws import Draws
 from services.notebook.read import Name, given_site, messages_of_paths, paths_of, site_of_paths
 from services.notebook.simulate import Simulation
@@ -28,13 +28,14 @@ def identify(
 ) -> Identification:
     """Identify every crossing in recordings (.mcap), folders of CSV files or a simulation.
 
-    `site` is needed where the source brings none of its own (a recording carries it, a folder may
-    hold site.toml). `method` is pre, least_squares or random_walk. `draws=False` forgets the Markov
-    chains: about 1 MB a crossing. `say` is told what is being done. BLAS is limited to one thread
-    meanwhile. The same source, site, method and seed give the same numbers as `driveby identify`.
+    `site` is needed where the source has none of its own (a recording carries it, a folder may hold
+    site.toml). `method` is pre, least_squares or random_walk. `draws=False` drops the posterior
+    draws: about 1 MB a crossing. `say` is called with progress messages. BLAS is limited to one
+    thread meanwhile. The same source, site, method and seed give the same numbers as `driveby
+    identify`.
 
-    InputError, in one line, for what cannot be read; a crossing that cannot be identified is no
-    error but a verdict.
+    Raise InputError, in one line, for unreadable input; a crossing that cannot be identified is no
+    error but has a verdict.
     """
     settings = _settings(method, seed)
     if isinstance(source, Simulation):
@@ -43,7 +44,7 @@ def identify(
     else:
         paths = paths_of([source] if isinstance(source, str | PathLike) else list(source))
         known, name = site_of_paths(paths, site), ", ".join(str(path) for path in paths)
-        read = remembered(lambda again: messages_of_paths(paths, known, site, vehicle))
+        read = cached_reader(lambda again: messages_of_paths(paths, known, site, vehicle))
     kept: dict[str, Draws] = {}
 
     def keep(crossing_id: str, chains: Draws) -> None:
@@ -54,7 +55,7 @@ def identify(
         if fraction < 1.0:
             say(f"{crossing_id}: {stage}")
 
-    found = identify_drives(look_over(name, read, known), known, settings, report, keep)
+    found = identify_drives(index_messages(name, read, known), known, settings, report, keep)
     solutions = (
         Solution(c, known.bridge(c.bridge), kept.get(c.crossing_id, {})) for c in found.crossings
     )

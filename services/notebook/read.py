@@ -1,4 +1,4 @@
-"""Recordings and folders of CSV files to arrays, and to the messages that an engine takes."""
+"""Recordings and folders of CSV files as arrays, and as messages for an engine."""
 
 from collections.abc import Iterator, Sequence
 from os import PathLike
@@ -7,10 +7,11 @@ from typing import TypeAlias
 
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site
+from schemas.topics import Message
 from services.common.errors import InputError
 from services.drives.importing import messages_of_folder, vehicle_of
 from services.drives.signals import Signals, signals_of_folder, signals_of_recording
-from services.recordings.recording import Message, read_messages, read_site
+from services.recordings.recording import read_messages, read_site
 
 Name: TypeAlias = str | PathLike[str]
 
@@ -20,10 +21,10 @@ def read(
 ) -> list[Signals]:
     """Read recordings (.mcap) and folders of CSV files, one `Signals` for each run of each truck.
 
-    Accelerations are upward and without gravity. How those of a CSV file were measured its site
-    file says: `site`, or `site.toml` in the folder; without one they are as in the file. Of a site
-    of several trucks `vehicle` says which one a CSV folder is of. InputError, in one line, if
-    something cannot be read.
+    Accelerations are upward and without gravity. The site file of a CSV folder declares how they
+    were measured: `site`, or `site.toml` in the folder; without one they are as in the file.
+    `vehicle` selects the truck of a CSV folder for a site of several trucks. Raise InputError, in
+    one line, for unreadable input.
     """
     found: list[Signals] = []
     for path in paths_of(sources):
@@ -40,7 +41,7 @@ def read(
 
 
 def paths_of(sources: Sequence[Name]) -> list[Path]:
-    """The sources as paths; InputError if there is none or one is not there."""
+    """Return the sources as paths; InputError if there is none or one does not exist."""
     if not sources:
         raise InputError("no source given, a recording (.mcap) or a folder of CSV files expected")
     paths = [Path(source) for source in sources]
@@ -53,7 +54,7 @@ def paths_of(sources: Sequence[Name]) -> list[Path]:
 
 
 def site_of_paths(paths: Sequence[Path], site: Name | Site | None) -> Site:
-    """The site given, or that of the first source that has one; InputError if there is none."""
+    """Return the given site, or that of the first source that has one; InputError without any."""
     for path in paths:
         if site is not None:
             return given_site(site)
@@ -70,7 +71,7 @@ def site_of_paths(paths: Sequence[Path], site: Name | Site | None) -> Site:
 def messages_of_paths(
     paths: Sequence[Path], site: Site, given: Name | Site | None, vehicle: str | None
 ) -> Iterator[Message]:
-    """All messages of the sources; of a CSV folder those that its truck would have sent."""
+    """Yield all messages of the sources; of a CSV folder those that its truck would have sent."""
     for path in paths:
         if path.is_dir():
             yield from messages_of_folder(path, site, _site_name(path, given), vehicle)
@@ -79,12 +80,12 @@ def messages_of_paths(
 
 
 def given_site(site: Name | Site) -> Site:
-    """The site, read if it is the name of a file."""
+    """Return the site, read if it is the name of a file."""
     return site if isinstance(site, Site) else load_site(Path(site))
 
 
 def site_of_folder(folder: Path, site: Name | Site | None) -> Site | None:
-    """The site given, or `site.toml` in the folder; None if there is neither."""
+    """Return the given site, or `site.toml` in the folder; None if there is neither."""
     if site is not None:
         return given_site(site)
     beside = folder / "site.toml"

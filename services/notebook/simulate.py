@@ -1,28 +1,31 @@
-"""A simulated crossing in memory, with its truth: what `driveby simulate` writes."""
+"""Simulation of a crossing in memory, with its truth, as by `driveby simulate`."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from schemas.site import Site
+from schemas.topics import Message
 from services.common.errors import InputError
 from services.drives.runs import run_to_messages
 from services.drives.signals import Signals, signals_of_run
 from services.execution.blas import one_blas_thread
-from services.identification.placed import middle_site
+from services.finding.placed import middle_site
 from services.notebook.read import Name, given_site
-from services.recordings.recording import Message
 from services.simulation.drive import (
-    Drive,
-    declared,
+    OutOfModelEffects,
+    SimulatedDrive,
+    declared_site,
+    given_road,
     paper_site,
     ratios_of,
     simulate_drive,
     write_drive,
 )
+from services.simulation.lane import twist_of
 
 _REALM = "sim-drive"
 _SCENARIOS = range(1, 13)
@@ -31,34 +34,45 @@ _SCENARIOS = range(1, 13)
 class Simulation(NamedTuple):
     """A simulated crossing and the truth behind it."""
 
-    drive: Drive
-    """What was measured, the road as the tyres felt it, and the true ratios of EI to nominal."""
+    drive: SimulatedDrive
+    """Measurements, profile under the tyres, and the true ratios of EI to nominal."""
     site: Site
-    """As the owner of this truck would declare it, with the noise of its sensors."""
+    """Site as the owner of this truck would declare it, with the noise of its sensors."""
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        vehicle, bridge, run = self.site.vehicles[0].id, self.site.bridges[0].id, self.drive.run
+        ratios = " ".join(f"{ratio:.2f}" for ratio in self.ei_ratios)
+        seconds = float(run.accel_time_s[-1] - run.accel_time_s[0])
+        return (
+            f"<Simulation {vehicle} over {bridge}: {seconds:.1f} s at {run.rate_hz:g} Hz, "
+            f"EI of nominal {ratios}>"
+        )
 
     @property
     def signals(self) -> Signals:
-        """What the truck measured, as `read` gives it."""
+        """Return the measurements of the truck, in the form of `read`."""
         return signals_of_run(self.drive.run, self.site.vehicles[0].id)
 
     @property
     def ei_ratios(self) -> NDArray[np.float64]:
-        """True EI of each element over its nominal value."""
+        """Return the true EI of each element over its nominal value, (n,)."""
         return self.drive.rigidity_ratios
 
     @property
     def road_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The true road as the tyres felt it: chainage and height."""
+        """Return the true profile under the tyres: chainage and height (m,), both in m."""
         return self.drive.road.x_m, self.drive.road.height_m
 
     def messages(self) -> Iterator[Message]:
-        """What the truck would have sent."""
+        """Return the messages that the truck would have sent."""
         return run_to_messages([self.drive.run], self.site, _REALM, self.site.vehicles[0].id)
 
     def write(self, path: str | Path, *, force: bool = False) -> None:
         """Write the recording (.mcap) that the truck would have made.
 
-        InputError if there is a recording, which only `force` replaces, or it cannot be written.
+        Raise InputError if there is a recording, which only `force` replaces, or if it cannot be
+        written.
         """
         write_drive(Path(path), self.drive, self.site, force=force)
 
@@ -68,7 +82,7 @@ def simulate(
     scenario: int | None = None,
     ei: Sequence[float] | None = None,
     site: Name | Site | None = None,
-    road: str = "A",
+    road: str | tuple[ArrayLike, ArrayLike] = "A",
     seed: int = 1,
     noise: float = 0.0,
     speed: float | tuple[float, float] = 10.0,
@@ -76,21 +90,22 @@ def simulate(
     gps_noise: bool = False,
     rate: float | None = None,
 ) -> Simulation:
-    """Drive the site's first truck over its first bridge; the options are `driveby simulate`'s.
+    """Simulate a crossing of the site's first bridge by its first truck.
 
-    The truth is a damage `scenario` of the paper (1 to 12) or `ei`, the ratio of each element's EI
-    to its nominal value. `site` is by default that of the paper. `road` is an ISO 8608 class, A to
-    E; `noise` the accelerometers' noise density in µg/√Hz; `speed` in m/s, or a pair (start, end);
-    `rate` in Hz is by default the site's. BLAS is limited to one thread meanwhile.
+    The options are those of `driveby simulate`. The truth is a damage `scenario` of the paper (1 to
+    12) or `ei`, the ratio of each element's EI to its nominal value. `site` is by default that of
+    the paper. `road` is an ISO 8608 class, A to E, or a profile under both axles: chainages and
+    heights (n,) in m, level beyond its ends; `noise` the accelerometers' noise density in
+    µg/√Hz; `speed` in m/s, or a pair (start, end); `rate` in Hz is by default the site's. BLAS is
+    limited to one thread meanwhile.
 
-    InputError, in one line, for what cannot be; FailureError if the simulation does not settle.
+    Raise InputError, in one line, for an impossible value, FailureError if the simulation does not
+    converge.
     """
     if (scenario is None) == (ei is None):
         raise InputError("give either scenario= or ei=")
     if scenario is not None and scenario not in _SCENARIOS:
         raise InputError(f"scenario is {scenario}, it must be 1 to 12")
-    if road not in tuple("ABCDE"):
-        raise InputError(f'road is "{road}", it must be a class from A to E')
     if direction not in ("start_to_end", "end_to_start"):
         raise InputError(f'direction is "{direction}", start_to_end or end_to_start expected')
     begin, end = speed if isinstance(speed, tuple) else (speed, speed)
@@ -109,12 +124,13 @@ def simulate(
         drive = simulate_drive(
             known,
             ratios_of(known.bridges[0], scenario, ei),
-            road_class=road,
+            road_class=given_road(road),
             seed=seed,
             noise_ug_per_rthz=noise,
             speed_m_per_s=(begin, end),
             forward=direction == "start_to_end",
             receiver_errors=gps_noise,
             rate_hz=rate,
+            beyond=OutOfModelEffects(twist=twist_of(known.bridges[0])),
         )
-    return Simulation(drive, declared(known, noise, drive.run.rate_hz))
+    return Simulation(drive, declared_site(known, noise, drive.run.rate_hz))

@@ -1,13 +1,13 @@
-"""What an identification gives back: one shape for every method, as arrays and as tables.
+"""Results of an identification: one shape for every method, as arrays and as tables.
 
-pandas and xarray are needed by what returns their types and by nothing else.
+pandas and xarray are needed only by the functions that return their types.
 """
 
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from schemas.reasons import Reason
-from schemas.results import Crossing, Parameter, Results, Verdict, results_json
+from schemas.results import CrossingResult, Parameter, Results, Verdict, results_json
 from schemas.site import Bridge, Site
 from services.common.errors import InputError
 from services.common.extras import check_installed
@@ -20,6 +20,7 @@ from services.history.draws import (
     posterior,
     write_draws,
 )
+from services.notebook.showing import MOST_SHOWN, all_as_html, as_html, counted, one_line
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,74 +31,95 @@ _SPREAD = ("std", "q025", "q975")
 
 
 class Solution(NamedTuple):
-    """What was found of one crossing, by whichever method."""
+    """Result of one crossing, by whichever method."""
 
-    crossing: Crossing
-    """All of it, with the fields of results.json (docs/contract.md)."""
+    crossing: CrossingResult
+    """Complete result, with the fields of results.json (docs/contract.md)."""
     bridge: Bridge
-    """What the site file says of the bridge: lengths and nominal values."""
+    """Bridge of the site file: lengths and nominal values."""
     draws: Draws
-    """By unknown, arrays (chain, draw); empty for a rejected crossing, without `draws=True`, and
-    for methods that have none (`least_squares`, `random_walk`)."""
+    """Draws of each parameter, arrays (chain, draw).
+
+    They are empty for a rejected crossing, without `draws=True`, and for methods without draws
+    (`least_squares`, `random_walk`).
+    """
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        return f"<Solution {one_line(self.crossing, self.bridge)}>"
+
+    def _repr_html_(self) -> str:
+        return as_html(self.crossing, self.bridge)
 
     @property
     def value(self) -> dict[str, Parameter]:
-        """The estimate of each unknown, by name; empty for a rejected crossing."""
+        """Return the estimate of each parameter, by name; empty for a rejected crossing."""
         return dict(self.crossing.parameters or {})
 
     @property
     def verdict(self) -> Verdict:
-        """`good`, `suspect` or `rejected`."""
+        """Return `good`, `suspect` or `rejected`."""
         return self.crossing.verdict
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Why the verdict is not `good`; `crossing.reason_texts` are sentences."""
+        """Return why the verdict is not `good`; `crossing.reason_texts` are sentences."""
         return self.crossing.reasons
 
     @property
     def stats(self) -> dict[str, float]:
-        """How the search went: evaluations, convergence, seconds."""
+        """Return statistics of the search: evaluations, convergence, seconds."""
         return dict(self.crossing.diagnostics)
 
     def elements(self) -> "pd.DataFrame":
-        """One row for each element of the bridge; see `Identification.elements`."""
+        """Return one row for each element of the bridge; see `Identification.elements`."""
         return _elements_of([self])
 
     def parameters(self) -> "pd.DataFrame":
-        """One row for each unknown; see `Identification.parameters`."""
+        """Return one row for each parameter; see `Identification.parameters`."""
         return _parameters_of([self])
 
     def posterior(self) -> "xr.Dataset":
-        """The draws as arrays (chain, draw)."""
+        """Return the draws as arrays (chain, draw)."""
         whole = posterior([_draws_of(self)])
         return whole.isel(crossing=0) if whole.data_vars else whole
 
 
 class Identification(NamedTuple):
-    """What was found of all crossings, in order of time."""
+    """Results of all crossings, in order of time."""
 
     solutions: tuple[Solution, ...]
     results: Results
-    """The same with the fused estimate of each bridge, as in results.json."""
+    """Results with the fused estimate of each bridge, as in results.json."""
     site: Site
 
+    def __repr__(self) -> str:
+        """Return one line for each crossing, at most twenty."""
+        lines = [f"<Identification {counted(self.results.crossings)}>"]
+        lines += map(repr, self.solutions[:MOST_SHOWN])
+        if len(self.solutions) > MOST_SHOWN:
+            lines.append(f"… {len(self.solutions) - MOST_SHOWN} more")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return all_as_html([(one.crossing, one.bridge) for one in self.solutions])
+
     def elements(self) -> "pd.DataFrame":
-        """One row for each element of each crossing; needs pandas.
+        """Return one row for each element of each crossing; needs pandas.
 
         Columns: crossing, bridge, vehicle, method, verdict, element; from_m and to_m; mean, std,
         q025, q50 and q975 of EI in N·m²; nominal in N·m²; ratio (mean over nominal). Numbers are
-        NaN for a rejected crossing, and std, q025 and q975 where the method has no noise model:
-        what it calls an interval would say nothing.
+        NaN for a rejected crossing, and std, q025 and q975 where the method has no noise model, so
+        that an interval would be meaningless.
         """
         return _elements_of(self.solutions)
 
     def parameters(self) -> "pd.DataFrame":
-        """One row for each unknown of each crossing, in the units of its column `unit`."""
+        """Return one row for each parameter of each crossing, in the units of its column `unit`."""
         return _parameters_of(self.solutions)
 
     def posterior(self) -> "xr.Dataset":
-        """The draws as arrays (chain, draw, crossing); needs xarray.
+        """Return the draws as arrays (chain, draw, crossing); needs xarray.
 
         Longer chains are thinned to the shortest. For ArviZ:
         `arviz.InferenceData(posterior=found.posterior())`.
@@ -107,7 +129,8 @@ class Identification(NamedTuple):
     def to_netcdf(self, path: str | Path) -> None:
         """Write the draws, as `driveby identify --draws` does; `arviz.from_netcdf` reads `.nc`.
 
-        InputError if there are none, or xarray and h5netcdf are not installed and it is no `.npz`.
+        Raise InputError without draws, or if xarray and h5netcdf are not installed and the file is
+        no `.npz`.
         """
         check_draws_file(Path(path))
         if not any(solution.draws for solution in self.solutions):
@@ -137,14 +160,14 @@ def _elements_of(solutions: "list[Solution] | tuple[Solution, ...]") -> "pd.Data
             name = f"EI_{number + 1}"
             found = _statistics(solution, solution.value.get(name))
             rows.append(
-                _whose(solution)
+                _identity_columns(solution)
                 | {"element": name, "from_m": start_m, "to_m": start_m + length_m}
                 | found
                 | {"nominal": sound, "ratio": found["mean"] / sound}
             )
             start_m += length_m
-    whose = ("crossing", "bridge", "vehicle", "method", "verdict")
-    columns = [*whose, "element", "from_m", "to_m", *_STATISTICS, "nominal", "ratio"]
+    identity = ("crossing", "bridge", "vehicle", "method", "verdict")
+    columns = [*identity, "element", "from_m", "to_m", *_STATISTICS, "nominal", "ratio"]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -153,15 +176,17 @@ def _parameters_of(solutions: "list[Solution] | tuple[Solution, ...]") -> "pd.Da
     import pandas as pd
 
     rows = [
-        _whose(solution) | {"name": name, "unit": value.unit} | _statistics(solution, value)
+        _identity_columns(solution)
+        | {"name": name, "unit": value.unit}
+        | _statistics(solution, value)
         for solution in solutions
         for name, value in solution.value.items()
     ]
-    whose = ("crossing", "bridge", "vehicle", "method", "verdict")
-    return pd.DataFrame(rows, columns=[*whose, "name", "unit", *_STATISTICS])
+    identity = ("crossing", "bridge", "vehicle", "method", "verdict")
+    return pd.DataFrame(rows, columns=[*identity, "name", "unit", *_STATISTICS])
 
 
-def _whose(solution: Solution) -> dict[str, object]:
+def _identity_columns(solution: Solution) -> dict[str, object]:
     crossing = solution.crossing
     return {
         "crossing": crossing.crossing_id,

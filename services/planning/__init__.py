@@ -1,1 +1,1 @@
-"""What a survey will tell, before anyone drives: by simulated crossings of a site file."""
+"""Forecast of a survey before the drive, by simulated crossings of a site file."""

@@ -1,44 +1,45 @@
-"""What else could be done at a site: other tyres, loads, lanes, speeds, sensors, elements.
+"""Alternatives at a site: other tyres, loads, lanes, speeds, sensors, elements.
 
-Each alternative is the plan with one thing changed, so that its gain can be read beside it.
+Each alternative is the plan with one change, so that its gain can be compared with the plan.
 """
 
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from schemas.site import Bridge, Site, Vehicle
-from services.identification.checks import axle_loads_kg, loads_are_alike
-from services.planning.crossings import Crossing, axles_of
+from schemas.site_vehicle import axle_loads_kg
+from services.identification.checks import loads_are_alike
+from services.planning.crossings import PlannedCrossing, axles_of
 
 SPREAD: Final = 0.15
-"""Speeds of a survey lie so far about the planned one, to either side."""
+"""Relative deviation of a survey's speeds from the planned one, to either side."""
 _LIGHTER, _HEAVIER = 0.4, 1.5
-"""What the springs carry of an emptied and of a loaded truck, over what they carry as planned."""
+"""Loads of an emptied and of a loaded truck, relative to the planned load on its springs."""
 _QUIETER: Final = 0.25
 _ELEMENTS: Final = (5, 3)
 _MOVED: Final = 0.12
-"""Of the wheelbase: so far the load goes to the heavier axle where both carry alike."""
+"""Shift of the load to the heavier axle, relative to the wheelbase, where both are alike."""
 
 
 class Plan(NamedTuple):
-    """Crossings of equal number each; those of one tuple run in one track."""
+    """Crossings in equal numbers; those of one tuple are one wheel-path group."""
 
     name: str
-    tracks: tuple[tuple[Crossing, ...], ...]
+    tracks: tuple[tuple[PlannedCrossing, ...], ...]
 
     @property
     def site(self) -> Site:
-        """Whose elements and tyres are those of the plan."""
+        """Return the site with the elements and tyres of the plan."""
         return self.tracks[0][0].site
 
 
 def as_planned(site: Site, speed_m_per_s: float) -> Plan:
-    """One truck in one lane and one direction, at speeds about the planned one."""
+    """Return a plan of one truck in one lane and direction, at speeds about the planned one."""
     return Plan("as planned", (_spread(site, speed_m_per_s),))
 
 
 def alternatives(site: Site, speed_m_per_s: float) -> Iterator[Plan]:
-    """Each with one thing changed, as far as this site leaves it open."""
+    """Yield plans with one change each, as far as this site permits."""
     vehicle, bridge = site.vehicles[0], site.bridges[0]
     front, rear = axles_of(vehicle)
     planned = _spread(site, speed_m_per_s)
@@ -74,7 +75,7 @@ def alternatives(site: Site, speed_m_per_s: float) -> Iterator[Plan]:
 
 
 def with_tyres(site: Site, behind: str) -> Site:
-    """Single tyres in front, and `behind` single ones like them or usual twins."""
+    """Return a site with single tyres in front, and like single ones or twins `behind`."""
     vehicle = site.vehicles[0]
     width = (vehicle.tyre_width_m or (0.25, 0.25))[0]
     twin = behind == "twin"
@@ -86,14 +87,15 @@ def with_tyres(site: Site, behind: str) -> Site:
 
 
 def with_noise(site: Site, densities_ug_per_rthz: tuple[float, ...]) -> Site:
-    """Other sensors."""
+    """Return a site with other sensors."""
     changed = {"noise_density_ug_per_rthz": densities_ug_per_rthz}
     return site.model_copy(update={"sensor": site.sensor.model_copy(update=changed)})
 
 
-def _spread(site: Site, speed_m_per_s: float) -> tuple[Crossing, ...]:
+def _spread(site: Site, speed_m_per_s: float) -> tuple[PlannedCrossing, ...]:
     return tuple(
-        Crossing(site, round(factor * speed_m_per_s, 2)) for factor in (1.0 - SPREAD, 1.0 + SPREAD)
+        PlannedCrossing(site, round(factor * speed_m_per_s, 2))
+        for factor in (1.0 - SPREAD, 1.0 + SPREAD)
     )
 
 
@@ -102,7 +104,7 @@ def _with_vehicle(site: Site, vehicle: Vehicle) -> Site:
 
 
 def _carrying(vehicle: Vehicle, factor: float) -> Vehicle:
-    """The truck with so many times the load on its springs, its place unchanged."""
+    """Return the truck with a multiple of the load on its springs, at the same position."""
     total = sum(vehicle.unsprung_mass_kg) + factor * vehicle.sprung_mass_kg
     return vehicle.model_copy(update={"total_mass_kg": round(total, 1)})
 
@@ -116,7 +118,7 @@ def _moved(vehicle: Vehicle) -> Vehicle:
 
 
 def _coarser(bridge: Bridge, elements: int) -> Bridge:
-    """The same bridge with fewer elements, alike within each span."""
+    """Return the same bridge with fewer elements, alike within each span."""
     rigidity = sum(bridge.nominal_flexural_rigidity_nm2) / bridge.elements
     return bridge.model_copy(
         update={

@@ -1,4 +1,4 @@
-"""A survey's expectation: what so many crossings will tell, and what would help most."""
+"""Forecast of a survey: the information of its crossings, and the most useful changes."""
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -8,63 +8,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.survey import detection
-from pre_core.survey.plan import Known, Spreads, Track, spreads, together
+from pre_core.survey.plan import (
+    BridgePrior,
+    PlannedPathGroup,
+    SurveySpreads,
+    non_increasing,
+    survey_information,
+    survey_spreads,
+)
 from schemas.site import Bridge, Site
 from services.common.errors import FailureError
 from services.planning.alternatives import Plan, alternatives, as_planned
-from services.planning.crossings import Crossing, Road, Simulated, scale_error
+from services.planning.crossings import CrossingSimulator, PlannedCrossing, PlannedRoad, scale_error
 
 Floats = NDArray[np.float64]
 
 _JOINED_M: Final = 1e-6
 MOST_CROSSINGS: Final = 300
-"""Nobody drives more often."""
+"""Maximum number of crossings of a survey."""
 _COUNTS: Final = (1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200, 300)
-"""Numbers of crossings that the figure shows."""
+"""Numbers of crossings in the figure."""
 _SPEEDS: Final = 4
 
 
-class Asked(NamedTuple):
-    """What the engineer wants to know."""
+class SurveyQuestion(NamedTuple):
+    """Question of a forecast."""
 
     loss: float
     crossings: int
     speed_m_per_s: float
-    """About which the survey drives."""
+    """Mean speed of the survey."""
     speeds_m_per_s: tuple[float, float]
-    """That are possible."""
+    """Slowest and fastest possible speed."""
 
 
-class Expected(NamedTuple):
-    """What a plan's crossings tell; arrays (e,) by element from the bridge's start."""
+class SurveyExpectation(NamedTuple):
+    """Expected information of a plan's crossings; arrays (e,) by element from the start."""
 
     crossings: int
     std: Floats
-    """Of ln EI, with what is common to all."""
+    """Standard deviation of ln EI, with the common part."""
     level_std: float
     seen: Floats
-    """Probability that the loss is seen against the nominal value."""
+    """Probability of detecting the loss against the nominal value."""
     seen_among_others: Floats
     """The same against the mean of the other elements."""
     smallest_loss: Floats
-    """That is seen with probability `detection.SURE` against the nominal value."""
+    """Minimum loss against the nominal value that is detected with `DETECTION_PROBABILITY`."""
 
 
-class Outlook(NamedTuple):
-    """A plan, with what it tells."""
+class PlanForecast(NamedTuple):
+    """A plan with its forecast."""
 
     plan: Plan
-    once: Expected
-    expected: Expected
+    once: SurveyExpectation
+    expected: SurveyExpectation
     middle: int
-    """The element at the middle of the longest span; of two, the one that is told less."""
+    """Element at the middle of the longest span; of two, the one with less information."""
     needed_middle: int | None
-    """Crossings by which the loss is seen there for sure; None: more than MOST_CROSSINGS."""
+    """Crossings needed to detect the loss there; None beyond MOST_CROSSINGS."""
     needed_ends: int | None
     """The same at both ends."""
 
 
-class AtSpeed(NamedTuple):
+class SpeedForecast(NamedTuple):
     """The plan at another speed."""
 
     speed_m_per_s: float
@@ -74,54 +81,55 @@ class AtSpeed(NamedTuple):
     smallest_middle: float
 
 
-class Survey(NamedTuple):
-    """All that is found."""
+class SurveyForecast(NamedTuple):
+    """Forecast of a survey, with alternatives."""
 
-    asked: Asked
-    road: Road
-    planned: Outlook
-    others: tuple[Outlook, ...]
-    speeds: tuple[AtSpeed, ...]
-    rougher: Outlook | None
+    question: SurveyQuestion
+    road: PlannedRoad
+    planned: PlanForecast
+    others: tuple[PlanForecast, ...]
+    speeds: tuple[SpeedForecast, ...]
+    rougher: PlanForecast | None
     """The plan on a road one class worse."""
-    growth: tuple[Expected, ...]
-    """The plan with more and more crossings."""
+    growth: tuple[SurveyExpectation, ...]
+    """The plan with an increasing number of crossings."""
     compared_m: float
-    """Of road beside the bridge, at the planned speed."""
+    """Length of road next to the bridge that is compared at the planned speed."""
 
 
-def survey(
+def forecast_survey(
     site: Site,
-    road: Road,
-    asked: Asked,
+    road: PlannedRoad,
+    question: SurveyQuestion,
     progress: Callable[[int, int], None] = lambda done, jobs: None,
-) -> Survey:
-    """Plan a survey of the site's first bridge with its first truck."""
-    simulated = Simulated(road)
-    plans = list(alternatives(site, asked.speed_m_per_s))
-    speeds = _speeds(asked)
+) -> SurveyForecast:
+    """Forecast a survey of the site's first bridge with its first truck."""
+    simulated = CrossingSimulator(road)
+    plans = list(alternatives(site, question.speed_m_per_s))
+    speeds = _speeds(question)
     jobs = 2 + len(plans) + len(speeds)
-    planned = _outlook(simulated, as_planned(site, asked.speed_m_per_s), asked)
+    planned = _forecast_of(simulated, as_planned(site, question.speed_m_per_s), question)
     progress(1, jobs)
     others = []
     for plan in plans:
-        others.append(_outlook(simulated, plan, asked))
+        others.append(_forecast_of(simulated, plan, question))
         progress(1 + len(others), jobs)
     at_speeds = []
     for number, speed in enumerate(speeds, start=1):
-        # A speed that is only looked at beside the plan may be one that tells nothing.
+        # A speed that is only compared with the plan may give no information.
         with suppress(FailureError):
-            at_speeds.append(_at_speed(simulated, site, speed, asked))
+            at_speeds.append(_at_speed(simulated, site, speed, question))
         progress(1 + len(others) + number, jobs)
-    growth = _growth(simulated, planned.plan, asked)
+    growth = _growth(simulated, planned, question)
     crossing = planned.plan.tracks[0][0]
-    found = Survey(
-        asked,
+    (as_grown,) = (one for one in growth if one.crossings == question.crossings)
+    found = SurveyForecast(
+        question,
         road,
-        planned,
+        planned._replace(expected=as_grown),
         tuple(others),
         tuple(at_speeds),
-        _on_rougher_road(planned.plan, road, asked),
+        _on_rougher_road(planned.plan, road, question),
         growth,
         simulated.compared_m(crossing),
     )
@@ -129,9 +137,11 @@ def survey(
     return found
 
 
-def forecasts(road: Road, plan: Plan, crossings: int, ratios: Iterable[Floats]) -> list[Spreads]:
-    """What a plan's crossings tell of bridges whose EI (e,) is so many times the nominal one."""
-    simulated = Simulated(road)
+def forecasts(
+    road: PlannedRoad, plan: Plan, crossings: int, ratios: Iterable[Floats]
+) -> list[SurveySpreads]:
+    """Return a plan's spreads for bridges whose EI are `ratios` (e,) of the nominal one."""
+    simulated = CrossingSimulator(road)
     tracks = [simulated.track(some) for some in plan.tracks]
     precision = _precision(simulated, plan, tracks, crossings)
     known = simulated.known(plan.tracks[0][0])
@@ -143,91 +153,119 @@ def forecasts(road: Road, plan: Plan, crossings: int, ratios: Iterable[Floats]) 
     return found
 
 
-def _speeds(asked: Asked) -> list[float]:
-    """Speeds to compare, from the slowest to the fastest; none where there is no choice."""
-    low, high = asked.speeds_m_per_s
+def _speeds(question: SurveyQuestion) -> list[float]:
+    """Return speeds to compare, from the slowest to the fastest; none without a range."""
+    low, high = question.speeds_m_per_s
     return np.geomspace(low, high, _SPEEDS).round(1).tolist() if high > low else []
 
 
-def _on_rougher_road(plan: Plan, road: Road, asked: Asked) -> Outlook | None:
+def _on_rougher_road(
+    plan: Plan, road: PlannedRoad, question: SurveyQuestion
+) -> PlanForecast | None:
     if road.road_class == "E":
         return None
     rougher = road._replace(road_class=chr(ord(road.road_class) + 1))
-    return _outlook(Simulated(rougher), plan, asked)
+    return _forecast_of(CrossingSimulator(rougher), plan, question)
 
 
-def _outlook(simulated: Simulated, plan: Plan, asked: Asked) -> Outlook:
+def _forecast_of(
+    simulated: CrossingSimulator, plan: Plan, question: SurveyQuestion
+) -> PlanForecast:
     tracks = [simulated.track(crossings) for crossings in plan.tracks]
     middles = middle_elements(plan.site.bridges[0])
     last = plan.site.bridges[0].elements - 1
 
-    def errors_of(crossings: int) -> detection.Errors:
+    def errors_of(crossings: int) -> detection.DetectionErrors:
         return _errors(simulated, plan, tracks, crossings)
 
-    expected = _expected(simulated, plan, tracks, asked.crossings, asked.loss)
-    return Outlook(
+    expected = _expected(simulated, plan, tracks, question.crossings, question.loss)
+    return PlanForecast(
         plan,
-        _expected(simulated, plan, tracks, 1, asked.loss),
+        _expected(simulated, plan, tracks, 1, question.loss),
         expected,
-        _told_less(plan.site.bridges[0], expected),
-        _needed(errors_of, asked.loss, middles),
-        _needed(errors_of, asked.loss, (0, last)),
+        _less_determined(plan.site.bridges[0], expected),
+        _needed(errors_of, question.loss, middles),
+        _needed(errors_of, question.loss, (0, last)),
     )
 
 
-def _told_less(bridge: Bridge, expected: Expected) -> int:
-    """Which element at the middle is told less."""
+def _less_determined(bridge: Bridge, expected: SurveyExpectation) -> int:
+    """Return the element at the middle with less information."""
     return max(middle_elements(bridge), key=lambda element: expected.smallest_loss[element])
 
 
-def _precision(simulated: Simulated, plan: Plan, tracks: list[Track], crossings: float) -> Floats:
+def _precision(
+    simulated: CrossingSimulator, plan: Plan, tracks: list[PlannedPathGroup], crossings: float
+) -> Floats:
     known = simulated.known(plan.tracks[0][0])
-    return together(tracks, crossings, known.log_odds.size)
+    return survey_information(tracks, crossings, known.log_odds.size)
 
 
 def _errors(
-    simulated: Simulated, plan: Plan, tracks: list[Track], crossings: int
-) -> detection.Errors:
+    simulated: CrossingSimulator, plan: Plan, tracks: list[PlannedPathGroup], crossings: int
+) -> detection.DetectionErrors:
     precision = _precision(simulated, plan, tracks, crossings)
-    return detection.errors(simulated.known(plan.tracks[0][0]), precision, scale_error(plan.site))
-
-
-def _expected(
-    simulated: Simulated, plan: Plan, tracks: list[Track], crossings: int, loss: float
-) -> Expected:
-    precision = _precision(simulated, plan, tracks, crossings)
-    known, scale = simulated.known(plan.tracks[0][0]), scale_error(plan.site)
-    wide = _spreads(known, precision, plan.site)
-    errors = detection.errors(known, precision, scale)
-    return Expected(
-        crossings,
-        wide.elements,
-        wide.level,
-        detection.probability(loss, errors.of_nominal),
-        detection.probability(loss, errors.of_others),
-        detection.smallest_loss(errors.of_nominal),
+    return detection.detection_errors(
+        simulated.known(plan.tracks[0][0]), precision, scale_error(plan.site)
     )
 
 
-def _spreads(known: Known, precision: Floats, site: Site, truth: Floats | None = None) -> Spreads:
-    """Of ln EI, with what is common to all."""
-    wide = spreads(known, precision, np.array(site.bridges[0].lengths_m), truth)
+def _expected(
+    simulated: CrossingSimulator,
+    plan: Plan,
+    tracks: list[PlannedPathGroup],
+    crossings: int,
+    loss: float,
+) -> SurveyExpectation:
+    precision = _precision(simulated, plan, tracks, crossings)
+    known, scale = simulated.known(plan.tracks[0][0]), scale_error(plan.site)
+    wide = _spreads(known, precision, plan.site)
+    errors = detection.detection_errors(known, precision, scale)
+    return SurveyExpectation(
+        crossings,
+        wide.elements,
+        wide.level,
+        detection.detection_probability(loss, errors.of_nominal),
+        detection.detection_probability(loss, errors.of_others),
+        detection.minimum_detectable_loss(errors.of_nominal),
+    )
+
+
+def _spreads(
+    known: BridgePrior, precision: Floats, site: Site, truth: Floats | None = None
+) -> SurveySpreads:
+    """Return standard deviations of ln EI, with the common part."""
+    wide = survey_spreads(known, precision, np.array(site.bridges[0].lengths_m), truth)
     scale = scale_error(site)
-    return Spreads(np.hypot(wide.elements, scale), float(np.hypot(wide.level, scale)))
+    return SurveySpreads(np.hypot(wide.elements, scale), float(np.hypot(wide.level, scale)))
 
 
-def _growth(simulated: Simulated, plan: Plan, asked: Asked) -> tuple[Expected, ...]:
+def _growth(
+    simulated: CrossingSimulator, planned: PlanForecast, question: SurveyQuestion
+) -> tuple[SurveyExpectation, ...]:
+    plan = planned.plan
     tracks = [simulated.track(crossings) for crossings in plan.tracks]
-    counts = sorted({*_COUNTS, asked.crossings})
-    return tuple(_expected(simulated, plan, tracks, count, asked.loss) for count in counts)
+    known = {one.crossings: one for one in (planned.once, planned.expected)}
+    found = [
+        known.get(count) or _expected(simulated, plan, tracks, count, question.loss)
+        for count in sorted({*_COUNTS, *known})
+    ]
+    std = non_increasing(np.array([one.std for one in found]))
+    level = non_increasing(np.array([[one.level_std] for one in found]))
+    return tuple(
+        one._replace(std=wide, level_std=float(whole[0]))
+        for one, wide, whole in zip(found, std, level, strict=True)
+    )
 
 
-def _at_speed(simulated: Simulated, site: Site, speed: float, asked: Asked) -> AtSpeed:
-    plan = Plan(f"at {speed:g} m/s", ((Crossing(site, speed),),))
+def _at_speed(
+    simulated: CrossingSimulator, site: Site, speed: float, question: SurveyQuestion
+) -> SpeedForecast:
+    plan = Plan(f"at {speed:g} m/s", ((PlannedCrossing(site, speed),),))
     tracks = [simulated.track(crossings) for crossings in plan.tracks]
-    expected = _expected(simulated, plan, tracks, asked.crossings, asked.loss)
-    middle = _told_less(site.bridges[0], expected)
-    return AtSpeed(
+    expected = _expected(simulated, plan, tracks, question.crossings, question.loss)
+    middle = _less_determined(site.bridges[0], expected)
+    return SpeedForecast(
         speed,
         float(expected.std[middle]),
         expected.level_std,
@@ -237,13 +275,13 @@ def _at_speed(simulated: Simulated, site: Site, speed: float, asked: Asked) -> A
 
 
 def _needed(
-    errors_of: Callable[[int], detection.Errors], loss: float, elements: tuple[int, ...]
+    errors_of: Callable[[int], detection.DetectionErrors], loss: float, elements: tuple[int, ...]
 ) -> int | None:
-    """The fewest crossings by which the loss is seen for sure in these elements."""
+    """Return the fewest crossings that detect the loss with certainty in these elements."""
 
     def is_seen(crossings: int) -> bool:
-        seen = detection.probability(loss, errors_of(crossings).of_nominal)
-        return bool(seen[list(elements)].min() >= detection.SURE)
+        seen = detection.detection_probability(loss, errors_of(crossings).of_nominal)
+        return bool(seen[list(elements)].min() >= detection.DETECTION_PROBABILITY)
 
     if not is_seen(MOST_CROSSINGS):
         return None
@@ -256,7 +294,7 @@ def _needed(
 
 
 def middle_elements(bridge: Bridge) -> tuple[int, ...]:
-    """Which elements, from 0, lie at the middle of the longest span: two where they meet there."""
+    """Return the elements, from 0, at the middle of the longest span: two where they meet there."""
     spans = bridge.lengths_of_spans_m
     longest = spans.index(max(spans))
     at = sum(spans[:longest]) + 0.5 * spans[longest]

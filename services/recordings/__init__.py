@@ -1,1 +1,1 @@
-"""MCAP files: written so that they stay readable, read even if damaged, recovered."""
+"""MCAP files: written to stay readable, read even if damaged, recovered."""

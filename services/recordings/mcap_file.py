@@ -1,9 +1,9 @@
-"""Writes MCAP so that as little as possible depends on the rest of the file.
+"""Writer of MCAP files whose parts depend as little as possible on each other.
 
-mcap's own writer puts a channel only into the first chunk that uses it: damage there costs the
-messages of all later chunks, whose channel nobody knows any more. Here every chunk repeats the
-channels of its messages (150 bytes each before compression), and a chunk with its index goes out
-in one write, so that a write that fails leaves the writer as it was before.
+mcap's own writer puts a channel only into the first chunk that uses it: damage there makes the
+messages of all later chunks unreadable. Here every chunk repeats the channels of its messages (150
+bytes each before compression), and a chunk with its index is one write, so that a failed write
+leaves the writer unchanged.
 """
 
 import struct
@@ -46,10 +46,10 @@ _THREAD = threading.local()
 
 
 class McapWriter:
-    """Writes one MCAP file through `write`, which must take all the bytes or raise OSError.
+    """A writer of one MCAP file through `write`, which must write all bytes or raise OSError.
 
-    After an OSError the writer is as it was before the call, and so must the caller make the file:
-    `offset` bytes long.
+    After an OSError the writer is in the state before the call, and the caller must restore the
+    file: truncate it to `offset` bytes.
     """
 
     def __init__(self, write: Callable[[bytes], object], *, library: str, chunk_bytes: int) -> None:
@@ -76,18 +76,18 @@ class McapWriter:
 
     @property
     def pending(self) -> int:
-        """Messages in the chunk that is still in memory."""
+        """The number of messages in the open chunk."""
         return sum(len(entries) for entries in self._entries.values()) // _ENTRY.size
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Make a schema known and return its id."""
+        """Register a schema and return its id."""
         self._schemas.append(Schema(len(self._schemas) + 1, data, encoding, name))
         return len(self._schemas)
 
     def add_channel(
         self, topic: str, encoding: str, schema_id: int, metadata: Mapping[str, str]
     ) -> int:
-        """Make a channel known and return its id; ValueError if MCAP can count no further."""
+        """Register a channel and return its id; raise ValueError if MCAP's ids are used up."""
         if len(self._channels) >= (1 << 16) - 1:
             raise ValueError(f"more than {(1 << 16) - 1} channels in one file")
         channel = Channel(len(self._channels) + 1, topic, encoding, dict(metadata), schema_id)
@@ -161,15 +161,15 @@ class McapWriter:
         self._clear()
 
     def discard(self) -> int:
-        """Throw away the chunk that is still in memory; return how many messages it held."""
+        """Discard the open chunk; return the number of its messages."""
         number = self.pending
-        # A schema in it has not been written after all.
+        # A schema in it has not been written.
         self._written_schemas = 0
         self._clear()
         return number
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
-        """Write the chunk, and behind it a metadata record."""
+        """Write the chunk, then a metadata record."""
         self.flush()
         offset = self.offset
         encoded = _encoded(Metadata(name, dict(metadata)))
@@ -179,7 +179,7 @@ class McapWriter:
     def add_attachment(
         self, name: str, media_type: str, data: bytes, *, log_time: int = 0, create_time: int = 0
     ) -> None:
-        """Write the chunk, and behind it an attachment."""
+        """Write the chunk, then an attachment."""
         self.flush()
         offset = self.offset
         encoded = _encoded(Attachment(create_time, log_time, name, media_type, data))
@@ -232,7 +232,7 @@ class McapWriter:
         )
 
     def _begin_channel(self, channel_id: int) -> None:
-        """Put what is needed to read a channel into the chunk."""
+        """Add the records that a channel needs to the chunk."""
         # Schemas stand before the channels that need them, and once: they are large, and a reader
         # of ours finds them in its own tables.
         for schema in self._schemas[self._written_schemas :]:
@@ -255,7 +255,7 @@ class McapWriter:
 
 
 class _Compressed:
-    """Bytes that are needed only at the end and take little memory until then."""
+    """Bytes that are needed only at the end, compressed until then."""
 
     def __init__(self) -> None:
         self._blocks: list[bytes] = []
@@ -264,7 +264,7 @@ class _Compressed:
     def add(self, data: bytes) -> None:
         self._last += data
         if len(self._last) >= _INDEX_BLOCK_BYTES:
-            # A copy: zstandard's own bytes keep the room that they might have needed.
+            # A copy: zstandard's own bytes keep their reserved memory.
             self._blocks.append(bytes(memoryview(_compressed(self._last))))
             self._last.clear()
 
@@ -273,7 +273,7 @@ class _Compressed:
 
 
 def _compressed(data: bytes | bytearray) -> bytes:
-    # One for each thread and not one for each file: to make one takes as long as what it does.
+    # One per thread and not per file, because creating one takes as long as using it.
     compressor: zstandard.ZstdCompressor | None = getattr(_THREAD, "compressor", None)
     if compressor is None:
         compressor = _THREAD.compressor = zstandard.ZstdCompressor(level=_LEVEL)

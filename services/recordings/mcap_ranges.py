@@ -1,7 +1,7 @@
-"""Reading parts of a closed recording by its index: the summary first, then single chunks.
+"""Reader of parts of a closed recording by its index: the summary first, then single chunks.
 
-For files that are far away, or of which a little is wanted. Works on anything that seeks and reads.
-What has no index that holds is none of these; `mcap_scan` reads it from its beginning.
+For remote files, or small parts of one. Works on anything that can seek and read. Files without an
+intact index are refused; `mcap_scan` reads them from the beginning.
 """
 
 import io
@@ -24,17 +24,17 @@ _TAIL_BYTES = _FOOTER.size + len(MCAP0_MAGIC)
 
 
 class ChunkIndexes(NamedTuple):
-    """What the summary of a recording says."""
+    """The summary of a recording."""
 
     chunks: tuple[ChunkIndex, ...]
-    """In the order of the file."""
+    """Indexes in the order of the file."""
     channels: dict[int, Channel]
     metadata: tuple[str, ...]
     """Names of its metadata records."""
 
 
 def read_index(file: BinaryIO, size: int) -> ChunkIndexes | None:
-    """The summary of a recording of `size` bytes; None if it has none that holds."""
+    """Return the summary of a recording of `size` bytes; None without an intact one."""
     if size < _TAIL_BYTES + len(MCAP0_MAGIC):
         return None
     file.seek(size - _TAIL_BYTES)
@@ -58,7 +58,7 @@ def read_index(file: BinaryIO, size: int) -> ChunkIndexes | None:
 def chunk_messages(
     file: BinaryIO, chunk: ChunkIndex, channels: Collection[int]
 ) -> Iterator[RawMessage]:
-    """The messages of some channels in a chunk; ValueError if the chunk does not hold."""
+    """Yield the messages of some channels in a chunk; raise ValueError if it is damaged."""
     if not 0 < chunk.chunk_length <= MAX_RECORD_BYTES:
         raise ValueError(f"chunk at byte {chunk.chunk_start_offset} has an impossible length")
     file.seek(chunk.chunk_start_offset)

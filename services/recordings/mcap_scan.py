@@ -1,14 +1,13 @@
-"""Reading MCAP files that may be damaged anywhere: every record is checked before it is believed.
+"""Reader of MCAP files that may be damaged anywhere: every record is verified.
 
 mcap's own readers need an intact index, or raise in the middle of a record that is cut off or
-changed. Here a record counts only if it holds together: the lengths inside it agree with its own,
-encoding it again gives the same bytes, the checksum of a chunk or attachment is right. Where a
-record does not hold, the search goes on byte by byte for the next one that does. A chunk is also
-found when its opcode, a length or its compression's name is damaged, because its checksum says
-whether the right bytes were taken.
+changed. Here a record is valid only if it is consistent: the lengths inside it agree with its own,
+encoding it again gives the same bytes, the checksum of a chunk or attachment is right. After an
+invalid record the search continues byte by byte for the next valid one. A chunk is also found when
+its opcode, a length or its compression's name is damaged, because its checksum verifies the bytes.
 
-Memory is bounded whatever the lengths in the file say: by `MAX_RECORD_BYTES` for a record, and for
-what a chunk decompresses to.
+Memory is bounded whatever the lengths in the file: by `MAX_RECORD_BYTES` for a record and for a
+decompressed chunk.
 """
 
 import io
@@ -44,15 +43,15 @@ from mcap.writer import MCAP0_MAGIC
 from services.common.errors import InputError
 
 MAX_RECORD_BYTES = 64 << 20
-"""A record, or what a chunk decompresses to, that says it is larger is damage: ours are a thousand
-times smaller."""
+"""Largest valid record or decompressed chunk, a thousand times as large as ours."""
 
 _SURE_BYTES = 64 << 20
 _LARGEST_RATIO = 1000
-"""All chunks together may decompress to the first and so many times the file: constant signals in
-chunks of 64 KiB give a tenth of it. More is a bomb."""
+"""Largest ratio of all decompressed chunks to the file, beyond the first chunk. Constant signals in
+chunks of 64 KiB reach a tenth of it; more is a decompression bomb."""
 _MOST_OTHERS = 200_000
-"""Records of a chunk that are no messages: there are 65,536 channels and schemas at most."""
+"""Largest number of records other than messages in a chunk; MCAP has 65,536 channels and schemas.
+"""
 
 _HEADER = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -67,7 +66,7 @@ _FRAME_AT = _ZSTD_AT + len(_ZSTD) + _LENGTH.size
 _LZ4 = b"\x03\x00\x00\x00lz4"
 _LZ4_FRAME = b"\x04\x22\x4d\x18"
 _LZ4_BYTES = _ZSTD_AT + len(_LZ4) + _LENGTH.size + len(_LZ4_FRAME)
-"""From the beginning of a chunk to the end of the mark of an lz4 frame."""
+"""Length from the beginning of a chunk to the end of the magic number of an lz4 frame."""
 # A record's header with a length below 2**40, or what marks a chunk whose header is damaged.
 _CANDIDATE = re.compile(
     rb"(?=(?:([\x01-\x0f].{5}\x00{3})|(%b)|(%b)))" % (re.escape(_ZSTD), re.escape(_FRAME)), re.S
@@ -103,34 +102,34 @@ class RawMessage(NamedTuple):
 
 
 class Indexed(NamedTuple):
-    """How many messages of a channel the chunk before held, said by the index behind it."""
+    """Number of messages of a channel in the previous chunk, according to its index."""
 
     channel_id: int
     messages: int
 
 
 class Damage(NamedTuple):
-    """Bytes of the file that belong to no record that holds."""
+    """Bytes of the file outside every valid record."""
 
     offset: int
     size: int
     text: str
     is_chunk: bool
-    """A chunk is where it should be, but its content is not what was written."""
+    """Whether a chunk is in its place but its content is damaged."""
     is_cut_off: bool
-    """The file ends here."""
+    """Whether the file ends here."""
 
 
 Item = Schema | Channel | RawMessage | Indexed | Attachment | Metadata | DataEnd | Footer | Damage
 
 
 def scan(file: BinaryIO, start: int = 0) -> Iterator[Item]:
-    """Yield what holds in the file, in its order, and the damage between; from a record's start.
+    """Yield the valid records of a file in order, and the damage between; `start` is at a record.
 
-    Of the summary come its schemas and channels, and the footer. A file that ends without a footer
-    ends with a `Damage` that is cut off, of size 0 if not even a record was torn; so does one
-    whose chunks decompress to more than any recording's. OSError if reading fails, InputError if
-    the file is compressed in a way that this program does not read.
+    Of the summary only schemas, channels and the footer are yielded. A file without a footer ends
+    with a `Damage` that is cut off, of size 0 if no record was torn; so does one whose chunks
+    decompress to more than any recording's. Raise OSError if reading fails, InputError for an
+    unsupported compression.
     """
     size = os.fstat(file.fileno()).st_size
     at = start or len(MCAP0_MAGIC)
@@ -153,7 +152,7 @@ def scan(file: BinaryIO, start: int = 0) -> Iterator[Item]:
                 return
             at = begin
             record = _strong_record_at(file, at, size)
-            if record is None:  # it was one a moment ago: somebody else writes to the file
+            if record is None:  # it was valid a moment ago: another process writes to the file
                 return
         left -= record.unpacked_bytes
         if left < 0:
@@ -171,13 +170,13 @@ def scan(file: BinaryIO, start: int = 0) -> Iterator[Item]:
 
 
 def chunk_items(data: bytes) -> Iterator[Item] | None:
-    """What a chunk holds, given the bytes of its record; None if they do not hold together."""
+    """Yield the content of a chunk's record; None if it is inconsistent."""
     chunk = _chunk_at(io.BytesIO(data), 0, len(data), len(data))
     return None if chunk is None else chunk.items()
 
 
 def last_metadata(file: BinaryIO, name: str) -> tuple[Metadata, int] | None:
-    """Return the last metadata record of a name and where it ends, read from the file's end."""
+    """Return the last metadata record of a name and its end, reading from the file's end."""
     encoded = name.encode()
     mark = len(encoded).to_bytes(4, "little") + encoded
     size = os.fstat(file.fileno()).st_size
@@ -201,18 +200,18 @@ class _Record(NamedTuple):
     items: Callable[[], Iterator[Item]]
     is_chunk: bool = False
     unpacked_bytes: int = 0
-    """What a chunk says it decompresses to."""
+    """Declared decompressed size of a chunk."""
 
 
 def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Record | None:
-    """Return the record that begins where the one before ended; None if it does not hold."""
+    """Return the record at the end of the previous one; None if it is invalid."""
     record = _strong_record_at(file, at, size)
     if record is not None:
         return record
     opcode, length = _header_at(file, at, size) or (0, 0)
     end = at + _HEADER.size + length
     if opcode == Opcode.CHUNK and _is_lz4(_read(file, at, _LZ4_BYTES)):
-        # No file of ours is, and to find such a chunk among damage would take a second search.
+        # None of ours is, and finding such a chunk among damage would require a second search.
         raise InputError(
             f"{file.name}: is compressed with lz4, which is not read; compress it with zstd, as "
             "`mcap compress` does"
@@ -220,7 +219,7 @@ def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Reco
     if opcode not in (Opcode.CHUNK, Opcode.MESSAGE) or not _is_followed(file, end, size):
         return None
     if opcode == Opcode.CHUNK:
-        # Its content alone is wrong: the next record is where this one says.
+        # Only its content is wrong: its length is that of the record.
         text = f"damaged chunk at byte {at}"
         return _found(end, Damage(at, end - at, text, is_chunk=True, is_cut_off=False))
     # Nothing shows whether a message outside chunks is one. Where there are chunks it is none:
@@ -231,13 +230,13 @@ def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Reco
 
 
 def _is_lz4(head: bytes) -> bool:
-    """Whether this is how a chunk begins that is compressed with lz4."""
+    """Return whether this is the beginning of a chunk compressed with lz4."""
     name, frame = _ZSTD_AT, _ZSTD_AT + len(_LZ4) + _LENGTH.size
     return head[name : name + len(_LZ4)] == _LZ4 and head[frame:] == _LZ4_FRAME
 
 
 def _strong_record_at(file: BinaryIO, at: int, size: int) -> _Record | None:
-    """Return the record that begins at a byte, if there is one that shows by itself to be one."""
+    """Return the record at a byte, if its own content proves that there is one."""
     opcode, length = _header_at(file, at, size) or (0, 0)
     outer_end = at + _HEADER.size + length if opcode else None
     chunk = _chunk_at(file, at, size, outer_end)
@@ -290,7 +289,7 @@ def _found(end: int, *items: Item) -> _Record:
 
 
 def _is_followed(file: BinaryIO, at: int, size: int) -> bool:
-    """Whether at a byte there is the end of the file or something like a record."""
+    """Return whether the end of the file or a plausible record is at a byte."""
     header = _read(file, at, _HEADER.size)
     if len(header) < _HEADER.size:
         return at == size
@@ -300,10 +299,10 @@ def _is_followed(file: BinaryIO, at: int, size: int) -> bool:
 
 
 def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Record | None:
-    """Return the chunk whose record begins at a byte, if its checksum holds.
+    """Return the chunk whose record begins at a byte, if its checksum is right.
 
-    Its end is said twice, by the record and by the length of what is compressed, and either may be
-    damaged, as may be its opcode and the name of the compression.
+    Both the record's length and the length of the compressed data define its end, and either may be
+    damaged, as may its opcode and the name of the compression.
     """
     head = _read(file, at, _FRAME_AT + len(_FRAME))
     if len(head) < _FRAME_AT:
@@ -314,7 +313,7 @@ def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Rec
     if head[0] == Opcode.CHUNK and name_bytes == 0:
         begin = at + _ZSTD_AT + 4 + _LENGTH.size
         attempts.append((False, begin, begin + _LENGTH.unpack_from(head, _ZSTD_AT + 4)[0]))
-    # Also where the length of the compression's name is damaged and says that there is none.
+    # Also where the length of the compression's name is damaged to zero.
     if head[_FRAME_AT:] == _FRAME or head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD:
         begin = at + _FRAME_AT
         inner_end = begin + _LENGTH.unpack_from(head, _FRAME_AT - _LENGTH.size)[0]
@@ -335,7 +334,7 @@ def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Rec
 
 def _decompressed(data: bytes) -> bytes | None:
     try:
-        # Reading one byte too many tells a bomb without unpacking it.
+        # Reading one byte too many detects a bomb without decompressing it.
         with zstandard.ZstdDecompressor().stream_reader(data) as reader:
             content: bytes = reader.read(MAX_RECORD_BYTES + 1)
     except (zstandard.ZstdError, MemoryError):
@@ -355,7 +354,7 @@ def _holds(content: bytes, crc: int, *, is_certain: bool) -> bool:
 
 
 def _records_of(content: bytes, offset: int) -> Iterator[Item]:
-    """Yield what the chunk at a byte of the file holds, as far as it goes."""
+    """Yield the content of the chunk at a byte of the file as far as it is valid."""
     at = others = 0
     while at + _HEADER.size <= len(content):
         opcode, length = _HEADER.unpack_from(content, at)
@@ -386,9 +385,9 @@ def _raw_message(content: bytes, begin: int, end: int) -> RawMessage:
 
 
 def _torn_messages(file: BinaryIO, at: int, size: int) -> Iterator[Item]:
-    """Yield what can be had of a chunk that the end of the file cuts off.
+    """Yield the readable messages of a chunk that the end of the file cuts off.
 
-    zstd gives back whole blocks only, of 128 KiB before compression: nothing of a chunk of ours.
+    zstd restores whole blocks only, of 128 KiB before compression: nothing of our own chunks.
     """
     head = _read(file, at, _FRAME_AT)
     compressed = head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD
@@ -396,7 +395,7 @@ def _torn_messages(file: BinaryIO, at: int, size: int) -> Iterator[Item]:
         return
     length = _HEADER.unpack_from(head)[1]
     if at + _HEADER.size + length <= size or length > MAX_RECORD_BYTES:
-        return  # damaged, not torn: what came out could be anything
+        return  # damaged, not torn: the output is arbitrary
     content = bytearray()
     data = _read(file, at + _FRAME_AT, size - at - _FRAME_AT)
     try:
@@ -409,11 +408,11 @@ def _torn_messages(file: BinaryIO, at: int, size: int) -> Iterator[Item]:
 
 
 def _next_record(file: BinaryIO, at: int, size: int) -> int:
-    """Return where the next record that holds begins, at a byte or after it; `size` if none."""
+    """Return the place of the next valid record, at a byte or after it; `size` if none."""
     begin = at
     while begin < size:
         window = _read(file, begin, _WINDOW_BYTES)
-        # Room that was reserved and not written: no candidate, and compared at memory's speed.
+        # Space that was reserved and not written is no candidate; skip it at the speed of memory.
         for match in () if window == _ZEROS else _CANDIDATE.finditer(window):
             behind = (0, _ZSTD_AT, _FRAME_AT)[(match.lastindex or 1) - 1]
             start = begin + match.start() - behind

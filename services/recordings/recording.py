@@ -1,19 +1,19 @@
-"""Recordings: MCAP files of the bytes that went over the bus, and what is needed to read them.
+"""Recordings: MCAP files of the bytes on the bus, and the data to read them.
 
-One MCAP channel per key and boot; its topic is the Zenoh key, its metadata holds the boot_id, the
-message's `sequence` is MCAP's own, `log_time` the wall time of the first sample, `publish_time`
-when the message came in. Schemas carry all that they import, so that Rerun and Foxglove decode
-them. Besides the messages a file has
+There is one MCAP channel for each key and boot; its topic is the Zenoh key, its metadata holds the
+boot_id, the message's `sequence` is MCAP's own, `log_time` the wall time of the first sample,
+`publish_time` that of arrival. Schemas include their imports, so that Rerun and Foxglove can decode
+them. In addition to the messages a file has
 
 - metadata `driveby`: program, version, format, and realm and vehicle where there is only one;
-- metadata `driveby.start` and `driveby.end`: reason, time, and at the end the counts. A file
-  without `driveby.end` was cut off: everything up to its last whole chunk can still be read. A file
-  that continues another one names it as `previous` in `driveby.start`, and begins with that many
-  latched messages again as `repeated` says;
+- metadata `driveby.start` and `driveby.end`: reason, time, and at the end counts. A file without
+  `driveby.end` was cut off: it is readable up to its last whole chunk. A file that continues
+  another one names it as `previous` in `driveby.start`, and begins with as many repeated latched
+  messages as `repeated` states;
 - metadata `driveby.identities`, every minute and before the end: by key and boot, the sequence
   numbers of all messages before it;
-- metadata `driveby.recovered`, if the file was rewritten by `driveby recover`: what was lost;
-- attachment `site.toml`, if the site was known to the writer.
+- metadata `driveby.recovered`, if the file was rewritten by `driveby recover`: the losses;
+- attachment `site.toml`, if the writer knew the site.
 """
 
 import contextlib
@@ -30,11 +30,11 @@ from mcap.writer import MCAP0_MAGIC
 
 from schemas.messages import check_stamp
 from schemas.signals import check_wall_time, encode_identity
-from schemas.topics import Key, key, parse_key, topic
+from schemas.topics import Key, Message, key, parse_key, topic
 from services.common.errors import InputError
 from services.common.files import check_ordinary, is_held
 from services.common.intervals import Intervals
-from services.common.progress import Offset, unwatched
+from services.common.progress import Offset, no_progress
 from services.recordings.mcap_scan import Damage, Item, RawMessage, last_metadata, scan
 
 FORMAT = "1"
@@ -47,43 +47,30 @@ SITE = "site.toml"
 
 _log = logging.getLogger(__name__)
 _BOOT_DIGITS = 20
-"""A number of 64 bits has no more."""
+"""Largest number of digits in 64 bits."""
 
 Warn = Callable[[str], None]
-"""Takes what is wrong with a file that can be read all the same, in one line."""
+"""Callback with one line for a defect of a file that is readable all the same."""
 Identities = dict[tuple[Key, int], Intervals]
-"""By key and boot_id: the sequence numbers of the messages."""
-
-
-class Message(NamedTuple):
-    """One message as it went over the bus; its identity is (key, boot_id, sequence)."""
-
-    key: Key
-    payload: bytes
-    boot_id: int
-    sequence: int
-    log_time_ns: int
-    """Wall time of the first sample, ns since 1970 UTC."""
-    publish_time_ns: int
-    """Wall time at which the writer got it, ns since 1970 UTC."""
+"""Sequence numbers of the messages by key and boot_id."""
 
 
 class RecordingInfo(NamedTuple):
-    """What a recording says of itself and what it holds."""
+    """The metadata of a recording and a summary of its content."""
 
     about: dict[str, str]
     start: dict[str, str]
     end: dict[str, str] | None
-    """None: the writer did not get to finish the file."""
+    """Content of `driveby.end`; None if the writer did not finish the file."""
     site_toml: str | None
     messages: dict[str, int]
     """Number of messages by key."""
     first_time_ns: int
     last_time_ns: int
     damaged_chunks: int
-    """Places in the middle of the file that cannot be read, a chunk each as a rule."""
+    """Number of unreadable places in the middle of the file, usually a chunk each."""
     truncated: bool
-    """The file ends in the middle of a record or without MCAP's footer."""
+    """Whether the file ends in the middle of a record or without MCAP's footer."""
 
 
 def _log_warning(text: str) -> None:
@@ -91,14 +78,14 @@ def _log_warning(text: str) -> None:
 
 
 def read_messages(
-    path: Path, progress: Offset = unwatched, *, warn: Warn = _log_warning
+    path: Path, progress: Offset = no_progress, *, warn: Warn = _log_warning
 ) -> Iterator[Message]:
-    """Yield the messages in the order of the file; `progress` is told how far that is.
+    """Yield the messages in the order of the file; `progress` receives the position in it.
 
-    A file that was cut off is read up to its last whole chunk, damaged places are left out; both
-    are said to `warn` (and counted by `read_info`). InputError if the file is missing, is no MCAP
-    file, holds no message of ours, or one of a truck that is larger than its topic allows: taking
-    apart what fits the name of a message and nothing else can cost gigabytes.
+    A truncated file is read up to its last whole chunk and damaged places are skipped; `warn`
+    receives both (and `read_info` counts them). Raise InputError if the file is missing, is not
+    MCAP, holds no message of ours, or one of a truck that is larger than its topic allows: decoding
+    bytes that only claim to be a message can cost gigabytes.
     """
     found = False
     for item in _scan(path, progress=progress, warn=warn):
@@ -115,7 +102,7 @@ def read_messages(
 
 
 def check_message(path: Path, message: Message) -> None:
-    """InputError if the bus would not take a message, or no logger: what is wrong, in one line."""
+    """Raise InputError in one line if bus or logger would refuse a message."""
     try:
         check_stamp(topic(message.key.owner, message.key.stream), message.payload)
     except ValueError as error:
@@ -124,7 +111,7 @@ def check_message(path: Path, message: Message) -> None:
 
 
 def check_envelope(path: Path, message: Message) -> None:
-    """The same of all but what is in a message, which whoever decodes it sees by that."""
+    """Raise InputError as `check_message` does, but leave the payload to its decoder."""
     most = topic(message.key.owner, message.key.stream).max_bytes
     try:
         if len(message.payload) > most:
@@ -141,14 +128,14 @@ def _wrong(path: Path, message: Message, error: ValueError) -> InputError:
 
 
 def read_site(path: Path) -> str | None:
-    """Return the site file stored in the recording, None if there is none; InputError as above."""
+    """Return the site file in the recording, None if there is none; raise InputError as above."""
     for item in _scan(path):
         if isinstance(item, Attachment) and item.name == SITE:
             try:
                 return item.data.decode()
             except UnicodeDecodeError:
                 raise InputError(f"{path}: its attachment {SITE} is not UTF-8 text") from None
-        if isinstance(item, Message):  # the attachment stands before all messages
+        if isinstance(item, Message):  # the attachment precedes all messages
             return None
     return None
 
@@ -156,11 +143,11 @@ def read_site(path: Path) -> str | None:
 def read_info(
     path: Path,
     look: Callable[[Message], object] = lambda message: None,
-    progress: Offset = unwatched,
+    progress: Offset = no_progress,
 ) -> RecordingInfo:
-    """Read the whole file and say what is in it; InputError if it is missing or not MCAP.
+    """Read the whole file and return its summary; raise InputError if it is missing or not MCAP.
 
-    `look` is given every message of a topic that is logged, `progress` is told how far it is.
+    `look` receives every message of a logged topic, `progress` the position in the file.
     """
     sentinels: dict[str, dict[str, str]] = {}
     site_toml: str | None = None
@@ -196,9 +183,9 @@ def read_info(
 
 
 def read_identities(path: Path) -> Identities:
-    """Return which messages a recording holds, without reading all of it if it is one of ours.
+    """Return the messages in a recording; one of our own is not read completely.
 
-    InputError if the file is missing or not MCAP.
+    Raise InputError if the file is missing or not MCAP.
     """
     identities: Identities = {}
     start = 0
@@ -220,7 +207,7 @@ def read_identities(path: Path) -> Identities:
 
 
 def is_closed(path: Path) -> bool:
-    """Whether a recording has an END sentinel and its index; InputError if it cannot be read."""
+    """Return whether a recording has END and its index; raise InputError if unreadable."""
     with _opened(path) as file:
         size = os.fstat(file.fileno()).st_size
         file.seek(max(0, size - len(MCAP0_MAGIC)))
@@ -228,7 +215,7 @@ def is_closed(path: Path) -> bool:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a living process writes to a recording; InputError if it cannot be opened."""
+    """Return whether a living process writes to a recording; raise InputError if unreadable."""
     with _opened(path) as file:
         return is_held(file)
 
@@ -257,9 +244,9 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def _scan(
-    path: Path, start: int = 0, progress: Offset = unwatched, warn: Warn = _log_warning
+    path: Path, start: int = 0, progress: Offset = no_progress, warn: Warn = _log_warning
 ) -> Iterator[Message | Metadata | Attachment | Damage]:
-    """Yield all that is of use in a file, in its order, and what is damaged."""
+    """Yield the useful records of a file in order, and the damage."""
     with _opened(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size == 0:
@@ -291,7 +278,7 @@ def _scan(
 
 
 def watched(items: Iterator[Item], file: BinaryIO, progress: Offset) -> Iterator[Item]:
-    """The same items; `progress` is told whenever more of the file has been read."""
+    """Yield the same items; `progress` receives every new position in the file."""
     before = -1
     for item in items:
         if (offset := file.tell()) > before:
@@ -301,7 +288,7 @@ def watched(items: Iterator[Item], file: BinaryIO, progress: Offset) -> Iterator
 
 
 def find_channels(path: Path) -> dict[int, Channel]:
-    """Return all channels that are named anywhere in a file; of several, the first."""
+    """Return all channels named anywhere in a file; of several, the first."""
     channels: dict[int, Channel] = {}
     with _opened(path) as file:
         for item in scan(file):
@@ -313,7 +300,7 @@ def find_channels(path: Path) -> dict[int, Channel]:
 def our_channel(
     path: Path | str, channel: Channel, warn: Warn = _log_warning
 ) -> tuple[Key, int] | None:
-    """Key and boot of a channel's messages; None, and `warn` is told, if they are not ours."""
+    """Return key and boot of a channel's messages; None, with a warning, if they are not ours."""
     boot_id = channel.metadata.get("boot_id", "0")
     try:
         where = parse_key(channel.topic)
@@ -325,8 +312,8 @@ def our_channel(
 
 
 def program_version() -> str:
-    """Return this program's version, as recordings and results carry it."""
+    """Return this program's version, as recordings and results contain it."""
     try:
         return metadata.version("driveby")
-    except metadata.PackageNotFoundError:  # run from a checkout that was not installed
+    except metadata.PackageNotFoundError:  # run from a checkout that is not installed
         return "0"

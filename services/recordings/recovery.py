@@ -1,4 +1,4 @@
-"""Rewriting a damaged recording: all that still holds, and exact counts of what does not."""
+"""Recovery of a damaged recording: all valid content, and exact counts of the losses."""
 
 import fcntl
 import time
@@ -14,7 +14,7 @@ from schemas.topics import Key, check_realm, key, parse_key, topic
 from services.common.errors import FailureError, InputError
 from services.common.files import check_ordinary, check_writable, replaced_atomically
 from services.common.intervals import Intervals
-from services.common.progress import Offset, unwatched
+from services.common.progress import Offset, no_progress
 from services.recordings.mcap_file import McapWriter
 from services.recordings.mcap_scan import Damage, Indexed, RawMessage, scan
 from services.recordings.recording import (
@@ -30,42 +30,42 @@ from services.recordings.writer import CHUNK_BYTES, identities_text
 
 SUFFIX = ".recovered.mcap"
 ASIDE = ".crashed"
-"""Added to the name of a damaged recording whose place another one has taken."""
+"""Suffix of a damaged recording that another one has replaced."""
 SERVICE = "recover"
-"""The service that the event in a recovered recording is from."""
+"""Name of the service that writes the event in a recovered recording."""
 
 
 class Recovery(NamedTuple):
-    """What was found in a recording, and written to another one."""
+    """Result of a recovery."""
 
     messages: int
-    """Written; all of them whole."""
+    """Number of messages written, all complete."""
     lost: int | None
-    """Messages that the file once held and that are gone; None: it does not say how many."""
+    """Number of lost messages; None if the file does not show it."""
     missing_numbers: int
-    """Numbers missing from the sequences of what was written. Gaps that the recording's events
-    speak of are among them."""
+    """Number of gaps in the written sequences, including those that the recording's events report.
+    """
     damaged_places: int
     damaged_bytes: int
-    """Bytes in those places, and at the end if it was cut off."""
+    """Bytes in the damaged places, and at the end of a truncated file."""
     is_cut_off: bool
-    """There is no END sentinel: the writer died, or the end of the file is gone."""
+    """Whether there is no END sentinel: the writer died, or the end of the file is lost."""
     bytes: int
     """Size of the damaged file."""
 
     @property
     def is_lossy(self) -> bool:
-        """Whether anything that was written to the file may be missing."""
+        """Whether any content of the file may be missing."""
         return bool(self.is_cut_off or self.damaged_places or self.lost)
 
 
 def recovered_path(source: Path) -> Path:
-    """Return where a recovered recording is put unless told otherwise."""
+    """Return the default path of a recovered recording."""
     return source.with_name(source.name.removesuffix(ASIDE).removesuffix(".mcap") + SUFFIX)
 
 
 def put_aside(source: Path) -> Path:
-    """Rename a damaged recording so that it is none for `*.mcap`; return its new name."""
+    """Rename a damaged recording so that `*.mcap` does not match; return its new name."""
     aside = source.with_name(source.name + ASIDE)
     number = 2
     while aside.exists():
@@ -79,7 +79,7 @@ def put_aside(source: Path) -> Path:
 
 
 def is_name_taken(path: Path) -> bool:
-    """Whether a recording of that name is there, or one that was recovered or set aside."""
+    """Return whether a recording of that name exists, or a recovered or replaced one."""
     return (
         path.exists() or recovered_path(path).exists() or path.with_name(path.name + ASIDE).exists()
     )
@@ -91,18 +91,18 @@ def recover_recording(
     time_ns: int | None = None,
     *,
     force: bool = False,
-    progress: Offset = unwatched,
+    progress: Offset = no_progress,
 ) -> Recovery:
-    """Write what holds in `source` to `target`, beside it first and then renamed.
+    """Write the valid content of `source` to `target`, beside it first and then renamed.
 
-    Messages, channels, metadata and attachments are copied as they are, topics of others too. A
-    schema that is lost is taken from our own tables. Damage behind the END sentinel costs only the
-    index, which is made anew. Event and metadata `driveby.recovered` say in the file what was
-    done. Memory is bounded whatever the file holds. `progress` is told how far it is.
+    Messages, channels, metadata and attachments are copied unchanged, foreign topics too. A lost
+    schema is taken from our own tables. Damage after the END sentinel affects only the index, which
+    is rebuilt. Event and metadata `driveby.recovered` document the recovery in the file. Memory is
+    bounded whatever the file holds. `progress` receives the position in it.
 
-    InputError: `source` is missing, is no MCAP file, holds nothing that can be read, is being
-    written, or is `target`; there is a recording at `target`, which only `force` replaces.
-    FailureError: reading or writing failed. Never another exception.
+    Raise InputError if `source` is missing, is not MCAP, holds nothing readable, is being written,
+    or is `target`, and if there is a recording at `target`, which only `force` replaces;
+    FailureError if reading or writing failed. There is no other exception.
     """
     now_ns = time.time_ns() if time_ns is None else time_ns
     if target.exists() and source.exists() and target.samefile(source):
@@ -117,7 +117,7 @@ def recover_recording(
         raise InputError(f"{source}: cannot be read: {error.strerror}") from None
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two at once would hinder each other
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two at once would conflict
         except BlockingIOError:
             raise InputError(
                 f"{source}: is being written, or recovered by somebody else, at this moment"
@@ -127,22 +127,22 @@ def recover_recording(
         with replaced_atomically(target, force=force) as temporary, temporary.open("wb") as out:
             library = f"driveby {program_version()}"
             writer = McapWriter(out.write, library=library, chunk_bytes=CHUNK_BYTES)
-            copy = _Copy(source, writer)
+            copy = _Copier(source, writer)
             for item in _read(source, file, progress):
                 copy.take(item)
             return copy.finish(source, source.stat().st_size, now_ns)
 
 
-def _read(source: Path, file: BinaryIO, progress: Offset = unwatched) -> Iterable[object]:
-    # An OSError of the source must not be taken for one of the file that is written.
+def _read(source: Path, file: BinaryIO, progress: Offset = no_progress) -> Iterable[object]:
+    # An OSError of the source must not count as one of the target.
     try:
         yield from watched(scan(file), file, progress)
     except OSError as error:
         raise FailureError(f"{source}: reading failed: {error.strerror}") from None
 
 
-class _Copy:
-    """Takes what is found in one file, and writes it to another."""
+class _Copier:
+    """A copier of valid items from one file to another."""
 
     def __init__(self, source: Path, writer: McapWriter) -> None:
         self._source = source
@@ -170,7 +170,7 @@ class _Copy:
                 self._is_after_damage = False
                 self._copy(item)
             case Indexed():
-                # Behind a damaged chunk its index still stands.
+                # The index of a damaged chunk may be intact.
                 self._lost_by_index += item.messages if self._is_after_damage else 0
             case Schema():
                 self._schemas.setdefault(item.id, item)
@@ -194,13 +194,13 @@ class _Copy:
                 self._damaged_bytes += item.size
 
     def finish(self, source: Path, size: int, now_ns: int) -> Recovery:
-        """Write what a reader must know of the damage, and END."""
+        """Write the data on the damage that a reader needs, and END."""
         written = self._writer.messages + self._writer.pending
         lost: int | None = None
         if self._end is not None:
             said = self._end.get("messages", "")
             if said.isascii() and said.isdecimal():
-                # Never less than nothing: the number itself may be damaged.
+                # Not negative: the number itself may be damaged.
                 lost = max(0, int(said) - written)
         elif self._lost_by_index or self._unknown:
             lost = self._lost_by_index + self._unknown
@@ -220,7 +220,7 @@ class _Copy:
         if record.name == END:
             self._end = dict(record.metadata)
             self._is_behind_data = True
-        elif record.name != IDENTITIES:  # which is written anew
+        elif record.name != IDENTITIES:  # written again below
             if record.name == ABOUT:
                 self._about = dict(record.metadata)
             self._writer.add_metadata(record.name, record.metadata)
@@ -245,7 +245,7 @@ class _Copy:
 
     def _channel(self, channel_id: int) -> Channel | None:
         if channel_id not in self._channels and not self._has_searched:
-            # The chunk that named it is lost; another one or the summary may name it too.
+            # Its chunk is lost; another one or the summary may name the channel too.
             self._has_searched = True
             self._channels = find_channels(self._source) | self._channels
         return self._channels.get(channel_id)
@@ -307,7 +307,7 @@ class _Copy:
             vehicle=self._about.get("vehicle", ""),
             messages=recovery.messages,
         )
-        # At the end of what it speaks of: a viewer's time axis need not reach to today.
+        # At the end of the drive, so that a viewer's time axis need not reach to today.
         log_time_ns = self._last_ns or now_ns
         self._writer.add_message(channel_id, 0, log_time_ns, now_ns, encode_event(event))
 
@@ -323,7 +323,7 @@ class _Copy:
 
 
 def describe(recovery: Recovery) -> str:
-    """Return in one line what was found."""
+    """Return the result of a recovery in one line."""
     lost = "an unknown number" if recovery.lost is None else f"{recovery.lost:,}"
     parts = [f"{recovery.messages:,} messages recovered"]
     if recovery.is_lossy:

@@ -1,6 +1,6 @@
-"""Writing recordings: as they come, whole after every sync; or whole files at once.
+"""Writers of recordings: message by message, complete after every sync, or whole files at once.
 
-What is in a file stands in `recording`.
+The content of a file is described in `recording`.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from schemas.messages import descriptors
-from schemas.topics import Key, key, topic
+from schemas.topics import Key, Message, key, topic
 from services.common.disk import DISK, Disk, write_all
 from services.common.errors import InputError
 from services.common.files import replaced_atomically
@@ -28,25 +28,24 @@ from services.recordings.recording import (
     SITE,
     START,
     Identities,
-    Message,
     program_version,
 )
 
 _log = logging.getLogger(__name__)
 CHUNK_BYTES = 64 * 1024
 _IDENTITIES_PERIOD_S = 60.0
-"""What is newer must be read message by message after a crash, before recording goes on."""
+"""Period of the identities; newer messages must be read one by one after a crash."""
 Misplaced = Literal["deleted", "cut short", "moved"]
-"""What can become of a recording that is being written. Moved, it still holds everything."""
+"""Kind of interference with a recording being written. A moved one still holds everything."""
 
 
 class RecordingWriter:
-    """Writes a recording under its final name, so that a crash leaves a readable file.
+    """A writer to the final name of a recording, so that a crash leaves a readable file.
 
-    `sync()` must be called at least once a second: what was written before it survives `kill -9`
-    and loss of power. Until it is closed the file is locked (flock), which tells a recording that
-    is being written from one whose writer has died. Not thread-safe. Every method may raise
-    OSError; then only `fail` may follow.
+    Call `sync()` at least once a second: everything written before it survives `kill -9` and loss
+    of power. Until it is closed the file is locked (flock), which distinguishes a recording being
+    written from one whose writer has died. Not thread-safe. Every method may raise OSError; then
+    only `fail` may follow.
     """
 
     def __init__(
@@ -62,10 +61,10 @@ class RecordingWriter:
         latched: Sequence[Message] = (),
         disk: Disk = DISK,
     ) -> None:
-        """Create the file; InputError if it exists (recordings are never overwritten).
+        """Create the file; raise InputError if it exists (recordings are never overwritten).
 
-        `previous` is the name of the recording that this one continues, `latched` what a reader
-        must know of it: those messages are written once more.
+        `previous` is the name of the recording that this one continues; the messages `latched` are
+        repeated for its readers.
         """
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -116,7 +115,7 @@ class RecordingWriter:
         _add(self._mcap, message)
 
     def sync(self) -> None:
-        """Close the chunk and bring everything written so far to the disk itself."""
+        """Close the chunk and sync everything written so far to the disk."""
         if self._is_dirty:
             self._mcap.writer.flush()
             if time.monotonic() >= self._next_identities_s:
@@ -125,8 +124,8 @@ class RecordingWriter:
             self._sync_file()
             self._is_dirty = False
 
-    def misplaced(self) -> Misplaced | None:
-        """What somebody else has done to the file under its writer, after `sync`; None: nothing."""
+    def displacement(self) -> Misplaced | None:
+        """Return an interference by another process with the file, after `sync`; else None."""
         status = os.fstat(self._file.fileno())
         if status.st_nlink == 0:
             return "deleted"
@@ -156,11 +155,11 @@ class RecordingWriter:
         self._file.close()
 
     def fail(self, reason: str, counts: Mapping[str, int], events: Iterable[Message]) -> int | None:
-        """Close the file after an OSError, with END and what happened if there is room for that.
+        """Close the file after an OSError, with END and the events if there is space.
 
-        Half a chunk at the end is cut off, and messages not yet in a chunk are given up: their
-        number is returned, or None if what was written after the last `sync` may be lost too.
-        Never raises OSError: without END the file is one that crashed, and as readable.
+        Half a chunk at the end is truncated, and messages outside chunks are dropped. Return their
+        number, or None if messages since the last `sync` may be lost too. Never raise OSError: a
+        file without END counts as crashed, and is as readable.
         """
         writer = self._mcap.writer
         discarded = writer.discard()
@@ -175,19 +174,19 @@ class RecordingWriter:
             _end(writer, reason, self.messages, counts, None)
             self._sync_file()
         except OSError as error:
-            _log.error("%s: not even its end could be written: %s", self.path, error.strerror)
+            _log.error("%s: its END could not be written either: %s", self.path, error.strerror)
             with contextlib.suppress(OSError):
                 self._cut(whole)
                 self._sync_file()
         self.abandon()
-        # After one failure the next success says nothing: the system may have forgotten the pages.
+        # After a failure, a later success proves nothing: the system may have dropped the pages.
         return None if self._has_failed_sync else discarded
 
     def abandon(self) -> None:
-        """Close the file as it is: what was synced stays readable."""
+        """Close the file as it is: synced content stays readable."""
         try:
             self._file.close()
-        except OSError as error:  # the handle is closed anyway
+        except OSError as error:  # the handle is closed all the same
             _log.error("%s: %s", self.path, error.strerror)
 
     def _sync_file(self) -> None:
@@ -210,12 +209,12 @@ def write_recording(
     reason: str,
     force: bool = False,
 ) -> int:
-    """Write a whole recording beside `path`, sync it and rename it; return how many messages.
+    """Write a whole recording beside `path`, sync it and rename it; return the number of messages.
 
     Realm and vehicle are those of the first message. The file depends on nothing but the arguments
-    and this program's version: no clock is read. InputError if `path` cannot be written, is a
-    recording (which `force` replaces, unless somebody writes it) or there is no message,
-    FailureError if writing fails; then `path` is as it was before.
+    and this program's version: no clock is read. Raise InputError if `path` is not writable, is a
+    recording (which `force` replaces, unless a process writes it) or there is no message,
+    FailureError if writing fails; then `path` is unchanged.
     """
     source = iter(messages)
     first = next(source, None)

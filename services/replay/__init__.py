@@ -1,4 +1,4 @@
-"""Publishes recordings again, byte for byte, in a realm of their own."""
+"""Publication of recordings, byte for byte, in a realm of their own."""
 
 import logging
 import threading
@@ -10,51 +10,56 @@ from pathlib import Path
 from typing import NamedTuple
 
 from schemas.signals import Identity
-from schemas.topics import Key, check_realm
+from schemas.topics import Key, Message, check_realm
 from services.bus.credentials import check_speaks_for
-from services.bus.delivery import Delivery
-from services.bus.playback import check_speed, confirm, hold_back, settle, stopped_by_signals
+from services.bus.delivery import DeliveryTracker
+from services.bus.playback import (
+    apply_backpressure,
+    check_speed,
+    confirm,
+    declare_and_wait,
+    stopped_by_signals,
+)
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.common.errors import FailureError, InputError
-from services.recordings.recording import Message
-from services.replay.choice import EVERYTHING, Choice
-from services.replay.drive import Drive, open_drive, warn_of_silence
-from services.replay.player import Command, Controls, Course, Played, play
+from services.replay.choice import EVERYTHING, ReplaySelection
+from services.replay.drive import ReplayDrive, open_drive, warn_of_silence
+from services.replay.player import Command, Controls, PlaybackResult, PlaybackSettings, play
 
-__all__ = ["Statistics", "run"]
+__all__ = ["ReplayStatistics", "run"]
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
-"""A router that was started a moment before is there by then."""
+"""Timeout for a router that was started a moment before."""
 SUBSCRIBER_TIMEOUT_S = 10.0
-"""A replay that nobody hears is of no use: it waits longer than a truck does."""
+"""Timeout for a subscriber, longer than a truck's, because a replay without one is useless."""
 
-Display = Callable[[str, Drive, threading.Event], AbstractContextManager[Controls]]
-"""Shows a drive in a realm, and takes commands; QUIT is one when the event is set."""
+Display = Callable[[str, ReplayDrive, threading.Event], AbstractContextManager[Controls]]
+"""Display of a drive in a realm with commands; QUIT is one when the event is set."""
 
 
-class Statistics(NamedTuple):
-    """What was published."""
+class ReplayStatistics(NamedTuple):
+    """Statistics of published messages."""
 
     realm: str
     by_stream: dict[str, int]
     trucks: tuple[str, ...]
-    """Under the names that they were given."""
+    """Trucks under their new names."""
     rounds: int
     drive_s: float
-    """How much of the drive was published, all rounds together."""
+    """Published duration of the drive, all rounds together."""
     took_s: float
     jumped_over: int
-    """Messages left out by jumps to a crossing."""
+    """Number of messages skipped by jumps to a crossing."""
     skipped_s: float
-    """Silence of the drive that was not waited for."""
+    """Silence of the drive that was skipped."""
     is_confirmed: bool
-    """By a logger; without one nobody confirms anything."""
+    """Whether a logger confirmed the messages."""
 
     @property
     def messages(self) -> int:
-        """How many, of all streams."""
+        """The number of messages of all streams."""
         return sum(self.by_stream.values())
 
 
@@ -64,33 +69,33 @@ def run(
     endpoint: str,
     speed: float,
     name: str,
-    choice: Choice = EVERYTHING,
+    choice: ReplaySelection = EVERYTHING,
     skip_gaps: bool = False,
     loop: bool = False,
     start_paused: bool = False,
     site: Path | None = None,
     display: Display | None = None,
-    report: Callable[[Statistics], None] = lambda statistics: None,
+    report: Callable[[ReplayStatistics], None] = lambda statistics: None,
     connect_timeout_s: float | None = CONNECT_TIMEOUT_S,
     subscriber_timeout_s: float = SUBSCRIBER_TIMEOUT_S,
     tls: Path | None = None,
 ) -> int:
-    """Publish what recordings hold in the realm `replay-{name}`, as one drive; return 0.
+    """Publish recordings in the realm `replay-{name}` as one drive; return 0.
 
     Payloads and identities are the recorded ones; the spacing is that of the recorded log times
-    divided by `speed` (0: as fast as possible). A recording that holds bridge results and events
-    has these published again too. Returns when a logger has everything on disk, or, where there
-    is no logger, when subscribers have had the time to fetch what they missed. The same recording
-    replayed twice under one name, or in a `loop`, is taken for duplicates by a logger that saw
-    both.
+    divided by `speed` (0: as fast as possible). Recorded bridge results and events are published
+    too. Return when a logger has everything on disk or, without a logger, when subscribers have had
+    the time to fetch missing messages. A logger that saw the same recording twice under one name,
+    or in a `loop`, treats the second as duplicates.
 
-    `recordings` may be folders. `display` shows where it is and takes commands; `site` tells where
-    bridges are if the recordings do not; `tls` is a folder of credentials, see `open_session`.
+    `recordings` may be folders. `display` shows the position and takes commands; `site` locates the
+    bridges if the recordings do not; `tls` is a folder of credentials, see `open_session`.
 
-    InputError: no such file, not a recording, a message that no logger would take, a choice that
-    leaves nothing, a name that is no identifier or that of the realm that was recorded.
-    FailureError: nobody answers at the endpoint within `connect_timeout_s` (None: wait for ever),
-    nobody subscribes within `subscriber_timeout_s`, or the logger did not confirm everything.
+    Raise InputError for a missing file, one that is not a recording, a message that no logger would
+    accept, an empty selection, and a name that is not an identifier or that of the recorded realm.
+    Raise FailureError if the endpoint does not answer within `connect_timeout_s` (None: wait for
+    ever), no subscriber appears within `subscriber_timeout_s`, or the logger did not confirm
+    everything.
     """
     check_speed(speed)
     try:
@@ -101,22 +106,22 @@ def run(
     drive = open_drive(recordings, realm, choice, site)
     if speed > 0.0 and not skip_gaps:
         warn_of_silence(drive)
-    course = Course(speed, skip_gaps, start_paused, drive.crossings_ns)
+    course = PlaybackSettings(speed, skip_gaps, start_paused, drive.crossings_ns)
     with (
         stopped_by_signals() as stop,
         open_session(connect=endpoint, timeout_s=connect_timeout_s, tls=tls) as session,
     ):
         publisher = Publisher(session, realm)
-        delivery = Delivery(session, realm)
+        delivery = DeliveryTracker(session, realm)
         try:
             keys = [where._replace(identifier=named) for where, named in drive.names.items()]
-            if not settle(publisher, keys, subscriber_timeout_s):
+            if not declare_and_wait(publisher, keys, subscriber_timeout_s):
                 raise FailureError(
-                    f"nobody subscribes to realm {realm} at {endpoint}; start "
+                    f"no subscriber to realm {realm} at {endpoint}; start "
                     f"`driveby logger --realm {realm}` or another subscriber of "
                     f"driveby/v1/{realm}/** first"
                 )
-            with (display or _unseen)(realm, drive, stop) as controls:
+            with (display or _headless_controls)(realm, drive, stop) as controls:
                 began_s = time.monotonic()
                 played = _play_rounds(drive, publisher, delivery, course, controls, loop=loop)
                 took_s = time.monotonic() - began_s
@@ -131,15 +136,15 @@ def run(
 
 
 class _Round(NamedTuple):
-    played: Played
+    played: PlaybackResult
     by_stream: Counter[str]
 
 
 def _play_rounds(
-    drive: Drive,
+    drive: ReplayDrive,
     publisher: Publisher,
-    delivery: Delivery,
-    course: Course,
+    delivery: DeliveryTracker,
+    course: PlaybackSettings,
     controls: Controls,
     *,
     loop: bool,
@@ -156,7 +161,7 @@ def _play_rounds(
             if not rounds:  # a logger counts no message twice
                 delivery.sent(Key(publisher.realm, owner, identifier, stream), identity)
             sent[stream] += 1
-            hold_back(delivery, sent.total())
+            apply_backpressure(delivery, sent.total())
 
         rounds.append(_Round(play(drive.messages(), put, course, controls), sent))
         course = rounds[-1].played.course
@@ -164,13 +169,13 @@ def _play_rounds(
 
 
 def _statistics(
-    realm: str, drive: Drive, rounds: list[_Round], took_s: float, delivery: Delivery
-) -> Statistics:
+    realm: str, drive: ReplayDrive, rounds: list[_Round], took_s: float, delivery: DeliveryTracker
+) -> ReplayStatistics:
     by_stream: Counter[str] = Counter()
     for one in rounds:
         by_stream.update(one.by_stream)
     trucks = {named for where, named in drive.names.items() if where.owner == "vehicle"}
-    return Statistics(
+    return ReplayStatistics(
         realm,
         dict(sorted(by_stream.items())),
         tuple(sorted(trucks)),
@@ -184,6 +189,6 @@ def _statistics(
 
 
 @contextmanager
-def _unseen(realm: str, drive: Drive, stop: threading.Event) -> Iterator[Controls]:
-    """Nobody looks: only a signal ends it."""
+def _headless_controls(realm: str, drive: ReplayDrive, stop: threading.Event) -> Iterator[Controls]:
+    """Yield controls without a display, which only a signal ends."""
     yield Controls(lambda s: Command.QUIT if stop.wait(s) else None, lambda status: None)

@@ -1,4 +1,4 @@
-"""Which recorded messages are published: when, of which topics and trucks, by which names."""
+"""Selection of recorded messages: time, topics, trucks and their names."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
@@ -9,37 +9,37 @@ from schemas.signals import NS_PER_S
 from schemas.topics import Key, topic
 from services.common.errors import InputError
 from services.common.naming import checked_identifier
-from services.recordings.together import Timed
+from services.recordings.merge import TimedMessage
 
 
-class Choice(NamedTuple):
-    """What a user asked for, as it was given."""
+class ReplaySelection(NamedTuple):
+    """The user's selection as given."""
 
     start: str | None = None
     """Seconds from the beginning of the drive, or a time in UTC."""
     end: str | None = None
     duration_s: float | None = None
     topics: tuple[str, ...] = ()
-    """Patterns with * and ? of `STREAM` or `OWNER/ID/STREAM`; none: all."""
+    """Patterns with * and ? of `STREAM` or `OWNER/ID/STREAM`; empty: all."""
     exclude: tuple[str, ...] = ()
     vehicles: tuple[str, ...] = ()
-    """Only what these trucks said; none: everything."""
+    """Trucks whose messages are published; empty: everything."""
     renames: tuple[tuple[str, str], ...] = ()
-    """Old and new name of trucks."""
+    """Old and new names of trucks."""
 
 
-EVERYTHING = Choice()
+EVERYTHING = ReplaySelection()
 
 
-class Window(NamedTuple):
-    """A stretch of the drive; ns since 1970 UTC, the end is not in it."""
+class ReplayWindow(NamedTuple):
+    """A period of the drive; ns since 1970 UTC, without its end."""
 
     begin_ns: int
     end_ns: int
 
 
-def window_of(choice: Choice, first_ns: int, last_ns: int) -> Window:
-    """The stretch that was asked for; InputError if there is nothing of the drive in it."""
+def window_of(choice: ReplaySelection, first_ns: int, last_ns: int) -> ReplayWindow:
+    """Return the selected period; raise InputError if it holds nothing of the drive."""
     begin_ns = _moment("--start", choice.start, first_ns, last_ns) or first_ns
     end_ns = _moment("--end", choice.end, first_ns, last_ns)
     if choice.duration_s is not None:
@@ -48,13 +48,13 @@ def window_of(choice: Choice, first_ns: int, last_ns: int) -> Window:
         end_ns = last_ns + 1
     if end_ns <= begin_ns:
         raise InputError(f"--end: is {choice.end}, it must be later than the start")
-    return Window(begin_ns, end_ns)
+    return ReplayWindow(begin_ns, end_ns)
 
 
-def chosen_keys(choice: Choice, keys: Iterable[Key]) -> dict[Key, str]:
-    """The keys to publish, with the identifier under which each is; InputError if that is none.
+def chosen_keys(choice: ReplaySelection, keys: Iterable[Key]) -> dict[Key, str]:
+    """Return the keys to publish with their identifiers; raise InputError if there is none.
 
-    Every option must have something to act on: what is misspelt is said rather than ignored.
+    Every option must match something: a misspelt value is an error.
     """
     all_keys = [where for where in keys if topic(where.owner, where.stream).logged]
     trucks = sorted({where.identifier for where in all_keys if where.owner == "vehicle"})
@@ -84,9 +84,9 @@ def chosen_keys(choice: Choice, keys: Iterable[Key]) -> dict[Key, str]:
     return found
 
 
-def within(messages: Iterable[Timed], window: Window) -> Iterator[Timed]:
-    """The messages of a stretch, after what latched topics said last before it."""
-    latched: dict[Key, Timed] = {}
+def within(messages: Iterable[TimedMessage], window: ReplayWindow) -> Iterator[TimedMessage]:
+    """Yield the messages of a period, after the last values of latched topics before it."""
+    latched: dict[Key, TimedMessage] = {}
     has_begun = False
     for timed in messages:
         due_ns, message = timed
@@ -100,19 +100,19 @@ def within(messages: Iterable[Timed], window: Window) -> Iterator[Timed]:
             elif due_ns < window.end_ns:
                 yield timed
         elif window.begin_ns <= message.log_time_ns < window.end_ns:
-            # One that was recovered stands behind the end, and nobody shall wait for that.
-            yield Timed(min(due_ns, window.end_ns), message)
+            # A recovered message stands after the end, and the replay does not wait for it.
+            yield TimedMessage(min(due_ns, window.end_ns), message)
 
 
 def parsed_rename(text: str) -> tuple[str, str]:
-    """`OLD=NEW`; InputError if it is something else."""
+    """Return the parts of `OLD=NEW`; raise InputError if it is malformed."""
     old, separator, new = text.partition("=")
     if not separator or not old:
         raise InputError(f'--rename: is "{text}", OLD=NEW is expected, as truck-1=truck-9')
     return old, checked_identifier(new, "--rename")
 
 
-def _is_wanted(choice: Choice, where: Key) -> bool:
+def _is_wanted(choice: ReplaySelection, where: Key) -> bool:
     if choice.vehicles and (where.owner != "vehicle" or where.identifier not in choice.vehicles):
         return False
     if choice.topics and not any(_fits(pattern, where) for pattern in choice.topics):
@@ -165,6 +165,6 @@ def _utc_ns(option: str, text: str) -> int:
 
 
 def utc_text(time_ns: int) -> str:
-    """A time in UTC to the millisecond, as `--start` takes it."""
+    """Return a time in UTC to the millisecond, as `--start` accepts it."""
     moment = datetime.fromtimestamp(time_ns / NS_PER_S, UTC)
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,4 +1,4 @@
-"""Recordings looked through before they are published: what is in them, what of it is wanted."""
+"""Check and index of recordings before they are published."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -7,65 +7,74 @@ from pathlib import Path
 from typing import NamedTuple
 
 from schemas.site_file import load_site
-from schemas.topics import Key, parse_key, topic
+from schemas.topics import Key, Message, parse_key, topic
+from services.catalogue.contents import RecordingSummary, summarise_recording
 from services.common.errors import InputError
-from services.drives.survey import Survey, survey
-from services.recordings.recording import Message, check_message
-from services.recordings.together import Timed, read_together, recordings_in
-from services.replay.choice import Choice, Window, chosen_keys, utc_text, window_of, within
+from services.recordings.merge import TimedMessage, read_together, recordings_in
+from services.recordings.recording import check_message
+from services.replay.choice import (
+    ReplaySelection,
+    ReplayWindow,
+    chosen_keys,
+    utc_text,
+    window_of,
+    within,
+)
 
 _log = logging.getLogger(__name__)
 _LONG_SILENCE_NS = 60_000_000_000
-"""Who sees nothing for longer thinks that something is broken."""
+"""Shortest silence that needs an explanation to the user."""
 
 Stretch = tuple[int, int]
-"""From the first to the last message of a time without long silence, ns since 1970 UTC."""
+"""First and last message of a period without long silence, ns since 1970 UTC."""
 
 
-class Drive(NamedTuple):
-    """What is to be published of several recordings, as one drive."""
+class ReplayDrive(NamedTuple):
+    """The messages of several recordings to publish, as one drive."""
 
     files: tuple[tuple[int, Path], ...]
-    """With the time at which each begins."""
+    """Files with the time at which each begins."""
     names: dict[Key, str]
-    """The identifier under which each key is published; other keys are left out."""
-    window: Window
+    """Published identifier of each key; other keys are skipped."""
+    window: ReplayWindow
     crossings_ns: tuple[int, ...]
-    """When trucks come onto bridges, ascending."""
+    """Times at which trucks enter bridges, ascending."""
     stretches: tuple[Stretch, ...]
 
-    def messages(self) -> Iterator[Timed]:
-        """The messages to publish, in the order of time."""
+    def messages(self) -> Iterator[TimedMessage]:
+        """Return the messages to publish in the order of time."""
         chosen = (one for one in read_together(self.files) if one.message.key in self.names)
         return within(chosen, self.window)
 
 
-def open_drive(paths: list[Path], realm: str, choice: Choice, site: Path | None) -> Drive:
-    """Look at every message of all recordings before anybody is connected to.
+def open_drive(
+    paths: list[Path], realm: str, choice: ReplaySelection, site: Path | None
+) -> ReplayDrive:
+    """Check every message of all recordings before connecting.
 
-    What no logger would take could not be confirmed, and the logger is not to blame. Of a damaged
-    recording what is intact is taken, with a warning; one in a folder that holds nothing at all is
-    passed over with a warning too. InputError as of `services.replay.run`.
+    A message that no logger would accept could not be confirmed, and would look like a fault of the
+    logger. Of a damaged recording the intact part is used, with a warning; an empty one in a folder
+    is skipped with a warning too. Raise InputError as `services.replay.run` does.
     """
     if not paths:
         raise InputError("no recording: give one or more .mcap files")
     known = None if site is None else load_site(site)
-    surveys: list[Survey] = []
+    surveys: list[RecordingSummary] = []
     stretches: list[Stretch] = []
     for path in recordings_in(paths):
         times_ns: list[int] = []
         look = partial(_look, path, times_ns)
         try:
-            found = survey(path, known, look)
+            found = summarise_recording(path, known, look)
             if not found.info.messages:
                 raise InputError(f"{path}: holds no driveby message; a recording is expected")
         except InputError as error:
             if path in paths:
                 raise
-            _log.warning("%s; it is passed over", error)
+            _log.warning("%s; skipped", error)
             continue
         if found.info.truncated or found.info.damaged_chunks:
-            _log.warning("%s: damaged, only its whole chunks are replayed", path)
+            _log.warning("%s: damaged, only its intact chunks are replayed", path)
         surveys.append(found)
         stretches += _stretches(times_ns)
     if not surveys:
@@ -88,17 +97,17 @@ def open_drive(paths: list[Path], realm: str, choice: Choice, site: Path | None)
             if not choice.vehicles or passing.vehicle in choice.vehicles
         }
     )
-    return Drive(
+    return ReplayDrive(
         tuple((one.first_ns, one.path) for one in surveys),
         names,
-        Window(window.begin_ns, min(window.end_ns, last_ns + 1)),
+        ReplayWindow(window.begin_ns, min(window.end_ns, last_ns + 1)),
         tuple(ns for ns in entries if window.begin_ns <= ns < window.end_ns),
         tuple(_joined(stretches)),
     )
 
 
-def warn_of_silence(drive: Drive) -> None:
-    """Say where nothing comes for long, so that nobody thinks that something is broken."""
+def warn_of_silence(drive: ReplayDrive) -> None:
+    """Log long silences, so that they do not look like a fault."""
     begin_ns, end_ns = drive.window
     ends = [stop for start, stop in drive.stretches if stop < end_ns]
     silences = [
@@ -109,7 +118,7 @@ def warn_of_silence(drive: Drive) -> None:
     if silences:
         stop, start = max(silences, key=lambda silence: silence[1] - silence[0])
         _log.warning(
-            "nothing was recorded for %.0f s after %s%s; --skip-gaps passes over it",
+            "nothing was recorded for %.0f s after %s%s; --skip-gaps skips it",
             (start - stop) * 1e-9,
             utc_text(stop),
             f", nor {len(silences) - 1} times more" if len(silences) > 1 else "",
@@ -127,7 +136,7 @@ def _stretches(times_ns: list[int]) -> Iterator[Stretch]:
 
 
 def _joined(stretches: Sequence[Stretch]) -> Iterator[Stretch]:
-    """Join what overlaps or follows soon."""
+    """Yield the periods, merged where they overlap or follow closely."""
     begin = end = None
     for start, stop in sorted(stretches):
         if begin is None or end is None:

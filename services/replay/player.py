@@ -1,7 +1,7 @@
-"""When each recorded message is published: the spacing of the drive, and what the user does to it.
+"""Timing of published messages: the spacing of the drive, and the user's commands.
 
-The player knows neither terminal nor bus. It asks `Controls.wait` for what to do while it waits,
-and shows what it does through `Controls.show`.
+The player knows neither terminal nor bus. It gets commands from `Controls.wait` while it waits, and
+shows its status through `Controls.show`.
 """
 
 import time
@@ -11,21 +11,21 @@ from math import inf
 from typing import Final, NamedTuple
 
 from schemas.signals import NS_PER_S
-from schemas.topics import topic
+from schemas.topics import Message, topic
 from services.bus.playback import GAP_S
-from services.recordings.recording import Message
-from services.recordings.together import Timed
+from services.recordings.merge import TimedMessage
 
 SPEEDS: Final = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 0.0)
-"""What the keys for faster and slower go through; 0, as fast as possible, is the fastest."""
+"""Speeds of the keys for faster and slower; 0, as fast as possible, is the fastest."""
 LEAD_S: Final = 5.0
-"""So long before a truck comes onto a bridge a jump ends: its road before the bridge is needed."""
+"""Time before a truck enters a bridge at which a jump ends: the road before the bridge is needed.
+"""
 REFRESH_S: Final = 0.1
-"""So soon a key has its effect and the display follows."""
+"""Longest delay of a key and of the display."""
 
 
 class Command(Enum):
-    """What a user may want while messages are published."""
+    """A user's command during the replay."""
 
     PAUSE = "pause, or go on"
     STEP = "publish one message, and pause"
@@ -36,61 +36,61 @@ class Command(Enum):
 
 
 class Status(NamedTuple):
-    """Where the player is."""
+    """The state of the player."""
 
     position_ns: int
     speed: float
     is_paused: bool
     sent: int
     note: str
-    """What the last key did not do, and why; mostly empty."""
+    """Reason why the last key had no effect; usually empty."""
 
 
 class Controls(NamedTuple):
-    """The user."""
+    """The user's controls."""
 
     wait: Callable[[float], Command | None]
-    """Wait so many seconds at most; returns early with what is wanted."""
+    """Wait at most so many seconds; return early with a command."""
     show: Callable[[Status], None]
 
 
-class Course(NamedTuple):
-    """How messages are to be played."""
+class PlaybackSettings(NamedTuple):
+    """Settings of a playback."""
 
     speed: float
-    """Times real speed; 0: as fast as possible."""
+    """Multiple of real speed; 0: as fast as possible."""
     skip_gaps: bool = False
     start_paused: bool = False
     crossings_ns: Sequence[int] = ()
-    """When trucks come onto bridges, ascending."""
+    """Times at which trucks enter bridges, ascending."""
 
 
-class Played(NamedTuple):
-    """What came of it."""
+class PlaybackResult(NamedTuple):
+    """Result of a playback."""
 
     covered_ns: int
-    """How far in the drive it came, jumps and skipped gaps included."""
+    """Covered duration of the drive, jumps and skipped gaps included."""
     jumped_over: int
-    """Messages left out by jumps to a crossing."""
+    """Number of messages skipped by jumps to a crossing."""
     skipped_ns: int
-    """Silence that was not waited for."""
+    """Silence that was skipped."""
     has_quit: bool
-    course: Course
-    """How another round goes on: at the speed, and with the pause, that the user has chosen."""
+    course: PlaybackSettings
+    """Settings of the next round, with the speed and pause that the user has chosen."""
 
 
 def play(
-    messages: Iterable[Timed],
+    messages: Iterable[TimedMessage],
     put: Callable[[Message], None],
-    course: Course,
+    course: PlaybackSettings,
     controls: Controls,
     clock: Callable[[], float] = time.monotonic,
-) -> Played:
-    """Put the messages when each is due, until there are no more or the user quits.
+) -> PlaybackResult:
+    """Publish the messages when due, until the last one or until the user quits.
 
-    Who was held up makes up for it. A latched message is published even where a jump passes it.
+    Delays are caught up. A latched message is published even if a jump passes it.
     """
-    tape = _Tape(course, clock)
+    tape = _Timeline(course, clock)
     jumped_over = 0
     first_ns = last_ns = None
     for timed in messages:
@@ -113,11 +113,11 @@ def play(
     controls.show(tape.status())
     covered_ns = 0 if first_ns is None or last_ns is None else last_ns - first_ns
     chosen = course._replace(speed=tape.speed, start_paused=tape.is_paused)
-    return Played(covered_ns, jumped_over, tape.skipped_ns, tape.has_quit, chosen)
+    return PlaybackResult(covered_ns, jumped_over, tape.skipped_ns, tape.has_quit, chosen)
 
 
-def _wait_for_turn(tape: "_Tape", due_ns: int, controls: Controls) -> None:
-    """Return when a message is due, has been jumped over, or the user has quit."""
+def _wait_for_turn(tape: "_Timeline", due_ns: int, controls: Controls) -> None:
+    """Return when a message is due or has been jumped over, or the user has quit."""
     while not tape.has_quit and due_ns >= tape.target_ns:
         tape.take_into_view(due_ns)
         left_s = tape.left_s(due_ns)
@@ -127,15 +127,15 @@ def _wait_for_turn(tape: "_Tape", due_ns: int, controls: Controls) -> None:
             return
         command = controls.wait(max(0.0, min(left_s, REFRESH_S)))
         if command is not None:
-            tape.obey(command)
+            tape.apply(command)
         if command is not None or is_stale:
             controls.show(tape.status())
 
 
-class _Tape:
-    """Which moment of the drive belongs to which moment of the clock."""
+class _Timeline:
+    """Mapping between the time of the drive and of the clock."""
 
-    def __init__(self, course: Course, clock: Callable[[], float]) -> None:
+    def __init__(self, course: PlaybackSettings, clock: Callable[[], float]) -> None:
         self._course = course
         self._clock = clock
         self._anchor_s = self._shown_s = -inf
@@ -148,7 +148,7 @@ class _Tape:
         self.note = ""
 
     def take_into_view(self, due_ns: int) -> None:
-        """Go to the next message at once if it is the first, behind a gap, or the end of a jump."""
+        """Jump to the next message if it is the first, after a gap, or the end of a jump."""
         silence_ns = due_ns - self.position_ns
         skips = self._course.skip_gaps and silence_ns > GAP_S * NS_PER_S
         if self.is_new or due_ns >= self.target_ns > 0 or skips:
@@ -159,12 +159,12 @@ class _Tape:
             self._anchor(due_ns)
 
     def has_reached(self, due_ns: int) -> None:
-        """A message is published."""
+        """Note that a message is published."""
         self.is_stepping = False
         self.position_ns = max(self.position_ns, due_ns)
 
     def left_s(self, due_ns: int) -> float:
-        """Seconds of the clock until a moment of the drive."""
+        """Return the seconds of the clock until a moment of the drive."""
         if self.is_paused:
             return inf
         if self.speed == 0.0:
@@ -173,15 +173,15 @@ class _Tape:
         return due_s - self._clock()
 
     def is_stale(self) -> bool:
-        """Whether the user has not been asked for a while; counts as asking."""
+        """Return whether the user has not been asked for a while; counts as asking."""
         now_s = self._clock()
         if now_s - self._shown_s < REFRESH_S:
             return False
         self._shown_s = now_s
         return True
 
-    def obey(self, command: Command) -> None:
-        """Do what the user wants."""
+    def apply(self, command: Command) -> None:
+        """Execute a command of the user."""
         self.note = ""
         self._anchor(self.now_ns())
         match command:
@@ -197,14 +197,14 @@ class _Tape:
                 self._jump()
 
     def now_ns(self) -> int:
-        """The moment of the drive that it is now."""
+        """Return the current moment of the drive."""
         if self.is_paused or self.speed == 0.0 or self.is_new:
             return self.position_ns
         gone_s = self._clock() - self._anchor_s
         return self._anchor_ns + round(gone_s * self.speed * NS_PER_S)
 
     def status(self) -> Status:
-        """What there is to show."""
+        """Return the status to show."""
         return Status(self.now_ns(), self.speed, self.is_paused, self.sent, self.note)
 
     def _anchor(self, moment_ns: int) -> None:
@@ -222,7 +222,7 @@ class _Tape:
 
 
 def _next_speed(speed: float, *, faster: bool) -> float:
-    """The next of `SPEEDS` in a direction; at the end it stays."""
+    """Return the next of `SPEEDS` in a direction; the last one stays."""
 
     def rank(one: float) -> float:
         return inf if one == 0.0 else one

@@ -1,4 +1,4 @@
-"""HTML in which every text is escaped: names in results and site files may be anybody's."""
+"""HTML in which every text is escaped: names in results and site files are not trusted."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Html(str):
 
 
 def tag(name: str, /, *children: str, **attributes: str) -> Html:
-    """An element. `class_` is the attribute `class`; children that are no `Html` are escaped."""
+    """Return an element; `class_` is the attribute `class`, and plain text is escaped."""
     written = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{escape(value)}"'
         for key, value in attributes.items()
@@ -27,22 +27,22 @@ def tag(name: str, /, *children: str, **attributes: str) -> Html:
 
 
 def joined(*children: str) -> Html:
-    """Several pieces, one after the other."""
+    """Return several pieces, one after the other."""
     return Html("".join(c if isinstance(c, Html) else escape(c) for c in children))
 
 
 def table(heads: list[str], rows: list[list[str]], classes: list[str] | None = None) -> Html:
-    """A table; `classes` has one for each row."""
+    """Return a table that scrolls where it is too wide; `classes` has one class for each row."""
     body = [
         tag("tr", *(tag("td", cell) for cell in row), class_=classes[n] if classes else "")
         for n, row in enumerate(rows)
     ]
     head = tag("thead", tag("tr", *(tag("th", text) for text in heads)))
-    return tag("table", head, tag("tbody", *body))
+    return tag("div", tag("table", head, tag("tbody", *body)), class_="wide")
 
 
 def inlined_svg(svg: bytes, prefix: str, description: str) -> Html:
-    """An SVG of Matplotlib as part of a page: its names get a prefix, as pages hold several."""
+    """Return an SVG of Matplotlib within a page; its names get a prefix, as pages have several."""
     text = svg.decode()
     text = text[text.index("<svg") :]
     text = re.sub(r'\bid="', f'id="{prefix}', text)

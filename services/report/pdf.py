@@ -1,4 +1,4 @@
-"""An HTML file as PDF, by a browser that is installed and draws without a screen."""
+"""Conversion of an HTML file to PDF, by an installed browser without a screen."""
 
 import contextlib
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from services.common.errors import FailureError
 from services.common.files import write_atomically
-from services.common.progress import Steps, unwatched_steps
+from services.common.progress import Steps, no_step_progress
 
 _BROWSERS = (
     "chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome",
@@ -18,12 +18,12 @@ _BROWSERS = (
 )  # fmt: skip
 _TIMEOUT_S = 120.0
 _USUAL_S, _USUAL_S_PER_BYTE = 1.5, 0.7e-6
-"""What printing takes; the browser does not say how far it is."""
-_LOOK_AGAIN_S = 0.1
+"""Usual time of printing in s: the browser reports no progress."""
+_POLL_S = 0.1
 
 
 def find_browser() -> str:
-    """The first browser that there is; FailureError with a way out if there is none."""
+    """Return the first installed browser; FailureError with advice if there is none."""
     for name in _BROWSERS:
         found = shutil.which(name)
         if found is not None:
@@ -34,10 +34,10 @@ def find_browser() -> str:
     )
 
 
-def write_pdf(html: Path, pdf: Path, browser: str, progress: Steps = unwatched_steps) -> None:
+def write_pdf(html: Path, pdf: Path, browser: str, progress: Steps = no_step_progress) -> None:
     """Print an HTML file; FailureError if the browser does not.
 
-    `progress` is told the milliseconds that have passed, of those that it usually takes.
+    `progress` is called with the milliseconds passed, and the usual ones.
     """
     with tempfile.TemporaryDirectory(prefix="driveby-pdf-") as folder:
         printed = Path(folder) / "report.pdf"
@@ -65,7 +65,7 @@ def write_pdf(html: Path, pdf: Path, browser: str, progress: Steps = unwatched_s
 
 
 def _run(command: list[str], usual_s: float, progress: Steps) -> int:
-    """The exit code; subprocess.TimeoutExpired for a command that does not end."""
+    """Return the exit code; subprocess.TimeoutExpired for a command that does not end."""
     began, usual_ms = time.monotonic(), round(1e3 * usual_s)
     nowhere = subprocess.DEVNULL
     with subprocess.Popen(command, stdout=nowhere, stderr=nowhere) as process:
@@ -73,7 +73,7 @@ def _run(command: list[str], usual_s: float, progress: Steps) -> int:
             while (passed_s := time.monotonic() - began) < _TIMEOUT_S:
                 progress(min(round(1e3 * passed_s), usual_ms), usual_ms)
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    return process.wait(timeout=_LOOK_AGAIN_S)
+                    return process.wait(timeout=_POLL_S)
         finally:
-            process.kill()  # does nothing to one that has ended
+            process.kill()  # it has no effect on an ended process
     raise subprocess.TimeoutExpired(command, _TIMEOUT_S)

@@ -1,7 +1,10 @@
-"""How the report looks, on a screen and on A4; legible in grey."""
+"""Style sheet of the report, for a screen, a phone and A4; legible in grey."""
 
-CSS = """
-@page { size: A4; margin: 14mm 15mm; }
+from services.common.language import Language
+
+_CSS = """
+@page { size: A4; margin: 13mm 15mm 15mm; @bottom-right { content: "PAGE_NUMBER";
+  font: 8pt "DejaVu Sans", Verdana, Arial, sans-serif; color: #5b6570; } }
 * { box-sizing: border-box; }
 body { font: 10.5pt/1.38 "DejaVu Sans", Verdana, Arial, sans-serif; color: #1b1f24;
   max-width: 190mm; margin: 0 auto; padding: 8mm; background: #fff; }
@@ -27,32 +30,60 @@ figure { margin: 1.5mm 0; }
 svg { width: 100%; height: auto; display: block; }
 .note { font-size: 9pt; color: #3d4650; }
 .first ul { font-size: 9pt; }
+.about { display: flex; gap: 4mm; align-items: flex-start; }
+.about .facts { flex: 1; min-width: 0; }
+.sketch { flex: 0 0 36mm; }
+.sketch text { font: 11px "DejaVu Sans", Verdana, Arial, sans-serif; fill: #3d4650; }
+.wide { overflow-x: auto; }
+.wide th:first-child { white-space: nowrap; }
+.first .wide td { white-space: nowrap; }
+.measures td { white-space: nowrap; }
+.measures td:first-child { padding-right: 4mm; }
+.measures td:last-child { white-space: normal; font-size: 0.94em; color: #3d4650; }
+.signature { border-top: 0.8pt solid #5b6570; padding-top: 1mm; margin-top: 9mm; width: 60%;
+  font-size: 9pt; color: #5b6570; }
 .words { border-top: 0.8pt solid #5b6570; font-size: 9pt; margin-top: 3mm; }
-.crossing { border-top: 0.8pt solid #5b6570; padding-bottom: 2mm; }
-.crossing.suspect h3::before { content: "○ "; }
-.crossing.rejected h3::before { content: "× "; }
-.crossing.good h3::before { content: "● "; }
+tr.suspect td:first-child::before { content: "○ "; }
+tr.rejected td:first-child::before { content: "× "; }
+tr.good td:first-child::before { content: "● "; }
+@media screen and (max-width: 700px) {
+  body { padding: 4mm; }
+  h1 { font-size: 16pt; }
+  .about { flex-wrap: wrap; }
+  .about .facts { flex-basis: 100%; }
+  .facts th { width: 24mm; }
+  .wide table { width: max-content; min-width: 100%; }
+  .wide td { max-width: 62mm; overflow-wrap: break-word; }
+  figure.wide svg { width: 640px; }
+  .signature { width: 100%; }
+}
 @media print {
   body { padding: 0; font-size: 9.5pt; }
-  .break { break-before: page; }
-  .evidence { break-after: avoid; }
-  .crossing table { font-size: 8.4pt; }
-  .first + .break + .crossing { break-before: avoid; }
-  .past + .break + .crossing { break-before: avoid; }
-  .crossing + .first { break-before: page; }
   figure, tr, .finding { break-inside: avoid; }
-  .past { break-before: page; }
+  .evidence, .past, .words + .first { break-before: page; }
+  .evidence table { font-size: 8.2pt; }
+  .evidence figure svg { max-height: 74mm; }
+  .measures table { font-size: 7.8pt; }
+  .measures td, .measures th { padding-top: 0.3mm; padding-bottom: 0.3mm; }
+  .note.how { display: none; }
   .past figure svg { max-height: 175mm; }
-  .first figure svg { max-height: 44mm; }
-  .crossing figure svg { max-height: 85mm; }
-  .crossing { break-inside: avoid; }
-  h2 { margin-top: 2mm; }
-  .words { columns: 2; column-gap: 6mm; font-size: 7.5pt; line-height: 1.22; margin-top: 1mm; }
-  .words h2 { font-size: 10pt; margin: 1mm 0 0; }
+  .first figure.wide svg { max-height: 54mm; }
+  .wide { overflow: visible; }
+  h2, h3 { break-after: avoid; margin-top: 2mm; }
+  .words { columns: 2; column-gap: 6mm; font-size: 7.5pt; line-height: 1.22; margin-top: 2mm; }
+  .words h2 { font-size: 10pt; margin: 1mm 0 0; column-span: all; }
   .words p { break-inside: avoid; margin: 0.5mm 0; }
   .finding p { margin: 0.3mm 0; }
   .note, .first ul { font-size: 8pt; line-height: 1.25; }
   .first table { font-size: 8.6pt; margin: 1mm 0; }
+  .sketch { flex-basis: 30mm; margin: 0; }
+  .signature { margin-top: 9mm; break-inside: avoid; }
   * { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
 }
 """
+
+
+def style_sheet(language: Language) -> str:
+    """Return the style sheet; its page numbers are in the language."""
+    number = language.text("page.number", page='" counter(page) "', pages='" counter(pages) "')
+    return _CSS.replace("PAGE_NUMBER", number)

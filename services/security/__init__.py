@@ -1,1 +1,1 @@
-"""Credentials for the bus, and who may say and hear what on it."""
+"""Credentials for the bus, and access control by role."""

@@ -1,14 +1,13 @@
-"""Who may say and hear what on the bus: Zenoh's access control, made from the table of topics.
+"""Access control of the bus by role: Zenoh's settings, derived from the table of topics.
 
-Pure: names in, settings out. A router with these settings drops every message that no rule
-allows. It knows who speaks by the common name of the certificate.
+Pure: names in, settings out. A router with these settings drops every message that no rule allows.
+It identifies a client by the common name of its certificate.
 
-A rule of Zenoh is about one direction of one kind of message. Whoever publishes a key also
-answers for it (the cache of an advanced publisher, the last message of a latched topic, the
-truck's spool) and announces itself; whoever reads a key also asks for it. So two sets of keys per
-subject, what it publishes and what it reads, give all rules. To each key belongs the tree
-`KEY/@adv/**`, where advanced publishers have their cache, their announcements and their presence;
-`**` does not match it.
+A rule of Zenoh is about one direction of one kind of message. A publisher of a key also answers
+queries of it (the cache of an advanced publisher, the last message of a latched topic, the truck's
+spool) and announces itself; a reader of a key also queries it. So two sets of keys per subject,
+published and read ones, give all rules. To each key belongs the tree `KEY/@adv/**`, where advanced
+publishers have their cache, their announcements and their liveliness; `**` does not match it.
 """
 
 from collections.abc import Iterable
@@ -17,26 +16,25 @@ from typing import Any
 from schemas.topics import PREFIX, TOPICS, gateway_service
 from services.bus.credentials import Subject
 
-_SAYS = ("put", "reply", "declare_queryable", "liveliness_token")
-_ASKS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
+_PUBLISHES = ("put", "reply", "declare_queryable", "liveliness_token")
+_QUERIES = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 _EVERYTHING = [f"{PREFIX}/**"]
 _REPLAYS = "replay-$*"
 _SERVICE_STREAMS = {
     "logger": ("health", "event", "durable"),
     "worker": ("health", "progress", "event"),
 }
-"""`durable` lets a truck forget its data: nobody but a logger may say it."""
+"""Streams by role; `durable` makes a truck delete data, so only loggers publish it."""
 
 
 def access_control(subjects: Iterable[Subject]) -> dict[str, Any]:
-    """Return the value of Zenoh's key `access_control` that lets these in, and nobody else.
+    """Return the value of Zenoh's key `access_control` that admits these subjects only.
 
-    A truck publishes its own keys and events of its gateway, which is a service of a name of its
-    own, and reads `durable`, for that tells it what it may forget. A
-    logger publishes about itself and reads everything; a worker publishes results and alarms and
-    reads trucks, those and its own health; a viewer reads results and alarms. A replay publishes in
-    realms of replays only.
-    Routers trust each other: each filters what its own clients say.
+    A truck publishes its own keys and events of its gateway, which is a service of its own name,
+    and reads `durable`, which permits it to delete data. A logger publishes about itself and reads
+    everything; a worker publishes results and alarms and reads trucks, those and its own health; a
+    viewer reads results and alarms. A replay publishes in realms of replays only. Routers trust
+    each other: each filters the messages of its own clients.
     """
     rules: list[dict[str, Any]] = []
     named: list[dict[str, Any]] = []
@@ -78,7 +76,7 @@ def published_by(subject: Subject) -> list[str]:
 
 
 def read_by(subject: Subject) -> list[str]:
-    """Return the key expressions to which a subject may subscribe and for which it may ask."""
+    """Return the key expressions that a subject may subscribe to and query."""
     role, name = subject
     match role:
         case "truck" | "replay":
@@ -107,14 +105,14 @@ def _keys(owner: str, identifier: str = "*", streams: Iterable[str] | None = Non
 
 
 def _rules(name: str, published: list[str], read: list[str]) -> list[dict[str, Any]]:
-    # What others ask for comes with their key expression, which may be wider than one's own keys.
-    # A rule applies only to expressions that it includes, hence everything; Zenoh passes on
-    # nothing but what meets the receiver's keys.
+    # Queries of other clients arrive with their key expression, which may be wider than one's own
+    # keys. A rule applies only to expressions that it includes, hence everything; Zenoh passes on
+    # only messages that match the receiver's keys.
     rules = [
-        ("publishes", "ingress", _SAYS, published),
-        ("is asked", "egress", _ASKS, _EVERYTHING if published else []),
-        ("asks", "ingress", _ASKS, read),
-        ("reads", "egress", _SAYS, read),
+        ("publishes", "ingress", _PUBLISHES, published),
+        ("is asked", "egress", _QUERIES, _EVERYTHING if published else []),
+        ("asks", "ingress", _QUERIES, read),
+        ("reads", "egress", _PUBLISHES, read),
     ]
     return [
         {

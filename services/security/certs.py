@@ -1,18 +1,18 @@
-"""`driveby certs`: a private authority, and a folder of credentials for everybody on the bus.
+"""Credentials of the bus by `driveby certs`: a private authority, and a folder per subject.
 
-What lies in the folder afterwards:
+The folder then holds:
 
-    authority/ca.pem       whom everybody believes
-    authority/ca-key.pem   makes certificates; may be kept elsewhere between two runs
-    authority/issued/      a copy of every certificate, the list of who may take part
-    authority/revoked/     those who may no longer
-    NAME/                  what NAME needs on its machine: see services.bus.credentials
+    authority/ca.pem       the certificate that every subject trusts
+    authority/ca-key.pem   the key that signs certificates; may be kept elsewhere between two runs
+    authority/issued/      a copy of every certificate, the list of subjects with access
+    authority/revoked/     certificates of subjects without access
+    NAME/                  the files for NAME's machine: see services.bus.credentials
 
-Zenoh knows no list of revoked certificates. What keeps somebody out is the access control of the
-routers, which lists those who may take part; it is written anew by every run.
+Zenoh has no list of revoked certificates. A revoked subject is kept out by the access control of
+the routers, which lists those with access; every run writes it again.
 
-A Dask cluster runs whatever it is sent by anybody with a certificate of its authority. So that is
-another one, in another folder (`--cluster`): a stolen truck must not come in there.
+A Dask cluster runs whatever it receives from any holder of a certificate of its authority. So that
+is another authority, in another folder (`--cluster`): a stolen truck must not gain access there.
 """
 
 import ipaddress
@@ -60,18 +60,18 @@ from services.security.access_control import access_control
 
 AUTHORITY_DAYS = 3650
 FIRST = tuple(Subject(role, role) for role in ("router", "logger", "worker", "viewer", "replay"))
-"""Made together with the authority."""
+"""Subjects created together with the authority."""
 FIRST_OF_CLUSTER = tuple(Subject(role, role) for role in CLUSTER_ROLES)
-"""Made together with the authority of a cluster."""
+"""Subjects created together with the authority of a cluster."""
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 PLACE = "/etc/driveby/tls"
-"""Where the ready-made configurations expect the folder on its machine."""
+"""Folder on its machine that the generated configurations expect."""
 
 _AUTHORITY_KEY = "ca-key.pem"
 _FOLDER, _ISSUED, _REVOKED = "authority", "issued", "revoked"
 _PORT = 7447
 _CLOCK_SLACK = timedelta(days=1)
-"""Certificates are valid from a day ago: a truck's clock may be slow."""
+"""Age of a new certificate's validity: a truck's clock may be slow."""
 _HOST = re.compile(r"(?=.{1,253}\Z)(?!-)[A-Za-z0-9-]{1,63}(\.(?!-)[A-Za-z0-9-]{1,63})*")
 
 _Key = ec.EllipticCurvePrivateKey
@@ -97,7 +97,7 @@ class _Authority(NamedTuple):
         return key
 
     def issued(self) -> dict[str, x509.Certificate]:
-        """Return the certificates of those who may take part, by name."""
+        """Return the certificates of the subjects with access, by name."""
         paths = sorted((self.folder / _ISSUED).glob("*.pem"))
         return {path.stem: read_certificate(path) for path in paths}
 
@@ -119,17 +119,17 @@ def certs_command(
     days: int = 365,
     is_cluster: bool = False,
 ) -> list[str]:
-    """Make credentials in `folder` and return lines that say what there is now.
+    """Create credentials in `folder` and return lines on its present contents.
 
-    The first run makes the authority, `FIRST` and the trucks named, or with `is_cluster` the
-    authority of a cluster and `FIRST_OF_CLUSTER`. A later one adds `trucks` and
-    `others` (ROLE/NAME), gives the names in `renew` a new key and certificate and takes those in
-    `revoke` off the list, and leaves everything else as it is. Certificates of routers and loggers
-    name this machine and `hosts`.
+    The first run creates the authority, `FIRST` and the named trucks, or with `is_cluster` the
+    authority of a cluster and `FIRST_OF_CLUSTER`. A later one adds `trucks` and `others`
+    (ROLE/NAME), gives the names in `renew` a new key and certificate, removes those in `revoke`
+    from the list, and leaves everything else as it is. Certificates of routers and loggers name
+    this machine and `hosts`.
 
-    InputError: a malformed name, one that exists already or was revoked, a name that is not there
-    to be renewed or revoked, a role of a cluster in a folder of the bus or the other way round, no
-    authority's key. Nothing is made then.
+    Raise InputError, and create nothing, for a malformed name, one that exists already or was
+    revoked, an unknown name to renew or revoke, a role of a cluster in a folder of the bus or the
+    other way round, and without the authority's key.
     """
     for host in hosts:
         _check_host(host)
@@ -141,8 +141,8 @@ def certs_command(
         wanted = [*(FIRST_OF_CLUSTER if is_cluster else FIRST), *wanted]
     _check_kind(folder, authority, wanted, is_cluster=is_cluster)
     _check_new(folder, authority, wanted)
-    renewed = [] if authority is None else _known(authority, renew)
-    revoked = [] if authority is None else _known(authority, revoke)
+    renewed = [] if authority is None else _existing_subjects(authority, renew)
+    revoked = [] if authority is None else _existing_subjects(authority, revoke)
     if revoked and revoked[0].role in CLUSTER_ROLES:
         raise InputError("--revoke: Dask knows no revoked certificates; make a new authority")
     if both := set(renewed) & set(revoked):
@@ -167,7 +167,7 @@ def certs_command(
 def _check_kind(
     folder: Path, authority: _Authority | None, wanted: Iterable[Subject], *, is_cluster: bool
 ) -> None:
-    """One authority is of the bus or of a cluster, never of both."""
+    """Check that an authority is of the bus or of a cluster, never of both."""
     if authority is not None:
         is_of_cluster = any(one.role in CLUSTER_ROLES for one in authority.subjects().values())
         if is_cluster and not is_of_cluster:
@@ -179,7 +179,7 @@ def _check_kind(
     for subject in wanted:
         if subject.role not in roles:
             raise InputError(
-                f"{subject}: {folder} is an authority of {kind}, where everybody is one of "
+                f"{subject}: {folder} is an authority of {kind}, where every subject is one of "
                 f"{', '.join(roles)}; a cluster has a folder of its own (--cluster)"
             )
 
@@ -225,23 +225,23 @@ def _existing(folder: Path) -> _Authority | None:
 
 
 def _check_new(folder: Path, authority: _Authority | None, wanted: Iterable[Subject]) -> None:
-    """Nothing is overwritten, and no name stands for two."""
-    taken = set() if authority is None else set(authority.issued())
+    """Check that nothing is overwritten, and that no name is given twice."""
+    used = set() if authority is None else set(authority.issued())
     for subject in wanted:
         name = subject.name
         if authority is not None and (authority.folder / _REVOKED / f"{name}.pem").exists():
             raise InputError(
-                f"{name}: was revoked, and its old key would come alive again; "
+                f"{name}: was revoked, and its old key would become valid again; "
                 "take another name or make a new authority in another folder"
             )
-        if name in taken or (folder / name).exists():
+        if name in used or (folder / name).exists():
             raise InputError(f"{folder / name}: exists and is not overwritten; --renew replaces it")
         if name == _FOLDER:
             raise InputError(f"{name!r} is the name of the authority's folder, take another")
-        taken.add(name)
+        used.add(name)
 
 
-def _known(authority: _Authority, names: Iterable[str]) -> list[Subject]:
+def _existing_subjects(authority: _Authority, names: Iterable[str]) -> list[Subject]:
     subjects = authority.subjects()
     for name in names:
         if name not in subjects:
@@ -254,7 +254,7 @@ def _make_authority(folder: Path) -> _Authority:
     folder.mkdir(mode=0o700, exist_ok=True)
     key = ec.generate_private_key(ec.SECP256R1())
     now = datetime.now(UTC)
-    # The number tells one authority from another one that replaces it.
+    # The number distinguishes an authority from one that replaces it.
     name = f"driveby {now:%Y-%m-%d} {secrets.token_hex(4)}"
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     certificate = (
@@ -281,7 +281,7 @@ def _issue(
     hosts: Sequence[str],
     days: int,
 ) -> None:
-    """Make a key and a certificate; one of the same name is replaced."""
+    """Create a key and a certificate; one of the same name is replaced."""
     listens = subject.role in LISTENERS
     copy = authority.folder / _ISSUED / f"{subject.name}.pem"
     if listens:
@@ -291,7 +291,7 @@ def _issue(
     now = datetime.now(UTC)
     until = min(now + timedelta(days=days), authority.certificate.not_valid_after_utc)
     usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    # Or a truck could pose as the router, and who only asks as the scheduler.
+    # Otherwise a truck could pose as the router, and a client as the scheduler.
     if listens or subject.role in CLUSTER_LISTENERS:
         usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
     builder = (
@@ -315,7 +315,7 @@ def _issue(
         (new / AUTHORITY).write_bytes(public)
         if not listens and subject.role in BUS_ROLES:
             (new / CONFIGURATION).write_text(_client_configuration(_router_host(authority)))
-        # On the list before the folder is there: a name that is listed is never issued twice.
+        # On the list before the folder exists: a listed name is never issued twice.
         write_atomically(copy, certificate)
 
 
@@ -345,7 +345,7 @@ def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
 
 
 def _alternative_names(subject: Subject, hosts: Sequence[str]) -> x509.SubjectAlternativeName:
-    """The hosts of one who listens; of others a name that no host can have."""
+    """Return the hosts of a listening subject; for others a name that no host can have."""
     if not hosts:
         return x509.SubjectAlternativeName([x509.UniformResourceIdentifier(f"driveby:{subject}")])
     return x509.SubjectAlternativeName(
@@ -362,7 +362,7 @@ def _hosts_of(certificate: x509.Certificate) -> list[str]:
 
 
 def _router_host(authority: _Authority) -> str:
-    """Where a client would find the router: the first host that is not this machine's own name."""
+    """Return the router's likely address: the first host other than this machine's own name."""
     for name in ("router", "logger"):
         certificate = authority.issued().get(name)
         hosts = [] if certificate is None else _hosts_of(certificate)
@@ -385,7 +385,7 @@ def _write_access_control(folder: Path, authority: _Authority) -> None:
     }
     for subject in subjects:
         if subject.role in LISTENERS:
-            place = folder / subject.name  # anew if its folder has moved to its machine
+            place = folder / subject.name  # created again if its folder has moved to its machine
             place.mkdir(mode=0o700, exist_ok=True)
             write_atomically(place / CONFIGURATION, _json5(settings))
 
@@ -406,13 +406,13 @@ def _common_settings(mode: str) -> dict[str, Any]:
 
 def _json5(settings: dict[str, Any]) -> str:
     return (
-        f"// Made by `driveby certs`, which writes it anew. Expects its folder at {PLACE}.\n"
+        f"// Made by `driveby certs`, which overwrites it. Expects its folder at {PLACE}.\n"
         f"{json.dumps(settings, indent=2)}\n"
     )
 
 
 def _write_key(path: Path, key: _Key) -> None:
-    """Write a private key that never, not for an instant, anybody else can read."""
+    """Write a private key that is never readable by others, not even for an instant."""
     pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
     with os.fdopen(descriptor, "wb") as file:
@@ -423,7 +423,7 @@ def _write_key(path: Path, key: _Key) -> None:
 
 @contextmanager
 def _new_folder(target: Path) -> Iterator[Path]:
-    """A folder that is whole or absent: made beside, readable by its owner alone, then renamed."""
+    """Create a folder completely or not at all, readable by its owner alone, by renaming it."""
     new = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
     new.mkdir(mode=0o700)
     try:
@@ -445,6 +445,6 @@ def _summary(folder: Path, authority: _Authority) -> list[str]:
         lines.append(f"  {place:<20} {subject!s:<28} until {until:%Y-%m-%d}")
     lines.append(
         f"  {_FOLDER}/{_AUTHORITY_KEY} makes certificates: keep it off line. "
-        "Each other folder goes to its machine; who listens is to be started anew."
+        "Each other folder goes to its machine; restart the processes that listen."
     )
     return lines

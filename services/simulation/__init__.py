@@ -1,1 +1,1 @@
-"""Crossings that were never driven: of a known truth, or drawn from ranges."""
+"""Simulated crossings, of a known truth or drawn from ranges."""

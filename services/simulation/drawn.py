@@ -1,48 +1,47 @@
-"""Crossings whose truth is drawn from the priors of a site, identified and set beside the truth.
+"""Crossings whose truth is drawn from the priors of a site, identified and compared with it.
 
-If a method's intervals are true, then over many such crossings they cover the truth as often as
-they say (simulation-based calibration). So everything that the method calls unknown is drawn from
-what it is told of it: truck and tyres, rigidity of every element, mass per length, damping, support
-springs and how far bearings give (both may be absent), wheelbase, gains and delays of the channels,
-the receiver's errors, and also the total mass and the gain common to all channels, which no
-residual shows. Nothing is cut off: what a prior allows may come. The bridge rests before the
-crossing. The rest is varied as drives vary: road, speed, direction, rates, noise density.
+If a method's intervals are true, then over many such crossings their coverage is nominal
+(simulation-based calibration). So every parameter of the method is drawn from its prior: truck and
+tyres, rigidity of every element, mass per length, damping, rotational restraint and bearing
+compliance (both may be absent), wheelbase, gains and delays of the channels, the receiver's errors,
+and also the total mass and the common sensor gain, which no residual shows. Nothing is truncated.
+The bridge is at rest before the crossing. The rest varies as drives vary: road, speed, direction,
+rates, noise density.
 
 The truth is computed by the simulation of `services.simulation.drive` (ten finite elements in each
 element, 40 modes, steps of at most 0.1 ms), measured, put into messages and fed to the worker's
-engine: the identification gets what it would get from a recording.
+finder: the identification gets what it would get from a recording.
 """
 
-from typing import Any, NamedTuple
+import time
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core import unknowns
+from pre_core import parameters
 from pre_core.physics.bridge import Beam, natural_frequencies_hz
 from pre_core.physics.models import from_models
 from pre_core.physics.road import Profile
-from pre_core.physics.sensors import Accelerometer, Receiver
+from pre_core.physics.sensors import Accelerometer, ReceiverModel
 from pre_core.physics.simulate import Motion
 from pre_core.physics.vehicle import HalfCar
 from schemas.reasons import Reason
-from schemas.results import Crossing
+from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site, Vehicle
 from services.drives.runs import Run, run_to_messages
-from services.execution.dispatch import feed_all
-from services.execution.here import Here
-from services.execution.offline import header_of
-from services.identification.crossing_data import CrossingData
-from services.identification.engine import Engine
+from services.finding.crossing_data import CrossingData
+from services.finding.finder import crossings_in
 from services.identification.identify import Identify, identify
 from services.identification.pre_method import absence
+from services.identification.windows import window_of
 from services.simulation.drive import (
     LONGEST_STEP_S,
     SETTLE_S,
-    Left,
+    DepartedVehicle,
     beam_of,
-    declared,
+    declared_site,
     measured_run,
     paper_site,
 )
@@ -55,7 +54,7 @@ Floats = NDArray[np.float64]
 
 REALM = "sim-calibration"
 _BEFORE_S, _AFTER_S = 4.0, 3.5
-"""A recording begins so long before the entry and ends so long after the exit."""
+"""Duration of a recording before the entry, and after the exit."""
 
 _ROADS = ("A", "B")
 _SPEED_M_PER_S = (5.0, 25.0)
@@ -67,23 +66,24 @@ _FIX_RATE_SHARES = (0.7, 0.3)
 _BIAS_M_PER_S2 = 0.03
 """Standard deviation of a channel's offset, 3 mg: a MEMS sensor after a change of temperature."""
 _CHANGING_SHARE = 0.4
-"""This share accelerates and brakes by up to 1 m/s²; the others drive as steadily as a driver
-does. Where the height of the centre of gravity is unknown, all do."""
+"""Share of crossings that accelerate and brake by up to 1 m/s²; the others are driven steadily, and
+so are all where the height of the centre of gravity is unknown."""
 _STEADY_M_PER_S2, _CHANGING_M_PER_S2 = (0.0, 0.1), (0.1, 1.0)
 _PERIOD_S = (6.0, 16.0)
 _CG_HEIGHT_M = 1.1
-"""A loaded truck's, above the road."""
+"""Height of a loaded truck's centre of gravity above the road."""
 _LARGEST_CHANGE = 0.3
-"""The speed changes by no larger share of itself, to either side."""
+"""Largest relative change of speed in either direction."""
 
 
-class Conditions(NamedTuple):
-    """How a crossing is driven and measured: what an owner knows or does not care about."""
+class DriveConditions(NamedTuple):
+    """Driving and measuring conditions, which an owner knows or does not need."""
 
     road_class: str
     road_seed: int
     speed_m_per_s: float
-    """At the entry; it changes as a sine of `change_m_per_s` and `period_s` from `phase` on."""
+    """Speed at the entry; it changes as a sine of `change_m_per_s` and `period_s` from `phase` on.
+    """
     change_m_per_s: float
     period_s: float
     phase: float
@@ -92,12 +92,11 @@ class Conditions(NamedTuple):
     fix_rate_hz: float
     noise_ug_per_rthz: float
     body_noise_ug_per_rthz: float | None = None
-    """The noise of the two sensors on the body, where they are of another kind than those of the
-    axles."""
+    """Noise of the two body sensors, if they are of another kind than those of the axles."""
 
 
-class Channels(NamedTuple):
-    """The errors of the four channels, (4,) each; `common` is that of all gains."""
+class ChannelErrors(NamedTuple):
+    """Errors of the four channels, (4,) each; `common` is that of all gains."""
 
     common_gain: float
     gain: Floats
@@ -105,56 +104,56 @@ class Channels(NamedTuple):
     bias_m_per_s2: Floats
 
 
-class Truth(NamedTuple):
-    """Everything behind one crossing."""
+class CrossingTruth(NamedTuple):
+    """The truth of one crossing."""
 
     car: HalfCar
     beam: Beam
-    channels: Channels
+    channels: ChannelErrors
     latency_s: float
-    conditions: Conditions
-    left: Left | None = None
-    """What was on the bridge before."""
+    conditions: DriveConditions
+    left: DepartedVehicle | None = None
+    """Vehicle on the bridge before."""
     paths: WheelPaths | None = None
-    """Where the wheels run on a road that is a surface; None: both axles feel one groove."""
+    """Wheel paths on a 2-D road surface; None: both axles follow one profile."""
     width: Width | None = None
-    """What truck and bridge have beyond the plane; None: nothing."""
+    """Properties of truck and bridge beyond the plane; None: none."""
 
 
-class Drawn(NamedTuple):
-    """One crossing as it is recorded, with what is behind it."""
+class SimulatedCrossing(NamedTuple):
+    """One recorded crossing with its truth."""
 
-    truth: Truth
+    truth: CrossingTruth
     run: Run
     site: Site
-    """What the owner declares: the nominal values, and the noise density."""
+    """Declared site: nominal values and noise density."""
     motion: Motion
     start_s: float
     """Time of the first position of `motion` on the clock of `run`."""
     step_s: float
     road: Profile
-    """As the tyres felt it; on a surface, those in front."""
+    """Profile under the tyres; on a surface, the front tyres."""
     largest_deflection_m: float
 
 
-class Seen(NamedTuple):
-    """The result of a crossing, and the data that it was made of."""
+class IdentifiedCrossing(NamedTuple):
+    """The result of a crossing, and its data."""
 
-    result: Crossing
+    result: CrossingResult
     data: CrossingData
     settings: IdentificationSettings
     draws: dict[str, Floats] | None = None
-    """By the names of `true_values`, (n,) draws of each; None where a method keeps none."""
+    """Posterior draws (n,) by the names of `true_values`; None where a method has none."""
 
 
 def default_site() -> Site:
-    """The paper's truck and bridge; the truck's owner knows how high its centre of gravity is."""
+    """Return the paper's truck and bridge, with a known height of the centre of gravity."""
     site = paper_site()
     vehicle = site.vehicles[0].model_copy(update={"cg_height_m": _CG_HEIGHT_M})
     return site.model_copy(update={"vehicles": (vehicle,)})
 
 
-def draw_truth(site: Site, seed: int) -> Truth:
+def draw_truth(site: Site, seed: int) -> CrossingTruth:
     """Draw everything that the site's priors and the conditions above leave open."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7247]))
     vehicle, bridge, sensor = site.vehicles[0], site.bridges[0], site.sensor
@@ -195,7 +194,7 @@ def draw_truth(site: Site, seed: int) -> Truth:
         ),
         rayleigh_beta_s=log_normal(bridge.rayleigh_beta_s, bridge.spread("rayleigh_beta_s")),
     )
-    channels = Channels(
+    channels = ChannelErrors(
         float(sensor.common_gain_spread * rng.standard_normal()),
         sensor.gain_spread * rng.standard_normal(4),
         sensor.delay_spread_s * rng.standard_normal(4),
@@ -208,18 +207,18 @@ def draw_truth(site: Site, seed: int) -> Truth:
     of_axle = np.abs(rng.standard_normal(2))
 
     def at_end(place: int, size: float) -> float:
-        row = unknowns.SCALARS[place]
+        row = parameters.SCALARS[place]
         is_absent = rng.uniform() < absence(bridge, row)
         return 0.0 if is_absent else float(size * bridge.scale_at_zero(row.key))
 
     beam = beam._replace(
         support_rotational_stiffness_nm_per_rad=(
-            at_end(unknowns.K_ROT, springs[0]),
-            at_end(unknowns.K_ROT + 1, springs[1]),
+            at_end(parameters.K_ROT, springs[0]),
+            at_end(parameters.K_ROT + 1, springs[1]),
         ),
         support_compliance_m_per_n=(
-            at_end(unknowns.F, compliances[0]),
-            at_end(unknowns.F + 1, compliances[1]),
+            at_end(parameters.F, compliances[0]),
+            at_end(parameters.F + 1, compliances[1]),
         ),
     )
     tyres = "tyre_damping_ns_per_m"
@@ -231,15 +230,15 @@ def draw_truth(site: Site, seed: int) -> Truth:
             log_normal(rear, vehicle.spread(tyres)) if rear else float(scale * of_axle[1]),
         )
     )
-    return Truth(car, beam, channels, latency, conditions)
+    return CrossingTruth(car, beam, channels, latency, conditions)
 
 
-def _draw_conditions(vehicle: Vehicle, rng: np.random.Generator) -> Conditions:
+def _draw_conditions(vehicle: Vehicle, rng: np.random.Generator) -> DriveConditions:
     speed = rng.uniform(*_SPEED_M_PER_S)
     changing = vehicle.cg_height_m is not None and rng.uniform() < _CHANGING_SHARE
     acceleration = rng.uniform(*(_CHANGING_M_PER_S2 if changing else _STEADY_M_PER_S2))
     period = rng.uniform(*_PERIOD_S)
-    return Conditions(
+    return DriveConditions(
         road_class=str(rng.choice(_ROADS)),
         road_seed=int(rng.integers(1 << 31)),
         speed_m_per_s=float(speed),
@@ -255,12 +254,12 @@ def _draw_conditions(vehicle: Vehicle, rng: np.random.Generator) -> Conditions:
 
 def drive(
     site: Site,
-    truth: Truth,
+    truth: CrossingTruth,
     seed: int,
     *,
     noise_ug_per_rthz: tuple[float, float, float, float] | None = None,
-) -> Drawn:
-    """Drive and measure one crossing; `seed` is that of noise and receiver.
+) -> SimulatedCrossing:
+    """Simulate and measure one crossing; `seed` is that of noise and receiver.
 
     The noise is that of the conditions, unless that of each channel is given.
     """
@@ -283,7 +282,7 @@ def drive(
         )
         for c in range(4)
     ]
-    receiver = Receiver(
+    receiver = ReceiverModel(
         how.fix_rate_hz,
         position_noise_m=site.receiver.position_noise_m,
         position_spread_m=site.receiver.position_spread_m,
@@ -310,10 +309,10 @@ def drive(
             antenna_to_front_axle_m=vehicle.gps_antenna_to_front_axle_m,
         )
         of_channels = np.array(densities) / (np.sqrt(2.0) if truth.width.sensors else 1.0)
-        return Drawn(
+        return SimulatedCrossing(
             truth,
             wide.run,
-            declared(site, tuple(of_channels.tolist()), how.rate_hz),
+            declared_site(site, tuple(of_channels.tolist()), how.rate_hz),
             Motion(*(values[::2] for values in halves)),
             float(wide.run.accel_time_s[0]) - settling * step_s,
             step_s,
@@ -336,10 +335,10 @@ def drive(
         left=truth.left,
         paths=truth.paths,
     )
-    return Drawn(
+    return SimulatedCrossing(
         truth,
         run,
-        declared(site, densities, how.rate_hz),
+        declared_site(site, densities, how.rate_hz),
         motion,
         float(run.accel_time_s[0]) - settling * step_s,
         step_s,
@@ -348,11 +347,11 @@ def drive(
     )
 
 
-def _motion(truth: Truth, bridge: Bridge, step_s: float, every: int) -> Motion:
-    """From `SETTLE_S` + `_BEFORE_S` before the entry to `_AFTER_S` after the exit."""
+def _motion(truth: CrossingTruth, bridge: Bridge, step_s: float, every: int) -> Motion:
+    """Return the motion from `SETTLE_S` + `_BEFORE_S` before entry to `_AFTER_S` after exit."""
     how, car = truth.conditions, truth.car
     omega = 2.0 * np.pi / how.period_s
-    # At the entry, t = 0, the speed is what the conditions say.
+    # At the entry, t = 0, the speed is that of the conditions.
     level = how.speed_m_per_s - how.change_m_per_s * np.sin(how.phase)
     slowest = level - how.change_m_per_s
     longest = (bridge.span_m + car.wheelbase_m) / slowest
@@ -372,45 +371,29 @@ def _motion(truth: Truth, bridge: Bridge, step_s: float, every: int) -> Motion:
     return Motion(position[:stop], sign * speed[:stop], acceleration[:stop])
 
 
-def see(
+def identify_simulated(
     runs: list[Run],
     site: Site,
     settings: IdentificationSettings,
     identify: Identify = identify,
-) -> list[Seen]:
-    """Identify all crossings of the site's first truck through the engine, as from a recording.
+) -> list[IdentifiedCrossing]:
+    """Identify all crossings of the site's first truck, as from a recording.
 
-    A bridge that is drawn from the prior may have elements that no real one has: they are no reason
-    against the crossing.
+    A bridge drawn from the prior may have implausible elements, which do not count against the
+    crossing.
     """
-    kept: dict[str, CrossingData] = {}
     draws: dict[str, dict[str, Floats]] = {}
-
-    def keeping(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
-        kept[data.crossing_id] = data
-        return of_any_bridge(identify(data, settings, **others))
-
-    header = header_of(site, settings, 0.0)
     messages = run_to_messages(runs, site, REALM, site.vehicles[0].id)
-    outputs = feed_all(
-        Engine(site, settings, header),
-        Here(identify=keeping, keep=draws.__setitem__),
-        ((message.key, message.payload) for message in messages),
-    )
-    found = [output.result for output in outputs]
-    return [
-        Seen(
-            result,
-            kept[result.crossing_id],
-            settings,
-            _flat(draws.get(result.crossing_id)),
-        )
-        for result in found
-        if result is not None
-    ]
+    pairs = ((message.key, message.payload) for message in messages)
+    found = []
+    for data in crossings_in(pairs, site, window_of(settings.method)):
+        result = identify(data, settings, stopwatch=time.perf_counter, keep=draws.__setitem__)
+        kept = _flat(draws.get(data.crossing_id))
+        found.append(IdentifiedCrossing(of_any_bridge(result), data, settings, kept))
+    return found
 
 
-def of_any_bridge(result: Crossing) -> Crossing:
+def of_any_bridge(result: CrossingResult) -> CrossingResult:
     """Return the result without the reason that its bridge is implausible."""
     kept = [k for k, code in enumerate(result.reasons) if code != Reason.IMPLAUSIBLE_BRIDGE]
     if len(kept) == len(result.reasons):
@@ -428,11 +411,11 @@ def _flat(draws: dict[str, Floats] | None) -> dict[str, Floats] | None:
     return None if draws is None else {name: values.ravel() for name, values in draws.items()}
 
 
-def true_values(truth: Truth) -> dict[str, float]:
-    """The truth under the names of docs/contract.md."""
+def true_values(truth: CrossingTruth) -> dict[str, float]:
+    """Return the truth under the names of docs/contract.md."""
     car, beam = truth.car, truth.beam
     vector = from_models(car, beam)
-    names = unknowns.names(beam.flexural_rigidity_nm2.size)
+    names = parameters.names(beam.flexural_rigidity_nm2.size)
     values = dict(zip(names, vector.tolist(), strict=True))
     d_1 = car.front_axle_to_cg_m
     rear_share = d_1 / car.wheelbase_m

@@ -1,4 +1,4 @@
-"""Simulated crossings: the truth of a site file or of the paper's scenarios, driven and measured.
+"""Simulated drives: the truth of a site file or of the paper's scenarios, driven and measured.
 
 The truth is computed on a mesh ten times finer than the elements, with 40 modes for each span and
 steps of at most 0.1 ms, so that no identification shares its discretisation.
@@ -10,42 +10,43 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.paper import experiment
 from pre_core.physics.bridge import (
     Beam,
-    held_nodes,
     modes,
     node_dofs,
     refine,
+    supported_nodes,
     uniform_beam,
 )
-from pre_core.physics.passing import state_after
+from pre_core.physics.free_vibration import free_vibration_after
 from pre_core.physics.road import Profile, contact_patch_average, iso_8608_profile, under_axles
 from pre_core.physics.sensors import (
     Accelerometer,
-    Receiver,
+    ReceiverModel,
     measure_acceleration,
 )
-from pre_core.physics.simulate import Motion, Simulation, constant_acceleration, simulate
+from pre_core.physics.simulate import CoupledResponse, Motion, constant_acceleration, simulate
 from pre_core.physics.vehicle import HalfCar, static_axle_loads_n
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site, Vehicle
 from schemas.site_file import load_site, parse_site, site_toml
-from schemas.site_lane import flexibility_per_n, wave_speed_m_per_s
 from services.common.errors import FailureError, InputError
 from services.common.files import check_writable
 from services.common.progress import steps_bar
 from services.drives.runs import Run, run_to_messages
-from services.identification.placed import middle_site
+from services.finding.placed import middle_site
 from services.recordings.writer import write_recording
+from services.simulation.lane import Twist, twist_of
 from services.simulation.positions import START_TIME_S as START_TIME_S
 from services.simulation.positions import gnss_track, receiver_of
+from services.simulation.schedule import ONCE, Schedule, begun_at
 from services.simulation.wheel_paths import (
     AxleRoads,
-    OnSurface,
+    SurfaceOptions,
     WheelPaths,
     roads_of_surface,
     wheel_paths_of,
@@ -58,45 +59,34 @@ Floats = NDArray[np.float64]
 
 _PARTS = 10
 _MODES = 40
-"""For each span."""
+"""Number of modes of each span."""
 LONGEST_STEP_S = 1e-4
-"""The truth must be far more exact than what is to be tested by it."""
+"""Longest time step: the truth must be far more exact than the tested method."""
 SETTLE_S = 3.0
-"""The truck drives this long before its recording begins: it starts at rest on a rough road."""
+"""Duration of the drive before its recording: it starts at rest on a rough road."""
 _BEFORE_S, _AFTER_S = 3.0, 2.5
 _ROAD_SPACING_M = 0.01
 _CONTACT_PATCH_M = 0.2
-BETWEEN_RUNS_S = 600.0
-"""From the beginning of a run to that of the next."""
 
 
-class Left(NamedTuple):
+class DepartedVehicle(NamedTuple):
     """A lorry that has left the bridge, as a constant force."""
 
     weight_n: float
     speed_m_per_s: float
-    """Negative from the bridge's end to its start."""
+    """Speed; negative from the bridge's end to its start."""
     seconds: float
-    """Between its leaving and the first wheel's coming on."""
+    """Time between its exit and the entry of the first wheel."""
 
 
-class Twist(NamedTuple):
-    """A deck that twists under a truck whose middle runs beside the bridge's axis."""
-
-    flexibility_per_n: float
-    wave_speed_m_per_s: float
-    lane_offset_m: float
-    """To the left of the axis, looking from start to end."""
-
-
-class Beyond(NamedTuple):
-    """What truck and bridge have that a site file does not tell."""
+class OutOfModelEffects(NamedTuple):
+    """Effects in truck and bridge that a site file does not describe."""
 
     support_rotational_stiffness_nm_per_rad: tuple[float, float] = (0.0, 0.0)
     support_compliance_m_per_n: tuple[float, float] = (0.0, 0.0)
-    left: Left | None = None
+    left: DepartedVehicle | None = None
     friction_share: float = 0.0
-    """Dry friction of the springs over the static load that they carry."""
+    """Dry friction of the suspension over its static load."""
     friction_load_growth: float = 0.0
     bilinear_damping: float = 0.0
     air_spring_exponent: float = 0.0
@@ -104,23 +94,23 @@ class Beyond(NamedTuple):
     twist: Twist | None = None
 
 
-NOTHING = Beyond()
+NO_EFFECTS = OutOfModelEffects()
 
 
-class Drive(NamedTuple):
-    """What the truck measured, and the truth behind it."""
+class SimulatedDrive(NamedTuple):
+    """The measurements of a truck, and the truth."""
 
     run: Run
     road: Profile
-    """As the tyres felt it; on a surface, those in front."""
+    """Profile under the tyres; on a surface, the front tyres."""
     rigidity_ratios: Floats
     """EI of each element over the site's nominal value."""
     rear_road: Profile | None = None
-    """As the rear tyres felt it, on a surface."""
+    """Profile under the rear tyres, on a surface."""
 
 
 def paper_site() -> Site:
-    """The site of the paper: Tables 1 and 2."""
+    """Return the site of the paper: Tables 1 and 2."""
     text = resources.files("services").joinpath("data/paper.toml").read_text(encoding="utf-8")
     return parse_site(text, "paper.toml")
 
@@ -137,10 +127,10 @@ def simulate_command(
     direction: str,
     gps_noise: bool,
     rate: float | None,
-    beyond: Beyond = NOTHING,
-    twist: tuple[float, float, float] | None = None,
-    surface: OnSurface | None = None,
-    runs: int = 1,
+    beyond: OutOfModelEffects = NO_EFFECTS,
+    lane: tuple[float | None, tuple[float, float] | None] = (None, None),
+    surface: SurfaceOptions | None = None,
+    schedule: Schedule = ONCE,
     drive_seed: int | None = None,
     output: Path,
     force: bool = False,
@@ -148,18 +138,18 @@ def simulate_command(
 ) -> int:
     """Write the recording of one simulated crossing, or of several over the same road.
 
-    `twist` is lane offset in m, ratio of torsional to bending frequency and deck gyration in m.
+    `lane` has lane offset in m, and ratio of torsional to bending frequency with deck gyration in
+    m; None: as in the site file (see `twist_of`).
     """
     check_writable(output, force=force)
     known = paper_site() if site is None else middle_site(load_site(site))
     ratios = ratios_of(known.bridges[0], scenario, ei)
-    if twist is not None:
-        beyond = beyond._replace(twist=twist_of(known.bridges[0], *twist))
+    beyond = beyond._replace(twist=twist_of(known.bridges[0], *lane))
     drives, paths = [], None if surface is None else wheel_paths_of(known.vehicles[0], surface)
     of_noise = seed if drive_seed is None else drive_seed
     with steps_bar("simulating", console) as progress:
-        for number in range(runs):
-            progress(number, runs)
+        for number in range(schedule.drives):
+            progress(number, schedule.drives)
             drive = simulate_drive(
                 known,
                 ratios,
@@ -175,20 +165,20 @@ def simulate_command(
                 drive_seed=(of_noise, number) if number else of_noise,
             )
             drives.append(drive)
-        site_of_sensors = declared(known, noise, drives[0].run.rate_hz)
-        messages = write_drives(output, drives, site_of_sensors, force=force)
+        site_of_sensors = declared_site(known, noise, drives[0].run.rate_hz)
+        messages = write_drives(output, drives, site_of_sensors, force=force, schedule=schedule)
     times = drives[0].run.accel_time_s
-    passages = "" if runs == 1 else f"{runs} runs of "
     console.print(
-        f"{output}: {passages}{times[-1] - times[0]:.1f} s, {messages} messages", highlight=False
+        f"{output}: {schedule.in_words()}{times[-1] - times[0]:.1f} s, {messages} messages",
+        highlight=False,
     )
     return 0
 
 
-def declared(
+def declared_site(
     site: Site, noise_ug_per_rthz: float | tuple[float, float, float, float], rate_hz: float
 ) -> Site:
-    """The site as the owner of this simulated truck would declare it: its own sensors' noise."""
+    """Return the site as the owner of this simulated truck would declare it, with sensor noise."""
     alike = isinstance(noise_ug_per_rthz, float | int)
     sensor = site.sensor.model_copy(
         update={
@@ -200,7 +190,7 @@ def declared(
 
 
 def write_drive(
-    path: Path, drive: Drive, site: Site, realm: str = "sim-drive", *, force: bool = False
+    path: Path, drive: SimulatedDrive, site: Site, realm: str = "sim-drive", *, force: bool = False
 ) -> int:
     """Write the recording that the truck would have made, with the site in it."""
     return write_drives(path, [drive], site, realm, force=force)
@@ -208,49 +198,47 @@ def write_drive(
 
 def write_drives(
     path: Path,
-    drives: Sequence[Drive],
+    drives: Sequence[SimulatedDrive],
     site: Site,
     realm: str = "sim-drive",
     *,
     force: bool = False,
+    schedule: Schedule | None = None,
 ) -> int:
-    """Write the recording of drives one after the other, ten minutes apart."""
-    runs = [_later(drive.run, number * BETWEEN_RUNS_S) for number, drive in enumerate(drives)]
+    """Write the recording of several drives, ten minutes apart without another schedule."""
+    at = schedule or Schedule(len(drives))
+    runs = [begun_at(drive.run, at.begin_s(number)) for number, drive in enumerate(drives)]
     messages = run_to_messages(runs, site, realm, site.vehicles[0].id)
     return write_recording(
         path, messages, site_toml=site_toml(site), reason="simulation complete", force=force
     )
 
 
-def _later(run: Run, seconds: float) -> Run:
-    gnss = run.gnss._replace(time_s=run.gnss.time_s + seconds)
-    return run._replace(accel_time_s=run.accel_time_s + seconds, gnss=gnss)
-
-
 def simulate_drive(
     site: Site,
     rigidity_ratios: Floats,
     *,
-    road_class: str,
+    road_class: str | Profile,
     seed: int,
     noise_ug_per_rthz: float = 0.0,
     speed_m_per_s: tuple[float, float] = (experiment.SPEED_M_PER_S, experiment.SPEED_M_PER_S),
     forward: bool = True,
     receiver_errors: bool = False,
     rate_hz: float | None = None,
-    beyond: Beyond = NOTHING,
+    beyond: OutOfModelEffects = NO_EFFECTS,
     paths: WheelPaths | None = None,
     drive_seed: int | tuple[int, ...] | None = None,
-) -> Drive:
+) -> SimulatedDrive:
     """Drive the site's first truck over its first bridge.
 
     The speed changes evenly from the first to the second value between 3 s before the entry and the
-    end. With `paths` the road is a surface; `drive_seed` is that of noise and of the truck's place
-    across the lane where it is another one than the road's. FailureError if the coupled simulation
-    does not settle.
+    end. A profile in place of a class is the road of both axles. With `paths` the road is a surface
+    of a class; `drive_seed` is that of noise and of the truck's
+    lateral position if it differs from the road's. Raise FailureError if the coupled simulation
+    does not converge.
     """
     vehicle, bridge = site.vehicles[0], site.bridges[0]
-    car, beam = with_beyond(truck_of(vehicle), beam_of(bridge, rigidity_ratios), beyond)
+    car, beam = with_effects(truck_of(vehicle), beam_of(bridge, rigidity_ratios), beyond)
     rate = rate_hz or max(site.sensor.rate_hz)
     every = max(1, round(1.0 / (rate * LONGEST_STEP_S)))
     step_s = 1.0 / (rate * every)
@@ -260,7 +248,7 @@ def simulate_drive(
     acceleration = (end - begin) / driven_s
     settle = round(SETTLE_S * rate) * every
     steps = settle + int(np.ceil(driven_s * rate)) * every + 1
-    # At the moment the recording begins the truck has its first speed and 3 s to the bridge.
+    # When the recording begins the truck has its first speed and is 3 s from the bridge.
     first_speed = begin - acceleration * SETTLE_S
     approach = begin * _BEFORE_S + 0.5 * acceleration * _BEFORE_S**2
     approach += first_speed * SETTLE_S + 0.5 * acceleration * SETTLE_S**2
@@ -285,7 +273,7 @@ def simulate_drive(
         lane_offset_m=beyond.twist.lane_offset_m if beyond.twist else 0.0,
     )[:2]
     ratios = np.asarray(rigidity_ratios, dtype=np.float64)
-    return Drive(run, roads.front, ratios, None if paths is None else roads.rear)
+    return SimulatedDrive(run, roads.front, ratios, None if paths is None else roads.rear)
 
 
 def measured_run(
@@ -295,39 +283,40 @@ def measured_run(
     motion: Motion,
     step_s: float,
     settling_steps: int,
-    road: tuple[str, int],
+    road: tuple[str | Profile, int],
     sensors: Sequence[Accelerometer],
-    receiver: Receiver,
+    receiver: ReceiverModel,
     rng: np.random.Generator,
     *,
     antenna_to_front_axle_m: float = 0.0,
-    left: Left | None = None,
+    left: DepartedVehicle | None = None,
     paths: WheelPaths | None = None,
     lane_offset_m: float = 0.0,
-) -> tuple[Run, AxleRoads, Simulation]:
+) -> tuple[Run, AxleRoads, CoupledResponse]:
     """Drive `car` over `beam` along `motion` and measure it with one sensor per channel.
 
-    `road` is an ISO 8608 class and the seed of its phases: of one groove for both axles, or of a
-    surface where the wheels run along `paths`. The recording begins after `settling_steps`; the
-    sensors are of one rate, of which the steps are a whole fraction. If something has `left` the
-    bridge before, it swings when the first wheel comes on. Returns the recording, the road as the
-    tyres felt it and all that truck and bridge did. FailureError if the coupled simulation does not
-    settle.
+    `road` is an ISO 8608 class and the seed of its phases: of one profile for both axles, or of a
+    surface where the wheels follow `paths`; or a profile, and a seed without effect. The recording
+    begins after `settling_steps`; the sensors have one rate, of which the steps are a whole
+    fraction. After a vehicle has `left` the bridge, it vibrates when the first wheel enters. Return
+    the recording, the road under the tyres and the response of truck and bridge. Raise FailureError
+    if the coupled simulation does not converge.
     """
     accel_rng, gnss_rng, place_rng = rng.spawn(3)
     sign = 1 if motion.speed_m_per_s[0] >= 0.0 else -1
     reach = car.wheelbase_m + 1.0
     if paths is None:
         low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
-        raw = iso_8608_profile(np.floor(low), np.ceil(high), _ROAD_SPACING_M, *road)
-        groove = contact_patch_average(raw, _CONTACT_PATCH_M)
+        groove = contact_patch_average(_profile(low, high, *road), _CONTACT_PATCH_M)
         roads = AxleRoads(groove, groove)
     else:
-        roads = roads_of_surface(bridge, motion, reach, _ROAD_SPACING_M, road, paths, place_rng)
+        assert isinstance(road[0], str)  # noqa: S101 - a profile has no width
+        of_class = (road[0], road[1])
+        roads = roads_of_surface(bridge, motion, reach, _ROAD_SPACING_M, of_class, paths, place_rng)
     felt = under_axles(*roads, motion, car.wheelbase_m, sign)
     mesh = refine(beam, _PARTS)
     count = min(_MODES * (1 + len(mesh.interior_supports)), _freedoms(mesh))
-    swing = None if left is None else state_after(mesh, modes(mesh, count), *left)
+    swing = None if left is None else free_vibration_after(mesh, modes(mesh, count), *left)
     fine = simulate(car, mesh, motion, felt, step_s, modes=count, swing=swing)
     if not fine.converged:
         raise FailureError("the simulation did not converge: are the site's values possible?")
@@ -345,8 +334,40 @@ def measured_run(
     return Run("simulation", time_s, rate, channels, gnss), roads, fine
 
 
+def _profile(low_m: float, high_m: float, road: str | Profile, seed: int) -> Profile:
+    """Return the road between two chainages; beyond a given profile it stays level."""
+    start, stop = float(np.floor(low_m)), float(np.ceil(high_m))
+    if isinstance(road, str):
+        return iso_8608_profile(start, stop, _ROAD_SPACING_M, road, seed)
+    x_m: Floats = np.arange(start, stop + 0.5 * _ROAD_SPACING_M, _ROAD_SPACING_M)
+    return Profile(x_m, np.interp(x_m, road.x_m, road.height_m))
+
+
+def given_road(given: str | tuple[ArrayLike, ArrayLike]) -> str | Profile:
+    """Return a class, or the profile of chainages and heights (n,) in m; InputError if invalid."""
+    if isinstance(given, str):
+        if given not in tuple("ABCDE"):
+            raise InputError(f'road is "{given}", it must be a class from A to E')
+        return given
+    try:
+        x_m, height_m = given
+        road = Profile(np.asarray(x_m, dtype=np.float64), np.asarray(height_m, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise InputError("road has values that are no numbers") from error
+    if road.x_m.ndim != 1 or road.x_m.shape != road.height_m.shape or road.x_m.size < 2:
+        raise InputError(
+            f"road has shapes {road.x_m.shape} and {road.height_m.shape}, it must have as many "
+            "heights as chainages, at least two"
+        )
+    if not np.all(np.isfinite(road)):
+        raise InputError("road has values that are not finite numbers")
+    if not np.all(np.diff(road.x_m) > 0.0):
+        raise InputError("road has chainages that do not increase")
+    return road
+
+
 def truck_of(vehicle: Vehicle) -> HalfCar:
-    """The site's nominal truck."""
+    """Return the site's nominal truck."""
     return HalfCar(
         body_mass_kg=vehicle.sprung_mass_kg,
         front_axle_to_cg_m=vehicle.front_axle_to_cg_m,
@@ -362,7 +383,7 @@ def truck_of(vehicle: Vehicle) -> HalfCar:
 
 
 def beam_of(bridge: Bridge, rigidity_ratios: Floats) -> Beam:
-    """The site's nominal bridge with these ratios of the flexural rigidity."""
+    """Return the site's nominal bridge with these ratios of the flexural rigidity."""
     return uniform_beam(
         bridge.span_m,
         np.array(bridge.nominal_flexural_rigidity_nm2) * rigidity_ratios,
@@ -375,8 +396,8 @@ def beam_of(bridge: Bridge, rigidity_ratios: Floats) -> Beam:
     )
 
 
-def with_beyond(car: HalfCar, beam: Beam, beyond: Beyond) -> tuple[HalfCar, Beam]:
-    """The same truck and bridge with what no site file tells of them."""
+def with_effects(car: HalfCar, beam: Beam, beyond: OutOfModelEffects) -> tuple[HalfCar, Beam]:
+    """Return the truck and bridge with out-of-model effects."""
     loads = static_axle_loads_n(car, STANDARD_GRAVITY_M_PER_S2)
     friction = [
         beyond.friction_share * (load - STANDARD_GRAVITY_M_PER_S2 * unsprung)
@@ -395,20 +416,8 @@ def with_beyond(car: HalfCar, beam: Beam, beyond: Beyond) -> tuple[HalfCar, Beam
     )
 
 
-def twist_of(
-    bridge: Bridge, lane_offset_m: float, frequency_ratio: float, gyration_m: float
-) -> Twist:
-    """Return the twist of the site's bridge, uniform and sound, under a lane beside its axis."""
-    span_m, rigidity_nm2, mass_kg_per_m = bridge.uniform()
-    return Twist(
-        flexibility_per_n(lane_offset_m, gyration_m, frequency_ratio, span_m, rigidity_nm2),
-        wave_speed_m_per_s(frequency_ratio, span_m, rigidity_nm2, mass_kg_per_m),
-        lane_offset_m,
-    )
-
-
 def ratios_of(bridge: Bridge, scenario: int | None, ei: Sequence[float] | None) -> Floats:
-    """EI over nominal of each element, by scenario or one by one; InputError if too few or many."""
+    """Return EI over nominal by scenario or by element; raise InputError for a wrong number."""
     if scenario is not None:
         ratios = experiment.scenario_ratios(scenario)
         option = "--scenario"
@@ -424,4 +433,4 @@ def ratios_of(bridge: Bridge, scenario: int | None, ei: Sequence[float] | None) 
 
 
 def _freedoms(beam: Beam) -> int:
-    return int(node_dofs(beam.element_lengths_m.size, held_nodes(beam)).max()) + 1
+    return int(node_dofs(beam.element_lengths_m.size, supported_nodes(beam)).max()) + 1

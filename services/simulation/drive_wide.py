@@ -1,7 +1,7 @@
-"""Drives of a half-car and a beam that are given width: the truth of `two_sided` behind a run.
+"""Drives of a half-car and a beam with width: the truth of `two_sided` for a run.
 
-What a plane truck and bridge leave open (roll, tracks, torsion, the lane) is in `Width`. Sensors in
-the middle, or left and right, become the four channels that every method takes.
+`Width` holds the properties beyond a plane truck and bridge (roll, tracks, torsion, the lane).
+Sensors on the centre line, or left and right, become the four channels of every method.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pre_core.physics.bridge import Beam
 from pre_core.physics.road import Profile
-from pre_core.physics.sensors import Accelerometer, Receiver, measure_acceleration
+from pre_core.physics.sensors import Accelerometer, ReceiverModel, measure_acceleration
 from pre_core.physics.simulate import Motion as PlaneMotion
 from pre_core.physics.surface import Footprint
 from pre_core.physics.vehicle import HalfCar
@@ -21,49 +21,49 @@ from schemas.site import Bridge
 from services.drives.runs import Run
 from services.simulation.positions import START_TIME_S, gnss_track
 from services.simulation.two_sided import (
-    Axle,
     Body,
     Deck,
-    Motion,
-    Road,
     Torsion,
-    Truck,
+    WideAxle,
+    WideMotion,
+    WideRoad,
+    WideTruck,
     cross,
 )
 from services.simulation.two_sided_surface import draw_waves
 from services.simulation.wheel_paths import WheelPaths
-from services.simulation.wide_crossings import Sensor, middle_channels, road_under, sensor_row
+from services.simulation.wide_crossings import WideSensor, middle_channels, road_under, sensor_row
 
 Floats = NDArray[np.float64]
 
 LONGEST_STEP_S = 2e-4
-"""The accelerometers' filters take samples at this interval or less."""
+"""Longest sampling interval of the accelerometers' filters."""
 _ROLL_GYRATION_M = 0.85
 _SETTLE_S = 1.5
-"""The road rises to its heights during this time at the beginning of the run-up."""
+"""Duration at the beginning of the run-up in which the road rises to its heights."""
 
 
 class Width(NamedTuple):
-    """What a truck and a bridge have beyond the plane through the truck's middle."""
+    """Properties of truck and bridge beyond the plane through the truck's centre line."""
 
     paths: WheelPaths
     lane_offset_m: float = 0.0
-    """Middle of the lane to the left of the bridge's axis, looking from start to end."""
+    """Distance of the lane's middle to the left of the bridge's axis, seen from start to end."""
     torsion: Torsion | None = None
     load_left_m: float = 0.0
-    """Distance of the body's centre of gravity to the left of the middle."""
-    sensors: tuple[Sensor, ...] = ()
-    """Where they are, gains, delays and biases; none: the four in the middle."""
+    """Distance of the body's centre of gravity to the left of the centre line."""
+    sensors: tuple[WideSensor, ...] = ()
+    """Sensors with gains, delays and biases; empty: the four on the centre line."""
 
 
 class WideDrive(NamedTuple):
-    """What the truck recorded, and what was behind it."""
+    """The recording of a truck, and the truth."""
 
     run: Run
     road: Profile
-    """Mean of what the front tyres feel."""
+    """Mean profile under the front tyres."""
     largest_deflection_m: float
-    """Of the bridge's axis under an axle."""
+    """Largest deflection of the bridge's axis under an axle."""
 
 
 def measured_wide_run(
@@ -76,16 +76,16 @@ def measured_wide_run(
     settling_steps: int,
     road: tuple[str, int],
     sensors: Sequence[Accelerometer],
-    receiver: Receiver,
+    receiver: ReceiverModel,
     rng: np.random.Generator,
     *,
     antenna_to_front_axle_m: float = 0.0,
 ) -> WideDrive:
     """Drive a truck with width along `motion` (every half step) and measure it.
 
-    `sensors` are those of the four channels; where the truck has more, they have the first one's
-    rate, the density of the channel's kind, and errors of their own. The recording begins after
-    `settling_steps` whole steps.
+    `sensors` are those of the four channels; further sensors of the truck have the rate of the
+    first one, the density of their channel's kind, and errors of their own. The recording begins
+    after `settling_steps` whole steps.
     """
     accel_rng, gnss_rng, place_rng = rng.spawn(3)
     truck, deck = truck_with_width(car, width), deck_with_width(beam, width)
@@ -106,7 +106,7 @@ def measured_wide_run(
         truck,
         deck,
         surface,
-        Motion(step_s, *(values[:count] for values in motion)),
+        WideMotion(step_s, *(values[:count] for values in motion)),
         lane_offset_m=lane,
         settle_s=_SETTLE_S,
     )
@@ -139,15 +139,15 @@ def measured_wide_run(
 
 def _places(
     car: HalfCar, width: Width, sensors: Sequence[Accelerometer]
-) -> list[tuple[Sensor, Accelerometer]]:
-    """All sensors of the truck with what each makes of the motion."""
+) -> list[tuple[WideSensor, Accelerometer]]:
+    """Return all sensors of the truck with their accelerometer models."""
     front, rear = sensors[:2], sensors[2:]
     if not width.sensors:
         middle = (
-            Sensor(CHANNELS[0], "body", 0.0),
-            Sensor(CHANNELS[1], "body", car.wheelbase_m),
-            Sensor(CHANNELS[2], "axle", axle=1),
-            Sensor(CHANNELS[3], "axle", axle=2),
+            WideSensor(CHANNELS[0], "body", 0.0),
+            WideSensor(CHANNELS[1], "body", car.wheelbase_m),
+            WideSensor(CHANNELS[2], "axle", axle=1),
+            WideSensor(CHANNELS[3], "axle", axle=2),
         )
         return list(zip(middle, sensors, strict=True))
     return [
@@ -163,14 +163,14 @@ def _places(
     ]
 
 
-def _felt_in_front(road: Road, truck: Truck) -> Profile:
+def _felt_in_front(road: WideRoad, truck: WideTruck) -> Profile:
     front = 4 if truck.axles[0].twin_distance_m > 0.0 else 2
     x = road.start_m + road.spacing_m * np.arange(road.height_m.shape[1], dtype=np.float64)
     return Profile(x, road.height_m[:front].mean(axis=0))
 
 
-def truck_with_width(car: HalfCar, width: Width) -> Truck:
-    """Return the truck with two sides that moves as `car` does in its middle plane."""
+def truck_with_width(car: HalfCar, width: Width) -> WideTruck:
+    """Return the truck with two sides that moves as `car` does in its centre plane."""
     body_kg, d_1 = car.body_mass_kg, car.front_axle_to_cg_m
     pitch = car.pitch_inertia_ratio * body_kg * d_1 * (car.wheelbase_m - d_1)
     body = Body(
@@ -181,7 +181,7 @@ def truck_with_width(car: HalfCar, width: Width) -> Truck:
         cg_left_m=width.load_left_m,
         cg_height_m=car.cg_height_m,
     )
-    return Truck(
+    return WideTruck(
         (body,),
         tuple(
             _axle(car, i, footprint)
@@ -190,8 +190,8 @@ def truck_with_width(car: HalfCar, width: Width) -> Truck:
     )
 
 
-def _axle(car: HalfCar, i: int, footprint: Footprint) -> Axle:
-    return Axle(
+def _axle(car: HalfCar, i: int, footprint: Footprint) -> WideAxle:
+    return WideAxle(
         i * car.wheelbase_m,
         car.unsprung_mass_kg[i],
         car.suspension_stiffness_n_per_m[i],
@@ -209,7 +209,7 @@ def _axle(car: HalfCar, i: int, footprint: Footprint) -> Axle:
 
 
 def deck_with_width(beam: Beam, width: Width) -> Deck:
-    """Return the deck of a single span of equal elements; ValueError for any other beam."""
+    """Return the deck of a single span of equal elements; raise ValueError for any other beam."""
     lengths = beam.element_lengths_m
     if beam.interior_supports or np.ptp(lengths) > 1e-9 * lengths[0]:
         raise ValueError("a deck with width has one span of equal elements")

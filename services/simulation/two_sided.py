@@ -1,27 +1,27 @@
 """Trucks and bridges with width: left and right sides, roll, bogies and a deck that twists.
 
-The truth of validations beyond the plane half-car. It shares no physics, mesh or integrator with
-`pre_core`: a program that is judged by its own simulator would not see its own mistakes.
+This is the truth of validations beyond the plane half-car. It shares no physics, mesh or integrator
+with `pre_core`: a program tested by its own simulator would not notice its own errors.
 
 Truck: rigid bodies (heave, pitch, roll), of which the second may be a semitrailer on a kingpin; any
 number of axles (heave, roll); springs, dampers and friction on either side; anti-roll bars; tyres
-one by one. A body's point at the distance o behind the first axle and e to the left of the middle
-moves by z + (cg - o) theta + (e - cg_left) phi, an axle's by z + e phi; pitch is positive nose up,
-roll with the left side up. Everything is measured from the equilibrium on a flat road. An equalised
-bogie has one spring on each side whose lower end follows the mean of its axles, weighted with their
-shares, and which loads them in the same shares. Friction follows Dahl's law, dF/du = (F_c/l)
-(1 - sign(du) F/F_c).
+one by one. A body's point at the distance o behind the first axle and e to the left of the centre
+line moves by z + (cg - o) theta + (e - cg_left) phi, an axle's by z + e phi; pitch is positive nose
+up, roll with the left side up. Everything is relative to the equilibrium on a flat road. An
+equalised bogie has one spring on each side whose lower end follows the mean of its axles, weighted
+with their shares, and which loads them in the same shares. Friction follows Dahl's law, dF/du =
+(F_c/l) (1 - sign(du) F/F_c).
 
 Bridge: Euler-Bernoulli bending of a beam whose rigidity differs between elements, in modes of its
-own finite elements, and uniform St. Venant torsion between ends held against twist: psi_j =
-sin(j pi x/L), omega_j = j omega_1, modal mass rho A r^2 L/2. Both are damped by alpha +
-beta omega^2. A wheel at the distance e to the left of the axis finds w(x) + e theta(x), and its
-force drives both.
+own finite elements, and uniform St. Venant torsion between ends fixed against twist: psi_j = sin(j
+pi x/L), omega_j = j omega_1, modal mass rho A r^2 L/2. Both are damped by alpha + beta omega^2. A
+wheel at the distance e to the left of the axis follows w(x) + e theta(x), and its force drives
+both.
 
 Time: fourth-order Runge-Kutta steps, in their exponential form (Cox and Matthews 2002, eq. 26-29):
 the free motion of each mode is exact, so that modes of several kHz or with many times their
-critical damping need no shorter steps. Of the truck, which has no exponential part, they are the
-classical steps. Only while a wheel is on the bridge does the bridge move.
+critical damping need no shorter steps. For the truck, which has no exponential part, they are the
+classical steps. The bridge moves only while a wheel is on it.
 
 Longer than other modules: an equation and its coefficients are read together.
 """
@@ -29,28 +29,28 @@ Longer than other modules: an equation and its coefficients are read together.
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh, expm
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
+from pre_core.kernels.lanes import compiled
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 LONGEST_STEP_S: Final = 5e-4
 _CELLS: Final = 70
-"""Finite elements of the bridge, at least."""
+"""Fewest finite elements of the bridge."""
 _BENDING_MODES: Final = 36
 _TORSION_MODES: Final = 60
-"""Twist under a wheel converges as their inverse: 60 leave 0.7 % of it."""
+"""Number of torsional modes: twist under a wheel converges as its inverse, and 60 leave 0.7 %."""
 _KINGPIN_N_PER_M: Final = 2e7
 _KINGPIN_NS_PER_M: Final = 1e5
 
 
-class Axle(NamedTuple):
-    """One axle; stiffness, damping and friction are those of both sides together."""
+class WideAxle(NamedTuple):
+    """An axle; stiffness, damping and friction are those of both sides together."""
 
     position_m: float
     """Distance behind the first axle."""
@@ -62,9 +62,9 @@ class Axle(NamedTuple):
     track_m: float = 1.9
     tyre_width_m: float = 0.25
     twin_distance_m: float = 0.0
-    """Between the middles of twin tyres; 0 for single ones."""
+    """Distance between the middles of twin tyres; 0 for single ones."""
     outer_share: float = 0.5
-    """Share of a side's stiffness and load that the outer one of twin tyres has."""
+    """Share of the outer twin tyre in a side's stiffness and load."""
     contact_length_m: float = 0.2
     spring_track_m: float = 1.0
     anti_roll_nm_per_rad: float = 1.0e5
@@ -91,10 +91,10 @@ class Body(NamedTuple):
     cg_left_m: float = 0.0
     cg_height_m: float = 1.3
     roll_arm_m: float = 0.5
-    """Height of the centre of gravity above the axis about which it rolls."""
+    """Height of the centre of gravity above the roll axis."""
 
 
-class Bogie(NamedTuple):
+class WideBogie(NamedTuple):
     """Axles (indices from 0) that share one spring force on each side."""
 
     axles: tuple[int, ...]
@@ -109,12 +109,12 @@ class Kingpin(NamedTuple):
     roll_damping_nms_per_rad: float = 1.0e4
 
 
-class Truck(NamedTuple):
+class WideTruck(NamedTuple):
     """A truck, or a tractor with a semitrailer."""
 
     bodies: tuple[Body, ...]
-    axles: tuple[Axle, ...]
-    bogies: tuple[Bogie, ...] = ()
+    axles: tuple[WideAxle, ...]
+    bogies: tuple[WideBogie, ...] = ()
     kingpin: Kingpin | None = None
 
     @property
@@ -124,10 +124,10 @@ class Truck(NamedTuple):
 
 
 class Torsion(NamedTuple):
-    """Twist of the deck."""
+    """Torsional properties of the deck."""
 
     frequency_hz: float
-    """Of the first mode."""
+    """Frequency of the first mode."""
     gyration_m: float
     """Radius of gyration of the cross-section."""
 
@@ -144,8 +144,8 @@ class Deck(NamedTuple):
     support_rotational_stiffness_nm_per_rad: tuple[float, float] = (0.0, 0.0)
 
 
-class Motion(NamedTuple):
-    """Where the first axle is at the times 0, h/2, h, …: (2 steps + 1,) each."""
+class WideMotion(NamedTuple):
+    """Motion of the first axle at the times 0, h/2, h, …: (2 steps + 1,) each."""
 
     step_s: float
     position_m: Floats
@@ -156,7 +156,7 @@ class Motion(NamedTuple):
     """Rate of change of the magnitude of the speed."""
 
 
-class Road(NamedTuple):
+class WideRoad(NamedTuple):
     """Heights under each tyre at equally spaced chainages, in the order of `tyres_of`."""
 
     start_m: float
@@ -164,17 +164,17 @@ class Road(NamedTuple):
     height_m: Floats  # (tyres, n)
 
 
-class Tyres(NamedTuple):
+class WideTyres(NamedTuple):
     """All tyres of a truck: (tyres,) each, axle by axle, the left side first."""
 
     axle: Integers
     lateral_m: Floats
-    """To the left of the truck's middle."""
+    """Distance to the left of the truck's centre line."""
     share: Floats
-    """Of the axle's tyre stiffness."""
+    """Share of the axle's tyre stiffness."""
 
 
-class Response(NamedTuple):
+class WideResponse(NamedTuple):
     """Motion of truck and bridge at every step."""
 
     time_s: Floats
@@ -187,7 +187,7 @@ class Response(NamedTuple):
     twist_rad: Floats  # (steps, axles)
 
 
-def tyres_of(truck: Truck) -> Tyres:
+def tyres_of(truck: WideTruck) -> WideTyres:
     """Return the tyres of a truck; an axle has two, or four where they are twins."""
     rows = []
     for i, axle in enumerate(truck.axles):
@@ -200,13 +200,13 @@ def tyres_of(truck: Truck) -> Tyres:
             else:
                 rows.append((i, middle, 0.5))
     number, lateral, share = zip(*rows, strict=True)
-    return Tyres(np.array(number, dtype=np.int64), np.array(lateral), np.array(share))
+    return WideTyres(np.array(number, dtype=np.int64), np.array(lateral), np.array(share))
 
 
-def static_axle_loads_n(truck: Truck) -> Floats:
+def static_axle_loads_n(truck: WideTruck) -> Floats:
     """Return the load of each axle (n,) on a flat road, wheels included.
 
-    More independent springs than equations share the load as if their relaxed lengths were equal.
+    Redundant springs share the load as if their relaxed lengths were equal.
     """
     gravity = STANDARD_GRAVITY_M_PER_S2
     loads = np.array([gravity * axle.mass_kg for axle in truck.axles])
@@ -235,15 +235,15 @@ def static_axle_loads_n(truck: Truck) -> Floats:
     return loads
 
 
-def groups_of(truck: Truck) -> list[Bogie]:
+def groups_of(truck: WideTruck) -> list[WideBogie]:
     """Return the bogies, and every other axle as one of its own, from front to rear."""
     alone = set(range(len(truck.axles))) - {i for bogie in truck.bogies for i in bogie.axles}
-    groups = [*truck.bogies, *(Bogie((i,), (1.0,)) for i in alone)]
+    groups = [*truck.bogies, *(WideBogie((i,), (1.0,)) for i in alone)]
     return sorted(groups, key=lambda group: group.axles)
 
 
 def bending_frequencies_hz(deck: Deck, count: int) -> Floats:
-    """Return the lowest undamped frequencies of bending."""
+    """Return the lowest undamped bending frequencies."""
     return np.asarray(np.sqrt(_bending(deck, count)[0]) / (2.0 * np.pi))
 
 
@@ -256,8 +256,8 @@ def even_motion(
     forward: bool = True,
     change_m_per_s: float = 0.0,
     period_s: float = 10.0,
-) -> Motion:
-    """Drive from `start_m` with the speed v + change sin(2 pi t/period)."""
+) -> WideMotion:
+    """Return the motion from `start_m` with the speed v + change sin(2 pi t/period)."""
     half = 0.5 * step_s
     t = half * np.arange(2 * round(duration_s / step_s) + 1)
     omega = 2.0 * np.pi / period_s
@@ -265,23 +265,23 @@ def even_motion(
     speed = speed_m_per_s + change_m_per_s * np.sin(omega * t)
     acceleration = change_m_per_s * omega * np.cos(omega * t)
     sign = 1.0 if forward else -1.0
-    return Motion(step_s, start_m + sign * travel, sign * speed, acceleration)
+    return WideMotion(step_s, start_m + sign * travel, sign * speed, acceleration)
 
 
 def cross(
-    truck: Truck,
+    truck: WideTruck,
     deck: Deck,
-    road: Road,
-    motion: Motion,
+    road: WideRoad,
+    motion: WideMotion,
     *,
     lane_offset_m: float = 0.0,
     settle_s: float = 0.0,
-) -> Response:
-    """Drive the truck along `motion`; the bridge is at rest until the first wheel comes on.
+) -> WideResponse:
+    """Drive the truck along `motion`; the bridge is at rest until the first wheel enters.
 
-    The truck's middle runs `lane_offset_m` to the left of the bridge's axis, looking from start to
-    end. It starts at rest in its equilibrium; the road rises from nothing to its heights during the
-    first `settle_s`, so that no step excites the truck. ValueError if the road is too short.
+    The truck's centre line runs `lane_offset_m` to the left of the bridge's axis, seen from start
+    to end. It starts at rest in equilibrium; the road rises from zero to its heights during the
+    first `settle_s`, so that no step excites the truck. Raise ValueError if the road is too short.
     """
     system = _system(truck)
     tyres = tyres_of(truck)
@@ -298,7 +298,7 @@ def cross(
     steps = motion.position_m.size // 2
     touched = np.flatnonzero(on.any(axis=1)) // 2
     first, last = (int(touched[0]), int(touched[-1])) if touched.size else (steps + 1, -1)
-    out = Response(
+    out = WideResponse(
         motion.step_s * np.arange(steps + 1, dtype=np.float64),
         motion.position_m[::2].copy(),
         np.zeros((steps + 1, system.mass.size)),
@@ -331,16 +331,16 @@ def cross(
     return out
 
 
-def body_row(truck: Truck, position_m: float, lateral_m: float, body: int = 0) -> Floats:
-    """Return the row that takes coordinates to the motion of a point of a body."""
+def body_row(truck: WideTruck, position_m: float, lateral_m: float, body: int = 0) -> Floats:
+    """Return the row from coordinates to the motion of a point of a body."""
     row = np.zeros(3 * len(truck.bodies) + 2 * len(truck.axles))
     of = truck.bodies[body]
     row[3 * body : 3 * body + 3] = 1.0, of.cg_position_m - position_m, lateral_m - of.cg_left_m
     return row
 
 
-def axle_row(truck: Truck, axle: int, lateral_m: float) -> Floats:
-    """Return the row that takes coordinates to the motion of a point of an axle (from 0)."""
+def axle_row(truck: WideTruck, axle: int, lateral_m: float) -> Floats:
+    """Return the row from coordinates to the motion of a point of an axle (from 0)."""
     row = np.zeros(3 * len(truck.bodies) + 2 * len(truck.axles))
     first = 3 * len(truck.bodies) + 2 * axle
     row[first : first + 2] = 1.0, lateral_m
@@ -362,7 +362,7 @@ class _System(NamedTuple):
     friction_length: Floats
 
 
-def _system(truck: Truck) -> _System:
+def _system(truck: WideTruck) -> _System:
     size = 3 * len(truck.bodies) + 2 * len(truck.axles)
     mass = np.array(
         [
@@ -400,7 +400,7 @@ def _system(truck: Truck) -> _System:
         row[3 * axle.body + 2] = -1.0
         stiffness += axle.anti_roll_nm_per_rad * np.outer(row, row)
     for b, body in enumerate(truck.bodies):
-        # The weight of a body that leans pulls it further.
+        # The weight of a tilted body adds to its roll.
         stiffness[3 * b + 2, 3 * b + 2] -= (
             body.mass_kg * STANDARD_GRAVITY_M_PER_S2 * body.roll_arm_m
         )
@@ -434,23 +434,23 @@ def _system(truck: Truck) -> _System:
     )
 
 
-def _place(truck: Truck, group: Bogie) -> float:
-    """Where a bogie carries the body."""
+def _place(truck: WideTruck, group: WideBogie) -> float:
+    """Return the place at which a bogie supports the body."""
     return sum(
         share * truck.axles[i].position_m
         for i, share in zip(group.axles, group.shares, strict=True)
     )
 
 
-def _series_stiffness(truck: Truck, group: Bogie) -> float:
+def _series_stiffness(truck: WideTruck, group: WideBogie) -> float:
     axles = [truck.axles[i] for i in group.axles]
     spring = sum(axle.suspension_stiffness_n_per_m for axle in axles)
     tyre = sum(axle.tyre_stiffness_n_per_m for axle in axles)
     return spring * tyre / (spring + tyre)
 
 
-def _static_tyre_loads(truck: Truck, tyres: Tyres) -> Floats:
-    """Loads (tyres,): a load beside the middle is shared by the axles as they resist roll."""
+def _static_tyre_loads(truck: WideTruck, tyres: WideTyres) -> Floats:
+    """Return loads (tyres,): the axles share an eccentric load by their roll stiffness."""
     loads = static_axle_loads_n(truck)[tyres.axle] * tyres.share
     for b, body in enumerate(truck.bodies):
         moment = body.mass_kg * STANDARD_GRAVITY_M_PER_S2 * body.cg_left_m
@@ -470,9 +470,9 @@ def _static_tyre_loads(truck: Truck, tyres: Tyres) -> Floats:
 
 
 def _under_tyres(
-    road: Road, tyres: Tyres, places: Floats, motion: Motion, settle_s: float
+    road: WideRoad, tyres: WideTyres, places: Floats, motion: WideMotion, settle_s: float
 ) -> tuple[Floats, Floats]:
-    """Heights and their rates of change (half steps, tyres)."""
+    """Return heights and their rates of change (half steps, tyres)."""
     stop = road.start_m + road.spacing_m * (road.height_m.shape[1] - 1)
     if places.min() < road.start_m or places.max() > stop:
         raise ValueError(
@@ -553,7 +553,7 @@ def _modes(deck: Deck, step_s: float) -> _Modes:
 def _phi_functions(scaled: Floats) -> tuple[Floats, Floats]:
     """Return exp(A) and the second columns (3, 2) of phi_1, phi_2, phi_3 of A.
 
-    They stand in the exponential of A with a chain of integrators beside it.
+    They are in the exponential of A augmented with a chain of integrators.
     """
     joined = np.zeros((5, 5))
     joined[:2, :2] = scaled
@@ -564,7 +564,7 @@ def _phi_functions(scaled: Floats) -> tuple[Floats, Floats]:
 
 
 def _bending(deck: Deck, count: int) -> tuple[Floats, Floats]:
-    """Eigenvalues (count,) in 1/s² and mass-normalised shapes (2 nodes, count): w, w' by node."""
+    """Return eigenvalues (count,) in 1/s² and mass-normalised shapes (2 nodes, count): w, w'."""
     parts = -(-_CELLS // len(deck.flexural_rigidity_nm2))
     rigidity = np.repeat(np.array(deck.flexural_rigidity_nm2), parts)
     cells = rigidity.size
@@ -602,7 +602,7 @@ def _bending(deck: Deck, count: int) -> tuple[Floats, Floats]:
     return np.asarray(values), shapes
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _shape(x, span, modes, out):  # type: ignore[no-untyped-def]
     """Write the mass-normalised modes at the chainage x to `out` (modes,), 0 off the bridge."""
     bending = modes.bending.shape[1]
@@ -631,7 +631,7 @@ def _shape(x, span, modes, out):  # type: ignore[no-untyped-def]
         before, sine = sine, twice * sine - before
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _derivative(  # type: ignore[no-untyped-def]
     system,
     tyre_axle,
@@ -712,7 +712,7 @@ def _derivative(  # type: ignore[no-untyped-def]
         qdd[n] /= system.mass[n]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _march(  # type: ignore[no-untyped-def]
     step,
     system,
@@ -748,7 +748,7 @@ def _march(  # type: ignore[no-untyped-def]
     slopes = np.zeros((3, axles, count))
     q, qd, friction = np.zeros(size), np.zeros(size), np.zeros(springs)
     w, wd = np.zeros(count), np.zeros(count)
-    # The stages of a step: state at which each is evaluated, and what it gives.
+    # The stages of a step: the state of each evaluation, and its result.
     q_s, qd_s, friction_s = np.zeros(size), np.zeros(size), np.zeros(springs)
     w_s, wd_s = np.zeros(count), np.zeros(count)
     w_a, wd_a = np.zeros(count), np.zeros(count)

@@ -1,9 +1,9 @@
 """Isotropic random road surfaces, sampled under single tyres.
 
-A surface is a sum of plane waves whose profile along any line has the density of ISO 8608,
-G_d(n_0) (n/n_0)^-2. Its two-dimensional density is Phi(k) = G_d(n_0) n_0^2/2 k^-3, one-sided in
-n_x: the integral of Phi over all n_y is the density of the profile at n_x. A tyre averages over its
-width and contact length, which multiplies the wave (n_x, n_y) by sinc(width n_y) sinc(length n_x).
+A surface is a sum of plane waves whose profile along any line has the density of ISO 8608, G_d(n_0)
+(n/n_0)^-2. Its two-dimensional density is Phi(k) = G_d(n_0) n_0^2/2 k^-3, one-sided in n_x: the
+integral of Phi over all n_y is the density of the profile at n_x. A tyre averages over its width
+and contact length, which multiplies the wave (n_x, n_y) by sinc(width n_y) sinc(length n_x).
 
 The waves are drawn one in each cell of a grid over (n_x, n_y), at a random place in the cell, with
 a Gaussian complex amplitude. Nothing here is shared with `pre_core.physics.surface`, which the
@@ -13,8 +13,9 @@ truth of a validation must not depend on.
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pre_core.kernels.lanes import compiled
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -25,13 +26,13 @@ _CLASS_A_M3: Final = 16e-6
 _REFERENCE_CYCLES_PER_M: Final = 0.1
 _LONGEST_WAVE_M: Final = 100.0
 _SHORTEST_WAVE_M: Final = 0.1
-"""Along the road; the contact patch leaves little of shorter waves."""
+"""Shortest wave along the road; the contact patch averages out shorter ones."""
 _ALONG_STEP_CYCLES_PER_M: Final = 0.004
-"""Two waves for each line that 120 m of road can resolve."""
+"""Spacing of waves: two for each line that 120 m of road can resolve."""
 _ACROSS: Final = 160
 _WIDEST_CYCLES_PER_M: Final = 40.0
 _ACROSS_SCALE_CYCLES_PER_M: Final = 0.02
-"""Cells across are even below this wave number and grow in proportion to it above."""
+"""Lateral wave number below which cells are even, and above which they grow in proportion."""
 
 
 class Waves(NamedTuple):
@@ -46,7 +47,7 @@ class Strip(NamedTuple):
     """Part of the surface that one tyre covers."""
 
     lateral_m: float
-    """Distance of its middle to the left of the bridge's axis, looking from start to end."""
+    """Distance of its middle to the left of the bridge's axis, seen from start to end."""
     width_m: float
     length_m: float
 
@@ -72,7 +73,7 @@ def draw_waves(road_class: str, seed: int) -> Waves:
 
 
 def density_constant_m2(road_class: str) -> float:
-    """Return Phi k^3, 8e-8 m² for class A; ValueError for an unknown class."""
+    """Return Phi k^3, 8e-8 m² for class A; raise ValueError for an unknown class."""
     grade = _CLASSES.find(road_class) if road_class else -1
     if grade < 0:
         raise ValueError(f"{road_class} is no road class, it must be one of {', '.join(_CLASSES)}")
@@ -96,13 +97,13 @@ def heights_m(waves: Waves, strip: Strip, start_m: float, spacing_m: float, coun
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _sinc(x: float) -> float:
     angle = np.pi * x
     return 1.0 if abs(angle) < 1e-9 else np.sin(angle) / angle
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _heights(
     n_x: Floats,
     n_y: Floats,

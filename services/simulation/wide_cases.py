@@ -1,7 +1,7 @@
 """Cases with width: drawn trucks and decks that twist, and trucks with more axles than declared.
 
-The owner knows total mass and axle distances; of everything else the site file has the value of the
-undamaged bridge and the truck within SITE_ERROR.
+The owner knows total mass and axle distances; all other values of the site file are those of the
+undamaged bridge and of the truck within SITE_ERROR.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,26 +12,26 @@ import numpy as np
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from schemas.wgs84 import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
 from services.simulation.two_sided import (
-    Axle,
     Body,
-    Bogie,
     Deck,
     Kingpin,
     Torsion,
-    Truck,
+    WideAxle,
+    WideBogie,
+    WideTruck,
     bending_frequencies_hz,
     static_axle_loads_n,
 )
 from services.simulation.wide_crossings import (
     USUAL_RECEIVER,
-    Case,
     SatelliteErrors,
-    Sensor,
+    WideCase,
     WideRun,
+    WideSensor,
 )
 
 SITE_ERROR: Final = 0.15
-"""Largest relative error of what the owner declares."""
+"""Largest relative error of declared values."""
 _LATITUDE_DEG, _LONGITUDE_DEG = 36.4, 140.3
 
 GAIN_SPREAD: Final = 0.01
@@ -41,7 +41,7 @@ NOISE_UG: Final = (10.0, 25.0, 50.0)
 TOTAL_MASS_KG: Final = (12e3, 19e3)
 WHEELBASE_M: Final = (4.5, 6.0)
 FRONT_SHARE: Final = (0.34, 0.45)
-"""Of the body's mass on the front axle."""
+"""Share of the body's mass on the front axle."""
 SPAN_M: Final = (18.0, 40.0)
 SPEED_M_PER_S: Final = (8.0, 15.0)
 LANE_OFFSET_M: Final = (0.0, 2.0)
@@ -64,10 +64,10 @@ def draw_wide(
     declared: bool | None = None,
     runs: int = 1,
     receiver: SatelliteErrors = USUAL_RECEIVER,
-) -> Case:
-    """Draw a two-axle truck in a lane beside the axis of a deck that twists.
+) -> WideCase:
+    """Draw a two-axle truck on an eccentric lane of a deck that twists.
 
-    `tyres` is "single" (equal tracks, the rear axle 5 mm aside) or "twin" (behind); `declared` is
+    `tyres` is "single" (equal tracks, rear axle offset by 5 mm) or "twin" (behind); `declared` is
     whether the site file has lane offset, torsional ratio and gyration. Both are drawn unless
     given.
     """
@@ -103,11 +103,11 @@ def draw_wide(
     )
     width = {
         "lane_offset_m": round(lane + LANE_ERROR_M * float(rng.standard_normal()), 2),
-        "torsional_frequency_ratio": _disturbed(ratio, rng),
-        "deck_gyration_m": _disturbed(gyration, rng),
+        "torsional_frequency_ratio": disturbed(ratio, rng),
+        "deck_gyration_m": disturbed(gyration, rng),
     }
     noise = float(rng.choice(NOISE_UG))
-    return Case(
+    return WideCase(
         f"wide-{seed}",
         seed,
         truck,
@@ -139,7 +139,7 @@ def draw_wide(
 
 def two_axle_truck(
     total_kg: float, wheelbase_m: float, front_share: float, tyres: str, rng: np.random.Generator
-) -> Truck:
+) -> WideTruck:
     """Return a lorry whose springs and tyres fit its load, varied by some 15 %."""
     vary = np.exp(0.12 * rng.standard_normal(9))
     front_kg, rear_kg = 650.0 * vary[0], 1100.0 * vary[1]
@@ -151,7 +151,7 @@ def two_axle_truck(
     cg = (1.0 - front_share) * wheelbase_m
     behind = SINGLE if tyres == "single" else TWIN
     axles = (
-        Axle(
+        WideAxle(
             0.0,
             float(front_kg),
             float(stiffness[0]),
@@ -160,7 +160,7 @@ def two_axle_truck(
             spring_track_m=0.84,
             **SINGLE,
         ),
-        Axle(
+        WideAxle(
             wheelbase_m,
             float(rear_kg),
             float(stiffness[1]),
@@ -171,27 +171,29 @@ def two_axle_truck(
             **behind,
         ),
     )
-    return Truck((rigid_body(float(body_kg), cg, cg * (wheelbase_m - cg) * vary[8]),), axles)
+    return WideTruck((rigid_body(float(body_kg), cg, cg * (wheelbase_m - cg) * vary[8]),), axles)
 
 
 def rigid_body(mass_kg: float, cg_position_m: float, gyration_squared_m2: float) -> Body:
-    """Return a body with the pitch gyration of its square and a roll gyration of 0.85 m."""
+    """Return a body with this squared pitch gyration and a roll gyration of 0.85 m."""
     pitch, roll = mass_kg * float(gyration_squared_m2), mass_kg * 0.85**2
     return Body(mass_kg, cg_position_m, pitch, roll)
 
 
-def middle_sensors(wheelbase_m: float, noise_ug: float, rear_axle: int = 2) -> tuple[Sensor, ...]:
-    """Return the four sensors that a two-axle truck has, in the middle."""
+def middle_sensors(
+    wheelbase_m: float, noise_ug: float, rear_axle: int = 2
+) -> tuple[WideSensor, ...]:
+    """Return the four sensors of a two-axle truck on its centre line."""
     return (
-        Sensor("sprung_front", "body", 0.0, noise_ug_per_rthz=noise_ug),
-        Sensor("sprung_rear", "body", wheelbase_m, noise_ug_per_rthz=noise_ug),
-        Sensor("unsprung_front", "axle", axle=1, noise_ug_per_rthz=noise_ug),
-        Sensor("unsprung_rear", "axle", axle=rear_axle, noise_ug_per_rthz=noise_ug),
+        WideSensor("sprung_front", "body", 0.0, noise_ug_per_rthz=noise_ug),
+        WideSensor("sprung_rear", "body", wheelbase_m, noise_ug_per_rthz=noise_ug),
+        WideSensor("unsprung_front", "axle", axle=1, noise_ug_per_rthz=noise_ug),
+        WideSensor("unsprung_rear", "axle", axle=rear_axle, noise_ug_per_rthz=noise_ug),
     )
 
 
-def with_errors(sensors: Sequence[Sensor], rng: np.random.Generator) -> tuple[Sensor, ...]:
-    """Return the sensors with gains, delays and biases drawn from what owners declare."""
+def with_errors(sensors: Sequence[WideSensor], rng: np.random.Generator) -> tuple[WideSensor, ...]:
+    """Return the sensors with gains, delays and biases drawn from the declared spreads."""
     return tuple(
         sensor._replace(
             gain_error=GAIN_SPREAD * float(rng.standard_normal()),
@@ -203,20 +205,20 @@ def with_errors(sensors: Sequence[Sensor], rng: np.random.Generator) -> tuple[Se
 
 
 def declared_vehicle(
-    truck: Truck,
+    truck: WideTruck,
     total_mass_kg: float,
     rng: np.random.Generator,
     rear: Sequence[int] = (1,),
 ) -> dict[str, Any]:
-    """Return the table of a truck with two axles; those of `rear` (indices) are taken for one."""
+    """Return the table of a truck with two axles; those of `rear` (indices) count as one."""
     front, behind = truck.axles[0], [truck.axles[i] for i in rear]
     wheelbase = float(np.mean([axle.position_m for axle in behind]))
     body = truck.bodies[0]
 
     def pair(key: str) -> list[float]:
         return [
-            _disturbed(float(getattr(front, key)), rng),
-            _disturbed(float(sum(getattr(axle, key) for axle in behind)), rng),
+            disturbed(float(getattr(front, key)), rng),
+            disturbed(float(sum(getattr(axle, key) for axle in behind)), rng),
         ]
 
     tracks = [front.track_m, behind[0].track_m]
@@ -226,7 +228,7 @@ def declared_vehicle(
         "cg_height_m": 1.3,
         "total_mass_kg": round(total_mass_kg, 1),
         "wheelbase_m": round(wheelbase, 4),
-        "front_axle_to_cg_m": min(_disturbed(body.cg_position_m, rng), 0.9 * wheelbase),
+        "front_axle_to_cg_m": min(disturbed(body.cg_position_m, rng), 0.9 * wheelbase),
         "suspension_damping_ns_per_m": pair("suspension_damping_ns_per_m"),
         "suspension_stiffness_n_per_m": pair("suspension_stiffness_n_per_m"),
         "unsprung_mass_kg": pair("mass_kg"),
@@ -238,7 +240,7 @@ def declared_vehicle(
 
 
 def declared_bridge(deck: Deck, undamaged_nm2: float, rng: np.random.Generator) -> dict[str, Any]:
-    """Return the table of a bridge without what is known of its torsion."""
+    """Return the table of a bridge without its torsional properties."""
     azimuth = float(rng.uniform(0.0, 2.0 * np.pi))
     latitude = np.radians(_LATITUDE_DEG)
     root = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
@@ -254,27 +256,28 @@ def declared_bridge(deck: Deck, undamaged_nm2: float, rng: np.random.Generator) 
         "end_latitude_deg": round(float(_LATITUDE_DEG + north), 8),
         "end_longitude_deg": round(float(_LONGITUDE_DEG + east), 8),
         "elements": len(deck.flexural_rigidity_nm2),
-        "flexural_rigidity_nm2": _disturbed(undamaged_nm2, rng),
-        "mass_per_length_kg_per_m": _disturbed(deck.mass_per_length_kg_per_m, rng),
-        "rayleigh_alpha_per_s": _disturbed(deck.rayleigh_alpha_per_s, rng),
-        "rayleigh_beta_s": _disturbed(deck.rayleigh_beta_s, rng),
+        "flexural_rigidity_nm2": disturbed(undamaged_nm2, rng),
+        "mass_per_length_kg_per_m": disturbed(deck.mass_per_length_kg_per_m, rng),
+        "rayleigh_alpha_per_s": disturbed(deck.rayleigh_alpha_per_s, rng),
+        "rayleigh_beta_s": disturbed(deck.rayleigh_beta_s, rng),
     }
 
 
-def _disturbed(value: float, rng: np.random.Generator) -> float:
+def disturbed(value: float, rng: np.random.Generator) -> float:
+    """Return a value as its owner has it: five digits, within SITE_ERROR."""
     return float(f"{value * (1.0 + rng.uniform(-SITE_ERROR, SITE_ERROR)):.5g}")
 
 
 TYRE_KINDS: Final = ("twin", "single", "same")
-"""Twin tyres on all axles but the first, single ones on equal tracks, or one road for all."""
+"""Twin tyres on all axles except the first, single ones on equal tracks, or one profile for all."""
 
 
-def more_axles(number: int) -> Case:
+def more_axles(number: int) -> WideCase:
     """Return one of 16 crossings of a semitrailer or tandem that is declared as two axles.
 
     Even numbers are tractors with a semitrailer, declared with the tractor's mass or all of it; odd
     ones trucks with a tandem, equalised or not, whose third or second axle has the sensor. Speeds
-    are from 8 to 14 m/s. ValueError for other numbers.
+    are from 8 to 14 m/s. Raise ValueError for other numbers.
     """
     if not 0 <= number < 16:
         raise ValueError(f"{number} is no case, it must be from 0 to 15")
@@ -296,7 +299,7 @@ def more_axles(number: int) -> Case:
     ratios = np.ones(7)
     ratios[number % 7] = 0.6
     deck = Deck(30.0, tuple((rigidity * ratios).tolist()), 4400.0, 0.7, 0.005)
-    return Case(
+    return WideCase(
         f"more-axles-{number}",
         number,
         truck,
@@ -316,13 +319,13 @@ def more_axles(number: int) -> Case:
     )
 
 
-def semitrailer(rear: Mapping[str, Any]) -> Truck:
+def semitrailer(rear: Mapping[str, Any]) -> WideTruck:
     """Return a tractor of two axles and a loaded trailer on three that share their load."""
-    axles = [Axle(0.0, 700.0, 3.4e5, 2.4e4, 2.0e6, spring_track_m=0.84, **SINGLE)]
-    axles.append(Axle(3.7, 1150.0, 7e5, 4e4, 3.8e6, offset_m=REAR_OFFSET_M, **rear))
+    axles = [WideAxle(0.0, 700.0, 3.4e5, 2.4e4, 2.0e6, spring_track_m=0.84, **SINGLE)]
+    axles.append(WideAxle(3.7, 1150.0, 7e5, 4e4, 3.8e6, offset_m=REAR_OFFSET_M, **rear))
     for k, offset in enumerate((0.008, 0.004, 0.0)):
         axles.append(
-            Axle(
+            WideAxle(
                 9.2 + 1.31 * k,
                 850.0,
                 6e5,
@@ -334,22 +337,22 @@ def semitrailer(rear: Mapping[str, Any]) -> Truck:
                 **SINGLE,
             )
         )
-    return Truck(
+    return WideTruck(
         (rigid_body(6200.0, 1.25, 3.0), rigid_body(28500.0, 7.6, 12.0)),
         tuple(axles),
-        (Bogie((2, 3, 4), (1.0 / 3.0,) * 3),),
+        (WideBogie((2, 3, 4), (1.0 / 3.0,) * 3),),
         Kingpin(3.1),
     )
 
 
 def tandem_truck(
     rear: Mapping[str, Any], *, equalised: bool = True, outer_share: float = 0.5
-) -> Truck:
+) -> WideTruck:
     """Return a truck of 24.8 t on a front axle and a tandem."""
-    axles = [Axle(0.0, 700.0, 3.4e5, 2.4e4, 2.0e6, spring_track_m=0.84, **SINGLE)]
+    axles = [WideAxle(0.0, 700.0, 3.4e5, 2.4e4, 2.0e6, spring_track_m=0.84, **SINGLE)]
     for position, offset in ((4.6, REAR_OFFSET_M), (5.95, 2.0 * REAR_OFFSET_M)):
         axles.append(
-            Axle(
+            WideAxle(
                 position,
                 1050.0,
                 8.5e5,
@@ -362,5 +365,5 @@ def tandem_truck(
                 **rear,
             )
         )
-    bogies = (Bogie((1, 2), (0.5, 0.5)),) if equalised else ()
-    return Truck((rigid_body(22000.0, 3.55, 6.74),), tuple(axles), bogies)
+    bogies = (WideBogie((1, 2), (0.5, 0.5)),) if equalised else ()
+    return WideTruck((rigid_body(22000.0, 3.55, 6.74),), tuple(axles), bogies)

@@ -1,12 +1,12 @@
-"""Crossings of trucks and bridges with width: what sensors record, and folders of files.
+"""Crossings of trucks and bridges with width: their sensors, and folders of files.
 
 A case is one truck, bridge, road, set of sensors and the site file of its owner, with any number of
-runs. `two_sided` drives it, `wide_cases` draws some. Accelerometers have gain, delay, bias and
+runs. `two_sided` simulates it, `wide_cases` draws some. Accelerometers have gain, delay, bias and
 white noise; a receiver has a slow error, which is constant during a run, and white ones.
 
     case = draw_wide(3)
     write_folder(Path("w3"), case)                       # as shared crossings: CSV, site, truth
-    found = see([drive_case(case, 0).run], site_of(case), IdentificationSettings())
+    found = identify_simulated([drive_case(case, 0).run], site_of(case), IdentificationSettings())
 """
 
 import json
@@ -20,15 +20,15 @@ from scipy.interpolate import CubicSpline
 
 from pre_core.constants import MICRO_G_M_PER_S2
 from schemas.site import Bridge, Site
-from schemas.site_file import parse_site
+from schemas.site_file import parse_site, toml_of
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run
 from services.simulation.two_sided import (
     LONGEST_STEP_S,
     Deck,
-    Response,
-    Road,
-    Truck,
+    WideResponse,
+    WideRoad,
+    WideTruck,
     axle_row,
     body_row,
     cross,
@@ -44,7 +44,7 @@ START_TIME_S: Final = 1_796_300_000.0
 BETWEEN_RUNS_S: Final = 600.0
 _RUN_UP_S, _SETTLE_S = 5.0, 2.0
 _BEFORE_M, _BEHIND_M = 30.0, 25.0
-"""Road between the beginning of a recording and the first axle's entry; after the last exit."""
+"""Road between the beginning of a recording and the first axle's entry, and after the last exit."""
 _ROAD_SPACING_M = 0.02
 _FIX_RATE_HZ = 10.0
 _ALTITUDE_M, _ALTITUDE_NOISE_M = 20.0, 0.2
@@ -52,23 +52,23 @@ _ALTITUDE_M, _ALTITUDE_NOISE_M = 20.0, 0.2
 PAIR_NAMES: Final = ("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear")
 
 
-class Sensor(NamedTuple):
+class WideSensor(NamedTuple):
     """An accelerometer on a body, or on an axle."""
 
     channel: str
     on: str
-    """"body" or "axle"."""
+    """Place: "body" or "axle"."""
     position_m: float = 0.0
-    """Distance behind the first axle; of sensors on a body."""
+    """Distance behind the first axle, for sensors on a body."""
     axle: int = 0
-    """Number from 1; of sensors on axles."""
+    """Number from 1, for sensors on axles."""
     lateral_m: float = 0.0
-    """To the left of the middle."""
+    """Distance to the left of the centre line."""
     body: int = 0
     noise_ug_per_rthz: float = 25.0
     gain_error: float = 0.0
     delay_s: float = 0.0
-    """A sample stamped t shows what was at t - delay."""
+    """Delay: a sample stamped t shows the motion at t - delay."""
     bias_m_per_s2: float = 0.0
 
 
@@ -85,10 +85,10 @@ RTK: Final = SatelliteErrors(0.02, 0.02, 0.02)
 
 
 class WideRun(NamedTuple):
-    """How one run is driven."""
+    """Driving conditions of one run."""
 
     speed_m_per_s: float
-    """Mean; it changes as a sine of `change_m_per_s` and `period_s`."""
+    """Mean speed; it changes as a sine of `change_m_per_s` and `period_s`."""
     forward: bool = True
     beside_m: float = 0.0
     """Distance of the truck to the left of its lane's middle, seen from start to end."""
@@ -96,21 +96,21 @@ class WideRun(NamedTuple):
     period_s: float = 10.0
 
 
-class Case(NamedTuple):
-    """One truck on one bridge, and what its owner declares."""
+class WideCase(NamedTuple):
+    """One truck on one bridge, and the owner's declaration."""
 
     name: str
     seed: int
-    """Of noise and receiver."""
-    truck: Truck
+    """Seed of noise and receiver."""
+    truck: WideTruck
     deck: Deck
     undamaged_nm2: float
     lane_offset_m: float
     road_class: str
     road_seed: int
     is_one_road: bool
-    """All tyres feel the profile of one line."""
-    sensors: tuple[Sensor, ...]
+    """Whether all tyres follow the profile of one line."""
+    sensors: tuple[WideSensor, ...]
     runs: tuple[WideRun, ...]
     declared: Mapping[str, Mapping[str, Any]]
     """Tables and keys of the site file."""
@@ -118,20 +118,20 @@ class Case(NamedTuple):
     receiver: SatelliteErrors = USUAL_RECEIVER
 
 
-class Driven(NamedTuple):
-    """One run as it is recorded, with what is behind it."""
+class WideDrivenRun(NamedTuple):
+    """One recorded run with its truth."""
 
     run: Run
-    response: Response
-    road: Road
+    response: WideResponse
+    road: WideRoad
     entry_s: float
-    """When the first axle comes on, on the clock of the recording."""
+    """Entry of the first axle on the clock of the recording."""
     exit_s: float
-    """When the last axle leaves."""
+    """Exit of the last axle."""
 
 
-def drive_case(case: Case, number: int) -> Driven:
-    """Drive and measure one of the case's runs."""
+def drive_case(case: WideCase, number: int) -> WideDrivenRun:
+    """Simulate and measure one of the case's runs."""
     how = case.runs[number]
     truck, span = case.truck, case.deck.span_m
     length = max(axle.position_m for axle in truck.axles)
@@ -179,11 +179,11 @@ def drive_case(case: Case, number: int) -> Driven:
         _fixes(case, response, lane, time_s, start_s - begin, rng),
     )
     crossed = [float(np.interp(x, travel, response.time_s)) for x in (0.0, span + length)]
-    return Driven(run, response, road, *(start_s + at - begin for at in crossed))
+    return WideDrivenRun(run, response, road, *(start_s + at - begin for at in crossed))
 
 
 def road_under(
-    truck: Truck,
+    truck: WideTruck,
     waves: Waves,
     start_m: float,
     stop_m: float,
@@ -192,10 +192,10 @@ def road_under(
     forward: bool = True,
     is_one_road: bool = False,
     spacing_m: float = _ROAD_SPACING_M,
-) -> Road:
-    """Return what each tyre of a truck feels whose middle runs beside the bridge's axis.
+) -> WideRoad:
+    """Return the profile under each tyre of a truck on an eccentric lane.
 
-    On one road every tyre feels the same line, averaged over the first axle's contact length.
+    With one road every tyre follows the same line, averaged over the first axle's contact length.
     """
     count = round((stop_m - start_m) / spacing_m) + 1
     sign = 1.0 if forward else -1.0
@@ -208,20 +208,20 @@ def road_under(
     if is_one_road:
         strips = [Strip(0.0, 0.0, truck.axles[0].contact_length_m)] * len(strips)
     felt = {s: heights_m(waves, s, start_m, spacing_m, count) for s in dict.fromkeys(strips)}
-    return Road(start_m, spacing_m, np.stack([felt[strip] for strip in strips]))
+    return WideRoad(start_m, spacing_m, np.stack([felt[strip] for strip in strips]))
 
 
-def sensor_row(truck: Truck, sensor: Sensor) -> Floats:
-    """Return the row that takes the truck's accelerations to what a perfect sensor reads."""
+def sensor_row(truck: WideTruck, sensor: WideSensor) -> Floats:
+    """Return the row from the truck's accelerations to the reading of a perfect sensor."""
     if sensor.on == "body":
         return body_row(truck, sensor.position_m, sensor.lateral_m, sensor.body)
     return axle_row(truck, sensor.axle - 1, sensor.lateral_m)
 
 
 def _measured(
-    truck: Truck,
-    response: Response,
-    sensor: Sensor,
+    truck: WideTruck,
+    response: WideResponse,
+    sensor: WideSensor,
     time_s: Floats,
     rate_hz: float,
     rng: np.random.Generator,
@@ -237,8 +237,8 @@ def _measured(
 
 
 def _fixes(
-    case: Case,
-    response: Response,
+    case: WideCase,
+    response: WideResponse,
     lane_m: float,
     time_s: Floats,
     clock_s: float,
@@ -264,11 +264,13 @@ def _fixes(
     )
 
 
-def middle_channels(channels: Mapping[str, Floats], sensors: Sequence[Sensor]) -> dict[str, Floats]:
-    """Average sensors left and right of the same place into the four middle channels.
+def middle_channels(
+    channels: Mapping[str, Floats], sensors: Sequence[WideSensor]
+) -> dict[str, Floats]:
+    """Average sensors left and right of the same place into the four centre channels.
 
-    Body places and axles are front and rear in their order. ValueError where sensors of one place
-    have no mean in the middle.
+    Body places and axles are front and rear in their order. Raise ValueError where sensors of one
+    place have no mean on the centre line.
     """
     found: dict[str, Floats] = {}
     for on, names in (("body", PAIR_NAMES[:2]), ("axle", PAIR_NAMES[2:])):
@@ -282,17 +284,17 @@ def middle_channels(channels: Mapping[str, Floats], sensors: Sequence[Sensor]) -
     return found
 
 
-def site_text(case: Case, *, with_width: bool = True) -> str:
-    """Return the owner's site file; `with_width` False leaves out what only width needs."""
-    lines = ["# All SI."]
-    for table in ("vehicle", "bridge", "sensor"):
-        lines.append(f"[{table}]")
-        lines += [
-            f"{key} = {json.dumps(value)}"
+def site_text(case: WideCase, *, with_width: bool = True) -> str:
+    """Return the owner's site file; `with_width` False omits keys that only width needs."""
+    tables = {
+        table: {
+            key: value
             for key, value in case.declared[table].items()
             if with_width or not _is_of_width(key, value)
-        ]
-    return "\n".join(lines) + "\n"
+        }
+        for table in ("vehicle", "bridge", "sensor")
+    }
+    return "# All SI.\n" + toml_of(tables)
 
 
 def _is_of_width(key: str, value: object) -> bool:
@@ -300,14 +302,14 @@ def _is_of_width(key: str, value: object) -> bool:
     return key in torsion or (key == "track_m" and isinstance(value, list))
 
 
-def site_of(case: Case) -> Site:
+def site_of(case: WideCase) -> Site:
     """Return the owner's site file as the program reads it."""
     return parse_site(
         site_text(case, with_width="lane_offset_m" in Bridge.model_fields), f"{case.name}.toml"
     )
 
 
-def write_folder(folder: Path, case: Case) -> None:
+def write_folder(folder: Path, case: WideCase) -> None:
     """Write accel_NN.csv, gps_NN.csv, site.toml and truth.json of all runs to a new folder."""
     folder.mkdir(parents=True)
     runs = []
@@ -353,8 +355,8 @@ def write_folder(folder: Path, case: Case) -> None:
     )
 
 
-def truth_of(case: Case) -> dict[str, Any]:
-    """Return what the simulator uses, for judging results only."""
+def truth_of(case: WideCase) -> dict[str, Any]:
+    """Return the simulator's values, for evaluating results only."""
     truck, deck = case.truck, case.deck
     return {
         "EI": list(deck.flexural_rigidity_nm2),

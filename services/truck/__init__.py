@@ -1,6 +1,6 @@
-"""The truck: a gateway that puts what sensors say on the bus, and recordings that play sensors.
+"""The truck: a gateway that publishes sensor data, and recordings that simulate sensors.
 
-`gateway` is what a program with sensors of its own uses; `run` drives a recording again.
+A program with its own sensors uses `gateway`; `run` plays a recording.
 """
 
 import contextlib
@@ -28,19 +28,19 @@ from schemas.signals import (
     encode_info,
     location_class,
 )
-from schemas.topics import check_realm
+from schemas.topics import Message, check_realm
 from services.bus.credentials import check_speaks_for
 from services.bus.playback import (
     GAP_S,
     check_speed,
     confirm,
-    play,
-    settle,
+    declare_and_wait,
+    publish_paced,
     stopped_by_signals,
 )
 from services.bus.session import open_session
 from services.common.errors import InputError
-from services.recordings.recording import Message, check_message, read_messages
+from services.recordings.recording import check_message, read_messages
 from services.truck.gateway import Connect, Gateway
 from services.truck.spool import DEFAULT_BUDGET_BYTES, Spool
 
@@ -48,13 +48,13 @@ __all__ = ["Gateway", "run"]
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
-"""A router that was started a moment before is there by then."""
+"""Timeout for a router that was started a moment before."""
 _LONG_WAIT_S = 10.0
-"""Who sees nothing for longer thinks that something is broken."""
+"""Shortest silence that needs an explanation to the user."""
 _OLD_S = 60.0
-"""Samples that are older when they are sent make others ask why."""
+"""Age of published samples that needs an explanation."""
 SUBSCRIBER_TIMEOUT_S = 1.0
-"""A truck does not wait for an audience: its cache serves those who come late."""
+"""Timeout for a subscriber; the cache serves late ones."""
 
 
 def run(
@@ -73,23 +73,21 @@ def run(
 ) -> int:
     """Play one vehicle of a recording as a truck that drives now; return 0.
 
-    Instead of a recording a folder of CSV files may be given (docs/contract.md), with its `site`.
-    It is a new boot of that truck: new boot_id, sequences from 0, and times shifted as a whole
-    so that the recording ends now (at `speed` 1 or less: begins now). **Only the publication is
-    faster than real, not the data**: rates and the time between samples stay those of the
+    A folder of CSV files may replace the recording (docs/contract.md), with its `site`. The
+    playback is a new boot of that truck: new boot_id, sequences from 0, and times shifted as a
+    whole so that the recording ends now (at `speed` 1 or less: begins now). **Only the publication
+    is faster than real time, not the data**: rates and the time between samples stay those of the
     recording, because they are physics. Shifted to the end, no stamp lies in the future. With
-    `skip_gaps` silences of the recording (between runs) are not waited for; they stay in the data,
-    so the first samples are older by as much.
+    `skip_gaps` silences of the recording (between runs) are skipped, but stay in the data.
 
-    `vehicle` chooses one of several; `tls` is a folder of its credentials, see `open_session`.
-    With a folder `spool` every message goes to disk there first and stays until a logger has it
-    (see `services.truck.spool`); what an earlier drive left there is offered, too, and there need
-    be no router yet: it drives at once and connects when it can. Returns when a logger has
-    everything on disk (see `services.bus.delivery`).
+    `vehicle` chooses one of several; `tls` is a folder of its credentials, see `open_session`. With
+    a folder `spool` every message goes to disk there first and stays until a logger has it (see
+    `services.truck.spool`). Messages of an earlier drive are offered too, and the router may come
+    later. Return when a logger has everything on disk (see `services.bus.delivery`).
 
-    InputError: the recording is missing, is none, or holds no such vehicle, or another truck uses
-    the spool. FailureError: nobody answers at the endpoint within `connect_timeout_s` (None: wait
-    for ever; with a spool it does not matter), or the logger did not confirm everything.
+    Raise InputError if the recording is missing, invalid or without that vehicle, or the spool is
+    another truck's; FailureError if the endpoint does not answer within `connect_timeout_s` (None:
+    wait for ever; irrelevant with a spool), or the logger did not confirm everything.
     """
     check_speed(speed)
     try:
@@ -109,19 +107,21 @@ def run(
         gateway = Gateway(bus, realm, vehicle, _open_spool(spool, spool_budget_bytes))
         stack.callback(gateway.close)
         times = _times(streams, speed, skip_gaps=skip_gaps)
-        _tell(times)
+        _log_timing(times)
         messages = _driven_now(recording, streams, realm, gateway.boot_id, times)
         keys = [queue[0].key for queue in streams.values()]
-        if gateway.is_online and not settle(gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S):
-            # A real truck drives on as well; its cache serves those who come late.
-            _log.warning("nobody subscribes to %s in realm %s yet", gateway.vehicle, realm)
+        if gateway.is_online and not declare_and_wait(
+            gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S
+        ):
+            # A real truck continues as well; its cache serves late subscribers.
+            _log.warning("no subscriber to %s in realm %s yet", gateway.vehicle, realm)
 
         def put(message: Message) -> None:
             identity = Identity(message.boot_id, message.sequence)
             gateway.put(message.key.stream, message.payload, identity, patient=True)
 
         longest_gap_s = GAP_S if skip_gaps else math.inf
-        sent = play(
+        sent = publish_paced(
             messages, put, gateway.delivery, speed=speed, stop=stop, longest_gap_s=longest_gap_s
         )
         confirm(gateway.delivery, sent)
@@ -142,7 +142,7 @@ def _open_spool(folder: Path | None, budget_bytes: int) -> Spool | None:
 def _read_vehicle(
     recording: Path, vehicle: str | None, site: Path | None
 ) -> dict[str, list[Message]]:
-    """Return the messages of one vehicle by stream, each stream in the order it was made."""
+    """Return the messages of one vehicle by stream, each stream in the order of its creation."""
     streams: dict[str, list[Message]] = {}
     vehicles: set[str] = set()
     for message in _messages(recording, vehicle, site):
@@ -162,7 +162,7 @@ def _read_vehicle(
 
 
 def _messages(source: Path, vehicle: str | None, site: Path | None) -> Iterator[Message]:
-    """Yield what the truck will measure; InputError at the first message that is not right."""
+    """Yield the truck's future messages; raise InputError at the first invalid one."""
     if not source.is_dir():
         for message in read_messages(source):
             if message.key.owner == "vehicle":
@@ -176,20 +176,20 @@ def _messages(source: Path, vehicle: str | None, site: Path | None) -> Iterator[
     yield from messages_of(source, site, vehicle)
 
 
-class _Times(NamedTuple):
-    """When what was recorded is published."""
+class _DriveTiming(NamedTuple):
+    """Times of a playback."""
 
     first_ns: int
     ahead_ns: int
-    """By how much the last sample would run ahead of the clock: so old is the first one."""
+    """Lead of the last sample over the clock, which is the age of the first one."""
     takes_s: float
     waits_s: float
-    """How much of that nothing is published in silences of the recording."""
+    """Duration of silences in which nothing is published."""
     longest_ns: tuple[int, int]
-    """Where its longest silence begins and ends."""
+    """Begin and end of its longest silence."""
 
 
-def _times(streams: dict[str, list[Message]], speed: float, *, skip_gaps: bool) -> _Times:
+def _times(streams: dict[str, list[Message]], speed: float, *, skip_gaps: bool) -> _DriveTiming:
     recorded = sorted(message.log_time_ns for queue in streams.values() for message in queue)
     gaps = [(a, b) for a, b in pairwise(recorded) if b - a > GAP_S * NS_PER_S]
     silent_ns = sum(b - a for a, b in gaps)
@@ -199,16 +199,16 @@ def _times(streams: dict[str, list[Message]], speed: float, *, skip_gaps: bool) 
     waits_ns = 0 if skip_gaps or not speed else round(silent_ns / speed)
     longest = max(gaps, key=lambda gap: gap[1] - gap[0], default=(recorded[0], recorded[0]))
     ahead_ns = max(0, duration_ns - takes_ns)
-    return _Times(recorded[0], ahead_ns, takes_ns * 1e-9, waits_ns * 1e-9, longest)
+    return _DriveTiming(recorded[0], ahead_ns, takes_ns * 1e-9, waits_ns * 1e-9, longest)
 
 
-def _tell(times: _Times) -> None:
-    """What of a drive that is played may surprise who waits for it, or looks at its times."""
+def _log_timing(times: _DriveTiming) -> None:
+    """Log waits and ages of samples that may look like a fault."""
     if times.waits_s > _LONG_WAIT_S:
         begin_ns, end_ns = times.longest_ns
         _log.warning(
             "nothing was recorded for up to %.0f s (between runs): of the %.0f s that the drive "
-            "takes, %.0f s are spent waiting; --skip-gaps passes over them",
+            "takes, %.0f s are spent waiting; --skip-gaps skips them",
             *((end_ns - begin_ns) * 1e-9, times.takes_s, times.waits_s),
         )
     if times.ahead_ns > _OLD_S * NS_PER_S:
@@ -221,11 +221,15 @@ def _tell(times: _Times) -> None:
 
 
 def _driven_now(
-    recording: Path, streams: dict[str, list[Message]], realm: str, boot_id: int, times: _Times
+    recording: Path,
+    streams: dict[str, list[Message]],
+    realm: str,
+    boot_id: int,
+    times: _DriveTiming,
 ) -> Iterator[Message]:
-    """Yield all streams merged by time, with the times and identities of a drive that is now.
+    """Yield all streams merged by time, with the times and identities of a drive that happens now.
 
-    InputError: the times of the recording lie so far apart that some would not be of this century.
+    Raise InputError if the times of the recording are so far apart that some leave this century.
     """
     first_ns = times.first_ns
     wall_shift_ns = time.time_ns() - first_ns - times.ahead_ns
@@ -259,10 +263,10 @@ def _restamped(
     device_time_ns: int,
     device_shifts: dict[int, int],
 ) -> Message:
-    """Return the message as of another boot and time; samples, rates and positions untouched.
+    """Return the message with another boot and time; samples, rates and positions unchanged.
 
-    The device clock keeps its own intervals within a recorded boot: `device_shifts` holds what
-    to add to it, by recorded boot, decided by the first message of that boot.
+    The device clock keeps its own intervals within a recorded boot: `device_shifts` holds the
+    offset of each recorded boot, determined by its first message.
     """
     wall_time_ns = message.log_time_ns + wall_shift_ns
     times: dict[str, Any] = {

@@ -1,7 +1,7 @@
-"""A queue between a thread that must never wait and one that works: bounded in messages and bytes.
+"""A queue from a thread that must never wait to a worker: bounded in messages and bytes.
 
-What finds no room pushes out the oldest, which are counted. Zenoh's own ring counts messages only,
-so a stranger with messages of 10 MB would fill the memory.
+A new item displaces the oldest ones, which are counted. Zenoh's own ring counts messages only, so a
+hostile sender with messages of 10 MB could fill the memory.
 """
 
 import threading
@@ -12,14 +12,14 @@ ItemT = TypeVar("ItemT")
 
 
 class Dropped(NamedTuple):
-    """Items that were pushed out, or never found room."""
+    """Items that were displaced or too large."""
 
     messages: int
     size_bytes: int
 
 
 class BoundedQueue(Generic[ItemT]):
-    """Items in the order in which they came; may be used from several threads."""
+    """A thread-safe queue of items in the order of their arrival."""
 
     def __init__(self, most_messages: int, most_bytes: int) -> None:
         self._most_messages = most_messages
@@ -43,7 +43,7 @@ class BoundedQueue(Generic[ItemT]):
                 self._drop(oldest_bytes)
 
     def get(self) -> ItemT | None:
-        """Return the oldest item, or None if none waits."""
+        """Return the oldest item, or None if the queue is empty."""
         with self._lock:
             if not self._items:
                 return None
@@ -52,7 +52,7 @@ class BoundedQueue(Generic[ItemT]):
             return item
 
     def dropped(self) -> Dropped:
-        """Return what was dropped since the last call."""
+        """Return the items dropped since the last call."""
         with self._lock:
             dropped, self._dropped = self._dropped, Dropped(0, 0)
             return dropped

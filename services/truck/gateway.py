@@ -1,4 +1,4 @@
-"""What a truck's computer does with each message: to its own disk first, then to the bus.
+"""The gateway on a truck's computer: each message goes to its own disk first, then to the bus.
 
     def connect():
         return open_session(connect="tcp/127.0.0.1:7447", timeout_s=0.0)
@@ -6,17 +6,16 @@
     gateway = Gateway(connect, "live", "truck-1", Spool(Path("spool/truck-1")))
     gateway.info(Path("site.toml").read_text(), device_time_ns=..., wall_time_ns=...)
     for samples in my_driver():                      # every 50 ms
-        channels = {"sprung_front": Channel(1000.0, samples)}
+        channels = {"sprung_front": AccelChannel(1000.0, samples)}
         gateway.accel(channels, device_time_ns=..., wall_time_ns=...)
     gateway.close()
 
-`docs/examples/own_driver.py` is a program that runs. The caller never waits for the network: a
-message is appended to the spool and put into a queue, from which a thread publishes. Where that
-queue is full, because the router does not take anything, the message stays in the spool, and the
-logger asks for it (`schemas.spool`) once it sees that it lacks it. What a logger has confirmed is
-freed. Where there is no router yet when a truck starts, a thread tries until there is one. Without
-a spool, messages are published at once, and the end of this process is the end of those that nobody
-has fetched yet.
+`docs/examples/own_driver.py` is a complete program. The caller never waits for the network: a
+message is appended to the spool and queued, and a thread publishes it. If the queue is full,
+because the router accepts nothing, the message stays in the spool, and the logger requests it
+(`schemas.spool`) once it notices the gap. Messages that a logger has confirmed are freed. Without a
+router at the start a thread tries until there is one. Without a spool, messages are published at
+once, and those that nobody has fetched are lost with this process.
 """
 
 import contextlib
@@ -34,7 +33,7 @@ from zenoh import handlers
 from schemas.events import Event, encode_event
 from schemas.signals import (
     AccelBatch,
-    Channel,
+    AccelChannel,
     GnssFix,
     Identity,
     VehicleInfo,
@@ -53,8 +52,8 @@ from schemas.spool import (
     spool_selector,
 )
 from schemas.topics import Key, check_identifier, check_realm, gateway_service, key, topic
-from schemas.vehicle_info import own_part
-from services.bus.delivery import Delivery
+from schemas.vehicle_info import vehicle_part
+from services.bus.delivery import DeliveryTracker
 from services.bus.publisher import Publisher
 from services.common.errors import FailureError
 from services.truck.spool import Spool
@@ -63,26 +62,26 @@ __all__ = ["Gateway"]
 
 _log = logging.getLogger(__name__)
 _OUTBOX_MESSAGES = 10_000
-"""What waits for the bus; what finds no room stays in the spool and is asked for."""
+"""Capacity of the queue to the bus; further messages stay in the spool and are requested."""
 _SYNC_PERIOD_S = 0.5
-"""What is older is on the disk when the power goes."""
+"""Interval of syncs: older messages survive a power cut."""
 _FREE_EVERY = 10  # syncs
 _GOODBYE_S = 5.0
-"""A truck that is switched off waits so long for the bus to take what is left; the spool has it."""
+"""Time for the bus to accept waiting messages at the end; the spool keeps the others."""
 _QUERIES_WAITING = 100
-"""Questions about the spool that wait for an answer: a few loggers, each every two seconds."""
+"""Capacity for queries of the spool: a few loggers, each every two seconds."""
 _COMPLAINT_PERIOD_S = 60.0
-"""A disk that fails does so at every message: a line says so once in this time."""
+"""Interval of log lines about a failing disk, which fails at every message."""
 _CONNECT_PAUSE_S = 0.2
-"""Between two attempts, each of which may end at once."""
+"""Pause between two attempts, each of which may fail at once."""
 Connect = Callable[[], zenoh.Session]
-"""Opens a session, or raises FailureError if nobody answers now."""
+"""Open a session; raise FailureError if there is no answer now."""
 
 
 class Gateway:
-    """Publishes one truck's messages with identities of this boot. May not be shared by threads.
+    """A publisher of one truck's messages with identities of this boot; not thread-safe.
 
-    The spool, if there is one, belongs to the gateway from then on and is closed with it.
+    A spool belongs to the gateway from then on and is closed with it.
     """
 
     def __init__(
@@ -94,13 +93,13 @@ class Gateway:
     ) -> None:
         """Join the bus. With a spool, `session` may be a function that opens one.
 
-        It is called at once, and where it raises FailureError again and again by a thread, while
-        the spool already takes what is measured. The gateway closes a session that it has opened.
+        It is called at once, and after a FailureError again repeatedly by a thread, while the spool
+        already accepts messages. The gateway closes a session that it has opened.
         """
         self.vehicle = check_identifier(vehicle)
         boot_id = None if spool is None else spool.boot_id
         self.publisher = Publisher(None, check_realm(realm), boot_id)
-        self.delivery = Delivery(None, realm)
+        self.delivery = DeliveryTracker(None, realm)
         self.deferred = 0
         """Messages that were spooled and not published, because the bus did not take them."""
         self.unspooled = 0
@@ -122,7 +121,7 @@ class Gateway:
         try:
             self._own_session = session()
         except FailureError as error:
-            _log.warning("%s: %s; all goes to the spool meanwhile", vehicle, error)
+            _log.warning("%s: %s; all messages go to the spool meanwhile", vehicle, error)
             self._connecting = threading.Thread(
                 target=self._connect, args=(session,), name="connect", daemon=True
             )
@@ -132,22 +131,22 @@ class Gateway:
 
     @property
     def boot_id(self) -> int:
-        """The boot of all messages of this gateway: higher than any before it."""
+        """The boot of all messages of this gateway, higher than any before it."""
         return self.publisher.boot_id
 
     def info(self, site_toml: str, *, device_time_ns: int, wall_time_ns: int) -> None:
-        """Say what the truck is. Late subscribers get it too.
+        """Publish the truck's description, also for late subscribers.
 
-        `site_toml` is a site file, or the truck's own part of one; only that part is sent.
-        InputError: it has no such vehicle, or its part is longer than a message may be.
+        `site_toml` is a site file, or the truck's own part of one; only that part is sent. Raise
+        InputError if it has no such vehicle, or its part is longer than a message may be.
         """
-        own = own_part(site_toml, self.vehicle)
+        own = vehicle_part(site_toml, self.vehicle)
         identity = self._identity("info")
         info = VehicleInfo(*identity, device_time_ns, wall_time_ns, self.vehicle, own)
         self.put("info", encode_info(info), identity)
 
     def accel(
-        self, channels: dict[str, Channel], *, device_time_ns: int, wall_time_ns: int
+        self, channels: dict[str, AccelChannel], *, device_time_ns: int, wall_time_ns: int
     ) -> None:
         """Publish 50-100 ms of accelerations, m/s², up, without gravity; times of their first."""
         identity = self._identity("accel")
@@ -162,9 +161,9 @@ class Gateway:
         self.put("location", encode_location(own), self._identity("location"))
 
     def event(self, event: Event) -> bool:
-        """Publish an event about this truck; False if the bus does not take it now.
+        """Publish an event about this truck; return False if the bus does not accept it now.
 
-        It is neither spooled nor waited for.
+        Events are not spooled, and the call does not wait.
         """
         if not self.is_online:
             return False
@@ -177,10 +176,11 @@ class Gateway:
     def put(
         self, stream: str, payload: bytes, identity: Identity, *, patient: bool = False
     ) -> None:
-        """Publish a message that is encoded already; of each stream the sequences ascend from 0.
+        """Publish an encoded message; the sequences of each stream ascend from 0.
 
         With `patient` it waits for room in the queue, as the reader of a file can, rather than
-        leave the message to the spool. ValueError if the payload is larger than its topic allows.
+        leave the message to the spool. Raise ValueError if the payload is larger than its topic
+        allows.
         """
         row = topic("vehicle", stream)
         if not row.message or len(payload) > row.max_bytes:
@@ -189,7 +189,7 @@ class Gateway:
             self.publisher.put("vehicle", self.vehicle, stream, payload, identity)
         else:
             spooled = self._append(self._spool.spool, stream, payload, identity)
-            # What is on no disk can only be published, however long that takes.
+            # A message that is on no disk has to be published, however long that takes.
             wait = self.is_online and (patient or not spooled)
             put = _Put("vehicle", self.vehicle, stream, payload, identity)
             if not self._spool.publish(put, wait=wait):
@@ -198,7 +198,7 @@ class Gateway:
         self.delivery.sent(Key(self.publisher.realm, "vehicle", self.vehicle, stream), identity)
 
     def close(self) -> None:
-        """Leave the bus. What is spooled and on no logger's disk the next boot offers again."""
+        """Leave the bus. The next boot offers spooled messages that no logger has on disk."""
         self._closing.set()
         if self._connecting is not None:
             self._connecting.join()
@@ -217,8 +217,8 @@ class Gateway:
                 self._own_session = connect()
             except FailureError:
                 self._closing.wait(_CONNECT_PAUSE_S)
-            except Exception:  # a thread of a truck that nobody watches; it drives on
-                _log.exception("%s: no connection any more", self.vehicle)
+            except Exception:  # an unattended truck continues without this thread
+                _log.exception("%s: connecting failed for good", self.vehicle)
                 return
             else:
                 self._join(self._own_session)
@@ -228,7 +228,7 @@ class Gateway:
     def _join(self, session: zenoh.Session) -> None:
         self.publisher.connect(session)
         self.delivery.connect(session)
-        # There while this process runs: services see trucks come and go by it.
+        # Present while this process runs: services notice trucks by it.
         alive = key(self.publisher.realm, "vehicle", self.vehicle, "alive")
         self._alive = session.liveliness().declare_token(alive)
         self.is_online = True
@@ -236,7 +236,7 @@ class Gateway:
             self._spool.join(session)
 
     def _identity(self, stream: str) -> Identity:
-        """Return the identity of the next message; used up only by `put`, not by a refused one."""
+        """Return the identity of the next message, which only a successful `put` uses up."""
         return Identity(self.boot_id, self._next[stream])
 
     def _append(self, spool: Spool, stream: str, payload: bytes, identity: Identity) -> bool:
@@ -255,7 +255,7 @@ class Gateway:
 
 
 class _Put(NamedTuple):
-    """What `Publisher.put` takes."""
+    """Arguments of `Publisher.put`."""
 
     owner: str
     identifier: str
@@ -278,7 +278,7 @@ class _SpoolService:
         self._start("sync", self._sync_all)
 
     def join(self, session: zenoh.Session) -> None:
-        """Publish, and answer queries, from now on."""
+        """Publish and answer queries from now on."""
         self._queryable = session.declare_queryable(
             spool_selector(self._realm, self._gateway.vehicle),
             handlers.FifoChannel(_QUERIES_WAITING),
@@ -293,7 +293,7 @@ class _SpoolService:
         thread.start()
 
     def publish(self, put: _Put, *, wait: bool) -> bool:
-        """Hand over a message for publication; False if the bus is behind."""
+        """Queue a message for publication; return False if the queue is full."""
         try:
             self._outbox.put(put, block=wait)
             return True
@@ -301,7 +301,7 @@ class _SpoolService:
             return False
 
     def close(self) -> None:
-        """Publish what waits, as far as the bus takes it within seconds; close the spool."""
+        """Publish waiting messages within a few seconds, and close the spool."""
         deadline = time.monotonic() + (_GOODBYE_S if self._queryable is not None else 0.0)
         while not self._outbox.empty() and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -340,12 +340,12 @@ class _SpoolService:
     def _free(self) -> None:
         try:
             self.spool.confirm(self._gateway.delivery.confirmed(self._gateway.vehicle))
-        except (OSError, FailureError) as error:  # what is not freed now is freed later
+        except (OSError, FailureError) as error:  # freed later
             _log.error("%s: spool: %s", self._gateway.vehicle, error)
 
     def _answer_all(self, queries: handlers.Handler[zenoh.Query]) -> None:
-        # A thread of our own: one of Zenoh's that still calls Python while the interpreter ends
-        # takes the process down with it.
+        # A thread of our own: one of Zenoh's that calls Python while the interpreter ends
+        # would crash the process.
         while True:
             try:
                 query = queries.recv()
@@ -376,7 +376,7 @@ class _SpoolService:
     def _reply(
         self, query: zenoh.Query, where: str, payload: bytes, attachment: bytes | None = None
     ) -> None:
-        # With the priority and the congestion control of the query: Zenoh ignores others.
+        # With the priority and congestion control of the query: Zenoh ignores others.
         query.reply(where, payload, attachment=attachment)
 
     def _key(self, stream: str) -> str:

@@ -1,10 +1,10 @@
-"""How ROS 2 speaks Zenoh (rmw_zenoh_cpp): its keys, and what it attaches to messages.
+"""Zenoh keys and attachments of ROS 2 (rmw_zenoh_cpp).
 
-A key is `<domain>/<topic>/<type>/<hash of the type>`, the topic without its slash at the begin,
-e.g. `0/imu/data/sensor_msgs::msg::dds_::Imu_/RIHS01_7d9a…`. An attachment is a sequence number and
-the time of sending (ns since 1970), both int64, little-endian, and an array of bytes, its length
-before it, that names the publisher. Nodes are peers and rmw_zenoh's router hands nothing from peer
-to peer, so a subscriber that is no ROS node must be a client.
+A key is `<domain>/<topic>/<type>/<hash of the type>`, the topic without its leading slash, e.g.
+`0/imu/data/sensor_msgs::msg::dds_::Imu_/RIHS01_7d9a…`. An attachment is a sequence number and the
+time of sending (ns since 1970), both int64, little-endian, and an array of bytes, preceded by its
+length, that names the publisher. Nodes are peers and rmw_zenoh's router forwards nothing from peer
+to peer, so a subscriber outside ROS must be a client.
 """
 
 import struct
@@ -12,13 +12,13 @@ from typing import Final, NamedTuple
 
 _NUMBERS: Final = struct.Struct("<qqB")
 _LONGEST_GID: Final = 24
-"""RMW_GID_STORAGE_SIZE: 16, or 24 in distributions of before."""
+"""Largest RMW_GID_STORAGE_SIZE: 16, or 24 in older distributions."""
 MAX_KEY_CHARACTERS: Final = 600
-"""A topic and a type of 255 each, a hash and a domain."""
+"""Longest key: topic and type of 255 each, a hash and a domain."""
 
 
 class Attachment(NamedTuple):
-    """What comes with a message of ROS 2."""
+    """The attachment of a ROS 2 message."""
 
     sequence: int
     sent_ns: int
@@ -26,12 +26,12 @@ class Attachment(NamedTuple):
 
 
 def key_expression(domain: int, topic: str) -> str:
-    """All messages of a topic, whatever their type: what cannot be used is to be told, too."""
+    """Return the expression of all messages of a topic; wrong types are reported, too."""
     return f"{domain}/{topic.strip('/')}/*/*"
 
 
 def type_and_hash(key: str) -> tuple[str, str]:
-    """The type and its hash at the end of a key; ValueError if it has none."""
+    """Return the type and its hash at the end of a key; raise ValueError if they are missing."""
     parts = key[:MAX_KEY_CHARACTERS].split("/")
     if len(parts) < 4 or len(key) > MAX_KEY_CHARACTERS:
         raise ValueError(f"key {key[:80]!r}: DOMAIN/TOPIC/TYPE/HASH is expected")
@@ -39,7 +39,7 @@ def type_and_hash(key: str) -> tuple[str, str]:
 
 
 def decode_attachment(attachment: bytes | None) -> Attachment:
-    """Return what rmw_zenoh attached; ValueError if it is missing or malformed."""
+    """Return rmw_zenoh's attachment; raise ValueError if it is missing or malformed."""
     if attachment is None:
         raise ValueError("has no attachment, a publisher of rmw_zenoh gives one")
     size = len(attachment) - _NUMBERS.size

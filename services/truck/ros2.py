@@ -1,7 +1,7 @@
-"""A gateway for trucks that speak ROS 2: from their Zenoh router to ours.
+"""A gateway for trucks with ROS 2: from their Zenoh router to ours.
 
-It is a client of both. What it hears of the topics in the site file's `[ros2]` becomes batches and
-fixes (`services.drives.ros2_truck`), which a `Gateway` publishes as any truck's.
+It is a client of both. Messages of the topics in the site file's `[ros2]` become batches and fixes
+(`services.drives.ros2_truck`), which a `Gateway` publishes like those of any truck.
 """
 
 import contextlib
@@ -26,13 +26,13 @@ from services.bus.playback import confirm, stopped_by_signals
 from services.bus.session import open_session
 from services.common.errors import FailureError, InputError, one_line
 from services.drives.importing import vehicle_of
-from services.drives.ros2_complaints import (
+from services.drives.ros2_anomalies import (
     DROPPED,
     TOO_LARGE,
     UNKNOWN_TYPE,
     UNPUBLISHED,
     UNREADABLE,
-    Refusals,
+    TopicRefusals,
 )
 from services.drives.ros2_messages import IMU, MAX_PAYLOAD_BYTES, check_rosbags, unknown_hash
 from services.drives.ros2_truck import Accel, Ros2Truck
@@ -43,27 +43,26 @@ from services.truck.spool import DEFAULT_BUDGET_BYTES, Spool
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S: Final = 10.0
-"""A router that was started a moment before is there by then."""
+"""Timeout for a router that was started a moment before."""
 _WAITING: Final = 20_000
-"""Messages of a topic: more than ten seconds of the fastest. Beyond it the oldest are dropped and
-counted; nobody at the ROS router is held up."""
+"""Messages of a topic that may wait: more than ten seconds of the fastest. Beyond it the oldest are
+dropped and counted; no ROS process is held up."""
 _WAITING_BYTES: Final = 24 << 20
-"""The same in bytes: `_WAITING` messages of a sensor have some 19 MB."""
+"""Bytes of a topic that may wait: `_WAITING` messages of a sensor have some 19 MB."""
 _OVERHEAD_BYTES: Final = 500
-"""Memory of a waiting message besides its content: 263 by `sys.getsizeof`, and what an
-allocator adds."""
+"""Memory of a waiting message besides its content: 263 by `sys.getsizeof`, and the allocator's."""
 _AT_ONCE: Final = 50
-"""Of a topic, before another one has its turn."""
+"""Messages of a topic before another one has its turn."""
 _MOST_BYTES: Final = MAX_PAYLOAD_BYTES + 1024
-"""Of a message with its key and what is attached to it."""
+"""Largest message with its key and attachment."""
 _PAUSE_S: Final = 0.005
-_TELL_EVERY_S: Final = 10.0
+_LOG_EVERY_S: Final = 10.0
 _EVENT_EVERY_S: Final = 60.0
-"""What is refused and dropped is an event once in this time, with counts by topic."""
+"""Interval of events on refused and dropped messages, with counts by topic."""
 _MOST_PUBLISHERS: Final = 1000
-"""Of which it is remembered what has come; beyond them it begins anew."""
+"""Number of publishers with remembered sequences; beyond, all are forgotten."""
 _MOST_REFUSED: Final = 100
-"""Types and hashes that are told of; a stranger could make up as many as it likes."""
+"""Number of reported types and hashes, because a hostile sender could invent any number."""
 
 
 def run(
@@ -78,16 +77,16 @@ def run(
     spool_budget_bytes: int = DEFAULT_BUDGET_BYTES,
     ready: Callable[[], None] = lambda: None,
 ) -> int:
-    """Publish what a ROS 2 truck says at the router `ros` to the one at `endpoint`, until stopped.
+    """Publish the messages of a ROS 2 truck at the router `ros` to `endpoint`, until stopped.
 
-    No message ends it: what cannot be used is counted, logged and published as an event.
+    No message ends it: unusable ones are counted, logged and published as an event.
 
     `site` names the topics (`[ros2]`); `vehicle` chooses one of several trucks. With a folder
     `spool` messages go to disk there first, and our router may come later (see `services.truck`);
-    that of ROS must be there. `ready` is called when all topics are subscribed to.
+    that of ROS must be present. `ready` is called when all topics are subscribed to.
 
-    InputError: bad arguments, or a site file without the truck's `[ros2]`. FailureError: nobody
-    answers at an address in time, or a logger did not confirm all at the end.
+    Raise InputError for bad arguments, or a site file without the truck's `[ros2]`; FailureError if
+    a router does not answer in time, or a logger did not confirm everything at the end.
     """
     check_rosbags()
     try:
@@ -96,7 +95,7 @@ def run(
         raise InputError(str(error)) from None
     known = load_site(site)
     vehicle = vehicle_of(known, str(site), vehicle)
-    # It is counted as all else; the sensor's topic is free for another one.
+    # It is counted like others; the sensor's topic is free for another one.
     truck = Ros2Truck(known, str(site), vehicle, wrong_rate=lambda error: None)
     check_speaks_for(tls, "truck", vehicle)
     with stopped_by_signals() as stop, contextlib.ExitStack() as stack:
@@ -110,14 +109,14 @@ def run(
         spooled = None if spool is None else Spool(spool, budget_bytes=spool_budget_bytes)
         gateway = Gateway(bus, realm, vehicle, spooled)
         stack.callback(gateway.close)
-        out = _Out(gateway, vehicle_toml(known, vehicle), truck)
-        telling = _Telling(gateway, truck)
-        with _Hearing(ros_session, truck) as hearing:
+        out = _InfoFirstPublisher(gateway, vehicle_toml(known, vehicle), truck)
+        reports = _Reports(gateway, truck)
+        with _RosSubscriptions(ros_session, truck) as hearing:
             ready()
-            _hear(hearing, truck, out, telling, stop)
+            _hear(hearing, truck, out, reports, stop)
         for item in truck.finish():
             out.put(item)
-        telling.tell(closing=True)
+        reports.report(closing=True)
         confirm(gateway.delivery, out.sent)
         _log.info("%d messages of %s published in realm %s", out.sent, vehicle, realm)
     return 0
@@ -134,13 +133,13 @@ def _open_ros(ros: str) -> zenoh.Session:
 
 
 def _hear(
-    hearing: "_Hearing",
+    hearing: "_RosSubscriptions",
     truck: Ros2Truck,
-    out: "_Out",
-    telling: "_Telling",
+    out: "_InfoFirstPublisher",
+    reports: "_Reports",
     stop: threading.Event,
 ) -> None:
-    told_s = time.monotonic()
+    logged_s = time.monotonic()
     while not stop.is_set():
         has_heard = False
         for topic in truck.table.topics():
@@ -151,38 +150,38 @@ def _hear(
                 has_heard = True
                 for item in hearing.taken(topic, heard):
                     out.put(item)
-        if time.monotonic() >= told_s + _TELL_EVERY_S:
-            told_s = time.monotonic()
+        if time.monotonic() >= logged_s + _LOG_EVERY_S:
+            logged_s = time.monotonic()
             hearing.count_drops()
-            telling.tell()
-            hearing.tell_silence()
+            reports.report()
+            hearing.report_silence()
         if not has_heard:
             stop.wait(_PAUSE_S)
     hearing.count_drops()
 
 
-class _Telling:
-    """Logs what was left out, and publishes it as events."""
+class _Reports:
+    """Log and events of unused messages."""
 
     def __init__(self, gateway: Gateway, truck: Ros2Truck) -> None:
         self._gateway = gateway
         self._truck = truck
         self._event_s = float("-inf")
 
-    def tell(self, *, closing: bool = False) -> None:
-        """Log a line for each kind with news; publish events if a minute has passed, or at last."""
-        for line in self._truck.complaints.news():
+    def report(self, *, closing: bool = False) -> None:
+        """Log a line for each kind with news; publish events after a minute, or at the end."""
+        for line in self._truck.anomalies.news():
             _log.warning("%s: %s", self._gateway.vehicle, line)
         now_s = time.monotonic()
         if not closing and now_s < self._event_s + _EVENT_EVERY_S:
             return
-        for refusals in self._truck.complaints.refusals():
-            # What finds no way now is in the counts of the next event.
+        for refusals in self._truck.anomalies.refusals():
+            # The next event includes counts that cannot be published now.
             if self._publish(refusals):
-                self._truck.complaints.reported(refusals.topic)
+                self._truck.anomalies.reported(refusals.topic)
                 self._event_s = now_s
 
-    def _publish(self, refusals: Refusals) -> bool:
+    def _publish(self, refusals: TopicRefusals) -> bool:
         numbers = {EventKind.REFUSED: refusals.refused, EventKind.DROPPED: refusals.dropped}
         return all(
             self._gateway.event(
@@ -201,19 +200,19 @@ class _Telling:
         )
 
 
-class _Out:
-    """Publishes; what the truck is comes before all else that it says."""
+class _InfoFirstPublisher:
+    """A publisher that sends the truck's description before all other messages."""
 
     def __init__(self, gateway: Gateway, toml: str, truck: Ros2Truck) -> None:
         self.sent = 0
         self._gateway = gateway
         self._toml = toml
-        self._complaints = truck.complaints
+        self._anomalies = truck.anomalies
         self._gnss = truck.table.gnss
         self._topics = {name: imu.topic for name, imu in truck.table.imu.by_channel().items()}
 
     def put(self, item: Accel | GnssFix) -> None:
-        """Publish an item; one that no message can hold is counted."""
+        """Publish an item; count one that fits no message."""
         times = {"device_time_ns": item.device_time_ns, "wall_time_ns": item.wall_time_ns}
         try:
             if not self.sent:
@@ -225,29 +224,30 @@ class _Out:
             else:
                 self._gateway.accel(item.channels, **times)
                 self.sent += 1
-        except ValueError as error:  # times of a stranger's clock
+        except ValueError as error:  # times of a foreign clock
             if isinstance(item, GnssFix):
                 topic = self._gnss
             else:
                 topic = self._topics[next(iter(item.channels))]
-            self._complaints.add(topic, UNPUBLISHED, example=one_line(str(error))[:200])
+            self._anomalies.add(topic, UNPUBLISHED, example=one_line(str(error))[:200])
 
 
-class _Heard(NamedTuple):
-    """A message as it came: copied, as one of Zenoh's keeps the whole of what it came in."""
+class _RosMessage(NamedTuple):
+    """A received message, copied, because Zenoh's object keeps the whole network buffer."""
 
     key: str
     attachment: bytes | None
     payload: bytes
 
 
-class _Hearing:
-    """The subscriptions, and what is to be said of messages before they are looked into."""
+class _RosSubscriptions:
+    """The subscriptions, and the checks of messages before they are decoded."""
 
     def __init__(self, session: zenoh.Session, truck: Ros2Truck) -> None:
         self._truck = truck
         self._waiting = {
-            topic: BoundedQueue[_Heard](_WAITING, _WAITING_BYTES) for topic in truck.table.topics()
+            topic: BoundedQueue[_RosMessage](_WAITING, _WAITING_BYTES)
+            for topic in truck.table.topics()
         }
         self._too_large: Counter[str] = Counter()
         """Written by Zenoh's threads."""
@@ -255,7 +255,7 @@ class _Hearing:
         self._subscribers: list[zenoh.Subscriber[None]] = []
         self._refused: set[str] = set()
         self._latest: dict[tuple[str, bytes], int] = {}
-        """By topic and publisher: the number of its last message."""
+        """Number of the last message by topic and publisher."""
         self._heard: set[str] = set()
         self._silent: set[str] = set()
         for topic in truck.table.topics():
@@ -265,19 +265,19 @@ class _Hearing:
             where = key_expression(truck.table.domain, topic)
             self._subscribers.append(session.declare_subscriber(where, receive))
 
-    def __enter__(self) -> "_Hearing":
+    def __enter__(self) -> "_RosSubscriptions":
         return self
 
     def __exit__(self, *_: object) -> None:
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
 
-    def next(self, topic: str) -> _Heard | None:
+    def next(self, topic: str) -> _RosMessage | None:
         """Return the next message of a topic, or None if none waits."""
         return self._waiting[topic].get()
 
     def _receive(self, topic: str, sample: zenoh.Sample) -> None:
-        """Keep a message that a sensor could have sent, in the thread that Zenoh receives in."""
+        """Queue a plausible sensor message, in the receiving thread of Zenoh."""
         key = str(sample.key_expr)
         attached = sample.attachment
         size = len(key) + len(sample.payload) + (0 if attached is None else len(attached))
@@ -285,44 +285,46 @@ class _Hearing:
             self._too_large[topic] += 1
             return
         attachment = None if attached is None else attached.to_bytes()
-        heard = _Heard(key, attachment, sample.payload.to_bytes())
+        heard = _RosMessage(key, attachment, sample.payload.to_bytes())
         self._waiting[topic].put(heard, size + _OVERHEAD_BYTES)
 
     def count_drops(self) -> None:
-        """Count what came and was not kept since the last call."""
-        complaints = self._truck.complaints
+        """Count the messages dropped since the last call."""
+        anomalies = self._truck.anomalies
         for topic, waiting in self._waiting.items():
             dropped = waiting.dropped()
-            complaints.add(topic, DROPPED, dropped.messages)
+            anomalies.add(topic, DROPPED, dropped.messages)
             too_large = self._too_large[topic]
-            complaints.add(topic, TOO_LARGE, too_large - self._counted_too_large[topic])
+            anomalies.add(topic, TOO_LARGE, too_large - self._counted_too_large[topic])
             self._counted_too_large[topic] = too_large
 
-    def taken(self, topic: str, heard: _Heard) -> list[Accel | GnssFix]:
-        """Return what of a message can be published now."""
-        complaints = self._truck.complaints
+    def taken(self, topic: str, heard: _RosMessage) -> list[Accel | GnssFix]:
+        """Return the parts of a message that can be published now."""
+        anomalies = self._truck.anomalies
         try:
-            name, told_hash = type_and_hash(heard.key)
+            name, reported_hash = type_and_hash(heard.key)
             attachment = decode_attachment(heard.attachment)
         except ValueError as error:
-            complaints.add(topic, UNREADABLE, example=f"the first {error}")
+            anomalies.add(topic, UNREADABLE, example=f"the first {error}")
             return []
         of = next((one for one in self._truck.types(topic) if one.dds_name == name), None)
         if of is None:
             wanted = " or ".join(one.name for one in self._truck.types(topic))
             self._refuse(topic, f"is of {one_line(name[:80])}, {wanted} is expected; refused")
             return []
-        problem = unknown_hash(of, told_hash)
+        problem = unknown_hash(of, reported_hash)
         if problem is not None:
             self._refuse(topic, f"{one_line(problem)}; refused")
             return []
         self._heard.add(topic)
         if not self._is_next(topic, attachment.publisher, attachment.sequence):
             return []
-        return self._truck.take(topic, of, heard.payload, attachment.sent_ns, attachment.publisher)
+        return self._truck.convert(
+            topic, of, heard.payload, attachment.sent_ns, attachment.publisher
+        )
 
-    def tell_silence(self) -> None:
-        """Name the topics of which nothing has come since it was asked last, once."""
+    def report_silence(self) -> None:
+        """Log the topics without messages since the last call, once."""
         for topic in self._truck.table.topics():
             if topic in self._heard:
                 self._silent.discard(topic)
@@ -330,27 +332,27 @@ class _Hearing:
                 self._silent.add(topic)
                 _log.warning(
                     "%s: nothing on %s in domain %d for %.0f s",
-                    *(self._truck.table.vehicle, topic, self._truck.table.domain, _TELL_EVERY_S),
+                    *(self._truck.table.vehicle, topic, self._truck.table.domain, _LOG_EVERY_S),
                 )
         self._heard.clear()
 
     def _is_next(self, topic: str, publisher: bytes, sequence: int) -> bool:
-        """Count what was lost on the way; False of what has come before."""
-        complaints = self._truck.complaints
+        """Count lost messages; return False for a repeated one."""
+        anomalies = self._truck.anomalies
         name = (topic, publisher)
         before = self._latest.get(name)
         if before is not None and sequence <= before:
-            complaints.add(topic, "messages that came again, left out")
+            anomalies.add(topic, "messages that came again, left out")
             return False
         if before is not None:
-            complaints.add(topic, "messages lost on the way", sequence - before - 1)
+            anomalies.add(topic, "messages lost on the way", sequence - before - 1)
         elif len(self._latest) >= _MOST_PUBLISHERS:
             self._latest.clear()
         self._latest[name] = sequence
         return True
 
     def _refuse(self, topic: str, why: str) -> None:
-        self._truck.complaints.add(topic, UNKNOWN_TYPE, example=f"the first {why}")
+        self._truck.anomalies.add(topic, UNKNOWN_TYPE, example=f"the first {why}")
         line = f"{topic}: {why}"
         if line not in self._refused and len(self._refused) < _MOST_REFUSED:
             self._refused.add(line)

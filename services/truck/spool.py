@@ -1,15 +1,15 @@
-"""The spool: what a truck has sent, on its own disk until a logger has it on another.
+"""The spool: a truck's messages on its own disk until a logger has them.
 
-A folder of segments, one boot after the other, `{boot_id}-{number}.spool`. A segment is appended
-to and never changed: a header (magic, boot_id, CRC), then records
+A folder of segments, one boot after the other, `{boot_id}-{number}.spool`. A segment is appended to
+and never changed: a header (magic, boot_id, CRC), then records
 
     CRC-32 of the rest | length of the rest | sequence | length of the name | stream | payload
 
-all big-endian. What `append` was given survives `kill -9` of the process; what stood there when
-`sync` was called survives a power cut. The end that a cut left half-written is removed when the
-folder is opened. `state.json` holds what is known of messages whose segments are gone: up to where
-loggers have confirmed them, and which were given up for room; it is replaced before a segment is
-deleted, so that nothing is ever unaccounted for.
+all big-endian. Messages passed to `append` survive `kill -9` of the process; those before a `sync`
+survive a power cut. The end that a cut left incomplete is removed when the folder is opened.
+`state.json` records the fate of messages whose segments are gone: up to where loggers have
+confirmed them, and which were dropped for space. It is replaced before a segment is deleted, so
+that every message is always accounted for.
 """
 
 import fcntl
@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from schemas.spool import PAGE_BYTES, PAGE_MESSAGES, Held
+from schemas.spool import PAGE_BYTES, PAGE_MESSAGES, SpoolBoot
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable, write_atomically
 from services.common.intervals import Intervals
@@ -33,7 +33,7 @@ from services.common.intervals import Intervals
 __all__ = ["DEFAULT_BUDGET_BYTES", "Page", "Spool", "SpooledMessage"]
 
 DEFAULT_BUDGET_BYTES = 4 << 30
-"""More than a day of four channels at 1 kHz."""
+"""Default size, more than a day of four channels at 1 kHz."""
 
 _log = logging.getLogger(__name__)
 _MAGIC = b"DBSPOOL1"
@@ -41,40 +41,40 @@ _HEADER = struct.Struct("!8sQI")
 _RECORD = struct.Struct("!IIQB")
 _RECORD_PREFIX = 8  # CRC and length, which the length does not count
 _SMALLEST_BUDGET_BYTES = 1 << 20
-"""Segments of a smaller one would hold few messages."""
+"""Smallest size; segments of a smaller one would hold few messages."""
 _LARGEST_SEGMENT_BYTES = 4 << 20
-"""The largest file: what is freed is freed a file at a time."""
+"""Largest file; whole files are freed."""
 _SEGMENTS_IN_BUDGET = 16
-"""So many files at least share the budget, so that freeing one gives up a small part only."""
+"""Fewest files in the budget, so that freeing one drops only a small part."""
 _STATE = "state.json"
 _LOCK = "lock"
 _BOOTS_REMEMBERED = 100
-"""Boots that are remembered for what was lost of them, though nothing of them is held."""
+"""Boots with remembered losses, although none of their messages is held."""
 
 
 class SpooledMessage(NamedTuple):
-    """One message of a stream and boot, as it was or should have been published."""
+    """One message of a stream and boot as it was or should have been published."""
 
     sequence: int
     payload: bytes
 
 
 class Page(NamedTuple):
-    """A part of what was asked for, in ascending order."""
+    """A part of an answer, in ascending order."""
 
     messages: list[SpooledMessage]
     next_sequence: int | None
-    """Where to go on; None: there is no more. What lies below it and was not given is not held."""
+    """Sequence to continue from; None at the end. Lower ones that are missing are not held."""
 
 
 class Spool:
-    """The spool in one folder, of one truck, for one boot that begins with its opening.
+    """The spool of one truck in one folder, for a boot that begins with its opening.
 
     Thread-safe. `append` and `sync` may raise OSError; the spool stays usable.
     """
 
     def __init__(self, folder: Path, *, budget_bytes: int = DEFAULT_BUDGET_BYTES) -> None:
-        """Open or make the folder; InputError if it cannot be used or another process has it."""
+        """Open or create the folder; raise InputError if unusable or another process has it."""
         if budget_bytes < _SMALLEST_BUDGET_BYTES:
             least = _SMALLEST_BUDGET_BYTES >> 20
             raise InputError(f"spool budget of {budget_bytes} bytes; at least {least} MiB")
@@ -102,7 +102,7 @@ class Spool:
         self._number = 0
 
     def append(self, stream: str, sequence: int, payload: bytes) -> None:
-        """Add a message of this boot; of each stream the sequences ascend. May raise OSError."""
+        """Add a message of this boot; the sequences of each stream ascend. May raise OSError."""
         name = stream.encode("ascii")
         body = _RECORD.pack(0, _RECORD.size - _RECORD_PREFIX + len(name) + len(payload), sequence,
                             len(name))[4:] + name + payload  # fmt: skip
@@ -116,7 +116,7 @@ class Spool:
             segment.streams.setdefault(stream, Intervals()).add(sequence)
 
     def sync(self) -> None:
-        """Bring everything appended so far to the disk itself, and keep to the budget."""
+        """Sync everything appended so far to the disk, and keep to the budget."""
         with self._lock:
             self._enforce_budget()
             files, self._unsynced = self._unsynced, []
@@ -138,7 +138,7 @@ class Spool:
         max_messages: int = PAGE_MESSAGES,
         max_bytes: int = PAGE_BYTES,
     ) -> Page:
-        """Return the messages from first to last that are held, as many as a page takes."""
+        """Return the held messages from first to last, as many as a page takes."""
         with self._lock:
             segments = [
                 (segment.path, segment.size)
@@ -157,19 +157,19 @@ class Spool:
                 used += len(record.payload)
         return Page(found, None)
 
-    def contents(self, stream: str) -> list[Held]:
-        """Return what is held of a stream, boot by boot, oldest first."""
+    def contents(self, stream: str) -> list[SpoolBoot]:
+        """Return the held ranges of a stream, boot by boot, oldest first."""
         with self._lock:
             return self._contents(stream)
 
     def streams(self) -> list[str]:
-        """Return the names of all streams of which anything is known."""
+        """Return the names of all known streams."""
         with self._lock:
             names = {name for segment in self._segments for name in segment.streams}
             return sorted(names | set(self._next) | {name for name, _ in self._past})
 
     def confirm(self, durable: Mapping[tuple[str, int], int]) -> None:
-        """Free what is on a logger's disk: the highest contiguous sequence by (stream, boot_id)."""
+        """Free messages on a logger's disk: highest contiguous sequence by (stream, boot_id)."""
         with self._lock:
             changed = False
             for name, sequence in durable.items():
@@ -179,11 +179,11 @@ class Spool:
                     for segment in self._segments
                 )
                 if known and (past is None or sequence > past.durable):
-                    self._past.setdefault(name, _Past()).durable = sequence
+                    self._past.setdefault(name, _BootTotals()).durable = sequence
                     changed = True
             if not changed:
                 return
-            # A boot that is still going on keeps its open segment.
+            # The current boot keeps its open segment.
             done = [
                 segment
                 for segment in (self._segments if self._file is None else self._segments[:-1])
@@ -192,7 +192,7 @@ class Spool:
             self._delete(done)
 
     def dropped(self) -> int:
-        """Return how many messages were given up for room before any logger had them."""
+        """Return the number of messages dropped for space before any logger had them."""
         with self._lock:
             return sum(past.dropped.size for past in self._past.values())
 
@@ -202,7 +202,7 @@ class Spool:
             return sum(segment.size for segment in self._segments)
 
     def close(self) -> None:
-        """Sync, and let another process have the folder. Nothing can be appended any more."""
+        """Sync, and unlock the folder. Nothing can be appended any more."""
         try:
             self.sync()
         finally:
@@ -213,7 +213,7 @@ class Spool:
                 self._delete([segment for segment in self._segments if self._is_durable(segment)])
                 os.close(self._lock_file)
 
-    def _contents(self, stream: str) -> list[Held]:
+    def _contents(self, stream: str) -> list[SpoolBoot]:
         by_boot: dict[int, Intervals] = {}
         for segment in self._segments:
             if stream in segment.streams:
@@ -226,11 +226,11 @@ class Spool:
         contents = []
         for boot_id in sorted(boots):
             numbers = by_boot.get(boot_id, Intervals())
-            past = self._past.get((stream, boot_id), _Past())
+            past = self._past.get((stream, boot_id), _BootTotals())
             highest = max(numbers.highest or 0, past.durable, past.dropped.highest or 0)
             next_sequence = self._next.get(stream, 0) if boot_id == self.boot_id else highest + 1
             contents.append(
-                Held(boot_id, next_sequence, numbers.ranges(), past.durable, past.dropped.size)
+                SpoolBoot(boot_id, next_sequence, numbers.ranges(), past.durable, past.dropped.size)
             )
         return contents
 
@@ -255,14 +255,14 @@ class Spool:
             if written != len(data):
                 raise OSError(28, "No space left on device")
         except OSError:
-            # A half-written record in the middle would hide those behind it.
+            # An incomplete record in the middle would hide those after it.
             os.ftruncate(self._file, segment.size)
             raise
         segment.size += written
 
     def _is_durable(self, segment: "_Segment") -> bool:
         return all(
-            (numbers.highest or 0) <= self._past.get((name, segment.boot_id), _Past()).durable
+            (numbers.highest or 0) <= self._past.get((name, segment.boot_id), _BootTotals()).durable
             for name, numbers in segment.streams.items()
         )
 
@@ -276,11 +276,11 @@ class Spool:
             doomed.append(segment)
             lost = 0
             for name, numbers in segment.streams.items():
-                past = self._past.setdefault((name, segment.boot_id), _Past())
+                past = self._past.setdefault((name, segment.boot_id), _BootTotals())
                 for first, last in numbers.ranges():
                     lost += past.dropped.add_range(max(first, past.durable + 1), last)
             if lost:
-                _log.error("%s: full, %d messages that no logger has are gone", self.folder, lost)
+                _log.error("%s: full, %d messages that no logger has were lost", self.folder, lost)
         self._delete(doomed)
 
     def _delete(self, doomed: list["_Segment"]) -> None:
@@ -294,7 +294,7 @@ class Spool:
             segment.path.unlink(missing_ok=True)
 
     def _forget_old_boots(self) -> None:
-        """Drop what is remembered of boots of which nothing is left and nothing was lost."""
+        """Forget boots without held and without lost messages."""
         held = {(name, segment.boot_id) for segment in self._segments for name in segment.streams}
         for name, past in list(self._past.items()):
             settled = not past.dropped.size or (past.dropped.highest or 0) <= past.durable
@@ -311,7 +311,7 @@ class Spool:
         boot_id = _boot_of(content)
         if boot_id is None:
             self.torn_bytes += len(content)
-            _log.warning("%s: no segment of a spool, removed (%d bytes)", path, len(content))
+            _log.warning("%s: not a segment of a spool, removed (%d bytes)", path, len(content))
             path.unlink()
             return None
         segment = _Segment(path, boot_id, _HEADER.size)
@@ -321,7 +321,7 @@ class Spool:
         torn = len(content) - segment.size
         if torn:
             self.torn_bytes += torn
-            _log.warning("%s: %d bytes at its end were cut off, removed", path, torn)
+            _log.warning("%s: removed %d incomplete bytes at its end", path, torn)
             os.truncate(path, segment.size)
         if not segment.streams:
             path.unlink()
@@ -330,7 +330,7 @@ class Spool:
 
 
 @dataclass
-class _Past:
+class _BootTotals:
     durable: int = -1
     dropped: Intervals = field(default_factory=Intervals)
 
@@ -355,7 +355,7 @@ class _Record(NamedTuple):
 
 
 def _records(content: bytes) -> Iterator[_Record]:
-    """Yield the intact records; a damaged one is left out if the next one can be found."""
+    """Yield the intact records; skip a damaged one if the next one can be found."""
     at = _HEADER.size
     while at + _RECORD.size <= len(content):
         crc, length, sequence, name_length = _RECORD.unpack_from(content, at)
@@ -407,8 +407,8 @@ def _locked(folder: Path) -> int:
     return file
 
 
-def _read_state(path: Path) -> tuple[int, dict[tuple[str, int], _Past]]:
-    """Return the boot that wrote it, and what it knew of messages by (stream, boot_id)."""
+def _read_state(path: Path) -> tuple[int, dict[tuple[str, int], _BootTotals]]:
+    """Return the boot that wrote it, and the fate of messages by (stream, boot_id)."""
     if not path.exists():
         return 0, {}
     try:
@@ -416,17 +416,17 @@ def _read_state(path: Path) -> tuple[int, dict[tuple[str, int], _Past]]:
         entries: list[dict[str, Any]] = content["streams"]
         state = {}
         for entry in entries:
-            past = _Past(int(entry["durable"]))
+            past = _BootTotals(int(entry["durable"]))
             for first, last in entry["dropped"]:
                 past.dropped.add_range(int(first), int(last))
             state[(str(entry["stream"]), int(entry["boot_id"]))] = past
         return int(content["boot_id"]), state
     except (ValueError, KeyError, TypeError) as error:
-        _log.warning("%s: unreadable (%s), what was confirmed will be offered again", path, error)
+        _log.warning("%s: unreadable (%s), confirmed messages will be offered again", path, error)
         return 0, {}
 
 
-def _write_state(path: Path, boot_id: int, past: Mapping[tuple[str, int], _Past]) -> None:
+def _write_state(path: Path, boot_id: int, past: Mapping[tuple[str, int], _BootTotals]) -> None:
     entries = [
         {
             "stream": stream,

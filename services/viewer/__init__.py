@@ -1,1 +1,1 @@
-"""Pictures of what was recorded and found: a figure as PNG, a recording for the Rerun viewer."""
+"""Pictures of recordings and results: figures as PNG or SVG, and files for the Rerun viewer."""

@@ -1,4 +1,4 @@
-"""What was stored of a bridge, for later results to be compared with."""
+"""The stored baseline of a bridge, with which later results are compared."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import logging
 from pathlib import Path
 
 from schemas.site import Bridge
-from services.history.baselines import stored_state
 from services.identification.comparison import Estimate, estimate_of_state
+from services.ledger.baselines import stored_state
 
 _log = logging.getLogger(__name__)
 
@@ -15,11 +15,11 @@ _log = logging.getLogger(__name__)
 def named_baseline(
     bridge: Bridge, folder: Path, *, required: bool = False
 ) -> tuple[Estimate | None, str | None]:
-    """The baseline that the site file names for a bridge, and its file's name; None without one.
+    """Return the baseline that the site file names for a bridge, and its file's name, or None.
 
-    A path that is not absolute begins at `folder`. A file that is not there is a warning unless it
-    is `required`: a recording carries its site file to where the baseline need not be. InputError
-    if the file is none, or has no state of this bridge with as many elements.
+    A relative path begins at `folder`. An absent file is a warning unless it is `required`: a
+    recording carries its site file to places without the baseline. Raise InputError if the file is
+    invalid, or has no state of this bridge with as many elements.
     """
     if bridge.baseline is None:
         return None, None
@@ -31,5 +31,5 @@ def named_baseline(
 
 
 def stored_baseline(bridge: Bridge, path: Path) -> tuple[Estimate, str]:
-    """The state of a bridge in a results file, and the file's name; InputError as above."""
+    """Return a bridge's state from a results file, and the file's name; InputError as above."""
     return estimate_of_state(stored_state(path, bridge)), path.name

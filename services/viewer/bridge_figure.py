@@ -1,4 +1,4 @@
-"""The picture of one bridge: its stiffness along the span, and all crossings that told of it."""
+"""The figure of one bridge: its stiffness along the span, and all crossings used for it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from services.viewer.bridge_view import BridgeView, told
+from services.common.language import ENGLISH, Language
+from services.viewer.bridge_view import BridgeView, describe_bridge, origin_of
 from services.viewer.crossing_view import VERDICT_COLOURS, CrossingView
 from services.viewer.drawing import (
     BANNERS,
     BAR_EDGE,
-    BASELINE_LINE,
+    BASELINE_COLOUR,
     INK,
     LEFT,
     MUTED,
@@ -26,21 +27,26 @@ from services.viewer.drawing import (
     RIGHT,
     STYLE,
     WIDTH_IN,
+    BarPlaces,
     add_ratio_axis,
+    bar_places,
     draw_bars,
     draw_intervals,
     label_bars,
-    label_loss,
+    label_losses,
     legend_beside_title,
     mark_bridge,
-    quieten,
+    simplify_axes,
+    simplify_numbers,
     write_centred,
     write_figure,
 )
 
 _MOST_LISTED = 12
+_BEFORE, _AFTER = (0.02, 0.42), (0.42, 1.0)
+"""Parts of an element that the bars of baseline and state take."""
 _SIGNS = {"good": "●", "suspect": "○", "rejected": "×"}
-"""Told apart without colour."""
+"""Signs of the verdicts, distinguishable without colour."""
 
 
 def bridge_figure(path: Path, bridge: BridgeView) -> None:
@@ -50,86 +56,121 @@ def bridge_figure(path: Path, bridge: BridgeView) -> None:
     write_figure(path, figure)
 
 
-def draw_bridge(bridge: BridgeView, *, with_heading: bool = True) -> Figure:
-    """The figure itself, to be drawn in `STYLE`; without heading and list it is one panel."""
+def draw_bridge(
+    bridge: BridgeView, *, with_heading: bool = True, language: Language = ENGLISH
+) -> Figure:
+    """Return the figure, to be drawn in `STYLE`; without heading and list it is one panel.
+
+    The heading and the list are English.
+    """
     listed = min(len(bridge.crossings), _MOST_LISTED + 1) if with_heading else 0
     lines = _heading(bridge) if with_heading else []
     heading_in = 1.15 + 0.17 * max(0, len(lines) - 2) if with_heading else 0.35
-    # Alone it stands on a page where the width is what limits how large its words are.
-    panel_in, list_in = 3.6 if with_heading else 2.2, 0.2 * listed
+    # On a page of its own the width limits the size of its text.
+    panel_in, list_in = 3.6 if with_heading else 1.8, 0.2 * listed
     list_in += 0.35 if listed else 0.0
     height = heading_in + panel_in + 0.5 + list_in
     figure = Figure(figsize=(WIDTH_IN, height), facecolor="white")
     FigureCanvasAgg(figure)
     bottom = (list_in + 0.5) / height
     axes = figure.add_axes((LEFT, bottom, RIGHT - LEFT, panel_in / height))
-    _draw_panel(axes, bridge)
+    _draw_panel(axes, bridge, language)
     if with_heading:
         _draw_heading(figure, bridge, lines)
         _list_crossings(figure, bridge, (list_in - 0.1) / height, 0.2 / height)
     return figure
 
 
-def _draw_panel(axes: Axes, bridge: BridgeView) -> None:
+def _draw_panel(axes: Axes, bridge: BridgeView, language: Language) -> None:
     nominal = bridge.nominal_nm2 / 1e9
-    axes.set_title("Rigidity EI")
-    axes.set_ylabel("EI (GN·m²)")
-    axes.stairs(nominal, bridge.edges_m, baseline=None, label="nominal", **NOMINAL_LINE)
+    axes.set_title(language.text("figure.rigidity"))
+    axes.set_ylabel(language.text("figure.ei"))
+    label = language.text("figure.nominal")
+    axes.stairs(nominal, bridge.edges_m, baseline=None, label=label, **NOMINAL_LINE)
     highest = float(nominal.max())
-    if bridge.baseline is not None:
-        stored = bridge.baseline.mean / 1e9
-        axes.stairs(stored, bridge.edges_m, baseline=None, label="baseline", **BASELINE_LINE)
-        highest = max(highest, float(stored.max()))
     if bridge.estimate is None:
         write_centred(axes, _why_nothing(bridge))
     else:
-        mean, low, high = (column / 1e9 for column in bridge.estimate[:3])
-        weak = () if bridge.comparison is None else bridge.comparison.weak
-        numbers = {element.number for element in weak}
-        draw_bars(
-            axes,
-            bridge.edges_m,
-            mean,
-            numbers,
-            doubtful=bridge.is_doubtful,
-            unresolved=bridge.unresolved,
-        )
-        colour = MUTED if bridge.is_doubtful else BAR_EDGE
-        draw_intervals(axes, bridge.edges_m, low, high, colour=colour, label="95 % interval")
-        highest = max(highest, float(high.max()), _draw_crossings(axes, bridge))
-        label_bars(axes, bridge.edges_m, mean, low, [f"{r:.3f}" for r in mean / nominal])
-        for element in weak:
-            label_loss(
-                axes,
-                element,
-                float(high[element.number - 1]),
-                small=mean.size > 11,
-                doubt="?" if bridge.is_doubtful else "",
-                up=14.0 if len(bridge.crossings) > 1 else 8.0,
-            )
+        highest = max(highest, _draw_state(axes, bridge, language))
     axes.set_ylim(0.0, 1.1 * highest)
     legend_beside_title(axes)
-    add_ratio_axis(axes, nominal)
-    quieten(axes)
+    simplify_axes(axes)
+    simplify_numbers(axes, language)
+    add_ratio_axis(axes, nominal, language)
     mark_bridge(axes, (0.0, *bridge.interior_supports_m, bridge.span_m))
     axes.set_xlim(-0.03 * bridge.span_m, 1.03 * bridge.span_m)
-    axes.set_xlabel("chainage from the start of the bridge (m)")
+    axes.set_xlabel(language.text("figure.chainage"))
 
 
-def _draw_crossings(axes: Axes, bridge: BridgeView) -> float:
-    """What single crossings said, beside the interval; returns the highest."""
+def _draw_state(axes: Axes, bridge: BridgeView, language: Language) -> float:
+    """Draw the state, the baseline beside it, and single crossings; return the highest."""
+    assert bridge.estimate is not None  # noqa: S101 - its caller checked
+    mean, low, high = (column / 1e9 for column in bridge.estimate[:3])
+    highest, places = float(high.max()), bar_places(bridge.edges_m)
+    if bridge.baseline is not None:
+        before, places = _BEFORE, bar_places(bridge.edges_m, *_AFTER)
+        highest = max(
+            highest, _draw_before(axes, bridge, bar_places(bridge.edges_m, *before), language)
+        )
+    weak = () if bridge.comparison is None else bridge.comparison.weak
+    draw_bars(
+        axes,
+        places,
+        mean,
+        {element.number for element in weak},
+        doubtful=bridge.is_doubtful,
+        unresolved=bridge.unresolved,
+        language=language,
+    )
+    colour = MUTED if bridge.is_doubtful else BAR_EDGE
+    label = language.text("figure.interval")
+    draw_intervals(axes, places, low, high, colour=colour, label=label)
+    highest = max(highest, _draw_crossings(axes, bridge, places, language))
+    ratios = mean / (bridge.nominal_nm2 / 1e9)
+    label_bars(axes, places, low, high, [language.number(ratio, ".3f") for ratio in ratios])
+    doubt = "?" if bridge.is_doubtful else ""
+    losses = {
+        element.number: language.text(
+            "figure.less", loss=100.0 * (1.0 - element.ratio), doubt=doubt
+        )
+        for element in weak
+    }
+    label_losses(axes, places, low, high, losses)
+    return highest
+
+
+def _draw_before(axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language) -> float:
+    """Draw the baseline; return its highest value."""
+    assert bridge.baseline is not None  # noqa: S101 - its caller checked
+    mean, low, high = (column / 1e9 for column in bridge.baseline[:3])
+    axes.bar(
+        places.centres_m,
+        mean,
+        width=0.86 * places.lengths_m,
+        facecolor="white",
+        edgecolor=BASELINE_COLOUR,
+        linewidth=1.3,
+        zorder=2,
+        label=language.text("figure.before"),
+    )
+    draw_intervals(axes, places, low, high, colour=BASELINE_COLOUR, label="")
+    return float(high.max())
+
+
+def _draw_crossings(axes: Axes, bridge: BridgeView, places: BarPlaces, language: Language) -> float:
+    """Draw the estimates of single crossings next to the interval; return the highest."""
     drawn = [c for c in bridge.crossings if c.rigidity_nm2 is not None]
     if len(drawn) < 2:
         return 0.0
-    centres, lengths = (bridge.edges_m[:-1] + bridge.edges_m[1:]) / 2.0, np.diff(bridge.edges_m)
     highest = 0.0
     named: set[str] = set()
-    for place, crossing in zip(np.linspace(-0.36, -0.16, len(drawn)), drawn, strict=True):
+    for place, crossing in zip(np.linspace(-0.38, -0.2, len(drawn)), drawn, strict=True):
         assert crossing.rigidity_nm2 is not None  # noqa: S101 - chosen by that
         values = crossing.rigidity_nm2 / 1e9
         good = crossing.verdict == "good"
+        label = language.text(f"figure.crossing.{crossing.verdict}")
         axes.plot(
-            centres + place * lengths,
+            places.centres_m + place * places.lengths_m,
             values,
             linestyle="none",
             marker="o",
@@ -138,7 +179,7 @@ def _draw_crossings(axes: Axes, bridge: BridgeView) -> float:
             markerfacecolor=INK if good else "white",
             markeredgewidth=0.9,
             zorder=6,
-            label=None if crossing.verdict in named else f"{crossing.verdict} crossing",
+            label=None if crossing.verdict in named else label,
         )
         named.add(crossing.verdict)
         highest = max(highest, float(values.max()))
@@ -161,19 +202,19 @@ def _draw_heading(figure: Figure, bridge: BridgeView, lines: list[str]) -> None:
 
 
 def _heading(bridge: BridgeView) -> list[str]:
-    """What is said above the picture, in lines."""
+    """Return the lines of text above the figure."""
     doubt = f"DOUBTFUL: {_doubt(bridge)} " if bridge.is_doubtful else ""
-    said = " ".join(told(bridge))
+    sentences = " ".join((*describe_bridge(bridge), origin_of(bridge))).strip()
     if bridge.estimate is None:
         number = len(bridge.crossings)
-        said = f"No finding: none of {number} crossings could be used."
+        sentences = f"No finding: none of {number} crossings could be used."
         if number == 1:
-            said = "No finding: the only crossing could not be used."
-    return textwrap.wrap(doubt + said, 112, max_lines=3, placeholder=" …")
+            sentences = "No finding: the only crossing could not be used."
+    return textwrap.wrap(doubt + sentences, 112, max_lines=3, placeholder=" …")
 
 
 def _doubt(bridge: BridgeView) -> str:
-    """Why what is shown is doubtful, in a sentence."""
+    """Return in a sentence why the figure is doubtful."""
     if bridge.state is not None and bridge.state.reason_texts:
         return bridge.state.reason_texts[0]
     return "a crossing that was used is suspect."

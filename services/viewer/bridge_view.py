@@ -1,4 +1,4 @@
-"""What a picture of one bridge shows: its latest state, and what every crossing said."""
+"""Data of one bridge's figure: its latest state, and all crossings."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.reasons import Reason
-from schemas.results import BridgeResult, Crossing, Results
+from schemas.results import BridgeResult, CrossingResult, Results
 from schemas.site import Bridge, Site
+from services.common.language import ENGLISH, Language
 from services.identification import comparison
 from services.identification.comparison import (
     Comparison,
     Estimate,
     compare,
     estimate_of_state,
+    origin_of_state,
     unresolved_elements,
 )
 from services.viewer.baseline import named_baseline
@@ -27,7 +29,7 @@ from services.viewer.crossing_view import (
 
 
 class BridgeView(NamedTuple):
-    """One bridge as it is drawn."""
+    """One bridge as drawn."""
 
     bridge: str
     owner_id: str | None
@@ -35,42 +37,42 @@ class BridgeView(NamedTuple):
     nominal_nm2: FloatArray  # (n,)
     interior_supports_m: tuple[float, ...]
     crossings: tuple[CrossingView, ...]
-    """All that there are, in order of time."""
+    """Crossings in order of time."""
     used: frozenset[str]
-    """Those that the state was made of."""
+    """Ids of the crossings that the state includes."""
     estimate: Estimate | None
-    """None if no crossing could be used."""
+    """Estimate of the state; None if no crossing could be used."""
     is_doubtful: bool
-    """Whether the state or a crossing in it is suspect, or its method knows no intervals."""
+    """Whether the state or one of its crossings is suspect, or its method has no intervals."""
     comparison: Comparison | None
     baseline: Estimate | None = None
-    """What was stored of the bridge, to compare with."""
+    """Stored state to compare with."""
     state: BridgeResult | None = None
-    """What `estimate` is of."""
+    """State that `estimate` belongs to."""
 
     @property
     def span_m(self) -> float:
-        """Length of the bridge between its outer bearings."""
+        """Return the length of the bridge between its outer bearings, m."""
         return float(self.edges_m[-1])
 
     @property
     def unresolved(self) -> frozenset[int]:
-        """Numbers of the elements of which too little is known to tell a loss of half of them."""
+        """Return the numbers of elements too uncertain to resolve a loss of half their EI."""
         if self.state is None or self.estimate is None:
             return frozenset()
         return unresolved_elements(self.state.elements.values())
 
     @property
-    def elsewhere(self) -> tuple[int, ...]:
-        """Numbers of the unresolved neighbours of weak elements: the loss may be theirs."""
-        return comparison.elsewhere(self.comparison, self.unresolved)
+    def ambiguous_neighbours(self) -> tuple[int, ...]:
+        """Return the unresolved neighbours of weak elements, where the loss may be instead."""
+        return comparison.ambiguous_neighbours(self.comparison, self.unresolved)
 
 
 def views_of_bridges(results: Results, site: Site, folder: Path | None = None) -> list[BridgeView]:
-    """Every bridge of the site that was crossed.
+    """Return the view of every bridge of the site that was crossed.
 
-    With a `folder` the baselines that the site file names are looked for there; InputError if one
-    does not fit.
+    With a `folder` the baselines that the site file names are read from there; raise InputError if
+    one does not fit.
     """
     crossed = {crossing.bridge for crossing in results.crossings}
     return [
@@ -80,14 +82,21 @@ def views_of_bridges(results: Results, site: Site, folder: Path | None = None) -
     ]
 
 
-def told(view: BridgeView) -> list[str]:
-    """What was found, in words, as the state's own finding says it."""
+def describe_bridge(view: BridgeView, language: Language = ENGLISH) -> list[str]:
+    """Return sentences on the result, as in the state's own finding."""
     level = None if view.state is None else view.state.level
-    return comparison.told(view.comparison, view.unresolved, level)
+    return comparison.describe_comparison(view.comparison, view.unresolved, level, language)
+
+
+def origin_of(view: BridgeView) -> str:
+    """Return in a sentence which crossings the numbers are of; empty without numbers."""
+    if view.estimate is None or view.state is None:
+        return ""
+    return origin_of_state(view.state)
 
 
 def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) -> BridgeView:
-    """Take results of one bridge apart; `baseline` is what was stored of it."""
+    """Return the view of one bridge in results; `baseline` is its stored state."""
     crossings = sorted(
         (crossing for crossing in results.crossings if crossing.bridge == bridge.id),
         key=lambda crossing: crossing.entry_time,
@@ -121,5 +130,5 @@ def view_of_bridge(bridge: Bridge, results: Results, baseline: Estimate | None) 
     )
 
 
-def _is_doubtful(crossing: Crossing) -> bool:
+def _is_doubtful(crossing: CrossingResult) -> bool:
     return crossing.verdict != "good" or Reason.NO_NOISE_MODEL in crossing.reasons

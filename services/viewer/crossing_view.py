@@ -1,4 +1,4 @@
-"""What a picture of one crossing shows: bare arrays, whatever file or message they came from."""
+"""Data of one crossing's figure: bare arrays, from whatever file or message."""
 
 from __future__ import annotations
 
@@ -7,25 +7,28 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.results import Crossing, Prior, resolution
+from schemas.results import CrossingResult, Prior, unresolved_note
 from services.identification.comparison import (
     Comparison,
     Estimate,
     compare,
-    of_clear_elements,
+    describe_clear_elements,
     sentences,
     unresolved_elements,
 )
 
 FloatArray = NDArray[np.float64]
 
-VEHICLE_COLOURS = {"front": "#0072B2", "rear": "#D55E00"}  # Okabe and Ito: told apart by all eyes
+VEHICLE_COLOURS = {
+    "front": "#0072B2",
+    "rear": "#D55E00",
+}  # Okabe and Ito: distinguishable by all eyes
 TRUTH_COLOUR = "#000000"
 VERDICT_COLOURS = {"good": "#009E73", "suspect": "#B57A00", "rejected": "#C0392B"}
 
 
-class OnBridge(Protocol):
-    """Where a truck was on a bridge, and when: of a crossing, identified or not."""
+class CrossingSpan(Protocol):
+    """A truck's stay on a bridge, identified or not."""
 
     @property
     def forward(self) -> bool: ...  # noqa: D102
@@ -39,8 +42,8 @@ class OnBridge(Protocol):
     def span_m(self) -> float: ...  # noqa: D102
 
 
-class Elements(Protocol):
-    """What of a bridge stands along its span; `schemas.site.Bridge` has it."""
+class ElementGeometry(Protocol):
+    """The elements of a bridge along its span; `schemas.site.Bridge` fits."""
 
     @property
     def elements(self) -> int: ...  # noqa: D102
@@ -52,8 +55,8 @@ class Elements(Protocol):
     def interior_supports_m(self) -> tuple[float, ...]: ...  # noqa: D102
 
 
-class ToldElements(NamedTuple):
-    """The elements of a bridge as a result tells them, where there is no site file."""
+class ResultElements(NamedTuple):
+    """The elements of a bridge according to a result, without a site file."""
 
     lengths_m: tuple[float, ...]
     nominal_flexural_rigidity_nm2: tuple[float, ...]
@@ -61,12 +64,12 @@ class ToldElements(NamedTuple):
 
     @property
     def elements(self) -> int:
-        """How many there are."""
+        """Return the number of elements."""
         return len(self.lengths_m)
 
 
-class PassingView(NamedTuple):
-    """A crossing that was seen in the positions and not identified; fields as in `CrossingView`."""
+class DetectedCrossingView(NamedTuple):
+    """A crossing detected in the positions and not identified; fields as in `CrossingView`."""
 
     vehicle: str
     bridge: str
@@ -78,7 +81,7 @@ class PassingView(NamedTuple):
 
 
 class RoadView(NamedTuple):
-    """Road profiles over chainage, all of one length; metres."""
+    """Road profiles over chainage, all of one length, m."""
 
     x_m: FloatArray
     front_m: FloatArray
@@ -97,19 +100,21 @@ class ParameterRow(NamedTuple):
 
 
 class ResidualCells(NamedTuple):
-    """What a fit left over, in multiples of what the declared noise explains: 1 is expected."""
+    """Residual bins of a fit, in multiples of the declared noise power: 1 is expected."""
 
     mean_square: FloatArray
-    """(3, 3, b): roads, front and rear body; before, on and behind the bridge; bands. NaN where
-    there are no rows."""
+    """Mean squares (3, 3, b): kinds, segments and bands; NaN without data.
+
+    The kinds are profiles, front and rear body; the segments before, on and behind the bridge.
+    """
     excess_std: FloatArray
-    """(3, 3, b): how many standard deviations of chance that lies above 1."""
+    """Excess (3, 3, b) over 1, in standard deviations of chance."""
     edges_hz: tuple[float, ...]
-    """b + 1, the last infinite."""
+    """Band edges (b + 1,), the last one infinite."""
 
 
 class CrossingView(NamedTuple):
-    """One crossing as it is drawn.
+    """One crossing as drawn.
 
     The bridge has n elements: `element_edges_m` has n + 1 values, the others n. A rejected crossing
     has no `rigidity_nm2` and no interval; a crossing without an interval has `interval_nm2` None.
@@ -135,22 +140,22 @@ class CrossingView(NamedTuple):
     parameters: tuple[ParameterRow, ...]
     interior_supports_m: tuple[float, ...] = ()
     scale_error: float = 0.0
-    """Relative standard deviation that all elements have in common (mass, gain)."""
+    """Relative standard deviation that all elements share (mass, gain)."""
     resolution: str | None = None
-    """In words what the crossing could not tell; None where it resolves every element."""
+    """Sentence on unresolved elements; None where the crossing resolves every element."""
     residuals: ResidualCells | None = None
-    """None where the samples are not at hand."""
+    """Residual bins; None where the samples are not available."""
     unresolved: frozenset[int] = frozenset()
-    """Numbers of the elements of which too little is known to tell a loss of half of them."""
+    """Numbers of the elements too uncertain to resolve a loss of half their EI."""
 
     @property
     def span_m(self) -> float:
-        """Length of the bridge between its bearings."""
+        """Return the length of the bridge between its bearings, m."""
         return float(self.element_edges_m[-1])
 
     @property
     def resolved_ratio(self) -> FloatArray | None:
-        """EI over nominal (n,), NaN where an element is not resolved; None if rejected."""
+        """Return EI over nominal (n,), NaN for an unresolved element; None if rejected."""
         if self.rigidity_nm2 is None:
             return None
         return np.array(
@@ -162,12 +167,12 @@ class CrossingView(NamedTuple):
 
     @property
     def interval_has_meaning(self) -> bool:
-        """Whether the method knows the noise, without which an interval says nothing."""
+        """Return whether the method has a noise model, without which an interval means nothing."""
         return "no_noise_model" not in self.reasons
 
 
 def summary_line(view: CrossingView) -> str:
-    """Vehicle, bridge, speed, method and goodness of fit in one line."""
+    """Return vehicle, bridge, speed, method and goodness of fit in one line."""
     parts = [
         f"{view.vehicle} over {view.bridge}",
         f"{view.speed_m_per_s:.1f} m/s",
@@ -179,7 +184,7 @@ def summary_line(view: CrossingView) -> str:
 
 
 def comparison_of(crossing: CrossingView, baseline: Estimate | None = None) -> Comparison | None:
-    """The elements of one crossing against the baseline or each other; None if it has none."""
+    """Compare the elements of one crossing with the baseline or each other; None without any."""
     if crossing.rigidity_nm2 is None or crossing.interval_nm2 is None:
         return None
     if not crossing.interval_has_meaning:
@@ -189,17 +194,17 @@ def comparison_of(crossing: CrossingView, baseline: Estimate | None = None) -> C
     return compare(found, crossing.nominal_nm2, crossing.element_edges_m, baseline)
 
 
-def told_of_crossing(crossing: CrossingView, found: Comparison | None) -> list[str]:
-    """What one crossing found, in words: only of what is resolved is said that it agrees."""
+def describe_crossing(crossing: CrossingView, found: Comparison | None) -> list[str]:
+    """Return sentences on one crossing; only resolved elements are said to agree."""
     if found is None:
         return []
     if crossing.resolution is None:
         return sentences(found)
-    return [*of_clear_elements(found), f"Not all is resolved: {crossing.resolution}."]
+    return [*describe_clear_elements(found), f"Not all is resolved: {crossing.resolution}."]
 
 
-def view_of_crossing(crossing: Crossing, bridge: Elements) -> CrossingView:
-    """Gather what is drawn of a result; the bridge gives the lengths and nominal rigidities."""
+def view_of_crossing(crossing: CrossingResult, bridge: ElementGeometry) -> CrossingView:
+    """Return the view of a result; the bridge gives the lengths and nominal rigidities."""
     parameters = crossing.parameters
     rigidity = interval = None
     unresolved = frozenset[int]()
@@ -236,26 +241,26 @@ def view_of_crossing(crossing: Crossing, bridge: Elements) -> CrossingView:
         ),
         interior_supports_m=bridge.interior_supports_m,
         scale_error=crossing.scale_error or 0.0,
-        resolution=resolution(crossing),
+        resolution=unresolved_note(crossing),
         unresolved=unresolved,
     )
 
 
-def elements_of_result(crossing: Crossing) -> ToldElements | None:
-    """The elements of the bridge of a result, by its priors; None where it does not tell them.
+def elements_of_result(crossing: CrossingResult) -> ResultElements | None:
+    """Return the elements of a result's bridge, from its priors; None if it has none.
 
-    Where it does not tell their lengths they are taken as equal, of the span that its road covers.
+    Without their lengths the elements count as equal parts of the span that its road covers.
     """
     estimates = crossing.parameters or {}
     found = [value for name, value in estimates.items() if name.startswith("EI_")]
     nominal = tuple(value.prior.location for value in found if value.prior is not None)
     if not nominal or len(nominal) != len(found) or min(nominal) <= 0.0:
         return None
-    told = crossing.fusion_likelihood
-    lengths = () if told is None else tuple(told.element_lengths_m)
+    likelihood = crossing.fusion_likelihood
+    lengths = () if likelihood is None else tuple(likelihood.element_lengths_m)
     if len(lengths) != len(nominal):
         road = crossing.road
-        # Its grid lies in the middle of the span.
+        # The grid lies in the middle of the span.
         span_m = float(len(nominal)) if road is None or not road.x_m else road.x_m[0] + road.x_m[-1]
         lengths = (span_m / len(nominal),) * len(nominal)
-    return ToldElements(lengths, nominal)
+    return ResultElements(lengths, nominal)

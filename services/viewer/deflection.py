@@ -1,7 +1,7 @@
-"""The bridge under the truck, as the estimate says: how it bends at each place of the truck.
+"""Deflection of the bridge under the truck, by the estimate, for each position of the truck.
 
-Static: the weight of each axle on the estimated beam. What swings about it (springs, the bridge's
-own modes) is in the method, not in this picture.
+It is static: the weight of each axle on the estimated beam. The method includes vibrations of the
+suspension and of the bridge; this picture does not.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from services.viewer.crossing_view import CrossingView, FloatArray
 
 _NEEDED = ("d_1", "m_s", "m_s1", "m_s2", "m_u1", "m_u2")
 _PARTS = 6
-"""Straight lines that an element is drawn with."""
+"""Number of straight lines per element."""
 _FRAMES = 160
 _BESIDE_S = 1.0
-"""Before and after, as long as the accelerations that are shown: a viewer begins there."""
+"""Time in s shown before and after the stay, as for the accelerations."""
 
 
-class Passage(NamedTuple):
-    """The bent bridge at f places of the truck, drawn with k + 1 points."""
+class DeflectionFrames(NamedTuple):
+    """The deflected bridge at f positions of the truck, drawn with k + 1 points."""
 
     front_m: FloatArray  # (f,) chainage of the front axle
     rear_m: FloatArray  # (f,)
@@ -35,14 +35,14 @@ class Passage(NamedTuple):
 
     @property
     def largest_m(self) -> float:
-        """The largest deflection, downwards and positive."""
+        """Return the largest deflection, downwards and positive, m."""
         return float(-self.deflection_m.min())
 
 
-def passage_of(crossing: CrossingView) -> Passage | None:
-    """How the bridge bends while the truck passes; None where a value that it takes is missing.
+def deflection_frames(crossing: CrossingView) -> DeflectionFrames | None:
+    """Return the deflection during the crossing; None where a required value is missing.
 
-    The wheelbase follows from how the body's mass is shared: m_s2/m_s = d_1/D.
+    The wheelbase follows from the shares of the body's mass: m_s2/m_s = d_1/D.
     """
     value = {row.name: row.mean for row in crossing.parameters}
     if crossing.rigidity_nm2 is None or not all(value.get(name, 0.0) > 0.0 for name in _NEEDED):
@@ -60,21 +60,21 @@ def passage_of(crossing: CrossingView) -> Passage | None:
     front = way if crossing.forward else span - way
     rear = front - sign * wheelbase
     fine = refine(beam, _PARTS)
-    # Rounding must not push the last point off the bridge, where nothing bends.
+    # Rounding must not push the last point off the bridge, where the deflection is zero.
     end = float(np.cumsum(beam.element_lengths_m)[-1])
     x = np.minimum(np.concatenate(([0.0], np.cumsum(fine.element_lengths_m))), end)
     x[-1] = end
     under = [interpolation_matrix(beam, axle) for axle in (front, rear)]  # (f, d) each
     force = loads[0] * under[0] + loads[1] * under[1]
-    nodal = np.linalg.solve(stiffness_matrix(beam), force.T)  # (d, f): all places at once
+    nodal = np.linalg.solve(stiffness_matrix(beam), force.T)  # (d, f): all positions at once
     bent = (interpolation_matrix(beam, x) @ nodal).T
     below = np.column_stack([np.einsum("fd,df->f", one, nodal) for one in under])
     element = np.repeat(np.arange(crossing.nominal_nm2.size), _PARTS)
-    return Passage(front, rear, x, bent, below, element)
+    return DeflectionFrames(front, rear, x, bent, below, element)
 
 
 def _beam(crossing: CrossingView, value: dict[str, float]) -> Beam | None:
-    assert crossing.rigidity_nm2 is not None  # noqa: S101 - asked before
+    assert crossing.rigidity_nm2 is not None  # noqa: S101 - checked before
     edges = crossing.element_edges_m
     nodes = []
     for support in crossing.interior_supports_m:
@@ -86,7 +86,7 @@ def _beam(crossing: CrossingView, value: dict[str, float]) -> Beam | None:
     return Beam(
         np.diff(edges),
         crossing.rigidity_nm2,
-        np.full(count, value.get("rhoA", 1.0)),  # a standing load does not ask for it
+        np.full(count, value.get("rhoA", 1.0)),  # a static load does not need it
         0.0,
         0.0,
         (value.get("k_rot_start", 0.0), value.get("k_rot_end", 0.0)),

@@ -1,17 +1,17 @@
-"""What pictures have in common: style, colours, words, and how a doubtful result looks.
+"""Common parts of the figures: style, colours, labels, and the look of doubtful results.
 
-Colours are Okabe and Ito's, and nothing is told by colour alone: what is doubtful is hatched, what
-is weak is darker and marked, lines differ by their dashes. Drawn with Matplotlib's objects and the
-Agg canvas, never with pyplot: no global state, no window.
+Colours are Okabe and Ito's, and no information is in colour alone: doubtful values are hatched,
+weak elements are darker and marked, lines differ by their dashes. Figures use Matplotlib's objects
+and the Agg canvas, never pyplot: no global state, no window.
 """
 
 from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -21,7 +21,7 @@ from matplotlib.patches import FancyBboxPatch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from services.common.files import write_atomically
-from services.identification.comparison import Element
+from services.common.language import ENGLISH, Language
 from services.viewer.crossing_view import (
     TRUTH_COLOUR,
     VEHICLE_COLOURS,
@@ -42,15 +42,22 @@ WEAK_BAR, WEAK_EDGE = "#E69F00", "#8a4b00"
 DOUBTFUL_BAR, DOUBTFUL_EDGE = "#f1f1f1", "#8a8f94"
 BANNERS = {"suspect": "#fdf0d5", "rejected": "#f6e1de"}
 _NOTES = {
-    "suspect": "doubtful: to be looked at, not to be relied upon",
-    "rejected": "no number of this crossing means anything",
+    "suspect": "doubtful: do not rely on these values",
+    "rejected": "this crossing has no usable values",
 }
 _SVG_METADATA = ("Date", "Creator", "Format", "Type")
+_PLATE: dict[str, Any] = {
+    "boxstyle": "round,pad=0.15",
+    "facecolor": "white",
+    "alpha": 0.85,
+    "linewidth": 0,
+}
+"""Box behind a label, which hides the lines that it would stand on."""
 _CHARACTERS = 118
-"""So long a line of reasons may be between the figure's edges."""
+"""Maximum length of a line of reasons between the figure's edges."""
 
 NOMINAL_LINE: dict[str, Any] = {"color": MUTED, "linewidth": 1.0, "linestyle": (0, (4, 3))}
-BASELINE_LINE: dict[str, Any] = {"color": VERDICT_COLOURS["good"], "linewidth": 1.6, "zorder": 3}
+BASELINE_COLOUR = VERDICT_COLOURS["good"]
 TRUTH_MARKER: dict[str, Any] = {
     "linestyle": "none",
     "marker": "D",
@@ -90,7 +97,7 @@ def write_figure(path: Path, figure: Figure) -> None:
 
 
 def figure_bytes(figure: Figure, form: str, *, dpi: int = DPI) -> bytes:
-    """A figure as `png` or `svg`; the same figure gives the same bytes."""
+    """Return a figure as `png` or `svg`; equal figures give equal bytes."""
     buffer = io.BytesIO()
     metadata = dict.fromkeys(("Software",) if form == "png" else _SVG_METADATA)
     with matplotlib.rc_context(STYLE):
@@ -99,18 +106,22 @@ def figure_bytes(figure: Figure, form: str, *, dpi: int = DPI) -> bytes:
 
 
 def draw_verdict(
-    figure: Figure, verdict: str, reasons: tuple[str, ...], top: float, told: Sequence[str] = ()
+    figure: Figure,
+    verdict: str,
+    reasons: tuple[str, ...],
+    top: float,
+    sentences: Sequence[str] = (),
 ) -> None:
-    """The verdict below a heading: a word if it is good, a banner with the reasons if not.
+    """Write the verdict below a heading: a word if it is good, a banner with reasons if not.
 
-    Of what was `told` the first sentence stands beside a good one.
+    The first of the `sentences` stands next to a good one.
     """
     words: dict[str, Any] = {"fontsize": 9.5, "va": "top"}
     if verdict == "good":
         colour = VERDICT_COLOURS["good"]
         figure.text(LEFT, top, "verdict: good", color=colour, fontweight="bold", **words)
-        if told:
-            short = textwrap.shorten(told[0], width=100, placeholder=" …")
+        if sentences:
+            short = textwrap.shorten(sentences[0], width=100, placeholder=" …")
             figure.text(LEFT + 0.12, top, short, color=INK, parse_math=False, **words)
         return
     height = 0.40 / figure.get_figheight()
@@ -134,30 +145,43 @@ def draw_verdict(
     figure.text(LEFT + 0.01, top, text, fontsize=8.5, color=INK, va="top", parse_math=False)
 
 
+class BarPlaces(NamedTuple):
+    """Where the bars of elements stand along the bridge, m."""
+
+    centres_m: FloatArray  # (n,)
+    lengths_m: FloatArray  # (n,)
+
+
+def bar_places(edges_m: FloatArray, begin: float = 0.0, end: float = 1.0) -> BarPlaces:
+    """Return the places of bars that take this part of each element; `edges_m` is (n + 1,)."""
+    lengths = np.diff(edges_m)
+    return BarPlaces(edges_m[:-1] + 0.5 * (begin + end) * lengths, (end - begin) * lengths)
+
+
 def draw_bars(
     axes: Axes,
-    edges_m: FloatArray,
+    places: BarPlaces,
     heights: FloatArray,
     weak: set[int],
     *,
     doubtful: bool,
     unresolved: Set[int] = frozenset(),
+    language: Language = ENGLISH,
 ) -> None:
-    """A bar for each element: the weak ones stand out, doubtful ones are grey and hatched.
+    """Draw a bar for each element: weak ones stand out, doubtful ones are grey and hatched.
 
-    Those that are `unresolved` are empty, with a dashed edge.
+    Unresolved ones are empty, with a dashed edge.
     """
-    centres, lengths = (edges_m[:-1] + edges_m[1:]) / 2.0, np.diff(edges_m)
     bars = axes.bar(
-        centres,
+        places.centres_m,
         heights,
-        width=0.86 * lengths,
+        width=0.86 * places.lengths_m,
         color=DOUBTFUL_BAR if doubtful else BAR,
         edgecolor=DOUBTFUL_EDGE if doubtful else BAR_EDGE,
         hatch="////" if doubtful else None,
         linewidth=1.1,
         zorder=2,
-        label="estimate, doubtful" if doubtful else "estimate",
+        label=language.text("figure.doubtful" if doubtful else "figure.estimate"),
     )
     if doubtful:
         return
@@ -166,9 +190,9 @@ def draw_bars(
             bar.set(facecolor="white", linestyle="--")
         if number in weak:
             bar.set(facecolor=WEAK_BAR, edgecolor=WEAK_EDGE, linewidth=1.8)
-    if unresolved:  # a legend would show the first bar, whatever that is
+    if unresolved:  # a legend would show the first bar, resolved or not
         bars.set_label("")
-        for name, fill, line in (("estimate", BAR, "-"), ("not resolved", "white", "--")):
+        for name, fill, line in (("estimate", BAR, "-"), ("unresolved", "white", "--")):
             axes.add_patch(
                 Rectangle(
                     (0.0, 0.0),
@@ -177,58 +201,62 @@ def draw_bars(
                     facecolor=fill,
                     edgecolor=BAR_EDGE,
                     linestyle=line,
-                    label=name,
+                    label=language.text(f"figure.{name}"),
                 )
             )
 
 
 def draw_intervals(
-    axes: Axes, edges_m: FloatArray, low: FloatArray, high: FloatArray, *, colour: str, label: str
+    axes: Axes, places: BarPlaces, low: FloatArray, high: FloatArray, *, colour: str, label: str
 ) -> None:
-    """The interval of each element."""
-    centres, lengths = (edges_m[:-1] + edges_m[1:]) / 2.0, np.diff(edges_m)
+    """Draw the interval of each element."""
+    centres, half = places.centres_m, 0.09 * places.lengths_m
     axes.vlines(centres, low, high, color=colour, linewidth=2.2, zorder=5, label=label)
     for end in (low, high):
-        left, right = centres - 0.09 * lengths, centres + 0.09 * lengths
-        axes.hlines(end, left, right, color=colour, zorder=5)
+        axes.hlines(end, centres - half, centres + half, color=colour, zorder=5)
 
 
-def label_loss(
-    axes: Axes, element: Element, top: float, *, small: bool, doubt: str = "", up: float = 8.0
+def label_losses(
+    axes: Axes,
+    places: BarPlaces,
+    low: FloatArray,
+    high: FloatArray,
+    losses: Mapping[int, str],
 ) -> None:
-    """What an element has lost, over its interval that ends at `top`."""
-    axes.annotate(
-        f"{100.0 * (1.0 - element.ratio):.0f} % less{doubt}",
-        ((element.from_m + element.to_m) / 2.0, top),
-        xytext=(0, up),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8 if small else 9.5,
-        fontweight="bold",
-        zorder=8,
-    )
+    """Label the losses of elements, by their numbers, above their intervals and their values."""
+    above = _are_low(low, high)
+    for number, text in losses.items():
+        axes.annotate(
+            text,
+            (places.centres_m[number - 1], high[number - 1]),
+            xytext=(0, 21 if above[number - 1] else 6),
+            textcoords="offset points",
+            ha="center",
+            fontsize=8 if high.size > 11 else 9.5,
+            fontweight="bold",
+            zorder=8,
+            bbox=_PLATE,
+        )
 
 
 def label_bars(
-    axes: Axes, edges_m: FloatArray, heights: FloatArray, bottoms: FloatArray, texts: list[str]
+    axes: Axes, places: BarPlaces, low: FloatArray, high: FloatArray, texts: list[str]
 ) -> None:
-    """A number in each bar below its interval, or above where the bar is too low; its name."""
-    centres = (edges_m[:-1] + edges_m[1:]) / 2.0
+    """Write a number below each interval, or above where the bar is too low; and its name."""
     small = 8.5 if len(texts) > 11 else 10.5
-    highest = max(float(heights.max()), float(bottoms.max()))
-    for number, (centre, bottom, text) in enumerate(zip(centres, bottoms, texts, strict=True)):
-        above = bottom < 0.25 * highest  # no room for the label inside a bar as low as this
+    above = _are_low(low, high)
+    for number, (centre, text) in enumerate(zip(places.centres_m, texts, strict=True)):
         axes.annotate(
             text,
-            (centre, max(heights[number], bottom) if above else bottom),
-            xytext=(0, 12 if above else -10),
+            (centre, high[number] if above[number] else low[number]),
+            xytext=(0, 5 if above[number] else -10),
             textcoords="offset points",
             ha="center",
-            va="bottom" if above else "top",
+            va="bottom" if above[number] else "top",
             fontsize=small,
             fontweight="bold",
             zorder=7,
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewidth": 0},
+            bbox=_PLATE,
         )
         axes.annotate(
             f"$EI_{{{number + 1}}}$",
@@ -243,21 +271,26 @@ def label_bars(
         )
 
 
-def add_ratio_axis(axes: Axes, nominal: FloatArray) -> None:
-    """Mark ratios at the right, if all elements have one nominal value, on a twin's same limits."""
+def _are_low(low: FloatArray, high: FloatArray) -> Sequence[bool]:
+    """Return for each bar whether a number and a name do not fit below its interval."""
+    return [bool(one) for one in low < 0.36 * high.max()]
+
+
+def add_ratio_axis(axes: Axes, nominal: FloatArray, language: Language = ENGLISH) -> None:
+    """Mark ratios at the right, if all elements share one nominal value, by a twin axis."""
     if np.ptp(nominal) > 1e-9 * nominal.max():
         return
     ratio = axes.twinx()
     low, high = axes.get_ylim()
     ratio.set_ylim(low / nominal[0], high / nominal[0])
-    ratio.set_ylabel("ratio to nominal")
+    ratio.set_ylabel(language.text("figure.ratio"))
     ratio.spines[:].set_visible(False)
     ratio.yaxis.set_major_locator(MaxNLocator(nbins=8, steps=[1, 2, 5, 10]))
     ratio.tick_params(length=0)
 
 
 def mark_bridge(axes: Axes, supports_m: tuple[float, ...]) -> None:
-    """Shade the bridge and set a bearing below each of its supports."""
+    """Shade the bridge and draw a bearing below each of its supports."""
     axes.axvspan(supports_m[0], supports_m[-1], color="#f4f7f9", zorder=0, linewidth=0)
     for support in supports_m:
         axes.axvline(support, color=MUTED, linewidth=0.8, zorder=1)
@@ -273,8 +306,8 @@ def mark_bridge(axes: Axes, supports_m: tuple[float, ...]) -> None:
         )
 
 
-def quieten(axes: Axes) -> None:
-    """Few ticks, a grid across, no frame."""
+def simplify_axes(axes: Axes) -> None:
+    """Reduce a panel to few ticks and a horizontal grid, without a frame."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     axes.grid(axis="y", color=GRID, linewidth=0.8, zorder=0.5)
@@ -284,8 +317,14 @@ def quieten(axes: Axes) -> None:
     axes.tick_params(length=3)
 
 
+def simplify_numbers(axes: Axes, language: Language) -> None:
+    """Write the ticks of both axes as the language does."""
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda value, _: language.number(round(value, 9), "g"))
+
+
 def legend_beside_title(axes: Axes) -> None:
-    """The legend on the line of the panel's title."""
+    """Place the legend on the line of the panel's title."""
     handles, _ = axes.get_legend_handles_labels()
     is_long = len(handles) > 4
     if handles:
@@ -302,7 +341,7 @@ def legend_beside_title(axes: Axes) -> None:
 
 
 def write_centred(axes: Axes, text: str) -> None:
-    """Words where a panel has nothing to show."""
+    """Write text into a panel without data."""
     axes.text(
         *(0.5, 0.5, text),
         transform=axes.transAxes,

@@ -1,4 +1,4 @@
-"""The picture of one crossing: flexural rigidity along the span, and the road."""
+"""The figure of one crossing: flexural rigidity along the span, and the road profile."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from services.viewer.crossing_view import (
     FloatArray,
     RoadView,
     comparison_of,
+    describe_crossing,
     summary_line,
-    told_of_crossing,
 )
 from services.viewer.drawing import (
     BAR_EDGE,
@@ -32,14 +32,15 @@ from services.viewer.drawing import (
     TRUTH_MARKER,
     WIDTH_IN,
     add_ratio_axis,
+    bar_places,
     draw_bars,
     draw_intervals,
     draw_verdict,
     label_bars,
-    label_loss,
+    label_losses,
     legend_beside_title,
     mark_bridge,
-    quieten,
+    simplify_axes,
     write_centred,
     write_figure,
 )
@@ -47,7 +48,7 @@ from services.viewer.drawing import (
 HEIGHT_IN = 7.1
 _HEIGHT_WITHOUT_ROAD_IN = 4.4
 _HEADING_IN, _BANNER_IN = 1.17, 0.36
-"""Above the first panel; a banner takes more."""
+"""Height of the heading above the first panel, and of a banner in addition."""
 
 
 def crossing_figure(
@@ -57,11 +58,11 @@ def crossing_figure(
     element_truth: list[float] | None = None,
     road_truth: tuple[FloatArray, FloatArray] | None = None,
 ) -> None:
-    """Draw one crossing into a PNG or SVG file.
+    """Draw one crossing into a PNG or SVG file; an existing file is replaced.
 
     `element_truth` is the true rigidity of each element as a ratio to the nominal value;
     `road_truth` the true profile as chainage and height in metres. Both are known only for
-    simulated crossings. An existing file is replaced.
+    simulated crossings.
     """
     with matplotlib.rc_context(STYLE):
         figure = draw_crossing(crossing, element_truth=element_truth, road_truth=road_truth)
@@ -74,7 +75,7 @@ def draw_crossing(
     element_truth: list[float] | None,
     road_truth: tuple[FloatArray, FloatArray] | None,
 ) -> Figure:
-    """The figure itself; to be drawn in `STYLE`."""
+    """Return the figure, to be drawn in `STYLE`."""
     has_road = crossing.road is not None or road_truth is not None
     height_in = HEIGHT_IN if has_road else _HEIGHT_WITHOUT_ROAD_IN
     heading_in = _HEADING_IN
@@ -102,7 +103,7 @@ def draw_crossing(
         _draw_profiles(panels[1], crossing, road_truth)
         _draw_differences(panels[2], crossing.road, road_truth)
     for axes in panels:
-        quieten(axes)
+        simplify_axes(axes)
         mark_bridge(axes, (0.0, *crossing.interior_supports_m, crossing.span_m))
     for axes in panels[:-1]:
         axes.tick_params(labelbottom=False)
@@ -119,8 +120,8 @@ def _draw_heading(figure: Figure, crossing: CrossingView) -> None:
     small: dict[str, Any] = {"fontsize": 9.5, "color": MUTED, "va": "top"}
     figure.text(LEFT, 1.0 - 0.455 * inch, summary, parse_math=False, **small)
     reasons = crossing.reason_texts
-    told = told_of_crossing(crossing, comparison_of(crossing))
-    draw_verdict(figure, crossing.verdict, reasons, 1.0 - 0.65 * inch, told)
+    sentences = describe_crossing(crossing, comparison_of(crossing))
+    draw_verdict(figure, crossing.verdict, reasons, 1.0 - 0.65 * inch, sentences)
 
 
 def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None) -> None:
@@ -133,7 +134,7 @@ def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None
     highest = float(nominal.max())
     if truth is not None:
         true_values = np.asarray(truth) * nominal
-        # Beside the interval's line, which may be shorter than the marker.
+        # To the side of the interval's line, which may be shorter than the marker.
         beside = centres - 0.22 * np.diff(edges)
         axes.plot(beside, true_values, label="truth", zorder=4, **TRUTH_MARKER)
         highest = max(highest, float(true_values.max()))
@@ -147,27 +148,27 @@ def _draw_rigidity(axes: Axes, crossing: CrossingView, truth: list[float] | None
 
 
 def _draw_estimate(axes: Axes, crossing: CrossingView, estimate: FloatArray) -> float:
-    """Bars, intervals and labels, in GN·m²; returns the highest value drawn."""
+    """Draw bars, intervals and labels in GN·m²; return the highest value drawn."""
     edges = crossing.element_edges_m
     doubtful = crossing.verdict != "good" or not crossing.interval_has_meaning
     compared = comparison_of(crossing)
     weak = () if compared is None or doubtful else compared.weak
     numbers = {one.number for one in weak}
     open_ones = crossing.unresolved
-    draw_bars(axes, edges, estimate, numbers, doubtful=doubtful, unresolved=open_ones)
-    lowest, upper, highest = estimate, estimate, float(estimate.max())
+    places = bar_places(edges)
+    draw_bars(axes, places, estimate, numbers, doubtful=doubtful, unresolved=open_ones)
+    lowest, upper = estimate, estimate
     if crossing.interval_nm2 is not None:
         low, high = crossing.interval_nm2.T / 1e9
         colour = MUTED if doubtful else BAR_EDGE
         label = "95 % interval" if crossing.interval_has_meaning else "interval (without meaning)"
-        draw_intervals(axes, edges, low, high, colour=colour, label=label)
-        lowest, upper, highest = np.minimum(lowest, low), high, max(highest, float(high.max()))
+        draw_intervals(axes, places, low, high, colour=colour, label=label)
+        lowest, upper = np.minimum(estimate, low), np.maximum(estimate, high)
     ratios = estimate / (crossing.nominal_nm2 / 1e9)
-    label_bars(axes, edges, estimate, lowest, [f"{ratio:.3f}" for ratio in ratios])
-    for element in weak:
-        over = max(estimate[element.number - 1], upper[element.number - 1])
-        label_loss(axes, element, float(over), small=ratios.size > 11)
-    return highest
+    label_bars(axes, places, lowest, upper, [f"{ratio:.3f}" for ratio in ratios])
+    losses = {one.number: f"{100.0 * (1.0 - one.ratio):.0f} % less" for one in weak}
+    label_losses(axes, places, lowest, upper, losses)
+    return float(upper.max())
 
 
 def _draw_profiles(
@@ -187,7 +188,7 @@ def _draw_profiles(
             road.front_m * 1e3,
             color=VEHICLE_COLOURS["front"],
             linewidth=1.7,
-            label="felt by the front wheel",
+            label="profile of the front wheel",
         )
         axes.plot(
             road.x_m,
@@ -195,7 +196,7 @@ def _draw_profiles(
             color=VEHICLE_COLOURS["rear"],
             linewidth=1.7,
             linestyle=(0, (3.2, 2.2)),
-            label="felt by the rear wheel",
+            label="profile of the rear wheel",
         )
     legend_beside_title(axes)
 
@@ -229,7 +230,7 @@ def _draw_differences(
 
 
 def _unit_of_length(largest_m: float) -> tuple[str, float]:
-    """Millimetres, micrometres or nanometres: whichever gives readable tick labels."""
+    """Return millimetres, micrometres or nanometres, whichever gives readable tick labels."""
     if largest_m >= 1e-4:
         return "mm", 1e3
     return ("µm", 1e6) if largest_m >= 1e-7 else ("nm", 1e9)
@@ -250,7 +251,7 @@ def _leave_empty(axes: Axes) -> None:
 
 
 def _chainage_limits(crossing: CrossingView) -> tuple[float, float]:
-    """The bridge and what was estimated before and after it, at most half a span on each side."""
+    """Return the limits of bridge and road, at most half a span beyond each end."""
     margin = 0.03 * crossing.span_m
     left, right = 0.0, crossing.span_m
     if crossing.road is not None:

@@ -1,4 +1,4 @@
-"""The picture of a bridge's past: EI of each element over time, its alarms, temperature beneath."""
+"""The figure of a bridge's history: EI of each element over time, alarms, temperature."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from services.history.past import Past, Statement, statements
+from services.history.bridge_history import BridgeHistory, Statement, statements
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import (
     BAR_EDGE,
@@ -32,12 +33,16 @@ from services.viewer.drawing import (
 
 _PANEL_IN, _TEMPERATURE_IN = 0.92, 0.75
 _MOST_CHARACTERS = 100
-"""Of what somebody noted: a line."""
+"""Maximum length of an acknowledgement's note, one line."""
 _LINE_CHARACTERS = 105
-"""Of a sentence, before it is continued on the next line."""
+"""Maximum length of a line of a sentence."""
+_MOST_PER_CENT = 400.0
+"""Upper end of the axes; an interval beyond it means that the element is unresolved."""
+_LEAST_DAYS = 7.0
+"""Minimum time shown before the first and behind the last period."""
 
 
-class Point(NamedTuple):
+class PeriodPoint(NamedTuple):
     """A bridge in one period; time in s since 1970 UTC, EI in N·m²."""
 
     time_s: float
@@ -48,47 +53,47 @@ class Point(NamedTuple):
     temperature_deg_c: float | None
 
 
-class Mark(NamedTuple):
-    """An alarm in the picture."""
+class AlarmMark(NamedTuple):
+    """An alarm in the figure."""
 
     element: int
-    """From 1."""
+    """Number of the element, from 1."""
     is_stiffer: bool
     since_s: float
     raised_s: float
     sentence: str
     acknowledged: str
-    """By whom and when; empty while it stands."""
+    """Name and time of the acknowledgement; empty without one."""
     note: str = ""
-    """What they said of it."""
+    """Note of the acknowledgement."""
 
 
-class History(NamedTuple):
-    """What a picture of a bridge's past is drawn from."""
+class HistoryView(NamedTuple):
+    """Data of the figure of a bridge's history."""
 
     bridge: str
     unit: str
-    points: tuple[Point, ...]
-    marks: tuple[Mark, ...]
+    points: tuple[PeriodPoint, ...]
+    marks: tuple[AlarmMark, ...]
     statements: tuple[Statement, ...]
-    """What there is to say where no alarm stands."""
+    """Sentences where no alarm stands."""
 
 
-def history_figure(path: Path, past: Past) -> None:
-    """Draw a bridge's past into a PNG or SVG file; an existing file is replaced."""
+def history_figure(path: Path, past: BridgeHistory) -> None:
+    """Draw a bridge's history into a PNG or SVG file; an existing file is replaced."""
     with matplotlib.rc_context(STYLE):
-        figure = draw_history(history_of(past))
+        figure = draw_history(history_view(past))
     write_figure(path, figure)
 
 
-def history_of(past: Past) -> History:
-    """What is drawn of a bridge's past: the periods that gave numbers."""
+def history_view(past: BridgeHistory) -> HistoryView:
+    """Return the data of the figure: the periods with an estimate."""
     points = []
     for one in past.periods:
         if one.state is not None and one.state.elements:
             of = list(one.state.elements.values())
             points.append(
-                Point(
+                PeriodPoint(
                     0.5 * (one.begin_s + one.end_s),
                     tuple(e.mean for e in of),
                     tuple(e.q025 for e in of),
@@ -98,7 +103,7 @@ def history_of(past: Past) -> History:
                 )
             )
     marks = tuple(
-        Mark(
+        AlarmMark(
             alarm.element,
             alarm.direction == "stiffer",
             alarm.since,
@@ -110,13 +115,13 @@ def history_of(past: Past) -> History:
         )
         for alarm in past.alarms
     )  # fmt: skip
-    return History(past.bridge, past.unit, tuple(points), marks, tuple(statements(past)))
+    return HistoryView(past.bridge, past.unit, tuple(points), marks, tuple(statements(past)))
 
 
-def draw_history(history: History) -> Figure:
-    """The figure itself, to be drawn in `STYLE`: a panel for each element, the same scale in all.
+def draw_history(history: HistoryView) -> Figure:
+    """Return the figure, to be drawn in `STYLE`: a panel per element, with one scale.
 
-    In per cent of each element's own median, so that elements can be compared.
+    Values are per cent of each element's own median, so that elements can be compared.
     """
     elements = max((len(point.mean) for point in history.points), default=0)
     has_temperature = any(p.temperature_deg_c is not None for p in history.points)
@@ -142,16 +147,22 @@ def draw_history(history: History) -> Figure:
         first = first or axes
         _draw_element(axes, history, n, limits)
         axes.tick_params(labelbottom=n == elements - 1 and not has_temperature)
+    if first is not None:
+        days = _dates(point.time_s for point in history.points)
+        margin = max(_LEAST_DAYS, 0.04 * (max(days) - min(days)))
+        first.set_xlim(min(days) - margin, max(days) + margin)
     if has_temperature and first is not None:
         size = (LEFT, bottom / height, RIGHT - LEFT, (_TEMPERATURE_IN - 0.1) / height)
         _draw_temperature(figure.add_axes(size, sharex=first), history)
     return figure
 
 
-def _heading(history: History) -> list[tuple[str, str]]:
+def _heading(history: HistoryView) -> list[tuple[str, str]]:
     many = len(history.points)
-    said = f"{many} {history.unit}{'s' if many != 1 else ''} with crossings; bars: 95 % intervals"
-    lines = [(said + ", grey where no crossing was good", MUTED)]
+    wording = (
+        f"{many} {history.unit}{'s' if many != 1 else ''} with crossings; bars: 95 % intervals"
+    )
+    lines = [(wording + ", grey where no crossing was good", MUTED)]
     for mark in history.marks:
         if not mark.acknowledged:
             lines.append((f"ALARM: {mark.sentence}", _colour(mark)))
@@ -172,30 +183,30 @@ def _short(text: str) -> str:
     return text if len(text) <= _MOST_CHARACTERS else text[: _MOST_CHARACTERS - 1] + "…"
 
 
-def _colour(mark: Mark) -> str:
+def _colour(mark: AlarmMark) -> str:
     if mark.acknowledged:
         return INK
     return BAR_EDGE if mark.is_stiffer else WEAK_EDGE
 
 
-def _limits(history: History, elements: int) -> tuple[float, float]:
-    """Of all panels: all estimates that are good, and all but the longest intervals."""
-    ends, middles = [], [90.0, 110.0]
+def _limits(history: HistoryView, elements: int) -> tuple[float, float]:
+    """Return the limits of all panels: the whole intervals of good periods, or of all."""
+    good = [point for point in history.points if point.verdict == "good"]
+    ends = [90.0, 110.0]
     for n in range(elements):
-        for point in (point for point in history.points if len(point.mean) > n):
-            usual = _usual(history, n)
+        usual = _usual(history, n)
+        for point in (point for point in good or history.points if len(point.mean) > n):
             ends += [100.0 * point.low[n] / usual, 100.0 * point.high[n] / usual]
-            if point.verdict == "good":
-                middles.append(100.0 * point.mean[n] / usual)
-    low, high = np.quantile(ends or middles, [0.01, 0.99])
-    return float(min(low, *middles) - 4.0), float(max(high, *middles) + 4.0)
+    low, high = min(ends), max(ends)
+    margin = 0.05 * (high - low)
+    return max(0.0, low - margin), min(high + margin, _MOST_PER_CENT)
 
 
-def _usual(history: History, n: int) -> float:
+def _usual(history: HistoryView, n: int) -> float:
     return float(np.median([p.mean[n] for p in history.points if len(p.mean) > n]))
 
 
-def _draw_element(axes: Axes, history: History, n: int, limits: tuple[float, float]) -> None:
+def _draw_element(axes: Axes, history: HistoryView, n: int, limits: tuple[float, float]) -> None:
     usual = _usual(history, n)
     axes.axhline(100.0, color=MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
     for is_good in (True, False):
@@ -216,19 +227,20 @@ def _draw_element(axes: Axes, history: History, n: int, limits: tuple[float, flo
             since, raised = _dates([mark.since_s, mark.raised_s])
             axes.axvspan(since, raised, color=colour, alpha=0.13, linewidth=0.0)
             axes.axvline(raised, color=colour, linewidth=1.6)
-            said = "stiffer" if mark.is_stiffer else "weaker"
+            wording = "stiffer" if mark.is_stiffer else "weaker"
             axes.annotate(
-                f"{said}, noted" if mark.acknowledged else said, (raised, limits[1]),
+                f"{wording}, noted" if mark.acknowledged else wording, (raised, limits[1]),
                 xytext=(4, -3), textcoords="offset points", va="top", fontsize=8.5,
                 color=colour, fontweight="bold",
             )  # fmt: skip
     axes.set_ylim(*limits)
     axes.set_ylabel(f"EI_{n + 1}", rotation=0, ha="right", va="center", labelpad=6)
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 5, 10], integer=True))
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0f} %")
     axes.yaxis.tick_right()
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
-    # Beside the panel, as points may be anywhere in it.
+    # Outside the panel, as points may be anywhere within it.
     axes.annotate(
         f"100 %:\n{usual / 1e9:#.3g} GN·m²", (0.0, 0.5), xycoords="axes fraction", xytext=(-6, -8),
         textcoords="offset points", ha="right", va="top", fontsize=7, color=MUTED,
@@ -236,7 +248,7 @@ def _draw_element(axes: Axes, history: History, n: int, limits: tuple[float, flo
     _over_time(axes)
 
 
-def _draw_temperature(axes: Axes, history: History) -> None:
+def _draw_temperature(axes: Axes, history: HistoryView) -> None:
     known = [p for p in history.points if p.temperature_deg_c is not None]
     axes.plot(
         _dates(p.time_s for p in known), [p.temperature_deg_c or 0.0 for p in known],

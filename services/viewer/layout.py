@@ -1,4 +1,4 @@
-"""The layout of a Rerun file: which view stands where."""
+"""The layout of a Rerun file."""
 
 from __future__ import annotations
 
@@ -9,33 +9,35 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from services.viewer.bridge_view import BridgeView
-from services.viewer.crossing_view import CrossingView, PassingView
-from services.viewer.deflection import passage_of
-from services.viewer.learned import learned_of
+from services.viewer.crossing_view import CrossingView, DetectedCrossingView
+from services.viewer.deflection import deflection_frames
+from services.viewer.prior_posterior import prior_posterior_rows
 from services.viewer.rerun_parts import CHAINAGE, RATIO_LEGEND, TIME
 from services.viewer.rerun_places import PLAN_MARGIN, BridgeOnMap, plan_root
 from services.viewer.rerun_residuals import RESIDUALS_BOUNDS
 from services.viewer.strip import STRIP_HEIGHT, STRIP_PAPER, STRIP_WIDTH
 from services.viewer.vehicle_signals import VehicleSignals
 
+_LEAST_SPEED_M_PER_S = 1.0
+"""Lowest speed at which a crossing is played: a truck may have stopped on the bridge."""
 ENDS = "ends"
-"""Beside the channels of a crossing: the ends of the bridge."""
-LEARNED_ROW = 0.4
-"""From one unknown to the next, in prior standard deviations: the view has one scale."""
+"""Entity of the ends of the bridge, next to the channels of a crossing."""
+PRIOR_POSTERIOR_ROW = 0.4
+"""Distance between two parameters in prior standard deviations; the view has one scale."""
 
 
 def crossing_root(crossing: CrossingView) -> str:
-    """Entity path under which everything of one crossing stands."""
+    """Return the entity path of a crossing."""
     return f"crossing/{rr.escape_entity_path_part(crossing.crossing_id)}/{crossing.method}"
 
 
 def bridge_root(bridge: BridgeView) -> str:
-    """Entity path under which everything of one bridge stands."""
+    """Return the entity path of a bridge."""
     return f"bridge/{rr.escape_entity_path_part(bridge.bridge)}"
 
 
-def passing_root(passing: PassingView) -> str:
-    """Entity path of a crossing that was not identified."""
+def passing_root(passing: DetectedCrossingView) -> str:
+    """Return the entity path of a crossing that was not identified."""
     return f"passing/{passing.bridge}/{passing.vehicle}/{round(1e3 * passing.entry_time_s)}"
 
 
@@ -43,15 +45,14 @@ def blueprint(
     vehicles: Mapping[str, VehicleSignals],
     crossings: Sequence[CrossingView],
     overviews: Sequence[BridgeView] = (),
-    passings: Sequence[PassingView] = (),
+    passings: Sequence[DetectedCrossingView] = (),
     *,
     bridges: Sequence[BridgeOnMap] = (),
     about: str | None = None,
 ) -> rrb.Blueprint:
-    """A tab for every bridge and every crossing, the first one open, and one for the drive.
+    """Return a tab for every bridge and crossing, the first one open, and one for the drive.
 
-    Without any result the drive comes first, on the timeline that it has; then the crossings that
-    were seen in it.
+    Without any result the drive comes first, on its own timeline; then its detected crossings.
     """
     on_map = {bridge.identifier: bridge for bridge in bridges}
     channels = {
@@ -71,17 +72,36 @@ def blueprint(
     tabs = [*found, drive, *seen] if found else [drive, *seen]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
-        rrb.TimePanel(state="collapsed", timeline=CHAINAGE if found else TIME, play_state="paused"),
+        _time_panel(crossings, has_results=bool(found)),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,
     )
 
 
+def _time_panel(crossings: Sequence[CrossingView], *, has_results: bool) -> rrb.TimePanel:
+    """Return a panel that plays the newest crossing at the truck's speed, on the bridge.
+
+    The chainage is a sequence in mm, of which a viewer shows a number of steps each second.
+    """
+    if not has_results or not crossings:
+        timeline = CHAINAGE if has_results else TIME
+        return rrb.TimePanel(state="collapsed", timeline=timeline, play_state="paused")
+    newest = max(crossings, key=lambda crossing: crossing.entry_time_s)
+    return rrb.TimePanel(
+        state="collapsed",
+        timeline=CHAINAGE,
+        play_state="playing",
+        fps=1e3 * max(newest.speed_m_per_s, _LEAST_SPEED_M_PER_S),
+        loop_mode="selection",
+        time_selection=rrb.components.AbsoluteTimeRange(0, round(1e3 * newest.span_m)),
+    )
+
+
 def _crossing_layout(
     crossing: CrossingView, channels: Set[str], bridge: BridgeOnMap | None
 ) -> rrb.Container:
-    """Verdict and place, what was found, and what it was found from; only what there is."""
+    """Lay out verdict and position, result, and evidence, as far as each exists."""
     root = crossing_root(crossing)
     plots = acceleration_plots(f"{root}/acceleration", channels)
     if crossing.road is not None:
@@ -99,8 +119,8 @@ def _crossing_layout(
     evidence: list[rrb.Container | rrb.View] = []
     if plots:
         evidence.append(rrb.Vertical(*plots, name="Road and signals"))
-    if crossing.interval_has_meaning and learned_of(crossing.parameters):
-        evidence.append(_learned_view(root, crossing))
+    if crossing.interval_has_meaning and prior_posterior_rows(crossing.parameters):
+        evidence.append(_prior_posterior_view(root, crossing))
     if crossing.residuals is not None:
         evidence.append(_residuals_view(root))
     if evidence:
@@ -114,11 +134,12 @@ def _crossing_layout(
 
 
 def tab_name(crossing: CrossingView) -> str:
-    """Which crossing, and what is to be thought of it: there may be many of one bridge."""
-    return f"{_when_and_where(crossing)}, {crossing.verdict}"
+    """Return time, place and verdict of a crossing: a bridge may have many."""
+    return f"{when_and_where(crossing)}, {crossing.verdict}"
 
 
-def _when_and_where(crossing: CrossingView | PassingView) -> str:
+def when_and_where(crossing: CrossingView | DetectedCrossingView) -> str:
+    """Return time, direction and bridge of a crossing."""
     moment = datetime.fromtimestamp(crossing.entry_time_s, UTC)
     way = "→" if crossing.forward else "←"
     return f"{moment:%Y-%m-%d %H:%M} {way} {crossing.bridge}"
@@ -131,7 +152,7 @@ def _verdict_and_place(root: str, bridge: BridgeOnMap | None, *, coloured: bool)
 
 
 def _overview_layout(bridge: BridgeView, on_map: BridgeOnMap | None) -> rrb.Container:
-    """The picture of the bridge, for who has one minute, and where it is."""
+    """Lay out the figure of the bridge, a summary for a short look, and its position."""
     picture = rrb.Spatial2DView(
         origin=f"{bridge_root(bridge)}/picture",
         name="Stiffness, and all crossings",
@@ -146,7 +167,7 @@ def _overview_layout(bridge: BridgeView, on_map: BridgeOnMap | None) -> rrb.Cont
 
 
 def is_doubtful(crossing: CrossingView) -> bool:
-    """Whether what was found is not to be relied upon."""
+    """Return whether a result must not be relied upon."""
     return crossing.verdict != "good" or not crossing.interval_has_meaning
 
 
@@ -155,7 +176,7 @@ def _rigidity_layout(root: str, crossing: CrossingView) -> rrb.Container:
     along = rrb.Tabs(
         rrb.Spatial2DView(
             origin=f"{root}/strip",
-            name=f"{doubt}EI along the span, of nominal, 95 % interval",
+            name=f"{doubt}EI / nominal, 95 % interval",
             background=STRIP_PAPER,
             visual_bounds=rrb.VisualBounds2D(
                 x_range=(-20.0, STRIP_WIDTH + 150.0), y_range=(-20.0, STRIP_HEIGHT + 150.0)
@@ -168,12 +189,12 @@ def _rigidity_layout(root: str, crossing: CrossingView) -> rrb.Container:
         ),
         active_tab=0,
     )
-    if passage_of(crossing) is None:
+    if deflection_frames(crossing) is None:
         return along
     span = crossing.span_m
     passage = rrb.Spatial2DView(
         origin=f"{root}/passage",
-        name=f"{doubt}The bridge under the truck (static; move the time)",
+        name=f"{doubt}The bridge under the truck",
         background=STRIP_PAPER,
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-0.15 * span, 1.15 * span), y_range=(-0.25 * span, 0.15 * span)
@@ -182,14 +203,15 @@ def _rigidity_layout(root: str, crossing: CrossingView) -> rrb.Container:
     return rrb.Vertical(along, passage, row_shares=[5, 3])
 
 
-def _learned_view(root: str, crossing: CrossingView) -> rrb.View:
-    rows = len(learned_of(crossing.parameters))
+def _prior_posterior_view(root: str, crossing: CrossingView) -> rrb.View:
+    rows = len(prior_posterior_rows(crossing.parameters))
     return rrb.Spatial2DView(
         origin=f"{root}/learned",
-        name="Told beyond the prior (grey)",
+        name="Posterior against prior (grey)",
         background=STRIP_PAPER,
         visual_bounds=rrb.VisualBounds2D(
-            x_range=(-3.6, 4.2), y_range=(-2.0 * LEARNED_ROW, (rows + 1) * LEARNED_ROW)
+            x_range=(-3.6, 4.2),
+            y_range=(-2.0 * PRIOR_POSTERIOR_ROW, (rows + 1) * PRIOR_POSTERIOR_ROW),
         ),
     )
 
@@ -198,22 +220,22 @@ def _residuals_view(root: str) -> rrb.View:
     x_range, y_range = RESIDUALS_BOUNDS
     return rrb.Spatial2DView(
         origin=f"{root}/residuals",
-        name="Left over by band",
+        name="Residuals by frequency band",
         background=STRIP_PAPER,
         visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
     )
 
 
 def _passing_layout(
-    passing: PassingView, channels: Set[str], bridge: BridgeOnMap | None
+    passing: DetectedCrossingView, channels: Set[str], bridge: BridgeOnMap | None
 ) -> rrb.Container:
-    """The accelerations of a crossing that nobody has identified."""
+    """Lay out the accelerations of a crossing that was not identified."""
     root = passing_root(passing)
     plots = acceleration_plots(f"{root}/acceleration", channels)
     return rrb.Vertical(
         *plots,
         bridge_places(bridge, root, has_elements=False, coloured=False),
-        name=f"{_when_and_where(passing)}, not identified",
+        name=f"{when_and_where(passing)}, not identified",
     )
 
 
@@ -225,7 +247,11 @@ def _drive_layout(
         plots += acceleration_plots(f"vehicle/{vehicle}/acceleration", known, f"{vehicle}:")
         plots.append(_plot(f"vehicle/{vehicle}/speed", f"{vehicle}: Speed (m/s)"))
     places = rrb.Tabs(
-        rrb.Spatial2DView(origin="plan_of_drive", name="Plan of the drive (m, north up)"),
+        rrb.Spatial2DView(
+            origin="plan_of_drive",
+            name="Plan of the drive (m, north up)",
+            background=STRIP_PAPER,
+        ),
         _map("/map/**"),
         active_tab=0,
     )
@@ -233,17 +259,31 @@ def _drive_layout(
     if has_about:
         page = rrb.TextDocumentView(origin="about", name="What was recorded")
         side = rrb.Vertical(page, places)
-    # A crossing is on both timelines, a drive has no chainage: Rerun shows one timeline at a time.
-    name = f"Whole drive (choose the timeline {TIME})" if has_results else "Recording"
-    return rrb.Horizontal(side, rrb.Vertical(*plots), column_shares=[2, 3], name=name)
+    if not has_results:
+        return rrb.Horizontal(side, rrb.Vertical(*plots), column_shares=[2, 3], name="Recording")
+    # A drive has no chainage, and Rerun shows one timeline at a time: its plots would be empty.
+    pictures = [
+        rrb.Spatial2DView(
+            origin=drive_picture(vehicle), name=f"{vehicle} over time", background=(255, 255, 255)
+        )
+        for vehicle in channels
+    ]
+    signals = rrb.Vertical(*plots, name=f"All samples (timeline {TIME})")
+    drawn = rrb.Tabs(*pictures, signals, active_tab=0)
+    return rrb.Horizontal(side, drawn, column_shares=[2, 3], name="Whole drive")
+
+
+def drive_picture(vehicle: str) -> str:
+    """Return the entity path of the picture of a truck's whole drive."""
+    return f"drive/{vehicle}/picture"
 
 
 def acceleration_plots(
     origin: str, channels: Set[str], vehicle: str = "", *, window_s: float | None = None
 ) -> list[rrb.View]:
-    """Body and axles apart: those of the axles are ten times larger. Only what the truck has.
+    """Return plots of body and axles, whose accelerations are ten times larger, for a truck.
 
-    All of it, or with `window_s` what lies so shortly before the moment that is looked at.
+    They show all samples, or with `window_s` those within so many seconds before the cursor.
     """
     plots = []
     for part, name in (("sprung", "Body"), ("unsprung", "Axle"), ("", "Other")):
@@ -257,7 +297,7 @@ def acceleration_plots(
 
 
 def _part(channel: str) -> str:
-    """By the beginning of its name what a channel is plotted with: the site file is not at hand."""
+    """Return a channel's part of the truck, from its name: the site file is not available."""
     part = channel.partition("_")[0]
     return part if part in ("sprung", "unsprung") else ""
 
@@ -268,7 +308,7 @@ def _plot(
     only: Sequence[str] | None = None,
     window_s: float | None = None,
 ) -> rrb.View:
-    """A plot of all of a series, not only of what lies before the time cursor, or of a window."""
+    """Return a plot of a whole series, not only of its part before the cursor, or of a window."""
     start = end = rrb.TimeRangeBoundary.infinite()
     timelines = [TIME, CHAINAGE]
     if window_s is not None:
@@ -283,7 +323,7 @@ def _plot(
         name=name,
         time_ranges=shown,
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end)),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
     )
 
 
@@ -295,10 +335,10 @@ def bridge_places(
     coloured: bool,
     name: str | None = None,
 ) -> rrb.Container | rrb.View:
-    """The plan of a bridge and beside it the map, which needs a network for its background.
+    """Lay out the plan of a bridge and the map, whose background needs a network.
 
-    With the root of a crossing the truck is that of this crossing, and so are the elements, if it
-    has any. They are `coloured` if something is known of them.
+    With the root of a crossing, truck and elements are those of this crossing. Elements are
+    `coloured` if their EI is known.
     """
     own = [f"/{root}/map"] if root is not None and has_elements else ["/map/bridge/**"]
     own += ["/map/position/**"] if root is None else [f"/{root}/position"]
@@ -315,7 +355,8 @@ def bridge_places(
     view = rrb.Spatial2DView(
         origin="/",
         contents=[*around, *drawn],
-        name=f"Plan (m), EI: {RATIO_LEGEND}" if coloured else "Plan (m)",
+        name=f"Plan (m), {RATIO_LEGEND}" if coloured else "Plan (m)",
+        background=STRIP_PAPER,
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-PLAN_MARGIN * span, (1.0 + PLAN_MARGIN) * span),
             y_range=(-0.25 * span, 0.4 * span),

@@ -1,8 +1,8 @@
-"""`driveby view live`: what travels on a bus now, in the Rerun viewer.
+"""`driveby view live`: the messages of a realm, live in the Rerun viewer.
 
-This process is a subscriber as any other and needs nothing of the worker. It serves what it draws
-to viewers: the one that it opens, and others that connect later, which get what happened before as
-far as `_KEPT` goes. Beyond it the oldest is let go of.
+This process is a subscriber as any other and needs nothing of the worker. It serves its pictures to
+the viewer that it opens, and to others that connect later, which receive the history in the limits
+of `_KEPT`; older data are dropped.
 """
 
 from __future__ import annotations
@@ -23,11 +23,16 @@ from urllib.parse import quote
 import rerun as rr
 
 from schemas.site_file import load_site
-from services.bus.listening import Listening, check_listenable, elsewhere_line, listening
 from services.bus.playback import leave_at_once, stopped_by_signals
+from services.bus.realm_listener import (
+    RealmListener,
+    check_listenable,
+    open_listener,
+    other_realms_hint,
+)
 from services.common.errors import FailureError, InputError
 from services.viewer.live_layout import WAITING, waiting_blueprint
-from services.viewer.live_picture import LivePicture
+from services.viewer.live_view import LiveView
 from services.viewer.rerun_parts import log_markdown
 from services.viewer.view import check_ended_well, prepare_viewer, viewer_arguments
 
@@ -35,14 +40,14 @@ _log = logging.getLogger(__name__)
 
 APPLICATION: Final = "driveby-live"
 _KEPT: Final = "256MB"
-"""For viewers that come late."""
+"""Memory of the history for viewers that connect later."""
 _PAST_S: Final = 60.0
-"""Of what trucks measured before this command began, as far as they keep it."""
+"""Time in s of measurements before the start, as far as trucks keep them."""
 _PERIOD_S: Final = 0.5
-"""How often what has come is drawn."""
+"""Interval in s at which new data are drawn."""
 
 _TRIES: Final = 120
-"""How often it is looked whether the page is there."""
+"""Number of checks whether the page is available."""
 
 Show = Literal["window", "web"]
 
@@ -56,15 +61,15 @@ def live_command(
     show: Show | None,
     address: str,
     port: int,
-    say: Callable[[str], None],
+    print_line: Callable[[str], None],
 ) -> int:
-    """Show a realm until the viewer is closed or a signal comes; return 0.
+    """Show a realm until the viewer is closed or a signal arrives; return 0.
 
-    `show` None: only serve it. Viewers connect to `address`, at a `port` (0: any that is free).
-    Waits for the router for ever.
+    `show` None only serves it. Viewers connect to `address`, at a `port` (0: any free one). The
+    command waits for the router without limit.
 
-    InputError: a bad realm, site file or address. FailureError: the port is taken, or there is no
-    viewer or it fails.
+    Raise InputError for a bad realm, site file or address, FailureError if the port is taken, or
+    the viewer is absent or fails.
     """
     check_listenable(realm)
     known = None if site is None else load_site(site)
@@ -81,15 +86,15 @@ def live_command(
         recording.send_recording_name(realm)
         recording.send_blueprint(waiting_blueprint())
         log_markdown(recording, WAITING, f"Waiting for a router at {endpoint}.")
-        say(f"realm {realm}, live at {sink.uri}; more viewers: rerun {sink.uri}")
-        with _viewer(sink.uri, show, address, say) as viewer:
+        print_line(f"realm {realm}, live at {sink.uri}; more viewers: rerun {sink.uri}")
+        with _viewer(sink.uri, show, address, print_line) as viewer:
 
             def is_over() -> bool:
                 return stop.is_set() or _has_ended(viewer)
 
-            with listening(endpoint, tls, realm, is_over, past_s=_PAST_S) as heard:
+            with open_listener(endpoint, tls, realm, is_over, past_s=_PAST_S) as heard:
                 if heard is not None:
-                    _draw(recording, LivePicture(recording, known), heard, stop, is_over)
+                    _draw(recording, LiveView(recording, known), heard, stop, is_over)
         recording.disconnect()
     if viewer is not None and not stop.is_set():
         check_ended_well(viewer.returncode)
@@ -98,22 +103,22 @@ def live_command(
 
 def _draw(
     recording: rr.RecordingStream,
-    picture: LivePicture,
-    heard: Listening,
+    picture: LiveView,
+    heard: RealmListener,
     stop: threading.Event,
     is_over: Callable[[], bool],
 ) -> None:
-    """Draw what comes until the viewer is closed or a signal comes."""
+    """Draw new data until the viewer is closed or a signal arrives."""
     shown = ""
     while not is_over():
         for one in heard.heard():
-            picture.take(one)
+            picture.ingest(one)
             if stop.is_set():
                 return
         picture.flush()
         if picture.is_empty:
-            hint = elsewhere_line(heard.realm, heard.elsewhere)
-            page = f"# Realm {heard.realm}\n\nNobody drives yet.\n\n{hint or ''}"
+            hint = other_realms_hint(heard.realm, heard.elsewhere)
+            page = f"# Realm {heard.realm}\n\nNo trucks yet.\n\n{hint or ''}"
             if page != shown:
                 log_markdown(recording, WAITING, page)
                 shown = page
@@ -124,9 +129,9 @@ def _draw(
 
 @contextlib.contextmanager
 def _viewer(
-    uri: str, show: Show | None, address: str, say: Callable[[str], None]
+    uri: str, show: Show | None, address: str, print_line: Callable[[str], None]
 ) -> Iterator[subprocess.Popen[bytes] | None]:
-    """The viewer of a server; it ends with this."""
+    """Run the viewer of a server; end it with the context."""
     if show is None:
         yield None
         return
@@ -134,11 +139,11 @@ def _viewer(
     if show == "web":
         port = _free_port(address, 0)
         arguments[1:1] = ["--serve-web", "--web-viewer-port", str(port)]
-        # The words in its pictures are meant for a dark page.
+        # The texts in its pictures are meant for a dark page.
         page = f"http://{address}:{port}?url={quote(uri, safe='')}&theme=dark"
-        say(f"in a browser: {page}")
+        print_line(f"in a browser: {page}")
         threading.Thread(target=_open_browser, args=(page, address, port), daemon=True).start()
-    # Of a Ctrl-C this process hears, and ends the viewer.
+    # This process handles a Ctrl-C, and ends the viewer.
     with subprocess.Popen(arguments, start_new_session=True) as process:
         try:
             yield process
@@ -147,7 +152,7 @@ def _viewer(
 
 
 def _open_browser(page: str, address: str, port: int) -> None:
-    """Open a page as soon as it is served; who has no browser here has been told where it is."""
+    """Open a page as soon as it is served; its address was printed for use without a browser."""
     for _ in range(_TRIES):
         with contextlib.suppress(OSError), socket.create_connection((address, port), 1.0):
             webbrowser.open(page)
@@ -167,11 +172,11 @@ def _check_address(address: str) -> None:
             f"--listen {address}: is no IPv4 address; one of this machine is expected, as 127.0.0.1"
         ) from None
     if not ip.is_loopback:
-        _log.warning("whoever reaches %s sees what is shown: nobody is asked who they are", address)
+        _log.warning("%s is not authenticated: anyone who can reach it sees the view", address)
 
 
 def _free_port(address: str, port: int) -> int:
-    """A port at which nobody listens: Rerun takes another one's for its own without a word."""
+    """Return a free port: Rerun would accept one of another process without a message."""
     with socket.socket() as probe:
         try:
             probe.bind((address, port))

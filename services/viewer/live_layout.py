@@ -1,4 +1,4 @@
-"""The layout of the live view: where trucks are, how crossings go, what was felt and found."""
+"""The layout of the live view: positions of trucks, states of crossings, signals, results."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from services.viewer.rerun_places import BridgeOnMap
 from services.viewer.strip import STRIP_PAPER, STRIP_WIDTH
 
 WINDOW_S: Final = 60.0
-"""Of accelerations and crossings before the moment that is looked at."""
+"""Time in s of accelerations and crossings before the cursor."""
 WAITING = "waiting"
-"""Entity of the page that stands alone until something is heard."""
+"""Entity of the page shown until the first message."""
 
 
 def lane_entity(bridge: str, vehicle: str) -> str:
-    """Entity of the states of a truck's crossings of a bridge."""
+    """Return the entity of the states of a truck's crossings of a bridge."""
     return f"crossings/{_part(bridge)}/{_part(vehicle)}"
 
 
 def result_root(bridge: str) -> str:
-    """Entity path of the newest result of a bridge."""
+    """Return the entity path of the newest result of a bridge."""
     return f"latest/{_part(bridge)}"
 
 
 def trend_root(bridge: str) -> str:
-    """Entity path of what all crossings of a bridge say together, over time."""
+    """Return the entity path of the fused states of a bridge over time."""
     return f"fused/{_part(bridge)}"
 
 
 def waiting_blueprint() -> rrb.Blueprint:
-    """Before anything is heard."""
+    """Return the layout before the first message."""
     page = rrb.TextDocumentView(origin=WAITING, name="Live")
     return _blueprint(page)
 
@@ -44,8 +44,7 @@ def waiting_blueprint() -> rrb.Blueprint:
 def live_blueprint(
     trucks: Mapping[str, Set[str]], bridges: Sequence[str], on_map: Sequence[BridgeOnMap]
 ) -> rrb.Blueprint:
-    """The trucks whose channels are drawn, the bridges, and those of them of which it is known
-    where they are."""
+    """Return the layout of the drawn trucks and bridges, and of the bridges with a position."""
     columns: list[tuple[rrb.Container | rrb.View, int]] = [(_where_and_when(on_map), 4)]
     if trucks:
         columns.append((_tabs([_truck(name, known) for name, known in trucks.items()]), 4))
@@ -89,10 +88,10 @@ def _truck(vehicle: str, channels: Set[str]) -> rrb.Container:
 
 
 def _bridge(bridge: str) -> rrb.Container:
-    said = rrb.TextDocumentView(origin=f"said/{_part(bridge)}", name="Newest result")
+    wording = rrb.TextDocumentView(origin=f"said/{_part(bridge)}", name="Newest result")
     strip = rrb.Spatial2DView(
         origin=f"{result_root(bridge)}/strip",
-        name="EI along the span, of nominal, 95 % interval; road",
+        name="EI / nominal along the span, 95 % interval; road",
         background=STRIP_PAPER,
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-20.0, STRIP_WIDTH + 150.0),
@@ -102,13 +101,13 @@ def _bridge(bridge: str) -> rrb.Container:
     infinite = rrb.TimeRangeBoundary.infinite()
     trend = rrb.TimeSeriesView(
         origin=trend_root(bridge),
-        name="EI by all crossings so far, of nominal; orange: the lowest",
+        name="Fused EI / nominal over time; orange: lowest element",
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=infinite, end=infinite)),
         axis_y=rrb.ScalarAxis(range=(0.0, 1.6)),
         time_ranges=[rrb.VisibleTimeRange(TIME, start=infinite, end=infinite)],
         plot_legend=rrb.PlotLegend(visible=False),
     )
-    return rrb.Vertical(said, strip, trend, row_shares=[4, 6, 3], name=bridge)
+    return rrb.Vertical(wording, strip, trend, row_shares=[4, 6, 3], name=bridge)
 
 
 def _tabs(parts: Sequence[rrb.Container | rrb.View]) -> rrb.Container | rrb.View:

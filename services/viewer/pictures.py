@@ -1,4 +1,4 @@
-"""A folder of pictures: every crossing and every bridge of results, as PNG and as SVG."""
+"""A folder of figures: every crossing and every bridge of results, as PNG and as SVG."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from schemas.results import Results
 from schemas.site import Site
 from services.common.files import make_folder
-from services.common.progress import Steps, unwatched_steps
+from services.common.progress import Steps, no_step_progress
 from services.viewer.bridge_figure import bridge_figure
 from services.viewer.bridge_view import views_of_bridges
 from services.viewer.crossing_view import view_of_crossing
@@ -16,12 +16,12 @@ FORMS = ("png", "svg")
 
 
 def write_pictures(
-    folder: Path, results: Results, site: Site, progress: Steps = unwatched_steps
+    folder: Path, results: Results, site: Site, progress: Steps = no_step_progress
 ) -> list[Path]:
     """Write `CROSSING.png`, `BRIDGE.png` and the same as `.svg`; return them.
 
-    The folder is made if it is not there, files of these names are replaced. `progress` is told of
-    each picture.
+    The folder is created if absent, files of these names are replaced. `progress` is called for
+    each figure.
     """
     make_folder(folder)
     bridges = views_of_bridges(results, site)
@@ -44,5 +44,5 @@ def write_pictures(
 
 
 def _file_name(crossing_id: str) -> str:
-    """A results file may be anybody's: its names are no paths."""
+    """Return a safe file name: a results file of unknown origin must not name paths."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", crossing_id).lstrip(".")[:200] or "crossing"

@@ -1,30 +1,32 @@
-"""What a recording holds, before anything in it is identified: a page and the crossings in it."""
+"""The contents of a recording before any identification: a page, and its crossings."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 
-from schemas.results import Crossing
+from schemas.results import CrossingResult
 from schemas.site import Site
-from services.drives.survey import Survey, Truck
-from services.identification.bridges import Passing
-from services.identification.placed import sensors_in_words
-from services.identification.stays import MERGE_S, Passage
-from services.viewer.crossing_view import PassingView
+from services.catalogue.contents import RecordingSummary, TruckSummary
+from services.finding.bridges import DetectedCrossing
+from services.finding.placed import sensors_in_words
+from services.finding.stays import MERGE_S, Passage
+from services.viewer.crossing_view import DetectedCrossingView
 
 MOST_SHOWN = 12
-"""Crossings that have a tab of their own; the newest of more."""
+"""Maximum number of crossings with a tab of their own, the newest ones."""
 _MOST_GAPS = 8
 _S = 1e-9
 
 
-def passings_of_survey(found: Survey, identified: Iterable[Crossing] = ()) -> list[PassingView]:
-    """The crossings that were seen and not identified, the newest; in order of time."""
+def detected_views(
+    found: RecordingSummary, identified: Iterable[CrossingResult] = ()
+) -> list[DetectedCrossingView]:
+    """Return the newest crossings that were detected and not identified, in order of time."""
     if found.site is None:
         return []
     done = [(c.vehicle, c.bridge, c.entry_time) for c in identified]
-    wheelbase = {vehicle.id: vehicle.wheelbase_m for vehicle in found.site.vehicles}
+    wheelbase = {vehicle.id: vehicle.length_m for vehicle in found.site.vehicles}
     views = []
     for one in found.passings:
         entry, leave = one.entry_ns * _S, one.exit_ns * _S
@@ -36,12 +38,14 @@ def passings_of_survey(found: Survey, identified: Iterable[Crossing] = ()) -> li
             continue
         span = found.site.bridge(one.bridge).span_m
         speed = (span + wheelbase[one.vehicle]) / (leave - entry)
-        views.append(PassingView(one.vehicle, one.bridge, one.forward, entry, leave, speed, span))
+        views.append(
+            DetectedCrossingView(one.vehicle, one.bridge, one.forward, entry, leave, speed, span)
+        )
     return views[-MOST_SHOWN:]
 
 
-def recording_page(found: Survey) -> str:
-    """Trucks, bridges, crossings and gaps of a recording, as Markdown."""
+def recording_page(found: RecordingSummary) -> str:
+    """Return trucks, bridges, crossings and gaps of a recording, as Markdown."""
     seconds = (found.last_ns - found.first_ns) * _S
     lines = [f"# {found.path.name}", ""]
     lines += [f"{_moment(found.first_ns)} UTC, {_length(seconds)}{_state(found)}.", ""]
@@ -66,11 +70,11 @@ def recording_page(found: Survey) -> str:
         ]
         if len(found.gaps) > _MOST_GAPS:
             lines.append(f"- and {len(found.gaps) - _MOST_GAPS} more")
-    lines += ["", f"What was measured, not what it means: `driveby identify {found.path.name}`."]
+    lines += ["", f"Measurements only; to interpret them: `driveby identify {found.path.name}`."]
     return "\n".join(lines)
 
 
-def _crossings(passings: Sequence[Passing]) -> Iterator[str]:
+def _crossings(passings: Sequence[DetectedCrossing]) -> Iterator[str]:
     yield f"**Crossings seen: {len(passings)}**" if passings else "No crossing of a known bridge."
     yield ""
     for one in passings[-MOST_SHOWN:]:
@@ -82,7 +86,7 @@ def _crossings(passings: Sequence[Passing]) -> Iterator[str]:
         yield f"- and {len(passings) - MOST_SHOWN} earlier"
 
 
-def _truck(truck: Truck) -> str:
+def _truck(truck: TruckSummary) -> str:
     rates = truck.channel_rates_hz
     hertz = ", ".join(f"{rate:g} Hz" for rate in sorted(set(rates.values())))
     channels = f"{len(rates)} accelerometers at {hertz}" if rates else "no accelerometers"
@@ -91,15 +95,15 @@ def _truck(truck: Truck) -> str:
     return f"Truck **{truck.vehicle}** ({truck.realm}): {channels}{lost}"
 
 
-def _sensors(truck: Truck, site: Site | None) -> list[str]:
-    """Places of the sensors, of a truck that names its own."""
+def _sensors(truck: TruckSummary, site: Site | None) -> list[str]:
+    """Return the positions of the sensors of a truck that names its own."""
     if site is None:
         return []
     known = (vehicle for vehicle in site.vehicles if vehicle.id == truck.vehicle)
     return [line for vehicle in known for line in sensors_in_words(site.sensor, vehicle)]
 
 
-def _state(found: Survey) -> str:
+def _state(found: RecordingSummary) -> str:
     cut = ", **cut off**" if found.info.truncated else ""
     damaged = found.info.damaged_chunks
     return f"{cut}, **{damaged} damaged places**" if damaged else cut

@@ -1,7 +1,6 @@
-"""What a Rerun file holds of one crossing: what was found, what it was found from, how sure it is.
+"""One crossing in a Rerun file: result, evidence, uncertainty.
 
-Rerun has no plot of y over x: what stands along the span is drawn as lines and pictures.
-
+Rerun has no plot of y over x: data along the span are drawn as lines and pictures.
 Longer than other modules, because each of its many views is a dozen lines, and no other room uses
 any of them.
 """
@@ -17,22 +16,22 @@ from services.common.geodesy import bridge_frame, to_chainage
 from services.identification.comparison import Comparison, Estimate
 from services.viewer.crossing_view import (
     VEHICLE_COLOURS,
+    CrossingSpan,
     CrossingView,
     FloatArray,
-    OnBridge,
     comparison_of,
+    describe_crossing,
     summary_line,
-    told_of_crossing,
 )
-from services.viewer.deflection import Passage, passage_of
-from services.viewer.layout import ENDS, LEARNED_ROW, crossing_root, is_doubtful
-from services.viewer.learned import Learned, learned_of
+from services.viewer.deflection import DeflectionFrames, deflection_frames
+from services.viewer.layout import ENDS, PRIOR_POSTERIOR_ROW, crossing_root, is_doubtful
+from services.viewer.prior_posterior import PriorPosterior, prior_posterior_rows
 from services.viewer.rerun_parts import (
     BASELINE,
     MUTED,
     WEAK,
     IntArray,
-    Stream,
+    RerunStream,
     chainage_column,
     channel_colour,
     columns_of,
@@ -66,25 +65,25 @@ Channels = Mapping[str, tuple[IntArray, FloatArray]]
 
 WINDOW_S = 1.0  # of accelerations before the entry and after the exit that a crossing shows
 _BENT_SHARE = 0.06
-"""Of the span, as which the largest deflection is drawn."""
+"""Height of the largest deflection in the drawing, as a share of the span."""
 
 
 def log_crossing(
-    recording: Stream,
+    recording: RerunStream,
     crossing: CrossingView,
     bridge: BridgeOnMap | None,
     signals: VehicleSignals | None,
     channels: Channels,
     baseline: Estimate | None = None,
 ) -> None:
-    """Everything of one crossing, below its root; `bridge` is where it is, if that is known."""
+    """Log everything of one crossing below its root; `bridge` is its position, if known."""
     root = crossing_root(crossing)
     compared = comparison_of(crossing, baseline)
     log_markdown(recording, f"{root}/verdict", verdict_markdown(crossing, compared))
     log_rigidity(recording, root, crossing, compared, baseline)
-    _log_learned(recording, root, crossing, compared)
+    _log_prior_posterior(recording, root, crossing, compared)
     log_residuals(recording, root, crossing)
-    passage = passage_of(crossing)
+    passage = deflection_frames(crossing)
     if passage is not None:
         _log_passage(recording, root, crossing, passage)
     if bridge is not None:
@@ -103,17 +102,16 @@ def log_crossing(
         _log_road(recording, root, crossing)
 
 
-def front_axle_chainage(crossing: OnBridge, time_s: FloatArray) -> FloatArray:
-    """Chainage (m) of the front axle at the crossing's mean speed: for display, not for numbers."""
+def front_axle_chainage(crossing: CrossingSpan, time_s: FloatArray) -> FloatArray:
+    """Return the front axle's chainage (n,), m, at the mean speed: for display only."""
     travelled = crossing.speed_m_per_s * (time_s - crossing.entry_time_s)
     return travelled if crossing.forward else crossing.span_m - travelled
 
 
-def log_acceleration(recording: Stream, root: str, crossing: OnBridge, channels: Channels) -> None:
-    """The accelerations while the truck was on the bridge, and a second around, on both timelines.
-
-    Nothing of a crossing of which there are no samples.
-    """
+def log_acceleration(
+    recording: RerunStream, root: str, crossing: CrossingSpan, channels: Channels
+) -> None:
+    """Log the accelerations of a stay ± 1 s on both timelines; nothing without samples."""
     first_ns = round((crossing.entry_time_s - WINDOW_S) * 1e9)
     last_ns = round((crossing.exit_time_s + WINDOW_S) * 1e9)
     for channel, (time_ns, samples) in channels.items():
@@ -131,15 +129,15 @@ def log_acceleration(recording: Stream, root: str, crossing: OnBridge, channels:
         _log_ends(recording, f"{root}/acceleration/{ENDS}", crossing)
 
 
-def _log_ends(recording: Stream, entity: str, crossing: OnBridge) -> None:
-    """When the first axle came onto the bridge and the last one left it.
+def _log_ends(recording: RerunStream, entity: str, crossing: CrossingSpan) -> None:
+    """Log when the first axle came onto the bridge and the last one left it.
 
-    Triangles on the line of zero, for a plot has no vertical lines (Rerun 0.41).
+    The marks are triangles on the zero line, as a plot has no vertical lines (Rerun 0.41).
     """
     recording.log(
         entity,
         rr.SeriesPoints(
-            colors=[rgb("#E8EAED")],
+            colors=[rgb(MUTED)],
             markers=["up"],
             marker_sizes=[6.0],
             names="on, off the bridge",
@@ -155,13 +153,13 @@ def _log_ends(recording: Stream, entity: str, crossing: OnBridge) -> None:
 
 
 def log_position(
-    recording: Stream,
+    recording: RerunStream,
     root: str,
-    crossing: OnBridge,
+    crossing: CrossingSpan,
     signals: VehicleSignals,
     bridge: BridgeOnMap | None,
 ) -> None:
-    """The truck on map and plan, also when the timeline is the chainage."""
+    """Log the truck on map and plan, also for the timeline of the chainage."""
     fixes = [
         fix
         for fix in signals.gnss
@@ -187,13 +185,13 @@ def log_position(
 
 
 def log_rigidity(
-    recording: Stream,
+    recording: RerunStream,
     root: str,
     crossing: CrossingView,
     compared: Comparison | None,
     baseline: Estimate | None,
 ) -> None:
-    """EI of each element as bars, and as a strip along the span; nothing of a rejected crossing."""
+    """Log EI of each element as bars, and as a strip along the span; nothing if rejected."""
     if crossing.rigidity_nm2 is None:
         return
     edges = crossing.element_edges_m
@@ -203,7 +201,7 @@ def log_rigidity(
         f"{root}/rigidity",
         rr.BarChart(
             crossing.rigidity_nm2 / 1e9,
-            abscissa=edges[:-1] + 0.05 * lengths,  # Rerun wants where a bar begins
+            abscissa=edges[:-1] + 0.05 * lengths,  # Rerun expects the beginning of a bar
             widths=0.9 * lengths,
             color=rgb(MUTED if doubtful else VEHICLE_COLOURS["front"]),
         ),
@@ -239,14 +237,14 @@ def log_rigidity(
 
 
 def _log_whiskers(
-    recording: Stream,
+    recording: RerunStream,
     entity: str,
     across: FloatArray,
     tips: FloatArray,
     limits: tuple[FloatArray, FloatArray],
     top: float,
 ) -> None:
-    """Intervals; one that goes beyond the strip has no bar at that end."""
+    """Draw intervals; one that exceeds the strip has no bar at that end."""
     low, high = limits
     rows = np.stack((strip_row(low, top), strip_row(high, top)), axis=1)
     strips = [[(x, bottom), (x, end)] for x, (bottom, end) in zip(across, rows, strict=True)]
@@ -262,14 +260,14 @@ def _log_whiskers(
 
 
 def _log_level(
-    recording: Stream,
+    recording: RerunStream,
     entity: str,
     edges_m: FloatArray,
     rows: FloatArray,
     name: str,
     colour: str,
 ) -> None:
-    """A line across the strip, at a height for each element."""
+    """Draw a line across the strip, at a height for each element."""
     x = np.repeat(edges_m, 2)[1:-1] * STRIP_WIDTH / edges_m[-1]
     recording.log(
         entity,
@@ -284,21 +282,21 @@ def _log_level(
     log_labels(recording, f"{entity}/name", [name], beside, last, colour=colour)
 
 
-def _log_learned(
-    recording: Stream, root: str, crossing: CrossingView, compared: Comparison | None
+def _log_prior_posterior(
+    recording: RerunStream, root: str, crossing: CrossingView, compared: Comparison | None
 ) -> None:
-    """A line for each unknown: its prior, wide and grey, and on it what is known now."""
-    rows = learned_of(crossing.parameters) if crossing.interval_has_meaning else []
+    """Draw a line for each parameter: its prior, wide and grey, and its posterior on top."""
+    rows = prior_posterior_rows(crossing.parameters) if crossing.interval_has_meaning else []
     if not rows:
         return
     weak = set() if compared is None else {f"EI_{element.number}" for element in compared.weak}
     doubtful = is_doubtful(crossing)
 
-    def colour(row: Learned) -> tuple[int, int, int]:
+    def colour(row: PriorPosterior) -> tuple[int, int, int]:
         plain = WEAK if row.name in weak else "#56B4E9"
         return rgb("#d5d9dd" if doubtful else plain)
 
-    down: FloatArray = LEARNED_ROW * np.arange(len(rows), dtype=np.float64)
+    down: FloatArray = PRIOR_POSTERIOR_ROW * np.arange(len(rows), dtype=np.float64)
     recording.log(
         f"{root}/learned/prior",
         rr.LineStrips2D(
@@ -336,16 +334,18 @@ def _log_learned(
         ),
         static=True,
     )
-    up = down - 0.2  # a label stands below its place
+    up = down - 0.2  # a label is drawn below its point
     names = [row.name for row in rows]
     log_labels(recording, f"{root}/learned/name", names, np.full(len(rows), -2.9), up)
     shares = [f"{100.0 * row.share:.2g} % of prior" for row in rows]
     log_labels(recording, f"{root}/learned/share", shares, np.full(len(rows), 3.3), up)
 
 
-def _log_passage(recording: Stream, root: str, crossing: CrossingView, passage: Passage) -> None:
-    """The truck over the bending bridge, a picture for each place of the front axle."""
-    assert crossing.rigidity_nm2 is not None  # noqa: S101 - there is no passage without
+def _log_passage(
+    recording: RerunStream, root: str, crossing: CrossingView, passage: DeflectionFrames
+) -> None:
+    """Draw the truck on the deflected bridge, a picture for each position of the front axle."""
+    assert crossing.rigidity_nm2 is not None  # noqa: S101 - otherwise there are no frames
     span = crossing.span_m
     enlarged = _BENT_SHARE * span / max(passage.largest_m, 1e-9)
     chainage = passage.front_m
@@ -363,8 +363,8 @@ def _log_passage(recording: Stream, root: str, crossing: CrossingView, passage: 
         x = passage.x_m[piece]
         strips = [[np.column_stack((x, -enlarged * bent[piece]))] for bent in passage.deflection_m]
         element = f"{entity}/bridge/EI_{n + 1}"
-        look = rr.LineStrips2D.from_fields(colors=[colour], radii=rr.Radius.ui_points(3.0))
-        recording.log(element, look, static=True)
+        style = rr.LineStrips2D.from_fields(colors=[colour], radii=rr.Radius.ui_points(3.0))
+        recording.log(element, style, static=True)
         recording.send_columns(
             element, columns, rr.LineStrips2D.columns(strips=[s[0] for s in strips])
         )
@@ -391,7 +391,7 @@ def _log_passage(recording: Stream, root: str, crossing: CrossingView, passage: 
 
 
 def _body(front: FloatArray, rear: FloatArray, wheel: float) -> FloatArray:
-    """The outline of a truck on two axles, closed: cab over the front one."""
+    """Return the outline of a two-axle truck, closed, with the cab over the front axle."""
     along = front - rear
     up = np.array([0.0, -wheel])
 
@@ -403,13 +403,13 @@ def _body(front: FloatArray, rear: FloatArray, wheel: float) -> FloatArray:
 
 
 def _log_scene(
-    recording: Stream,
+    recording: RerunStream,
     entity: str,
     crossing: CrossingView,
-    passage: Passage,
+    passage: DeflectionFrames,
     enlarged: float,
 ) -> None:
-    """What stands still: the unbent line, the road before and behind, bearings, the scale."""
+    """Draw the static parts: undeflected line, road on both sides, bearings, scale."""
     span = crossing.span_m
     supports = (0.0, *crossing.interior_supports_m, span)
     side = 0.025 * span
@@ -436,11 +436,11 @@ def _log_scene(
         ),
         static=True,
     )
-    said = f"at most {1e3 * passage.largest_m:.2g} mm, drawn {enlarged:.0f} times larger"
-    log_labels(recording, f"{entity}/scale", [said], np.array([span / 2]), np.array([0.085 * span]))
+    text = f"at most {1e3 * passage.largest_m:.2g} mm, drawn {enlarged:.0f} times larger"
+    log_labels(recording, f"{entity}/scale", [text], np.array([span / 2]), np.array([0.085 * span]))
 
 
-def _log_road(recording: Stream, root: str, crossing: CrossingView) -> None:
+def _log_road(recording: RerunStream, root: str, crossing: CrossingView) -> None:
     road = crossing.road
     if road is None:
         return
@@ -450,7 +450,7 @@ def _log_road(recording: Stream, root: str, crossing: CrossingView) -> None:
     )
     for wheel, height_m in (("front", road.front_m), ("rear", road.rear_m)):
         entity = f"{root}/road/{wheel}"
-        # The two lie on one another: the one drawn first is wider, so that both are seen.
+        # The two lines coincide: the one drawn first is wider, so that both are visible.
         width = 3.5 if wheel == "front" else 1.2
         log_line(recording, entity, f"{wheel} wheel", VEHICLE_COLOURS[wheel], width=width)
         send_scalars(recording, entity, height_m * 1e3, time_ns=time_ns, chainage_m=road.x_m)
@@ -464,18 +464,18 @@ def _log_road(recording: Stream, root: str, crossing: CrossingView) -> None:
 
 
 def verdict_markdown(crossing: CrossingView, compared: Comparison | None = None) -> str:
-    """The verdict with its reasons, what was found, and a table of all parameters, as Markdown."""
+    """Return verdict, reasons, result and a table of all parameters, as Markdown."""
     lines = [f"# {crossing.verdict.capitalize()}", ""]
     if crossing.verdict == "suspect":
-        lines += ["**Doubtful: to be looked at, not to be relied upon.**", ""]
+        lines += ["**Doubtful. Do not rely on these values.**", ""]
     lines += [summary_line(crossing), ""]
     lines += [f"- {text}" for text in crossing.reason_texts]
     if crossing.rigidity_nm2 is None:
         return "\n".join([*lines, "", "No estimate is given for a rejected crossing."])
-    said = told_of_crossing(crossing, compared)
-    if said:
-        lines += ["", " ".join(said)]
-    lines += ["", "| | estimate | 95 % interval | ratio to nominal |", "|---|---|---|---|"]
+    wording = describe_crossing(crossing, compared)
+    if wording:
+        lines += ["", " ".join(wording)]
+    lines += ["", "| | estimate | 95 % interval | ratio |", "|---|---|---|---|"]
     for index, value in enumerate(crossing.rigidity_nm2):
         interval = "–"
         if crossing.interval_nm2 is not None and crossing.interval_has_meaning:

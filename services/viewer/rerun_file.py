@@ -1,7 +1,7 @@
-"""A Rerun recording of a drive: accelerations, tracks on map and plan, and what was found.
+"""A Rerun file of a drive: accelerations, tracks on map and plan, and results.
 
-Two timelines: `time` (UTC) and `chainage_mm` (front axle, from the start of the bridge). Rerun
-draws one timeline at a time, so what belongs to a crossing is there on both.
+There are two timelines: `time` (UTC) and `chainage_mm` (front axle, from the start of the bridge).
+Rerun draws one timeline at a time, so the data of a crossing are on both.
 """
 
 from __future__ import annotations
@@ -13,17 +13,30 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import rerun as rr
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from schemas.signals import AccelBatch
 from services.common.files import replaced_atomically
-from services.common.progress import Steps, unwatched_steps
+from services.common.progress import Steps, no_step_progress
 from services.drives.signals import series_of_batches
 from services.viewer.bridge_figure import draw_bridge
-from services.viewer.bridge_view import BridgeView, told
-from services.viewer.crossing_view import CrossingView, FloatArray, OnBridge, PassingView
+from services.viewer.bridge_view import BridgeView, describe_bridge, origin_of
+from services.viewer.crossing_view import (
+    CrossingSpan,
+    CrossingView,
+    DetectedCrossingView,
+    FloatArray,
+)
 from services.viewer.drawing import STYLE, figure_bytes
-from services.viewer.layout import blueprint, bridge_root, passing_root
+from services.viewer.drive_figure import draw_drive
+from services.viewer.layout import (
+    blueprint,
+    bridge_root,
+    drive_picture,
+    passing_root,
+    when_and_where,
+)
 from services.viewer.rerun_crossing import (
     WINDOW_S,
     Channels,
@@ -51,21 +64,21 @@ from services.viewer.vehicle_signals import VehicleSignals
 
 APPLICATION = "driveby"
 _PIECE = 2000
-"""Batches that are sent at a time."""
+"""Number of batches sent at a time."""
 _PICTURE_DPI = 110
-"""A picture that is larger than its view is drawn without smoothing, and cannot be read."""
+"""Resolution of figures: one larger than its view is drawn without smoothing, illegibly."""
 
 
 class _Count:
-    """How many steps have been done."""
+    """Counter of the steps done."""
 
-    def __init__(self, told: Steps, steps: int) -> None:
-        self._told, self._steps, self._done = told, steps, 0
-        told(0, steps)
+    def __init__(self, describe_bridge: Steps, steps: int) -> None:
+        self._report, self._steps, self._done = describe_bridge, steps, 0
+        describe_bridge(0, steps)
 
     def one_more(self) -> None:
         self._done += 1
-        self._told(self._done, self._steps)
+        self._report(self._done, self._steps)
 
 
 def write_rrd(
@@ -75,17 +88,17 @@ def write_rrd(
     bridges: Sequence[BridgeOnMap],
     crossings: Sequence[CrossingView],
     overviews: Sequence[BridgeView] = (),
-    passings: Sequence[PassingView] = (),
+    passings: Sequence[DetectedCrossingView] = (),
     about: str | None = None,
-    drawing: Steps = unwatched_steps,
+    drawing: Steps = no_step_progress,
 ) -> None:
-    """Write a Rerun recording with its own layout; an existing file is replaced as a whole.
+    """Write a Rerun file with its own layout; an existing file is replaced as a whole.
 
     `overviews` are the bridges' states with all their crossings, and come first. `vehicles` are the
-    signals by vehicle identifier. A crossing's accelerations are looked up in the signals of its
-    vehicle; one without any, or with fewer channels, is drawn with what it has. `passings` are
-    stays on a bridge that nobody has identified; `about` says in Markdown what was recorded.
-    `drawing` is told of each crossing, and of each piece of accelerations.
+    signals by vehicle identifier. A crossing's accelerations are taken from the signals of its
+    vehicle; one without any, or with fewer channels, is drawn with those it has. `passings` are
+    stays that were not identified; `about` is a page on the recording in Markdown. `drawing` is
+    called for each crossing, and each block of accelerations.
     """
     near = bridges_near_tracks(bridges, vehicles.values())
     default = blueprint(vehicles, crossings, overviews, passings, bridges=near, about=about)
@@ -107,6 +120,8 @@ def write_rrd(
         for vehicle, signals in vehicles.items():
             log_vehicle(recording, vehicle, signals.gnss)
             _log_accelerations(recording, vehicle, signals, drawn)
+            if overviews or crossings:
+                _log_drive(recording, vehicle, signals, (*crossings, *passings))
         for view in overviews:
             _log_overview(recording, view)
         for crossing in crossings:
@@ -121,20 +136,16 @@ def write_rrd(
             )
             drawn.one_more()
         for passing in passings:
-            root = passing_root(passing)
-            around = _series_around(passing, vehicles.get(passing.vehicle))
-            log_acceleration(recording, root, passing, around)
-            if passing.vehicle in vehicles:
-                place = places.get(passing.bridge)
-                log_position(recording, root, passing, vehicles[passing.vehicle], place)
+            place = places.get(passing.bridge)
+            _log_passing(recording, passing, vehicles.get(passing.vehicle), place)
         recording.flush()
 
 
 def acceleration_series(batches: Sequence[AccelBatch]) -> dict[str, tuple[IntArray, FloatArray]]:
-    """Join batches into one series per channel: wall time (ns) and acceleration (m/s²).
+    """Join batches into one series per channel: wall time (ns) and acceleration (m/s²), (n,).
 
-    A NaN stands in every gap longer than one and a half samples: a plot then breaks its line there
-    instead of drawing an acceleration that nobody measured.
+    A NaN is inserted into every gap longer than one and a half samples: a plot then breaks its line
+    there instead of drawing values that were not measured.
     """
     marked = {}
     for name, (times, samples) in series_of_batches(batches).items():
@@ -151,10 +162,10 @@ def acceleration_series(batches: Sequence[AccelBatch]) -> dict[str, tuple[IntArr
 def _log_accelerations(
     recording: rr.RecordingStream, vehicle: str, signals: VehicleSignals, drawn: _Count
 ) -> None:
-    """All samples, a piece at a time: an hour at once takes a gigabyte more."""
+    """Log all samples, a block at a time: an hour at once takes a gigabyte more."""
     named: set[str] = set()
     for first in range(0, len(signals.accel), _PIECE):
-        # With the batch before it, so that a gap between two pieces is one, too.
+        # Include the previous batch, so that a gap between two blocks counts as one, too.
         before = first - 1 if first else 0
         piece = signals.accel[before : first + _PIECE]
         for channel, (time_ns, samples) in acceleration_series(piece).items():
@@ -168,8 +179,8 @@ def _log_accelerations(
         drawn.one_more()
 
 
-def _series_around(passage: OnBridge, signals: VehicleSignals | None) -> Channels:
-    """Accelerations while a truck was on a bridge, and somewhat more."""
+def _series_around(passage: CrossingSpan, signals: VehicleSignals | None) -> Channels:
+    """Return the accelerations around a stay on a bridge."""
     if signals is None:
         return {}
     first_ns = (passage.entry_time_s - 2.0 * WINDOW_S) * 1e9
@@ -178,14 +189,14 @@ def _series_around(passage: OnBridge, signals: VehicleSignals | None) -> Channel
 
 
 def _recording_id(crossings: Sequence[CrossingView]) -> str:
-    """The same for the same crossings, so that writing anew replaces what a viewer has open."""
+    """Return the same id for the same crossings, so that a viewer replaces an open file."""
     return "_".join(crossing.crossing_id for crossing in crossings) or "drive"
 
 
 def _log_state(
     recording: rr.RecordingStream, bridge: BridgeOnMap, state: BridgeView | None
 ) -> None:
-    """The bridge on map and plan, with the colours of what is known of it."""
+    """Draw the bridge on map and plan, in the colours of its relative EI."""
     ratios = None
     if state is not None and state.estimate is not None:
         ratios = state.estimate.mean / state.nominal_nm2
@@ -201,22 +212,56 @@ def _log_state(
 
 
 def _log_overview(recording: rr.RecordingStream, bridge: BridgeView) -> None:
-    with matplotlib.rc_context(STYLE):
-        drawn = imread(io.BytesIO(figure_bytes(draw_bridge(bridge), "png", dpi=_PICTURE_DPI)))
     root = bridge_root(bridge)
-    pixels = np.rint(255.0 * drawn[:, :, :3]).astype(np.uint8)
-    # Not as PNG: such a picture is not drawn at all while the chainage is negative (Rerun 0.41).
-    recording.log(f"{root}/picture", rr.Image(pixels), static=True)
-    said = "None of the crossings could be used."
+    with matplotlib.rc_context(STYLE):
+        figure = draw_bridge(bridge)
+    _log_picture(recording, f"{root}/picture", figure)
+    wording = "None of the crossings could be used."
     if bridge.estimate is not None:
-        said = " ".join(told(bridge))
-    doubt = "**Doubtful: to be looked at, not to be relied upon.** " if bridge.is_doubtful else ""
-    lines = [f"# {bridge.owner_id or bridge.bridge}", "", f"{doubt}{said}", ""]
+        wording = " ".join((*describe_bridge(bridge), origin_of(bridge))).strip()
+    doubt = "**Doubtful. Do not rely on these values.** " if bridge.is_doubtful else ""
+    lines = [f"# {bridge.owner_id or bridge.bridge}", "", f"{doubt}{wording}", ""]
     verdicts = [crossing.verdict for crossing in bridge.crossings]
     counted = [f"{verdicts.count(v)} {v}" for v in dict.fromkeys(sorted(verdicts))]
     lines += [f"Crossings: {', '.join(counted)}; used: {len(bridge.used)}.", ""]
     of_state = () if bridge.state is None else bridge.state.reason_texts
-    of_crossings = (text for c in bridge.crossings for text in c.reason_texts)
-    reasons = dict.fromkeys((*of_state, *of_crossings))
-    lines += [f"- {text}" for text in reasons]
+    lines += [f"- {text}" for text in of_state]
+    for crossing in bridge.crossings:
+        used = "used" if crossing.crossing_id in bridge.used else "not used"
+        which = f"{when_and_where(crossing)}, {crossing.verdict}, {used}"
+        lines += [f"- {which}: {text}" for text in crossing.reason_texts]
     log_markdown(recording, f"{root}/finding", "\n".join(lines))
+
+
+def _log_passing(
+    recording: rr.RecordingStream,
+    passing: DetectedCrossingView,
+    signals: VehicleSignals | None,
+    place: BridgeOnMap | None,
+) -> None:
+    """Log accelerations and position of a stay that was not identified."""
+    root = passing_root(passing)
+    log_acceleration(recording, root, passing, _series_around(passing, signals))
+    if signals is not None:
+        log_position(recording, root, passing, signals, place)
+
+
+def _log_drive(
+    recording: rr.RecordingStream,
+    vehicle: str,
+    signals: VehicleSignals,
+    crossings: Sequence[CrossingView | DetectedCrossingView],
+) -> None:
+    """Log the picture of a whole drive, which no timeline empties."""
+    own: list[CrossingSpan] = []
+    own += [one for one in crossings if one.vehicle == vehicle]
+    with matplotlib.rc_context(STYLE):
+        figure = draw_drive(vehicle, signals, own)
+    _log_picture(recording, drive_picture(vehicle), figure)
+
+
+def _log_picture(recording: rr.RecordingStream, entity: str, figure: Figure) -> None:
+    """Log a figure as pixels: a PNG is not drawn while the chainage is negative (Rerun 0.41)."""
+    drawn = imread(io.BytesIO(figure_bytes(figure, "png", dpi=_PICTURE_DPI)))
+    pixels = np.rint(255.0 * drawn[:, :, :3]).astype(np.uint8)
+    recording.log(entity, rr.Image(pixels), static=True)

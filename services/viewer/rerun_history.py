@@ -1,4 +1,4 @@
-"""A bridge's past as a Rerun recording: its picture, and EI of each element over time."""
+"""A bridge's history as a Rerun file: its figure, and EI of each element over time."""
 
 import io
 import tempfile
@@ -13,9 +13,9 @@ from matplotlib.image import imread
 from numpy.typing import NDArray
 
 from services.common.files import replaced_atomically
-from services.history.past import Past
+from services.history.bridge_history import BridgeHistory
 from services.viewer.drawing import STYLE, figure_bytes
-from services.viewer.history_figure import History, draw_history, history_of
+from services.viewer.history_figure import HistoryView, draw_history, history_view
 from services.viewer.view import run_viewer
 
 _APPLICATION = "driveby"
@@ -23,13 +23,13 @@ _TIME = "date"
 _GOOD, _DOUBTFUL, _TEMPERATURE = (86, 180, 233), (150, 150, 150), (204, 121, 167)
 _DOTS_PER_INCH = 110
 _BESIDE_S = 15 * 86_400
-"""Before the first and behind the last period, so that both are seen."""
+"""Margin in s before the first and behind the last period, so that both are visible."""
 
 
-def view_history(past: Past, *, web: bool) -> int:
-    """Open a bridge's past in the viewer, or (`web`) for a browser; wait until it is closed.
+def view_history(past: BridgeHistory, *, web: bool) -> int:
+    """Open a bridge's history in the viewer or a browser (`web`); wait until it is closed.
 
-    Returns the exit code. FailureError if the viewer does not start.
+    Return the exit code. Raise FailureError if the viewer does not start.
     """
     with tempfile.TemporaryDirectory(prefix="driveby-view-") as folder:
         shown = Path(folder) / f"{past.bridge}.rrd"
@@ -37,14 +37,14 @@ def view_history(past: Past, *, web: bool) -> int:
         return run_viewer(shown, web=web)
 
 
-def write_history(path: Path, past: Past) -> None:
-    """Write the recording; an existing file is replaced."""
-    history = history_of(past)
+def write_history(path: Path, past: BridgeHistory) -> None:
+    """Write the file; an existing file is replaced."""
+    history = history_view(past)
     with replaced_atomically(path) as temporary:
         recording = rr.RecordingStream(_APPLICATION, recording_id=f"history-{history.bridge}")
         recording.save(temporary, default_blueprint=_blueprint(history))
         recording.log("picture", rr.Image(_picture(history)), static=True)
-        recording.log("alarms", rr.TextDocument(_said(history), media_type="text/markdown"),
+        recording.log("alarms", rr.TextDocument(_history_text(history), media_type="text/markdown"),
                       static=True)  # fmt: skip
         _log_elements(recording, history)
         recording.log(
@@ -58,8 +58,8 @@ def write_history(path: Path, past: Past) -> None:
         recording.disconnect()
 
 
-def _log_elements(recording: rr.RecordingStream, history: History) -> None:
-    """Lines at the ends of the interval and a point at the mean, grey where it is doubtful."""
+def _log_elements(recording: rr.RecordingStream, history: HistoryView) -> None:
+    """Log lines at the limits of the interval and a point at the mean, grey if doubtful."""
     thin = {"q025": "2.5 %", "q975": "97.5 %"}
     for n in range(_elements(history)):
         where = f"history/EI_{n + 1}"
@@ -79,29 +79,29 @@ def _log_elements(recording: rr.RecordingStream, history: History) -> None:
             recording.log(f"{where}/q975", rr.Scalars(point.high[n] / 1e9))
 
 
-def _picture(history: History) -> NDArray[np.uint8]:
-    """(height, width, 3) of the figure."""
+def _picture(history: HistoryView) -> NDArray[np.uint8]:
+    """Return the figure as an image (height, width, 3)."""
     with matplotlib.rc_context(STYLE):
         drawn = imread(io.BytesIO(figure_bytes(draw_history(history), "png", dpi=_DOTS_PER_INCH)))
     return np.rint(255.0 * drawn[:, :, :3]).astype(np.uint8)
 
 
-def _said(history: History) -> str:
+def _history_text(history: HistoryView) -> str:
     lines = [f"# {history.bridge}", ""]
     for mark in history.marks:
         state = f"noted by {mark.acknowledged}" if mark.acknowledged else "stands"
         lines.append(f"- Alarm of {datetime.fromtimestamp(mark.raised_s, UTC):%Y-%m-%d}, {state}: "
                      f"{mark.sentence}")  # fmt: skip
-    for said in history.statements:
-        lines += ["", said.text]
+    for wording in history.statements:
+        lines += ["", wording.text]
     return "\n".join(lines) + "\n"
 
 
-def _elements(history: History) -> int:
+def _elements(history: HistoryView) -> int:
     return max((len(point.mean) for point in history.points), default=0)
 
 
-def _blueprint(history: History) -> rrb.Blueprint:
+def _blueprint(history: HistoryView) -> rrb.Blueprint:
     tabs: list[rrb.View | rrb.Container] = [
         rrb.Horizontal(
             rrb.Spatial2DView(origin="picture", name="over time", background=(255, 255, 255)),

@@ -1,4 +1,4 @@
-"""What the parts of a Rerun file have in common: timelines, series, labels, colours."""
+"""Common parts of Rerun files: timelines, series, labels, colours."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from services.viewer.crossing_view import VEHICLE_COLOURS, FloatArray
 
 TIME, CHAINAGE = "time", "chainage_mm"
-"""The two timelines."""
+"""Names of the two timelines."""
 
 IntArray = NDArray[np.int64]
 Rgb = tuple[int, int, int]
 
 
-class Stream(Protocol):
-    """Where it is logged: a recording, or one that dates what it gets (`live_parts.Dated`)."""
+class RerunStream(Protocol):
+    """Destination of entities: a recording, or a `TimestampedStream` of the live view."""
 
     def log(self, entity_path: str, entity: Any, *, static: bool = False) -> None:
-        """Log one thing: for all times, or for that at which the recording is."""
+        """Log one entity: statically, or at the present time of the recording."""
 
     def send_columns(
         self, entity_path: str, indexes: Iterable[Any], columns: Iterable[Any]
@@ -40,28 +40,29 @@ _OTHER_CHANNELS = ("#0072B2", "#CC79A7", "#999999", "#44AA99", "#882255", "#DDCC
 MUTED = "#9AA5B1"
 WEAK, BASELINE = "#E69F00", "#009E73"
 UNKNOWN = "#CC79A7"
-"""Of a bridge of which nothing is known: none of the colours that say something."""
-_RATIO_COLOURS = ((0.5, (213, 94, 0)), (0.75, (240, 228, 66)), (1.0, (86, 180, 233)))
-RATIO_LEGEND = "blue 1, yellow 0.75, orange 0.5 of nominal"
+"""Colour of a bridge with unknown EI, distinct from those with a meaning."""
+_RATIO_COLOURS = ((0.8, (230, 159, 0)), (1.0, (86, 180, 233)))
+"""Colours of relative EI: from 0.8 down that of a weak element in every picture."""
+RATIO_LEGEND = "orange: EI ≤ 0.8"
 
 
 def channel_colour(channel: str) -> str:
-    """Return the colour of a channel: one of its own for the four, else one by its name."""
+    """Return the colour of a channel: a fixed one for the four, otherwise one by its name."""
     if channel in CHANNEL_COLOURS:
         return CHANNEL_COLOURS[channel]
     return _OTHER_CHANNELS[sum(channel.encode()) % len(_OTHER_CHANNELS)]
 
 
 def rgb(colour: str) -> Rgb:
-    """Red, green and blue, 0 to 255, of #RRGGBB."""
+    """Return red, green and blue, 0 to 255, of #RRGGBB."""
     red, green, blue = bytes.fromhex(colour.removeprefix("#"))
     return red, green, blue
 
 
 def ratio_colours(ratios: FloatArray | None, count: int, *, doubtful: bool) -> list[Rgb]:
-    """A colour for each of `count` elements by its ratio to nominal.
+    """Return a colour for each of `count` elements by its relative EI (n,).
 
-    Grey where doubtful, and where a ratio is NaN: not resolved.
+    It is grey where doubtful, and where a value is NaN: unresolved.
     """
     if ratios is None:
         return [rgb(UNKNOWN)] * count
@@ -77,25 +78,27 @@ def ratio_colours(ratios: FloatArray | None, count: int, *, doubtful: bool) -> l
 
 
 def time_column(time_ns: IntArray) -> rr.TimeColumn:
-    """Wall time, ns since 1970 UTC."""
+    """Return the index of wall time (n,), ns since 1970 UTC."""
     return rr.TimeColumn(TIME, timestamp=time_ns.astype("datetime64[ns]"))
 
 
 def chainage_column(chainage_m: FloatArray) -> rr.TimeColumn:
-    """Chainage of the front axle: a timeline has whole numbers, so it is in millimetres."""
+    """Return the index of the front axle's chainage (n,), in whole mm as a timeline needs."""
     return rr.TimeColumn(CHAINAGE, sequence=np.rint(1e3 * chainage_m).astype(np.int64))
 
 
 def columns_of(time_ns: IntArray, chainage_m: FloatArray | None) -> list[rr.TimeColumn]:
-    """On both timelines, or without a chainage on that of time."""
+    """Return both indexes (n,), or without a chainage that of time."""
     indexes = [time_column(time_ns)]
     if chainage_m is not None:
         indexes.append(chainage_column(chainage_m))
     return indexes
 
 
-def log_line(recording: Stream, entity: str, name: str, colour: str, *, width: float = 1.3) -> None:
-    """How the line of a time series looks."""
+def log_line(
+    recording: RerunStream, entity: str, name: str, colour: str, *, width: float = 1.3
+) -> None:
+    """Define the style of a time series' line."""
     recording.log(
         entity,
         rr.SeriesLines(
@@ -110,31 +113,31 @@ def log_line(recording: Stream, entity: str, name: str, colour: str, *, width: f
 
 
 def send_scalars(
-    recording: Stream,
+    recording: RerunStream,
     entity: str,
     values: FloatArray,
     *,
     time_ns: IntArray,
     chainage_m: FloatArray | None = None,
 ) -> None:
-    """A time series, if it has any samples."""
+    """Log a time series (n,), if it has any samples."""
     if len(values):
         indexes = columns_of(time_ns, chainage_m)
         recording.send_columns(entity, indexes, rr.Scalars.columns(scalars=values))
 
 
-def log_round_beginning(recording: Stream, entity: str, chainage_m: FloatArray) -> None:
-    """Nothing, at the last multiple of 10 m that is not above any of a series' chainages.
+def log_round_beginning(recording: RerunStream, entity: str, chainage_m: FloatArray) -> None:
+    """Clear an entity at the last multiple of 10 m below a series' chainages (n,).
 
-    Rerun counts the ticks of a plot from the first place that it has something for: they were
-    #50, #10 050 and so on for a road that begins 50 mm behind the start of the bridge.
+    Rerun counts the ticks of a plot from the first chainage with data: they were #50, #10 050 and
+    so on for a road that begins 50 mm behind the start of the bridge.
     """
     first_m = 10.0 * np.floor(np.min(chainage_m, keepdims=True).ravel() / 10.0)
     recording.send_columns(entity, [chainage_column(first_m)], rr.Scalars.columns(scalars=[np.nan]))
 
 
 def log_labels(
-    recording: Stream,
+    recording: RerunStream,
     entity: str,
     labels: Sequence[str],
     across: FloatArray,
@@ -142,7 +145,7 @@ def log_labels(
     *,
     colour: str = MUTED,
 ) -> None:
-    """Words in a 2-D view, each centred a little below its place."""
+    """Draw texts in a 2-D view, each centred a little below its point; coordinates (n,)."""
     recording.log(
         entity,
         rr.Points2D(
@@ -156,7 +159,7 @@ def log_labels(
     )
 
 
-def log_markdown(recording: Stream, entity: str, text: str) -> None:
-    """A page of text."""
+def log_markdown(recording: RerunStream, entity: str, text: str) -> None:
+    """Log a page of text."""
     document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
     recording.log(entity, document, static=True)

@@ -1,8 +1,8 @@
-"""Where bridges and trucks are, in a Rerun file: on the map, and on a plan that needs no network.
+"""Positions of bridges and trucks in a Rerun file: on the map, and on a plan without network.
 
-The map's tiles come from the internet. The plan of a bridge is drawn in the bridge's own
-coordinates, chainage across and to the left of it upwards, both in metres; that of a drive has east
-across and north upwards.
+The map's tiles come from the internet. The plan of a bridge has the bridge's own coordinates,
+chainage to the right and the left-hand side upwards, both in metres; that of a drive has east to
+the right and north upwards.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from services.viewer.rerun_parts import (
     MUTED,
     UNKNOWN,
     IntArray,
+    RerunStream,
     Rgb,
-    Stream,
     columns_of,
     log_labels,
     log_line,
@@ -34,17 +34,17 @@ from services.viewer.rerun_parts import (
 from services.viewer.vehicle_signals import VehicleSignals
 
 NEAR_M = 20_000.0
-"""A bridge and a track that one map can show."""
+"""Distance in m between a bridge and a track that one map can show."""
 M_PER_DEGREE = 111_200.0
-"""Of latitude, as a mean: for what is drawn, not for numbers."""
+"""Mean length of a degree of latitude in m, for drawing only."""
 PLAN_MARGIN = 0.3
-"""Of the span, that the plan of a bridge shows before and behind it."""
+"""Margin of the plan before and behind the bridge, as a share of the span."""
 _HALF_WIDTH = 0.02
-"""Of the span, with which the plan draws a bridge: nobody has said how wide it is."""
+"""Half width of a bridge in the plan, as a share of the span: its width is unknown."""
 
 
 class BridgeOnMap(NamedTuple):
-    """Where a bridge is: its ends are (latitude, longitude) in degrees."""
+    """Position of a bridge; its ends are (latitude, longitude) in degrees."""
 
     identifier: str
     start: tuple[float, float]
@@ -55,32 +55,32 @@ class BridgeOnMap(NamedTuple):
 
     @property
     def start_latitude_deg(self) -> float:
-        """With the three below: the ends, as a frame wants them."""
+        """Return the latitude of the start; with the three below, the ends for a frame."""
         return self.start[0]
 
     @property
     def start_longitude_deg(self) -> float:
-        """See above."""
+        """Return the longitude of the start."""
         return self.start[1]
 
     @property
     def end_latitude_deg(self) -> float:
-        """See above."""
+        """Return the latitude of the end."""
         return self.end[0]
 
     @property
     def end_longitude_deg(self) -> float:
-        """See above."""
+        """Return the longitude of the end."""
         return self.end[1]
 
     @property
     def span_m(self) -> float:
-        """Length between the outer bearings."""
+        """Return the length between the outer bearings, m."""
         return self.edges_m[-1]
 
 
 def bridges_of_site(site: Site) -> list[BridgeOnMap]:
-    """The bridges of a site file as the map draws them."""
+    """Return the bridges of a site file as drawn on the map."""
     return [
         BridgeOnMap(
             bridge.id,
@@ -96,9 +96,9 @@ def bridges_of_site(site: Site) -> list[BridgeOnMap]:
 def bridges_near_tracks(
     bridges: Sequence[BridgeOnMap], vehicles: Iterable[VehicleSignals]
 ) -> list[BridgeOnMap]:
-    """The bridges within about 20 km of where a truck was; all of them if no truck was anywhere.
+    """Return the bridges within about 20 km of a track; all of them without any track.
 
-    The map shows all that is on it: one bridge at the other end of a country, and a track is a dot.
+    The map shows everything on it: with a bridge at the other end of a country a track is a dot.
     """
     fixes = [fix for signals in vehicles for fix in signals.gnss]
     if not fixes:
@@ -112,12 +112,12 @@ def bridges_near_tracks(
 
 
 def plan_root(identifier: str) -> str:
-    """Entity path of the plan of a bridge."""
+    """Return the entity path of the plan of a bridge."""
     return f"plan/{rr.escape_entity_path_part(identifier)}"
 
 
 def log_bridge(
-    recording: Stream,
+    recording: RerunStream,
     bridge: BridgeOnMap,
     ratios: FloatArray | None,
     *,
@@ -125,10 +125,9 @@ def log_bridge(
     map_entity: str,
     plan_entity: str,
 ) -> None:
-    """The elements of a bridge on map and plan, coloured by their ratio to nominal.
+    """Draw the elements of a bridge on map and plan, coloured by their relative EI.
 
-    `ratios` (n,) is None where nothing is known of the bridge, and NaN where an element is not
-    resolved.
+    `ratios` (n,) is None where nothing is known of the bridge, and NaN for an unresolved element.
     """
     count = len(bridge.edges_m) - 1
     colours = ratio_colours(ratios, count, doubtful=doubtful)
@@ -144,18 +143,18 @@ def log_bridge(
         static=True,
     )
     if ratios is not None:
-        told = [f"{ratio:.2f}" if np.isfinite(ratio) else "?" for ratio in ratios]
-        words = [f"EI_{n} {ratio}" for n, ratio in enumerate(told, start=1)]
+        values = [f"{ratio:.2f}" if np.isfinite(ratio) else "?" for ratio in ratios]
+        words = [f"EI_{n} {ratio}" for n, ratio in enumerate(values, start=1)]
         centres = (edges[:-1] + edges[1:]) / 2.0
-        # Two rows: elements of a short bridge are narrower than words.
+        # Two rows: elements of a short bridge are narrower than their labels.
         down = half + np.where(np.arange(count) % 2 == 0, 0.0, 0.09 * bridge.span_m)
         log_labels(recording, f"{plan_entity}/name", words, centres, down)
 
 
 def log_surroundings(
-    recording: Stream, bridge: BridgeOnMap, vehicles: Mapping[str, VehicleSignals]
+    recording: RerunStream, bridge: BridgeOnMap, vehicles: Mapping[str, VehicleSignals]
 ) -> None:
-    """What the plan of a bridge has beside its elements: bearings, scale, north, and tracks."""
+    """Draw the bearings, scale, north and tracks on the plan of a bridge."""
     root, span = plan_root(bridge.identifier), bridge.span_m
     frame = bridge_frame(bridge)
     recording.log(
@@ -207,58 +206,58 @@ def log_surroundings(
             log_truck_on_plan(recording, f"{root}/truck/{vehicle}", places[near], time_ns)
 
 
-def log_track_on_plan(recording: Stream, entity: str, places_m: FloatArray) -> None:
-    """All places at which the receiver said that a truck was (f, 2), in the plan's coordinates."""
+def log_track_on_plan(recording: RerunStream, entity: str, places_m: FloatArray) -> None:
+    """Draw all positions of a truck (f, 2), in the plan's coordinates."""
     recording.log(
         entity,
         rr.Points2D(
             places_m,
             radii=rr.Radius.ui_points(1.5),
             colors=[rgb(MUTED)],
-            draw_order=10.0,  # below the elements, which have 20: of many runs they are a carpet
+            draw_order=10.0,  # below the elements, which have 20: many runs cover the plan
         ),
         static=True,
     )
 
 
 def log_truck_on_plan(
-    recording: Stream,
+    recording: RerunStream,
     entity: str,
     places_m: FloatArray,
     time_ns: IntArray,
     chainage_m: FloatArray | None = None,
 ) -> None:
-    """Where the receiver said that the truck was (f, 2), in the plan's coordinates, over time."""
-    log_truck_look(recording, entity)
+    """Draw the positions of the truck (f, 2) over time, in the plan's coordinates."""
+    log_truck_style(recording, entity)
     send_places(recording, entity, places_m, time_ns, chainage_m)
 
 
-def log_truck_look(recording: Stream, entity: str, name: str | None = None) -> None:
-    """How a truck looks on a plan, with its name where there may be others."""
-    look = rr.Points2D.from_fields(
+def log_truck_style(recording: RerunStream, entity: str, name: str | None = None) -> None:
+    """Define the style of a truck on a plan, with its name if there may be others."""
+    style = rr.Points2D.from_fields(
         radii=rr.Radius.ui_points(6.0),
         colors=[rgb(VEHICLE_COLOURS["rear"])],
         labels=None if name is None else [name],
         show_labels=None if name is None else True,
     )
-    recording.log(entity, look, static=True)
+    recording.log(entity, style, static=True)
 
 
 def send_places(
-    recording: Stream,
+    recording: RerunStream,
     entity: str,
     places_m: FloatArray,
     time_ns: IntArray,
     chainage_m: FloatArray | None = None,
 ) -> None:
-    """Places on a plan (f, 2), over time."""
+    """Log positions on a plan (f, 2) over time."""
     recording.send_columns(
         entity, columns_of(time_ns, chainage_m), rr.Points2D.columns(positions=places_m)
     )
 
 
-def log_vehicle(recording: Stream, vehicle: str, fixes: Sequence[GnssFix]) -> None:
-    """The track of a truck on the map, where it is at a time, and how fast."""
+def log_vehicle(recording: RerunStream, vehicle: str, fixes: Sequence[GnssFix]) -> None:
+    """Log the track of a truck on the map, its position over time and its speed."""
     if not fixes:
         return
     positions = _positions(fixes)
@@ -283,11 +282,11 @@ def log_vehicle(recording: Stream, vehicle: str, fixes: Sequence[GnssFix]) -> No
 
 
 def log_drive_plan(
-    recording: Stream,
+    recording: RerunStream,
     bridges: Sequence[BridgeOnMap],
     vehicles: Mapping[str, VehicleSignals],
 ) -> None:
-    """All tracks and the bridges near them, east across and north upwards."""
+    """Draw all tracks and the bridges near them, east to the right and north upwards."""
     tracks = {name: _positions(signals.gnss) for name, signals in vehicles.items() if signals.gnss}
     if not tracks:
         return
@@ -316,15 +315,17 @@ def log_drive_plan(
         )
 
 
-def log_marker(recording: Stream, entity: str) -> None:
-    """How a truck looks on the map."""
-    look = rr.GeoPoints.from_fields(
+def log_marker(recording: RerunStream, entity: str) -> None:
+    """Define the style of a truck on the map."""
+    style = rr.GeoPoints.from_fields(
         radii=rr.Radius.ui_points(7.0), colors=[rgb(VEHICLE_COLOURS["front"])]
     )
-    recording.log(entity, look, static=True)
+    recording.log(entity, style, static=True)
 
 
-def _log_on_map(recording: Stream, entity: str, bridge: BridgeOnMap, colours: list[Rgb]) -> None:
+def _log_on_map(
+    recording: RerunStream, entity: str, bridge: BridgeOnMap, colours: list[Rgb]
+) -> None:
     start, end = np.array(bridge.start), np.array(bridge.end)
     share = np.array(bridge.edges_m) / bridge.span_m
     edges = start + share[:, None] * (end - start)
@@ -344,12 +345,12 @@ def _positions(fixes: Sequence[GnssFix]) -> FloatArray:
 
 
 def _east_north_m(lat_lon: FloatArray, origin: FloatArray) -> FloatArray:
-    """Metres (m, 2) to the east and to the north of the origin."""
+    """Return metres (m, 2) to the east and to the north of the origin."""
     north, east = ((lat_lon - origin) * M_PER_DEGREE).T
     return np.column_stack((east * np.cos(np.radians(origin[0])), north))
 
 
 def _round_length(length: float) -> float:
-    """The largest of 1, 2, 5, 10, 20, … m that is not longer."""
+    """Return the largest of 1, 2, 5, 10, 20, … m that is not longer."""
     decade = 10.0 ** np.floor(np.log10(length))
     return float(max(step for step in (1.0, 2.0, 5.0) if step * decade <= length) * decade)

@@ -1,6 +1,6 @@
-"""The view of what a fit leaves over: a table of coloured cells, as Rerun has no plot of y over x.
+"""The view of the residuals: a table of coloured bins, as Rerun has no plot of y over x.
 
-In units of a cell: bands from left to right, rows from top to bottom.
+Coordinates are in units of a bin: bands from left to right, segments from top to bottom.
 """
 
 from __future__ import annotations
@@ -10,23 +10,23 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from services.viewer.crossing_view import CrossingView, FloatArray, ResidualCells
-from services.viewer.rerun_parts import Stream, log_labels
+from services.viewer.rerun_parts import RerunStream, log_labels
 
 RESIDUALS_BOUNDS = ((-2.8, 4.2), (-1.3, 10.7))
-"""What the view shows of x and y."""
+"""Limits of the view in x and y."""
 _KINDS = ("roads", "front body", "rear body")
 _STRETCHES = ("before", "on", "behind")
 _PIXELS = 40
-"""A cell is so many high and wide: a picture of fewer would be drawn blurred."""
+"""Height and width of a bin in pixels; fewer would be drawn blurred."""
 _SHADES = ((0.0, (30, 58, 82)), (3.0, (58, 78, 92)), (6.0, (213, 94, 0)))
-"""Colours by standard deviations above what is expected; grey where there is nothing."""
+"""Colours by standard deviations above the expectation; grey without data."""
 _NOTHING = (42, 46, 50)
 _GAP = 0.3
-"""Between the kinds."""
+"""Gap between the kinds."""
 
 
-def log_residuals(recording: Stream, root: str, crossing: CrossingView) -> None:
-    """The mean square of each cell over what the declared noise explains, if it is known."""
+def log_residuals(recording: RerunStream, root: str, crossing: CrossingView) -> None:
+    """Draw the mean square of each bin over the declared noise power, if it is known."""
     if crossing.residuals is None:
         return
     cells, entity = crossing.residuals, f"{root}/residuals"
@@ -50,13 +50,13 @@ def log_residuals(recording: Stream, root: str, crossing: CrossingView) -> None:
     names = [f"{kind}, {stretch}" for kind in _KINDS for stretch in _STRETCHES]
     log_labels(recording, f"{entity}/name", names, np.full(down.size, -1.5), down - 0.35)
     chi2 = "–" if crossing.chi2_per_dof is None else f"{crossing.chi2_per_dof:.2f}"
-    said = [f"χ² of all rows {chi2}; 1 is expected everywhere", "Hz"]
+    wording = [f"χ² of all rows {chi2}; 1 is expected everywhere", "Hz"]
     places = np.array([0.7, -1.5]), np.array([down[-1] + 0.75, -0.85])
-    log_labels(recording, f"{entity}/chi2", said, *places)
+    log_labels(recording, f"{entity}/chi2", wording, *places)
 
 
 def band_names(cells: ResidualCells) -> list[str]:
-    """`0–6`, … and `over 30`."""
+    """Return the names of the bands: `0–6`, … and `over 30`."""
     low, high = cells.edges_hz[:-1], cells.edges_hz[1:]
     return [
         f"{a:g}–{b:g}" if np.isfinite(b) else f"over {a:g}" for a, b in zip(low, high, strict=True)
@@ -64,7 +64,7 @@ def band_names(cells: ResidualCells) -> list[str]:
 
 
 def _rows(kinds: int, stretches: int) -> FloatArray:
-    """Middles of all rows from top to bottom, kinds apart."""
+    """Return the middles of all rows from top to bottom, with gaps between the kinds."""
     number = np.arange(kinds * stretches)
     return np.asarray(number + 0.5 + _GAP * (number // stretches), dtype=np.float64)
 

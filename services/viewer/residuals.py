@@ -1,62 +1,61 @@
-"""What the fit of a crossing leaves over by kind, stretch and band: made again for a picture.
+"""Residuals of a crossing's fit by kind, segment and band, computed again for a picture.
 
-A result says chi2 and keeps no residual. Where its crossing's samples are at hand what was left
-over is computed from the result (`pre_core.crossing.left_over`): a second a crossing, no search.
+A result has chi2 and no residuals. Where the samples of its crossing are available they are
+computed from the result (`crossing.fitted_residuals`): a second a crossing, no search.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from pre_core import unknowns
-from pre_core.crossing.left_over import Found, LeftOver, left_over
-from pre_core.crossing.preparation import Inputs
+from pre_core.crossing.fitted_residuals import FittedResiduals, FittedValues, fitted_residuals
+from pre_core.crossing.preparation import CrossingInputs
 from pre_core.diagnostics import quality
-from schemas.results import Crossing, Header
+from pre_core.parameters import names
+from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
-from services.common.progress import Steps, unwatched_steps
+from schemas.topics import Message
+from services.common.progress import Steps, no_step_progress
 from services.execution.blas import one_blas_thread
-from services.execution.dispatch import feed_all
-from services.execution.here import Here
-from services.identification.crossing_data import CrossingData, nominal_parameters
-from services.identification.engine import Engine
-from services.identification.placed import middle_of
+from services.finding.crossing_data import CrossingData, wide_window
+from services.finding.finder import crossings_in
+from services.finding.placed import first_axle, middle_of
 from services.identification.pre_method import inputs_of
-from services.recordings.recording import Message
+from services.identification.result_parts import nominal_parameters
 from services.viewer.crossing_view import FloatArray, ResidualCells
 
 BANDS_HZ = (0.0, 6.0, 12.0, 30.0, np.inf)
-"""Those that the verdict looks at (docs/verdicts.md)."""
+"""Bands that the verdict uses, Hz (docs/verdicts.md)."""
 _SAME_CHI2 = 0.1
-"""What is left over belongs to the result if chi2 comes out as the result's to this part of it."""
+"""Relative tolerance of chi2 within which residuals belong to the result."""
 _AROUND_NS = 30 * 10**9
-"""Fixes and samples so long before and after a crossing are what its identification looked at."""
+"""Time in ns before and after a crossing of the fixes and samples of its identification."""
 _BELIEVED = 0.999
 
 
-class _Seen(NamedTuple):
-    """A crossing's data as the engine found them, with its result."""
+class _CrossingWithData(NamedTuple):
+    """Data of a crossing, detected again, with its result."""
 
     data: CrossingData
-    result: Crossing
+    result: CrossingResult
 
 
 def residual_cells(
-    crossings: Iterable[Crossing],
+    crossings: Iterable[CrossingResult],
     messages: Iterable[Message],
     site: Site,
-    progress: Steps = unwatched_steps,
+    progress: Steps = no_step_progress,
     most: int = 12,
 ) -> dict[str, ResidualCells]:
-    """By crossing_id, of crossings by method `pre` whose samples are in the messages.
+    """Return the residual bins of crossings by method `pre` with samples, by crossing_id.
 
-    A crossing is left out if its chi2 does not come out again: its samples or its site file are not
-    those that it was identified from. Of more than `most` the newest count: each
-    takes half a second. `progress` is told of each.
+    A crossing is skipped if its chi2 differs: its samples or its site file are not those of its
+    identification. Of more than `most` the newest count, as each takes half a second. `progress` is
+    called for each.
     """
     fitted = [c for c in crossings if c.method == "pre" and c.parameters is not None]
     newest = sorted(fitted, key=lambda one: one.entry_time)[-most:]
@@ -65,7 +64,7 @@ def residual_cells(
         return {}
     found = {}
     with one_blas_thread():
-        seen = _seen(wanted, messages, site)
+        seen = _detect_again(wanted, messages, site)
         for number, (data, result) in enumerate(seen):
             progress(number, len(seen))
             cells = _cells(data, result)
@@ -74,16 +73,12 @@ def residual_cells(
     return found
 
 
-def _seen(wanted: Mapping[str, Crossing], messages: Iterable[Message], site: Site) -> list[_Seen]:
-    """What the engine finds again of crossings that have been identified; nothing is fitted."""
+def _detect_again(
+    wanted: Mapping[str, CrossingResult], messages: Iterable[Message], site: Site
+) -> list[_CrossingWithData]:
+    """Return the data of identified crossings, detected again; nothing is fitted."""
     times = np.array([(1e9 * c.entry_time, 1e9 * c.exit_time) for c in wanted.values()])
     begin, end = times[:, 0] - _AROUND_NS, times[:, 1] + _AROUND_NS
-    found: dict[str, CrossingData] = {}
-
-    def known(data: CrossingData, settings: IdentificationSettings, **_: Any) -> Crossing:
-        found[data.crossing_id] = data
-        return wanted.get(data.crossing_id, next(iter(wanted.values())))
-
     near = (
         (message.key, message.payload)
         for message in messages
@@ -91,25 +86,22 @@ def _seen(wanted: Mapping[str, Crossing], messages: Iterable[Message], site: Sit
         and message.key.stream in ("accel", "gnss")
         and bool(np.any((begin <= message.log_time_ns) & (message.log_time_ns <= end)))
     )
-    header = Header(version="", created=0.0, site_hash="", settings={}, seed=0)
-    engine = Engine(site, IdentificationSettings(), header, tells_states=False)
-    for _ in feed_all(engine, Here(identify=known), near):
-        pass
-    return [_Seen(found[name], wanted[name]) for name in wanted if name in found]
+    found = {one.crossing_id: one for one in crossings_in(near, site, wide_window)}
+    return [_CrossingWithData(found[name], wanted[name]) for name in wanted if name in found]
 
 
-def _cells(data: CrossingData, result: Crossing) -> ResidualCells | None:
+def _cells(data: CrossingData, result: CrossingResult) -> ResidualCells | None:
     inputs = _inputs(data)
     if inputs is None or result.chi2_per_dof is None:
         return None
-    left = left_over(inputs, _found(data, result))
+    left = fitted_residuals(inputs, _found(data, result))
     if not abs(left.chi2_per_dof / result.chi2_per_dof - 1.0) < _SAME_CHI2:
         return None
     return _by_band(left)
 
 
-def _inputs(data: CrossingData) -> Inputs | None:
-    """The unbroken samples around the crossing, as method `pre` takes them."""
+def _inputs(data: CrossingData) -> CrossingInputs | None:
+    """Return the unbroken samples around the crossing, as inputs of method `pre`."""
     samples = data.samples
     channels = data.vehicle.channels
     if samples is None or any(name not in samples.channels for name in channels):
@@ -124,25 +116,26 @@ def _inputs(data: CrossingData) -> Inputs | None:
     return inputs_of(data, IdentificationSettings(), acceleration[:, begin:stop], start_s)
 
 
-def _found(data: CrossingData, result: Crossing) -> Found:
+def _found(data: CrossingData, result: CrossingResult) -> FittedValues:
     parameters = result.parameters or {}
     theta: FloatArray = nominal_parameters(data.vehicle, data.bridge)
-    for n, name in enumerate(unknowns.names(data.bridge.elements)):
+    for n, name in enumerate(names(data.bridge.elements, first_axle(data.vehicle))):
         if name in parameters:
             theta[n] = parameters[name].q50
     believed = None if result.derived is None else result.derived.springs_believed
-    return Found(
+    return FittedValues(
         theta,
         result.diagnostics.get("position_shift_m", 0.0),
         result.road is not None and result.road.mismatch is not None,
         believed is None or believed > _BELIEVED,
+        result.hum_hz(),
     )
 
 
-def _by_band(left: LeftOver) -> ResidualCells:
+def _by_band(left: FittedResiduals) -> ResidualCells:
     kinds, bands = left.white.shape[1], len(BANDS_HZ) - 1
     mean_square, excess = np.full((kinds, 3, bands), np.nan), np.zeros((kinds, 3, bands))
-    found = quality.cells(left.white, left.stretch, left.step_s, np.array(BANDS_HZ))
+    found = quality.residual_bins(left.white, left.stretch, left.step_s, np.array(BANDS_HZ))
     for place, cell in found.items():
         if cell.size:
             mean_square[place], excess[place] = cell.mean_square, quality.cell_excess(cell)

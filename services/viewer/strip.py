@@ -1,4 +1,4 @@
-"""The picture of what is known of the rigidity along the span."""
+"""The picture of the rigidity along the span, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pre_core.constants import NORMAL_975
 from services.viewer.crossing_view import CrossingView
 
 STRIP_WIDTH, STRIP_HEIGHT = 1200, 600
-"""Pixels along the span, and for the rigidity."""
+"""Size in pixels: along the span, and for the rigidity."""
 STRIP_PAPER, STRIP_INK, STRIP_DOUBT = (17, 21, 26), (86, 180, 233), (150, 150, 150)
-"""Red, green and blue; the last is the ink of what is doubtful."""
+"""Red, green and blue; the last is the ink of doubtful values."""
 STRIP_WEAK = (230, 159, 0)
-"""The ink of an element that is clearly weak."""
+"""Ink of a clearly weak element."""
 
 
 def strip_top(crossing: CrossingView) -> float:
-    """The ratio to the nominal rigidity at the upper edge: 1.5, or up to 4 where intervals go."""
+    """Return the relative EI at the upper edge: 1.5, or up to 4 for high intervals."""
     highest = crossing.rigidity_nm2 if crossing.interval_nm2 is None else crossing.interval_nm2
     if highest is None:
         return 1.5
@@ -29,27 +29,27 @@ def strip_top(crossing: CrossingView) -> float:
 
 
 def strip_row(ratio: NDArray[np.float64], top: float) -> NDArray[np.float64]:
-    """How far down a ratio to the nominal rigidity is, in pixels; never outside the strip."""
+    """Return the rows of relative EI (n,), in pixels from the top, within the strip."""
     return np.asarray(STRIP_HEIGHT * (1.0 - np.clip(ratio, 0.0, top) / top))
 
 
 def rigidity_strip(
     crossing: CrossingView, *, doubtful: bool = False, weak: Set[int] = frozenset()
 ) -> NDArray[np.uint8]:
-    """Picture of what is known of the rigidity along the span; (height, width, 3).
+    """Return a picture of the rigidity along the span; (height, width, 3).
 
-    A column belongs to a chainage, a row to a ratio to the nominal rigidity, from `strip_top` at
-    the top to 0 at the bottom. Brightness is the probability density relative to its peak, as two
-    halves of normal distributions that end where the interval does; below the estimate the element
-    is filled faintly. The elements whose numbers are in `weak` have an ink of their own; what is
-    doubtful is grey.
+    A column belongs to a chainage, a row to a relative EI, from `strip_top` at the top to 0 at the
+    bottom. Brightness is the probability density relative to its peak, as two halves of normal
+    distributions that end where the interval does; below the estimate the element is filled
+    faintly. The elements whose numbers are in `weak` have an ink of their own; doubtful values are
+    grey.
     """
     estimate = crossing.rigidity_nm2
     if estimate is None:
         raise ValueError("a rejected crossing has no rigidity to draw")
     ratio = estimate / crossing.nominal_nm2
     top = strip_top(crossing)
-    thinnest = 1.5 * top / STRIP_HEIGHT  # a line that can still be seen
+    thinnest = 1.5 * top / STRIP_HEIGHT  # a line that is still visible
     below = above = np.full_like(ratio, thinnest)
     if crossing.interval_nm2 is not None:
         low, high = crossing.interval_nm2.T / crossing.nominal_nm2

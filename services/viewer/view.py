@@ -1,4 +1,4 @@
-"""Opening a recording, a result or a Rerun file in the Rerun viewer.
+"""Display of a recording, a result or a Rerun file in the Rerun viewer.
 
 The viewer listens on 127.0.0.1 only and its analytics are switched off. Background tiles of the map
 come from the internet when there is one; tracks and bridges are drawn without.
@@ -20,39 +20,46 @@ from google.protobuf.message import DecodeError
 from rich.console import Console
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing, load_results
+from schemas.results import CrossingResult, load_results
 from schemas.results_on_the_wire import estimate_to_crossing
 from schemas.site import Site
 from schemas.site_file import load_site
+from schemas.topics import Message
+from services.catalogue.contents import summarise_recording
 from services.common.errors import FailureError, InputError
 from services.common.progress import (
     Offset,
     Steps,
+    no_progress,
+    no_step_progress,
     progress_bar,
-    unwatched,
-    unwatched_steps,
 )
-from services.drives.survey import survey
-from services.history.site_of_results import site_of_results
-from services.recordings.recording import Message, check_envelope, check_message, read_messages
+from services.finding.drive import Drives
+from services.ledger.site_of_results import site_of_results
+from services.recordings.recording import check_envelope, check_message, read_messages
 from services.viewer.bridge_view import BridgeView, views_of_bridges
-from services.viewer.crossing_view import CrossingView, PassingView, ResidualCells, view_of_crossing
-from services.viewer.recording_page import passings_of_survey, recording_page
+from services.viewer.crossing_view import (
+    CrossingView,
+    DetectedCrossingView,
+    ResidualCells,
+    view_of_crossing,
+)
+from services.viewer.recording_page import detected_views, recording_page
 from services.viewer.rerun_file import write_rrd
 from services.viewer.rerun_places import bridges_of_site
 from services.viewer.residuals import residual_cells
-from services.viewer.vehicle_signals import Heard, VehicleSignals
+from services.viewer.vehicle_signals import VehicleSignals, signals_of
 
 SUFFIXES = (".rrd", ".mcap", ".json")
 _MOST_RESIDUALS = 3
-"""Whoever opens a recording waits for them; `identify` computes more."""
+"""Maximum number of crossings with residuals, as the user waits; `identify` computes more."""
 
 
 def view_command(*, target: str | Path, web: bool, console: Console) -> int:
-    """Open a Rerun file (.rrd), a recording (.mcap) or results (.json); wait until it is closed.
+    """Open a Rerun file (.rrd), a recording (.mcap) or results (.json) until it is closed.
 
-    `web` serves the viewer for a browser instead of opening a window. Returns the exit code.
-    Raises InputError for a missing or unknown file, FailureError if the viewer does not start.
+    `web` serves the viewer for a browser instead of opening a window. Return the exit code. Raise
+    InputError for a missing or unknown file, FailureError if the viewer does not start.
     """
     path = Path(target)
     if not path.is_file():
@@ -82,15 +89,15 @@ def convert(
     rrd: Path,
     *,
     site: Path | None = None,
-    progress: Offset = unwatched,
-    drawing: Steps = unwatched_steps,
+    progress: Offset = no_progress,
+    drawing: Steps = no_step_progress,
 ) -> None:
     """Write the Rerun file of a recording (.mcap) or of results (.json).
 
-    `progress` is told how far the recording has been read, `drawing` how far that is written.
+    `progress` is called while the recording is read, `drawing` while the file is written.
 
-    Results do not say where their bridge is: `site` does, or a recording in the same folder. The
-    crossings in a recording that nobody has identified yet are shown with what was measured.
+    Results do not contain the position of their bridge: `site` does, or a recording in the same
+    folder. Crossings of a recording that were not identified are shown with their signals.
     """
     if target.suffix == ".json":
         results = load_results(target)
@@ -104,18 +111,20 @@ def convert(
             drawing=drawing,
         )
         return
-    heard, estimates = Heard(), list[Message]()
+    drives, estimates = Drives(), list[Message]()
 
     def take(message: Message) -> None:
         if message.key.owner == "vehicle":
             check_envelope(target, message)
-            if not heard.add(message):  # what can be decoded is right
+            if not drives.add(message):  # decodable messages are valid
                 check_message(target, message)
         elif message.key.stream == "estimate":
             estimates.append(message)
 
-    with _nothing_collected():
-        found = survey(target, None if site is None else load_site(site), take, progress)
+    with _paused_gc():
+        found = summarise_recording(
+            target, None if site is None else load_site(site), take, progress
+        )
     if not found.info.messages:
         raise InputError(f"{target}: holds no driveby message; a recording of a truck is expected")
     crossings = crossings_of_messages(estimates)
@@ -125,10 +134,10 @@ def convert(
         residuals = residual_cells(crossings, messages, found.site, most=_MOST_RESIDUALS)
     write_views(
         rrd,
-        vehicles=heard.signals(),
+        vehicles=signals_of(drives.all()),
         crossings=crossings,
         site=found.site,
-        passings=passings_of_survey(found, crossings),
+        passings=detected_views(found, crossings),
         residuals=residuals,
         about=recording_page(found),
         drawing=drawing,
@@ -136,10 +145,10 @@ def convert(
 
 
 @contextlib.contextmanager
-def _nothing_collected() -> Iterator[None]:
-    """Python looks for circles among all that was read, again and again: a fifth of the time.
+def _paused_gc() -> Iterator[None]:
+    """Pause the search for reference cycles among messages, a fifth of the time.
 
-    There are none in messages.
+    There are no cycles in messages.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -154,13 +163,13 @@ def write_views(
     rrd: Path,
     *,
     vehicles: dict[str, VehicleSignals],
-    crossings: Iterable[Crossing],
+    crossings: Iterable[CrossingResult],
     site: Site | None,
     overviews: Sequence[BridgeView] = (),
-    passings: Sequence[PassingView] = (),
+    passings: Sequence[DetectedCrossingView] = (),
     residuals: Mapping[str, ResidualCells] | None = None,
     about: str | None = None,
-    drawing: Steps = unwatched_steps,
+    drawing: Steps = no_step_progress,
 ) -> None:
     """Write a Rerun file of results and signals; without a site only the signals are drawn.
 
@@ -188,8 +197,8 @@ def write_views(
     )
 
 
-def crossings_of_messages(messages: Iterable[Message]) -> list[Crossing]:
-    """The results in a recording; those that cannot be decoded are left out."""
+def crossings_of_messages(messages: Iterable[Message]) -> list[CrossingResult]:
+    """Return the results in a recording; undecodable ones are skipped."""
     crossings = []
     for message in messages:
         if message.key.stream != "estimate":
@@ -203,12 +212,12 @@ def crossings_of_messages(messages: Iterable[Message]) -> list[Crossing]:
 
 
 def viewer_program() -> Path:
-    """The viewer itself: the `rerun` command is a wrapper that leaves it running when killed."""
+    """Return the viewer itself: the `rerun` wrapper leaves it running when killed."""
     return Path(str(resources.files("rerun_cli") / "rerun"))
 
 
 def viewer_arguments(shown: Path | str, *, web: bool, address: str = "127.0.0.1") -> list[str]:
-    """Command line of the viewer of a file or a server.
+    """Return the command line of the viewer of a file or a server.
 
     It listens at one address; without `--bind` it would listen on every interface.
     """
@@ -219,7 +228,7 @@ def viewer_arguments(shown: Path | str, *, web: bool, address: str = "127.0.0.1"
 
 
 def prepare_viewer() -> None:
-    """Switch its statistics off; FailureError if there is none."""
+    """Switch its statistics off; raise FailureError if it is not installed."""
     program = viewer_program()
     if not program.is_file():
         raise FailureError(f"{program}: the Rerun viewer is not installed for this platform")
@@ -227,7 +236,7 @@ def prepare_viewer() -> None:
 
 
 def check_ended_well(code: int) -> None:
-    """FailureError if the viewer did not end because somebody closed it."""
+    """Raise FailureError if the viewer ended other than by being closed."""
     if code not in (0, -signal.SIGTERM):
         raise FailureError(f"the Rerun viewer ended with code {code}; without a screen, try --web")
 
@@ -235,17 +244,17 @@ def check_ended_well(code: int) -> None:
 def run_viewer(shown: Path, *, web: bool) -> int:
     """Show a Rerun file until it is closed; return the exit code.
 
-    FailureError: the viewer did not start, or ended badly.
+    Raise FailureError if the viewer did not start, or ended abnormally.
     """
     prepare_viewer()
-    # The viewer would go on alone if this program were told to stop and only itself did, be it
-    # while the viewer is being started.
-    told_to_stop = threading.Event()
-    previous = signal.signal(signal.SIGTERM, lambda *_: told_to_stop.set())
+    # The viewer would keep running if only this program received the signal to stop, also while the
+    # viewer is being started.
+    stop_requested = threading.Event()
+    previous = signal.signal(signal.SIGTERM, lambda *_: stop_requested.set())
     try:
         with subprocess.Popen(viewer_arguments(shown, web=web)) as viewer:
             signal.signal(signal.SIGTERM, lambda *_: viewer.terminate())
-            if told_to_stop.is_set():
+            if stop_requested.is_set():
                 viewer.terminate()
             try:
                 code = viewer.wait()

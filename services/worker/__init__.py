@@ -1,16 +1,15 @@
-"""Identifies crossings as they happen: from the bus to a results file, and from there to the bus.
+"""Live identification of crossings: from the bus to a results file, and from there to the bus.
 
 Every crossing gets one result, whenever the worker is stopped or killed. A message is on the disk
-before it is on the bus, so the results files know all that anybody may have heard. A new run reads
-those of the runs before: what the bus may not have got it publishes again as it was, identity and
-all; what was about to be said it says; and a crossing that has a result is not identified again.
-One that has none is found again in what its truck still keeps (`cache` in the table of topics: the
-last five minutes), or in the recordings that a logger made of it (`catching_up`).
+before it is on the bus, so the results files have everything that was published. A new run reads
+them: it republishes unchanged what the bus may have missed, publishes the pending messages, and
+identifies no crossing that has a result. One without a result is detected again in the data that
+its truck still keeps (`cache` in the table of topics), or in a logger's recordings (`backfill`).
 
-Real crossings (realm `live`) are identified only where simulated ones of the same truck on the same
-bridge have shown that the method recovers what was put in: until then they wait (`certificates`).
+Real crossings (realm `live`) wait until simulated ones of the same truck on the same bridge have
+shown that the method recovers the truth (`validation_runner`).
 
-Longer than other modules, because what is told, kept and published of one message has one order.
+Longer than other modules, because publishing, storing and counting a message has one order.
 """
 
 import contextlib
@@ -26,7 +25,6 @@ from typing import NamedTuple
 
 import zenoh
 
-from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import verdict_line
 from schemas.settings import IdentificationSettings
@@ -35,93 +33,94 @@ from schemas.site_file import parse_site, read_site_text
 from schemas.topics import (
     HEALTH_PERIOD_S,
     Key,
+    Message,
     check_identifier,
     check_realm,
-    is_replayed,
+    is_from_recording,
     parse_key,
     selector,
 )
+from schemas.validation_records import VehicleBridgePair
 from services.bus.credentials import check_speaks_for
-from services.bus.hearing import DeafError, Hearing
-from services.bus.listening import Elsewhere
+from services.bus.liveness import LivenessProbe, StaleConnectionError
 from services.bus.playback import leave_at_once, set_by_signals, stopped_by_signals
 from services.bus.publisher import Publisher
-from services.bus.session import connected
-from services.bus.subscription import Seen, Subscription
+from services.bus.realm_listener import OtherRealms
+from services.bus.session import wait_for_router
+from services.bus.subscription import SeenSequences, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
-from services.execution.dispatch import Execution, awaited, collected, dispatched
+from services.execution.dispatch import CrossingExecutor, collect, dispatch, drain
+from services.execution.hang_watchdog import LIMIT_S, TaskLimits
 from services.execution.offline import header_of
-from services.execution.processes import Processes
-from services.execution.watch import LIMIT_S, Limits
-from services.history.baselines import baselines_of
-from services.history.certificates import found_in
-from services.history.result_files import (
+from services.execution.processes import ProcessExecutor
+from services.history.validation_files import passed_validations
+from services.identification.bridge_state import Fusing
+from services.identification.engine import Engine
+from services.identification.known import search_hash
+from services.identification.outputs import EngineOutput, Output
+from services.ledger.baselines import baselines_of
+from services.ledger.crossing_log import Ledger
+from services.ledger.runs import (
     KNOWN_AGE_S,
-    Earlier,
+    EarlierRuns,
     ResultFiles,
     free_results_path,
     read_earlier,
 )
-from services.history.store import Ledger
-from services.identification.bridge_state import Fusing
-from services.identification.engine import Engine
-from services.identification.known import search_hash
-from services.identification.outputs import Output, Said
-from services.recordings.recording import Message
-from services.worker.arrivals import GONE_AFTER_S, Arrivals, Arrived, Token
-from services.worker.catching_up import DAYS, MARGIN_S, CatchingUp, Source
-from services.worker.certificates import Certificates
-from services.worker.site_watch import Edited, SiteWatch
+from services.worker.arrivals import GONE_AFTER_S, ArrivalQueue, LivenessToken, TruckMessage
+from services.worker.backfill import DAYS, MARGIN_S, Backfill, BackfillSource
+from services.worker.site_file_watcher import EditedSite, SiteFileWatcher
+from services.worker.validation_runner import ValidationRunner
 
 __all__ = ["run"]
 
 _log = logging.getLogger(__name__)
-_Queue = queue.Queue[Arrived | Token]
+_Queue = queue.Queue[TruckMessage | LivenessToken]
 _POLL_S = 0.1
-"""So late a stop, a token or a result is seen where no message comes."""
+"""Longest delay in s after which a stop, a token or a result is noticed without a message."""
 _LONGEST_QUEUE = 200_000
-"""Messages: two hours of one truck, or a minute of a hundred. Then publishers wait."""
+"""Messages, two hours of one truck or a minute of a hundred; beyond them publishers wait."""
 _LONGEST_NOTE = 1000
 _SOONEST_HEALTH_S = 5.0
-"""Who waits and what is identified may change many times a second: so often it is told at most."""
+"""Shortest time in s between two health messages, as the backlog may change often."""
 _MOST_NAMED = 10
-"""Crossings in one line of the log."""
+"""Maximum number of crossings in one line of the log."""
 _CATCH_UP_EVERY_S = 0.2
 
 
-class Editing(NamedTuple):
-    """How an edited site file is noticed, and what is done with it."""
+class SiteReload(NamedTuple):
+    """Detection of an edited site file, and its adoption."""
 
-    watch: SiteWatch
+    watch: SiteFileWatcher
     asked: threading.Event
-    """Somebody asks to read it again."""
-    retarget: Callable[[Edited], Iterator[Said]]
+    """Set when a reload is requested."""
+    retarget: Callable[[EditedSite], Iterator[EngineOutput]]
 
-    def edited(self, now_s: float) -> Edited | None:
-        """The site file, if it was edited since the last call."""
+    def edited(self, now_s: float) -> EditedSite | None:
+        """Return the site file, if it was edited since the last call."""
         is_asked = self.asked.is_set()
-        if is_asked:  # who asks after the look is not forgotten
+        if is_asked:  # a request after this check is not lost
             self.asked.clear()
         return self.watch.edited(now_s, is_asked=is_asked)
 
 
-class Service(NamedTuple):
-    """What a run works with: who decides, who computes, and where what was found goes."""
+class WorkerService(NamedTuple):
+    """Parts of a run: engine, executor, and destinations of their outputs."""
 
     id: str
     engine: Engine
-    execution: Execution
-    certificates: Certificates
+    execution: CrossingExecutor
+    certificates: ValidationRunner
     publisher: Publisher
     files: ResultFiles
 
-    def tell(self, outputs: Iterable[Output]) -> None:
-        """Write each message to the disk and only then to the bus: nobody hears what may be lost.
+    def publish(self, outputs: Iterable[Output]) -> None:
+        """Write each message to the disk and only then to the bus.
 
         FailureError: one cannot be written or published.
         """
-        for output in _worked_out(outputs):
+        for output in _guard_engine(outputs):
             _, owner, identifier, stream = output.key
             identity = self.files.next_identity(output.key, self.publisher.boot_id)
             now_ns = time.time_ns()
@@ -137,23 +136,23 @@ class Service(NamedTuple):
                 result = output.result
                 _log.info("%s: %s", result.crossing_id, verdict_line(result))
 
-    def go_on(self, said: Iterable[Said]) -> None:
-        """Tell what the engine says, and have done what it wants done."""
-        self.tell(dispatched(self.engine, self.execution, said, self.certificates.want))
+    def process_outputs(self, outputs: Iterable[EngineOutput]) -> None:
+        """Publish the engine's messages, and execute its tasks."""
+        self.publish(dispatch(self.engine, self.execution, outputs, self.certificates.request))
 
 
-class _Behind(NamedTuple):
-    """What has come and has not been looked at."""
+class _QueueLag(NamedTuple):
+    """Messages received and not yet processed."""
 
     messages: int
     lag_s: float
-    """The longest that one has waited since this was told last."""
+    """Longest wait in s of a message since the last health message."""
 
 
 class _Backlog(NamedTuple):
-    """What is not identified yet: how long it is under way does not change it."""
+    """Counts of unidentified crossings; running times are left out, as they always change."""
 
-    under_way: tuple[str, ...]
+    running: tuple[str, ...]
     waiting: int
     waiting_for_certificate: int
     in_recordings: int
@@ -180,19 +179,18 @@ def run(
     """Identify all crossings of a realm until SIGINT or SIGTERM; return 0.
 
     Results are written to `folder/REALM/results-TIME.mcap` and `.json` beside it, and published.
-    What earlier runs left in that folder is taken up, unless this run has a `file` of its own or
-    the realm is one of replays. Waits for the router for ever. `ready` is called once, when the
-    worker listens. `tls` is a folder of credentials, see `open_session`. Crossings are identified
-    in so many `processes` beside this one; one that takes more than `limit_s` of processor time
-    for a crossing is ended.
+    The run resumes what earlier runs left there, unless it has a `file` of its own or the realm is
+    one of replays. It waits for the router without limit. `ready` is called once, when the worker
+    listens. `tls` is a folder of credentials, see `open_session`. Crossings are identified in
+    `processes` processes; one that takes more than `limit_s` of processor time for one is ended.
 
-    A crossing whose vehicle and bridge have no certificate in the folder `certificates` (by default
-    one in `folder`) waits for one, which is made meanwhile: if `validate` says so, or says nothing
-    and the realm is `live`.
-    What nobody sends any more is taken from the logger's `recordings` (by default in `folder`) of
-    the last so many days, unless this run has a `file` of its own or the realm is one of replays.
-    InputError: a bad site file, realm or id, or a method that has no certificates. FailureError: a
-    result or a certificate cannot be written.
+    A crossing whose vehicle and bridge have no validation record in the folder `certificates` (by
+    default one in `folder`) waits for one, which is computed meanwhile: if `validate` is true, or
+    None and the realm is `live`. Data that trucks no longer send are read from the logger's
+    `recordings` (by default in `folder`) of the last `recordings_days` days, unless this run has a
+    `file` of its own or the realm is one of replays.
+    InputError: a bad site file, realm or id, or a method without validation. FailureError: a result
+    or a validation record cannot be written.
     """
     _check_names(realm, service_id)
     check_speaks_for(tls, "worker", service_id)
@@ -207,13 +205,13 @@ def run(
     settings = IdentificationSettings.model_validate({"method": method})
     header = header_of(known, settings, time.time())
     fusing = Fusing(baselines_of(known, site.parent), threads=settings.threads)
-    earlier = Earlier()
+    earlier = EarlierRuns()
     catches_up, age_s = False, 0.0
-    watch: SiteWatch | None = None
+    watch: SiteFileWatcher | None = None
     if file is None:
         file = free_results_path(folder / realm)
-        watch = SiteWatch(site, known)  # a file of its own has room for one site file
-        if not is_replayed(realm):
+        watch = SiteFileWatcher(site, known)  # a file of its own has room for one site file
+        if not is_from_recording(realm):
             catches_up = recordings_days > 0.0
             age_s = recordings_days * 86_400.0
             earlier = read_earlier(
@@ -232,19 +230,19 @@ def run(
     if are_required:
         check_folder_writable(certificates)
     elif realm == "live":
-        _log.warning("--skip-validation: crossings count that nobody has validated")
+        _log.warning("site validation is off (--skip-validation)")
     ledger = Ledger(earlier.crossings, time.time())
     files = ResultFiles(file, text, header, earlier.previous, ledger.note)
-    # A second signal: what was published is on the disk, and the next run takes it up.
+    # After a second signal: published messages are on the disk, and the next run resumes.
     with stopped_by_signals(leave_at_once) as stop, contextlib.ExitStack() as stack:
 
         def report(crossing_id: str, stage: str, fraction: float) -> None:
-            _say_progress(publisher, service_id, crossing_id, stage, fraction)
+            _publish_progress(publisher, service_id, crossing_id, stage, fraction)
 
         execution = stack.enter_context(
-            Processes(processes, report=report, limits=Limits(processor_s=limit_s))
+            ProcessExecutor(processes, report=report, limits=TaskLimits(processor_s=limit_s))
         )
-        bus = connected(endpoint, tls, stop.is_set)
+        bus = wait_for_router(endpoint, tls, stop.is_set)
         if bus is None:
             return 0
         stack.enter_context(bus)
@@ -254,16 +252,16 @@ def run(
             settings,
             header,
             fusing,
-            certificates=found_in(certificates, known, settings),
+            certificates=passed_validations(certificates, known, settings),
             are_required=are_required,
+            has_room=lambda: execution.has_room,
         )
-        engine.has_room = lambda: execution.has_room
-        certified = Certificates(certificates, known, settings, execution)
-        catching_up = None
+        certified = ValidationRunner(certificates, known, settings, execution)
+        backfill = None
         if catches_up:
-            source = Source(recordings or folder, realm, age_s)
-            catching_up = CatchingUp(source, known, settings, header, ledger)
-            stack.callback(catching_up.close)
+            source = BackfillSource(recordings or folder, realm, age_s)
+            backfill = Backfill(source, known, settings, ledger)
+            stack.callback(backfill.close)
         execution.wait_until_warm()
         arrivals: _Queue = queue.Queue(_LONGEST_QUEUE)
         closing, failed = threading.Event(), threading.Event()
@@ -276,26 +274,26 @@ def run(
 
         receiver = threading.Thread(target=receive, name="receive", daemon=True)
         try:
-            service = Service(service_id, engine, execution, certified, publisher, files)
+            service = WorkerService(service_id, engine, execution, certified, publisher, files)
             _resume(service, earlier)
-            del earlier  # of two days
+            del earlier  # it covers two days
             receiver.start()
 
-            def retarget(edited: Edited) -> Iterator[Said]:
+            def retarget(edited: EditedSite) -> Iterator[EngineOutput]:
                 now = header._replace(created=time.time(), site_hash=edited.hash)
-                found = found_in(certificates, edited.site, settings)
+                found = passed_validations(certificates, edited.site, settings)
                 path = free_results_path(files.path.parent)
-                files.begin_anew(path, edited.text, now)
+                files.rotate(path, edited.text, now)
                 certified.retarget(edited.site)
-                if catching_up is not None:
-                    catching_up.retarget(edited.site, now)
-                _log.info("%s was edited: %s counts now, results in %s", site, edited.hash, path)
+                if backfill is not None:
+                    backfill.retarget(edited.site)
+                _log.info("%s was edited: %s applies now, results in %s", site, edited.hash, path)
                 anew = fusing._replace(baselines=edited.baselines)
                 yield from engine.retarget(edited.site, now, anew, found)
 
             with set_by_signals(signal.SIGHUP) as asked:
-                editing = None if watch is None else Editing(watch, asked, retarget)
-                _serve(service, arrivals, stop, ready, catching_up, editing)
+                editing = None if watch is None else SiteReload(watch, asked, retarget)
+                _serve(service, arrivals, stop, ready, backfill, editing)
         except BaseException:
             files.abandon()
             raise
@@ -326,32 +324,32 @@ def _receive(
     closing: threading.Event,
     failed: threading.Event,
 ) -> None:
-    """Take everything off the bus quickly: an identification must not hold up a publisher.
+    """Take everything off the bus quickly: an identification must not delay a publisher.
 
-    Sets `failed` if it cannot go on: a worker that hears nothing must not look alive.
+    Set `failed` if that is impossible: a worker that receives nothing must not look alive.
     """
     try:
-        _take_all(bus, realm, arrivals, closing)
-    except Exception as error:  # whatever it is, nothing more would be heard
+        _receive_all(bus, realm, arrivals, closing)
+    except Exception as error:  # whatever it is, nothing more would be received
         if not closing.is_set():
             failed.set()
-            unforeseen = not isinstance(error, zenoh.ZError | DeafError)
+            unforeseen = not isinstance(error, zenoh.ZError | StaleConnectionError)
             _log.error("the connection to the bus failed: %s", error, exc_info=unforeseen)
 
 
-def _take_all(
+def _receive_all(
     bus: zenoh.Session,
     realm: str,
     arrivals: _Queue,
     closing: threading.Event,
 ) -> None:
-    seen = Seen()
-    elsewhere, is_told = Elsewhere(bus, realm), False
+    seen = SeenSequences()
+    other_realms, is_hinted = OtherRealms(bus, realm), False
     tokens = selector(realm, "vehicle", "alive")
     alive = bus.liveliness().declare_subscriber(
         tokens, zenoh.handlers.FifoChannel(1000), history=True
     )
-    hearing = Hearing(bus, tokens, elsewhere.alive)
+    probe = LivenessProbe(bus, tokens, other_realms.alive)
     with Subscription(bus, selector(realm, "vehicle")) as vehicles:
         while not closing.is_set():
             received = vehicles.receive(_POLL_S)
@@ -361,16 +359,18 @@ def _take_all(
                 if token is not None:
                     key = parse_key(str(token.key_expr))
                     is_alive = token.kind == zenoh.SampleKind.PUT
-                    hearing.heard(now_s)
-                    _put(arrivals, Token(key.realm, key.identifier, is_alive, now_s), closing)
+                    probe.heard(now_s)
+                    _put(
+                        arrivals, LivenessToken(key.realm, key.identifier, is_alive, now_s), closing
+                    )
                 if received is None:
-                    elsewhere.look()
-                    hearing.look(now_s)
-                    if not is_told and not seen.streams and (line := elsewhere.line()):
-                        is_told = True
+                    other_realms.look()
+                    probe.poll(now_s)
+                    if not is_hinted and not seen.streams and (line := other_realms.line()):
+                        is_hinted = True
                         _log.warning("%s", line)
                     continue
-                hearing.heard(now_s)
+                probe.heard(now_s)
                 key, identity = received.key(), received.identity()
             except ValueError as error:
                 _log.warning("refused: %.200s", error)
@@ -379,20 +379,20 @@ def _take_all(
                 continue
             try:
                 # A router that cuts off a reader in the middle of a message leaves the rest of it
-                # to whatever comes next. A good copy follows, which must not be taken for known.
+                # to the next one. A good copy follows, which must not count as known.
                 _check_whole(received.payload, key, identity)
             except ValueError as error:
                 _log.warning("refused %s of %s: %.200s", key.stream, key.identifier, error)
                 continue
             if seen.add(key, identity):
-                arrived = Arrived(key, identity.boot_id, received.payload, now_s)
+                arrived = TruckMessage(key, *identity, received.payload, now_s)
                 _put(arrivals, arrived, closing)
     alive.undeclare()  # type: ignore[no-untyped-call]
-    elsewhere.close()
+    other_realms.close()
 
 
 def _check_whole(payload: bytes, key: Key, identity: Identity) -> None:
-    """ValueError: the payload is malformed, or of another message than its attachment says."""
+    """Raise ValueError for a malformed payload, or one that differs from its attachment."""
     message = TRUCK_DECODERS[key.stream](payload)
     if (message.boot_id, message.sequence) != identity:
         raise ValueError(
@@ -401,7 +401,7 @@ def _check_whole(payload: bytes, key: Key, identity: Identity) -> None:
         )
 
 
-def _put(arrivals: _Queue, item: Arrived | Token, closing: threading.Event) -> None:
+def _put(arrivals: _Queue, item: TruckMessage | LivenessToken, closing: threading.Event) -> None:
     """Wait for room in the queue, but not beyond the end of the service."""
     while not closing.is_set():
         with contextlib.suppress(queue.Full):
@@ -409,25 +409,25 @@ def _put(arrivals: _Queue, item: Arrived | Token, closing: threading.Event) -> N
             return
 
 
-def _resume(service: Service, earlier: Earlier) -> None:
-    """Take up what earlier runs left: say again what may not have been heard, finish the rest.
+def _resume(service: WorkerService, earlier: EarlierRuns) -> None:
+    """Resume earlier runs: republish what may not have been received, and finish the rest.
 
-    States of bridges that they owe are told when they have been made, while others are listened to.
+    Pending states of bridges are published once they are computed, while the worker listens.
     """
-    again = [*earlier.unsure, *(m for m in earlier.latched if m not in earlier.unsure)]
+    again = [*earlier.unconfirmed, *(m for m in earlier.latched if m not in earlier.unconfirmed)]
     for message in again:
         _, owner, identifier, stream = message.key
         identity = Identity(message.boot_id, message.sequence)
         try:
             service.publisher.put(owner, identifier, stream, message.payload, identity)
         except ValueError as error:
-            _log.warning("not published again: %s", error)
+            _log.warning("cannot republish: %s", error)
     finished = list(service.engine.resume(earlier.crossings, earlier.states()))
-    service.go_on(finished)
+    service.process_outputs(finished)
     if earlier.previous is not None:
         _log.info(
-            "%d messages of earlier runs, the last in %s; published again %d, finished %d",
-            *(len(earlier.said), earlier.previous, len(again), len(finished)),
+            "%d messages of earlier runs, the last in %s; republished %d, finished %d",
+            *(len(earlier.published), earlier.previous, len(again), len(finished)),
         )
     waited = [
         known.crossing_id
@@ -436,140 +436,140 @@ def _resume(service: Service, earlier: Earlier) -> None:
     ]
     if waited:
         _log.warning(
-            "%d crossings waited for a certificate when an earlier run ended (%s): they go on if "
-            "their trucks still have them or they are in the logger's recordings",
+            "%d crossings waited for a site validation when an earlier run ended (%s): they "
+            "continue if their trucks still have them or they are in the logger's recordings",
             *(len(waited), ", ".join(waited[-_MOST_NAMED:])),
         )
 
 
 def _serve(
-    service: Service,
+    service: WorkerService,
     queued: _Queue,
     stop: threading.Event,
     ready: Callable[[], None] | None,
-    catching_up: CatchingUp | None = None,
-    editing: Editing | None = None,
+    backfill: Backfill | None = None,
+    editing: SiteReload | None = None,
 ) -> None:
-    """Identify until `stop`, and then what nobody would give to the next run.
+    """Identify until `stop`, and then finish what the next run could not receive again.
 
-    Of that only what comes until `GONE_AFTER_S` after the stop was seen.
+    After the stop this takes at most `GONE_AFTER_S`.
     """
     engine, execution, certificates = service.engine, service.execution, service.certificates
-    arrivals = Arrivals()
-    told: set[str] = set()
+    arrivals = ArrivalQueue()
+    warned: set[str] = set()
     next_health_s = soonest_health_s = next_catch_up_s = 0.0
-    told_backlog: _Backlog | None = None
+    published_backlog: _Backlog | None = None
     leave_at_s = math.inf
-    progress: tuple[Pair, float] | None = None
+    progress: tuple[VehicleBridgePair, float] | None = None
     now_s = time.monotonic()
     lag_s = 0.0
     if ready is not None:
         ready()
-    # Who goes on talking goes on to the next run, too: what comes so late is not waited for.
+    # A truck that keeps sending also reaches the next run, so the worker does not wait for it.
     while now_s < leave_at_s and (
-        not stop.is_set() or not queued.empty() or _may_lose(engine, arrivals)
+        not stop.is_set() or not queued.empty() or _has_undecided_departures(engine, arrivals)
     ):
         if time.monotonic() >= soonest_health_s or certificates.has_news:
             soonest_health_s = time.monotonic() + _SOONEST_HEALTH_S
-            backlog = _backlog(engine, execution, catching_up)
+            backlog = _backlog(engine, execution, backfill)
             is_due = time.monotonic() >= next_health_s or certificates.has_news
-            if is_due or backlog != told_backlog:
+            if is_due or backlog != published_backlog:
                 next_health_s = time.monotonic() + HEALTH_PERIOD_S
                 certificates.has_news = False
-                told_backlog = backlog
-                behind = _Behind(queued.qsize(), lag_s)
-                _say_health(service, behind, backlog)
+                published_backlog = backlog
+                behind = _QueueLag(queued.qsize(), lag_s)
+                _publish_health(service, behind, backlog)
                 lag_s = 0.0
-        batch: list[Arrived] = []
+        batch: list[TruckMessage] = []
         one = _next(queued)
-        # After a long identification the queue holds what came meanwhile: whether a truck has gone
-        # is told by when its messages came, not by when they are looked at.
+        # After a long identification the queue holds the messages received meanwhile: their times
+        # of reception decide whether a truck has left, not the times of their processing.
         now_s = time.monotonic() if one is None else one.received_s
         lag_s = max(lag_s, time.monotonic() - now_s)
-        if isinstance(one, Token):
+        if isinstance(one, LivenessToken):
             arrivals.note(one)
         elif one is not None:
-            engine.expect(one.key, one.payload)  # its own turn may come after another truck's
+            engine.expect(one.key, one.payload)  # it may be processed behind another truck's
             batch += arrivals.add(one)
-        # In this order: what has come in the queue is newer than a history that is due.
+        # Keep this order: the messages in the queue are newer than a history that is due.
         for arrived in arrivals.due(now_s) + batch:
             if stop.is_set() and not arrivals.is_leaving(arrived.key):
-                continue  # the next run gets it from the truck again
+                continue  # the truck sends it to the next run again
             name = f"{arrived.key.stream} of {arrived.key.identifier}"
             try:
                 outputs = engine.feed(arrived.key, arrived.payload)
             except ValueError as error:
                 _log.warning("refused %s: %s", name, error)
                 continue
-            service.go_on(outputs)
+            service.process_outputs(outputs)
         if stop.is_set():
             leave_at_s = min(leave_at_s, time.monotonic() + GONE_AFTER_S)
             arrivals.hurry()
             certificates.end()
         for gone in arrivals.gone(now_s):
-            service.go_on(engine.gone(gone.realm, gone.vehicle, for_good=gone.for_good))
-        service.tell(collected(engine, execution))
+            service.process_outputs(engine.gone(gone.realm, gone.vehicle, for_good=gone.for_good))
+        service.publish(collect(engine, execution))
         if not stop.is_set():
-            passed = certificates.advance(time.monotonic(), engine.pairs_that_wait)
+            passed = certificates.advance(time.monotonic(), engine.waiting_pairs)
             for pair, digest in passed.items():
                 engine.certify(pair, digest)
             if certificates.progress not in (None, progress):
                 progress = certificates.progress
                 pair, share = progress
                 validating = f"validating {pair}"
-                _say_progress(service.publisher, service.id, "", validating, share)
+                _publish_progress(service.publisher, service.id, "", validating, share)
             if engine.has_released and execution.has_room:
-                service.go_on(engine.release())
-            if catching_up is not None and time.monotonic() >= next_catch_up_s:
+                service.process_outputs(engine.release())
+            if backfill is not None and time.monotonic() >= next_catch_up_s:
                 next_catch_up_s = time.monotonic() + _CATCH_UP_EVERY_S
-                said = catching_up.advance(
+                outputs = backfill.advance(
                     engine,
                     time.monotonic(),
                     has_room=execution.is_idle and not engine.has_released,
-                    want=certificates.want,
+                    want=certificates.request,
                 )
-                service.go_on(said)
+                service.process_outputs(outputs)
         edited = None if stop.is_set() or editing is None else editing.edited(time.monotonic())
         if editing is not None and edited is not None:
-            # Every result belongs to one site file: what is under way still to that of before.
-            service.tell(awaited(engine, execution))
-            service.go_on(editing.retarget(edited))
-            told.clear()
-        for vehicle in engine.unknown_vehicles - told:
-            told.add(vehicle)
+            # Every result belongs to one site file: running tasks belong to the previous one.
+            service.publish(drain(engine, execution))
+            service.process_outputs(editing.retarget(edited))
+            warned.clear()
+        for vehicle in engine.unknown_vehicles - warned:
+            warned.add(vehicle)
             _log.warning("%s drives, but the site file has no such vehicle", vehicle)
-    service.tell(awaited(engine, execution))
+    service.publish(drain(engine, execution))
     waiting = [name for names in engine.waiting().values() for name in names]
     if waiting:
         _log.warning(
-            "%d crossings still wait for a certificate or a process (%s): the next run gets them "
-            "from their trucks, or from the logger's recordings",
+            "%d crossings still wait for a site validation or a process (%s): the next run gets "
+            "them from their trucks, or from the logger's recordings",
             *(len(waiting), ", ".join(waiting[-_MOST_NAMED:])),
         )
 
 
-def _next(queued: _Queue) -> Arrived | Token | None:
+def _next(queued: _Queue) -> TruckMessage | LivenessToken | None:
     try:
         return queued.get(timeout=_POLL_S)
     except queue.Empty:
         return None
 
 
-def _may_lose(engine: Engine, arrivals: Arrivals) -> bool:
-    """Whether a truck that is about to leave may have a crossing that is not decided."""
+def _has_undecided_departures(engine: Engine, arrivals: ArrivalQueue) -> bool:
+    """Return whether a departing truck may have a crossing that is not decided."""
     return any(waits or engine.has_undecided(*truck) for truck, waits in arrivals.leaving().items())
 
 
-def _worked_out(outputs: Iterable[Output]) -> Iterator[Output]:
-    """What the engine says; an error of its own is nobody's message to blame."""
+def _guard_engine(outputs: Iterable[Output]) -> Iterator[Output]:
+    """Yield the engine's messages; blame an error within it on no message."""
     try:
         yield from outputs
     except ValueError as error:
-        _log.error("an error of the program", exc_info=True)
-        raise FailureError(f"a crossing could not be worked out: {error}") from error
+        _log.error("internal error", exc_info=True)
+        raise FailureError(f"a crossing could not be processed: {error}") from error
 
 
-def _say_progress(
+def _publish_progress(
     publisher: Publisher, service_id: str, crossing_id: str, stage: str, fraction: float
 ) -> None:
     progress = pb.Progress(
@@ -582,20 +582,20 @@ def _say_progress(
     publisher.put("service", service_id, "progress", progress.SerializeToString())
 
 
-def _backlog(engine: Engine, execution: Execution, catching_up: CatchingUp | None) -> _Backlog:
+def _backlog(engine: Engine, execution: CrossingExecutor, source: Backfill | None) -> _Backlog:
     waiting = {pair: len(names) for pair, names in engine.waiting().items()}
     ready = sum(number for pair, number in waiting.items() if engine.is_certified(pair))
     return _Backlog(
-        tuple(one.crossing_id for one in execution.under_way),
+        tuple(one.crossing_id for one in execution.running),
         execution.waiting + ready,
         sum(waiting.values()) - ready,
-        0 if catching_up is None else catching_up.waiting,
+        0 if source is None else source.waiting,
     )
 
 
-def _say_health(service: Service, behind: _Behind, backlog: _Backlog) -> None:
-    under_way, note = service.execution.under_way, service.certificates.note
-    notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in under_way]
+def _publish_health(service: WorkerService, behind: _QueueLag, backlog: _Backlog) -> None:
+    running, note = service.execution.running, service.certificates.note
+    notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in running]
     notes += [f"{backlog.waiting} wait for a process"] if backlog.waiting else []
     notes += [f"{backlog.in_recordings} wait in recordings"] if backlog.in_recordings else []
     notes += [note] if note else []
@@ -607,8 +607,8 @@ def _say_health(service: Service, behind: _Behind, backlog: _Backlog) -> None:
         figures={
             "queue": float(behind.messages),
             "lag_s": behind.lag_s,
-            "identifying": float(len(under_way)),
-            "identifying_longest_s": max((one.seconds for one in under_way), default=0.0),
+            "identifying": float(len(running)),
+            "identifying_longest_s": max((one.seconds for one in running), default=0.0),
             "waiting_for_process": float(backlog.waiting),
             "waiting_for_certificate": float(backlog.waiting_for_certificate),
             "waiting_in_recordings": float(backlog.in_recordings),

@@ -1,34 +1,44 @@
-"""In which order and when what comes from the bus is looked at. No I/O, no clock."""
+"""Order and time in which messages from the bus are processed. No I/O, no clock."""
 
+from collections import defaultdict
 from typing import NamedTuple
 
 from schemas.topics import Key
-from services.identification.streams import device_time_ns
+from services.common.intervals import Intervals
+from services.finding.streams import device_time_ns
 
 GONE_AFTER_S = 3.0
-"""A truck whose token has gone is given this long for what is still on its way."""
+"""Time in s that a truck without a token has for messages still in transit."""
 _SILENT_S = 10.0
-"""So long must a truck be silent that has no token, such as a replayed one, to have gone."""
+"""Silence in s after which a truck that never had a token, such as a replayed one, has left."""
 _LOST_AFTER_S = 120.0
-"""A token also goes when only the connection is lost. So long after it, what is missing in the
-middle of a crossing is taken to be lost: who comes back brings it."""
+"""Time in s after a token's loss from which missing data count as lost.
+
+A token is also lost when only the connection is; a truck that returns sends the missing data.
+"""
 _HISTORY_S = 1.0
-"""A truck that is new here sends its history stream by stream: what comes in the first second is
-put in order of time before it is looked at."""
+"""Least time in s over which the history of a new truck is collected.
+
+It sends its history stream by stream, in pieces that a busy machine delays: all is sorted by time
+before it is processed.
+"""
+_LONGEST_HISTORY_S = 10.0
+"""Time in s after which a history is processed although sequences are missing in it."""
 
 
-class Arrived(NamedTuple):
+class TruckMessage(NamedTuple):
     """A message of a truck."""
 
     key: Key
     boot_id: int
+    sequence: int
     payload: bytes
     received_s: float
-    """When it came, on any steady clock: it may wait long before anybody looks at it."""
+    """Time of its reception by any steady clock; its processing may be much later."""
 
 
-class Token(NamedTuple):
-    """A truck has come to the bus or left it."""
+class LivenessToken(NamedTuple):
+    """The arrival of a truck on the bus, or its departure."""
 
     realm: str
     vehicle: str
@@ -36,8 +46,8 @@ class Token(NamedTuple):
     received_s: float
 
 
-class Gone(NamedTuple):
-    """A truck that left and did not come back, shortly or for good."""
+class DepartedTruck(NamedTuple):
+    """A truck that left, for now or for good."""
 
     realm: str
     vehicle: str
@@ -45,7 +55,7 @@ class Gone(NamedTuple):
 
 
 class _Leave(NamedTuple):
-    """Since when nothing tells that a truck is there, and how long that is too little to tell."""
+    """Start of a truck's absence, and the absence after which it has left."""
 
     since_s: float
     patience_s: float
@@ -57,37 +67,41 @@ _Vehicle = tuple[str, str]
 """Realm and vehicle."""
 
 
-class Arrivals:
-    """Puts what comes in the order in which it is to be looked at.
+class ArrivalQueue:
+    """Queue that puts messages into their order of processing.
 
-    What came first must be told first. `now_s` is a moment up to which everything that came has
-    been told: where more waits, the moment at which the last that was told came, not the clock's.
+    Messages are passed in the order of their reception. `now_s` is a time up to which all received
+    messages have been passed: the time of the last one passed where more wait, not the clock's.
     """
 
     def __init__(self) -> None:
         self._known: set[_Name] = set()
-        self._new: dict[_Name, list[Arrived]] = {}
+        self._new: dict[_Name, list[TruckMessage]] = {}
         self._since: dict[_Name, float] = {}
+        self._sequences: dict[_Name, defaultdict[str, Intervals]] = {}
+        """Received sequences of a new truck by stream."""
         self._alive: set[_Vehicle] = set()
         self._leaves: dict[_Vehicle, _Leave] = {}
         self._lost: dict[_Vehicle, float] = {}
-        """When a truck that has gone is taken not to come back."""
+        """Time at which the absence of a truck that left counts as permanent."""
 
-    def add(self, arrived: Arrived) -> list[Arrived]:
-        """Take a message in; return it if it can be looked at now."""
-        truck = (arrived.key.realm, arrived.key.identifier)
+    def add(self, message: TruckMessage) -> list[TruckMessage]:
+        """Add a message; return it if it can be processed now."""
+        truck = (message.key.realm, message.key.identifier)
         if truck not in self._alive:
-            self._leaves[truck] = _Leave(arrived.received_s, _SILENT_S)
+            self._leaves[truck] = _Leave(message.received_s, _SILENT_S)
             self._lost.pop(truck, None)
-        name = (arrived.key.realm, arrived.key.identifier, arrived.boot_id)
+        name = (message.key.realm, message.key.identifier, message.boot_id)
         if name in self._known:
-            return [arrived]
-        self._new.setdefault(name, []).append(arrived)
-        self._since.setdefault(name, arrived.received_s)
+            return [message]
+        self._new.setdefault(name, []).append(message)
+        self._since.setdefault(name, message.received_s)
+        streams = self._sequences.setdefault(name, defaultdict(Intervals))
+        streams[message.key.stream].add(message.sequence)
         return []
 
-    def note(self, token: Token) -> None:
-        """Note that a truck has come or gone."""
+    def note(self, token: LivenessToken) -> None:
+        """Record that a truck arrived or departed."""
         truck = (token.realm, token.vehicle)
         if token.is_alive:
             self._alive.add(truck)
@@ -97,43 +111,52 @@ class Arrivals:
             self._alive.discard(truck)
             self._leaves[truck] = _Leave(token.received_s, GONE_AFTER_S)
 
-    def due(self, now_s: float) -> list[Arrived]:
-        """What trucks that are new have sent in their first second, in order of time."""
-        due: list[Arrived] = []
-        for name in [n for n, since_s in self._since.items() if since_s + _HISTORY_S <= now_s]:
+    def due(self, now_s: float) -> list[TruckMessage]:
+        """Return the messages of new trucks' histories that are complete, in order of time."""
+        due: list[TruckMessage] = []
+        for name in [name for name in self._since if self._is_complete(name, now_s)]:
             self._known.add(name)
-            del self._since[name]
+            del self._since[name], self._sequences[name]
             due += sorted(self._new.pop(name), key=_device_time_ns)
         return due
 
-    def gone(self, now_s: float) -> list[Gone]:
-        """The trucks of which it has turned out since the last call that they have gone."""
+    def _is_complete(self, name: _Name, now_s: float) -> bool:
+        collected_s = now_s - self._since[name]
+        if collected_s < _HISTORY_S:
+            return False
+        has_gaps = any(numbers.runs > 1 for numbers in self._sequences[name].values())
+        return not has_gaps or collected_s >= _LONGEST_HISTORY_S
+
+    def gone(self, now_s: float) -> list[DepartedTruck]:
+        """Return the trucks found to have left since the last call."""
         gone = [t for t, leave in self._leaves.items() if sum(leave) <= now_s]
         lost = [truck for truck, lost_s in self._lost.items() if lost_s <= now_s]
         for truck in gone:
             self._lost[truck] = self._leaves.pop(truck).since_s + _LOST_AFTER_S
         for truck in lost:
             del self._lost[truck]
-        return [Gone(*t, for_good=False) for t in gone] + [Gone(*t, for_good=True) for t in lost]
+        return [DepartedTruck(*t, for_good=False) for t in gone] + [
+            DepartedTruck(*t, for_good=True) for t in lost
+        ]
 
     def leaving(self) -> dict[_Vehicle, bool]:
-        """Trucks that may be about to go, and whether something of theirs waits here."""
+        """Return trucks that may be leaving, and whether messages of theirs wait here."""
         waiting = {name[:2] for name in self._new}
         return {truck: truck in waiting for truck in self._leaves}
 
     def is_leaving(self, key: Key) -> bool:
-        """Whether the truck of a key may be about to go."""
+        """Return whether the truck of a key may be leaving."""
         return (key.realm, key.identifier) in self._leaves
 
     def hurry(self) -> None:
-        """Wait for nobody longer than for a truck whose token has gone."""
+        """Wait for no truck longer than for one whose token is lost."""
         for truck, leave in self._leaves.items():
             patience_s = min(leave.patience_s, GONE_AFTER_S)
             self._leaves[truck] = leave._replace(patience_s=patience_s)
 
 
-def _device_time_ns(arrived: Arrived) -> int:
+def _device_time_ns(message: TruckMessage) -> int:
     try:
-        return device_time_ns(arrived.key.stream, arrived.payload)
+        return device_time_ns(message.key.stream, message.payload)
     except ValueError:
-        return 0  # the engine will say what is wrong
+        return 0  # the engine reports the error

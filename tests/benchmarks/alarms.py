@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from scipy.stats import beta
 
 from pre_core.monitoring.baseline import Period
-from pre_core.monitoring.observation import Observation, fused
-from pre_core.monitoring.watch import Change, Rules, watch
+from pre_core.monitoring.change_detection import AlarmRules, Change, detect_change
+from pre_core.monitoring.observation import Observation, combine_observations
 from services.execution.blas import one_blas_thread
 from services.identification.observed import observation_of
 from tests.fleet import bridge_of, crossing_of, season_deg_c, templates, trucks_of
@@ -160,7 +160,7 @@ def _series() -> Iterator[tuple[Kind, bool]]:
 
 
 def _losses() -> Iterator[tuple[Kind, bool, float, float, bool]]:
-    usual = Rules().at_least
+    usual = AlarmRules().at_least
     white, wander, season = KINDS
     for share in LOSSES:
         yield white, True, usual, share, False
@@ -192,14 +192,14 @@ def _weeks(value: float) -> str:
 def _sound(row: tuple[int, int], kind: Kind, is_known: bool, bridge: int) -> Sound:
     rng = np.random.default_rng([*row, bridge])
     periods = drawn(rng, kind, SOUND_WEEKS[is_known], is_known=is_known)
-    usual = watch(periods, Rules())
+    usual = detect_change(periods, AlarmRules())
     # A change of which nobody wants to know: only the statistic counts.
-    free = watch(periods, Rules(at_least=0.999)) if usual.change is not None else usual
+    free = detect_change(periods, AlarmRules(at_least=0.999)) if usual.change is not None else usual
     judged = np.flatnonzero(free.judged)
     years = len(judged) / 52.0
     first = []
     for stated in STATED:
-        threshold = np.sqrt(2.0 * Rules(stated).threshold)
+        threshold = np.sqrt(2.0 * AlarmRules(stated).threshold)
         passed = np.flatnonzero(free.statistic[judged] > threshold)
         first.append((passed[0] + 1) / 52.0 if passed.size else -years)
     if usual.change is not None:
@@ -214,7 +214,7 @@ def _delay(
     rng = np.random.default_rng([*row, loss.element, bridge])
     at = LOST_AT[is_known]
     periods = drawn(rng, kind, at + FOLLOWED, is_known=is_known, loss=loss, at=at)
-    change = watch(periods, Rules(at_least=at_least)).change
+    change = detect_change(periods, AlarmRules(at_least=at_least)).change
     return float(change.raised_at - at + 1) if _is_it(change, loss.element) else float("inf")
 
 
@@ -286,7 +286,13 @@ def drawn(
             value = value + CHANGE * rng.standard_normal(n)
             value = value + sum((s.loading @ z[s.name] for s in one.shared), np.zeros(n))
             some.append(one._replace(value=value))
-        out.append(Period(fused(some, n), warm if is_known else None, 7.0 * (first + week) + 3.5))
+        out.append(
+            Period(
+                combine_observations(some, n),
+                warm if is_known else None,
+                7.0 * (first + week) + 3.5,
+            )
+        )
     return out
 
 

@@ -214,7 +214,7 @@ _PLACES = {
         "schemas/signals.py",
         "schemas/topics.py",
         "services/recordings/recording.py",
-        "services/identification/streams.py",
+        "services/finding/streams.py",
         "struct",
         "decompress",
     ),

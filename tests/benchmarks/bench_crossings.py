@@ -9,16 +9,16 @@ from typing import NamedTuple
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from schemas.results import Crossing, Header
+from schemas.results import CrossingResult, ResultHeader
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
-from services.execution.here import Here
-from services.execution.offline import site_of
-from services.execution.overview import as_they_were_made, look_over, messages_of_trucks
-from services.execution.processes import Processes
-from services.identification.bridge_state import Counted, count_in, state_of, usable
+from services.execution.inline import InlineExecutor
+from services.execution.offline import messages_of_trucks, site_of
+from services.execution.processes import ProcessExecutor
+from services.finding.order import in_measurement_order, index_messages
+from services.identification.bridge_state import RecentCrossings, add_crossings, state_of, usable
 from services.identification.engine import Engine
-from services.identification.outputs import Work
+from services.identification.outputs import IdentificationTask
 from services.recordings.recording import program_version
 from tests.benchmarks import recordings, view
 
@@ -42,8 +42,8 @@ print(1024 * int(lines["VmHWM"].split()[0]))
 
 class _Sample(NamedTuple):
     site: Site
-    work: Work
-    result: Crossing
+    work: IdentificationTask
+    result: CrossingResult
 
 
 @pytest.fixture(scope="module")
@@ -51,23 +51,23 @@ def sample() -> _Sample:
     """The crossing of the sample, as an engine gives it to be identified, and its result."""
     site = site_of([SAMPLE], None)
     settings = IdentificationSettings(threads=1)
-    header = Header(
+    header = ResultHeader(
         version=program_version(), created=0.0, site_hash="0" * 64,
         settings=settings.model_dump(mode="json"), seed=settings.seed,
     )  # fmt: skip
-    engine = Engine(site, settings, header, tells_states=False)
-    drives = look_over("sample", messages_of_trucks([SAMPLE]), site)
+    engine = Engine(site, settings, header, publishes_states=False)
+    drives = index_messages("sample", messages_of_trucks([SAMPLE]), site)
     for fix in drives.near:
         engine.expect(fix.key, fix.payload, for_ever=True)
     said = [
         one
-        for message in as_they_were_made(drives)
+        for message in in_measurement_order(drives)
         for one in engine.feed(message.key, message.payload)
     ]
-    (work,) = (one for one in [*said, *engine.finish()] if isinstance(one, Work))
-    here = Here()
-    here.start(work)
-    (finished,) = here.finished()
+    (work,) = (one for one in [*said, *engine.finish()] if isinstance(one, IdentificationTask))
+    here = InlineExecutor()
+    here.submit(work)
+    (finished,) = here.collect()
     return _Sample(site, work, finished.result)
 
 
@@ -82,19 +82,19 @@ def test_crossings_in_processes(
         given = taken = 0
         while taken < count:
             while given < count and not pool.is_full:
-                pool.start(sample.work._replace(number=given))
+                pool.submit(sample.work._replace(number=given))
                 given += 1
-            for finished in pool.finished(0.1):
+            for finished in pool.collect(0.1):
                 assert finished.result.verdict == "good"
                 taken += 1
 
-    with Processes(processes) as pool:
+    with ProcessExecutor(processes) as pool:
         pool.wait_until_warm()
         for number in range(processes):
-            pool.start(sample.work._replace(number=-1 - number))
+            pool.submit(sample.work._replace(number=-1 - number))
         warmed = 0
         while warmed < processes:
-            warmed += len(pool.finished(0.1))
+            warmed += len(pool.collect(0.1))
         benchmark.pedantic(run, rounds=1)
     benchmark.extra_info["crossings"] = count
 
@@ -106,7 +106,7 @@ def test_fusing(benchmark: BenchmarkFixture, sample: _Sample) -> None:
     def run() -> None:
         seconds.clear()
         for count in FUSED:
-            counted = Counted()
+            counted = RecentCrossings()
             for number in range(count):
                 again = sample.result.model_copy(
                     update={
@@ -115,7 +115,7 @@ def test_fusing(benchmark: BenchmarkFixture, sample: _Sample) -> None:
                         "exit_time": sample.result.exit_time + 3600.0 * number,
                     }
                 )
-                counted = count_in(counted, [one] if (one := usable(again)) else [])
+                counted = add_crossings(counted, [one] if (one := usable(again)) else [])
             began = time.perf_counter()
             state = state_of(counted, sample.work.data.bridge.id)
             seconds.append(time.perf_counter() - began)

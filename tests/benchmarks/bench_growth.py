@@ -7,14 +7,14 @@ import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from pre_core.paper import experiment, residual
-from pre_core.paper.residual import Window
+from pre_core.paper.residual import PaperWindow
 from tests.benchmarks import cases
 
 _ROUNDS = 15
 
 
 class _Size(NamedTuple):
-    window: Window
+    window: PaperWindow
     elements: int = experiment.ELEMENTS
     particles: int = 64
 

@@ -64,12 +64,12 @@ def test_paper_search(benchmark: BenchmarkFixture):
     walk = random_walk.problem(window, cases.NOMINAL, cases.FREE, seed=1)
     random_walk.init(walk, 8)  # compiled, or loaded
 
-    def whole_search() -> random_walk.State:
-        state, _, _ = loop.run(
+    def whole_search() -> random_walk.RandomWalkState:
+        state, _, _ = loop.run_search(
             partial(random_walk.init, walk),
             partial(random_walk.step, walk),
             random_walk.STEPS,
-            at_the_end=loop.Ending.STEPS_DONE,
+            at_the_end=loop.Termination.STEPS_DONE,
         )
         return state
 
@@ -81,14 +81,14 @@ def test_paper_search(benchmark: BenchmarkFixture):
 
 def test_least_squares(benchmark: BenchmarkFixture):
     window = cases.paper_window(cases.SCENARIO)
-    problem = least_squares.Problem(window, cases.NOMINAL, cases.FREE)
+    problem = least_squares.LeastSquaresProblem(window, cases.NOMINAL, cases.FREE)
     work = residual.workspace(window)
     nominal = cases.NOMINAL[cases.FREE]
     starts = iter(cases.start_ratios(21, seed=2))
     worst, steps, evaluations = [], [], []
 
     def from_start(start: cases.Floats) -> None:
-        state, infos, _ = loop.run(
+        state, infos, _ = loop.run_search(
             partial(least_squares.init, problem, work, nominal * start),
             partial(least_squares.step, problem, work),
             least_squares.MAX_STEPS,

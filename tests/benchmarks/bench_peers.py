@@ -147,13 +147,13 @@ def test_peer(
 def test_least_squares(benchmark: BenchmarkFixture, scenario: int):
     """Ours, one thread, to its own convergence."""
     window = cases.paper_window(scenario)
-    problem = least_squares.Problem(window, cases.NOMINAL, cases.FREE)
+    problem = least_squares.LeastSquaresProblem(window, cases.NOMINAL, cases.FREE)
     work = residual.workspace(window)
     nominal = cases.NOMINAL[cases.FREE]
 
     def run(seed: int) -> dict[str, float]:
         began = time.perf_counter()
-        state, infos, _ = loop.run(
+        state, infos, _ = loop.run_search(
             partial(least_squares.init, problem, work, nominal * cases.start_ratios(1, seed)[0]),
             partial(least_squares.step, problem, work),
             least_squares.MAX_STEPS,
@@ -179,11 +179,11 @@ def test_random_walk(benchmark: BenchmarkFixture, scenario: int):
 
     def run() -> dict[str, float]:
         began = time.perf_counter()
-        state, _, _ = loop.run(
+        state, _, _ = loop.run_search(
             partial(random_walk.init, walk),
             partial(random_walk.step, walk),
             random_walk.STEPS,
-            at_the_end=loop.Ending.STEPS_DONE,
+            at_the_end=loop.Termination.STEPS_DONE,
         )
         best = state.ratios[np.argmin(state.objective)]
         return {

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core import unknowns
+from pre_core import parameters
 from pre_core.paper import crossing, experiment, random_walk, residual
 from pre_core.paper.integrate import newmark_integrate
-from pre_core.paper.residual import Window
+from pre_core.paper.residual import PaperWindow
 from pre_core.physics.bridge import Beam
 from pre_core.physics.models import body_masses, from_models
 from pre_core.physics.road import iso_8608_profile, under_wheels
@@ -21,12 +21,12 @@ from pre_core.physics.vehicle import total_mass_kg
 Floats = NDArray[np.float64]
 
 SCENARIO = 6
-FREE = unknowns.paper_subset(experiment.ELEMENTS)
+FREE = parameters.paper_subset(experiment.ELEMENTS)
 NOMINAL = from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
 
 
 @cache
-def paper_window(scenario: int) -> Window:
+def paper_window(scenario: int) -> PaperWindow:
     """One crossing of the paper: 14 degrees of freedom, 1 ms, no noise."""
     beam = experiment.beam(experiment.scenario_ratios(scenario))
     return crossing.paper_window(experiment.TRUCK, beam, 0.0, 1)
@@ -58,10 +58,10 @@ def accuracy(ratios: Floats, scenario: int) -> Floats:
         for theta in (full(ratios[None, :])[0], NOMINAL)
     ]
     truth = np.ones(FREE.size)
-    rigidities = slice(unknowns.EI_1, unknowns.EI_1 + experiment.ELEMENTS)
+    rigidities = slice(parameters.EI_1, parameters.EI_1 + experiment.ELEMENTS)
     places = np.flatnonzero((rigidities.start <= FREE) & (rigidities.stop > FREE))
     truth[places] = experiment.scenario_ratios(scenario)
-    off = np.abs(ratios - truth)[FREE != unknowns.D_1]
+    off = np.abs(ratios - truth)[FREE != parameters.D_1]
     return np.asarray(1.0 - np.concatenate([np.abs(masses[0] / masses[1] - 1.0), off]))
 
 
@@ -92,7 +92,7 @@ def noise_window(
     parts: int = 1,
     coordinates: int | None = None,
     speed_m_per_s: float = experiment.SPEED_M_PER_S,
-) -> Window:
+) -> PaperWindow:
     """A crossing of the paper's span whose signals are noise: an evaluation takes as long."""
     travel = experiment.SPAN_M + experiment.TRUCK.wheelbase_m + 1.0
     steps = round(travel / speed_m_per_s / experiment.STEP_S)
@@ -140,7 +140,7 @@ class Objective:
         theta = full(ratios)
         total = np.full(ratios.shape[0], np.inf)
         physical = np.all(ratios > 0.0, axis=1) & np.all(np.isfinite(ratios), axis=1)
-        physical &= theta[:, unknowns.D_1] < self._window.wheelbase_m
+        physical &= theta[:, parameters.D_1] < self._window.wheelbase_m
         chosen = np.flatnonzero(physical)
         total[chosen] = self._batch(theta[chosen])
         self.evaluations += ratios.shape[0]

@@ -27,10 +27,10 @@ import zstandard
 
 from schemas.settings import IdentificationSettings
 from services.common.parquet_files import decoded
-from services.execution.archive import Asked, identify_archive
-from services.execution.here import Here
-from services.execution.kept import EDITION, KEY, Kept, files_of
+from services.execution.archive import ArchiveJob, identify_archive
+from services.execution.inline import InlineExecutor
 from services.execution.offline import site_of
+from services.execution.result_store import EDITION, KEY, ResultStore, files_of
 from services.identification.bridge_state import NOTHING_STORED
 from tests.drives import SAMPLE, drives
 from tests.faults.clusters import Running, RunningCluster, cluster, contents, start
@@ -95,15 +95,15 @@ class Taken(NamedTuple):
 
 def in_one_process(recordings: list[Path], into: Path) -> Taken:
     settings = IdentificationSettings(threads=1)
-    asked = Asked(tuple(recordings), site_of(recordings, None), settings, NOTHING_STORED, {})
+    asked = ArchiveJob(tuple(recordings), site_of(recordings, None), settings, NOTHING_STORED, {})
     times: list[tuple[float, float]] = []
 
-    class Timed(Here):
-        def start(self, work: Any) -> None:
-            super().start(work)
+    class Timed(InlineExecutor):
+        def submit(self, work: Any) -> None:
+            super().submit(work)
             times.append((time.monotonic(), time.process_time()))
 
-    identify_archive(asked, Timed(), Kept(into))
+    identify_archive(asked, Timed(), ResultStore(into))
     number = len(times) - 1
     (began_s, began), (ended_s, ended) = times[0], times[-1]
     return Taken((ended_s - began_s) / number, (ended - began) / number).said("one process")

@@ -14,16 +14,16 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from schemas.results import Header
+from schemas.results import ResultHeader
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.site import Bridge, Site
 from schemas.site_file import site_hash
+from schemas.topics import Message
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.identification.engine import Engine
-from services.identification.outputs import Work
-from services.recordings.recording import Message
+from services.identification.outputs import IdentificationTask
 from services.simulation.drive import paper_site
 
 SPEED_M_PER_S = 20.0
@@ -97,7 +97,9 @@ def measure(bridges: int, minutes: float) -> dict[str, float]:
     """Crossings found, and processor time in s by stream, of a drive among so many bridges."""
     site = site_of(bridges, minutes)
     settings = IdentificationSettings(method="least_squares")
-    header = Header("0", 0.0, site_hash(site), settings.model_dump(mode="json"), settings.seed)
+    header = ResultHeader(
+        "0", 0.0, site_hash(site), settings.model_dump(mode="json"), settings.seed
+    )
     engine = Engine(site, settings, header)
     spent = {"gnss": 0.0, "accel": 0.0}
     works = 0
@@ -107,7 +109,9 @@ def measure(bridges: int, minutes: float) -> dict[str, float]:
             continue
         began = time.thread_time()
         engine.expect(message.key, message.payload)
-        works += sum(isinstance(s, Work) for s in engine.feed(message.key, message.payload))
+        works += sum(
+            isinstance(s, IdentificationTask) for s in engine.feed(message.key, message.payload)
+        )
         spent[stream] += time.thread_time() - began
     return {"crossings": works, **spent}
 

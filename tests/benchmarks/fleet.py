@@ -22,13 +22,19 @@ from pathlib import Path
 
 import numpy as np
 
+from services.catalogue.index import _file_of
+from services.catalogue.row import CatalogRow
 from services.execution.blas import one_blas_thread
-from services.history.alarms import Settings, check, marks_of, remember, watch_bridge
-from services.history.archive import Kept, kept_of, partition, write_batch
-from services.history.catalog import _file_of
-from services.history.catalog_row import Row
-from services.history.questions import overview
-from services.identification.bridges import Box
+from services.finding.bridges import Box
+from services.history.alarms import (
+    AlarmSettings,
+    change_markers,
+    check,
+    monitor_bridge,
+    save_markers,
+)
+from services.history.history_store import HistoryRow, history_row, partition, write_batch
+from services.history.sql import overview
 from tests.fleet import HEADER, bridge_of, crossing_of, season_deg_c, templates, trucks_of
 
 REALM = "sim-fleet"
@@ -62,19 +68,19 @@ def main() -> None:
     for what in ("first", "again"):
         took(f"driveby history {bridge}, {what}", lambda: said(command))
     now_s = BEGIN_S + YEARS * 365.25 * 86_400.0
-    settings = Settings()
+    settings = AlarmSettings()
     with one_blas_thread():
         some = [f"bridge-{n:05d}" for n in range(min(OF_ONE, options.bridges))]
         took(
             f"alarms of {len(some)} bridges in this process",
             lambda: sum(
-                watch_bridge(history, REALM, b, settings, now_s).alarm is not None for b in some
+                monitor_bridge(history, REALM, b, settings, now_s).alarm is not None for b in some
             ),
         )
         if options.all:
             shutil.rmtree(history / "alarms", ignore_errors=True)
             took("alarms of all bridges, 2 processes", lambda: looked(history, now_s))
-        remember(history, marks_of(history, settings, now_s))
+        save_markers(history, change_markers(history, settings, now_s))
         night(history, options.bridges)
         took("alarms of a night, 2 processes", lambda: looked(history, now_s))
     took("all bridges in a table (DuckDB)", lambda: len(overview(history).rows))
@@ -90,14 +96,14 @@ def make(history: Path, bridges: int, crossings: int) -> str:
         mine = [trucks[k] for k in rng.choice(100, 4, replace=False)]
         where = partition(history, REALM, bridge.name)
         times = np.sort(rng.uniform(0.0, YEARS * 365.25 * 86_400.0, crossings)) + BEGIN_S
-        rows: list[Kept] = []
+        rows: list[HistoryRow] = []
         for time_s in times.tolist():
             warm = season_deg_c(time_s) + 4.0 * float(rng.standard_normal())
             ei = bridge.ei_nm2 * np.exp(bridge.slope_per_k * (warm - 10.0))
             ei = ei * np.exp(0.005 * rng.standard_normal(ei.size))
             kind, truck = kinds[int(rng.integers(len(kinds)))], mine[int(rng.integers(4))]
             crossing = crossing_of(rng, kind, truck, bridge, time_s, ei)
-            rows.append(kept_of(crossing, HEADER._replace(created=time_s), warm))
+            rows.append(history_row(crossing, HEADER._replace(created=time_s), warm))
         for batch in np.array_split(np.arange(crossings), BATCHES):
             write_batch(where, [rows[k] for k in batch.tolist()])
         folders.append(where)
@@ -116,7 +122,7 @@ def night(history: Path, bridges: int) -> None:
 
 
 def looked(history: Path, now_s: float) -> str:
-    found = check(history, Settings(), now_s, processes=2)
+    found = check(history, AlarmSettings(), now_s, processes=2)
     return f"{found.bridges} bridges, {len(found.standing)} alarms stand"
 
 
@@ -125,7 +131,7 @@ def catalogue_bytes() -> float:
     rng = np.random.default_rng(3)
     rates = dict.fromkeys(("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear"), 1e3)
     rows = [
-        Row(
+        CatalogRow(
             f"live/2026-01-01/truck-{n % 100}-20260101T{n:06d}Z.mcap",
             int(rng.integers(20e6, 30e6)), int(rng.integers(1 << 60)), rng.bytes(32), ("live",),
             (f"truck-{n % 100}",), 10**18 + n * 9 * 10**9, 10**18 + (n + 100) * 9 * 10**9, 27_000,

@@ -29,21 +29,21 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import (
     CHANNELS,
     AccelBatch,
-    Channel,
+    AccelChannel,
     GnssFix,
     Identity,
     decode_identity,
     encode_accel,
 )
 from services.bus.session import open_session
-from services.logger.writer import Limits
+from services.logger.writer import RotationLimits
 from services.recordings.recording import read_identities, read_info
 from services.truck.gateway import Gateway
 from tests.parent import die_with_parent, parent_environment
 
 BATCHES_PER_S = 20
 MESSAGES_PER_S = 40
-DEFAULT_MINUTES = Limits().age_s / 60.0
+DEFAULT_MINUTES = RotationLimits().age_s / 60.0
 _DRAIN_S = 5.0
 _LONGEST_MS = 600_000
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -252,7 +252,7 @@ def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
         realms=("*",),
         site=None,
         ready=lambda: print("ready", flush=True),
-        limits=writer.Limits(age_s=rotate_minutes * 60.0),
+        limits=writer.RotationLimits(age_s=rotate_minutes * 60.0),
     )
     shares = {"p50": 0.5, "p99": 0.99, "max": 1.0}
     reached = np.cumsum(delays)
@@ -357,7 +357,7 @@ def drive(endpoint: str, trucks: int, seconds: float) -> None:
 
 
 def made_up(rng: np.random.Generator) -> pb.AccelBatch:
-    channels = {name: Channel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+    channels = {name: AccelChannel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
     batch = AccelBatch(1, 0, 0, time.time_ns(), channels)
     return pb.AccelBatch.FromString(encode_accel(batch))
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.signal import lfilter
 
-from pre_core.paper.residual import Window
-from pre_core.unknowns import ALPHA, BETA, C_S1, D_1, EI_1, K_S1, K_U1, M_U1, RHO_A
+from pre_core.paper.residual import PaperWindow
+from pre_core.parameters import ALPHA, BETA, C_S1, D_1, EI_1, K_S1, K_U1, M_U1, RHO_A
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ class Prepared(NamedTuple):
     dx_m: float
 
 
-def prepare(window: Window, elements: int, span_m: float) -> Prepared:
+def prepare(window: PaperWindow, elements: int, span_m: float) -> Prepared:
     """The same samples as `window`, and a finite-element model of our own."""
     s = span_m / elements
     dx = float(np.mean(np.diff(window.x_m)))

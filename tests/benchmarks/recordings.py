@@ -15,13 +15,13 @@ import numpy as np
 from schemas.signals import (
     CHANNELS,
     AccelBatch,
-    Channel,
+    AccelChannel,
     GnssFix,
     encode_accel,
     encode_gnss,
 )
-from schemas.topics import Key
-from services.recordings.recording import Message, read_identities, read_messages
+from schemas.topics import Key, Message
+from services.recordings.recording import read_identities, read_messages
 from services.recordings.recovery import describe, recover_recording
 from services.recordings.writer import RecordingWriter
 
@@ -63,7 +63,7 @@ def drive() -> list[Message]:
     rng = np.random.default_rng(1)
     payloads = []
     for _ in range(50):
-        channels = {name: Channel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+        channels = {name: AccelChannel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
         payloads.append(encode_accel(AccelBatch(1, 0, 5, NOW_NS, channels)))
     fix = encode_gnss(GnssFix(1, 0, 0, NOW_NS, 50.0, 8.0, 100.0, 10.0))
     accel, gnss = (Key("live", "vehicle", "truck-1", name) for name in ("accel", "gnss"))

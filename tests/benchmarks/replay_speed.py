@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.signals import CHANNELS, AccelBatch, Channel, GnssFix, encode_accel, encode_gnss
-from schemas.topics import Key
-from services.recordings.recording import Message, read_info
+from schemas.signals import CHANNELS, AccelBatch, AccelChannel, GnssFix, encode_accel, encode_gnss
+from schemas.topics import Key, Message
+from services.recordings.recording import read_info
 from services.recordings.writer import write_recording
 from tests.endpoints import free_endpoint
 
@@ -67,7 +67,7 @@ def drive() -> Iterator[Message]:
     for n in range(MINUTES * 60 * 20):
         device_ns = n * 50_000_000
         time_ns = 1_700_000_000_000_000_000 + device_ns
-        channels = {name: Channel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+        channels = {name: AccelChannel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
         batch = encode_accel(AccelBatch(1, n, device_ns, time_ns, channels))
         yield Message(accel, batch, 1, n, time_ns, time_ns)
         if n % 2 == 0:

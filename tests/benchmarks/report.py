@@ -1,4 +1,4 @@
-"""Runs every benchmark once and writes docs/benchmarks.md: `python -m tests.benchmarks.report`."""
+"""Run every benchmark once, write studies/benchmarks.md: `python -m tests.benchmarks.report`."""
 
 import argparse
 import json
@@ -18,7 +18,7 @@ from tests.benchmarks.cases import slope
 
 PROJECT = Path(__file__).parents[2]
 FOLDER = PROJECT / "tests" / "benchmarks"
-PAGE = PROJECT / "docs" / "benchmarks.md"
+PAGE = PROJECT / "studies" / "benchmarks.md"
 
 _BUSY = 1.5  # one is ourselves, compiling
 

@@ -23,11 +23,11 @@ def main() -> None:
     topic = ros2.TOPICS["sprung_front"]
     stamps = [_FIRST_NS + number * 1_000_000 for number in range(_MESSAGES)]
     payloads = [ros2.imu(stamp_ns, 1.0) for stamp_ns in stamps]
-    truck.take(topic, IMU, payloads[0], stamps[0])  # rosbags makes its decoders
+    truck.convert(topic, IMU, payloads[0], stamps[0])  # rosbags makes its decoders
     begun = time.process_time()
     batches = 0
     for stamp_ns, payload in zip(stamps[1:], payloads[1:], strict=True):
-        for item in truck.take(topic, IMU, payload, stamp_ns):
+        for item in truck.convert(topic, IMU, payload, stamp_ns):
             assert not isinstance(item, GnssFix)
             encode_accel(AccelBatch(1, batches, *item))
             batches += 1

@@ -14,9 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.signals import CHANNELS, AccelBatch, Channel, GnssFix, encode_accel, encode_gnss
-from schemas.topics import Key
-from services.recordings.recording import Message
+from schemas.signals import CHANNELS, AccelBatch, AccelChannel, GnssFix, encode_accel, encode_gnss
+from schemas.topics import Key, Message
 from tests.benchmarks import recordings
 
 MINUTES = (10, 60)
@@ -40,7 +39,7 @@ def drive(minutes: int) -> list[Message]:
     for n in range(1, minutes * 1200 + 1):
         device_ns = n * 50_000_000
         time_ns = recordings.NOW_NS + device_ns
-        channels = {name: Channel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+        channels = {name: AccelChannel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
         batch = encode_accel(AccelBatch(1, n, device_ns, time_ns, channels))
         messages.append(Message(accel, batch, 1, n, time_ns, time_ns))
         if n % 2 == 0:

@@ -24,14 +24,13 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import CHANNELS, Identity
 from schemas.site import Site
 from schemas.site_file import site_toml
-from schemas.topics import Key, selector
+from schemas.topics import Key, Message, selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.recordings.recording import Message
-from services.simulation.drive import declared, paper_site, simulate_drive
+from services.simulation.drive import declared_site, paper_site, simulate_drive
 from tests.faults.day import APART_M, Fleet, place
 from tests.waiting import LONGEST_S
 
@@ -69,7 +68,7 @@ def site_of(trucks: int) -> Site:
     one = paper_site().vehicles[0]
     vehicles = [one.model_copy(update={"id": f"truck-{truck}"}) for truck in range(trucks)]
     site = paper_site().model_copy(update={"vehicles": tuple(vehicles), "bridges": tuple(bridges)})
-    return declared(site, _NOISE, max(site.sensor.rate_hz))
+    return declared_site(site, _NOISE, max(site.sensor.rate_hz))
 
 
 def drive_of(truck: int, site: Site, seconds: float) -> list[Message]:

@@ -2,18 +2,23 @@
 
 from typing import Any
 
-from schemas import certificates
-from schemas.certificates import Certificate, Pair, Tried, pair_hash
+from schemas import validation_records
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
+from schemas.validation_records import (
+    ValidationCrossing,
+    ValidationRecord,
+    VehicleBridgePair,
+    pair_hash,
+)
 from services.simulation.drive import paper_site
 
 SITE = paper_site()
-PAIR = Pair("truck-1", "bridge-1")
+PAIR = VehicleBridgePair("truck-1", "bridge-1")
 SETTINGS = IdentificationSettings()
 
 
-def tried(number: int = 0, **values: Any) -> Tried:
+def tried(number: int = 0, **values: Any) -> ValidationCrossing:
     """Return a crossing that found its two elements undamaged."""
     fields: dict[str, Any] = {
         "seed": number,
@@ -24,16 +29,18 @@ def tried(number: int = 0, **values: Any) -> Tried:
         "ei_ratio_q50": (1.0, 1.0),
         "ei_ratio_q975": (1.25, 1.25),
     }
-    return Tried.model_validate(fields | values)
+    return ValidationCrossing.model_validate(fields | values)
 
 
-def certificate(site: Site = SITE, pair: Pair = PAIR, **values: Any) -> Certificate:
+def certificate(
+    site: Site = SITE, pair: VehicleBridgePair = PAIR, **values: Any
+) -> ValidationRecord:
     """Return a certificate that passed and vouches for nothing but its own form."""
     fields: dict[str, Any] = {
         "version": "0",
         "created": 0.0,
         "hash": pair_hash(site, pair, SETTINGS),
-        "method_edition": certificates.METHOD_EDITION,
+        "method_edition": validation_records.METHOD_EDITION,
         "vehicle": pair.vehicle,
         "bridge": pair.bridge,
         "settings": SETTINGS.model_dump(mode="json"),
@@ -59,4 +66,4 @@ def certificate(site: Site = SITE, pair: Pair = PAIR, **values: Any) -> Certific
         "passed": True,
         "reason": "made up",
     }
-    return Certificate.model_validate(fields | values)
+    return ValidationRecord.model_validate(fields | values)

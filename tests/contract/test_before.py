@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.before import essentials, fields_of, make, unpacked
+from tests.before import essentials, fields_of, make, of_files, unpacked
 
 FOLDERS = sorted((Path(__file__).parents[1] / "data" / "before").iterdir())
 RELATIVE = 1e-6
@@ -66,7 +66,7 @@ def test_a_changed_file_is_seen(tmp_path: Path) -> None:
     site = copied / "paper.toml"
     site.write_text(site.read_text().replace("30.0", "31.0", 1))
     shutil.rmtree(copied / "history/crossings/realm=sim-drive")
-    found = different(stored, json.loads(json.dumps(essentials(copied))))
+    found = different(stored, json.loads(json.dumps(of_files(copied))))
     assert [line for line in found if line.startswith(".sites.paper.toml")]
     assert [line for line in found if line.startswith(".history")]
 

@@ -1,4 +1,4 @@
-"""Every shell command on README and the pages of docs/: it is run here, or listed with a reason.
+"""Every shell command of README, docs/ and studies/: it is run here, or listed with a reason.
 
 Of what is listed it is still looked at whether the program would take it: options that are gone,
 targets of make, modules and files that are not there.
@@ -17,7 +17,11 @@ import pytest
 from services.cli import main as cli
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "studies").glob("*.md")),
+]
 SAMPLE = "recordings/sample/crossing.mcap"
 
 LONG = "takes minutes to hours; `make test-all`, `make faults` or a person runs it"
@@ -28,25 +32,33 @@ MACHINES = "is for machines that are not here; tests/process_replay and tests/fa
 NETWORK = "needs a network"
 CLUSTER = "needs a cluster; tests/faults/test_cluster.py has one"
 FUSES = "is of many drives; tests/unit/identification/test_fusing.py runs the commands"
-CERTIFIES = "takes a minute; tests/process_replay and tests/unit/validation run it"
+KEPT = "is of a folder of `identify --into`; tests/unit/history/test_archive.py adds one"
+REFERENCE = "is of reference crossings that are not in this repository"
+CERTIFIES = "takes a minute; tests/process_replay and tests/unit/cli run it"
 ITSELF = "runs the tests, of which this is one"
 
 NOT_RUN = {
-    "driveby catalog s3://bucket/fleet": "tests/unit/history/test_catalog.py has a store",
+    "driveby catalog s3://bucket/fleet": "tests/unit/catalogue/test_catalog.py has a store",
     "driveby identify s3://bucket/fleet --into identified": (
         "tests/unit/cli/test_cluster.py has a store"
     ),
-    'pip install "driveby[s3]"': NETWORK,
-    "pytest tests/unit/history/test_catalog.py": ITSELF,
+    'pip install "driveby[history,s3]"': NETWORK,
     "python -m tests.benchmarks.fleet --out /tmp/fleet": LONG,
     "python -m tests.benchmarks.alarms": LONG,
-    "python -m tests.faults.year --out build/year": LONG,
     "make year": LONG,
-    'pytest tests/faults/test_cluster.py -m "faults or not faults" -k "idle or killed"': LONG,
     "pytest tests/numerics/test_monitoring.py": ITSELF,
     "driveby alarm ack BRIDGE --by NAME --note TEXT": (
         "needs an alarm; tests/unit/history/test_alarms.py has one"
     ),
+    "driveby alarm serve": SERVICE,
+    "driveby history BRIDGE --period week --figures DIR": (
+        "is of a bridge of one's own; its page runs it of another one"
+    ),
+    "driveby history add identified": KEPT,
+    "driveby history add DIR": KEPT,
+    "driveby import d10_left_and_right_8_runs --site d10_left_and_right_8_runs/site.toml "
+    "-o d10.mcap": REFERENCE,
+    "driveby identify d10.mcap --json d10.json": REFERENCE,
     "driveby cluster --workers 2": SERVICE,
     "driveby cluster --workers 2 --tls cluster-certs": SERVICE,
     "driveby identify recordings --site site.toml --scheduler tcp://127.0.0.1:8786 "
@@ -54,8 +66,7 @@ NOT_RUN = {
     "driveby identify recordings --site site.toml --scheduler tls://127.0.0.1:8786 "
     "--tls cluster-certs/client --into identified": CLUSTER,
     "pytest tests/faults/test_cluster.py": ITSELF,
-    "pytest tests/faults/test_cluster.py -m faults": ITSELF,
-    'pip install "driveby[cluster]"': NETWORK,
+    'pip install "driveby[identify,cluster]"': NETWORK,
     "python -m tests.benchmarks.cluster_scale --crossings 2000": LONG,
     "make install": "installs what this test runs in; .ci/run begins with it",
     "make demo": "tests/process_replay/test_demo.py runs the command of the target",
@@ -64,9 +75,7 @@ NOT_RUN = {
     "make faults": ITSELF,
     "make soak": LONG,
     "make day": LONG,
-    "python -m tests.faults.day --minutes 4 --speed 1 --kills 0 --folder build/day": LONG,
     "make validate": LONG,
-    "make validate WORLDS=30": LONG,
     "driveby identify monday.mcap tuesday.mcap --json week.json": FUSES,
     "driveby fuse week.json lastweek.json --json both.json": FUSES,
     "driveby fuse both.json --baseline lastyear.json": FUSES,
@@ -88,17 +97,21 @@ NOT_RUN = {
     "python -m tests.survey.achieved 5": LONG,
     "python -m tests.survey.sound 60": LONG,
     "python -m tests.benchmarks.logger_load --trucks 100 --seconds 200 --freeze 8": LONG,
+    "python -m pytest tests/faults -m soak -k fifty": LONG,
     "make bench": LONG,
     "make mutants MUTANTS=30 SEED=1": LONG,
     "make up": "needs a container engine; tests/contract/test_compose.py reads its files",
     "make down": "needs a container engine",
     "make docs": "needs a network the first time; tests/contract/test_site.py builds the site",
-    'pip install ".[notebook]"': NETWORK,
+    'pip install ".[identify,view,notebook]"': NETWORK,
+    'pip install "driveby[identify,view,notebook]"': NETWORK,
     'pip install "driveby[notebook]"': NETWORK,
+    "pip install driveby": NETWORK,
+    'pip install "driveby[identify,view]"': NETWORK,
+    'pip install "driveby[all]"': NETWORK,
     'pip install "arviz<1"': NETWORK,
     "driveby view crossing.rrd": WINDOW,
     f"driveby view {SAMPLE}": WINDOW,
-    "driveby view live": WINDOW,
     "driveby logger --realm sim-first": FOUR,
     "driveby worker --realm sim-first --site docs/site.example.toml": FOUR,
     "driveby watch --realm sim-first": FOUR,
@@ -133,8 +146,6 @@ NOT_RUN = {
     "driveby validate --scenarios 1,6,12 --noise 25": LONG,
     "driveby validate --method pre --crossings 200 --control 20 --out-of-model 30 "
     "--page docs/validation.md": LONG,
-    "driveby validate --method pre --crossings 0 --control 0 --scenarios 1 --out-of-model 200 "
-    "--effects free,sprung": LONG,
     "driveby simulate --scenario 6 --road A --seed 3 --noise 10 --road-surface --tyres twin "
     "--rear-offset 0.005 --wander 0.12 --runs 4 --gps-noise -o twin.mcap": LONG,
     "driveby identify twin.mcap": LONG,
@@ -142,15 +153,13 @@ NOT_RUN = {
         "needs a browser; tests/unit/report prints where there is one"
     ),
     "python tests/numerics/table.py": LONG,
-    "python docs/scripts/commands_page.py": "tests/contract/test_pages.py compares the page",
-    "python docs/scripts/reproduction.py frequencies": LONG,
-    "python -m pytest -m slow tests/unit/validation/test_validation.py": LONG,
-    "python -m tests.verdicts.both_ways --worlds 8 --records build/both_ways.jsonl": LONG,
+    "make tables": "tests/contract/test_tables.py compares the pages",
+    "python -m studies.scripts.reproduction frequencies": LONG,
+    "python -m pytest -m slow tests/studies/test_validation.py": LONG,
     "python -m tests.verdicts.measure": LONG,
     "python -m tests.verdicts.measure signals 300": LONG,
     "python -m tests.verdicts.measure sound 14": LONG,
     "pytest tests/verdicts -m slow": LONG,
-    "pytest tests/numerics/test_fusion.py -m slow": LONG,
     "pytest tests/verdicts/test_foreign_vehicle.py -m slow": LONG,
     "pytest tests/verdicts/test_as_they_are.py -m slow": LONG,
     "pytest tests/verdicts/test_width.py -m slow": LONG,
@@ -168,7 +177,6 @@ NOT_RUN = {
     "python -m tests.benchmarks.replay_speed": LONG,
     "python -m tests.benchmarks.view": LONG,
     "python -m tests.screenshots": "tests/unit/viewer/test_screenshots.py takes them",
-    "python -m schemas.topics_page": "tests/contract/test_topics_page.py compares what it writes",
 }
 
 ALTERNATIVES = {"logger.md"}

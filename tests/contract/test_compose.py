@@ -254,7 +254,7 @@ def checked(path: Path) -> tuple[int, str]:
         ("", "2.26.0", "says: nothing\n"),
     ],
 )
-def test_what_is_too_old_is_said_in_one_line(
+def test_too_old_version_gives_one_line(
     tmp_path: Path, engine: str, compose: str, said: str
 ) -> None:
     code, line = checked(a_docker(tmp_path, engine, compose))

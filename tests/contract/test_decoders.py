@@ -17,7 +17,11 @@ from schemas.topics import TOPICS, Topic, topic
 
 TIME_NS = 1_700_000_000_000_000_000
 BATCH = signals.AccelBatch(
-    1, 2, 3, TIME_NS, {name: signals.Channel(1000.0, np.arange(50.0)) for name in signals.CHANNELS}
+    1,
+    2,
+    3,
+    TIME_NS,
+    {name: signals.AccelChannel(1000.0, np.arange(50.0)) for name in signals.CHANNELS},
 )
 FIX = signals.GnssFix(1, 2, 3, TIME_NS, 52.5, 13.4, 34.0, 10.0, 359.0, 0.5, 1.0, 0.05)
 INFO = signals.VehicleInfo(1, 2, 3, TIME_NS, "truck-1", "[vehicle]\n")
@@ -82,7 +86,7 @@ def test_accel_round_trip(
 ) -> None:
     batch = signals.AccelBatch(
         *header,
-        {name: signals.Channel(rate, np.array(v)) for name, (rate, v) in channels.items()},
+        {name: signals.AccelChannel(rate, np.array(v)) for name, (rate, v) in channels.items()},
     )
     again = signals.decode_accel(signals.encode_accel(batch))
     assert again[:4] == batch[:4]
@@ -109,7 +113,7 @@ def test_a_channel_has_one_name() -> None:
 
 
 def test_a_batch_of_too_many_channels_is_refused() -> None:
-    channel = signals.Channel(200.0, np.array([0.5]))
+    channel = signals.AccelChannel(200.0, np.array([0.5]))
     names = [f"a{k}" for k in range(signals.MAX_CHANNELS + 1)]
     batch = signals.AccelBatch(1, 2, 3, TIME_NS, dict.fromkeys(names, channel))
     with pytest.raises(ValueError, match="33 channels; at most 32"):
@@ -238,6 +242,14 @@ def test_impossible_fixes_are_neither_read_nor_written(field: str, value: float)
         signals.decode_gnss(message.SerializeToString())
     with pytest.raises(ValueError, match=field):
         signals.encode_gnss(FIX._replace(**{field: value}))
+
+
+def test_unknown_altitude_is_nan_and_never_zero() -> None:
+    fix = signals.decode_gnss(signals.encode_gnss(FIX._replace(altitude_m=math.nan)))
+    assert math.isnan(fix.altitude_m)
+    location: Any = decode("foxglove.LocationFix", signals.encode_location(fix))
+    assert math.isnan(location.altitude)
+    assert signals.check_location(signals.encode_location(fix)) == FIX.wall_time_ns
 
 
 def test_too_large() -> None:

@@ -16,7 +16,9 @@ from typing import NamedTuple
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("driveby", "pre_core", "schemas", "services")
+PACKAGES = ("driveby", "pre_core", "schemas", "services", "studies")
+ROOMS = ("pre_core", "services", "studies")
+"""Packages whose rooms are empty `__init__` files and whose class names are counted together."""
 MODULE_LINES = 450
 CLASS_LINES = 250
 FUNCTION_LINES = 60
@@ -27,11 +29,8 @@ OFTEN = frozenset({"State", "Info", "Problem"})
 """Class names that each search has for itself."""
 
 LONG_MODULES = {
-    "pre_core.crossing.optimum": 738,
-    "pre_core.crossing.residuals": 803,
-    "pre_core.crossing.whitening": 622,
+    "pre_core.crossing.residuals": 767,
     "pre_core.paper.residual": 579,
-    "services.identification.engine": 763,
     "services.logger.writer": 511,
     "services.simulation.two_sided": 861,
     "services.viewer.rerun_crossing": 490,
@@ -39,36 +38,30 @@ LONG_MODULES = {
 }
 
 LONG_CLASSES = {
-    "services.execution.cluster:Cluster": 273,
-    "services.identification.engine:Engine": 661,
+    "services.execution.cluster:DaskExecutor": 273,
     "services.logger.intake:Intake": 293,
     "services.logger.writer:FileWriter": 395,
     "services.truck.spool:Spool": 260,
-    "services.viewer.live_picture:LivePicture": 315,
-    "services.worker.catching_up:CatchingUp": 314,
+    "services.viewer.live_view:LiveView": 315,
+    "services.worker.backfill:Backfill": 311,
 }
 
 LONG_FUNCTIONS = {
-    "pre_core.crossing.optimum:_from_likeliest_places": 69,
-    "pre_core.crossing.preparation:prepare": 77,
-    "pre_core.crossing.residuals:_deflect": 75,
-    "pre_core.monitoring.watch:watch": 71,
+    "pre_core.crossing.preparation:build_problem": 77,
+    "pre_core.monitoring.change_detection:detect_change": 71,
     "pre_core.paper.residual:build_window": 87,
-    "pre_core.paper.residual:march_particles": 64,
+    "pre_core.paper.residual:march_particles": 63,
     "pre_core.paper.residual:objective": 68,
     "pre_core.physics.simulate:_march": 232,
     "pre_core.physics.simulate:simulate": 115,
-    "schemas.results_on_the_wire:crossing_to_protobuf": 81,
     "services.cli.export:_export": 67,
     "services.cli.identify:identify_command": 70,
     "services.cli.info:as_json": 63,
     "services.cli.simulate:_add_beyond": 69,
     "services.cli.survey:add_survey": 63,
-    "services.cli.validate_pre:validate_pre_command": 69,
-    "services.history.recorded:look": 69,
+    "services.ledger.recorded_crossings:scan_stays": 69,
     "services.identification.bridge_state:state_of": 69,
-    "services.identification.engine:Engine._advance": 67,
-    "services.identification.pre_method:identify_pre": 81,
+    "services.identification.pre_method:identify_pre": 77,
     "services.logger.__init__:_record": 61,
     "services.replay.__init__:run": 70,
     "services.simulation.drawn:draw_truth": 78,
@@ -79,18 +72,18 @@ LONG_FUNCTIONS = {
     "services.simulation.two_sided:_system": 70,
     "services.simulation.two_sided:cross": 61,
     "services.simulation.wide_cases:draw_wide": 78,
-    "services.simulation.worlds:draw_world": 83,
+    "services.simulation.out_of_model:draw_out_of_model": 83,
     "services.truck.__init__:run": 76,
-    "services.validation.paper:run_scenario": 71,
+    "studies.paper.scenarios:run_scenario": 71,
     "services.worker.__init__:_serve": 104,
     "services.worker.__init__:run": 150,
 }
 
 MANY_ARGUMENTS = {
     "pre_core.crossing.compliances:_gibbs": 9,
-    "pre_core.crossing.compliances:of_normal": 9,
+    "pre_core.crossing.compliances:from_normal": 9,
     "pre_core.crossing.residuals:_evaluate": 9,
-    "pre_core.crossing.whitening:mismatch_power": 9,
+    "pre_core.crossing.noise:mismatch_power": 9,
     "pre_core.paper.residual:_march_stretch": 9,
     "pre_core.paper.residual:build_window": 15,
     "pre_core.physics.beam_basis:_one_mode_two_wheels": 9,
@@ -106,16 +99,12 @@ MANY_ARGUMENTS = {
     "pre_core.physics.simulate:simulate": 11,
     "services.cli.identify:identify_command": 13,
     "services.cli.identify_archive:archive_command": 12,
-    "services.cli.validate_paper:validate_command": 9,
-    "services.cli.validate_pre:validate_pre_command": 13,
     "services.drives.importing:_import_ros2": 8,
     "services.drives.importing:import_command": 8,
     "services.execution.offline:identify_drives": 8,
-    "services.history.recorded:take": 8,
     "services.identification.engine:Engine.__init__": 8,
-    "services.identification.outputs:crossing_output": 8,
     "services.identification.pre_method:identify_pre": 9,
-    "services.identification.stays:find_stays": 8,
+    "services.finding.stays:find_stays": 8,
     "services.logger.__init__:run": 11,
     "services.notebook.simulate:simulate": 10,
     "services.recordings.writer:RecordingWriter.__init__": 9,
@@ -132,16 +121,16 @@ MANY_ARGUMENTS = {
     "services.simulation.wide_crossings:road_under": 8,
     "services.truck.__init__:run": 11,
     "services.truck.ros2:run": 9,
-    "services.validation.paper:run_scenario": 8,
+    "studies.paper.scenarios:run_scenario": 8,
     "services.viewer.live:live_command": 8,
     "services.viewer.rerun_file:write_rrd": 8,
     "services.viewer.view:write_views": 9,
     "services.worker.__init__:run": 15,
-    "services.worker.catching_up:CatchingUp.__init__": 9,
+    "services.worker.backfill:Backfill.__init__": 8,
 }
 
 ROOMS_WITH_CODE = {
-    "pre_core": 7,
+    "pre_core": 5,
     "services.cluster": 37,
     "services.logger": 62,
     "services.replay": 31,
@@ -150,57 +139,7 @@ ROOMS_WITH_CODE = {
 }
 
 SHARED_NAMES = {
-    "Asked": 2,
-    "Comparison": 2,
-    "Complaints": 2,
-    "Crossing": 2,
-    "Drive": 2,
-    "Driven": 2,
-    "Elements": 2,
-    "Errors": 2,
-    "Finding": 2,
-    "Fixes": 3,
-    "Found": 2,
-    "Fused": 3,
-    "Gone": 2,
-    "Heard": 3,
-    "Kept": 2,
-    "Kind": 2,
-    "Known": 3,
-    "Layout": 2,
-    "Limits": 2,
-    "Looked": 2,
-    "Motion": 2,
-    "Passage": 2,
-    "Passing": 3,
-    "Refusals": 2,
-    "Response": 2,
-    "Road": 2,
-    "Row": 2,
-    "Run": 2,
-    "Seen": 2,
-    "Service": 2,
-    "Shared": 2,
-    "Simulation": 2,
-    "Solution": 2,
-    "Source": 2,
-    "Spreads": 2,
-    "Stream": 3,
-    "Survey": 2,
-    "Track": 3,
-    "Truck": 4,
-    "Truth": 2,
-    "Wanted": 2,
-    "Watch": 2,
-    "Watched": 2,
-    "Window": 3,
-    "Work": 2,
-    "_File": 2,
-    "_Heard": 2,
-    "_Place": 3,
-    "_Read": 2,
     "_Record": 2,
-    "_Source": 2,
     "_Truck": 2,
 }
 
@@ -279,14 +218,14 @@ def measured(modules: list[Module]) -> dict[str, dict[str, int]]:
 
     for module, text, tree in modules:
         note("lines of a module", module, text.count("\n"), MODULE_LINES)
-        if module.endswith(".__init__") and module.split(".")[0] in ("services", "pre_core"):
+        if module.endswith(".__init__") and module.split(".")[0] in ROOMS:
             room = module.removesuffix(".__init__")
             note("statements in a room's __init__", room, statements_of(tree), 0)
         for name, node in definitions(tree):
             where = f"{module}:{name}"
             if isinstance(node, ast.ClassDef):
                 note("lines of a class", where, lines_of(node), CLASS_LINES)
-                classes[node.name] += module.split(".")[0] in ("services", "pre_core")
+                classes[node.name] += module.split(".")[0] in ROOMS
             elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 note("lines of a function", where, lines_of(node), FUNCTION_LINES)
                 note("arguments", where, arguments_of(node), ARGUMENTS)
@@ -312,9 +251,14 @@ def beyond(found: Mapping[str, int], listed: Mapping[str, int]) -> list[str]:
     ]
 
 
+@pytest.fixture(scope="module")
+def of_ours(modules: list[Module]) -> dict[str, dict[str, int]]:
+    return measured(modules)
+
+
 @pytest.mark.parametrize("limit", LISTS)
-def test_nothing_new_is_beyond_a_limit(limit: str, modules: list[Module]) -> None:
-    assert beyond(measured(modules)[limit], LISTS[limit]) == []
+def test_nothing_new_is_beyond_a_limit(limit: str, of_ours: dict[str, dict[str, int]]) -> None:
+    assert beyond(of_ours[limit], LISTS[limit]) == []
 
 
 def test_a_list_may_only_shrink() -> None:

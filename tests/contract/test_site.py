@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 
 import driveby
-from schemas.results import Header
+from schemas.results import ResultHeader
 from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.site_file import load_site
-from schemas.topics import Key
-from services.recordings.recording import Message
+from schemas.topics import Key, Message
 from services.recordings.writer import write_recording
 from tests.unit.viewer.found import results_of, some_crossing
 
@@ -49,6 +48,13 @@ def test_the_site_is_built_and_every_page_is_in_it(site: Path) -> None:
         assert f"message {name}" in messages
 
 
+def test_pages_of_examples_link_to_pages_of_the_site(site: Path) -> None:
+    page = (site / "examples" / "sqlite" / "index.html").read_text()
+    assert 'href="../../index.html#live"' in page
+    assert 'href="../../contract.html"' in page
+    assert (site / "examples" / "two_spans" / "site.toml").is_file()
+
+
 def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
     for page in site.glob("*.html"):
         loaded = re.findall(
@@ -64,7 +70,7 @@ def definition() -> str:
 def test_the_example_decodes_an_estimate(tmp_path: Path) -> None:
     known = load_site(ROOT / "docs/site.example.toml")
     (found,) = results_of(known, some_crossing("a")).crossings
-    payload = crossing_to_protobuf(found, Header("0", 1.79e9, "0" * 16, {}, 0))
+    payload = crossing_to_protobuf(found, ResultHeader("0", 1.79e9, "0" * 16, {}, 0))
     key = Key("live", "bridge", "bridge-1", "estimate")
     now = 1_790_000_000_000_000_000
     message = Message(key, payload.SerializeToString(), 1, 0, now, now)

@@ -1,12 +1,16 @@
 """An installed wheel brings one name, `driveby`, and lives beside other people's packages."""
 
+import email
 import json
 import os
+import re
 import runpy
 import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,6 +18,8 @@ from typing import Any
 import pytest
 
 INNER = ("pre_core", "schemas", "services")
+LARGEST_TRUCK_MB = 120.0
+"""Site-packages of a truck's computer, without compiled bytecode."""
 DECOY = "raise RuntimeError('the package of somebody else was imported')\n"
 
 
@@ -22,14 +28,19 @@ def built() -> dict[str, Any]:
     return runpy.run_path(str(Path(__file__).parents[2] / "setup.py"), run_name="setup")
 
 
+def sources(project: Path, folder: Path) -> Path:
+    """Return the folder after copying into it what a distribution is built from, and studies."""
+    for name in ("driveby", "studies", *INNER):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(project / name, folder / name, ignore=ignored)
+    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(project / name, folder / name)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def wheel(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    source = tmp_path_factory.mktemp("source")
-    for name in ("driveby", *INNER):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(project / name, source / name, ignore=ignored)
-    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(project / name, source / name)
+    source = sources(project, tmp_path_factory.mktemp("source"))
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-index"]
     command += ["--no-build-isolation", "--wheel-dir", str(source / "dist"), str(source)]
     subprocess.run(command, check=True, capture_output=True)
@@ -57,10 +68,16 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return environment
 
 
-def run(environment: Path, program: str, *arguments: str, cwd: Path) -> str:
+def ended(
+    environment: Path, program: str, *arguments: str, cwd: Path
+) -> subprocess.CompletedProcess[str]:
     without = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     command = [str(environment / "bin" / program), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=without)
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=without)
+
+
+def run(environment: Path, program: str, *arguments: str, cwd: Path) -> str:
+    done = ended(environment, program, *arguments, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -72,8 +89,74 @@ def test_the_wheel_holds_one_package(wheel: Path) -> None:
         (about,) = (name for name in top if name.endswith(".dist-info"))
         assert top == {"driveby", about}
         assert file.read(f"{about}/top_level.txt") == b"driveby\n"
+    assert not [name for name in names if "studies" in name]
     for name in ("py.typed", "services/data/paper.toml", "schemas/proto/driveby.proto"):
         assert f"driveby/{name}" in names
+
+
+def test_tests_can_be_run_against_the_wheel(built: dict[str, Any], project: Path) -> None:
+    for path in (project / "tests").rglob("*.py"):
+        built["moved_inside"](path.read_bytes(), str(path))
+
+
+@pytest.fixture(scope="module")
+def distributions(project: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two builds of the same sources, in checkouts of other times and modes."""
+    found = []
+    for modified_s, mode, umask in ((1e9, 0o664, 0o002), (1.5e9, 0o600, 0o077)):
+        folder = tmp_path_factory.mktemp("distribution")
+        source = sources(project, folder / "source")
+        for path in source.rglob("*"):
+            os.utime(path, (modified_s, modified_s))
+            path.chmod(0o755 if path.is_dir() else mode)
+        script = project / "docs" / "scripts" / "distribution.py"
+        subprocess.run(
+            [sys.executable, script, source, folder / "out"],
+            env=os.environ | {"SOURCE_DATE_EPOCH": "1750000000"},
+            umask=umask,
+            check=True,
+            capture_output=True,
+        )
+        found.append(folder / "out")
+    return found
+
+
+def test_two_builds_give_the_same_bytes(distributions: list[Path]) -> None:
+    first, second = ({p.name: p.read_bytes() for p in out.iterdir()} for out in distributions)
+    assert sorted(name.rpartition(".")[2] for name in first) == ["gz", "whl"]
+    assert first.keys() == second.keys()
+    assert [name for name in first if first[name] != second[name]] == []
+
+
+def test_source_archive_holds_sources_and_nothing_of_the_machine(distributions: list[Path]) -> None:
+    (archive,) = distributions[0].glob("*.tar.gz")
+    with tarfile.open(archive) as file:
+        members = file.getmembers()
+    names = {member.name.partition("/")[2] for member in members}
+    assert {"setup.py", "pyproject.toml", "README.md", "LICENSE", "driveby/py.typed"} <= names
+    assert {"services/data/paper.toml", "schemas/proto/driveby.proto"} <= names
+    assert {member.mode for member in members if member.isfile()} == {0o644}
+    assert {(one.uid, one.gid, one.uname, one.gname, one.mtime) for one in members} == {
+        (0, 0, "", "", 1_750_000_000)
+    }
+
+
+def test_metadata_describe_the_project(distributions: list[Path], project: Path) -> None:
+    (wheel,) = distributions[0].glob("*.whl")
+    with zipfile.ZipFile(wheel) as file:
+        (name,) = (name for name in file.namelist() if name.endswith(".dist-info/METADATA"))
+        about = email.message_from_bytes(file.read(name))
+        assert name.replace("METADATA", "licenses/LICENSE") in file.namelist()
+    settings = tomllib.loads((project / "pyproject.toml").read_text())["project"]
+    assert (about["Name"], about["Version"]) == ("driveby", settings["version"])
+    assert about["License-Expression"] == "Apache-2.0"
+    assert about["Description-Content-Type"] == "text/markdown"
+    assert about.get_payload(decode=True) == (project / "README.md").read_bytes()
+    classifiers = about.get_all("Classifier", [])
+    assert "Typing :: Typed" in classifiers
+    assert "Programming Language :: Python :: 3.11" in classifiers
+    for url in about.get_all("Project-URL", []):
+        assert not re.search(r"example\.|TODO|OWNER|USER", url), url
 
 
 def test_every_module_is_imported_from_inside(installed: Path, tmp_path: Path) -> None:
@@ -103,6 +186,12 @@ def test_a_recording_is_read_beside_packages_of_the_same_name(
         assert "identify" in run(installed, "python", *module, "--help", cwd=tmp_path)
 
 
+def test_studies_are_refused_in_one_line(installed: Path, tmp_path: Path) -> None:
+    done = ended(installed, "driveby", "validate", "--scenarios", "6", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "driveby validate runs from a checkout" in done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.process
 def test_the_installed_command_identifies_and_starts_processes(
@@ -116,6 +205,58 @@ def test_the_installed_command_identifies_and_starts_processes(
     assert list(installed.glob("lib/*/site-packages/driveby/pre_core/**/*.nbi"))
     run(installed, "driveby", "demo", "--speed", "8", "--out", "demo", cwd=tmp_path)
     assert (tmp_path / "demo").is_dir()
+
+
+@pytest.mark.slow
+def test_a_trucks_computer_holds_what_it_needs_and_no_more(
+    wheel: Path, tmp_path: Path, project: Path
+) -> None:
+    """The wheel with the packages that it requires itself, in an empty environment."""
+    environment = tmp_path / "environment"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
+    pip = [sys.executable, "-m", "pip", "--python", str(environment / "bin" / "python")]
+    install = [*pip, "install", "--quiet", "--no-compile"]
+    pinned = project / "requirements" / "truck.txt"
+    done = subprocess.run(
+        [*install, "--require-hashes", "-r", str(pinned)], capture_output=True, text=True
+    )
+    if done.returncode:
+        pytest.skip(f"no package index: {done.stderr.strip().splitlines()[-1]}")
+    subprocess.run([*install, "--no-index", str(wheel)], check=True)
+    sample = project / "recordings" / "sample" / "crossing.mcap"
+    example = project / "tests" / "data" / "csv_example"
+
+    def driveby(*arguments: object) -> str:
+        return run(environment, "driveby", *map(str, arguments), cwd=tmp_path)
+
+    def run_all() -> None:
+        for command in ("truck", "logger", "replay", "watch", "health", "gateway"):
+            assert f"usage: driveby {command}" in driveby(command, "--help")
+        assert "truck-1" in driveby("info", sample)
+        driveby("import", example, "--site", example / "site.toml", "-o", "a.mcap", "--force")
+        driveby("export", sample, "--to", "csv")
+        lacking = ended(environment, "driveby", "identify", str(sample), cwd=tmp_path)
+        assert (lacking.returncode, lacking.stderr.count("\n")) == (2, 1)
+        assert 'pip install "driveby[identify]"' in lacking.stderr
+
+    (packages,) = environment.glob("lib/*/site-packages")
+    as_installed_mb = size_mb(packages)
+    run_all()
+    slim = project / "docs" / "scripts" / "slim_environment.sh"
+    if shutil.which("strip") is None:
+        pytest.skip("the image of a truck is made with strip of binutils")
+    for folder in packages.rglob("__pycache__"):
+        shutil.rmtree(folder)
+    subprocess.run(["sh", slim, environment], check=True)
+    slim_mb = size_mb(packages)
+    run_all()
+    print(f"a truck's packages: {as_installed_mb:.0f} MB, {slim_mb:.0f} MB as in its image")
+    assert slim_mb <= LARGEST_TRUCK_MB
+
+
+def size_mb(folder: Path) -> float:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return sum(path.stat().st_size for path in files) / 1e6
 
 
 def test_what_names_a_module_is_moved_inside(built: dict[str, Any]) -> None:

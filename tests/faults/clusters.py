@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from schemas.results import load_results
 from services.common.parquet_files import decoded
-from services.execution.kept import EDITION, KEY, files_of
+from services.execution.result_store import EDITION, KEY, files_of
 from tests.endpoints import free_port
 from tests.parent import parent_environment
 from tests.waiting import LONGEST_S, until
@@ -128,7 +128,12 @@ def other_worker(address: str, folder: Path, preload: Path) -> Iterator[str]:
     with log.open("w") as file:
         process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "services.common.leash", "distributed.cli.dask_worker"),
+                *(
+                    sys.executable,
+                    "-m",
+                    "services.common.child_process",
+                    "distributed.cli.dask_worker",
+                ),
                 *(address, "--no-nanny", "--nthreads", "1", "--host", "127.0.0.1"),
                 *("--worker-port", str(port), "--preload", str(preload)),
                 *("--no-dashboard", "--dashboard-address", "127.0.0.1:0"),

@@ -3,7 +3,7 @@
 import os
 import sys
 
-import services.cluster
+from services import cluster
 from services.cli.main import main
 from services.execution import scheduler
 from tests.parent import die_with_parent
@@ -11,7 +11,7 @@ from tests.parent import die_with_parent
 
 def hurry() -> None:
     """Take seconds for what takes a minute, where a test says so."""
-    services.cluster.FROZEN_S = float(os.environ.get("DRIVEBY_TEST_FROZEN_S", "600"))
+    cluster.FROZEN_S = float(os.environ.get("DRIVEBY_TEST_FROZEN_S", "600"))
     scheduler.CALL_S = float(os.environ.get("DRIVEBY_TEST_CALL_S", scheduler.CALL_S))
 
 

@@ -13,8 +13,9 @@ from typing import Any
 
 import pytest
 
+from schemas.topics import Message
 from services.common.errors import InputError
-from services.recordings.recording import Message, is_closed, read_info, read_messages
+from services.recordings.recording import is_closed, read_info, read_messages
 from tests.endpoints import free_endpoint
 from tests.parent import parent_environment
 from tests.waiting import LONGEST_S

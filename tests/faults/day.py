@@ -46,10 +46,10 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.recordings.recording import read_info, read_messages
 from services.recordings.writer import write_recording
-from services.simulation.drive import Drive, paper_site, simulate_drive
+from services.simulation.drive import SimulatedDrive, paper_site, simulate_drive
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.live_layout import lane_entity
-from services.viewer.live_picture import MOST_BRIDGES
+from services.viewer.live_view import MOST_BRIDGES
 from services.viewer.view import viewer_arguments, viewer_program
 from tests.endpoints import free_endpoint, free_port
 from tests.parent import parent_environment
@@ -119,7 +119,7 @@ def site() -> Site:
     return paper_site().model_copy(update={"vehicles": trucks, "bridges": (*others, *road)})
 
 
-def drives() -> tuple[Drive, Drive]:
+def drives() -> tuple[SimulatedDrive, SimulatedDrive]:
     """A crossing there and one back, without noise: what a truck feels on any of the bridges."""
     there, back = (
         simulate_drive(paper_site(), scenario_ratios(6), road_class="A", seed=1, forward=forward)
@@ -179,7 +179,7 @@ def way(
 
 
 def write_drive(
-    path: Path, vehicle: str, felt: tuple[Drive, Drive], rounds: int, bridges: int
+    path: Path, vehicle: str, felt: tuple[SimulatedDrive, SimulatedDrive], rounds: int, bridges: int
 ) -> Plan:
     """The recording of a truck that drives there and back so often."""
     # One behind the other: two on a bridge at a time are rejected, which is a result as well.

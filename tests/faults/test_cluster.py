@@ -13,8 +13,8 @@ from distributed import Client
 
 from services.cli import main as cli
 from services.common.errors import FailureError
-from services.execution.kept import kept_results
-from services.execution.scheduler import Credentials, connected, threads_of
+from services.execution.result_store import kept_results
+from services.execution.scheduler import Credentials, connect, threads_of
 from services.security.certs import certs_command
 from tests.drives import drives
 from tests.faults.clusters import (
@@ -54,10 +54,10 @@ if cluster_worker.unpacked.__name__ != "holding":  # Dask runs this twice
     cluster_worker.unpacked = holding
 """
 _SOON_HUNG = """
-from services.execution.processes import Processes
-from services.execution.watch import Limits
+from services.execution.processes import ProcessExecutor
+from services.execution.hang_watchdog import TaskLimits
 
-cluster_worker.new_pool = lambda: Processes(1, limits=Limits(idle_s=5.0))
+cluster_worker.new_pool = lambda: ProcessExecutor(1, limits=TaskLimits(idle_s=5.0))
 """
 _OTHER_VERSION = """
 from services.execution import cluster_worker, program
@@ -188,7 +188,7 @@ def test_a_drive_gives_what_it_gives_in_one_process(
         ),
     ],
 )
-def test_who_is_killed_costs_nothing(
+def test_killed_process_loses_no_result(
     two: RunningCluster,
     held: Held,
     begin: Callable[..., Running],
@@ -206,12 +206,12 @@ def test_who_is_killed_costs_nothing(
     before = two.pids(whom)
     os.kill(before[-1], by)
     until(lambda: len(two.pids(whom)) > len(before))
-    assert f"the {whom} has ended ({cause}); it is started again" in two.command.said()
+    assert f"the {whom} ended ({cause}); restarting it" in two.command.said()
     held.file.unlink()
     assert running.wait() == 0, running.said()
     assert results_of(path) == of_one_process
     assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
-    is_told = "the scheduler at " in running.said()
+    is_told = "scheduler tcp://" in running.said()
     assert is_told == (whom == "scheduler"), running.said()
 
 
@@ -232,8 +232,8 @@ def test_idle_scheduler_lives_on_whatever_dask_is_configured_to(
             until(lambda: client.run_on_scheduler(idle_s) > 2.0)
         running = begin(*of(recordings[:1], *on(two, tmp_path / "into")))
         assert running.wait() == 0, running.said()
-        assert "is gone" not in running.said()
-        assert "has ended" not in two.command.said()
+        assert " lost; waiting" not in running.said()
+        assert "ended (" not in two.command.said()
         assert len(two.pids("scheduler")) == 1
 
 
@@ -330,12 +330,12 @@ def test_a_worker_of_another_version_that_comes_later_is_sent_away(
         held.file.unlink()
         assert running.wait() == 0, running.said()
     assert refused in running.said()
-    assert "it is sent away" in running.said()
+    assert "retiring it" in running.said()
     assert results_of(path) == of_one_process
 
 
 @pytest.mark.faults
-def test_with_tls_only_who_has_a_certificate_of_the_cluster_comes_in(
+def test_tls_admits_only_certificates_of_the_cluster(
     credentials: Path, recordings: list[Path], tmp_path: Path
 ) -> None:
     certs = tmp_path / "certs"
@@ -353,7 +353,7 @@ def test_with_tls_only_who_has_a_certificate_of_the_cluster_comes_in(
         ):
             address = running.address if files else running.address.replace("tls", "tcp")
             with pytest.raises(FailureError, match="no scheduler answers"):
-                connected(address, files, 2.0)
+                connect(address, files, 2.0)
 
 
 @pytest.mark.faults
@@ -406,7 +406,7 @@ def checked(
 
 @pytest.mark.faults
 @pytest.mark.parametrize("whom", ["worker 1", "scheduler"])
-def test_who_is_frozen_for_ever_is_ended_and_costs_nothing(
+def test_permanently_frozen_process_is_ended_without_loss(
     checked: Callable[..., str], tmp_path: Path, whom: str
 ) -> None:
     with holding(tmp_path, DRIVEBY_TEST_FROZEN_S="5") as one:
@@ -415,10 +415,10 @@ def test_who_is_frozen_for_ever_is_ended_and_costs_nothing(
             before = one.cluster.pids(whom)
             os.kill(before[-1], signal.SIGSTOP)
             until(lambda: len(one.cluster.pids(whom)) > len(before))
-            assert f"the {whom} has done nothing for 5 s and is ended" in one.cluster.command.said()
+            assert f"the {whom} has done nothing for 5 s; ending it" in one.cluster.command.said()
 
         said = checked(one, freeze, DRIVEBY_TEST_CALL_S="2")
-    assert ("the scheduler at " in said) == (whom == "scheduler"), said
+    assert ("scheduler tcp://" in said) == (whom == "scheduler"), said
 
 
 @pytest.mark.faults
@@ -437,11 +437,11 @@ def test_a_worker_that_is_frozen_and_goes_on_leaves_what_was_its_own_to_others(
             until(lambda: len(one.cluster.pids("worker 1")) > len(before))
 
         said = checked(one, freeze)
-    assert "the scheduler at " not in said, said
+    assert "scheduler tcp://" not in said, said
 
 
 @pytest.mark.faults
-def test_who_comes_while_a_worker_is_frozen_asks_again(
+def test_client_retries_while_a_worker_is_frozen(
     begin: Callable[..., Running],
     recordings: list[Path],
     tmp_path: Path,
@@ -473,7 +473,7 @@ def test_a_scheduler_that_is_frozen_and_goes_on_costs_nothing(
         def freeze(running: Running) -> None:
             (scheduler,) = one.cluster.pids("scheduler")
             os.kill(scheduler, signal.SIGSTOP)
-            until(lambda: "the scheduler at " in running.said())
+            until(lambda: "scheduler tcp://" in running.said())
             os.kill(scheduler, signal.SIGCONT)
 
         checked(one, freeze, DRIVEBY_TEST_CALL_S="6")
@@ -524,4 +524,4 @@ def test_frozen_processes_below_workers_are_ended_and_cost_nothing(
         said = checked(one, freeze)
         assert frozen != []
         assert not [pid for pid in frozen if Path(f"/proc/{pid}").exists()]
-    assert "the scheduler at " not in said, said
+    assert "scheduler tcp://" not in said, said

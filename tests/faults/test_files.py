@@ -18,31 +18,31 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import (
     CHANNELS,
     AccelBatch,
-    Channel,
+    AccelChannel,
     GnssFix,
     VehicleInfo,
     encode_accel,
     encode_gnss,
     encode_info,
 )
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services import logger
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError
-from services.logger import places
+from services.logger import file_layout
 from services.logger import writer as writer_module
 from services.logger.backlog import QUEUE_BYTES, Backlog
-from services.logger.places import Place
-from services.logger.writer import FileWriter, Limits
-from services.recordings.recording import Message, is_closed, read_info, read_messages
+from services.logger.file_layout import RecordingTarget
+from services.logger.writer import FileWriter, RotationLimits
+from services.recordings.recording import is_closed, read_info, read_messages
 from services.recordings.recovery import recover_recording
 from tests.waiting import LONGEST_S
 
 NOW_NS = 1_700_000_000_000_000_000
 
 
-def place(folder: Path, file: Path | None = None) -> Place:
-    return Place(folder, file, None, None)
+def place(folder: Path, file: Path | None = None) -> RecordingTarget:
+    return RecordingTarget(folder, file, None, None)
 
 
 def fixes(number: int, vehicle: str = "truck-1", *, first: int = 0) -> Iterator[Message]:
@@ -106,7 +106,7 @@ def test_a_disk_that_stalls_for_10_s_loses_nothing_of_100_trucks(tmp_path: Path)
         return file.write(data)
 
     rng = np.random.default_rng(1)
-    channels = {name: Channel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+    channels = {name: AccelChannel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
     payload = encode_accel(AccelBatch(1, 0, 5, NOW_NS, channels))
     small = next(fixes(1)).payload
     writer = FileWriter(place(tmp_path), disk=faulty_disk(write))
@@ -228,7 +228,7 @@ SEEDS = (0, *(pytest.param(n, marks=pytest.mark.faults) for n in range(1, 60)))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_disk_that_is_full_anywhere_is_told_and_counted(
+def test_disk_full_at_any_byte_is_reported_and_counted(
     tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Full at a random byte, with one to three trucks: what is not counted as lost is on disk."""
@@ -327,14 +327,14 @@ def test_a_real_disk_that_is_full(tmp_path: Path) -> None:
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_little_room_is_told_and_ends_the_recording_before_the_disk_is_full(
+def test_low_space_is_reported_and_ends_recording_early(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writer_module, "SYNC_PERIOD_S", 0.01)
     monkeypatch.setattr(writer_module, "_DISK_CHECK_S", 0.0)
     room = 900_000
     disk = DISK._replace(free_bytes=lambda folder: room)
-    writer = FileWriter(place(tmp_path), Limits(min_free_bytes=800_000), disk=disk)
+    writer = FileWriter(place(tmp_path), RotationLimits(min_free_bytes=800_000), disk=disk)
     sent = list(fixes(20))
     for message in sent[:10]:
         writer.put(message)
@@ -368,7 +368,7 @@ def test_the_logger_does_not_start_without_room(tmp_path: Path) -> None:
             file=None,
             realms=("*",),
             site=None,
-            limits=Limits(min_free_bytes=1 << 60),
+            limits=RotationLimits(min_free_bytes=1 << 60),
         )
     assert not (tmp_path / "new").exists()
 
@@ -379,11 +379,11 @@ def test_rotation_neither_loses_nor_repeats(
 ) -> None:
     monkeypatch.setattr(writer_module, "SYNC_PERIOD_S", 0.01)
     limits = {
-        "size": Limits(bytes=20_000),
-        "age": Limits(age_s=0.1),
-        "on request": Limits(),
+        "size": RotationLimits(bytes=20_000),
+        "age": RotationLimits(age_s=0.1),
+        "on request": RotationLimits(),
     }[why]
-    writer = FileWriter(Place(tmp_path, None, None, "site = 1\n"), limits)
+    writer = FileWriter(RecordingTarget(tmp_path, None, None, "site = 1\n"), limits)
     sent: list[Message] = []
     for truck in ("truck-1", "truck-2"):
         writer.put(info(truck))
@@ -423,8 +423,8 @@ def test_rotation_neither_loses_nor_repeats(
 def test_more_trucks_in_a_day_than_files_can_be_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(places, "_SHORTEST_QUIET_S", 0.0)
-    monkeypatch.setattr(places, "MAX_OPEN_FILES", 5)
+    monkeypatch.setattr(file_layout, "_SHORTEST_QUIET_S", 0.0)
+    monkeypatch.setattr(file_layout, "MAX_OPEN_FILES", 5)
     writer = FileWriter(place(tmp_path))
     for n in range(12):
         writer.put(next(fixes(1, f"truck-{n}")))

@@ -11,10 +11,10 @@ import pytest
 from schemas.events import Event, EventKind, decode_event
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import GnssFix, VehicleInfo, encode_gnss, encode_info
-from schemas.topics import Key
-from services.logger.places import Place
+from schemas.topics import Key, Message
+from services.logger.file_layout import RecordingTarget
 from services.logger.writer import FileWriter
-from services.recordings.recording import Message, read_info, read_messages
+from services.recordings.recording import read_info, read_messages
 from tests.waiting import LONGEST_S
 
 NOW_NS = 1_700_000_000_000_000_000
@@ -68,7 +68,7 @@ def test_what_was_in_a_file_that_is_gone_is_not_called_durable(
 ) -> None:
     folder = tmp_path / "recordings"
     file = folder / "live" / "day" / "all.mcap" if single else None
-    writer = FileWriter(Place(folder, file, None, None))
+    writer = FileWriter(RecordingTarget(folder, file, None, None))
 
     def durable(stream: str = "gnss") -> Any:
         streams = writer.durable()[1].get("live", pb.Durable()).streams
@@ -98,7 +98,7 @@ def test_what_was_in_a_file_that_is_gone_is_not_called_durable(
         ours.append(moved)
     else:
         assert told.messages == 100
-        assert "100 messages are gone, 100 of them had been told to be durable" in told.text
+        assert "100 messages are gone, 100 of them were confirmed as durable" in told.text
         assert found.count == 50
         assert not found.HasField("sequence")
         [gone] = writer.withdrawn

@@ -26,7 +26,7 @@ _SWITCHES = 10
 
 
 @pytest.mark.faults  # the next but one does the same, and more
-def test_a_killed_truck_gives_what_it_had_not_said_when_it_starts_again(fleet: MakeFleet) -> None:
+def test_killed_truck_publishes_the_rest_after_its_restart(fleet: MakeFleet) -> None:
     """There is no logger while it drives: only its spool knows."""
     one = fleet(router=True)
     one.start_router()
@@ -40,10 +40,10 @@ def test_a_truck_that_starts_where_there_is_no_router(fleet: MakeFleet) -> None:
 
 def drive_twice_before_there_is_a_logger(one: Any) -> None:
     """The first drive ends with a kill."""
-    truck = one.start_truck()
+    truck = one.start_truck(rate=100.0)
     truck.wait_for(30)
     truck.kill()
-    again = one.start_truck()
+    again = one.start_truck(rate=100.0)
     again.wait_for(30)
     one.start_logger()
     again.wait_for(60)
@@ -210,7 +210,7 @@ def lags_s(one: Any, vehicle: str = "truck-*") -> list[float]:
 def test_a_truck_whose_wall_clock_jumps(fleet: MakeFleet, jump_s: int) -> None:
     one = fleet()
     one.start_logger()
-    truck = one.start_truck(DRIVEBY_TEST_CLOCK_STEP=f"30:{jump_s}")
+    truck = one.start_truck(rate=100.0, DRIVEBY_TEST_CLOCK_STEP=f"30:{jump_s}")
     truck.wait_for(50)
     one.finish()
     [path] = (one.folder / "recordings").glob("*/*/truck-1-*.mcap")

@@ -10,14 +10,14 @@ import pytest
 
 from schemas.events import EventKind, decode_event
 from schemas.signals import GnssFix, Identity, encode_gnss
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.logger.complaints import Complaints
 from services.logger.drops import Drop
-from services.logger.places import MAX_FILES_OF_ONE, Place
+from services.logger.file_layout import MAX_FILES_OF_ONE, RecordingTarget
+from services.logger.rate_limited_log import RateLimitedLog
 from services.logger.writer import FileWriter
-from services.recordings.recording import Message, read_messages
+from services.recordings.recording import read_messages
 from tests.waiting import LONGEST_S
 
 NOW_NS = 1_700_000_000_000_000_000
@@ -34,7 +34,7 @@ def fix(vehicle: str, realm: str, sequence: int) -> Message:
 
 def test_files_of_one_vehicle_in_many_realms_leave_room_for_the_others(tmp_path: Path) -> None:
     """What has no file is told with its cause, and may come again: it is not taken for seen."""
-    writer = FileWriter(Place(tmp_path, None, None, None))
+    writer = FileWriter(RecordingTarget(tmp_path, None, None, None))
     for number in range(300):
         for sequence in range(3):
             writer.put(fix("truck-evil", f"sim-{number}", sequence))
@@ -54,11 +54,9 @@ def test_files_of_one_vehicle_in_many_realms_leave_room_for_the_others(tmp_path:
     assert writer.drops() == []
 
 
-def test_too_many_vehicles_are_told_as_such(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("services.logger.places.MAX_OPEN_FILES", 5)
-    writer = FileWriter(Place(tmp_path, None, None, None))
+def test_too_many_vehicles_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.logger.file_layout.MAX_OPEN_FILES", 5)
+    writer = FileWriter(RecordingTarget(tmp_path, None, None, None))
     for number in range(6):
         writer.put(fix(f"truck-{number}", "live", 0))
     writer.finish("done", {})
@@ -77,7 +75,7 @@ def test_a_truck_in_300_realms_costs_another_one_nothing(fleet: Callable[..., An
             for publisher in publishers:
                 identity = Identity(publisher.boot_id, sequence)
                 publisher.put("vehicle", "truck-evil", "gnss", payload(*identity), identity)
-        truck = one.start_truck("truck-1")
+        truck = one.start_truck("truck-1", rate=100.0)
         truck.wait_for(60)
         truck.stop()
         truck.wait()
@@ -107,8 +105,8 @@ def test_warnings_of_a_kind_are_counted_rather_than_repeated(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr("services.logger.complaints.time.monotonic", lambda: now[0])
-    complaints = Complaints(logging.getLogger("test"))
+    monkeypatch.setattr("services.logger.rate_limited_log.time.monotonic", lambda: now[0])
+    complaints = RateLimitedLog(logging.getLogger("test"))
     for number in range(5113):
         complaints.warn("spool", "number %d", number)
     complaints.warn("other", "another kind")

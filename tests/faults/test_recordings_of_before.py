@@ -2,8 +2,9 @@
 
 import os
 import shutil
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,15 @@ import pytest
 from schemas.events import Event, EventKind
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import GnssFix, encode_gnss
-from schemas.topics import Key
+from schemas.topics import Key, Message
+from services.common.child_process import ChildOutput, run_gently
 from services.common.disk import DISK
-from services.history.processed import is_processed
+from services.ledger.processed import is_processed
 from services.logger import housekeeping
-from services.logger.housekeeping import House, Housekeeping
-from services.logger.places import Place
+from services.logger.file_layout import RecordingTarget
+from services.logger.housekeeping import Housekeeping, RetentionPolicy
 from services.logger.writer import FileWriter
-from services.recordings.recording import Message, is_closed, read_info, read_messages, read_site
+from services.recordings.recording import is_closed, read_info, read_messages, read_site
 from services.recordings.recovery import put_aside, recover_recording, recovered_path
 from services.recordings.writer import RecordingWriter, write_recording
 from tests.waiting import LONGEST_S, until
@@ -59,7 +61,7 @@ def kept(
     def tell(realm: str, event: Event) -> None:
         told.append((realm, event))
 
-    house = House(folder, ["*"], min_free_bytes, budget_bytes, tell)
+    house = RetentionPolicy(folder, ["*"], min_free_bytes, budget_bytes, tell)
     keeper = Housekeeping(house)
     until(lambda: not keeper.is_busy, "the end of the housekeeping")
     keeper.close()
@@ -100,7 +102,7 @@ def test_what_crashed_is_recovered_and_set_aside(tmp_path: Path) -> None:
     assert kept(tmp_path)[0][1].text.startswith("truck-3.mcap")  # whose writer is gone now
 
 
-def test_no_room_to_recover_is_told_and_leaves_it_alone(tmp_path: Path) -> None:
+def test_no_room_to_recover_is_reported_and_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "live" / DAY / "truck-1.mcap"
     crashed(path)
     [(_, event)] = kept(tmp_path, min_free_bytes=DISK.free_bytes(tmp_path) * 2)
@@ -118,8 +120,8 @@ def test_the_name_of_what_was_set_aside_is_not_used_again(
         taken.append(path.name)
         return len(taken) < 3
 
-    monkeypatch.setattr("services.logger.places.is_name_taken", is_taken)
-    writer = FileWriter(Place(tmp_path, None, None, None))
+    monkeypatch.setattr("services.logger.file_layout.is_name_taken", is_taken)
+    writer = FileWriter(RecordingTarget(tmp_path, None, None, None))
     writer.put(next(fixes(1)))
     writer.finish("done", {})
     [path] = tmp_path.glob("live/*/*.mcap")
@@ -233,14 +235,13 @@ def test_what_somebody_else_has_recovered_meanwhile_is_no_error(
 ) -> None:
     path = tmp_path / "live" / DAY / "truck-1.mcap"
     crashed(path)
-    real = Housekeeping._run_gently
 
-    def run(self: Housekeeping, arguments: list[str]) -> tuple[int, str, str] | None:
+    def run(arguments: Sequence[str], closing: threading.Event) -> ChildOutput | None:
         recover_recording(path, recovered_path(path))
         put_aside(path)
-        return real(self, arguments)
+        return run_gently(arguments, closing)
 
-    monkeypatch.setattr(Housekeeping, "_run_gently", run)
+    monkeypatch.setattr("services.logger.housekeeping.run_gently", run)
     assert kept(tmp_path) == []
     assert caplog.records == []
 
@@ -259,7 +260,7 @@ def is_alive(process: int) -> bool:
 
 
 @pytest.mark.process
-def test_a_killed_logger_leaves_nobody_who_recovers_on(fleet: Callable[..., Any]) -> None:
+def test_killed_logger_leaves_no_recovery_process(fleet: Callable[..., Any]) -> None:
     """Its child would rename what the next logger is about to read."""
     one = fleet()
     path = one.folder / "recordings" / "live" / DAY / "truck-1-20260101T000000Z.mcap"

@@ -18,11 +18,11 @@ from mcap.stream_reader import StreamReader
 from schemas.events import EventKind, decode_event
 from schemas.messages import descriptors
 from schemas.signals import GnssFix, encode_gnss
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.cli import main as cli
 from services.common.errors import FailureError, InputError
 from services.recordings.mcap_scan import MAX_RECORD_BYTES
-from services.recordings.recording import Message, read_info, read_messages, read_site
+from services.recordings.recording import read_info, read_messages, read_site
 from services.recordings.recovery import Recovery, recover_recording, recovered_path
 from services.recordings.writer import RecordingWriter
 
@@ -213,7 +213,7 @@ def test_a_stretch_of_zeros_costs_only_what_it_covers(
         assert data == sorted(data, key=lambda m: m.sequence)
 
 
-def test_the_index_tells_how_many_a_damaged_chunk_held(whole: Whole, tmp_path: Path) -> None:
+def test_index_gives_the_message_count_of_a_damaged_chunk(whole: Whole, tmp_path: Path) -> None:
     content = bytearray(whole.content[: whole.data_end])  # no END that would tell
     content[whole.chunks[5].begin + 80] ^= 0xFF
     content[whole.chunks[9].begin + 80] ^= 0xFF
@@ -250,9 +250,7 @@ def test_bombs_and_huge_lengths_ask_for_no_memory(whole: Whole, tmp_path: Path) 
     assert peak < 3 * MAX_RECORD_BYTES
 
 
-def test_without_the_first_chunk_the_others_still_say_whose_they_are(
-    whole: Whole, tmp_path: Path
-) -> None:
+def test_later_chunks_identify_the_truck_without_the_first(whole: Whole, tmp_path: Path) -> None:
     """Schemas stand in the first chunk only; its loss must not cost the rest of the drive."""
     first = whole.chunks[0]
     content = whole.content[: first.begin] + whole.content[first.end : whole.data_end]

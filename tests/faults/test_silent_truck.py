@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from schemas.events import EventKind, decode_event
-from services.recordings.recording import Message, read_messages
+from schemas.topics import Message
+from services.recordings.recording import read_messages
 from tests.faults.logger_process import FORGETFUL_ENV
 from tests.waiting import until
 
@@ -23,22 +24,27 @@ def test_silent_truck_is_fetched_from_its_spool(fleet: Callable[..., Any], reboo
     one = fleet(router=True)
     one.start_logger(**{FORGETFUL_ENV: "1"})
     one.start_router()
-    silent = one.start_truck("truck-1")
-    healthy = one.start_truck("truck-2", endpoint=one.logger_endpoint)
+    silent = one.start_truck("truck-1", rate=100.0)
+    healthy = one.start_truck("truck-2", rate=100.0, endpoint=one.logger_endpoint)
     silent.wait_for(20)
     healthy.wait_for(20)
-    until(lambda: "truck-1 in realm live came" in one.said_by_logger(), "the truck")
+    until(lambda: "truck-1 in realm live connected" in one.said_by_logger(), "the truck")
     one.kill(one.router)
-    until(lambda: "truck-1 in realm live left" in one.said_by_logger(), "the end of its link")
+    until(
+        lambda: "truck-1 in realm live disconnected" in one.said_by_logger(), "the end of its link"
+    )
     (boot_id, cut_off_at), *_ = silent.said.items()
     silent.wait_for(cut_off_at + 60)
     if reboots:
         silent.kill()
-        silent = one.start_truck("truck-1")
+        silent = one.start_truck("truck-1", rate=100.0)
         silent.wait_for(60)
     back_ns = time.time_ns()
     one.start_router()
-    until(lambda: one.said_by_logger().count("truck-1 in realm live came") == 2, "the truck again")
+    until(
+        lambda: one.said_by_logger().count("truck-1 in realm live connected") == 2,
+        "the truck again",
+    )
     silent.wait_for(max(silent.said.values()) + 20)
     assert one.finish() == 0  # not one is missing, and none is there twice
     boots = {boot for truck in one.trucks if truck.vehicle == "truck-1" for boot in truck.said}

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.signals import CHANNELS, Channel, GnssFix
+from schemas.signals import CHANNELS, AccelChannel, GnssFix
 from services.bus.playback import stopped_by_signals
 from services.bus.session import open_session
 from services.truck.gateway import Gateway
@@ -28,7 +28,7 @@ STEP_ENV = "DRIVEBY_TEST_CLOCK_STEP"
 def main(endpoint: str, realm: str, vehicle: str, spool: str, batches_per_s: str) -> None:
     period_s = 1.0 / float(batches_per_s)
     after, _, jump_s = os.environ.get(STEP_ENV, "0:0").partition(":")
-    channel = Channel(1000.0, np.random.default_rng(1).standard_normal(50))
+    channel = AccelChannel(1000.0, np.random.default_rng(1).standard_normal(50))
     with stopped_by_signals() as stop:
         connect = partial(open_session, connect=endpoint, timeout_s=0.0)
         gateway = Gateway(connect, realm, vehicle, Spool(Path(spool)))

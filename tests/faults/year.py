@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.results import Crossing, results_json
+from schemas.results import CrossingResult, results_json
 from services.cli import main as cli
 from services.common.files import make_folder, write_atomically
 from services.execution.blas import one_blas_thread
 from services.history.alarm_files import acknowledge, alarms_of
-from services.history.alarms import Settings, check
+from services.history.alarms import AlarmSettings, check
 from tests.fleet import (
     WEEK_S,
     Bridge,
@@ -75,7 +75,7 @@ def year(out: Path, seed: int, weeks: int = WEEKS) -> int:
     write_atomically(station, "time_s,temperature_deg_c\n" + "".join(lines))
     number = 0
     for week in range(weeks):
-        crossings: list[Crossing] = []
+        crossings: list[CrossingResult] = []
         for bridge in bridges:
             for _ in range(int(rng.integers(2, 5))):
                 entry_s = BEGIN_S + (week + rng.random()) * WEEK_S
@@ -91,7 +91,7 @@ def year(out: Path, seed: int, weeks: int = WEEKS) -> int:
         words = ["history", "add", str(found), "--later", "--history", str(history)]
         if not _done([*words, "--temperature", str(station)]):
             return 1
-        for alarm in check(history, Settings(), monday_s).raised:
+        for alarm in check(history, AlarmSettings(), monday_s).raised:
             print(f"{_day(monday_s)}  {alarm.bridge}: {alarm.sentence()}")
             if alarm.bridge == REPAIRED and alarm.direction == "stiffer":
                 noted_s = monday_s + 2.0 * WEEK_S

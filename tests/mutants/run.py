@@ -35,7 +35,7 @@ from tests.mutants.imports import Imports, distances_to, imports_of
 from tests.mutants.mutate import Mutant, mutants
 
 PROJECT = Path(__file__).parents[2]
-PACKAGES = ("driveby", "pre_core", "schemas", "services")
+PACKAGES = ("driveby", "pre_core", "schemas", "services", "studies")
 KILLED, TIMEOUT, SURVIVED = "killed", "killed by time", "survived"
 
 
@@ -146,7 +146,7 @@ def draw(sources: list[str], count: int, seed: int, only: str = "") -> list[Draw
 
 def _room(file: str) -> str:
     parts = file.split("/")
-    return "/".join(parts[:2]) if parts[0] in ("pre_core", "services") else parts[0]
+    return "/".join(parts[:2]) if parts[0] in ("pre_core", "services", "studies") else parts[0]
 
 
 def _known(results: Path) -> dict[str, dict[str, Any]]:

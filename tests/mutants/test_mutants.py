@@ -59,7 +59,7 @@ def test_a_sample_is_of_all_rooms_and_the_same_each_time(project: Path) -> None:
     assert rooms - {drawn.file.split("/")[1] for drawn in sample} == set()
 
 
-def test_imports_tell_which_tests_stand_close(tmp_path: Path) -> None:
+def test_imports_show_which_tests_are_near(tmp_path: Path) -> None:
     texts = {
         "a/__init__.py": "",
         "a/one.py": "import os",

@@ -11,23 +11,17 @@ from numpy.typing import NDArray
 
 from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.channels import channel_signals
+from pre_core.crossing.noise import no_force_noise, noise_path
 from pre_core.crossing.residuals import (
     SWING_MODES,
-    Crossing,
-    Points,
+    EvaluationPoints,
+    GriddedCrossing,
+    allocate_buffers,
     evaluate,
-    sinc_table,
-    step_table,
-    workspace,
 )
-from pre_core.crossing.whitening import (
-    linear_springs,
-    row_count,
-    row_filter,
-    truck_of,
-    white_rows,
-    whitener,
-)
+from pre_core.crossing.rows import row_count, row_filter
+from pre_core.crossing.step_tables import sinc_table, step_table
+from pre_core.crossing.whitening import white_rows, whitener
 from pre_core.paper import experiment
 from pre_core.physics.beam_basis import BeamBasis, beam_basis
 from pre_core.physics.bridge import Beam, refine
@@ -35,7 +29,7 @@ from pre_core.physics.models import from_models
 from pre_core.physics.road import contact_patch_average, iso_8608_profile, under_wheels
 from pre_core.physics.sensors import Accelerometer, measure_acceleration
 from pre_core.physics.simulate import (
-    Simulation,
+    CoupledResponse,
     constant_speed,
     simulate,
 )
@@ -46,7 +40,7 @@ from services.simulation import drive as site_drive
 from services.simulation.drive import paper_site
 
 if TYPE_CHECKING:
-    from services.simulation.drive import Drive
+    from services.simulation.drive import SimulatedDrive
 
 FloatArray = NDArray[np.float64]
 
@@ -66,7 +60,7 @@ class Case(NamedTuple):
 
 
 def case(
-    drive: "Drive",
+    drive: "SimulatedDrive",
     site: Site,
     *,
     forward: bool = True,
@@ -111,7 +105,7 @@ def crossing(
     cg_height_m: float | None = None,
     parts: int = PARTS,
     is_inertial: bool = True,
-) -> Crossing:
+) -> GriddedCrossing:
     vehicle, bridge = case.site.vehicles[0], case.site.bridges[0]
     basis = beam_basis(np.array(bridge.lengths_m), parts, bearings_give=True)
     model = channel_signals(case.acceleration, 1.0 / case.rate_hz, case.rate_hz)
@@ -141,9 +135,9 @@ def bare_crossing(
     total_mass_kg: float,
     *,
     is_inertial: bool,
-) -> Crossing:
+) -> GriddedCrossing:
     """From start to end, with a mass at the height of the road; every sample of (4, 6, n) a row."""
-    return Crossing(
+    return GriddedCrossing(
         step_s,
         signals,
         1,
@@ -162,7 +156,7 @@ def bare_crossing(
     )
 
 
-def point(case: Case, count: int = 1) -> Points:
+def point(case: Case, count: int = 1) -> EvaluationPoints:
     """`count` times the truth, without any correction."""
     model = channel_signals(np.zeros_like(case.acceleration), 1.0 / case.rate_hz, case.rate_hz)
     n = model.signals.shape[2]
@@ -174,9 +168,9 @@ def point(case: Case, count: int = 1) -> Points:
 
 def uncorrected(
     theta: FloatArray, wheelbase_m: float, front_m: FloatArray, count: int = 1
-) -> Points:
+) -> EvaluationPoints:
     """`count` times the same point at constant speed, front_m (n,), without any correction."""
-    return Points(
+    return EvaluationPoints(
         np.tile(theta, (count, 1)),
         np.full(count, wheelbase_m),
         np.tile(front_m, (count, 1)),
@@ -190,11 +184,11 @@ def uncorrected(
 
 
 def residual(
-    case: Case, at: Points, *, data: Crossing | None = None, threads: int = 1
+    case: Case, at: EvaluationPoints, *, data: GriddedCrossing | None = None, threads: int = 1
 ) -> FloatArray:
     data = crossing(case) if data is None else data
     rows = row_filter(data.step_s)
-    works = tuple(workspace(data, case.theta.size, rows) for _ in range(threads))
+    works = tuple(allocate_buffers(data, case.theta.size, rows) for _ in range(threads))
     return evaluate(data, works, at)
 
 
@@ -202,9 +196,9 @@ def white(case: Case, residuals: FloatArray, *, is_inertial: bool = True) -> Flo
     """White rows (k, 3 m), where one is the noise of 5 µg/√Hz."""
     rows = row_filter(crossing(case).step_s)
     vehicle = case.site.vehicles[0]
-    truck = truck_of(case.theta, vehicle.total_mass_kg, vehicle.wheelbase_m, is_inertial)
+    truck = noise_path(case.theta, vehicle.total_mass_kg, vehicle.wheelbase_m, is_inertial)
     density = np.full(4, NOISE_UG * MICRO_G_M_PER_S2)
-    noise = whitener(rows, row_count(rows, residuals.shape[2]), truck, density, linear_springs())
+    noise = whitener(rows, row_count(rows, residuals.shape[2]), truck, density, no_force_noise())
     return white_rows(rows, noise, residuals)
 
 
@@ -231,7 +225,7 @@ class Driven(NamedTuple):
     """A crossing of this module's own simulation, and all that truck and bridge did."""
 
     case: Case
-    run: Simulation
+    run: CoupledResponse
     start_s: float
     """When the simulation began, on the case's clock."""
 

@@ -3,8 +3,8 @@
     .venv/bin/python tests/numerics/table.py [--all]
 
 runs the tests and prints, of every group of values, the one that comes worst off; with --all, all
-of them. docs/forward-problem.md holds the output. The tests' own report goes to standard error, and
-the exit code is theirs.
+of them. studies/forward-problem.md holds the output. The tests' own report goes to standard error,
+and the exit code is theirs.
 """
 
 import sys

@@ -16,7 +16,7 @@ from pre_core.physics.bridge import (
     element_mass,
     element_stiffness,
     interpolation_matrix,
-    locate,
+    locate_element,
     mass_matrix,
     modes,
     natural_frequencies_hz,
@@ -28,7 +28,7 @@ from pre_core.physics.bridge import (
 )
 from pre_core.physics.simulate import WheelRoad, constant_speed, deflection_m, simulate
 from pre_core.physics.vehicle import static_axle_loads_n
-from pre_core.search.levenberg_marquardt import slopes
+from pre_core.search.levenberg_marquardt import sixth_order_jacobian
 
 FloatArray = NDArray[np.float64]
 Agree = Callable[[str, float, float, float], None]
@@ -326,7 +326,7 @@ def test_interpolation_is_that_of_the_shape_functions(x: float, ratios: list[flo
         element_lengths_m=lengths
     )
     row = interpolation_matrix(beam, np.array([x]))[0]
-    element, place = locate(lengths, np.array([x]))
+    element, place = locate_element(lengths, np.array([x]))
     full = np.zeros(2 * lengths.size + 2)
     if 0.0 <= x <= span:
         e = int(element[0])
@@ -357,7 +357,9 @@ def test_the_first_frequency_answers_to_where_the_strain_energy_is() -> None:
         )
         return np.log(natural_frequencies_hz(changed, 1))
 
-    differences = slopes(lambda y: np.array([frequency(np.exp(row)) for row in y]), np.zeros(11))
+    differences = sixth_order_jacobian(
+        lambda y: np.array([frequency(np.exp(row)) for row in y]), np.zeros(11)
+    )
     # Of an eigenvalue eleven digits are right, of its differences over thousandths eight.
     np.testing.assert_allclose(0.5 * shares, differences[0], rtol=0.0, atol=2e-8)
     # Held ends have no springs, and those that turn freely hold nothing.

@@ -8,11 +8,17 @@ from numpy.typing import NDArray
 
 from pre_core.paper import experiment
 from pre_core.paper.integrate import newmark_integrate
-from pre_core.physics.bridge import Beam, element_cubics, interpolation_matrix, locate, refine
+from pre_core.physics.bridge import (
+    Beam,
+    element_cubics,
+    interpolation_matrix,
+    locate_element,
+    refine,
+)
 from pre_core.physics.road import Profile, iso_8608_profile, under_wheels
 from pre_core.physics.simulate import (
+    CoupledResponse,
     Motion,
-    Simulation,
     WheelRoad,
     constant_acceleration,
     constant_speed,
@@ -50,7 +56,7 @@ def crossing(
     modes: int | None = 6,
     tolerance: float = 1e-12,
     acceleration: float = 0.7,
-) -> tuple[Beam, Motion, WheelRoad, Simulation]:
+) -> tuple[Beam, Motion, WheelRoad, CoupledResponse]:
     """A crossing with changing speed of a bridge with springs at its supports: 14 elements."""
     if beam is None:
         beam = refine(experiment.beam(experiment.scenario_ratios(6)), 2)._replace(
@@ -109,7 +115,7 @@ def energy_error(step_s: float, car: HalfCar) -> float:
     )
     lengths = beam.element_lengths_m
     cubics = element_cubics(lengths, (0, lengths.size), run.modes.shapes)
-    element, place = locate(lengths, wheels)
+    element, place = locate_element(lengths, wheels)
     on_bridge = element >= 0
     powers = place[..., None] ** np.arange(4)
     slopes = np.arange(4) * place[..., None] ** np.maximum(np.arange(4) - 1, 0)
@@ -242,7 +248,7 @@ def test_coupling_tolerance(measured: Agree) -> None:
     assert exact.iterations > 2
 
 
-def test_forces_that_do_not_settle_are_told() -> None:
+def test_forces_that_do_not_settle_are_reported() -> None:
     """One exchange at most is never enough to see that they stand still."""
     beam = experiment.beam(np.ones(7))
     motion = constant_speed(-1.0, 12.0, 500, 0.001)

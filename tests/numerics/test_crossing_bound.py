@@ -1,28 +1,30 @@
 """The Cramér-Rao bound of a crossing at its truth: it belongs to a model that is right there."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from pre_core.crossing import posterior
-from pre_core.survey.plan import Truth
+from pre_core.survey.plan import PosteriorAtTruth
 from schemas.settings import IdentificationSettings
-from services.simulation.data_alone import data_alone
+from services.simulation.data_alone import crossing_data_only
 from services.simulation.drawn import (
-    Drawn,
-    Seen,
+    IdentifiedCrossing,
+    SimulatedCrossing,
     default_site,
     draw_truth,
     drive,
     true_values,
 )
-from services.simulation.worlds import draw_world
-from services.validation.bound import (
+from services.simulation.out_of_model import draw_out_of_model
+from studies.validation.bound import (
     at_truth,
     bound_at,
     bound_at_truth,
     bound_of,
     bound_of_runs,
-    settle,
+    optimise_subset,
 )
 
 SITE = default_site()
@@ -30,7 +32,7 @@ SETTINGS = IdentificationSettings(method="pre", threads=1)
 SEED = 29
 
 
-def plain_drive(noise_ug: float = 40.0, **conditions: float) -> Drawn:
+def plain_drive(noise_ug: float = 40.0, **conditions: float) -> SimulatedCrossing:
     """A steady crossing whose sensors have noise, but neither gain nor delay; true total mass."""
     truth = draw_truth(SITE, SEED)
     zero = np.zeros(4)
@@ -47,15 +49,29 @@ def plain_drive(noise_ug: float = 40.0, **conditions: float) -> Drawn:
     return drive(SITE, truth._replace(car=car, channels=errors, conditions=how), SEED)
 
 
-def data_of(drawn: Drawn) -> Seen:
-    (seen,) = data_alone([drawn.run], drawn.site, SETTINGS)
+def data_of(drawn: SimulatedCrossing) -> IdentifiedCrossing:
+    (seen,) = crossing_data_only([drawn.run], drawn.site, SETTINGS)
     return seen
 
 
-def test_the_model_is_right_at_the_truth() -> None:
-    """No search has been there: a generator or a model that were wrong would show here."""
+class Plain(NamedTuple):
+    """A plain drive, what is seen of it, and its bound as JSON."""
+
+    drawn: SimulatedCrossing
+    seen: IdentifiedCrossing
+    bound: dict[str, dict[str, float]]
+
+
+@pytest.fixture(scope="module")
+def plain() -> Plain:
     drawn = plain_drive()
-    found = bound_at_truth(data_of(drawn), drawn)
+    seen = data_of(drawn)
+    return Plain(drawn, seen, bound_at_truth(seen, drawn))
+
+
+def test_the_model_is_right_at_the_truth(plain: Plain) -> None:
+    """No search has been there: a generator or a model that were wrong would show here."""
+    found = plain.bound
     assert 0.9 < found["at_truth"]["chi2_per_dof"] < 1.08
     rigidities = [found["std"][f"EI_{e + 1}"] for e in range(7)]
     assert 0.01 < min(rigidities) < max(rigidities) < 0.4
@@ -74,10 +90,8 @@ def test_the_bound_grows_with_the_noise() -> None:
     assert loud["EI_3"] / quiet["EI_3"] == pytest.approx(2.0, rel=0.15)
 
 
-def test_a_truth_known_by_its_entry_gives_the_same_bound() -> None:
-    drawn = plain_drive()
-    seen = data_of(drawn)
-    full = bound_at_truth(seen, drawn)
+def test_a_truth_known_by_its_entry_gives_the_same_bound(plain: Plain) -> None:
+    drawn, seen, full = plain
     near = 0.0 if drawn.truth.conditions.forward else SITE.bridges[0].span_m
     entry = drawn.start_s + drawn.step_s * np.argmin(np.abs(drawn.motion.position_m - near))
     part = bound_at(seen, true_values(drawn.truth), drawn.truth.car.wheelbase_m, float(entry))
@@ -89,15 +103,14 @@ def test_a_truth_known_by_its_entry_gives_the_same_bound() -> None:
         assert part["std"][name] == pytest.approx(full["std"][name], rel=0.03)
 
 
-def test_differences_are_fine_enough_and_nuisances_settle() -> None:
-    drawn = plain_drive()
-    problem, y = at_truth(data_of(drawn), drawn)
+def test_differences_are_fine_enough_and_nuisances_settle(plain: Plain) -> None:
+    problem, y = at_truth(plain.seen, plain.drawn)
     where = posterior.layout(problem)
     nuisances = np.arange(where.gains.start, where.size)
     moved = y.copy()
     moved[where.delays] += [2.0, -2.0, 1.0, -1.0]  # of 0.5 ms
     moved[where.gains] += 1.0
-    settled = settle(problem, moved, nuisances)
+    settled = optimise_subset(problem, moved, nuisances)
     np.testing.assert_array_equal(settled[: nuisances[0]], y[: nuisances[0]])
     rows = posterior.all_rows(problem, np.stack([y, moved, settled]))
     squares = np.sum(rows * rows, axis=1)
@@ -110,7 +123,7 @@ def test_differences_are_fine_enough_and_nuisances_settle() -> None:
 
 def test_roads_that_differ_are_noise_at_the_truth() -> None:
     """On a drawn surface the rows are white by its class and the tyres; without that, far off."""
-    world = draw_world(SITE, "surface", 1)
+    world = draw_out_of_model(SITE, "surface", 1)
     drawn = drive(world.site, world.truth, 1)
     seen = data_of(drawn)
     problem, y = at_truth(seen, drawn)
@@ -123,7 +136,7 @@ def test_roads_that_differ_are_noise_at_the_truth() -> None:
     # more than as many independent ones would.
     lengths_m = np.array(world.site.bridges[0].lengths_m)
     once, often, apart = (
-        bound_of_runs([Truth(problem, y)] * runs, wander_m, lengths_m, 0.01)
+        bound_of_runs([PosteriorAtTruth(problem, y)] * runs, wander_m, lengths_m, 0.01)
         for runs, wander_m in ((1, 0.12), (16, 0.12), (16, 1.0))
     )
     assert 0.08 < once.level < 0.2

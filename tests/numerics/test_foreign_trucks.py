@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core.fusion.tracks import Part
-from pre_core.fusion.trucks import Compared, compare_trucks
+from pre_core.fusion.path_groups import FusionInput
+from pre_core.fusion.vehicle_consistency import VehicleConsistency, find_misattributed
 from tests.numerics.test_fusion import PRIORS, crossing_of, root
 
 FloatArray = NDArray[np.float64]
@@ -16,7 +16,7 @@ SURE = 1e-3
 
 def by_truck(
     number: int, unknown: float, std: float = SURE, truck: str = "truck", c: float = 1.0
-) -> Part:
+) -> FusionInput:
     """A crossing by a truck whose one unknown is so, over a bridge of compliance `c`."""
     told = root()
     told[5, 5] = 1.0 / std
@@ -26,8 +26,8 @@ def by_truck(
     return crossing_of(number, np.array([0.0, 0.4, c, c, c, unknown]), told, rng, truck)
 
 
-def named(*numbers: int) -> Compared:
-    return Compared(tuple(f"crossing-{number:03d}" for number in numbers), False)
+def named(*numbers: int) -> VehicleConsistency:
+    return VehicleConsistency(tuple(f"crossing-{number:03d}" for number in numbers), False)
 
 
 @pytest.mark.parametrize("sound", [2, 9])
@@ -36,12 +36,12 @@ def test_one_by_another_truck_is_named_however_sure_it_is(sound: int, std: float
     """Nor does the surest crossing outvote the others."""
     parts = [by_truck(n, 0.2) for n in range(sound)]
     foreign = by_truck(sound, 0.6, std)
-    assert compare_trucks([*parts, foreign], PRIORS) == named(sound)
+    assert find_misattributed([*parts, foreign], PRIORS) == named(sound)
 
 
 def test_two_by_another_truck_among_six_are_named() -> None:
     parts = [by_truck(n, 0.9 if n in (1, 4) else 0.2) for n in range(6)]
-    assert compare_trucks(parts, PRIORS) == named(1, 4)
+    assert find_misattributed(parts, PRIORS) == named(1, 4)
 
 
 def test_none_of_one_truck_is_named() -> None:
@@ -55,17 +55,17 @@ def test_none_of_one_truck_is_named() -> None:
             )
             for n in range(12)
         ]
-        assert compare_trucks(parts, PRIORS) == named()
+        assert find_misattributed(parts, PRIORS) == named()
 
 
 def test_of_two_that_disagree_none_is_named() -> None:
     parts = [by_truck(0, 0.2), by_truck(1, 0.6)]
-    assert compare_trucks(parts, PRIORS) == Compared((), True)
+    assert find_misattributed(parts, PRIORS) == VehicleConsistency((), True)
     half = [by_truck(n, 0.2 if n % 2 else 0.6) for n in range(6)]
-    assert compare_trucks(half, PRIORS).disagree
+    assert find_misattributed(half, PRIORS).disagree
 
 
 def test_trucks_of_two_names_are_two_trucks() -> None:
     parts = [by_truck(n, 0.2 if n % 2 else 0.6, truck=f"truck-{n % 2}") for n in range(6)]
-    assert compare_trucks(parts, PRIORS) == named()
-    assert compare_trucks(parts[:1], PRIORS) == named()
+    assert find_misattributed(parts, PRIORS) == named()
+    assert find_misattributed(parts[:1], PRIORS) == named()

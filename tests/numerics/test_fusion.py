@@ -10,30 +10,36 @@ from scipy.integrate import trapezoid
 from scipy.interpolate import BSpline
 
 from pre_core.crossing import mismatch as mm
-from pre_core.crossing.optimum import Optimum
+from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import layout, log_odds_of_absence
-from pre_core.fusion.between import BETWEEN_SCALE
-from pre_core.fusion.joint import Fused, fuse
+from pre_core.fusion.information import BridgePriors
+from pre_core.fusion.joint import FusedDraws, fuse
 from pre_core.fusion.likelihood import (
     KNOT_M,
     Coordinates,
-    Likelihood,
-    OffBridge,
+    CrossingLikelihood,
+    OffBridgeMismatch,
     covariance_of_coefficients,
     likelihood,
     long_share,
 )
-from pre_core.fusion.sums import BridgePriors
-from pre_core.fusion.tracks import Part, common_share, wander
+from pre_core.fusion.path_groups import FusionInput, common_share, estimate_wander_m
+from pre_core.fusion.variability import BETWEEN_SCALE
+from pre_core.parameters import EI_1, mass_powers
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
-from pre_core.physics.surface import COMMON_LORRY, felt_by, random_surface, spectra, surface_density
-from pre_core.unknowns import EI_1, mass_powers
+from pre_core.physics.surface import (
+    COMMON_LORRY,
+    axle_profile,
+    random_surface,
+    spectra,
+    surface_density,
+)
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
 from services.drives.csv_import import read_folder
 from services.drives.runs import normalised
 from services.identification import pre_method
-from services.simulation.drawn import see
+from services.simulation.drawn import identify_simulated
 
 FloatArray = NDArray[np.float64]
 
@@ -43,7 +49,7 @@ FRONT, REAR = COMMON_LORRY
 def whole() -> mm.Mismatch:
     at = np.array([REFERENCE_CYCLES_PER_M])
     level = surface_density("A") * float(spectra(FRONT, REAR, at)[3][0])
-    return mm.Mismatch(mm.shapes_of(FRONT, REAR), np.array([level, 0.0]), 10.0)
+    return mm.Mismatch(mm.mismatch_spectra(FRONT, REAR), np.array([level, 0.0]), 10.0)
 
 
 def test_the_long_waves_of_splines() -> None:
@@ -68,14 +74,14 @@ def test_the_long_waves_of_splines() -> None:
 def test_common_part_of_two_tracks(wander_m: float) -> None:
     """Two tracks apart by sqrt(2) of the wander, on drawn surfaces."""
     shapes = whole().shapes
-    common = mm.common_shapes(FRONT, REAR, wander_m)[0]
+    common = mm.between_run_spectra(FRONT, REAR, wander_m)[0]
     rng = np.random.default_rng(7)
     together, power = 0.0, 0.0
     for seed in range(30):
         surface = random_surface(0.0, 120.0, 0.1, "A", seed)
         d = []
         for beside in wander_m * rng.standard_normal(2):
-            front, rear = felt_by(surface, FRONT, beside), felt_by(surface, REAR, beside)
+            front, rear = axle_profile(surface, FRONT, beside), axle_profile(surface, REAR, beside)
             d.append(front.height_m - rear.height_m)
         together += float(d[0] @ d[1])
         power += 0.5 * float(d[0] @ d[0] + d[1] @ d[1])
@@ -89,9 +95,9 @@ def test_the_wander_is_found_by_its_share() -> None:
     for wander_m in (0.05, 0.12, 0.3):
         n = mismatch.shapes.cycles_per_m
         seen = np.sin(np.pi * n) ** 4
-        common = mm.common_shapes(FRONT, REAR, wander_m)[0]
+        common = mm.between_run_spectra(FRONT, REAR, wander_m)[0]
         share = float(common @ seen / (mismatch.shapes.density[0] @ seen))
-        assert wander(mismatch, share) == pytest.approx(wander_m, rel=0.02)
+        assert estimate_wander_m(mismatch, share) == pytest.approx(wander_m, rel=0.02)
 
 
 def test_runs_that_are_put_beside_their_place_are_moved_back() -> None:
@@ -102,7 +108,7 @@ def test_runs_that_are_put_beside_their_place_are_moved_back() -> None:
     for lag in rng.integers(-4, 5, 10):
         value = np.roll(shared, lag) + rng.standard_normal(240)
         value[100:160] = np.nan  # the bridge
-        runs.append(OffBridge(-30.0 + 0.5 * float(rng.integers(0, 3)), value))
+        runs.append(OffBridgeMismatch(-30.0 + 0.5 * float(rng.integers(0, 3)), value))
     assert common_share(runs) == pytest.approx(0.5, abs=0.1)
     alone = [run._replace(value_m=rng.standard_normal(240)) for run in runs]
     assert common_share(alone) < 0.2
@@ -126,11 +132,11 @@ GAIN = Coordinates(("common_gain",), np.ones(1), np.array([0.01]), np.array([Tru
 
 def crossing_of(
     number: int, x: FloatArray, told: FloatArray, rng: np.random.Generator, truck: str = "truck"
-) -> Part:
+) -> FusionInput:
     """A crossing that tells (bridge, gain) x (6,) with a root `told` (6, 6) of its precision."""
-    return Part(
+    return FusionInput(
         f"crossing-{number:03d}",
-        Likelihood(
+        CrossingLikelihood(
             told,
             told @ x + rng.standard_normal(6),
             coordinates(),
@@ -154,7 +160,7 @@ def root(std: float = 0.03) -> FloatArray:
     return np.linalg.cholesky(precision).T
 
 
-def elements(found: Fused) -> FloatArray:
+def elements(found: FusedDraws) -> FloatArray:
     """Draws (k, 3) of ln EI over nominal."""
     return 0.55 * found.draws.reshape(-1, found.draws.shape[2])[:, -3:]
 
@@ -215,7 +221,7 @@ def test_intervals_hold_the_truth_where_the_bridge_changes() -> None:
     assert np.mean(np.abs(np.array(ranks) - 0.5) > 0.45) < 0.2  # 0.1
 
 
-def test_a_bridge_that_changes_is_told_from_one_that_does_not() -> None:
+def test_changed_bridge_is_distinguished_from_unchanged_one() -> None:
     rng = np.random.default_rng(5)
     found = []
     for tau in (0.0, 0.1):
@@ -248,13 +254,15 @@ def test_runs_over_a_real_road(
 
     monkeypatch.setattr(pre_method.optimum, "find_optimum", keeping)
     for drive in read_folder(folder):
-        see([normalised(drive, site.sensor)], site, IdentificationSettings(threads=1))
+        identify_simulated(
+            [normalised(drive, site.sensor)], site, IdentificationSettings(threads=1)
+        )
     assert len(runs) == count
     problem = runs[0].problem
     where = layout(problem)
     told = [likelihood(run) for run in runs]
     footprints = problem.mismatch.shapes.footprints
-    parts = [Part(f"{i:02d}", of, "truck", 1, footprints, 0.01) for i, of in enumerate(told)]
+    parts = [FusionInput(f"{i:02d}", of, "truck", 1, footprints, 0.01) for i, of in enumerate(told)]
     powers = mass_powers(7)[np.flatnonzero(problem.priors.estimated)][where.bridge]
     odds = log_odds_of_absence(problem)[where.bridge]
     fused = fuse(parts, BridgePriors(told[0].bridge, powers, odds, 7), 150, 1)

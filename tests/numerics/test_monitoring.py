@@ -6,23 +6,29 @@ from numpy.typing import NDArray
 
 from pre_core.monitoring.baseline import (
     SLOPE_SPREAD,
+    BaselineState,
     Period,
     Scales,
-    State,
-    begin,
+    adopt_change,
     change_of,
-    change_taken,
-    compressed,
-    innovation,
-    learned,
-    moved_on,
+    compress_shared_errors,
+    filter_step,
+    initial_baseline,
+    predict_state,
     scales_compared,
     standardised,
+    update_state,
     with_change,
 )
-from pre_core.monitoring.chart import STEP_SPREAD, log_ratio, moved, nothing
-from pre_core.monitoring.observation import Observation, Shared, fused
-from pre_core.monitoring.watch import Noted, Rules, difference, judged_periods, watch
+from pre_core.monitoring.change_detection import (
+    AcknowledgedChange,
+    AlarmRules,
+    compare_periods,
+    detect_change,
+    judged_periods,
+)
+from pre_core.monitoring.chart import STEP_SPREAD, empty_chart, log_ratio, update_chart
+from pre_core.monitoring.observation import Observation, SharedError, combine_observations
 from services.identification.observed import observation_of
 from tests.fleet import bridge_of, crossing_of, templates, trucks_of
 
@@ -59,7 +65,7 @@ def series(
         value = value + np.linalg.cholesky(spread) @ rng.standard_normal(N)
         if week >= at:
             value[element] += np.log(1.0 - loss)
-        of = Observation(value, spread, (Shared(truck, loading),))
+        of = Observation(value, spread, (SharedError(truck, loading),))
         out.append(Period(of, float(warm) if knows_temperature else None, 7.0 * week))
     return out
 
@@ -84,10 +90,10 @@ def with_moves(periods: list[Period], moves: FloatArray) -> list[Period]:
     ]
 
 
-def taught(state: State, periods: list[Period]) -> State:
+def taught(state: BaselineState, periods: list[Period]) -> BaselineState:
     for period in periods:
-        state, _ = moved_on(state, period.time_days)
-        state, _ = learned(state, innovation(state, period))
+        state, _ = predict_state(state, period.time_days)
+        state, _ = update_state(state, filter_step(state, period))
     return state
 
 
@@ -126,8 +132,8 @@ def test_a_period_of_several_crossings_is_their_weighted_mean() -> None:
         for k in range(3):
             root = (0.02 + 0.02 * k) * (np.eye(N) + 0.3 * np.eye(N, k=1))
             value = truth + loading @ z + root @ rng.standard_normal(N)
-            parts.append(Observation(value, root @ root.T, (Shared("truck", loading),)))
-        together = fused(parts, N)
+            parts.append(Observation(value, root @ root.T, (SharedError("truck", loading),)))
+        together = combine_observations(parts, N)
         ((name, share),) = together.shared
         assert name == "truck"
         assert np.allclose(share, loading)  # the weights sum to one
@@ -146,12 +152,12 @@ def test_innovations_are_standard_normals_that_know_nothing_of_each_other(
     for _ in range(150):
         slope = SLOPE_SPREAD * rng.standard_normal()  # as its prior has it
         periods = series(rng, weeks=45, common=0.1, second_truck=second_truck, slope=slope)
-        state, rows = begin(periods, ONE), []
+        state, rows = initial_baseline(periods, ONE), []
         for period in periods:
-            state, _ = moved_on(state, period.time_days)
-            found = innovation(state, period)
+            state, _ = predict_state(state, period.time_days)
+            found = filter_step(state, period)
             rows.append(standardised(state, found))
-            state, _ = learned(state, found)
+            state, _ = update_state(state, found)
         r.append(np.array(rows[8:]))
     of = np.array(r)
     assert of.std() == pytest.approx(1.0, abs=0.03)
@@ -160,18 +166,18 @@ def test_innovations_are_standard_normals_that_know_nothing_of_each_other(
     assert following == pytest.approx(0.0, abs=0.02)
 
 
-def test_innovations_of_who_forgets_what_is_shared_are_none() -> None:
+def test_ignoring_shared_errors_raises_false_alarms() -> None:
     """The negative control: a second truck would pass for a change of the whole bridge.
 
     By chance alone, of whatever size: some trucks differ by less than 5 %.
     """
     rng = np.random.default_rng(6)
-    alarms, rules = {True: 0, False: 0}, Rules(at_least=0.0)
+    alarms, rules = {True: 0, False: 0}, AlarmRules(at_least=0.0)
     for _ in range(20):
         periods = series(rng, common=0.2, second_truck=30)
         blind = [p._replace(observation=p.observation._replace(shared=())) for p in periods]
         for is_blind, some in ((False, periods), (True, blind)):
-            alarms[is_blind] += watch(some, rules).change is not None
+            alarms[is_blind] += detect_change(some, rules).change is not None
     assert alarms[False] <= 1
     assert alarms[True] >= 15
 
@@ -181,7 +187,7 @@ def test_a_truck_that_is_known_hides_nothing() -> None:
     rng = np.random.default_rng(7)
     delays = []
     for _ in range(20):
-        found = watch(series(rng, loss=0.1, common=0.5), Rules()).change
+        found = detect_change(series(rng, loss=0.1, common=0.5), AlarmRules()).change
         assert found is not None
         assert (found.element, found.direction) == (2, "weaker")
         delays.append(found.raised_at - 35)
@@ -190,7 +196,7 @@ def test_a_truck_that_is_known_hides_nothing() -> None:
 
 def test_a_season_is_no_change_where_the_temperature_is_known() -> None:
     rng = np.random.default_rng(8)
-    found = [watch(series(rng, slope=-0.006), Rules()).change for _ in range(20)]
+    found = [detect_change(series(rng, slope=-0.006), AlarmRules()).change for _ in range(20)]
     assert sum(one is not None for one in found) <= 1
 
 
@@ -206,7 +212,7 @@ def test_usual_movements_are_found_by_their_size_and_their_slowness() -> None:
                 moves += 0.015 * np.sqrt(0.5) * rng.standard_normal((weeks, 1))
             if kind == "wander":
                 moves = wandering(rng, weeks, 0.015, 26.0)
-            told = watch(with_moves(series(rng, weeks=weeks), moves), Rules())
+            told = detect_change(with_moves(series(rng, weeks=weeks), moves), AlarmRules())
             found.append((told.usual_change, told.usual_wander))
     quiet, white, wander = np.array(found).reshape(3, 3, 2).mean(axis=1)
     assert quiet.max() < 0.006
@@ -214,14 +220,14 @@ def test_usual_movements_are_found_by_their_size_and_their_slowness() -> None:
     assert wander == pytest.approx([0.0, 0.015], abs=0.006)
 
 
-def test_the_change_is_told_with_an_interval_that_holds() -> None:
+def test_change_is_printed_with_a_true_interval() -> None:
     rng = np.random.default_rng(10)
     inside = []
     for _ in range(60):
         periods = series(rng, loss=0.15)
-        state = taught(begin(periods, ONE), periods[:35])
+        state = taught(initial_baseline(periods, ONE), periods[:35])
         since = taught(with_change(state, 1.0), periods[35:])
-        now, (mean, covariance) = change_taken(since), change_of(since)
+        now, (mean, covariance) = adopt_change(since), change_of(since)
         half = 1.96 * np.sqrt(np.diag(covariance))
         truth = np.zeros(N)
         truth[2] = np.log(0.85)
@@ -234,14 +240,14 @@ def test_the_change_is_told_with_an_interval_that_holds() -> None:
 def test_after_an_acknowledgement_what_is_then_is_the_baseline() -> None:
     rng = np.random.default_rng(11)
     periods = series(rng, weeks=80, loss=0.2)
-    found = watch(periods, Rules())
+    found = detect_change(periods, AlarmRules())
     assert found.change is not None
-    noted = Noted(found.change.since, found.change.raised_at + 3)
-    assert watch(periods, Rules(), [noted]).change is None
+    noted = AcknowledgedChange(found.change.since, found.change.raised_at + 3)
+    assert detect_change(periods, AlarmRules(), [noted]).change is None
     # And a second loss behind it is found, against what was then.
     for period in periods[60:]:
         period.observation.value[0] += np.log(0.85)
-    second = watch(periods, Rules(), [noted]).change
+    second = detect_change(periods, AlarmRules(), [noted]).change
     assert second is not None
     assert (second.element, second.direction) == (0, "weaker")
     assert second.ratio[0] == pytest.approx(0.85, abs=0.03)
@@ -252,30 +258,32 @@ def test_one_wild_period_gives_no_alarm() -> None:
     rng = np.random.default_rng(12)
     periods = series(rng)
     periods[40].observation.value[1] += 3.0
-    assert watch(periods, Rules()).change is None
+    assert detect_change(periods, AlarmRules()).change is None
 
 
 def test_an_acknowledged_change_that_would_not_be_raised_again_is_taken() -> None:
     """As of an alarm that an earlier version raised: it is no reason for another one."""
     rng = np.random.default_rng(16)
     periods = series(rng, weeks=80, loss=0.2)
-    assert watch(periods, Rules(), [Noted(35, 36)]).change is None
-    assert watch(periods, Rules(), [Noted(20, 21)]).change is not None  # of something else
+    assert detect_change(periods, AlarmRules(), [AcknowledgedChange(35, 36)]).change is None
+    assert (
+        detect_change(periods, AlarmRules(), [AcknowledgedChange(20, 21)]).change is not None
+    )  # of something else
 
 
 def test_ratios_are_those_of_a_filter_that_knows_of_the_change() -> None:
     """Willsky's and Jones's sums against a state that has the step in it, element by element."""
     rng = np.random.default_rng(13)
     periods = series(rng, weeks=30, loss=0.1, at=20)
-    state = begin(periods, scales_compared())
-    chart, states = nothing(state), []
+    state = initial_baseline(periods, scales_compared())
+    chart, states = empty_chart(state), []
     wander = state.places["wander"]
     for number, period in enumerate(periods):
         states.append(state)
-        state, kept = moved_on(state, period.time_days)
-        told = innovation(state, period)
-        state, weight = learned(state, told)
-        chart = moved(chart, number, kept, wander, weight, told, 1.0)
+        state, kept = predict_state(state, period.time_days)
+        told = filter_step(state, period)
+        state, weight = update_state(state, told)
+        chart = update_chart(chart, number, kept, wander, weight, told, 1.0)
     _, log = log_ratio(chart, state, len(periods) - 1)
     assert chart.begins[-8:] == tuple(range(22, 30))
     for at, since in enumerate(chart.begins):
@@ -293,24 +301,24 @@ def test_ratios_are_those_of_a_filter_that_knows_of_the_change() -> None:
             assert log[at, element] == pytest.approx(with_it - without, abs=1e-6)
 
 
-def evidence(state: State, periods: list[Period]) -> float:
+def evidence(state: BaselineState, periods: list[Period]) -> float:
     """Logarithm of the density of what was observed, the scales integrated out."""
     total = 0.0
     for period in periods:
-        state, _ = moved_on(state, period.time_days)
-        told = innovation(state, period)
+        state, _ = predict_state(state, period.time_days)
+        told = filter_step(state, period)
         apart = np.linalg.solve(told.covariance, told.value[:, :, None])[:, :, 0]
         log = -0.5 * np.sum(apart * told.value, axis=1)
         log = log - 0.5 * np.linalg.slogdet(told.covariance)[1]
         total += float(np.log(np.sum(np.exp(state.log_weight + log))))
-        state, _ = learned(state, told)
+        state, _ = update_state(state, told)
     return total
 
 
 def test_false_alarms_are_no_more_than_stated() -> None:
     """Bridges that move as the priors have it, by chance alone, whatever the size of the change."""
     rng = np.random.default_rng(15)
-    scales, weeks, rules = scales_compared(), 60, Rules(1.0, at_least=0.0)
+    scales, weeks, rules = scales_compared(), 60, AlarmRules(1.0, at_least=0.0)
     alarms = 0
     for _ in range(40):
         which = rng.choice(scales.change.size, p=np.exp(scales.log_prior))
@@ -319,7 +327,7 @@ def test_false_alarms_are_no_more_than_stated() -> None:
         moves += scales.change[which] * np.sqrt(0.5) * (rng.standard_normal((weeks, N)) + common)
         slope = SLOPE_SPREAD * rng.standard_normal()
         periods = with_moves(series(rng, weeks=weeks, slope=slope), moves)
-        alarms += watch(periods, rules).change is not None
+        alarms += detect_change(periods, rules).change is not None
     # 40 years of a bridge; a chart that forgets what is uncertain alarms in most of them.
     assert alarms <= 10
 
@@ -330,7 +338,10 @@ def test_stiffness_that_wanders_is_no_change(memory_weeks: float) -> None:
     alarms = 0
     for _ in range(30):
         moves = wandering(rng, 104, 0.012, memory_weeks)
-        alarms += watch(with_moves(series(rng, weeks=104), moves), Rules()).change is not None
+        alarms += (
+            detect_change(with_moves(series(rng, weeks=104), moves), AlarmRules()).change
+            is not None
+        )
     assert alarms == 0
 
 
@@ -338,7 +349,7 @@ def test_a_season_of_unknown_temperature_is_no_change_and_takes_a_year() -> None
     rng = np.random.default_rng(22)
     for _ in range(15):
         periods = series(rng, weeks=156, slope=-0.006, knows_temperature=False)
-        found = watch(periods, Rules())
+        found = detect_change(periods, AlarmRules())
         assert found.change is None
         assert np.flatnonzero(found.judged)[0] == 52
 
@@ -348,7 +359,7 @@ def test_a_loss_behind_a_season_of_unknown_temperature_is_found() -> None:
     delays = []
     for _ in range(10):
         periods = series(rng, weeks=110, loss=0.15, at=70, knows_temperature=False)
-        found = watch(periods, Rules()).change
+        found = detect_change(periods, AlarmRules()).change
         assert found is not None
         assert (found.element, found.direction) == (2, "weaker")
         delays.append(found.raised_at - 69)
@@ -361,8 +372,8 @@ def test_a_change_that_is_too_small_to_matter_raises_no_alarm() -> None:
     inside = 0
     for _ in range(8):
         periods = series(rng, loss=0.04, own=0.005, weeks=60)
-        assert watch(periods, Rules()).change is None
-        found = watch(periods, Rules(at_least=0.02)).change
+        assert detect_change(periods, AlarmRules()).change is None
+        found = detect_change(periods, AlarmRules(at_least=0.02)).change
         assert found is not None
         assert (found.element, found.high[2] < 0.98) == (2, True)
         inside += bool(found.low[2] < 0.96 < found.high[2])
@@ -373,7 +384,10 @@ def test_a_slow_loss_is_found_though_the_baseline_learns_of_it() -> None:
     rng = np.random.default_rng(25)
     moves = np.zeros((130, N))
     moves[26:, 2] = np.log(1.0 - 0.15 * np.arange(104) / 52.0)
-    found = [watch(with_moves(series(rng, weeks=130), moves), Rules()).change for _ in range(6)]
+    found = [
+        detect_change(with_moves(series(rng, weeks=130), moves), AlarmRules()).change
+        for _ in range(6)
+    ]
     assert [c is not None and (c.element, c.direction) for c in found] == [(2, "weaker")] * 6
 
 
@@ -394,9 +408,9 @@ def test_months_that_are_missing_widen_what_is_not_known() -> None:
     rng = np.random.default_rng(27)
     moves = wandering(rng, 60, 0.02, 20.0)
     periods = with_moves(series(rng, own=0.01), moves)
-    state = taught(begin(periods, scales_compared()), periods[:52])
-    near = innovation(moved_on(state, periods[51].time_days + 7.0)[0], periods[52])
-    far = innovation(moved_on(state, periods[51].time_days + 182.0)[0], periods[52])
+    state = taught(initial_baseline(periods, scales_compared()), periods[:52])
+    near = filter_step(predict_state(state, periods[51].time_days + 7.0)[0], periods[52])
+    far = filter_step(predict_state(state, periods[51].time_days + 182.0)[0], periods[52])
     assert np.all(far.covariance[:, 2, 2] >= near.covariance[:, 2, 2])
     weight = np.exp(state.log_weight)
     assert weight @ far.covariance[:, 2, 2] > 1.3 * (weight @ near.covariance[:, 2, 2])
@@ -414,15 +428,15 @@ def test_shared_errors_lose_nothing_that_matters_by_compression() -> None:
         found = observation_of(crossing)
         assert found is not None
         periods.append(Period(found, 10.0, 7.0 * week))
-    few = compressed(periods)
-    whole, part = begin(periods, ONE), begin(few, ONE)
+    few = compress_shared_errors(periods)
+    whole, part = initial_baseline(periods, ONE), initial_baseline(few, ONE)
     assert part.mean.size < 0.7 * whole.mean.size
     for plain, short in zip(periods, few, strict=True):
-        a, b = innovation(whole, plain), innovation(part, short)
+        a, b = filter_step(whole, plain), filter_step(part, short)
         assert np.allclose(a.covariance, b.covariance, rtol=0.03, atol=1e-5)
         scale = np.sqrt(np.diagonal(a.covariance[0]))
         assert np.abs((a.value - b.value)[0] / scale).max() < 0.1
-        whole, part = learned(whole, a)[0], learned(part, b)[0]
+        whole, part = update_state(whole, a)[0], update_state(part, b)[0]
 
 
 def test_two_periods_are_compared_without_what_they_share() -> None:
@@ -431,7 +445,7 @@ def test_two_periods_are_compared_without_what_they_share() -> None:
     inside, widths = [], []
     for _ in range(100):
         first, *_, last = series(rng, weeks=20, loss=0.2, at=10, common=0.1, slope=0.0)
-        found = difference(first, last)
+        found = compare_periods(first, last)
         truth = np.where(np.arange(N) == 2, 0.8, 1.0)
         inside.append((found.low < truth) & (truth < found.high))
         widths.append(np.log(found.high / found.low) / 3.92)
@@ -453,7 +467,7 @@ def test_plain_series_against_skchange() -> None:
             Period(Observation(np.array([one]), 0.03**2 * np.eye(1), ()), 10.0, 7.0 * week)
             for week, one in enumerate(values)
         ]
-        found = watch(periods, Rules(0.1, at_least=0.0)).change
+        found = detect_change(periods, AlarmRules(0.1, at_least=0.0)).change
         told = PELT().fit(values[:, None] / 0.03).predict(values[:, None] / 0.03)
         theirs = np.asarray(told).ravel().tolist()
         assert (found is not None) == has_changed

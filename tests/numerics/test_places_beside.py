@@ -1,16 +1,16 @@
 """Where a bearing gives and the axles' roads hardly differ, optima lie a hand's breadth apart."""
 
-from schemas.results import Crossing
+from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from services.simulation.drawn import default_site
-from services.validation.surveys import one_crossing
+from studies.validation.surveys import one_crossing
 
 
 def test_the_right_one_of_optima_beside_each_other_is_found() -> None:
     """A crossing for which the walk along the road chooses the next but one: chi2 is 1.3 there."""
     settings = IdentificationSettings(method="pre", threads=1)
     record = one_crossing(default_site(), "single-5", 0, 2, settings)
-    result = Crossing.model_validate(record["result"])
+    result = CrossingResult.model_validate(record["result"])
     assert result.verdict == "good"
     assert result.chi2_per_dof is not None
     assert result.chi2_per_dof < 1.1

@@ -14,20 +14,20 @@ from scipy.interpolate import CubicSpline
 from pre_core.crossing.channels import A, channel_signals
 from pre_core.crossing.residuals import (
     SWING_MODES,
-    Crossing,
-    Points,
+    EvaluationPoints,
+    GriddedCrossing,
+    allocate_buffers,
     roads_and_deflections,
-    workspace,
 )
-from pre_core.crossing.whitening import row_filter
+from pre_core.crossing.rows import row_filter
 from pre_core.kernels.lanes import LANES
 from pre_core.paper import experiment
+from pre_core.parameters import C_U1, F
 from pre_core.physics import modal_response
-from pre_core.physics.beam_basis import RIGID_M_PER_N, beam_basis, rebased
+from pre_core.physics.beam_basis import RIGID_M_PER_N, beam_basis, change_basis
 from pre_core.physics.bridge import Beam, interpolation_matrix, modes, refine
 from pre_core.physics.models import beam_from, from_models
 from pre_core.physics.vehicle import body_masses_kg, total_mass_kg
-from pre_core.unknowns import C_U1, F
 from tests.numerics.crossings import (
     STEP_S,
     Driven,
@@ -78,7 +78,7 @@ def test_damping_of_either_tyre_stands_out(damped: Driven, wheel: int) -> None:
         assert in_noise(damped.case, residual(damped.case, at)).sum() > 100.0
 
 
-def sine_crossing(step_s: float, hz: float) -> tuple[Crossing, Points, FloatArray]:
+def sine_crossing(step_s: float, hz: float) -> tuple[GriddedCrossing, EvaluationPoints, FloatArray]:
     """Off the bridge, only the body above the front axle moves: data, truth, times (n,)."""
     n = 400
     omega = 2.0 * np.pi * hz
@@ -98,7 +98,7 @@ def error_of_tyre(step_s: float, hz: float, tau_s: float) -> float:
     m_11, _, _ = body_masses_kg(TRUCK)
     k_u = TRUCK.tyre_stiffness_n_per_m[0]
     at.theta[0, C_U1] = tau_s * k_u
-    work = workspace(data, at.theta.shape[1], row_filter(step_s))
+    work = allocate_buffers(data, at.theta.shape[1], row_filter(step_s))
     heights, _ = roads_and_deflections(data, work, at, 0)
     turn = 2j * np.pi * hz
     exact = m_11 * (np.exp(turn * t) / (k_u + turn * tau_s * k_u)).imag
@@ -183,7 +183,7 @@ def swinging() -> Driven:
     return simulated(TRUCK, BEAM, settle_s=0.0, before_s=LEAD_S, swing=np.stack([q, v]))
 
 
-def swing_of(driven: Driven, data: Crossing, sample: int) -> FloatArray:
+def swing_of(driven: Driven, data: GriddedCrossing, sample: int) -> FloatArray:
     """What `Points.swing` is at a sample of the model: (6,), from the simulation's own modes."""
     model = channel_signals(driven.case.acceleration, 1e-3, 1e3)
     time = driven.case.start_s + model.start_s + model.step_s * sample - driven.start_s
@@ -211,7 +211,7 @@ def test_a_bridge_that_swings_when_the_truck_comes(swinging: Driven) -> None:
     at = point(case)
     data = crossing(case)
     entry = int(np.searchsorted(at.position_m[0], 0.0))
-    basis = rebased(data.basis, case.theta)
+    basis = change_basis(data.basis, case.theta)
     seen = []
     for before in (12, 33, 60):
         here = data._replace(basis=basis, swing_sample=entry - before)
@@ -241,7 +241,7 @@ class Filters(NamedTuple):
 
 def filters(theta: FloatArray, lengths: FloatArray, interior: tuple[int, ...]) -> Filters:
     basis = beam_basis(lengths, 2, interior_supports=interior, bearings_give=True)
-    basis = rebased(basis, theta)
+    basis = change_basis(basis, theta)
     parts, _, m = basis.cubics.shape
     groups = -(-m // LANES)
     cubics, feedback = np.zeros((parts, groups, 4, LANES)), np.zeros((groups, 5, LANES))
@@ -312,7 +312,7 @@ def test_free_decay_of_a_mode(k: int, alpha_per_s: float) -> None:
     ours = filters(from_models(TRUCK, beam), BEAM.element_lengths_m, ())
     steps, q, v = 100, 3e-3, -0.4
     state = np.zeros((ours.feedback.shape[0], 2, LANES))
-    modal_response.swing(ours.feedback, state, ours.modes[k], k, q, v)
+    modal_response.add_free_vibration(ours.feedback, state, ours.modes[k], k, q, v)
     lanes = np.zeros((2, steps, LANES))
     modal_response.advance(
         ours.cubics,

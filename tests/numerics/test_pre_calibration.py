@@ -13,8 +13,8 @@ import pytest
 from pre_core.diagnostics import calibration
 from schemas.settings import IdentificationSettings
 from services.simulation.drawn import default_site
-from services.validation.calibration import Record, in_processes, one_crossing, scores
-from services.validation.uncertainty import HALF, JUDGED, judged_checks, one_judged, one_scenario
+from studies.validation.calibration import Record, in_processes, one_crossing, scores
+from studies.validation.uncertainty import HALF, JUDGED, judged_checks, one_judged, one_scenario
 
 SITE = default_site()
 SETTINGS = IdentificationSettings(method="pre", threads=1)

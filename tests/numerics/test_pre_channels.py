@@ -19,8 +19,8 @@ from pre_core.crossing.channels import (
     V,
     Z,
     channel_signals,
+    interpolate_at,
     low_pass,
-    read_between,
 )
 from pre_core.physics.sensors import resample
 
@@ -231,6 +231,6 @@ def test_reading_between_samples(share: float) -> None:
     rng = np.random.default_rng(9)
     place = np.concatenate([rng.uniform(SEEN_ASIDE, n - SEEN_ASIDE - 1, 500), [40.0, 41.0]])
     truth = np.cos(2.0 * np.pi * share * place + 0.3)
-    np.testing.assert_allclose(read_between(samples, place), truth, atol=RIPPLE)
+    np.testing.assert_allclose(interpolate_at(samples, place), truth, atol=RIPPLE)
     ends = np.array([-1.0, 0.5, SEEN_ASIDE - 1.5, n - SEEN_ASIDE + 0.5, n + 3.0])
-    assert np.isnan(read_between(samples, ends)).all()
+    assert np.isnan(interpolate_at(samples, ends)).all()

@@ -13,15 +13,15 @@ import pytest
 
 from pre_core.paper.experiment import scenario_ratios
 from pre_core.physics.bridge import natural_frequencies_hz, refine
-from pre_core.physics.simulate import Simulation
-from schemas.results import Crossing, Results, results_json
+from pre_core.physics.simulate import CoupledResponse
+from schemas.results import CrossingResult, Results, results_json
 from schemas.settings import IdentificationSettings
 from services.drives.runs import Run
 from services.execution.offline import identify_recordings
 from services.simulation import drive as simulation
 from services.simulation.drive import (
     beam_of,
-    declared,
+    declared_site,
     measured_run,
     paper_site,
     simulate_drive,
@@ -44,9 +44,9 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     """Scenario 6 at 10 m/s over a road of class A, 25 µg/√Hz, with errors of the receiver."""
     path: Path = tmp_path_factory.mktemp("pre") / "scenario-6.mcap"
     site = paper_site()
-    simulated: list[Simulation] = []
+    simulated: list[CoupledResponse] = []
 
-    def keeping(*arguments: Any, **named: Any) -> tuple[Run, AxleRoads, Simulation]:
+    def keeping(*arguments: Any, **named: Any) -> tuple[Run, AxleRoads, CoupledResponse]:
         measured = measured_run(*arguments, **named)
         simulated.append(measured[2])
         return measured
@@ -61,20 +61,20 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
             noise_ug_per_rthz=NOISE_UG,
             receiver_errors=True,
         )
-    known = declared(site, NOISE_UG, drive.run.rate_hz)
+    known = declared_site(site, NOISE_UG, drive.run.rate_hz)
     write_drive(path, drive, known)
     results = identify_recordings([path], known, IdentificationSettings(method="pre", seed=0))
     return Found(results, -float(simulated[0].wheel_deflection_m.min()))
 
 
 @pytest.fixture(scope="module")
-def crossing(found: Found) -> Crossing:
+def crossing(found: Found) -> CrossingResult:
     assert len(found.results.crossings) == 1
     return found.results.crossings[0]
 
 
 @pytest.mark.slow
-def test_rigidities_lie_within_their_intervals(crossing: Crossing) -> None:
+def test_rigidities_lie_within_their_intervals(crossing: CrossingResult) -> None:
     assert crossing.verdict != "rejected", crossing.reasons
     assert crossing.parameters is not None
     assert crossing.chi2_per_dof is not None
@@ -92,7 +92,7 @@ def test_rigidities_lie_within_their_intervals(crossing: Crossing) -> None:
 
 
 @pytest.mark.slow
-def test_result_says_all_that_the_contract_asks(found: Found, crossing: Crossing) -> None:
+def test_result_says_all_that_the_contract_asks(found: Found, crossing: CrossingResult) -> None:
     text = results_json(found.results)
     assert Results.model_validate(json.loads(text)) == found.results
     assert "NaN" not in text

@@ -1,39 +1,86 @@
 """Weighted draws against quadrature, against ArviZ's Pareto smoothing, and when they give up."""
 
+from collections.abc import Callable
+
 import arviz
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.integrate import dblquad, quad
+from scipy.stats import multivariate_normal
 
-from pre_core.crossing import sampling
-from pre_core.search import approximation, importance
-from tests.numerics.test_pre_chains import (
-    DEVIATIONS,
-    NONE,
-    gaussian,
-    log_gamma_times_normal,
-    shares_of_parts,
-    skewed_approximation,
-    some_covariance,
-    straight,
-)
+from pre_core.crossing import sampling, surrogate
+from pre_core.search import importance
 
 FloatArray = NDArray[np.float64]
 COUNT = 4000
+SPARE = surrogate._NUISANCES
+"""Coordinates that are not watched: as many as their principal directions that are."""
 
 
-def spread_of(
-    target: approximation.LogDensity, mixed: approximation.Mixture, number: int = 0
-) -> float:
-    """Standard deviation of the log weights of fresh draws: nothing where both are the same."""
-    return float(importance.draw(target, mixed, COUNT, number).log_weight.std())
+LogDensity = Callable[[FloatArray], FloatArray]
+DEVIATIONS = 4.5
+
+
+def gaussian(centre: FloatArray, matrix: FloatArray) -> LogDensity:
+    precision = np.linalg.inv(matrix)
+
+    def log_density(y: FloatArray) -> FloatArray:
+        return np.asarray(-0.5 * np.einsum("ki,ij,kj->k", y - centre, precision, y - centre))
+
+    return log_density
+
+
+def some_covariance(f: int, seed: int = 1) -> FloatArray:
+    root = np.random.default_rng(seed).standard_normal((f, 2 * f)) / np.sqrt(2 * f)
+    return np.asarray(root @ root.T + 0.2 * np.eye(f))
+
+
+def shares_of_parts(
+    centre: FloatArray, matrix: FloatArray, odds: FloatArray
+) -> dict[tuple[bool, bool], float]:
+    """How likely each of the first two coordinates, positive, is zero: by quadrature.
+
+    The third is integrated over: of a normal the first two are normal by themselves.
+    """
+    density = multivariate_normal(centre[:2], matrix[:2, :2]).pdf
+    top = np.maximum(centre[:2], 0.0) + 9.0 * np.sqrt(np.diag(matrix)[:2])
+    both, _ = dblquad(lambda b, a: density([a, b]), 0.0, top[0], 0.0, top[1], epsabs=1e-8)
+    weights = {
+        (False, False): both,
+        (True, False): odds[0] * quad(lambda b: density([0.0, b]), 0.0, top[1])[0],
+        (False, True): odds[1] * quad(lambda a: density([a, 0.0]), 0.0, top[0])[0],
+        (True, True): odds[0] * odds[1] * density([0.0, 0.0]),
+    }
+    total = sum(weights.values())
+    return {which: weight / total for which, weight in weights.items()}
+
+
+def coordinates(f: int, **changes: object) -> surrogate.SurrogateCoordinates:
+    """Return coordinates of which none is curved, cut off or absent, and all are watched."""
+    none = np.zeros(0, dtype=np.int64)
+    plain = surrogate.SurrogateCoordinates(
+        none, np.zeros(0), none, np.full(f, -np.inf), np.arange(f - SPARE), 1.0
+    )
+    return plain._replace(**changes)
+
+
+def of_normal(centre: FloatArray, matrix: FloatArray) -> surrogate.Surrogate:
+    precision = np.linalg.inv(matrix)
+    return surrogate.Surrogate(precision, precision @ centre)
+
+
+def wide(matrix: FloatArray) -> FloatArray:
+    """Return a covariance with `SPARE` more coordinates of unit variance."""
+    f = matrix.shape[0]
+    return np.block([[matrix, np.zeros((f, SPARE))], [np.zeros((SPARE, f)), np.eye(SPARE)]])
 
 
 @pytest.mark.parametrize("heaviness", [0.3, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("count", [60, 1200])
 def test_smoothed_weights_are_those_of_arviz(heaviness: float, count: int) -> None:
     log_weight = heaviness * np.random.default_rng(count).standard_normal(count)
-    ours = importance.smoothed(log_weight - 700.0)
+    ours = importance.pareto_smooth(log_weight - 700.0)
     log_theirs, k = arviz.psislw(log_weight.copy())
     theirs = np.exp(log_theirs)
     assert ours.pareto_k == pytest.approx(float(k), abs=1e-9)
@@ -42,106 +89,101 @@ def test_smoothed_weights_are_those_of_arviz(heaviness: float, count: int) -> No
 
 
 def test_weights_of_equal_and_of_impossible_points() -> None:
-    equal = importance.smoothed(np.full(400, 3.0))
+    equal = importance.pareto_smooth(np.full(400, 3.0))
     assert equal.ess == pytest.approx(400.0)
     nearly_all = np.full(400, -np.inf)
     nearly_all[:5] = 0.0
-    assert importance.smoothed(nearly_all).pareto_k == np.inf
+    assert importance.pareto_smooth(nearly_all).pareto_k == np.inf
 
 
 def test_evenly_is_as_often_as_the_share() -> None:
     share = np.array([0.5, 0.0, 0.3, 0.2])
     for seed in range(20):
-        places = importance.evenly(share, 101, np.random.default_rng(seed))
+        places = importance.systematic_resample(share, 101, np.random.default_rng(seed))
         counts = np.bincount(places, minlength=4)
         assert np.abs(counts - 101 * share).max() < 1.0
     assert np.any(np.diff(places) < 0)  # in no order
 
 
+def test_weights_of_a_mixture_know_its_shares() -> None:
+    """Two normals with other constants, one of them far too narrow: shares by the known constants.
+
+    Of the constants only the ratio counts, and its error is that of some thousand draws.
+    """
+    rng = np.random.default_rng(7)
+    spreads, constants = np.array([0.6, 1.5]), np.array([40.0, -300.0])
+    counts = np.array([3000, 1000])
+    x = np.concatenate([s * rng.standard_normal(n) for s, n in zip(spreads, counts, strict=True)])
+    normal = -0.5 * (x[:, None] / spreads) ** 2
+    log_target = -0.5 * x**2 + 5.0
+    found = importance.mixture_log_weights(log_target, normal + constants, counts)
+    shares = counts / counts.sum() / spreads
+    expected = log_target - np.log(np.exp(normal) @ shares)
+    assert np.ptp(found - expected) < 0.1
+    worth = importance.pareto_smooth(found)
+    assert float(worth.weight @ x**2) == pytest.approx(1.0, abs=DEVIATIONS * np.sqrt(2 / worth.ess))
+    alone = importance.pareto_smooth(found[:3000])  # with the narrow one alone
+    assert abs(float(alone.weight @ x[:3000] ** 2) - 1.0) > 0.1
+
+
+def test_impossible_points_weigh_nothing_in_a_mixture() -> None:
+    x = np.random.default_rng(0).standard_normal(400)
+    log_target = np.where(x > 0.0, -0.5 * x**2, -np.inf)
+    log_density = np.column_stack([-0.5 * x**2, -0.5 * x**2 + 3.0])
+    found = importance.mixture_log_weights(log_target, log_density, np.array([200, 200]))
+    assert np.all(np.isneginf(found[x <= 0.0]))
+    assert np.ptp(found[x > 0.0]) < 1e-6
+
+
 def test_how_likely_a_coordinate_is_nothing() -> None:
-    """As of the chains: both of two correlated ones, one of them, or none."""
+    """Both of two correlated ones, one of them, or none."""
     matrix = some_covariance(3)
     centre, odds = np.array([0.6, -0.2, 0.4]), np.array([0.8, 2.0])
-    mixed = approximation.mixture(
-        centre + 0.06,
-        1.3 * matrix,
-        np.array([0, 1]),
-        np.zeros(3),
-        11,
-        np.array([*np.log(odds), -np.inf]),
+    of = coordinates(3, half_normal=np.array([0, 1]), log_odds=np.array([*np.log(odds), -np.inf]))
+    poor = of_normal(centre + 0.06, 1.3 * matrix)
+    y = surrogate.draw(poor, of, centre, COUNT, 11, 0)
+    worth = importance.pareto_smooth(
+        gaussian(centre, matrix)(y) - surrogate.log_likelihood(poor, y)
     )
-    drawn = importance.draw(gaussian(centre, matrix), mixed, COUNT, 0)
-    worth = importance.smoothed(drawn.log_weight)
     assert worth.pareto_k < 0.5
     for which, expected in shares_of_parts(centre, matrix, odds).items():
-        there = np.all((drawn.y[:, :2] == 0.0) == np.array(which), axis=1)
+        there = np.all((y[:, :2] == 0.0) == np.array(which), axis=1)
         error = np.sqrt(expected * (1.0 - expected) / worth.ess)
         share = float(worth.weight @ there)
         assert abs(share - expected) < DEVIATIONS * error, (which, expected)
         assert abs(share - 1.5 * expected) > DEVIATIONS * error  # it would be noticed
 
 
-def test_two_coordinates_are_looked_at_together() -> None:
-    """An approximation that knows nothing of how two of five hang together, and not of the rest."""
-    precision = np.eye(5)
-    precision[1, 2] = precision[2, 1] = -0.7
-    matrix = np.linalg.inv(precision)
-    centre = np.linspace(-1.0, 1.0, 5)
-    target, plain = gaussian(centre, matrix), straight(centre, np.eye(5), NONE, 2)
-    alone = approximation.probed(target, plain)
-    both = approximation.probed(target, plain, np.array([2, 1]))
-    assert spread_of(target, alone) > 0.3
-    assert spread_of(target, both) < 1e-9
-    elsewhere = approximation.probed(target, plain, np.array([0, 3, 4]))
-    assert spread_of(target, elsewhere) == pytest.approx(spread_of(target, alone), rel=1e-9)
-
-
-def test_what_is_probed_is_counted() -> None:
-    seen = 0
-
-    def target(y: FloatArray) -> FloatArray:
-        nonlocal seen
-        seen += y.shape[0]
-        return np.asarray(-0.5 * np.sum(y * y, axis=1))
-
-    plain = straight(np.zeros(5), np.eye(5), np.array([0]), 2)
-    together = np.array([2, 3, 4])
-    approximation.probed(target, plain, together)
-    assert seen == approximation.probes(plain, together)
-
-
-def test_what_draws_show_is_learnt() -> None:
-    """Moved, stretched and turned by the weights of draws; what is never negative stays."""
-    matrix = some_covariance(4)
-    centre = np.array([0.5, 0.3, -0.2, 0.4])
+def test_a_surrogate_is_refined_by_weighted_draws() -> None:
+    """Moved, stretched and turned by the weights of draws, with a coordinate cut off at zero."""
+    matrix, centre = wide(some_covariance(4)), np.zeros(4 + SPARE)
+    centre[:4] = 0.5, 0.3, -0.2, 0.4
+    of = coordinates(4 + SPARE, half_normal=np.array([0]))
     target = gaussian(centre, matrix)
-
-    def cut(y: FloatArray) -> FloatArray:
-        return np.where(y[:, 0] >= 0.0, target(y), -np.inf)
-
-    poor = straight(centre + np.array([0.0, 0.3, 0.0, -0.3]), matrix * 1.4, np.array([0]), 5)
-    drawn = importance.draw(cut, poor, COUNT, 0)
-    better = approximation.learnt(poor, drawn.part, drawn.v, drawn.log_weight)
-    worth = [
-        importance.smoothed(importance.draw(cut, mixed, COUNT, 1).log_weight).ess
-        for mixed in (poor, better)
-    ]
+    moved = centre + np.array([0.0, 0.3, 0.0, -0.3, *np.zeros(SPARE)])
+    poor = of_normal(moved, matrix * 1.4)
+    y = surrogate.draw(poor, of, centre, COUNT, 5, 0)
+    better = surrogate.refine(poor, of, y, target(y), COUNT)
+    worth = []
+    for one in (poor, better):
+        y = surrogate.draw(one, of, centre, COUNT, 6, 0)
+        assert y[:, 0].min() >= 0.0
+        log_weight = target(y) - surrogate.log_likelihood(one, y)
+        worth.append(importance.pareto_smooth(log_weight).ess)
     assert worth[0] < 0.8 * COUNT
     assert worth[1] > 0.9 * COUNT
-    (before,), (after,) = poor.parts, better.parts
-    assert after.factor[0, 0] == before.factor[0, 0]
-    assert after.shift[0] == 0.0
-    assert np.array_equal(after.factor, np.tril(after.factor))
 
 
-def test_scatter_is_not_learnt() -> None:
-    matrix = some_covariance(4)
-    target, right = gaussian(np.zeros(4), matrix), straight(np.zeros(4), matrix, NONE, 5)
-    drawn = importance.draw(target, right, 300, 0)
-    noise = 0.5 * np.random.default_rng(1).standard_normal(300)
-    same = approximation.learnt(right, drawn.part, drawn.v, drawn.log_weight + noise)
-    np.testing.assert_allclose(same.parts[0].factor, right.parts[0].factor, atol=1e-12)
-    np.testing.assert_allclose(same.parts[0].shift, 0.0, atol=1e-12)
+def test_scatter_does_not_refine_a_surrogate() -> None:
+    matrix = wide(some_covariance(4))
+    of, right = coordinates(4 + SPARE), of_normal(np.zeros(4 + SPARE), matrix)
+    y = surrogate.draw(right, of, np.zeros(4 + SPARE), 800, 5, 0)
+    noise = 0.5 * np.random.default_rng(1).standard_normal(800)
+    same = surrogate.refine(right, of, y, surrogate.log_likelihood(right, y) + noise, 800)
+    ratio = np.linalg.eigvals(np.linalg.solve(right.precision, same.precision)).real
+    np.testing.assert_allclose(ratio, 1.0, atol=0.1)
+    mean = np.linalg.solve(same.precision, same.linear)
+    assert np.sqrt(mean @ right.precision @ mean) < 0.15
 
 
 def silent(stage: str, fraction: float) -> None:
@@ -149,14 +191,29 @@ def silent(stage: str, fraction: float) -> None:
 
 
 def test_weighted_draws_of_a_posterior_that_leans() -> None:
-    weighted, _, spent = sampling._weighted(
-        log_gamma_times_normal, skewed_approximation(bend=-0.2), 1200, silent
-    )
-    assert weighted is not None
-    drawn, worth = weighted
-    assert drawn.log_weight.size == spent == 1200
-    mean = float(worth.weight @ np.exp(drawn.y[:, 0]))  # of a gamma variate: its shape
-    assert abs(mean - 2.5) < DEVIATIONS * np.sqrt(2.5 / worth.ess)
+    """A likelihood nearly normal in exp(-y/2), with a normal prior of y, against quadrature."""
+    f, spread = 1 + SPARE, 0.3
+
+    def log_density(y: FloatArray) -> FloatArray:
+        z = (np.exp(-0.5 * y) - 0.7) / spread
+        return np.asarray(-0.5 * z**2 - 0.05 * z**4 - 0.5 * y**2)
+
+    def target(y: FloatArray) -> FloatArray:
+        return np.asarray(log_density(y[:, 0]) - 0.5 * np.sum(y[:, 1:] ** 2, axis=1))
+
+    of = coordinates(f, curved=np.array([0]), sigma=np.array([0.5]))
+    centre = np.array([0.9, *np.zeros(SPARE)])  # not where it should be
+    first = of_normal(centre, np.diag([1.3 * spread**2, *np.ones(SPARE)]))
+    y, worth = sampling._importance_draws(target, of, first, np.zeros(f), 1200, 1, silent)
+    assert sampling._is_enough(worth, 1200)
+    grid = np.linspace(-8.0, 6.0, 20_001)
+    density = np.exp(log_density(grid))
+    density /= density.sum()
+    for power in (1.0, -1.0):
+        expected = float(density @ np.exp(power * grid))
+        scatter = np.sqrt(float(density @ np.exp(2.0 * power * grid)) - expected**2)
+        mean = float(worth.weight @ np.exp(power * y[:, 0]))
+        assert abs(mean - expected) < DEVIATIONS * scatter / np.sqrt(worth.ess)
 
 
 def test_weighted_draws_give_up_where_tails_are_heavy() -> None:
@@ -165,15 +222,15 @@ def test_weighted_draws_give_up_where_tails_are_heavy() -> None:
     def target(y: FloatArray) -> FloatArray:
         return np.asarray(-np.sum(np.log1p(y**2), axis=1))
 
-    narrow = straight(np.zeros(20), 0.5 * np.eye(20), NONE, 3)
-    drawn, _, spent = sampling._weighted(target, narrow, 1200, silent)
-    assert drawn is None
-    assert 2 * 1200 <= spent <= 2 * 3000
+    of, narrow = coordinates(20), of_normal(np.zeros(20), 0.5 * np.eye(20))
+    found = sampling._importance_draws(target, of, narrow, np.zeros(20), 1200, 3, silent)
+    assert not sampling._is_enough(found.worth, 1200)
+    assert found.y.shape[0] == 400 * sampling._MOST_BATCHES
 
 
-def test_from_hardly_any_possible_draw_nothing_is_learnt() -> None:
-    plain = straight(np.zeros(4), np.eye(4), NONE, 5)
-    drawn = importance.draw(gaussian(np.zeros(4), np.eye(4)), plain, 40, 0)
-    log_weight = np.full(40, -np.inf)
-    log_weight[:3] = 1.0
-    assert approximation.learnt(plain, drawn.part, drawn.v, log_weight) is plain
+def test_a_surrogate_stays_where_hardly_any_draw_is_possible() -> None:
+    of, plain = coordinates(4 + SPARE), of_normal(np.zeros(4 + SPARE), np.eye(4 + SPARE))
+    y = surrogate.draw(plain, of, np.zeros(4 + SPARE), 40, 5, 0)
+    log_target = np.full(40, -np.inf)
+    log_target[:3] = 1.0
+    assert surrogate.refine(plain, of, y, log_target, 40) is plain

@@ -7,30 +7,26 @@ import pytest
 from numpy.typing import NDArray
 
 from pre_core.crossing import mismatch as mm
-from pre_core.crossing.compliances import Compliances, draws
-from pre_core.crossing.preparation import MISMATCHED
-from pre_core.crossing.whitening import (
-    RESIDUALS,
-    Truck,
+from pre_core.crossing.compliances import CompliancePosterior, draws
+from pre_core.crossing.noise import (
+    NoisePath,
     _estimation,
     _folded,
-    _spectrum,
-    filter_rows,
-    linear_springs,
     mismatch_levels,
     mismatch_power,
-    row_count,
-    row_filter,
-    truck_of,
-    white_rows,
-    whitener,
+    no_force_noise,
+    noise_path,
+    noise_spectrum,
 )
+from pre_core.crossing.preparation import MISMATCHED
+from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count, row_filter
+from pre_core.crossing.whitening import white_rows, whitener
 from pre_core.physics.models import from_models
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
 from pre_core.physics.surface import (
     COMMON_LORRY,
     Footprint,
-    felt_by,
+    axle_profile,
     random_surface,
     spectra,
     surface_density,
@@ -46,17 +42,17 @@ FRONT, REAR = COMMON_LORRY
 QUIET = np.full(4, 1e-6)
 
 
-def truck(change: int | None = None, by: float = 0.0) -> Truck:
+def truck(change: int | None = None, by: float = 0.0) -> NoisePath:
     site = paper_site()
     car = car_of(site.vehicles[0])
     theta = from_models(car, beam_of(site.bridges[0], np.ones(7)))
     if change is not None:
         theta[change] *= 1.0 + by
-    return truck_of(theta, site.vehicles[0].total_mass_kg, car.wheelbase_m, False)
+    return noise_path(theta, site.vehicles[0].total_mass_kg, car.wheelbase_m, False)
 
 
 def of_level(level: float) -> mm.Mismatch:
-    return mm.Mismatch(mm.shapes_of(FRONT, REAR), np.array([level, 0.0]), SPEED)
+    return mm.Mismatch(mm.mismatch_spectra(FRONT, REAR), np.array([level, 0.0]), SPEED)
 
 
 def true_level(road_class: str) -> float:
@@ -74,7 +70,7 @@ def driven(seed: int, samples: int = 2000) -> Driven:
     """Both axles' roads of class A at the samples of a steady drive."""
     spacing = STEP_S * SPEED
     surface = random_surface(0.0, spacing * (samples - 1), spacing, "A", seed)
-    front, rear = felt_by(surface, FRONT).height_m, felt_by(surface, REAR).height_m
+    front, rear = axle_profile(surface, FRONT).height_m, axle_profile(surface, REAR).height_m
     return Driven((front - rear)[:samples], front[:samples])
 
 
@@ -86,7 +82,7 @@ def filtered(values: FloatArray) -> FloatArray:
 
 
 def test_window_keeps_the_spectrum() -> None:
-    shapes = mm.shapes_of(FRONT, REAR)
+    shapes = mm.mismatch_spectra(FRONT, REAR)
     n = np.array([0.04, 0.1, 0.3, 1.0, 2.0])
     at = np.array([REFERENCE_CYCLES_PER_M])
     aside = Footprint(offset_m=0.005)
@@ -99,7 +95,7 @@ def test_window_keeps_the_spectrum() -> None:
 
 def test_two_numbers_are_those_of_the_literature() -> None:
     # Twin tyres on class A: 2.7e-8 m³, n_0 1.43 by a fit over all waves.
-    a, n_0 = mm.as_two_numbers(of_level(true_level("A")))
+    a, n_0 = mm.two_parameter_spectrum(of_level(true_level("A")))
     assert a == pytest.approx(2.74e-8, rel=0.03)
     assert n_0 == pytest.approx(1.43, rel=0.06)
 
@@ -113,7 +109,7 @@ def test_rows_of_drawn_surfaces_become_white() -> None:
         if noise is None:
             count = row_count(rows, difference.size)
             road = of_level(true_level("A"))
-            noise = whitener(rows, count, truck(), QUIET, linear_springs(), road)
+            noise = whitener(rows, count, truck(), QUIET, no_force_noise(), road)
         residuals = np.zeros((RESIDUALS, difference.size))
         residuals[0] = difference
         white = white_rows(rows, noise, residuals).reshape(-1, RESIDUALS)[:, 0]
@@ -137,9 +133,9 @@ def test_levels_of_drawn_surfaces() -> None:
             [filtered(drive.front)],
         )  # fmt: skip
         assert gain > 10.0 * MISMATCHED
-        shapes = mm.shapes_of(FRONT, REAR)
-        found.append(mm.as_two_numbers(mm.Mismatch(shapes, level, SPEED))[0])
-    wanted = mm.as_two_numbers(of_level(true_level("A")))[0]
+        shapes = mm.mismatch_spectra(FRONT, REAR)
+        found.append(mm.two_parameter_spectrum(mm.Mismatch(shapes, level, SPEED))[0])
+    wanted = mm.two_parameter_spectrum(of_level(true_level("A")))[0]
     assert np.exp(np.mean(np.log(found))) == pytest.approx(wanted, rel=0.15)
     assert np.std(np.log(found)) < 0.4
 
@@ -147,7 +143,7 @@ def test_levels_of_drawn_surfaces() -> None:
 def test_sensors_noise_is_no_mismatch() -> None:
     rows, one = row_filter(STEP_S), truck()
     density = np.full(4, 25.0 * 9.80665e-6)
-    noise = whitener(rows, 200, one, density, linear_springs())
+    noise = whitener(rows, 200, one, density, no_force_noise())
     rng = np.random.default_rng(5)
     gains = []
     for _ in range(40):
@@ -171,7 +167,7 @@ def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
     right, wrong = truck(), truck(unknown, 0.01)
     wheelbase = paper_site().vehicles[0].wheelbase_m
     told = mismatch_power(
-        rows, [right, wrong], np.zeros((2, 4)), np.zeros((2, 4)), QUIET, linear_springs(),
+        rows, [right, wrong], np.zeros((2, 4)), np.zeros((2, 4)), QUIET, no_force_noise(),
         road, wheelbase, [0],
     )[0]  # fmt: skip
     omega = _folded(rows, 4000).below
@@ -197,7 +193,7 @@ def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
     )
     seen = residuals(felt)
     change = residuals(np.einsum("fij,jsf->isf", mixing, felt)) - seen
-    spectrum = _spectrum(right, QUIET, linear_springs(), road, omega) / omega**4
+    spectrum = noise_spectrum(right, QUIET, no_force_noise(), road, omega) / omega**4
     weight = np.linalg.inv(np.moveaxis(spectrum, 2, 0))
     drawn = np.einsum("isf,fij,jsf->sf", seen.conj(), weight, change).real / SPEED
     mean, error = drawn.mean(), drawn.mean(axis=1).std() / np.sqrt(drawn.shape[0])
@@ -210,11 +206,11 @@ def test_draws_of_compliances_against_quadrature() -> None:
     precision = np.array([[6.0, 2.0], [2.0, 3.0]])
     linear = np.array([8.0, 3.5])
     sigma, odds = 0.55, -0.3
-    of = Compliances(
-        elements=np.array([0]), sigma=np.array([sigma]), told=np.array([0, 1]),
+    of = CompliancePosterior(
+        elements=np.array([0]), sigma=np.array([sigma]), sampled=np.array([0, 1]),
         others=np.array([2]), centre=np.array([1.0]), inflation=1.0, precision=precision,
         linear=linear, log_odds=np.array([-np.inf, odds]), others_root=np.array([[0.5]]),
-        others_linear=np.array([1.0]), others_told=np.array([[0.5, -0.4]]), leaning=np.zeros(3),
+        others_linear=np.array([1.0]), others_sampled=np.array([[0.5, -0.4]]), leaning=np.zeros(3),
     )  # fmt: skip
     drawn = np.concatenate([draws(of, 1500, 3, stream) for stream in range(4)])
     y = np.linspace(-6.0, 6.0, 2401)
@@ -237,6 +233,6 @@ def test_draws_of_compliances_against_quadrature() -> None:
     assert drawn[:, 0].mean() == pytest.approx(mean_y, abs=0.05)
     assert drawn[:, 0].std() == pytest.approx(np.sqrt(of_y @ (y - mean_y) ** 2), rel=0.05)
     x = np.stack([np.exp(-sigma * drawn[:, 0]), drawn[:, 1]])
-    rest = drawn[:, 2] - (1.0 - of.others_told[0] @ x) / 4.0
+    rest = drawn[:, 2] - (1.0 - of.others_sampled[0] @ x) / 4.0
     assert rest.mean() == pytest.approx(0.0, abs=0.03)
     assert rest.std() == pytest.approx(0.5, rel=0.05)

@@ -12,12 +12,17 @@ from numpy.typing import NDArray
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.channels import A, V, Z
-from pre_core.crossing.residuals import Crossing, Points, roads_and_deflections, workspace
-from pre_core.crossing.whitening import row_filter
+from pre_core.crossing.residuals import (
+    EvaluationPoints,
+    GriddedCrossing,
+    allocate_buffers,
+    roads_and_deflections,
+)
+from pre_core.crossing.rows import row_filter
 from pre_core.paper import experiment
-from pre_core.physics.beam_basis import RIGID_M_PER_N, BeamBasis, beam_basis, rebased
+from pre_core.parameters import ALPHA, BETA, C_U1, EI_1, K_ROT, K_U1, KAPPA, RHO_A, F
+from pre_core.physics.beam_basis import RIGID_M_PER_N, BeamBasis, beam_basis, change_basis
 from pre_core.physics.sensors import resample, white_noise
-from pre_core.unknowns import ALPHA, BETA, C_U1, EI_1, K_ROT, K_U1, KAPPA, RHO_A, F
 from services.simulation.drive import paper_site, simulate_drive, truck_of
 from tests.numerics.crossings import (
     PARTS,
@@ -33,7 +38,7 @@ from tests.numerics.crossings import (
 )
 
 if TYPE_CHECKING:
-    from services.simulation.drive import Drive
+    from services.simulation.drive import SimulatedDrive
 
 FloatArray = NDArray[np.float64]
 
@@ -41,7 +46,7 @@ START, END = K_ROT, K_ROT + 1
 
 
 @pytest.fixture(scope="module")
-def truth(scenario_6: "Drive") -> Case:
+def truth(scenario_6: "SimulatedDrive") -> Case:
     return case(scenario_6, paper_site())
 
 
@@ -71,7 +76,7 @@ def test_modes_keep_their_signs_from_bridge_to_bridge(truth: Case) -> None:
     for _ in range(20):
         theta = truth.theta.copy()
         theta[EI_1:] *= np.exp(0.5 * rng.standard_normal(theta.size - EI_1))
-        basis = rebased(basis, theta)
+        basis = change_basis(basis, theta)
         assert np.all(basis.cubics[0, 1] > 0.0)
 
 
@@ -122,7 +127,7 @@ def test_place_and_wheelbase_stand_out(truth: Case) -> None:
 
 
 def moved(
-    case: Case, data: Crossing, at: Points, place_m: float, longer_m: float = 0.0
+    case: Case, data: GriddedCrossing, at: EvaluationPoints, place_m: float, longer_m: float = 0.0
 ) -> FloatArray:
     """White rows with the bridge put elsewhere or with another wheelbase."""
     there = at._replace(position_m=at.position_m + place_m, wheelbase_m=at.wheelbase_m + longer_m)
@@ -136,7 +141,7 @@ def noisy(truth: Case) -> Case:
     return truth._replace(acceleration=truth.acceleration + np.stack(noise))
 
 
-def on_the_bearing(at: Points, axle: int, end_m: float, share: float) -> Points:
+def on_the_bearing(at: EvaluationPoints, axle: int, end_m: float, share: float) -> EvaluationPoints:
     """Moved so that the axle is on that bearing at a sample, or so much of a step beyond it."""
     wheel = at.position_m[0] - axle * at.wheelbase_m[0]
     step = wheel[1] - wheel[0]
@@ -188,7 +193,7 @@ def test_common_gain_scales_all_but_the_weight(truth: Case) -> None:
     np.testing.assert_allclose(residual(truth, known, data=low), expected / gain, atol=1e-9 * scale)
     unknown = residual(truth, at, data=low) - expected / gain
     assert np.sum(white(truth, unknown) ** 2) > 10.0**2  # ten standard deviations
-    work = workspace(data, at.theta.shape[1], row_filter(data.step_s))
+    work = allocate_buffers(data, at.theta.shape[1], row_filter(data.step_s))
     right = roads_and_deflections(data, work, at, 0)
     ours = roads_and_deflections(low, work, known, 0)
     for a, b in zip(ours, right, strict=True):
@@ -202,7 +207,7 @@ def test_coordinates_of_another_bridge_leave_everything_alone(truth: Case) -> No
     weak[[EI_1 + 1, EI_1 + 5]] *= 0.5
     weak[[START, END]] = 5e8, 0.0
     weak[[F, F + 1]] = 3e-10, 1e-9
-    other = rebased(data.basis, weak)
+    other = change_basis(data.basis, weak)
     n = other.stiffness.shape[0] - 4
 
     def stiffness(basis: BeamBasis, theta: FloatArray) -> FloatArray:
@@ -260,7 +265,7 @@ def test_axles_coupled_by_the_pitch_inertia() -> None:
 
 def read_with(
     case: Case, gain: FloatArray, delay_s: FloatArray, bias: FloatArray
-) -> tuple[Case, Points]:
+) -> tuple[Case, EvaluationPoints]:
     """The truth as imperfect channels read it, and the point that undoes their errors."""
     read = np.stack(
         [
@@ -351,7 +356,7 @@ def test_mirrored_crossing_gives_the_same_residuals(truth: Case) -> None:
     np.testing.assert_allclose(back, forth, atol=1e-9 * np.abs(forth).max())
 
 
-def changes(case: Case, count: int) -> Points:
+def changes(case: Case, count: int) -> EvaluationPoints:
     """Points that differ in one or another group only, in random order, many of them twice."""
     rng = np.random.default_rng(11)
     at = point(case, count)
@@ -379,7 +384,7 @@ def test_modes_are_never_those_of_another_bridge(truth: Case) -> None:
     together = residual(truth, at, data=data)
     assert np.isfinite(together).all()
     for k in range(60):
-        alone = Points(*(part[k : k + 1] for part in at))
+        alone = EvaluationPoints(*(part[k : k + 1] for part in at))
         np.testing.assert_array_equal(residual(truth, alone, data=data)[0], together[k])
     assert len({together[k].tobytes() for k in range(60)}) > 12
 
@@ -418,7 +423,7 @@ def test_at_rest_the_bridge_bends_by_its_weight(truth: Case) -> None:
     at.theta[0, ALPHA], at.theta[0, BETA] = 20.0, 0.02  # heavily damped
     # 0.2 of the speed would need a longer record: the mass is made small instead.
     at.theta[0, RHO_A] = 40.0
-    work = workspace(data, at.theta.shape[1], row_filter(data.step_s))
+    work = allocate_buffers(data, at.theta.shape[1], row_filter(data.step_s))
     _, deflection = roads_and_deflections(data, work, at, 0)
     car = truck_of(silent.site.vehicles[0])
     d_1 = car.front_axle_to_cg_m

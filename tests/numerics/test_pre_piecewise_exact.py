@@ -14,13 +14,13 @@ from scipy.linalg import expm
 
 from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
 from pre_core.crossing.residuals import (
+    allocate_buffers,
     roads_and_deflections,
-    workspace,
 )
-from pre_core.crossing.whitening import row_filter
+from pre_core.crossing.rows import row_filter
+from pre_core.parameters import ALPHA, C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1, RHO_A
 from pre_core.physics import modal_response as piecewise_exact
 from pre_core.physics.beam_basis import beam_basis
-from pre_core.unknowns import ALPHA, C_S1, D_1, EI_1, K_S1, K_U1, KAPPA, M_U1, RHO_A
 from tests.numerics.crossings import bare_crossing, uncorrected
 
 FloatArray = NDArray[np.float64]
@@ -81,7 +81,7 @@ def test_order_for_smooth_forces(is_sharpened: bool, low: float, high: float) ->
     steps = np.array([8e-3, 4e-3, 2e-3])
     fine = pulse(np.arange(0.0, 1.2, 1e-4))
     sharp_fine = np.empty_like(fine)
-    piecewise_exact.sharpened(fine, sharp_fine)
+    piecewise_exact.precompensate_force(fine, sharp_fine)
     truth = marched(eigenvalue, damping, 1e-4, sharp_fine)
     errors = []
     for step_s in steps:
@@ -89,7 +89,7 @@ def test_order_for_smooth_forces(is_sharpened: bool, low: float, high: float) ->
         force = np.ascontiguousarray(fine[::every])
         used = force.copy()
         if is_sharpened:
-            piecewise_exact.sharpened(force, used)
+            piecewise_exact.precompensate_force(force, used)
         ours = marched(eigenvalue, damping, float(step_s), used)
         errors.append(np.abs(ours - truth[::every]).max() / np.abs(truth).max())
     order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
@@ -141,7 +141,7 @@ def silent_crossing(beam: Beam, offset_m: float) -> tuple[FloatArray, FloatArray
     )
     theta = theta_of(beam)
     at = uncorrected(theta, WHEELBASE_M, front)
-    work = workspace(crossing, theta.size, row_filter(STEP_S))
+    work = allocate_buffers(crossing, theta.size, row_filter(STEP_S))
     return roads_and_deflections(crossing, work, at, 0)[1], front
 
 

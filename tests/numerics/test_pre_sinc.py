@@ -6,7 +6,8 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from pre_core.crossing.channels import PASS, STOP
-from pre_core.crossing.residuals import _read, sinc_table
+from pre_core.crossing.residuals import _read
+from pre_core.crossing.step_tables import sinc_table
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 
 FloatArray = NDArray[np.float64]

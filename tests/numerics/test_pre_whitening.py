@@ -15,25 +15,13 @@ from scipy.linalg import cholesky_banded, solve_banded
 
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing.channels import A_1, A_2, A, V, Z, channel_signals
-from pre_core.crossing.whitening import (
-    DOUBTED_SPRING_N_PER_M,
-    EVERY,
-    PASS,
-    RowFilter,
-    Truck,
-    Whitener,
-    filter_rows,
-    linear_springs,
-    noise_power,
-    row_count,
-    row_filter,
-    white_rows,
-    whitener,
-)
+from pre_core.crossing.noise import DOUBTED_SPRING_N_PER_M, NoisePath, no_force_noise, noise_power
+from pre_core.crossing.rows import EVERY, PASS, RowFilter, filter_rows, row_count, row_filter
+from pre_core.crossing.whitening import Whitener, white_rows, whitener
+from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
 from pre_core.physics.models import from_models
 from pre_core.physics.sensors import white_noise
 from pre_core.physics.vehicle import HalfCar, body_masses_kg
-from pre_core.unknowns import C_S1, K_S1, K_U1, M_U1
 from services.simulation.drive import beam_of, paper_site, truck_of
 
 FloatArray = NDArray[np.float64]
@@ -62,8 +50,8 @@ def theta() -> FloatArray:
     return from_models(truck(), beam_of(paper_site().bridges[0], np.ones(7)))
 
 
-def declared_truck(*, is_inertial: bool = True) -> Truck:
-    return Truck(theta(), *body_masses_kg(truck()), is_inertial)
+def declared_truck(*, is_inertial: bool = True) -> NoisePath:
+    return NoisePath(theta(), *body_masses_kg(truck()), is_inertial)
 
 
 def plain_residuals(signals: FloatArray, step_s: float, *, is_inertial: bool = True) -> FloatArray:
@@ -103,7 +91,7 @@ def case(
     rate_hz: float,
     samples: int,
     density_ug: FloatArray = DENSITY_UG,
-    declared: Truck | None = None,
+    declared: NoisePath | None = None,
 ) -> Case:
     model = channel_signals(np.zeros((4, samples)), 1.0 / rate_hz, rate_hz)
     rows = row_filter(model.step_s)
@@ -113,7 +101,7 @@ def case(
         row_count(rows, model.signals.shape[2] - round(BETWEEN_AXLES_S / model.step_s)),
         declared,
         density_ug * MICRO_G_M_PER_S2,
-        linear_springs(),
+        no_force_noise(),
     )
     return Case(rate_hz, rows, noise, samples, declared.is_inertial)
 
@@ -181,7 +169,7 @@ def test_body_rows_left_uncoupled_are_too_loud() -> None:
     """Negative control: without what each body sensor adds to the other axle's equation."""
     m_11, m_22, m_12 = body_masses_kg(truck())
     assert abs(m_12) > 0.01 * m_11
-    uncoupled = case(1000.0, 6001, declared=Truck(theta(), m_11, m_22, 0.0, True))
+    uncoupled = case(1000.0, 6001, declared=NoisePath(theta(), m_11, m_22, 0.0, True))
     white = np.concatenate([white_noise_rows(uncoupled, seed) for seed in range(8)])
     squares = np.mean(white[:, 1:] ** 2, axis=0)
     assert np.all(squares - 1.0 > 4.5 * np.sqrt(2.0 / white.shape[0])), squares
@@ -273,7 +261,7 @@ def test_pass_and_stop_band(rate_hz: float) -> None:
     )
 
 
-def test_rows_are_where_they_are_said_to_be() -> None:
+def test_rows_are_at_their_stated_places() -> None:
     rows = row_filter(3e-3)
     x = np.random.default_rng(4).standard_normal((2, 700))
     out = filtered(rows, x)
@@ -324,16 +312,16 @@ def test_a_whitener_for_other_rows_is_refused() -> None:
 
 def test_densities_of_zero_are_refused() -> None:
     with pytest.raises(ValueError, match="densities above zero"):
-        whitener(row_filter(3e-3), 20, declared_truck(), np.zeros(4), linear_springs())
+        whitener(row_filter(3e-3), 20, declared_truck(), np.zeros(4), no_force_noise())
 
 
-def changed_trucks() -> list[Truck]:
+def changed_trucks() -> list[NoisePath]:
     """The declared truck, and four whose dampers, springs and masses differ by 20 %."""
     trucks = [declared_truck(is_inertial=False)]
     for place in (C_S1, K_S1 + 1, M_U1, K_U1):
         other = theta()
         other[place] *= 1.2
-        trucks.append(Truck(other, *body_masses_kg(truck()), False))
+        trucks.append(NoisePath(other, *body_masses_kg(truck()), False))
     return trucks
 
 
@@ -348,11 +336,11 @@ def test_power_of_the_noise_of_other_trucks() -> None:
     density[-1, 2] *= 1.1  # and the declared truck with one sensor noisier
     trucks.append(trucks[0])
     which = list(range(len(trucks) - 1))
-    ours = noise_power(rows, trucks, density, linear_springs(), which)
+    ours = noise_power(rows, trucks, density, no_force_noise(), which)
     traces = []
     for count in (80, 140):
         dense = [
-            dense_covariance(whitener(rows, count, one, d, linear_springs()))
+            dense_covariance(whitener(rows, count, one, d, no_force_noise()))
             for one, d in zip(trucks, density, strict=True)
         ]
         traces.append([np.trace(np.linalg.solve(dense[0], dense[1 + k])) for k in which])
@@ -367,12 +355,12 @@ def test_slope_of_the_noise_power_is_that_of_drawn_noise() -> None:
     car = truck()
     softer = theta()
     softer[C_S1] *= 0.7
-    declared = Truck(softer, *body_masses_kg(car), True)
+    declared = NoisePath(softer, *body_masses_kg(car), True)
     here = case(1000.0, 6001, declared=declared)
     drawn = np.mean([3.0 * np.mean(white_noise_rows(here, seed) ** 2) for seed in range(12)])
     density = np.tile(DENSITY_UG * MICRO_G_M_PER_S2, (2, 1))
     (expected,) = noise_power(
-        here.rows, [declared, declared_truck()], density, linear_springs(), [0]
+        here.rows, [declared, declared_truck()], density, no_force_noise(), [0]
     )
     n = 12 * here.noise.reciprocal.size
     assert abs(expected) > 0.05

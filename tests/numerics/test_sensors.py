@@ -10,7 +10,7 @@ from scipy.signal import csd, welch
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.physics.sensors import (
     Accelerometer,
-    Receiver,
+    ReceiverModel,
     gauss_markov,
     measure_acceleration,
     measure_position,
@@ -178,14 +178,14 @@ TIME = np.arange(0, 600_001) / 1000.0  # 600 s at 10 m/s
 CHAINAGE, LATERAL, SPEED = 10.0 * TIME - 50.0, np.full(TIME.size, 1.5), np.full(TIME.size, 10.0)
 
 
-def drive(receiver: Receiver, seed: int = 6) -> tuple[FloatArray, FloatArray, FloatArray]:
+def drive(receiver: ReceiverModel, seed: int = 6) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times of the fixes and errors of chainage and of lateral position."""
     fixes = measure_position(TIME, CHAINAGE, LATERAL, SPEED, receiver, np.random.default_rng(seed))
     return fixes.time_s, fixes.chainage_m - (10.0 * fixes.time_s - 50.0), fixes.lateral_m - 1.5
 
 
 def test_perfect_receiver() -> None:
-    time_s, chainage_error, lateral_error = drive(Receiver(10.0))
+    time_s, chainage_error, lateral_error = drive(ReceiverModel(10.0))
     np.testing.assert_allclose(np.diff(time_s), 0.1, rtol=1e-9)
     assert time_s.size == 6001
     np.testing.assert_allclose(chainage_error, 0.0, atol=1e-9)
@@ -193,7 +193,7 @@ def test_perfect_receiver() -> None:
 
 
 def test_white_position_and_speed_errors() -> None:
-    receiver = Receiver(10.0, position_noise_m=0.4, speed_noise_m_per_s=0.07)
+    receiver = ReceiverModel(10.0, position_noise_m=0.4, speed_noise_m_per_s=0.07)
     _, chainage_error, lateral_error = drive(receiver)
     assert chainage_error.std() == pytest.approx(0.4, rel=0.04)
     assert lateral_error.std() == pytest.approx(0.4, rel=0.04)
@@ -216,20 +216,20 @@ def test_slow_error_has_its_spread_and_its_correlation_time() -> None:
 
 
 def test_infinite_correlation_time_is_a_constant_bias() -> None:
-    _, chainage_error, lateral_error = drive(Receiver(10.0, position_spread_m=1.5))
+    _, chainage_error, lateral_error = drive(ReceiverModel(10.0, position_spread_m=1.5))
     assert np.ptp(chainage_error) < 1e-9
     assert 0.01 < abs(chainage_error[0]) < 6.0
     assert abs(lateral_error[0] - chainage_error[0]) > 1e-3
 
 
 def test_latency_shows_where_the_truck_was() -> None:
-    time_s, chainage_error, _ = drive(Receiver(10.0, latency_s=0.25))
+    time_s, chainage_error, _ = drive(ReceiverModel(10.0, latency_s=0.25))
     np.testing.assert_allclose(chainage_error, -2.5, atol=1e-9)
     assert time_s[0] == pytest.approx(0.3)  # before, the drive had not begun
 
 
 def test_outages_take_fixes_out_and_change_no_other() -> None:
-    whole = Receiver(10.0, position_noise_m=0.4, position_spread_m=1.0, correlation_s=20.0)
+    whole = ReceiverModel(10.0, position_noise_m=0.4, position_spread_m=1.0, correlation_s=20.0)
     all_times, all_errors, _ = drive(whole)
     times, errors, _ = drive(whole._replace(outages_s=((100.0, 103.0), (200.0, 200.5))))
     out = ((all_times >= 100.0) & (all_times < 103.0)) | (

@@ -6,12 +6,12 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from pre_core.crossing.splines import (
     Spline,
+    antiderivative,
     basis,
     clamped_knots,
     curves_at,
-    integrals,
-    slopes,
-    through,
+    derivative,
+    interpolating_spline,
     value_at,
 )
 
@@ -46,14 +46,14 @@ def test_curves_through_samples_their_slopes_and_integrals(degree: int) -> None:
     rng = np.random.default_rng(5)
     x = np.cumsum(rng.uniform(0.5, 1.5, 40))
     y = rng.standard_normal((40, 4))
-    theirs, ours = make_interp_spline(x, y, k=degree), through(x, y, degree)
+    theirs, ours = make_interp_spline(x, y, k=degree), interpolating_spline(x, y, degree)
     at = np.concatenate([x, rng.uniform(x[0] - 0.2, x[-1] + 0.2, 100)])
     assert np.allclose(ours.knots, theirs.t, rtol=0.0, atol=1e-12)
     for _ in range(2):
-        ours, theirs = integrals(ours), theirs.antiderivative()
+        ours, theirs = antiderivative(ours), theirs.antiderivative()
         assert np.allclose(curves_at(ours, at), theirs(at), rtol=1e-11, atol=1e-11)
     for _ in range(1 + degree):
-        ours, theirs = slopes(ours), theirs.derivative()
+        ours, theirs = derivative(ours), theirs.derivative()
         expected = theirs(at)
         scale = np.abs(expected).max()
         assert np.allclose(curves_at(ours, at), expected, rtol=1e-11, atol=1e-11 * scale)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from pre_core.paper import experiment
-from pre_core.physics.simulate import Simulation, WheelRoad, constant_speed, simulate
+from pre_core.physics.simulate import CoupledResponse, WheelRoad, constant_speed, simulate
 from pre_core.physics.vehicle import (
     HalfCar,
     air_spring_excess_n,
@@ -57,7 +57,7 @@ def test_friction_depends_on_the_way_and_not_on_the_steps() -> None:
     assert dahl_friction_n(start, way, 3000.0, LENGTH_M) == pytest.approx(exact, rel=1e-12)
 
 
-def driven(car: HalfCar, step_s: float, seconds: float, amplitude: float = 0.01) -> Simulation:
+def driven(car: HalfCar, step_s: float, seconds: float, amplitude: float = 0.01) -> CoupledResponse:
     """Over waves of 8 m at 12 m/s (1.5 Hz), which grow from nothing, far from the bridge."""
     steps = round(seconds / step_s) + 1
     motion = constant_speed(-1000.0, 12.0, steps, step_s)

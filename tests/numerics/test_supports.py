@@ -10,13 +10,13 @@ from scipy.optimize import brentq
 
 from pre_core.physics.bridge import (
     Beam,
-    held_nodes,
     interpolation_matrix,
     natural_frequencies_hz,
     node_dofs,
     refine,
     static_deflection_m,
     stiffness_matrix,
+    supported_nodes,
     uniform_beam,
 )
 
@@ -49,7 +49,7 @@ def reactions_n(beam: Beam, x_m: FloatArray, load_n: FloatArray) -> FloatArray:
     stiffness[2 * n, 2 * n] -= 1.0
     force = interpolation_matrix(loose, x_m).T @ load_n
     found = np.linalg.solve(stiffness_matrix(beam), interpolation_matrix(beam, x_m).T @ load_n)
-    u = np.append(found, 0.0)[node_dofs(n, held_nodes(beam)).ravel()]  # the last: what is held
+    u = np.append(found, 0.0)[node_dofs(n, supported_nodes(beam)).ravel()]  # the last: what is held
     return np.array([(stiffness @ u - force)[2 * node] for node in nodes])
 
 

@@ -11,7 +11,7 @@ from pre_core.physics.road import Profile, under_axles, under_wheels
 from pre_core.physics.simulate import constant_speed
 from pre_core.physics.surface import (
     Footprint,
-    felt_by,
+    axle_profile,
     random_surface,
     spectra,
     surface_density,
@@ -65,8 +65,8 @@ def densities(
     for seed in seeds:
         surface = random_surface(-10.0, length_m - 10.0, spacing_m, "A", seed)
         for beside in PLACES_M:
-            one = felt_by(surface, front, beside).height_m
-            others = [felt_by(surface, rear, beside).height_m for rear in rears]
+            one = axle_profile(surface, front, beside).height_m
+            others = [axle_profile(surface, rear, beside).height_m for rear in rears]
             of_front = density(one, one)
             of_all.append(
                 [
@@ -112,8 +112,8 @@ def test_a_surface_is_as_rough_along_as_across() -> None:
     for seed in range(6):
         surface = random_surface(0.0, 200.0, 0.08, "A", seed)
         for beside in PLACES_M:
-            here = felt_by(surface, POINT, beside).height_m
-            there = felt_by(surface, POINT, beside + apart).height_m
+            here = axle_profile(surface, POINT, beside).height_m
+            there = axle_profile(surface, POINT, beside + apart).height_m
             along.append(np.mean((here[6:] - here[:-6]) ** 2))
             across.append(np.mean((here - there) ** 2))
             density.append(csd(here, here, fs=1.0 / 0.08, nperseg=1250)[1].real)
@@ -136,8 +136,8 @@ def test_a_surface_is_drawn_by_its_seed() -> None:
 def test_an_axle_beside_the_other_feels_what_that_one_feels_there() -> None:
     surface = random_surface(0.0, 50.0, 0.05, "A", 4)
     np.testing.assert_allclose(
-        felt_by(surface, TWIN._replace(offset_m=0.3), -0.1).height_m,
-        felt_by(surface, TWIN._replace(offset_m=0.0), 0.2).height_m,
+        axle_profile(surface, TWIN._replace(offset_m=0.3), -0.1).height_m,
+        axle_profile(surface, TWIN._replace(offset_m=0.0), 0.2).height_m,
         atol=1e-15,
     )
 

@@ -14,8 +14,8 @@ from pre_core.physics.bridge import (
     static_deflection_m,
     uniform_beam,
 )
+from pre_core.physics.free_vibration import free_motion, free_vibration_after
 from pre_core.physics.newmark import newmark_modal
-from pre_core.physics.passing import free_motion, state_after
 from pre_core.physics.simulate import WheelRoad, constant_speed, deflection_m, simulate
 
 FloatArray = NDArray[np.float64]
@@ -46,7 +46,7 @@ def test_moving_force_that_left_an_undamped_beam() -> None:
     rate = amplitude * drive * (np.cos(drive * t) - np.cos(omega * t))
     exact = at_exit * np.cos(omega * after) + rate / omega * np.sin(omega * after)
     middle = interpolation_matrix(beam, np.array([0.5 * span])) @ basis.shapes
-    state = state_after(beam, basis, weight, speed, after)
+    state = free_vibration_after(beam, basis, weight, speed, after)
     assert float((middle @ state[0])[0]) == pytest.approx(exact, rel=2e-4)
 
 
@@ -61,7 +61,7 @@ def test_moving_force_that_left_against_steps(speed: float) -> None:
     x = speed * t if speed > 0.0 else 40.0 + speed * t
     force = -3e5 * interpolation_matrix(beam, x) @ basis.shapes
     q = newmark_modal(basis.eigenvalues_per_s2, basis.damping_per_s, force, step_s)
-    state = state_after(beam, basis, 3e5, speed, float(t[-1]) - crossing_s)
+    state = free_vibration_after(beam, basis, 3e5, speed, float(t[-1]) - crossing_s)
     np.testing.assert_allclose(state[0], q[-1], atol=2e-4 * np.abs(q).max())
 
 
@@ -69,7 +69,7 @@ def test_a_force_that_crawls_leaves_nothing() -> None:
     """At 0.05 m/s the deflection under way is the static one, and the beam rests afterwards."""
     beam = uniform_beam(20.0, [4.2e9] * 6, 2000.0, 0.5, 1e-4)
     basis = modes(beam)
-    state = state_after(beam, basis, 1e5, 0.05, 0.0)
+    state = free_vibration_after(beam, basis, 1e5, 0.05, 0.0)
     largest = -static_deflection_m(beam, np.array([10.0]), np.array([-1e5]), np.array([10.0]))[0]
     left = np.abs(interpolation_matrix(beam, np.linspace(0.0, 20.0, 41)) @ basis.shapes @ state[0])
     assert left.max() < 0.01 * largest
@@ -98,7 +98,7 @@ def test_simulation_takes_the_swing_on() -> None:
     alone, and rests before; of second order in the step."""
     beam = refine(unequal_beam(), 2)
     basis = modes(beam, 5)
-    state = state_after(beam, basis, 3e5, 20.0, 0.1)
+    state = free_vibration_after(beam, basis, 3e5, 20.0, 0.1)
     light = experiment.TRUCK._replace(
         body_mass_kg=1e-3,
         unsprung_mass_kg=(1e-3, 1e-3),
@@ -133,7 +133,7 @@ def test_the_truck_feels_the_swing() -> None:
     steps, step_s = 3000, 0.0005
     motion = constant_speed(-1.0, 10.0, steps, step_s)
     flat = WheelRoad(np.zeros((steps, 2)), np.zeros((steps, 2)))
-    state = state_after(beam, basis, 3e5, 17.0, 0.1)
+    state = free_vibration_after(beam, basis, 3e5, 17.0, 0.1)
     middle = np.array([15.0])
 
     def drive(swing: FloatArray | None) -> FloatArray:

@@ -11,9 +11,10 @@ import itertools
 import numpy as np
 import pytest
 
-from pre_core.crossing.residuals import Crossing, roads_and_deflections, workspace
-from pre_core.crossing.whitening import row_filter
+from pre_core.crossing.residuals import GriddedCrossing, allocate_buffers, roads_and_deflections
+from pre_core.crossing.rows import row_filter
 from pre_core.paper import experiment
+from pre_core.parameters import TORSION
 from pre_core.physics.beam_basis import beam_basis
 from pre_core.physics.bridge import Beam, FloatArray, refine, uniform_beam
 from pre_core.physics.models import from_models
@@ -21,7 +22,6 @@ from pre_core.physics.road import Profile, under_wheels
 from pre_core.physics.simulate import constant_speed, simulate
 from pre_core.physics.torsion import NO_TORSION, TorsionBasis, torsion_basis
 from pre_core.physics.vehicle import static_axle_loads_n, total_mass_kg
-from pre_core.unknowns import TORSION
 from tests.numerics.crossings import (
     STEP_S,
     bare_crossing,
@@ -65,7 +65,7 @@ def standing(beam: Beam, speed_m_per_s: float = 0.02) -> tuple[FloatArray, Float
     step_s = 0.01 / speed_m_per_s
     front = np.arange(-3.0, beam.element_lengths_m.sum() + 8.0, 0.01)
     basis = beam_basis(beam.element_lengths_m, 2, interior_supports=beam.interior_supports)
-    data: Crossing = bare_crossing(
+    data: GriddedCrossing = bare_crossing(
         step_s,
         np.zeros((4, 6, front.size)),
         basis,
@@ -74,7 +74,7 @@ def standing(beam: Beam, speed_m_per_s: float = 0.02) -> tuple[FloatArray, Float
         is_inertial=True,
     )._replace(torsion=torsion_of(beam))
     at = uncorrected(from_models(TRUCK, beam), TRUCK.wheelbase_m, front)
-    work = workspace(data, at.theta.shape[1], row_filter(step_s))
+    work = allocate_buffers(data, at.theta.shape[1], row_filter(step_s))
     _, deflection = roads_and_deflections(data, work, at, 0)
     return front, deflection
 

@@ -16,15 +16,15 @@ from pre_core.physics.surface import Footprint, spectra, surface_density
 from pre_core.physics.vehicle import HalfCar, dahl_friction_n
 from services.simulation.two_sided import (
     LONGEST_STEP_S,
-    Axle,
     Body,
-    Bogie,
     Deck,
     Kingpin,
-    Response,
-    Road,
     Torsion,
-    Truck,
+    WideAxle,
+    WideBogie,
+    WideResponse,
+    WideRoad,
+    WideTruck,
     axle_row,
     bending_frequencies_hz,
     body_row,
@@ -43,18 +43,20 @@ from services.simulation.two_sided_surface import (
 Floats = NDArray[np.float64]
 
 GRAVITY = 9.80665
-LORRY = Truck(
+LORRY = WideTruck(
     (Body(14_500.0, 2.4, 60e3, 10e3),),
     (
-        Axle(0.0, 650.0, 3.2e5, 2.2e4, 1.9e6),
-        Axle(4.0, 1150.0, 9.0e5, 4.0e4, 3.8e6),
+        WideAxle(0.0, 650.0, 3.2e5, 2.2e4, 1.9e6),
+        WideAxle(4.0, 1150.0, 9.0e5, 4.0e4, 3.8e6),
     ),
 )
 DECK = Deck(14.0, (3e9, 3e9, 1.2e9, 3e9, 3e9, 3e9, 3e9), 4000.0, 0.7, 0.002)
 
 
-def level(truck: Truck, start_m: float = -40.0, stop_m: float = 60.0) -> Road:
-    return Road(start_m, 0.5, np.zeros((tyres_of(truck).axle.size, round(2 * (stop_m - start_m)))))
+def level(truck: WideTruck, start_m: float = -40.0, stop_m: float = 60.0) -> WideRoad:
+    return WideRoad(
+        start_m, 0.5, np.zeros((tyres_of(truck).axle.size, round(2 * (stop_m - start_m))))
+    )
 
 
 def wavy_heights(x: Floats) -> Floats:
@@ -69,9 +71,9 @@ def wavy_heights(x: Floats) -> Floats:
     )
 
 
-def wavy(truck: Truck) -> Road:
+def wavy(truck: WideTruck) -> WideRoad:
     x = np.arange(-20.0, 40.0, 0.005)
-    return Road(-20.0, 0.005, np.tile(wavy_heights(x), (tyres_of(truck).axle.size, 1)))
+    return WideRoad(-20.0, 0.005, np.tile(wavy_heights(x), (tyres_of(truck).axle.size, 1)))
 
 
 def unit_load_deflection(deck: Deck, at_m: float, load_m: float) -> float:
@@ -88,7 +90,7 @@ def unit_load_deflection(deck: Deck, at_m: float, load_m: float) -> float:
     return float(np.sum(moment(at_m) * moment(load_m) / rigidity) * span / count)
 
 
-def crawled(deck: Deck, lane_offset_m: float = 0.0) -> tuple[Response, int]:
+def crawled(deck: Deck, lane_offset_m: float = 0.0) -> tuple[WideResponse, int]:
     """A truck that is slow enough for statics, and the step at which its front is at 8 m."""
     slow = even_motion(-0.5, 0.25, 40.0, 1e-3)
     run = cross(LORRY, deck, level(LORRY), slow, lane_offset_m=lane_offset_m)
@@ -135,7 +137,7 @@ def test_frequencies_of_a_uniform_beam() -> None:
     np.testing.assert_allclose(bending_frequencies_hz(deck, 8), exact, rtol=2e-5)
 
 
-def accelerations(truck: Truck, deck: Deck, step_s: float) -> Floats:
+def accelerations(truck: WideTruck, deck: Deck, step_s: float) -> Floats:
     """Accelerations every 4 ms; axles, bridge ends and cells are met at whole steps."""
     motion = even_motion(-8.0, 10.0, 2.4, step_s)
     run = cross(truck, deck, wavy(truck), motion, lane_offset_m=1.2)
@@ -164,7 +166,7 @@ def test_longest_steps_are_exact_where_kinks_cost_the_order() -> None:
     np.testing.assert_allclose(used, exact, atol=4e-5)
 
 
-def half_car(truck: Truck, kappa: float) -> HalfCar:
+def half_car(truck: WideTruck, kappa: float) -> HalfCar:
     front, rear = truck.axles
     body = truck.bodies[0]
 
@@ -206,7 +208,7 @@ def test_in_the_middle_it_is_the_half_car(forward: bool, change: float) -> None:
     x = np.arange(-20.0, 40.0, 0.005)
     way = 1.0 if forward else -1.0
     seen_x = x if forward else 14.0 - x
-    road = Road(-20.0, 0.005, np.tile(wavy_heights(seen_x), (4, 1)))
+    road = WideRoad(-20.0, 0.005, np.tile(wavy_heights(seen_x), (4, 1)))
     ours = cross(truck, DECK, road, motion)
 
     places = motion.position_m[:, None] - way * np.array([0.0, 4.0])
@@ -257,14 +259,14 @@ def test_there_and_back_are_mirror_images() -> None:
     assert np.abs(there.twist_rad).max() > 1e-5
 
 
-TANDEM = Truck(
+TANDEM = WideTruck(
     (Body(22_000.0, 3.55, 148e3, 16e3),),
     (
-        Axle(0.0, 700.0, 3.4e5, 2.4e4, 2.0e6, friction_n=5000.0),
-        Axle(4.6, 1050.0, 8.5e5, 3.0e4, 3.7e6, twin_distance_m=0.33, friction_n=5000.0),
-        Axle(5.95, 1000.0, 8.0e5, 2.0e4, 3.5e6, twin_distance_m=0.33, friction_n=4000.0),
+        WideAxle(0.0, 700.0, 3.4e5, 2.4e4, 2.0e6, friction_n=5000.0),
+        WideAxle(4.6, 1050.0, 8.5e5, 3.0e4, 3.7e6, twin_distance_m=0.33, friction_n=5000.0),
+        WideAxle(5.95, 1000.0, 8.0e5, 2.0e4, 3.5e6, twin_distance_m=0.33, friction_n=4000.0),
     ),
-    (Bogie((1, 2), (0.55, 0.45)),),
+    (WideBogie((1, 2), (0.55, 0.45)),),
 )
 
 
@@ -276,7 +278,9 @@ def test_equalised_bogie_shares_its_spring_force() -> None:
     assert carried[1] / carried[1:].sum() == pytest.approx(0.55)
     assert carried @ [0.0, 4.6, 5.95] == pytest.approx(22_000.0 * GRAVITY * 3.55)
     road = wavy(TANDEM)
-    rough = Road(road.start_m, road.spacing_m, road.height_m * np.linspace(0.8, 1.2, 10)[:, None])
+    rough = WideRoad(
+        road.start_m, road.spacing_m, road.height_m * np.linspace(0.8, 1.2, 10)[:, None]
+    )
     run = cross(TANDEM, DECK, rough, even_motion(-9.0, 10.0, 2.0, 5e-4))
     tyres = tyres_of(TANDEM)
     springs = []
@@ -318,14 +322,14 @@ def test_friction_of_the_springs_follows_dahls_law() -> None:
 
 
 def test_semitrailer_stands_on_its_kingpin() -> None:
-    truck = Truck(
+    truck = WideTruck(
         (Body(6200.0, 1.25, 18e3, 4e3), Body(28_500.0, 7.6, 340e3, 20e3)),
         (
-            Axle(0.0, 700.0, 3.4e5, 2.4e4, 2.0e6),
-            Axle(3.7, 1150.0, 7e5, 4e4, 3.8e6),
-            *(Axle(9.2 + 1.3 * k, 850.0, 6e5, 2.5e4, 2.4e6, body=1) for k in range(3)),
+            WideAxle(0.0, 700.0, 3.4e5, 2.4e4, 2.0e6),
+            WideAxle(3.7, 1150.0, 7e5, 4e4, 3.8e6),
+            *(WideAxle(9.2 + 1.3 * k, 850.0, 6e5, 2.5e4, 2.4e6, body=1) for k in range(3)),
         ),
-        (Bogie((2, 3, 4), (1 / 3, 1 / 3, 1 / 3)),),
+        (WideBogie((2, 3, 4), (1 / 3, 1 / 3, 1 / 3)),),
         Kingpin(3.1),
     )
     loads = static_axle_loads_n(truck)
@@ -354,7 +358,7 @@ def test_load_beside_the_middle_leans_on_that_side() -> None:
 def test_one_side_higher_leans_the_body_by_its_springs_in_series() -> None:
     """Tyres and springs of each axle in series, less what the leaning body's weight takes away."""
     tyres = tyres_of(LORRY)
-    bank = Road(-60.0, 0.5, np.tile(0.01 * np.sign(tyres.lateral_m)[:, None], (1, 200)))
+    bank = WideRoad(-60.0, 0.5, np.tile(0.01 * np.sign(tyres.lateral_m)[:, None], (1, 200)))
     run = cross(LORRY, DECK, bank, even_motion(-50.0, 2.0, 12.0, 1e-3), settle_s=2.0)
     body, total = LORRY.bodies[0], 0.0
     for axle in LORRY.axles:

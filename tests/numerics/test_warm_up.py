@@ -66,7 +66,7 @@ warm_up.warm_up()
 """
 
 
-def test_who_compiles_gets_the_digits_of_who_loads(project: Path, tmp_path: Path) -> None:
+def test_compiled_and_loaded_kernels_give_the_same_digits(project: Path, tmp_path: Path) -> None:
     """The rows of method `pre`, bit for bit, with an empty cache and with what that has left."""
     first, second = (
         subprocess.run(

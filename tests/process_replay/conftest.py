@@ -15,7 +15,7 @@ import pytest
 from schemas.signals import (
     CHANNELS,
     AccelBatch,
-    Channel,
+    AccelChannel,
     GnssFix,
     VehicleInfo,
     encode_accel,
@@ -24,8 +24,7 @@ from schemas.signals import (
     encode_location,
 )
 from schemas.site_file import site_toml
-from schemas.topics import Key
-from services.recordings.recording import Message
+from schemas.topics import Key, Message
 from services.recordings.writer import write_recording
 from services.simulation.drive import paper_site
 from tests.process_replay.starting import End, Process, Start
@@ -118,7 +117,7 @@ def drive(batches: int = 200, vehicle: str = "truck-1", boot_id: int = 77) -> It
     for number in range(batches):
         device_ns = 5 + number * 50_000_000
         time_ns = start_ns + number * 50_000_000
-        channels = {name: Channel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
+        channels = {name: AccelChannel(1000.0, rng.standard_normal(50)) for name in CHANNELS}
         batch = AccelBatch(boot_id, number, device_ns, time_ns, channels)
         yield message("accel", encode_accel(batch), number, time_ns)
         if number % 2 == 0:

@@ -29,7 +29,7 @@ from services.bus.session import open_session
 from services.cli import main as cli
 from services.common.files import make_folder, write_atomically
 from services.history.alarm_files import alarms_folder
-from services.history.archive import add_results
+from services.history.history_store import add_results
 from services.viewer.view import viewer_program
 from tests.endpoints import free_port
 from tests.fleet import losses_of
@@ -208,7 +208,7 @@ def drawn(screen: int, pattern: str) -> str:
     return text
 
 
-def test_from_the_history_to_those_who_watch(
+def test_history_reaches_the_watchers(
     start: Start, endpoint: str, tmp_path: Path, project: Path
 ) -> None:
     """Processes and a router as they are: it is raised, seen, acknowledged, and seen no more."""
@@ -277,7 +277,7 @@ def test_a_history_that_is_away_for_a_while_ends_nothing(
     with Told(*serve, "--every", "0.01") as serving:
         until((history / "alarms/checked.json").exists, "the first look")
         history.rename(tmp_path / "away")
-        serving.says(r"history: no such folder.*; it is looked at again in 1 s$")
+        serving.says(r"history: no such folder.*; checking again in 1 s$")
         (tmp_path / "away/alarms/checked.json").unlink()
         (tmp_path / "away").rename(history)
         until((history / "alarms/checked.json").exists, "the next look")

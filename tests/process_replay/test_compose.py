@@ -184,7 +184,7 @@ def test_everything_comes_up_in_its_order_and_identifies_the_crossing(host: Host
         with host.zenoh_router():
             nobody = host.check("worker")
             assert nobody.returncode == 1
-            assert nobody.stderr.startswith("driveby: worker in realm sim-compose says nothing")
+            assert nobody.stderr.startswith("driveby: worker in realm sim-compose sends nothing")
             worker = host.start("worker")
             started.append(worker)
             host.wait_until_healthy("worker", worker)

@@ -21,9 +21,10 @@ from services.cli import main as cli
 from services.drives.runs import run_to_messages
 from services.recordings.recording import read_info, read_messages
 from services.simulation.drive import paper_site, simulate_drive
+from tests.builders.commands import run
 from tests.waiting import LONGEST_S, until
 
-# A group of their own: they share one demo, and depend on no time-out that is short.
+# They share one demo.
 pytestmark = [pytest.mark.process, pytest.mark.xdist_group("demo")]
 
 RATIOS = [1.0, 1.0, 1.0, 0.4, 1.0, 1.0, 1.0]
@@ -177,18 +178,13 @@ def test_its_recording_is_identified_again_to_the_same(
     assert before.site_hash == after.site_hash
 
 
-def test_a_folder_that_exists_is_left_alone(tmp_path: Path, project: Path) -> None:
+def test_a_folder_that_exists_is_left_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "kept").write_text("kept")
-    done = subprocess.run(
-        command(tmp_path),
-        cwd=project,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=LONGEST_S,
-    )
-    assert done.returncode == 2
-    assert done.stderr == f"driveby: {tmp_path}: exists, the demo wants a new folder\n"
+    done = run(capsys, "demo", "--out", tmp_path)
+    assert done.code == 2
+    assert done.err == f"driveby: {tmp_path}: exists, the demo wants a new folder\n"
     assert [path.name for path in tmp_path.iterdir()] == ["kept"]
 
 
@@ -205,6 +201,9 @@ def running(tmp_path: Path, project: Path) -> Iterator[subprocess.Popen[str]]:
             assert process.poll() is None, process.communicate()
             return any(" services worker " in line for line in processes_of(folder).values())
 
+        # Looking through all processes takes a processor: only when it is about to start.
+        log = folder / "worker.log"
+        until(lambda: log.exists() or process.poll() is not None, "the log of the worker")
         until(has_a_worker, "the demo's worker")
         yield process
     finally:
@@ -226,16 +225,14 @@ def test_a_worker_that_is_killed(running: subprocess.Popen[str], tmp_path: Path)
     assert (folder / "worker.log").is_file()
 
 
-def test_a_demo_that_is_told_to_end(running: subprocess.Popen[str], tmp_path: Path) -> None:
+def test_demo_ends_on_request(running: subprocess.Popen[str], tmp_path: Path) -> None:
     running.terminate()
     _, err = running.communicate(timeout=LONGEST_S)
     assert (running.returncode, err) == (130, "driveby: interrupted\n")
     assert processes_of(tmp_path / "demo") == {}
 
 
-def test_a_demo_that_is_watched_stays_until_it_is_told_to_end(
-    tmp_path: Path, project: Path
-) -> None:
+def test_demo_with_open_viewer_stays_until_it_is_ended(tmp_path: Path, project: Path) -> None:
     folder, log = tmp_path / "demo", tmp_path / "demo.log"
     # BROWSER: none of the machine's is to open.
     own = {**os.environ, "HOME": str(tmp_path), "BROWSER": "true", "PYTHONUNBUFFERED": "1"}

@@ -19,7 +19,7 @@ from schemas.signals import GnssFix, encode_gnss, encode_identity
 from schemas.topics import selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.bus.subscription import Received, Subscription, get_latest
+from services.bus.subscription import RawSample, Subscription, get_latest
 from services.recordings.recording import read_info, read_messages
 from tests.process_replay.starting import End, Start, start_logger
 from tests.waiting import LONGEST_S, until
@@ -96,7 +96,7 @@ def test_a_realm_keeps_out_the_others(
         if name == "x":
             _, log = process.communicate(timeout=LONGEST_S)
             assert process.returncode == 1
-            assert "nobody subscribes to realm replay-x" in log.splitlines()[-1]
+            assert "no subscriber to realm replay-x" in log.splitlines()[-1]
         else:
             finish(process)
     terminate(logger)
@@ -173,7 +173,7 @@ def test_an_existing_file_is_left_alone(
     assert file.read_bytes() == b"precious"
 
 
-def test_a_full_disk_is_told_and_ends_the_logger(
+def test_full_disk_is_reported_and_ends_the_logger(
     start: Start, endpoint: str, recording: Path, tmp_path: Path
 ) -> None:
     """A limit on the size of files stands for the full disk: writing fails in the same way."""
@@ -195,7 +195,7 @@ def test_a_full_disk_is_told_and_ends_the_logger(
         assert logger.returncode == 1
         assert log.splitlines()[-1] == "recording stopped: File too large"
         assert "Traceback" not in log
-        said: list[Received] = []
+        said: list[RawSample] = []
 
         def is_told() -> bool:
             if (received := services.receive(0.1)) is not None:
@@ -224,7 +224,7 @@ def test_a_full_disk_is_told_and_ends_the_logger(
     assert (tmp_path / "live.mcap").stat().st_size <= 100_000
 
 
-def test_durable_is_there_for_those_who_come_late(
+def test_late_subscriber_receives_durable(
     start: Start, finish: End, terminate: End, endpoint: str, recording: Path, tmp_path: Path
 ) -> None:
     logger = start_logger(start, endpoint, tmp_path / "live.mcap")

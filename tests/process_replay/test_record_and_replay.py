@@ -13,10 +13,10 @@ import zenoh
 
 from schemas.proto import driveby_pb2 as pb
 from schemas.signals import decode_accel, decode_gnss
-from schemas.topics import selector
+from schemas.topics import Message, selector
 from services.bus.session import open_session
-from services.bus.subscription import Received, Subscription, get_latest
-from services.recordings.recording import Message, read_info, read_messages
+from services.bus.subscription import RawSample, Subscription, get_latest
+from services.recordings.recording import read_info, read_messages
 from tests.process_replay.starting import End, Start, start_logger
 from tests.waiting import LONGEST_S, until
 
@@ -31,10 +31,10 @@ def by_stream(messages: list[Message]) -> dict[str, list[Message]]:
 
 
 @contextmanager
-def heard_at(endpoint: str) -> Iterator[Iterator[Received]]:
+def heard_at(endpoint: str) -> Iterator[Iterator[RawSample]]:
     """What trucks say of their acceleration, as it comes."""
 
-    def one_after_the_other() -> Iterator[Received]:
+    def one_after_the_other() -> Iterator[RawSample]:
         for _ in range(round(LONGEST_S / 0.1)):
             if (one := heard.receive(0.1)) is not None:
                 yield one

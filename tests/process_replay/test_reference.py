@@ -7,12 +7,9 @@ with other kernels of OpenBLAS, and without the fused multiply-add and the wide 
 would use. Measured on an AMD EPYC with AVX-512, values are up to 1e-11 apart and standard
 deviations, which are slopes and nearly cancelling sums of slopes, up to 3.1e-10.
 
-Markov chains take another path where a processor rounds otherwise, so what comes from them is
-compared in standard deviations, to a tenth of one. Chance alone is no smaller: the effective number
-of the sample's draws is 285, so the reference itself is uncertain by 1/√285 = 0.06 standard
-deviations in a mean and by √(0.025·0.975/285)/0.058 = 0.16 in the end of an interval. Processors
-part by less, for the chains draw the same random numbers: with the kernels below, everything is
-within 0.045 standard deviations of the reference, which is from yet another processor.
+Draws take another path where a processor rounds otherwise, because a slice of the Gibbs sampler is
+accepted or not: from there on they are another sample of the same distribution. So what comes from
+them is compared in standard deviations, with what two independent samples may be apart.
 """
 
 import importlib.util
@@ -29,8 +26,8 @@ import numpy as np
 import pytest
 
 from pre_core.physics.bridge import natural_frequencies_hz, uniform_beam
-from pre_core.search.levenberg_marquardt import slopes
-from schemas.results import Crossing
+from pre_core.search.levenberg_marquardt import sixth_order_jacobian
+from schemas.results import CrossingResult
 
 SOUND_NM2 = 1.56e10
 SCENARIO_6 = [1.0, 1.0, 1.0, 0.4, 1.0, 1.0, 1.0]
@@ -67,14 +64,14 @@ def reference(maker: ModuleType) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def sample(maker: ModuleType) -> Crossing:
-    found: Crossing = maker.identified(maker.SOURCES["sample"])
+def sample(maker: ModuleType) -> CrossingResult:
+    found: CrossingResult = maker.identified(maker.SOURCES["sample"])
     return found
 
 
 @pytest.fixture(scope="module")
-def noise_free(maker: ModuleType) -> Crossing:
-    found: Crossing = maker.identified(maker.SOURCES["noise_free"])
+def noise_free(maker: ModuleType) -> CrossingResult:
+    found: CrossingResult = maker.identified(maker.SOURCES["noise_free"])
     return found
 
 
@@ -111,7 +108,7 @@ def moved(
 
 
 def test_least_squares_gives_the_reference(
-    maker: ModuleType, reference: dict[str, Any], noise_free: Crossing
+    maker: ModuleType, reference: dict[str, Any], noise_free: CrossingResult
 ) -> None:
     assert moved(maker.digest(noise_free), reference["noise_free"], {}) == {}
 
@@ -137,7 +134,7 @@ def as_another_processor(which: str, maker: ModuleType, name: str) -> dict[str, 
 @pytest.mark.process
 @pytest.mark.parametrize("which", AS_ANOTHER_PROCESSOR)
 def test_least_squares_gives_the_reference_on_other_processors(
-    which: str, maker: ModuleType, reference: dict[str, Any], noise_free: Crossing
+    which: str, maker: ModuleType, reference: dict[str, Any], noise_free: CrossingResult
 ) -> None:
     found = as_another_processor(which, maker, "noise_free")
     assert moved(found, reference["noise_free"], {}) == {}
@@ -149,15 +146,15 @@ def test_least_squares_gives_the_reference_on_other_processors(
 def sample_tolerance(expected: dict[str, Any]) -> dict[str, float]:
     """How far the sample may be from its reference, as rounding decides which draws are kept.
 
-    A thousand draws of a normal tell its quantile 2.5 % to 0.085 standard deviations, two sets
-    differ by 0.12: three times that is allowed. Of what is mostly nothing at all a few draws make
-    the spread and the quantiles: 1. Means are told three times better and held to 0.1.
+    The least draws, 400, are those of the deflection: two such means differ by 0.07 standard
+    deviations, two quantiles 2.5 % by 0.19. Three times that is allowed. Of parameters that are
+    mostly zero a few draws decide, and whether a quantile is one of them: 3.
     """
     tolerance = {}
     for name, values in expected["estimates"].items():
         seldom = name.startswith(SELDOM)
         for what in values:
-            most = 0.1 if what == "mean" else 1.0 if seldom else 0.35
+            most = 3.0 if seldom else 0.2 if what == "mean" else 0.6
             tolerance[f".estimates.{name}.{what}"] = most * values["std"]
     # The road is drawn at the mean of the chains: micrometres follow from a tenth of all spreads.
     tolerance |= {".road_front_m": 5e-6, ".road_rear_m": 5e-6, ".iri_m_per_km": 1e-2}
@@ -165,7 +162,7 @@ def sample_tolerance(expected: dict[str, Any]) -> dict[str, float]:
 
 
 def test_the_sample_gives_the_reference(
-    maker: ModuleType, reference: dict[str, Any], sample: Crossing
+    maker: ModuleType, reference: dict[str, Any], sample: CrossingResult
 ) -> None:
     expected = reference["sample"]
     assert moved(maker.digest(sample), expected, sample_tolerance(expected)) == {}
@@ -181,7 +178,7 @@ def test_the_sample_gives_the_reference_on_other_processors(
     assert moved(found, expected, sample_tolerance(expected)) == {}
 
 
-def test_the_sample_is_small_good_and_true(maker: ModuleType, sample: Crossing) -> None:
+def test_the_sample_is_small_good_and_true(maker: ModuleType, sample: CrossingResult) -> None:
     """Of seven intervals that hold the truth 95 times of a hundred, one misses in 26 % of drives.
 
     Here that of EI_1 begins 1.8 % above it.
@@ -197,14 +194,16 @@ def test_the_sample_is_small_good_and_true(maker: ModuleType, sample: Crossing) 
     assert held.count(True) >= 6, held
 
 
-def test_without_noise_every_rigidity_is_found_within_one_per_cent(noise_free: Crossing) -> None:
+def test_without_noise_every_rigidity_is_found_within_one_per_cent(
+    noise_free: CrossingResult,
+) -> None:
     assert noise_free.parameters is not None
     ratios = [noise_free.parameters[f"EI_{n}"].mean / SOUND_NM2 for n in range(1, 8)]
     assert ratios == pytest.approx(SCENARIO_6, rel=0.01)
 
 
 def test_the_spread_of_the_first_frequency_follows_from_the_covariance(
-    noise_free: Crossing,
+    noise_free: CrossingResult,
 ) -> None:
     """By differences of the eigenvalue itself, which are right to a millionth of this spread."""
     assert noise_free.parameters is not None
@@ -222,7 +221,7 @@ def test_the_spread_of_the_first_frequency_follows_from_the_covariance(
         ]
         return np.array([natural_frequencies_hz(beam, 1) for beam in beams])
 
-    slope = slopes(frequency, np.zeros(len(names)))[0] / values
+    slope = sixth_order_jacobian(frequency, np.zeros(len(names)))[0] / values
     expected = float(np.sqrt(slope @ np.array(noise_free.covariance.matrix) @ slope))
     f_1 = noise_free.derived.f1_hz
     assert f_1.mean == pytest.approx(frequency(np.zeros((1, len(names))))[0, 0], rel=1e-9)

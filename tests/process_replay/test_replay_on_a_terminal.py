@@ -10,6 +10,7 @@ import pytest
 
 from schemas.topics import Key
 from services.recordings.recording import read_messages
+from tests.builders.commands import run
 from tests.process_replay.starting import End, Start, start_logger
 from tests.waiting import LONGEST_S
 
@@ -203,8 +204,8 @@ def test_a_damaged_file_in_a_folder_gives_what_is_intact(
     )
     terminate(logger)
     assert f"{intact} messages published" in done.stdout
-    assert "cut.mcap: damaged, only its whole chunks are replayed" in done.stderr
-    assert "empty.mcap: is empty; an MCAP recording is expected; it is passed over" in done.stderr
+    assert "cut.mcap: damaged, only its intact chunks are replayed" in done.stderr
+    assert "empty.mcap: is empty; an MCAP recording is expected; skipped" in done.stderr
     assert len(list(read_messages(tmp_path / "again.mcap"))) == intact
 
 
@@ -213,37 +214,32 @@ def test_a_damaged_file_in_a_folder_gives_what_is_intact(
     [
         (["--start", "11"], "--start: is 11, but the drive lasts 9.9 s"),
         (["--vehicle", "truck-2"], '"truck-2" is not in the recording'),
-        (["--paused"], "--paused: nobody could go on"),
+        (["--paused"], "--paused: cannot be resumed"),
         (["--start", "1", "--end", "1"], "it must be later than the start"),
     ],
 )
-def test_what_cannot_be_done_is_said_before_anybody_is_asked(
-    recording: Path, options: list[str], words: str
+def test_impossible_request_is_refused_before_any_query(
+    capsys: pytest.CaptureFixture[str], recording: Path, options: list[str], words: str
 ) -> None:
-    done = subprocess.run(
-        replay(recording, "tcp/127.0.0.1:1", *options),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert done.stderr.count("\n") == 1
+    nowhere = ("--endpoint", "tcp/127.0.0.1:1", "--name", "x")
+    done = run(capsys, "replay", recording, *nowhere, *options)
+    assert done.code == 2
+    assert words in done.err
+    assert done.err.count("\n") == 1
 
 
 def test_nothing_is_published_again_in_the_realm_that_was_recorded(
-    start: Start, terminate: End, endpoint: str, recording: Path, tmp_path: Path
+    capsys: pytest.CaptureFixture[str],
+    start: Start,
+    terminate: End,
+    endpoint: str,
+    recording: Path,
+    tmp_path: Path,
 ) -> None:
     logger = start_logger(start, endpoint, tmp_path / "again.mcap")
-    fast = ("--speed", "0")
-    subprocess.run(replay(recording, endpoint, *fast), capture_output=True, check=True)
+    fast = ("--endpoint", endpoint, "--name", "x", "--speed", "0")
+    assert run(capsys, "replay", recording, *fast).code == 0
     terminate(logger)
-    done = subprocess.run(
-        replay(tmp_path / "again.mcap", endpoint, *fast),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert "realm replay-x is the one that was recorded" in done.stderr
+    done = run(capsys, "replay", tmp_path / "again.mcap", *fast)
+    assert done.code == 2
+    assert "realm replay-x is the one that was recorded" in done.err

@@ -22,7 +22,7 @@ from schemas.topics import selector
 from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.cli.main import main
-from services.drives.ros2_complaints import DROPPED, TOO_LARGE
+from services.drives.ros2_anomalies import DROPPED, TOO_LARGE
 from services.drives.ros2_messages import FIX, IMU
 from services.drives.ros2_truck import Ros2Truck
 from services.drives.signals import Signals, signals_of_recording
@@ -375,7 +375,7 @@ def test_flood_fills_no_memory_and_costs_other_topics_nothing(
     where = f"0{front}/{IMU.dds_name}/{IMU.hash}"
     with (
         open_session(connect=ros.endpoint, timeout_s=LONGEST_S) as session,
-        gateway_of_ros2._Hearing(session, truck) as hearing,
+        gateway_of_ros2._RosSubscriptions(session, truck) as hearing,
     ):
         node = ros2.RosNode(ros.session)
         node.publish(ros2.Ros(front, IMU, ros2.imu(FIRST_NS, 0.0), FIRST_NS))
@@ -392,11 +392,11 @@ def test_flood_fills_no_memory_and_costs_other_topics_nothing(
             kept += 1
             assert len(heard.payload) == 4_000
         hearing.count_drops()
-    dropped = truck.complaints.count(front, DROPPED)
-    assert truck.complaints.count(front, TOO_LARGE) == 30
+    dropped = truck.anomalies.count(front, DROPPED)
+    assert truck.anomalies.count(front, TOO_LARGE) == 30
     assert kept * 4_000 < 1 << 20
     assert kept + dropped == 1_001
-    (refusals,) = truck.complaints.refusals()
+    (refusals,) = truck.anomalies.refusals()
     assert (refusals.refused, refusals.dropped) == (30, dropped)
 
 

@@ -13,7 +13,7 @@ import pytest
 import zenoh
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.signals import Channel
+from schemas.signals import AccelChannel
 from schemas.spool import spool_selector
 from schemas.topics import Key, selector
 from services.bus.session import open_session
@@ -22,6 +22,7 @@ from services.common.errors import InputError
 from services.recordings.recording import read_messages, read_site
 from services.truck import Gateway
 from services.truck.spool import Spool
+from tests.builders.commands import run
 from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process
@@ -172,18 +173,16 @@ def test_a_crossing_is_identified_under_access_control(
     ],
 )
 def test_what_would_be_dropped_without_a_word_is_refused_with_one_line(
-    driveby: Driveby, credentials: Path, recording: Path, arguments: list[str], line: str
+    capsys: pytest.CaptureFixture[str],
+    credentials: Path,
+    recording: Path,
+    arguments: list[str],
+    line: str,
 ) -> None:
     values = {"recording": recording, "certs": credentials}
-    command = [argument.format(**values) for argument in arguments]
-    ended = subprocess.run(
-        [sys.executable, "-m", "services", *command],
-        capture_output=True,
-        text=True,
-        timeout=LONGEST_S,
-    )
-    assert ended.returncode == 2
-    assert ended.stderr == f"driveby: {line.format(**values)}\n"
+    ended = run(capsys, *(argument.format(**values) for argument in arguments))
+    assert ended.code == 2
+    assert ended.err == f"driveby: {line.format(**values)}\n"
 
 
 def test_a_logger_killed_and_started_again_misses_nothing_under_access_control(
@@ -217,7 +216,7 @@ def test_a_logger_killed_and_started_again_misses_nothing_under_access_control(
 
 
 def say(gateway: Gateway) -> None:
-    channels = {"sprung_front": Channel(1000.0, np.zeros(50))}
+    channels = {"sprung_front": AccelChannel(1000.0, np.zeros(50))}
     gateway.accel(channels, device_time_ns=time.monotonic_ns(), wall_time_ns=time.time_ns())
 
 

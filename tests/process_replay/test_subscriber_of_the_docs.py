@@ -1,4 +1,4 @@
-"""The subscriber shown in docs/topics.md receives a truck, also when it comes late."""
+"""The subscriber shown in docs/programmer.md receives a truck, also when it comes late."""
 
 import re
 import subprocess
@@ -10,7 +10,7 @@ from threading import Timer
 
 import pytest
 
-from schemas.results import Header
+from schemas.results import ResultHeader
 from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.site_file import load_site
 from services.bus.publisher import Publisher
@@ -36,7 +36,7 @@ def test_it_receives_a_truck_and_prints_its_result(
     project: Path,
     stack: ExitStack,
 ) -> None:
-    text = (project / "docs" / "topics.md").read_text()
+    text = (project / "docs" / "programmer.md").read_text()
     code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     assert len(code) == 1
     file = tmp_path / "subscriber.py"
@@ -44,7 +44,7 @@ def test_it_receives_a_truck_and_prints_its_result(
     start_logger(start, endpoint, tmp_path / "live.mcap")
     bus = stack.enter_context(open_session(connect=endpoint, timeout_s=LONGEST_S))
     found = results_of(load_site(project / "docs/site.example.toml"), some_crossing("a"))
-    message = crossing_to_protobuf(found.crossings[0], Header("0.1.0", 1.79e9, "hash", {}, 1))
+    message = crossing_to_protobuf(found.crossings[0], ResultHeader("0.1.0", 1.79e9, "hash", {}, 1))
     publisher = Publisher(bus, "live")
     publisher.put("bridge", "bridge-1", "estimate", message.SerializeToString())
     start(

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.results import Header
+from schemas.results import ResultHeader
 from schemas.results_on_the_wire import crossing_to_protobuf
-from schemas.signals import CHANNELS, AccelBatch, Channel, GnssFix, encode_accel, encode_gnss
+from schemas.signals import CHANNELS, AccelBatch, AccelChannel, GnssFix, encode_accel, encode_gnss
 from schemas.site_file import load_site
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
@@ -70,14 +70,14 @@ def drive(publisher: Publisher, project: Path) -> None:
     for number in range(40):
         when = number * 50_000_000, BEGIN_NS + number * 50_000_000
         samples = np.sin(np.arange(50) / 5.0)
-        channels = {name: Channel(1000.0, samples) for name in CHANNELS}
+        channels = {name: AccelChannel(1000.0, samples) for name in CHANNELS}
         payload = encode_accel(AccelBatch(1, number, *when, channels))
         publisher.put("vehicle", "truck-1", "accel", payload)
         place = 36.1106 + 3e-6 * number, 140.1010 + 7e-6 * number
         payload = encode_gnss(GnssFix(1, number, *when, *place, 24.0, 10.0))
         publisher.put("vehicle", "truck-1", "gnss", payload)
     found = results_of(load_site(project / "docs/site.example.toml"), some_crossing("a"))
-    message = crossing_to_protobuf(found.crossings[0], Header("0.1.0", 1.79e9, "hash", {}, 1))
+    message = crossing_to_protobuf(found.crossings[0], ResultHeader("0.1.0", 1.79e9, "hash", {}, 1))
     publisher.put("bridge", "bridge-1", "estimate", message.SerializeToString())
 
 
@@ -118,7 +118,7 @@ def test_it_ends_where_no_router_ever_was(view: subprocess.Popen[str]) -> None:
     assert (view.returncode, err) == (0, "")
 
 
-def test_who_looks_into_the_wrong_realm_is_told(
+def test_query_of_the_wrong_realm_is_explained(
     view: subprocess.Popen[str], start: Start, endpoint: str, tmp_path: Path
 ) -> None:
     address_of(view)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.results import Header
+from schemas.results import ResultHeader
 from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.site_file import load_site
 from services.bus.publisher import Publisher
@@ -38,7 +38,7 @@ def publisher(start: Start, endpoint: str, tmp_path: Path) -> Iterator[Publisher
 
 def say_result(publisher: Publisher, project: Path) -> None:
     crossing = result(load_site(project / "docs/site.example.toml"), "a")
-    message = crossing_to_protobuf(crossing, Header("0.1.0", 1.79e9, "hash", {}, 1))
+    message = crossing_to_protobuf(crossing, ResultHeader("0.1.0", 1.79e9, "hash", {}, 1))
     publisher.put("bridge", "bridge-1", "estimate", message.SerializeToString())
 
 
@@ -69,7 +69,7 @@ def test_lines_into_a_pipe(
         watch.communicate()
 
 
-def test_the_wrong_realm_is_told(publisher: Publisher, endpoint: str) -> None:
+def test_wrong_realm_is_reported(publisher: Publisher, endpoint: str) -> None:
     publisher.put("vehicle", "truck-1", "info", b"")
     watch = subprocess.Popen(
         [*COMMAND, endpoint, "--realm", "sim-x"], stdout=subprocess.PIPE, text=True

@@ -12,9 +12,9 @@ from schemas.results import load_results
 from schemas.site_file import site_hash, site_toml
 from schemas.topics import selector
 from services.bus.session import open_session
-from services.bus.subscription import Received, Subscription
+from services.bus.subscription import RawSample, Subscription
 from services.recordings.recording import read_messages
-from services.simulation.drive import Drive, paper_site, write_drive
+from services.simulation.drive import SimulatedDrive, paper_site, write_drive
 from tests.builders.processes import stop
 from tests.process_replay.starting import Process, Start, start_logger
 from tests.waiting import LONGEST_S, until
@@ -41,7 +41,9 @@ def bus(logger: Process, endpoint: str) -> Iterator[zenoh.Session]:
 
 
 @pytest.fixture
-def drive_by(start: Start, endpoint: str, tmp_path: Path, scenario_6: Drive) -> Callable[[], None]:
+def drive_by(
+    start: Start, endpoint: str, tmp_path: Path, scenario_6: SimulatedDrive
+) -> Callable[[], None]:
     """A truck comes, crosses the bridge of scenario 6, and leaves."""
     path = tmp_path / "drive.mcap"
     write_drive(path, scenario_6, paper_site())
@@ -91,7 +93,7 @@ def test_trucks_that_came_and_left_while_the_worker_was_away(
     logger.send_signal(signal.SIGUSR1)
     drive_by()
     until(lambda: len(list((folder / REALM).glob("*/truck-1-*.mcap"))) == 2, "two recordings")
-    heard: list[Received] = []
+    heard: list[RawSample] = []
     with Subscription(bus, selector(REALM, "bridge")) as results:
 
         def hears(number: int) -> bool:
@@ -111,7 +113,7 @@ def test_trucks_that_came_and_left_while_the_worker_was_away(
         until(lambda: hears(2) and len(heard) >= 2 * len(WHOLE), "all that is told")
         stop(process)
         third = begin()  # and finds nothing left to do
-        until(lambda: "published again" in (third.stderr or [""]).readline(), "its start")  # type: ignore[union-attr]
+        until(lambda: "republished" in (third.stderr or [""]).readline(), "its start")  # type: ignore[union-attr]
         stop(third)
         while results.receive(0.5) is not None:
             hears(0)
@@ -159,14 +161,14 @@ def test_a_site_file_that_is_edited_while_the_worker_runs(
         until(lambda: heard(1), "the first result")
         site.write_text("nonsense")
         assert process.stderr is not None
-        until(lambda: "the site file of before stays" in process.stderr.readline(), "a warning")
+        until(lambda: "keeping the previous site file" in process.stderr.readline(), "a warning")
         site.write_text(site_toml(edited))
         until(lambda: "was edited" in process.stderr.readline(), "that it is taken up")
         drive_by()
         until(lambda: heard(2), "the second result")
         stop(process)
         again = begin()
-        until(lambda: "published again" in (again.stderr or [""]).readline(), "its start")  # type: ignore[union-attr]
+        until(lambda: "republished" in (again.stderr or [""]).readline(), "its start")  # type: ignore[union-attr]
         drive_by()
         until(lambda: heard(3), "the third result")
         stop(again)

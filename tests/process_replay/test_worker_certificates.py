@@ -6,18 +6,25 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from schemas.certificates import Pair, certificate_path, load_certificate, pair_hash
 from schemas.proto import driveby_pb2 as pb
 from schemas.settings import IdentificationSettings
 from schemas.signals import Identity
 from schemas.site_file import load_site
 from schemas.topics import selector
+from schemas.validation_records import (
+    VehicleBridgePair,
+    load_validation,
+    pair_hash,
+    validation_path,
+)
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.bus.subscription import Received, Subscription
+from services.bus.subscription import RawSample, Subscription
 from services.cli.health import health_command
-from services.history.certificates import save
+from services.common.errors import InputError
+from services.history.validation_files import save
 from services.recordings.recording import read_messages, read_site
+from services.worker import run as run_worker
 from tests.builders.certificates import certificate
 from tests.builders.processes import stop
 from tests.process_replay.starting import Process, Start, start_logger
@@ -25,7 +32,7 @@ from tests.waiting import LONGEST_S, until
 
 pytestmark = pytest.mark.process
 
-PAIR = Pair("truck-1", "bridge-1")
+PAIR = VehicleBridgePair("truck-1", "bridge-1")
 SETTINGS = IdentificationSettings()
 Begin = Callable[[], Process]
 
@@ -82,7 +89,7 @@ class Heard:
 
     def __init__(self, subscription: Subscription) -> None:
         self._subscription = subscription
-        self._received: dict[tuple[str, int, int], Received] = {}
+        self._received: dict[tuple[str, int, int], RawSample] = {}
 
     def _take(self) -> None:
         one = self._subscription.receive(0.1)
@@ -137,7 +144,7 @@ def test_a_crossing_waits_until_a_certificate_has_passed(
         assert line.endswith("; truck-1 on bridge-1 is not validated: it was so")
         log = stop(process)
         assert log.count("it was so") == 1
-        assert "1 crossings still wait for a certificate" in log
+        assert "1 crossings still wait for a site validation" in log
 
         process = begin()
         notes.clear()
@@ -147,7 +154,7 @@ def test_a_crossing_waits_until_a_certificate_has_passed(
         save(folder, certificate(known, PAIR))
         until(lambda: heard.states() == WHOLE, "its result")
         log = stop(process)
-        assert "1 crossings waited for a certificate when an earlier run ended" in log
+        assert "1 crossings waited for a site validation when an earlier run ended" in log
     (estimate,) = heard.estimates()
     assert estimate.certificate == pair_hash(known, PAIR, SETTINGS)
     assert estimate.verdict == pb.GOOD
@@ -173,24 +180,21 @@ def test_a_worker_makes_the_certificate_itself(
             stages.add(pb.Progress.FromString(one.payload).stage)
     (estimate,) = heard.estimates()
     assert estimate.certificate == digest
-    made = load_certificate(certificate_path(tmp_path / "runs" / "certificates", digest))
+    made = load_validation(validation_path(tmp_path / "runs" / "certificates", digest))
     assert made.passed
     assert made.figures.good >= 8
     assert "is validated" in log
     assert f"validating {PAIR}" in stages
 
 
-def test_other_methods_have_no_certificates(start: Start, endpoint: str, site: Path) -> None:
-    process = start(
-        "services.worker",
-        endpoint=endpoint,
-        realm="live",
-        site=site,
-        folder=site.parent,
-        file=None,
-        method="least_squares",
-        service_id="worker",
-    )
-    _, log = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 2
-    assert log.splitlines()[-1].startswith("--method least-squares: has no certificates")
+def test_other_methods_have_no_certificates(endpoint: str, site: Path) -> None:
+    with pytest.raises(InputError, match=r"^--method least-squares: has no certificates"):
+        run_worker(
+            endpoint=endpoint,
+            realm="live",
+            site=site,
+            folder=site.parent,
+            file=None,
+            method="least_squares",
+            service_id="worker",
+        )

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -17,14 +18,16 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import load_results
 from schemas.signals import Identity, decode_info, encode_info
-from schemas.topics import selector
+from schemas.topics import Message, selector
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.bus.subscription import Received, Subscription, get_latest
+from services.bus.subscription import RawSample, Subscription, get_latest
+from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, run_to_messages
-from services.recordings.recording import Message, read_info, read_messages, read_site
-from services.simulation.drive import Drive, paper_site
+from services.recordings.recording import read_info, read_messages, read_site
+from services.simulation.drive import SimulatedDrive, paper_site
+from services.worker import run as run_worker
 from tests.builders.processes import stop
 from tests.receiving import several
 from tests.waiting import LONGEST_S
@@ -40,7 +43,7 @@ LARGEST_FILE = 60_000
 
 
 @pytest.fixture(scope="module")
-def drive_on(scenario_6: Drive) -> list[Message]:
+def drive_on(scenario_6: SimulatedDrive) -> list[Message]:
     """Scenario 6, and then half a minute of driving on: longer than the worker is patient."""
     run, site = scenario_6.run, paper_site()
     more = 30.0
@@ -110,9 +113,9 @@ def publish(publisher: Publisher, messages: list[Message]) -> None:
         publisher.put(owner, identifier, stream, message.payload, identity)
 
 
-def up_to(subscription: Subscription, stream: str) -> list[Received]:
+def up_to(subscription: Subscription, stream: str) -> list[RawSample]:
     """Everything up to the first message of a stream."""
-    received: list[Received] = []
+    received: list[RawSample] = []
     deadline = time.monotonic() + LONGEST_S
     while time.monotonic() < deadline:
         one = subscription.receive(0.2)
@@ -123,7 +126,7 @@ def up_to(subscription: Subscription, stream: str) -> list[Received]:
     pytest.fail(f"no {stream} within {LONGEST_S} s, only {[r.key_text for r in received]}")
 
 
-def after(subscription: Subscription, seconds: float) -> list[Received]:
+def after(subscription: Subscription, seconds: float) -> list[RawSample]:
     received = []
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
@@ -133,7 +136,7 @@ def after(subscription: Subscription, seconds: float) -> list[Received]:
     return received
 
 
-def ratio_of(estimate: Received) -> float:
+def ratio_of(estimate: RawSample) -> float:
     message = pb.Estimate.FromString(estimate.payload)
     return message.parameters["EI_4"].mean / 1.56e10
 
@@ -174,7 +177,7 @@ def test_a_worker_that_comes_late_gives_the_result_once(
     ("who", "reason"),
     [("itself", "vehicle_differs_from_site"), ("a-stranger", "other_truck_on_bridge")],
 )
-def test_what_a_truck_says_of_itself_and_who_else_is_there_count_live(
+def test_unusable_or_unknown_truck_is_reported_live(
     bus: zenoh.Session,
     worker: Begin,
     terminate: End,
@@ -270,7 +273,7 @@ def test_a_second_truck_does_not_keep_the_first_from_leaving(
         token = bus.liveliness().declare_token(f"driveby/v1/{REALM}/vehicle/truck-1/alive")
         publish(publisher, short)
         token.undeclare()  # type: ignore[no-untyped-call]
-        estimates: list[Received] = []
+        estimates: list[RawSample] = []
         deadline = time.monotonic() + LONGEST_S
         stranger = itertools.cycle(
             m._replace(key=m.key._replace(identifier="stranger"))
@@ -298,13 +301,20 @@ def test_a_signal_ends_a_worker_that_waits_for_a_router(
     assert process.returncode == 0, log
 
 
-def test_results_that_exist_are_left_alone(worker: Begin, tmp_path: Path) -> None:
-    (tmp_path / "results.mcap").write_bytes(b"precious")
-    process = worker()
-    _, log = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 2
-    assert log.splitlines()[-1].startswith(f"{tmp_path / 'results.mcap'}: exists")
-    assert (tmp_path / "results.mcap").read_bytes() == b"precious"
+def test_results_that_exist_are_left_alone(site: Path, endpoint: str, tmp_path: Path) -> None:
+    file = tmp_path / "results.mcap"
+    file.write_bytes(b"precious")
+    with pytest.raises(InputError, match=re.escape(f"{file}: exists")):
+        run_worker(
+            endpoint=endpoint,
+            realm=REALM,
+            site=site,
+            folder=tmp_path,
+            file=file,
+            method="least_squares",
+            service_id="worker",
+        )
+    assert file.read_bytes() == b"precious"
 
 
 class Restartable(NamedTuple):
@@ -353,13 +363,13 @@ STATES = [pb.DETECTED, pb.COMPLETE, pb.IDENTIFYING, pb.DONE]
 Name = tuple[str, int, int]
 
 
-def name_of(message: Received | Message) -> Name:
+def name_of(message: RawSample | Message) -> Name:
     if isinstance(message, Message):
         return message.key.stream, message.boot_id, message.sequence
     return message.key().stream, *message.identity()
 
 
-def once(received: Iterable[Received]) -> dict[Name, bytes]:
+def once(received: Iterable[RawSample]) -> dict[Name, bytes]:
     """What a subscriber has that tells duplicates by identity: the first of each."""
     first: dict[Name, bytes] = {}
     for one in received:
@@ -367,7 +377,7 @@ def once(received: Iterable[Received]) -> dict[Name, bytes]:
     return first
 
 
-def until_whole(subscription: Subscription, told: list[Received]) -> list[Received]:
+def until_whole(subscription: Subscription, told: list[RawSample]) -> list[RawSample]:
     """Go on until everything of one crossing has been told, and a little longer."""
     told = list(told)
     deadline = time.monotonic() + LONGEST_S
@@ -381,7 +391,7 @@ def kill(process: subprocess.Popen[str]) -> None:
     process.communicate()
 
 
-def check_once(told: list[Received], restartable: Restartable, recorded: Path) -> None:
+def check_once(told: list[RawSample], restartable: Restartable, recorded: Path) -> None:
     """One crossing, told once: on the bus, in the results files, and in the logger's recording."""
     on_bus = once(told)
     stored = {name_of(message): message.payload for message in restartable.stored()}

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from schemas.results import Header
+from schemas.results import ResultHeader
 from schemas.settings import IdentificationSettings
 from schemas.site_file import parse_site
 from services.recordings.recording import read_messages, read_site
@@ -26,7 +26,7 @@ def main(recording: Path, method: str, out: Path) -> None:
     site = read_site(recording)
     assert site is not None
     settings = IdentificationSettings.model_validate({"method": method} | SETTINGS.get(method, {}))
-    header = Header("0", 0.0, "0" * 16, settings.model_dump(mode="json"), settings.seed)
+    header = ResultHeader("0", 0.0, "0" * 16, settings.model_dump(mode="json"), settings.seed)
     engine = WorkingEngine(parse_site(site, str(recording)), settings, header)
     lines: list[dict[str, Any]] = []
 

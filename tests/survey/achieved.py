@@ -15,15 +15,16 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from pre_core.survey.plan import Spreads, spreads, together
+from pre_core.survey.plan import SurveySpreads, survey_information, survey_spreads
 from schemas.settings import IdentificationSettings
 from schemas.site import Site
 from services.identification import fusing
+from services.identification.usable import Source, source_of
 from services.planning.alternatives import with_noise
-from services.planning.crossings import Crossing, Road, Simulated, scale_error
-from services.simulation.drawn import default_site, see
-from services.simulation.drive import declared, simulate_drive
-from services.simulation.wheel_paths import OnSurface, wheel_paths_of
+from services.planning.crossings import CrossingSimulator, PlannedCrossing, PlannedRoad, scale_error
+from services.simulation.drawn import default_site, identify_simulated
+from services.simulation.drive import declared_site, simulate_drive
+from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 
 WANDER_M = 0.12
 RATE_HZ = 1000.0
@@ -34,16 +35,16 @@ class Row(NamedTuple):
     name: str
     noise_ug: float
     speed_m_per_s: float
-    surface: OnSurface | None
+    surface: SurfaceOptions | None
 
 
 ROWS = (
     Row("one groove, 25 µg/√Hz", 25.0, 10.0, None),
     Row("one groove, 100 µg/√Hz", 100.0, 10.0, None),
     Row("one groove, 25 µg/√Hz, 20 m/s", 25.0, 20.0, None),
-    Row("surface, single tyres, 5 mm aside", 10.0, 10.0, OnSurface("single", 0.005, WANDER_M)),
-    Row("surface, single tyres, 10 mm aside", 10.0, 10.0, OnSurface("single", 0.01, WANDER_M)),
-    Row("surface, twin tyres behind", 10.0, 10.0, OnSurface("twin", 0.005, WANDER_M)),
+    Row("surface, single tyres, 5 mm aside", 10.0, 10.0, SurfaceOptions("single", 0.005, WANDER_M)),
+    Row("surface, single tyres, 10 mm aside", 10.0, 10.0, SurfaceOptions("single", 0.01, WANDER_M)),
+    Row("surface, twin tyres behind", 10.0, 10.0, SurfaceOptions("twin", 0.005, WANDER_M)),
 )
 
 
@@ -55,12 +56,12 @@ class Achieved(NamedTuple):
     level_std: np.ndarray  # (runs,)
     level_error: np.ndarray
     verdicts: list[str]
-    sources: list[fusing.Source]
+    sources: list[Source]
 
 
 def site_of(row: Row) -> Site:
     """The owner knows the tyres, but not that the rear axle runs aside."""
-    site = declared(with_noise(default_site(), (row.noise_ug,) * 4), row.noise_ug, RATE_HZ)
+    site = declared_site(with_noise(default_site(), (row.noise_ug,) * 4), row.noise_ug, RATE_HZ)
     if row.surface is None:
         return site
     single = row.surface.tyres == "single"
@@ -71,18 +72,18 @@ def site_of(row: Row) -> Site:
     return site.model_copy(update={"vehicles": (site.vehicles[0].model_copy(update=known),)})
 
 
-def predicted(row: Row, crossings: int) -> Spreads:
+def predicted(row: Row, crossings: int) -> SurveySpreads:
     site = site_of(row)
     if row.surface is not None:
         aside = {"rear_axle_offset_m": row.surface.rear_offset_m}
         site = site.model_copy(update={"vehicles": (site.vehicles[0].model_copy(update=aside),)})
-    crossing = Crossing(site, row.speed_m_per_s)
-    simulated = Simulated(Road("A", WANDER_M, row.surface is not None))
+    crossing = PlannedCrossing(site, row.speed_m_per_s)
+    simulated = CrossingSimulator(PlannedRoad("A", WANDER_M, row.surface is not None))
     known = simulated.known(crossing)
-    precision = together([simulated.track((crossing,))], crossings, known.log_odds.size)
-    found = spreads(known, precision, np.array(site.bridges[0].lengths_m))
+    precision = survey_information([simulated.track((crossing,))], crossings, known.log_odds.size)
+    found = survey_spreads(known, precision, np.array(site.bridges[0].lengths_m))
     scale = scale_error(site)
-    return Spreads(np.hypot(found.elements, scale), float(np.hypot(found.level, scale)))
+    return SurveySpreads(np.hypot(found.elements, scale), float(np.hypot(found.level, scale)))
 
 
 def achieved(row: Row, runs: int) -> Achieved:
@@ -91,7 +92,7 @@ def achieved(row: Row, runs: int) -> Achieved:
     asked = None if row.surface is None else row.surface._replace(tyres=None)
     paths = None if asked is None else wheel_paths_of(site.vehicles[0], asked)
     seen = [
-        see(
+        identify_simulated(
             [
                 simulate_drive(
                     site,
@@ -126,7 +127,7 @@ def achieved(row: Row, runs: int) -> Achieved:
         [one.result.verdict for one in seen],
         [
             source._replace(crossing_id=f"run-{run}")
-            for run, source in enumerate(fusing.source_of(one.result) for one in seen)
+            for run, source in enumerate(source_of(one.result) for one in seen)
             if source is not None
         ],
     )

@@ -12,8 +12,8 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from schemas.site_file import site_toml
-from services.inspection.finding import State
-from services.inspection.inspect import of_run
+from services.inspection.finding import CheckStatus
+from services.inspection.inspect import findings_of_run
 from services.inspection.recorded import recorded_runs
 from services.recordings.writer import write_recording
 from tests.verdicts import faults
@@ -32,8 +32,8 @@ def main() -> None:
             text = site_toml(case.site)
             write_recording(path, case.messages, site_toml=text, reason="test", force=True)
             (run,) = recorded_runs(path, case.site, "site.toml")
-            told = [f for f in of_run(run, case.site) if f.state is not State.OK]
-            wrong = [f for f in told if f.state is State.WRONG]
+            told = [f for f in findings_of_run(run, case.site) if f.state is not CheckStatus.OK]
+            wrong = [f for f in told if f.state is CheckStatus.WRONG]
             accused += bool(wrong)
             counts.update(f"{f.state.value} {f.name}" for f in told)
             for finding in wrong:

@@ -16,23 +16,22 @@ from pre_core.physics.bridge import refine
 from pre_core.physics.road import WheelRoad, contact_patch_average, iso_8608_profile, under_wheels
 from pre_core.physics.sensors import (
     Accelerometer,
-    Receiver,
+    ReceiverModel,
     measure_acceleration,
     measure_position,
 )
 from pre_core.physics.vehicle import HalfCar
-from schemas.results import Crossing, Header
+from schemas.results import CrossingResult, ResultHeader
 from schemas.settings import IdentificationSettings
-from schemas.signals import CHANNELS, Channel, decode_accel, encode_accel
+from schemas.signals import CHANNELS, AccelChannel, decode_accel, encode_accel
 from schemas.site import Bridge, Site, Vehicle
 from schemas.site_file import site_hash
+from schemas.topics import Message
 from services.common.geodesy import bridge_frame, heading_deg, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.execution.dispatch import feed_all
 from services.identification.engine import Engine
-from services.recordings.recording import Message
-from services.simulation.drive import START_TIME_S, beam_of, declared, paper_site, truck_of
-from tests.working_engine import unhurried
+from services.simulation.drive import START_TIME_S, beam_of, declared_site, paper_site, truck_of
+from tests.working_engine import feed_all, unhurried
 
 Floats = NDArray[np.float64]
 Channels = dict[str, Floats]
@@ -97,17 +96,19 @@ class Case(NamedTuple):
     """Front axle on and rear axle off, since 1970."""
 
 
-def identified(case: Case, settings: IdentificationSettings | None = None) -> Crossing:
+def identified(case: Case, settings: IdentificationSettings | None = None) -> CrossingResult:
     """The one result of a case."""
     chosen = settings or IdentificationSettings(method="pre", seed=0)
-    header = Header("0", 0.0, site_hash(case.site), chosen.model_dump(mode="json"), chosen.seed)
+    header = ResultHeader(
+        "0", 0.0, site_hash(case.site), chosen.model_dump(mode="json"), chosen.seed
+    )
     pairs = ((m.key, m.payload) for m in case.messages)
     outputs = list(feed_all(Engine(case.site, chosen, header), unhurried(), pairs))
     (result,) = [output.result for output in outputs if output.result is not None]
     return result
 
 
-def z_scores(case: Case, result: Crossing) -> Floats:
+def z_scores(case: Case, result: CrossingResult) -> Floats:
     """Error of every EI in its standard deviations."""
     assert result.parameters is not None
     found = [result.parameters[f"EI_{e + 1}"] for e in range(case.rigidity_nm2.size)]
@@ -166,7 +167,7 @@ def crossing(truth: Truth, fault: Fault = NOTHING) -> Case:
         {name: values[kept] for name, values in channels.items()},
         gnss,
     )
-    believed = fault.site(declared(site, truth.noise_ug_per_rthz, truth.rate_hz))
+    believed = fault.site(declared_site(site, truth.noise_ug_per_rthz, truth.rate_hz))
     messages = list(run_to_messages([run], believed, "sim-fault", believed.vehicles[0].id))
     if fault.slow is not None:
         slow = accelerometer._replace(rate_hz=100.0)
@@ -272,7 +273,7 @@ def _fixes(
     rng: np.random.Generator,
 ) -> GnssTrack:
     errors = truth.site.receiver
-    receiver = Receiver(
+    receiver = ReceiverModel(
         _FIX_RATE_HZ,
         position_noise_m=errors.position_noise_m,
         position_spread_m=errors.position_spread_m,
@@ -308,7 +309,7 @@ def _with_slow_channel(
             taken += batch.channels[name].samples.size
             if stop <= begin:
                 continue
-            slow = Channel(100.0, samples[begin:stop])
+            slow = AccelChannel(100.0, samples[begin:stop])
             message = message._replace(
                 payload=encode_accel(batch._replace(channels=batch.channels | {name: slow}))
             )

@@ -1,4 +1,4 @@
-"""Measures what docs/verdicts.md says.
+"""Measures what studies/faults.md says.
 
 python -m tests.verdicts.measure            every fault: verdict, reasons, worst EI (an hour)
 python -m tests.verdicts.measure signals N  checks of signals over N drawn sound crossings

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from schemas.results import Crossing, resolution
+from schemas.results import CrossingResult, unresolved_note
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
 from services.drives.csv_import import read_folder
 from services.drives.runs import normalised
-from services.simulation.drawn import see
+from services.simulation.drawn import identify_simulated
 
 FARTHEST = 5.0
 """Standard deviations. Of 29 elements one beyond 3.5 would be seen once in seventy such tests."""
@@ -28,7 +28,7 @@ FARTHEST = 5.0
 
 class Judged(NamedTuple):
     folder: Path
-    result: Crossing
+    result: CrossingResult
     truth: dict[str, Any]
     z: NDArray[np.float64]
     is_covered: NDArray[np.bool_]
@@ -39,7 +39,7 @@ def judged(folder: Path, run: int) -> Judged:
     site = load_site(folder / "site.toml")
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     drive = normalised(read_folder(folder)[run], site.sensor)
-    (seen,) = see([drive], site, IdentificationSettings(threads=1))
+    (seen,) = identify_simulated([drive], site, IdentificationSettings(threads=1))
     values = seen.result.parameters
     assert values is not None, seen.result.reasons
     true = np.array(truth["EI"])
@@ -59,7 +59,10 @@ def check(found: Judged, median_std: float) -> None:
     assert np.median(found.relative_std) < median_std
 
 
-@pytest.mark.parametrize("run", [0, 1])
+TWO_RUNS = [0, pytest.param(1, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("run", TWO_RUNS)
 def test_bearings_that_give(shared: Path, run: int) -> None:
     found = judged(shared / "crossings" / "d4_bearings_that_give", run)
     check(found, 0.04)
@@ -83,7 +86,7 @@ def test_a_swinging_bridge_and_damped_tyres(shared: Path) -> None:
         assert abs(tyre.mean - damping) < FARTHEST * tyre.std
 
 
-@pytest.mark.parametrize("run", [0, 1])
+@pytest.mark.parametrize("run", TWO_RUNS)
 def test_leaf_springs(shared: Path, run: int) -> None:
     found = judged(shared / "crossings" / "d6_leaf_springs", run)
     check(found, 0.1)
@@ -117,7 +120,7 @@ def check_on_two_roads(found: Judged) -> None:
     truth = float(np.exp(np.mean(np.log(found.truth["EI"]))))
     nominal = load_site(found.folder / "site.toml").bridges[0].nominal_flexural_rigidity_nm2[0]
     assert abs(level.mean - truth / nominal) < 3.0 * level.std
-    words = resolution(result)
+    words = unresolved_note(result)
     assert words is not None
     assert "not resolved" in words
     assert result.road is not None

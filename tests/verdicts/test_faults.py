@@ -1,7 +1,7 @@
 """Every fault through method `pre`: its cause is named, or the answer is right all the same.
 
 Not `good`, or every EI within three standard deviations. Dampers that are not linear are no fault:
-they get an answer. docs/verdicts.md has the table (`python -m tests.verdicts.measure`).
+they get an answer. studies/faults.md has the table (`python -m tests.verdicts.measure`).
 """
 
 from itertools import combinations
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pre_core.crossing import optimum
+from pre_core.crossing.fit import Optimum
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
@@ -168,6 +169,27 @@ def test_a_fit_that_explains_nothing_is_given_up_before_the_chains(
     assert result.diagnostics["iterations"] < 2000
 
 
+RULED = IdentificationSettings(method="pre", seed=0, draws=300)
+
+
+@pytest.fixture(scope="module")
+def fit_of_loud() -> Optimum:
+    """The fit of a sound crossing, of which no chains are begun."""
+    found: list[Optimum] = []
+    real = optimum.find_optimum
+
+    def kept(*arguments: object) -> Optimum:
+        found.append(real(*arguments))  # type: ignore[arg-type]
+        return found[-1]._replace(chi2_per_dof=1000.0)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(optimum, "find_optimum", kept)
+        patch.setattr(fit_reasons, "reasons_after_fit", lambda *_: [Reason.MODEL_MISFIT])
+        faults.identified(faults.crossing(LOUD), RULED)
+    (fit,) = found
+    return fit
+
+
 @pytest.mark.parametrize(
     ("chi2", "pattern", "verdict"),
     [
@@ -178,18 +200,17 @@ def test_a_fit_that_explains_nothing_is_given_up_before_the_chains(
     ],
 )
 def test_how_large_chi2_may_be_depends_on_the_pattern_up_to_25(
-    monkeypatch: pytest.MonkeyPatch, chi2: float, pattern: Reason, verdict: str
+    monkeypatch: pytest.MonkeyPatch,
+    fit_of_loud: Optimum,
+    chi2: float,
+    pattern: Reason,
+    verdict: str,
 ) -> None:
     """The very fit of a sound crossing, said to be as bad as that: only the rule is looked at."""
-
-    def found(*arguments: object) -> optimum.Optimum:
-        return real(*arguments)._replace(chi2_per_dof=chi2)  # type: ignore[arg-type]
-
-    real = optimum.find_optimum
-    monkeypatch.setattr(optimum, "find_optimum", found)
+    fit = fit_of_loud._replace(chi2_per_dof=chi2)
+    monkeypatch.setattr(optimum, "find_optimum", lambda *_: fit)
     monkeypatch.setattr(fit_reasons, "reasons_after_fit", lambda *_: [pattern])
-    settings = IdentificationSettings(method="pre", seed=0, draws=300)
-    result = faults.identified(faults.crossing(LOUD), settings)
+    result = faults.identified(faults.crossing(LOUD), RULED)
     assert result.verdict == verdict
     assert pattern in result.reasons
     assert (result.parameters is None) == (verdict == "rejected")

@@ -9,18 +9,18 @@ import pytest
 from numpy.typing import NDArray
 
 from schemas.reasons import LeftOutReason, Reason
-from schemas.results import BridgeResult, Crossing, load_results
+from schemas.results import BridgeResult, CrossingResult, load_results
 from schemas.site import Vehicle
 from services.cli.main import main
 from services.identification.bridge_state import (
     NOTHING_STORED,
-    Counted,
     Fusing,
-    count_in,
+    RecentCrossings,
+    add_crossings,
     state_of,
     usable,
 )
-from services.simulation.drive import declared, paper_site, simulate_drive, write_drives
+from services.simulation.drive import declared_site, paper_site, simulate_drive, write_drives
 
 NOISE_UG, RATE_HZ = 25.0, 500.0
 SEED = 5
@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), pytest.mark.xdist_grou
 
 
 @pytest.fixture(scope="module")
-def crossings(tmp_path_factory: pytest.TempPathFactory) -> tuple[Crossing, ...]:
+def crossings(tmp_path_factory: pytest.TempPathFactory) -> tuple[CrossingResult, ...]:
     """Nine by the site's truck and three foreign ones, in the order in which they were driven."""
     folder = tmp_path_factory.mktemp("foreign")
     site = paper_site()
@@ -56,13 +56,13 @@ def crossings(tmp_path_factory: pytest.TempPathFactory) -> tuple[Crossing, ...]:
         for number, (truck, speed) in enumerate(zip(trucks, SPEEDS_M_PER_S, strict=True))
     ]
     recording, found = folder / "week.mcap", folder / "week.json"
-    write_drives(recording, drives, declared(site, NOISE_UG, RATE_HZ))
+    write_drives(recording, drives, declared_site(site, NOISE_UG, RATE_HZ))
     assert main(["identify", str(recording), "--json", str(found)]) == 0
     return load_results(found).crossings
 
 
 def test_a_truck_of_another_make_is_named_by_its_own_crossing(
-    crossings: tuple[Crossing, ...],
+    crossings: tuple[CrossingResult, ...],
 ) -> None:
     ten = with_one(crossings, OTHER_MAKE)
     foreign = crossings[OTHER_MAKE]
@@ -74,7 +74,9 @@ def test_a_truck_of_another_make_is_named_by_its_own_crossing(
     }
 
 
-def test_a_truck_of_the_same_make_is_named_by_the_others(crossings: tuple[Crossing, ...]) -> None:
+def test_a_truck_of_the_same_make_is_named_by_the_others(
+    crossings: tuple[CrossingResult, ...],
+) -> None:
     """Springs and dampers that the site file's spreads allow: its answer is right, by itself."""
     foreign = crossings[SISTER]
     assert foreign.verdict == "good", foreign.reasons
@@ -86,7 +88,7 @@ def test_a_truck_of_the_same_make_is_named_by_the_others(crossings: tuple[Crossi
 
 
 def test_a_truck_that_is_heavier_in_all_its_parts_is_named_by_the_others(
-    crossings: tuple[Crossing, ...],
+    crossings: tuple[CrossingResult, ...],
 ) -> None:
     """It moves as the site's truck would over a softer bridge: by itself nobody could tell."""
     foreign = crossings[SAME_MOTION]
@@ -98,7 +100,7 @@ def test_a_truck_that_is_heavier_in_all_its_parts_is_named_by_the_others(
 
 @pytest.mark.parametrize("other", [OTHER_MAKE, SISTER, SAME_MOTION])
 def test_the_bridge_is_what_the_sound_crossings_say(
-    crossings: tuple[Crossing, ...], other: int
+    crossings: tuple[CrossingResult, ...], other: int
 ) -> None:
     state = fused(with_one(crossings, other))
     assert (state.verdict, len(state.crossings_used)) == ("good", 9)
@@ -107,15 +109,17 @@ def test_the_bridge_is_what_the_sound_crossings_say(
     assert state.finding.startswith("Element 4, 12.9 to 17.1 m: ")
 
 
-def with_one(crossings: tuple[Crossing, ...], foreign: int) -> list[Crossing]:
+def with_one(crossings: tuple[CrossingResult, ...], foreign: int) -> list[CrossingResult]:
     """The nine by the site's truck, and one that is not."""
     others = {OTHER_MAKE, SISTER, SAME_MOTION} - {foreign}
     return [one for number, one in enumerate(crossings) if number not in others]
 
 
-def fused(crossings: list[Crossing], fusing: Fusing = NOTHING_STORED) -> BridgeResult:
+def fused(crossings: list[CrossingResult], fusing: Fusing = NOTHING_STORED) -> BridgeResult:
     """As `driveby fuse` does."""
-    counted = count_in(Counted(), [one for one in map(usable, crossings) if one is not None])
+    counted = add_crossings(
+        RecentCrossings(), [one for one in map(usable, crossings) if one is not None]
+    )
     state = state_of(counted, "bridge-1", fusing)
     assert state is not None
     return state
@@ -125,7 +129,7 @@ def left_out(state: BridgeResult) -> dict[str, LeftOutReason]:
     return {one.crossing_id: one.reason for one in state.crossings_left_out}
 
 
-def z_scores(found: BridgeResult | Crossing) -> NDArray[np.float64]:
+def z_scores(found: BridgeResult | CrossingResult) -> NDArray[np.float64]:
     """Error of every EI in its standard deviations."""
     told = found.elements if isinstance(found, BridgeResult) else found.parameters
     assert told

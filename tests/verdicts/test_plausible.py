@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pre_core.crossing import optimum
-from pre_core.search.loop import Ending
+from pre_core.crossing.fit import Optimum
+from pre_core.search.loop import Termination
 from schemas.reasons import Reason
 from schemas.settings import IdentificationSettings
 from services.identification import pre_method
@@ -43,8 +44,8 @@ def test_bridge_is_plausible(ratios: tuple[float, ...], fault: Fault) -> None:
 
 
 def test_search_that_does_not_converge_gives_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    def found(*arguments: object) -> optimum.Optimum:
-        return real(*arguments)._replace(ending=Ending.STEPS_EXHAUSTED)  # type: ignore[arg-type]
+    def found(*arguments: object) -> Optimum:
+        return real(*arguments)._replace(ending=Termination.STEPS_EXHAUSTED)  # type: ignore[arg-type]
 
     def no_chains(*_: object) -> None:
         raise AssertionError("chains were begun")

@@ -7,7 +7,7 @@ import pytest
 
 from pre_core.physics.simulate import Motion
 from schemas.reasons import Reason
-from services.identification.crossing_data import caveats, longest_outage_s
+from services.identification.result_parts import caveats, longest_outage_s
 from tests.verdicts.steady import ENTRY_S, EXIT_S, steady_crossing
 
 

@@ -8,6 +8,7 @@ from scipy.fft import dct
 
 from pre_core.diagnostics import quality
 from schemas.reasons import Reason
+from services.finding.crossing_data import CrossingData
 from services.identification.checks import (
     BODY_FRONT,
     ROAD,
@@ -15,7 +16,7 @@ from services.identification.checks import (
     reasons_after_fit,
     stiffer_elements,
 )
-from services.identification.crossing_data import CrossingData, Floats
+from services.identification.result_parts import Floats
 from tests.verdicts.steady import steady_crossing
 
 STEP_S = 0.005
@@ -55,7 +56,7 @@ def test_noise_nearly_as_declared_is_good(power: float) -> None:
 
 
 @pytest.mark.parametrize("factor", [1.5, 3.0, 10.0])
-def test_noise_above_the_declared_is_told_from_a_misfit(factor: float) -> None:
+def test_noise_above_declared_is_distinguished_from_misfit(factor: float) -> None:
     assert reasons_after_fit(crossing(), fit(factor * normals())) == [Reason.NOISE_ABOVE_DECLARED]
 
 
@@ -157,9 +158,9 @@ def test_cells_hold_all_the_power() -> None:
     """The cosine transform is orthogonal: cells, weighted by their sizes, add up to the rows."""
     white = normals()
     stretches = np.repeat([0, 1, 2], [100, 700, 300])
-    found = quality.cells(white, stretches, STEP_S, np.array([0.0, 6.0, 30.0, np.inf]))
+    found = quality.residual_bins(white, stretches, STEP_S, np.array([0.0, 6.0, 30.0, np.inf]))
     for kind in range(3):
-        whole = quality.joined([cell for key, cell in found.items() if key[0] == kind])
+        whole = quality.merge_bins([cell for key, cell in found.items() if key[0] == kind])
         assert whole.size == ROWS
         assert whole.mean_square == pytest.approx(np.mean(white[:, kind] ** 2), rel=1e-12)
 
@@ -168,7 +169,7 @@ def test_a_tone_falls_into_its_own_cell() -> None:
     time_s = STEP_S * np.arange(ROWS)
     tone = np.zeros((ROWS, 3))
     tone[:, 1] = np.sin(2.0 * np.pi * 9.0 * time_s)
-    found = quality.cells(
+    found = quality.residual_bins(
         tone, np.zeros(ROWS, dtype=np.int64), STEP_S, np.array([0.0, 6.0, 12.0, np.inf])
     )
     power = {key: cell.mean_square * cell.size for key, cell in found.items()}
@@ -181,7 +182,7 @@ def test_excess_is_a_standard_normal(size: int) -> None:
     """Wilson and Hilferty's approximation, at its mean, its spread and in its tail."""
     rng = np.random.default_rng(size)
     squares = rng.chisquare(size, 40_000) / size
-    z = np.array([quality.cell_excess(quality.Cell(float(s), size)) for s in squares])
+    z = np.array([quality.cell_excess(quality.ResidualBin(float(s), size)) for s in squares])
     assert abs(z.mean()) < 0.03
     assert z.std() == pytest.approx(1.0, abs=0.03)
     assert np.mean(z > 3.0) < 0.003

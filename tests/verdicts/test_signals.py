@@ -1,7 +1,7 @@
 """What the accelerations alone show before any fit: every broken channel is named, no sound one is.
 
 The thresholds are in services/identification/checks.py; how far sound and broken signals lie from
-them was measured over more drives than these (docs/verdicts.md, tests/verdicts/measure.py).
+them was measured over more drives than these (studies/faults.md, tests/verdicts/measure.py).
 """
 
 from functools import cache
@@ -124,7 +124,7 @@ def test_a_broken_channel_of_another_truck_is_named(name: str, seed: int) -> Non
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_nothing_is_said_of_sound_channels(seed: int) -> None:
+def test_sound_channels_have_no_reason(seed: int) -> None:
     """Trucks of 6 to 26 t, spans of 12 to 40 m, 5 to 25 m/s, 100 to 2000 Hz, roads A to C."""
     assert reasons(seed) == []
 
@@ -231,7 +231,7 @@ def test_body_equation_is_exact_for_a_linear_truck() -> None:
     vehicle = case.site.vehicles[0]
     share = np.array([vehicle.cg_to_rear_axle_m, vehicle.front_axle_to_cg_m]) / vehicle.wheelbase_m
     body = vehicle.sprung_mass_kg * share
-    found = quality.pairing(
+    found = quality.assign_channels(
         np.stack([case.run.channels[name] for name in CHANNELS]),
         1e-3,
         np.array(vehicle.suspension_stiffness_n_per_m) / body,
@@ -248,7 +248,7 @@ def test_least_squares_in_a_box_are_scipys(seed: int) -> None:
     matrix = rng.standard_normal((40, 3)) @ rng.standard_normal((3, 3))
     right = matrix @ rng.uniform(-2.0, 2.0, 3) + 0.3 * rng.standard_normal(40)
     low, high = np.array([0.25, 0.0, -0.6]), np.array([1.0, 1.0, 0.6])
-    x, least = quality.least_squares_in_a_box(matrix, right, low, high)
+    x, least = quality.bounded_least_squares(matrix, right, low, high)
     theirs = lsq_linear(matrix, right, (low, high), method="bvls")
     np.testing.assert_allclose(x, theirs.x, atol=1e-9)
     assert least == pytest.approx(2.0 * theirs.cost, rel=1e-9)

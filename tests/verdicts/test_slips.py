@@ -1,6 +1,6 @@
 """A channel whose delay or gain changes within the record is named, wherever and in any channel.
 
-How far sound crossings lie from the thresholds stands in docs/verdicts.md.
+How far sound crossings lie from the thresholds stands in studies/faults.md.
 """
 
 from typing import NamedTuple

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.results import Crossing
+from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from schemas.site import Bridge, Site
 from schemas.site_file import load_site
 from services.drives.csv_import import read_folder
 from services.drives.runs import normalised
-from services.simulation.drawn import see
+from services.simulation.drawn import identify_simulated
 from services.simulation.drive import simulate_drive
-from services.simulation.wheel_paths import OnSurface, wheel_paths_of
+from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
 
 LARGEST_Z, LARGEST_Z_OF_ENDS = 4.0, 3.0
 TORSION = ("lane_offset_m", "torsional_frequency_ratio", "deck_gyration_m")
@@ -33,7 +33,7 @@ def undeclared(site: Site) -> Site:
     return site.model_copy(update={"bridges": (Bridge.model_validate(keys),)})
 
 
-def errors(result: Crossing, truth: np.ndarray) -> np.ndarray:
+def errors(result: CrossingResult, truth: np.ndarray) -> np.ndarray:
     """Return the error of every element (n,) over its standard deviation."""
     assert result.parameters is not None, result.reasons
     found = [result.parameters[f"EI_{e + 1}"] for e in range(truth.size)]
@@ -49,7 +49,9 @@ def test_twisting_deck_is_answered_truly(shared: Path, is_declared: bool) -> Non
     site = site if is_declared else undeclared(site)
     truth = np.array(json.loads((folder / "truth.json").read_text())["EI"])
     runs = [normalised(run, site.sensor) for run in read_folder(folder)]
-    found = [one.result for one in see(runs, site, IdentificationSettings(threads=1))]
+    found = [
+        one.result for one in identify_simulated(runs, site, IdentificationSettings(threads=1))
+    ]
     assert [result.verdict for result in found] == ["good"] * 8
     z = np.stack([errors(result, truth) for result in found])
     assert np.abs(z).max() < LARGEST_Z
@@ -66,7 +68,7 @@ def test_search_leaves_ends_that_are_held(shared: Path) -> None:
     """The bridge held at both ends, of less than half its stiffness, was `good` with z 20."""
     site = load_site(shared / "crossings" / "s1" / "site.toml")
     truth = np.array([1.0, 1.0, 0.75, 1.0, 1.0])
-    paths = wheel_paths_of(site.vehicles[0], OnSurface())
+    paths = wheel_paths_of(site.vehicles[0], SurfaceOptions())
     drive = simulate_drive(
         site,
         truth,
@@ -83,7 +85,7 @@ def test_search_leaves_ends_that_are_held(shared: Path) -> None:
         update={"noise_density_ug_per_rthz": (25.0,) * 4, "rate_hz": (500.0,) * 4}
     )
     declared = site.model_copy(update={"sensor": sensor})
-    (seen,) = see([drive.run], declared, IdentificationSettings(threads=1))
+    (seen,) = identify_simulated([drive.run], declared, IdentificationSettings(threads=1))
     nominal = np.array(site.bridges[0].nominal_flexural_rigidity_nm2)
     assert seen.result.verdict == "good", seen.result.reasons
     assert np.abs(errors(seen.result, truth * nominal)).max() < LARGEST_Z

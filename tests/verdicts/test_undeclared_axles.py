@@ -7,10 +7,10 @@ from schemas.reasons import Reason
 from schemas.signals import CHANNELS
 from services.identification.checks import undeclared_axles
 from services.simulation.wide_cases import draw_wide, more_axles
-from services.simulation.wide_crossings import Case, drive_case, site_of
+from services.simulation.wide_crossings import WideCase, drive_case, site_of
 
 
-def named(case: Case, *, is_doubted: bool) -> dict[Reason, str]:
+def named(case: WideCase, *, is_doubted: bool) -> dict[Reason, str]:
     run = drive_case(case, 0).run
     signals = np.stack([run.channels[name] for name in CHANNELS])
     vehicle = site_of(case).vehicles[0]

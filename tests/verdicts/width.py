@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.settings import IdentificationSettings
-from services.simulation.drawn import see
+from services.simulation.drawn import identify_simulated
 from services.simulation.wide_cases import draw_wide, more_axles
-from services.simulation.wide_crossings import Case, drive_case, site_of
+from services.simulation.wide_crossings import WideCase, drive_case, site_of
 
 
 class Judged(NamedTuple):
@@ -33,10 +33,10 @@ class Judged(NamedTuple):
     relative_std: NDArray[np.float64]
 
 
-def judged(case: Case) -> Judged:
+def judged(case: WideCase) -> Judged:
     """Drive the case's first run and identify it by the owner's site file."""
     settings = IdentificationSettings(method="pre", threads=1)
-    found = see([drive_case(case, 0).run], site_of(case), settings)
+    found = identify_simulated([drive_case(case, 0).run], site_of(case), settings)
     none = np.empty(0)
     if len(found) != 1:
         return Judged(case.name, "not_found", (), none, none.astype(bool), none)
@@ -53,7 +53,7 @@ def judged(case: Case) -> Judged:
     )
 
 
-def as_json(case: Case, found: Judged) -> dict[str, Any]:
+def as_json(case: WideCase, found: Judged) -> dict[str, Any]:
     """The verdict, and what of the truth a reader wants beside it."""
     torsion = case.deck.torsion
     return {

@@ -13,18 +13,24 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.signals import Identity
 from schemas.topics import Key, selector
 from services.bus import subscription as subscription_module
-from services.bus.delivery import LINGER_S, Delivery
+from services.bus.delivery import LINGER_S, DeliveryTracker
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
-from services.bus.subscription import Received, Seen, Subscription, get_latest, subscribe_latest
+from services.bus.subscription import (
+    RawSample,
+    SeenSequences,
+    Subscription,
+    get_latest,
+    subscribe_latest,
+)
 from services.common.errors import FailureError, InputError
 from tests.waiting import LONGEST_S, until
 
 ACCEL = Key("live", "vehicle", "truck-1", "accel")
 
 
-def receive(subscription: Subscription, number: int) -> list[Received]:
-    found: list[Received] = []
+def receive(subscription: Subscription, number: int) -> list[RawSample]:
+    found: list[RawSample] = []
     deadline = time.monotonic() + LONGEST_S
     while len(found) < number and time.monotonic() < deadline:
         received = subscription.receive(0.1)
@@ -57,7 +63,7 @@ def test_waiting_for_a_subscriber_ends(client: zenoh.Session) -> None:
     assert not Publisher(client, "live").wait_for_subscriber("vehicle", "truck-1", "accel", 0.2)
 
 
-def test_a_late_subscriber_gets_what_was_said_before(
+def test_late_subscriber_receives_earlier_messages(
     router: zenoh.Session, client: zenoh.Session
 ) -> None:
     publisher = Publisher(client, "live")
@@ -176,8 +182,8 @@ def durable(publisher: Publisher, number: int) -> None:
 
 
 @pytest.fixture
-def delivery(client: zenoh.Session) -> Iterator[Delivery]:
-    delivery = Delivery(client, "live")
+def delivery(client: zenoh.Session) -> Iterator[DeliveryTracker]:
+    delivery = DeliveryTracker(client, "live")
     for number in range(10):
         delivery.sent(ACCEL, Identity(1, number))
     yield delivery
@@ -185,7 +191,7 @@ def delivery(client: zenoh.Session) -> Iterator[Delivery]:
 
 
 def test_delivery_waits_until_everything_is_on_disk(
-    router: zenoh.Session, delivery: Delivery
+    router: zenoh.Session, delivery: DeliveryTracker
 ) -> None:
     logger = Publisher(router, "live")
     durable(logger, 4)
@@ -203,7 +209,7 @@ def test_delivery_waits_until_everything_is_on_disk(
     logger.close()
 
 
-def test_delivery_says_what_is_missing(router: zenoh.Session, delivery: Delivery) -> None:
+def test_delivery_says_what_is_missing(router: zenoh.Session, delivery: DeliveryTracker) -> None:
     logger = Publisher(router, "live")
     durable(logger, 4)
     assert delivery.wait(LONGEST_S, most_missing=6) == 6
@@ -212,7 +218,7 @@ def test_delivery_says_what_is_missing(router: zenoh.Session, delivery: Delivery
     logger.close()
 
 
-def test_without_a_logger_delivery_only_lingers(delivery: Delivery) -> None:
+def test_without_a_logger_delivery_only_lingers(delivery: DeliveryTracker) -> None:
     began = time.monotonic()
     assert delivery.wait(LONGEST_S) == 10
     assert LINGER_S <= time.monotonic() - began < LONGEST_S
@@ -252,8 +258,8 @@ def test_a_client_connects_again_by_itself(endpoint: str) -> None:
         client.close()
 
 
-def test_seen_tells_duplicates_by_identity() -> None:
-    seen = Seen()
+def test_seen_detects_duplicates_by_identity() -> None:
+    seen = SeenSequences()
     assert seen.add(ACCEL, Identity(1, 0))
     assert not seen.add(ACCEL, Identity(1, 0))
     assert seen.add(ACCEL, Identity(2, 0))

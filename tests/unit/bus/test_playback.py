@@ -7,9 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.bus import playback
-from services.recordings.recording import Message
 from tests.waiting import LONGEST_S
 
 WHERE = Key("live", "vehicle", "truck-1", "gnss")
@@ -51,7 +50,7 @@ def test_the_spacing_is_kept(monkeypatch: pytest.MonkeyPatch, speed: float) -> N
             clock.now_s += 0.3 / speed  # is held up, and makes up for it afterwards
 
     times_s = (50.0, 50.1, 50.2, 50.3, 50.2, 51.0, 53.0)
-    number = playback.play(recorded(*times_s), put, Delivered(), speed=speed, stop=clock)  # type: ignore[arg-type]
+    number = playback.publish_paced(recorded(*times_s), put, Delivered(), speed=speed, stop=clock)  # type: ignore[arg-type]
     assert number == len(times_s)
     due_s = (0.0, 0.1, 0.2, 0.5, 0.5, 1.0, 3.0)  # the fifth stands late in the recording
     assert came_s == pytest.approx([due / speed for due in due_s])
@@ -61,7 +60,7 @@ def test_without_a_speed_nothing_is_waited_for(monkeypatch: pytest.MonkeyPatch) 
     clock = Clock()
     monkeypatch.setattr("services.bus.playback.time.monotonic", lambda: clock.now_s)
     put: list[Message] = []
-    playback.play(recorded(0.0, 100.0), put.append, Delivered(), speed=0.0, stop=clock)  # type: ignore[arg-type]
+    playback.publish_paced(recorded(0.0, 100.0), put.append, Delivered(), speed=0.0, stop=clock)  # type: ignore[arg-type]
     assert (len(put), clock.now_s) == (2, 1000.0)
 
 

@@ -50,7 +50,7 @@ def test_a_folder_of_csv_files(csv_example: Path, capsys: pytest.CaptureFixture[
     assert f"{csv_example}, run 1 of" in out
 
 
-def test_many_runs_are_told_briefly(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_many_runs_are_printed_briefly(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = shared / "crossings" / "d3_edge_damage_4_runs"
     assert cli.main(["check", str(folder)]) == 0
     out = capsys.readouterr().out

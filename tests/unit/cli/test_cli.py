@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from schemas.signals import GnssFix, encode_gnss
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.cli import main as cli
 from services.common.errors import FailureError, InputError
 from services.drives import importing
-from services.recordings.recording import Message, read_info, read_site
+from services.recordings.recording import read_info, read_messages, read_site
 from services.recordings.writer import RecordingWriter, write_recording
 from tests.builders.commands import run
 
@@ -131,15 +131,20 @@ def test_import_of_a_real_drive(
             "rate_hz = 1000",
             "accel_00.csv: time_s gives a rate of 100 ",
         ),
-        ("accel_00.csv", "sprung_rear", "sprung_back", "accel_00.csv: line 1: unknown column"),
+        (
+            "accel_00.csv",
+            "sprung_rear",
+            "sprung_middle",
+            'accel_00.csv: no column is sprung_rear, and "sprung_middle" is not known',
+        ),
         (
             "accel_00.csv",
             "0.564480",
-            "nan",
-            "accel_00.csv: line 2: unsprung_rear is nan, it must be",
+            "inf",
+            "accel_00.csv: line 2: unsprung_rear is inf, it must be",
         ),
-        ("accel_00.csv", "00.030000", "00.020000", "accel_00.csv: line 5: time_s is 1790000000.02"),
-        ("gps_00.csv", "time_s", "time", 'gps_00.csv: line 1: unknown column "time"'),
+        ("accel_00.csv", "1790000000.030000", "12.5", "accel_00.csv: line 5: time_s is 12.5, it"),
+        ("gps_00.csv", "time_s", "clock", "gps_00.csv: no column of times is known by its name"),
         (
             "gps_00.csv",
             "47.0",
@@ -192,6 +197,59 @@ def test_missing_files_and_places_are_named(
     assert listing(drive.parent) == before
 
 
+def test_unusual_site_file_is_warned_of_and_used(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    site, output = drive / "site.toml", drive.parent / "out.mcap"
+    text = site.read_text()
+    site.write_text(text.replace("rthz = 25.0", "rthz = 0.025"))
+    arguments = ("import", drive, "--site", site, "-o", output)
+    code, _, err = run(capsys, *arguments)
+    assert code == 0
+    assert f"{site}: truck-x: noise 0.025 µg/√Hz: usual is" in err
+    assert "in mg/√Hz? then it is 25" in err
+    code, out, _ = run(capsys, "check", site)
+    assert code == 1
+    assert "in mg/√Hz? then it is 25" in out
+    site.write_text(text)
+    _, _, err = run(capsys, *arguments, "--force")
+    assert "usual" not in err
+    code, out, _ = run(capsys, "check", site)
+    assert "bridge-x: first natural frequency 6.8 Hz" in out
+
+
+def test_import_previews_writes_a_map_and_reads_by_it(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    site, output, told = drive / "site.toml", drive.parent / "out.mcap", drive.parent / "map.toml"
+    accel = drive / "accel_00.csv"
+    own = "Time,Body front [m/s2],Body rear [m/s2],Axle front [m/s2],Axle rear [m/s2]"
+    accel.write_text("\n".join([own, *accel.read_text().splitlines()[1:]]))
+    before = listing(drive.parent)
+    arguments = ("import", drive, "--site", site)
+    assert "required: -o/--output, or --preview" in refused(capsys, *arguments)
+    line = refused(capsys, *arguments, "-o", output)
+    assert line.startswith(f"{drive}: is read by guesses that change numbers (accel_00.csv: by th")
+    assert "--preview" in line
+    code, shown, _ = run(capsys, *arguments, "--preview")
+    assert (code, listing(drive.parent)) == (0, before)
+    assert 'guess: accel_00.csv: by their names sprung_front is column "Body front [m/s2]"' in shown
+    drawn = drive.parent / "as-read.png"
+    assert run(capsys, *arguments, "--preview", "--picture", drawn)[0] == 0
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    drawn.unlink()
+    assert listing(drive.parent) == before
+    assert run(capsys, *arguments, "--write-map", told)[0] == 0
+    assert run(capsys, *arguments, "--map", told, "-o", output)[0] == 0
+    by_map = list(read_messages(output))
+    assert run(capsys, *arguments, "--yes", "-o", output, "--force")[0] == 0
+    assert [one.payload for one in read_messages(output)] == [one.payload for one in by_map]
+    other = drive.parent / "other.toml"
+    other.write_text(site.read_text())
+    assert "only a map of an import" in refused(capsys, *arguments, "--write-map", other)
+    assert "is read by guesses" in refused(capsys, "check", drive)
+
+
 def test_the_vehicle_must_be_chosen_where_there_are_several(
     capsys: pytest.CaptureFixture[str], drive: Path
 ) -> None:
@@ -207,7 +265,27 @@ def test_the_vehicle_must_be_chosen_where_there_are_several(
     code, _, _ = run(capsys, *arguments, "--vehicle", "truck-y", "--name", "second")
     assert code == 0
     assert "driveby/v1/import-second/vehicle/truck-y/accel" in read_info(output).messages
-    assert "--name" in refused(capsys, *arguments, "--vehicle", "truck-y", "--name", "A B")
+    assert "--realm" in refused(capsys, *arguments, "--vehicle", "truck-y", "--name", "A B")
+
+
+def test_imports_of_one_campaign_share_a_realm(
+    capsys: pytest.CaptureFixture[str], drive: Path
+) -> None:
+    site, output = drive / "site.toml", drive.parent / "out.mcap"
+    arguments = ("import", drive, "--site", site, "--force", "-o", output)
+
+    def realm(*more: str) -> str:
+        assert run(capsys, *arguments, *more)[0] == 0
+        (found,) = {topic.split("/")[2] for topic in read_info(output).messages}
+        return found
+
+    assert realm() == f"import-{drive.name}"
+    site.write_text(site.read_text() + '\n[import]\nname = "isar"\n')
+    assert realm() == "import-isar"
+    assert realm("--realm", "elbe") == "import-elbe"
+    assert realm("--realm", "import-elbe") == "import-elbe"
+    site.write_text(site.read_text().replace('"isar"', '"Isar 1"'))
+    assert 'import.name is "Isar 1", it must be an identifier' in refused(capsys, *arguments)
 
 
 def gnss_only(path: Path) -> None:
@@ -418,6 +496,36 @@ raise SystemExit(cli.main(["import", "x", "--site", "s", "-o", "o"]))
     assert (done.returncode, done.stderr) == (141, "")
 
 
+def test_closed_pipe_of_a_console_is_no_failure(project: Path) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        driveby("identify", "recordings/sample/crossing.mcap", "--method", "least-squares"),
+        cwd=project, stdout=write, stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_closed_pipe_costs_no_file(project: Path, tmp_path: Path) -> None:
+    """Neither that of `identify`, which prints before it writes, nor that of `fuse`."""
+    sample, once, twice = (
+        "recordings/sample/crossing.mcap",
+        tmp_path / "a.json",
+        tmp_path / "b.json",
+    )
+    read, write = os.pipe()
+    os.close(read)
+    for arguments in (("identify", sample, "--json", once), ("fuse", once, "--json", twice)):
+        done = subprocess.run(
+            driveby(*map(str, arguments)),
+            cwd=project, stdout=write, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+        assert (done.returncode, done.stderr) == (141, "")
+    os.close(write)
+    assert json.loads(twice.read_text())["crossings"]
+
+
 def test_help_and_version_are_quick(project: Path) -> None:
     """At most 0.3 s of a processor, the best of three: waiting for one is not what is measured."""
     for arguments, words in ((["--help"], "identify"), (["--version"], "driveby 0.")):
@@ -478,7 +586,7 @@ def test_no_command_replaces_a_recording_by_accident_or_while_it_is_written(
     ("given", "realms"),
     [([], ("live",)), (["--realm", "sim-a", "--realm", "replay-*"], ["sim-a", "replay-*"])],
 )
-def test_a_logger_records_the_realms_it_is_told_to(
+def test_logger_records_the_chosen_realms(
     monkeypatch: pytest.MonkeyPatch, given: list[str], realms: object
 ) -> None:
     """And only live without: what appears in other realms is nobody's drive."""

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from services.catalogue.index import CATALOG, update_catalog
 from services.cli import main as cli
 from services.cli.parsing import EXIT_SOMETHING_LOST
 from services.common.stores import files_below, folder_at, put
 from services.execution import cluster
-from services.execution.kept import BRIDGES
-from services.history.catalog import CATALOG, mend
+from services.execution.result_store import BRIDGES
 from services.security.certs import certs_command
 from tests.drives import EXACT, drives
 from tests.faults.clusters import results_of
@@ -38,7 +38,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
         (["--scheduler", "tcp://127.0.0.1:8786#@10.0.0.1:8786"], "it must be processes"),
         (["--scheduler", "tcp://somebody@127.0.0.1:8786"], "it must be processes"),
         (["--scheduler", "http://127.0.0.1:8786"], "it must be processes"),
-        (["--scheduler", "tcp://10.0.0.1:8786"], "is another machine: without TLS whoever"),
+        (["--scheduler", "tcp://10.0.0.1:8786"], "is another machine: without TLS anyone"),
         (["--scheduler", "tcp://scheduler:8786"], "is another machine"),
         (["--scheduler", "tls://127.0.0.1:8786"], "needs --tls FOLDER"),
         (["--batch", "5"], "--batch: belongs to a cluster"),
@@ -71,7 +71,7 @@ def test_credentials_must_be_those_of_a_client(
         assert (code, err.count("\n")) == (2, 1)
         assert str(folder) in err
     where = ("--scheduler", "tcp://127.0.0.1:8786", "--tls", certs / "client")
-    assert "is spoken to without TLS" in said(capsys, "identify", EXACT, *where)[1]
+    assert "is an address without TLS" in said(capsys, "identify", EXACT, *where)[1]
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(
@@ -86,7 +86,7 @@ def test_a_scheduler_that_does_not_answer_is_one_line(
     assert f"{address}: no scheduler answers" in err
 
 
-def test_without_dask_it_is_said_how_to_install_it(
+def test_missing_dask_names_the_install_command(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     find = importlib.util.find_spec
@@ -107,7 +107,7 @@ def test_a_cluster_listens_here_only_unless_it_has_certificates(
 ) -> None:
     code, err = said(capsys, "cluster", "--listen", "0.0.0.0")  # noqa: S104 - it is refused
     assert (code, err.count("\n")) == (2, 1)
-    assert "without TLS whoever reaches it runs programs" in err
+    assert "without TLS anyone who reaches it runs programs" in err
     code, err = said(capsys, "cluster", "--tls", tmp_path / "none")
     assert (code, err.count("\n")) == (2, 1)
     with socket.socket() as taken:
@@ -132,7 +132,7 @@ def test_a_folder_is_identified_by_its_catalogue_and_gone_on_with(
 ) -> None:
     folder, into = tmp_path / "recordings", tmp_path / "into"
     first, second, third = drives(folder, 3)
-    mend(folder_at(str(folder)))
+    update_catalog(folder_at(str(folder)))
     third.unlink()  # the catalogue does not know
     second.write_bytes(first.read_bytes())  # nor that
     (folder / "none.mcap").write_bytes(b"no recording")
@@ -155,7 +155,7 @@ def test_a_folder_is_identified_by_its_catalogue_and_gone_on_with(
     assert "2 crossings, 1 known from before: 2 suspect" in capsys.readouterr().out
 
 
-def test_what_cannot_be_written_in_the_end_is_told_at_the_beginning(
+def test_unwritable_output_is_refused_at_the_beginning(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     into = tmp_path / "into"

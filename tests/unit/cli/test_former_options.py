@@ -15,6 +15,7 @@ SAME = [
     ("alarm check --learning 9", "alarm check --training 9"),
     ("history add r --later", "history add r --defer-fusion"),
     ("--verbose identify a.mcap --patience 7", "--verbose identify a.mcap --reconnect-timeout 7"),
+    ("import d --site s -o x --name n", "import d --site s -o x --realm n"),
     (
         "simulate --scenario 6 --left 3e5:17:0.1 -o x",
         "simulate --scenario 6 --departed-vehicle 3e5:17:0.1 -o x",

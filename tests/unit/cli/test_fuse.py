@@ -8,7 +8,7 @@ from services.cli.main import main
 from tests.unit.identification.test_fusing import crossing, write
 
 
-def test_results_that_are_there_twice_are_counted_once_and_that_is_said(
+def test_duplicate_results_count_once_and_are_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     one = write(tmp_path / "one.json", [crossing(n) for n in range(3)])
@@ -21,14 +21,14 @@ def test_results_that_are_there_twice_are_counted_once_and_that_is_said(
     assert "another file" not in capsys.readouterr().out
 
 
-def test_why_one_crossing_has_wider_intervals_is_said_of_one_only(
+def test_wider_intervals_are_explained_for_one_crossing_only(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for number, said in ((1, True), (2, False)):
         path = write(tmp_path / "r.json", [crossing(n) for n in range(number)])
         assert main(["fuse", str(path)]) == 0
         out = " ".join(capsys.readouterr().out.split())
-        assert ("one crossing: intervals are wider than its own" in out) is said
+        assert ("single crossing: intervals include" in out) is said
 
 
 def test_a_recording_is_refused_with_what_is_wanted(

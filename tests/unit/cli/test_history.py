@@ -6,52 +6,52 @@ import pytest
 
 from schemas.results import (
     BridgeResult,
-    Crossing,
-    Header,
+    CrossingResult,
+    ResultHeader,
     Results,
-    Road,
     RoadMismatch,
+    RoadResult,
     Track,
     results,
     results_json,
 )
 from services.cli import main as cli
 from services.cli.parsing import EXIT_SOMETHING_LOST
-from services.execution import kept as kept_module
-from services.execution.kept import BRIDGES, Kept, Result, kept_results
-from services.history.archive import partition, read_partition
+from services.execution import result_store as store_module
+from services.execution.result_store import BRIDGES, ResultStore, StoredResult, kept_results
+from services.history.history_store import partition, read_partition
 from services.identification.bridge_state import with_common_shares
 from services.identification.known import search_hash
 from tests.fleet import DAY_S
-from tests.unit.history.test_archive import BEGIN_S, crossings
+from tests.unit.history.test_history_store import BEGIN_S, crossings
 
-HEADER = Header("0.1.0", BEGIN_S + 50 * DAY_S, "1" * 64, {"method": "pre"}, 7)
+HEADER = ResultHeader("0.1.0", BEGIN_S + 50 * DAY_S, "1" * 64, {"method": "pre"}, 7)
 ENDED = HEADER._replace(created=BEGIN_S + 60 * DAY_S)
 """Of the run that ended last."""
 
 
 @pytest.fixture
-def found() -> list[Crossing]:
+def found() -> list[CrossingResult]:
     """Four crossings of one truck, on roads that differ under the axles."""
     mismatch = RoadMismatch(A_m3=1e-6, n_0_per_m=0.1)
     flat = (0.0, 0.0)
-    road = Road(x_m=(0.0, 1.0), front_m=flat, rear_m=flat, mean_m=flat, mismatch=mismatch)
+    road = RoadResult(x_m=(0.0, 1.0), front_m=flat, rear_m=flat, mean_m=flat, mismatch=mismatch)
     return [one.model_copy(update={"road": road}) for one in crossings(4).crossings]
 
 
 @pytest.fixture
-def into(tmp_path: Path, found: list[Crossing]) -> Path:
+def into(tmp_path: Path, found: list[CrossingResult]) -> Path:
     """Two files of two runs, one crossing in both, as after a client that was killed."""
     folder = tmp_path / "identified"
-    rows = [Result(f"content-{n}", one) for n, one in enumerate(found)]
-    kept = Kept(folder)
+    rows = [StoredResult(f"content-{n}", one) for n, one in enumerate(found)]
+    kept = ResultStore(folder)
     kept.put(rows[:2], HEADER)
     kept.put(rows[1:], HEADER._replace(created=HEADER.created + 60.0))
     (folder / BRIDGES).write_text(results_json(results(ENDED, [], bridges(found))))
     return folder
 
 
-def bridges(found: list[Crossing]) -> dict[str, BridgeResult]:
+def bridges(found: list[CrossingResult]) -> dict[str, BridgeResult]:
     track = Track(vehicle=found[0].vehicle, direction=found[0].direction, common_share=0.4)
     return {"bridge-1": BridgeResult(tracks=(track,))}
 
@@ -61,7 +61,7 @@ def add(what: Path, folder: Path) -> int:
 
 
 def test_a_folder_is_added_once_and_is_what_its_json_is(
-    tmp_path: Path, into: Path, found: list[Crossing], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, into: Path, found: list[CrossingResult], capsys: pytest.CaptureFixture[str]
 ) -> None:
     as_json = tmp_path / "all.json"
     shared = with_common_shares(found, bridges(found))
@@ -102,11 +102,11 @@ def the_larger_of(into: Path) -> Path:
 
 
 def test_results_of_another_search_keep_their_own_head(
-    into: Path, found: list[Crossing], monkeypatch: pytest.MonkeyPatch
+    into: Path, found: list[CrossingResult], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = HEADER._replace(seed=8, created=BEGIN_S)
-    Kept(into).put([Result("other", found[0])], other)
-    monkeypatch.setattr(kept_module, "_MOST_AT_ONCE", 2)
+    ResultStore(into).put([StoredResult("other", found[0])], other)
+    monkeypatch.setattr(store_module, "_MOST_AT_ONCE", 2)
     problems: list[str] = []
     files: list[Results] = list(kept_results(into, problems.append))
     assert problems == []

@@ -17,12 +17,13 @@ import pytest
 from rich.console import Console
 
 from pre_core.paper.experiment import scenario_ratios
-from schemas.certificates import Pair, pair_hash
-from schemas.results import Crossing, Results, load_results
+from schemas.results import CrossingResult, Results, load_results
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
 from schemas.site import Site
 from schemas.site_file import parse_site, site_hash, site_toml
+from schemas.topics import Message
+from schemas.validation_records import VehicleBridgePair, pair_hash
 from services.cli import main as cli
 from services.cli.identify import identify_command
 from services.common.errors import InputError
@@ -30,17 +31,17 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.importing import import_command
 from services.drives.runs import GnssTrack, Run, run_to_messages
 from services.execution.offline import identify_recordings, site_of
-from services.history.certificates import save
-from services.recordings.recording import Message, read_messages, read_site
+from services.history.validation_files import save
+from services.recordings.recording import read_messages, read_site
 from services.recordings.writer import write_recording
-from services.simulation.drive import Drive, paper_site, simulate_drive, write_drive
+from services.simulation.drive import SimulatedDrive, paper_site, simulate_drive, write_drive
 from tests.builders.certificates import certificate
 
 SOUND_NM2 = 1.56e10
 LEAST_SQUARES = IdentificationSettings(method="least_squares")
 
 
-def ratios(crossing: Crossing, sound: float = SOUND_NM2) -> list[float]:
+def ratios(crossing: CrossingResult, sound: float = SOUND_NM2) -> list[float]:
     assert crossing.parameters is not None, crossing.reasons
     return [crossing.parameters[f"EI_{n}"].mean / sound for n in range(1, 8)]
 
@@ -49,13 +50,13 @@ def identified(path: Path) -> Results:
     return identify_recordings([path], site_of([path], None), LEAST_SQUARES)
 
 
-def only(found: Results) -> Crossing:
+def only(found: Results) -> CrossingResult:
     assert len(found.crossings) == 1
     return found.crossings[0]
 
 
 @pytest.fixture(scope="module")
-def recording(scenario_6: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(scenario_6: SimulatedDrive, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("identify") / "drive.mcap"
     write_drive(path, scenario_6, paper_site())
     return path
@@ -105,7 +106,7 @@ def test_scenario_6_within_one_per_cent(recording: Path) -> None:
     assert found == pytest.approx(truck.tyre_stiffness_n_per_m, rel=0.01)
 
 
-def test_the_road_is_the_one_that_was_driven(recording: Path, scenario_6: Drive) -> None:
+def test_the_road_is_the_one_that_was_driven(recording: Path, scenario_6: SimulatedDrive) -> None:
     road = only(identified(recording)).road
     assert road is not None
     x = np.array(road.x_m)
@@ -152,7 +153,7 @@ def test_an_antenna_far_from_the_front_axle_and_a_changing_speed(tmp_path: Path)
     assert ratios(crossing) == pytest.approx(truth, rel=0.02)
 
 
-def test_accelerating_with_an_unknown_centre_of_gravity_is_said(tmp_path: Path) -> None:
+def test_acceleration_with_unknown_centre_of_gravity_is_named(tmp_path: Path) -> None:
     drive = simulate_drive(
         paper_site(), scenario_ratios(6), road_class="A", seed=4, speed_m_per_s=(8.0, 12.0)
     )
@@ -245,7 +246,7 @@ def test_parts_of_a_drive_in_any_order_and_overlapping(recording: Path, tmp_path
     assert unhurried(found) == unhurried(identified(recording))
 
 
-def unhurried(found: Results) -> list[Crossing]:
+def unhurried(found: Results) -> list[CrossingResult]:
     return [
         crossing.model_copy(update={"diagnostics": crossing.diagnostics | {"seconds": 0.0}})
         for crossing in found.crossings
@@ -401,7 +402,9 @@ def test_a_certificate_that_there_is_is_named(
 ) -> None:
     site, folder, out = paper_site(), tmp_path / "certificates", tmp_path / "out.json"
     identify = ["identify", str(recording), "--method", "least-squares", "--json", str(out)]
-    made = certificate(site, hash=pair_hash(site, Pair("truck-1", "bridge-1"), LEAST_SQUARES))
+    made = certificate(
+        site, hash=pair_hash(site, VehicleBridgePair("truck-1", "bridge-1"), LEAST_SQUARES)
+    )
     save(folder, made)
     assert cli.main([*identify, "--validations", str(folder)]) == 0
     assert only(load_results(out)).certificate == made.hash

@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def test_the_sample_is_told_in_full(capsys: pytest.CaptureFixture[str], project: Path) -> None:
+def test_sample_is_printed_in_full(capsys: pytest.CaptureFixture[str], project: Path) -> None:
     code, out, err = run(capsys, "info", project / "recordings/sample/crossing.mcap")
     assert (code, err) == (0, "")
     assert "319 kB, whole" in out
@@ -55,7 +55,7 @@ def test_a_folder_is_a_line_a_file_and_a_sum(
     assert total.endswith(", 2 trucks, 0 crossings")
 
 
-def test_json_tells_everything(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+def test_json_holds_all_fields(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
     code, out, _ = run(capsys, "info", folder, "--json")
     assert code == 0
     by_name = {Path(one["path"]).name: one for one in json.loads(out)["recordings"]}

@@ -31,6 +31,8 @@ OUTPUTS: dict[tuple[str, str], list[str]] = {
     ("identify", "--json"): [str(SAMPLE), "--site", READ],
     ("identify", "--rrd"): [str(SAMPLE), "--site", READ],
     ("import", "--output"): [str(EXAMPLE), "--site", READ, "--force"],
+    ("import", "--picture"): [str(EXAMPLE), "--site", READ],
+    ("import", "--write-map"): [str(EXAMPLE), "--site", READ],
     ("logger", "--file"): ["--site", READ],
     ("recover", "--output"): [READ, "--force"],
     ("report", "--output"): ["results.json", "--site", READ],
@@ -48,7 +50,7 @@ FOLDERS = {
 }  # fmt: skip
 READS = {
     "--site", "--baseline", "--tls", "--validations", "--history", "--truth", "--temperature",
-    "--recordings", "--folder", "--spool",
+    "--recordings", "--folder", "--spool", "--map",
 }  # fmt: skip
 """Options with a path that no file is put to by its own name."""
 
@@ -63,7 +65,11 @@ OTHERS = {
     "notes": "Brücke\n".encode(),
     "binary": b"\x00\xff\x01\xfe" * 10,
 }
-SAME_FAMILY = {("survey", "--figure"): {"picture"}, ("validate", "--records"): {"package"}}
+SAME_FAMILY = {
+    ("import", "--picture"): {"picture"},
+    ("survey", "--figure"): {"picture"},
+    ("validate", "--records"): {"package"},
+}
 
 
 def commands() -> dict[str, argparse.ArgumentParser]:

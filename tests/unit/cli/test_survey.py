@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -11,13 +12,14 @@ import pytest
 from schemas.site import Site
 from schemas.site_file import site_toml
 from services.cli import main as cli
-from services.cli.survey import lines_of
+from services.planning import plan_survey
 from services.planning import survey as planning
 from services.planning.advice import advice, warnings
 from services.planning.alternatives import as_planned, with_noise
-from services.planning.crossings import Road
+from services.planning.crossings import PlannedRoad
 from services.planning.figure import draw_survey
-from services.planning.survey import Asked, Expected, Outlook, Survey
+from services.planning.forecast_text import lines_of
+from services.planning.survey import PlanForecast, SurveyExpectation, SurveyForecast, SurveyQuestion
 from services.simulation.drive import paper_site
 from services.viewer.drawing import STYLE
 from tests.unit.words import assert_words_apart
@@ -42,9 +44,12 @@ def test_a_plan_of_the_example(
     assert single["crossings_needed"]["middle"] < 30
     once, whole = (plan["planned"][key]["std_ln_ei"] for key in ("one_crossing", "all_crossings"))
     assert np.median(whole) < np.median(once)
+    growth = {one["crossings"]: one["std_ln_ei"] for one in plan["growth"]}
+    assert (np.diff([growth[count] for count in sorted(growth)], axis=0) <= 0.0).all()
+    assert growth[planned["crossings"]] == whole
     assert "What helps most: equal single tyres on both axles" in plan["advice"]
     assert plan["advice"] in out
-    assert "nothing is known of the tyres" in out
+    assert "the tyres are not declared" in out
     assert plan["speeds"] == []
     table = [line for line in out.splitlines() if not line.startswith(("warning", "Not even"))]
     assert max(len(line) for line in table) <= 80
@@ -71,21 +76,21 @@ def test_what_is_refused(
     assert error.count("\n") == 1
 
 
-def expected(std: float, crossings: int = 12) -> Expected:
+def expected(std: float, crossings: int = 12) -> SurveyExpectation:
     wide = np.full(7, std)
-    return Expected(crossings, wide, std / 3.0, wide, wide, np.minimum(0.9, 3.0 * wide))
+    return SurveyExpectation(crossings, wide, std / 3.0, wide, wide, np.minimum(0.9, 3.0 * wide))
 
 
-def made_up(needed: int | None, others: dict[str, float], speed: float = 10.0) -> Survey:
+def made_up(needed: int | None, others: dict[str, float], speed: float = 10.0) -> SurveyForecast:
     site = with_noise(paper_site(), (25.0,) * 4)
     plan = as_planned(site, speed)
-    planned = Outlook(plan, expected(0.3, 1), expected(0.2), 3, needed, None)
-    return Survey(
-        Asked(0.2, 12, speed, (speed, speed)),
-        Road("A", 0.12),
+    planned = PlanForecast(plan, expected(0.3, 1), expected(0.2), 3, needed, None)
+    return SurveyForecast(
+        SurveyQuestion(0.2, 12, speed, (speed, speed)),
+        PlannedRoad("A", 0.12),
         planned,
         tuple(
-            Outlook(plan._replace(name=name), expected(std, 1), expected(std), 3, 4, 60)
+            PlanForecast(plan._replace(name=name), expected(std, 1), expected(std), 3, 4, 60)
             for name, std in others.items()
         ),
         (),
@@ -98,7 +103,7 @@ def made_up(needed: int | None, others: dict[str, float], speed: float = 10.0) -
 def test_the_advice_names_what_helps_most() -> None:
     found = made_up(9, {"a trailer": 0.19, "two trucks": 0.1, "a slower truck": 0.15})
     text = advice(found)
-    assert text.startswith("9 crossings at 10 m/s with twin tyres behind show a 20% loss")
+    assert text.startswith("9 crossings at 10 m/s with twin tyres behind show a 20 % loss")
     assert "the ends would take more than 300" in text
     assert "What helps most: two trucks; then 4 crossings do, and the ends need 60." in text
     assert "Next: a slower truck" in text
@@ -111,8 +116,8 @@ def test_the_advice_names_what_helps_most() -> None:
     assert "most: a trailer" in advice(coarse._replace(others=(coarse.others[0], few)))
     blind = advice(made_up(None, {"a trailer": 0.199}))
     assert blind.startswith("Not even 300 crossings")
-    assert "60% or more" in blind
-    assert blind.endswith("Nothing else that was tried here helps by much.")
+    assert "60 % or more" in blind
+    assert blind.endswith("No other change that was tried here helps much.")
 
 
 def test_what_makes_a_survey_blind_is_warned_of() -> None:
@@ -129,11 +134,11 @@ def test_sensors_are_named_and_their_middle_is_planned(
 ) -> None:
     planned: list[Site] = []
 
-    def kept(site: Site, *_: object) -> Survey:
+    def kept(site: Site, *_: object) -> SurveyForecast:
         planned.append(site)
         return made_up(9, {})
 
-    monkeypatch.setattr(planning, "survey", kept)
+    monkeypatch.setattr(plan_survey, "forecast_survey", kept)
     site, found = tmp_path / "site.toml", tmp_path / "plan.json"
     text = site_toml(paper_site())
     places = (("body", 0.0), ("body", 4.4), ("axle", 1), ("axle", 2))
@@ -167,14 +172,48 @@ def test_lines_fit_on_a_terminal() -> None:
     assert max(map(len, tables)) <= 80
 
 
+def test_each_number_of_crossings_is_forecast_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted: list[int] = []
+
+    def expected_once(simulated: object, plan: object, tracks: object, count: int, _: float) -> Any:
+        counted.append(count)
+        return expected(0.3 / np.sqrt(count), count)
+
+    monkeypatch.setattr(planning, "_expected", expected_once)
+    found = made_up(9, {})
+    question = found.question._replace(crossings=12)
+    planned = found.planned._replace(once=expected(0.3, 1), expected=expected(0.1, 12))
+
+    class NoSimulator:
+        """A stand-in whose tracks are never used."""
+
+        def track(self, _: object) -> None:
+            return None
+
+    growth = planning._growth(NoSimulator(), planned, question)  # type: ignore[arg-type]
+    assert [one.crossings for one in growth] == sorted({*planning._COUNTS, 12})
+    assert not {1, 12} & set(counted)
+
+
 def test_needed_is_the_fewest() -> None:
-    def errors_of(crossings: int) -> planning.detection.Errors:
+    def errors_of(crossings: int) -> planning.detection.DetectionErrors:
         std = np.full(3, 0.5 / np.sqrt(crossings))
-        return planning.detection.Errors(std, std)
+        return planning.detection.DetectionErrors(std, std)
 
     needed = planning._needed(errors_of, 0.2, (1,))
     assert needed is not None
-    probability = planning.detection.probability
+    probability = planning.detection.detection_probability
     assert probability(0.2, errors_of(needed).of_nominal)[1] >= 0.95
     assert probability(0.2, errors_of(needed - 1).of_nominal)[1] < 0.95
     assert planning._needed(errors_of, 0.01, (1,)) is None
+
+
+def test_picture_names_bridge_truck_and_threshold() -> None:
+    with matplotlib.rc_context(STYLE):
+        figure = draw_survey(made_up(9, {}))
+    words = [text.get_text() for text in figure.texts]
+    assert words[0] == "Survey of bridge-1 by truck-1"
+    assert "10 m/s" in words[1]
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    assert "95 %" in [text.get_text() for text in legend.get_texts()]

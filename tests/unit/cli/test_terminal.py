@@ -15,13 +15,13 @@ import pytest
 
 from services.cli import terminal
 from services.cli.replay import summary
-from services.replay import Statistics
-from services.replay.choice import Window
-from services.replay.drive import Drive
+from services.replay import ReplayStatistics
+from services.replay.choice import ReplayWindow
+from services.replay.drive import ReplayDrive
 from services.replay.player import Command, Status
 
 S = 1_000_000_000
-DRIVE = Drive((), {}, Window(100 * S, 160 * S), (110 * S, 140 * S), ())
+DRIVE = ReplayDrive((), {}, ReplayWindow(100 * S, 160 * S), (110 * S, 140 * S), ())
 
 
 def status(at_s: float, speed: float = 1.0, *, paused: bool = False, note: str = "") -> Status:
@@ -41,7 +41,7 @@ def test_the_line_says_where_it_is() -> None:
 
 
 def test_where_columns_are_few_the_bar_gives_way_and_the_words_stay() -> None:
-    day = Drive((), {}, Window(0, 29_008 * S), (3 * S, 28_000 * S), ())
+    day = ReplayDrive((), {}, ReplayWindow(0, 29_008 * S), (3 * S, 28_000 * S), ())
     at_rest = Status(60 * S, 10.0, is_paused=True, sent=10_255, note="no crossing ahead")
     wide, narrow, tiny = (terminal.status_line(day, at_rest, width) for width in (99, 79, 64))
     assert [len(line.split("  ")[2]) for line in (wide, narrow)] == [24, 16]
@@ -57,19 +57,21 @@ def test_the_bar_is_full_at_the_end_and_never_fuller() -> None:
         line = terminal.status_line(DRIVE, status(at_s), 99)
         assert "1:00.0 / 1:00.0" in line
         assert line.count("━") == 22
-    hour = Drive((), {}, Window(0, 3700 * S), (), ())
+    hour = ReplayDrive((), {}, ReplayWindow(0, 3700 * S), (), ())
     assert "1:01:40.0" in terminal.status_line(hour, status(0.0), 99)
     assert "crossing" not in terminal.status_line(hour, status(0.0), 99)
-    nothing = Drive((), {}, Window(5, 6), (5,), ())
+    nothing = ReplayDrive((), {}, ReplayWindow(5, 6), (5,), ())
     assert "◆" in terminal.status_line(nothing, status(0.0), 99)
 
 
 def test_the_pace_counts_neither_silence_that_was_passed_over_nor_jumps() -> None:
-    of_all = Statistics("replay-x", {"accel": 9}, (), 1, 1800.0, 4.0, 0, 0.0, is_confirmed=True)
+    of_all = ReplayStatistics(
+        "replay-x", {"accel": 9}, (), 1, 1800.0, 4.0, 0, 0.0, is_confirmed=True
+    )
     assert summary(of_all)[1] == "1800.0 s of the drive in 4.00 s, 450 times real speed"
     lines = summary(of_all._replace(skipped_s=1760.0))
     assert lines[1] == "1800.0 s of the drive in 4.00 s, 10 times real speed"
-    assert "1760.0 s of silence passed over" in lines
+    assert "1760.0 s of silence skipped" in lines
     lines = summary(of_all._replace(jumped_over=7))
     assert lines[1] == "1800.0 s of the drive in 4.00 s"
     assert "7 messages left out by jumps" in lines

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from schemas.certificates import load_certificate, pair_hash
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site, site_toml
+from schemas.validation_records import load_validation, pair_hash
 from services.cli import main as cli
 from services.cli import validate_site
-from services.simulation.certificate import Trial
 from services.simulation.drive import paper_site
-from tests.unit.simulation.test_certificate import made_up
+from services.simulation.validation_trial import ValidationTrial
+from tests.unit.simulation.test_validation_trial import made_up
 
 SETTINGS = IdentificationSettings()
 
@@ -38,7 +38,7 @@ def site(tmp_path: Path) -> Path:
 def made_up_crossings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those on bridge-2 are all rejected."""
 
-    def tried(trial: Trial, *_: Any) -> Iterator[float]:
+    def tried(trial: ValidationTrial, *_: Any) -> Iterator[float]:
         verdict = "good" if trial.pair.bridge == "bridge-1" else "rejected"
         while trial.judgement is None:
             run = trial.next_run()
@@ -46,7 +46,7 @@ def made_up_crossings(monkeypatch: pytest.MonkeyPatch) -> None:
             trial.add(run.number, made_up(run.number, verdict=verdict))
             yield trial.share
 
-    monkeypatch.setattr(validate_site, "tried_in_processes", tried)
+    monkeypatch.setattr(validate_site, "run_trial", tried)
 
 
 def validate(*arguments: object) -> int:
@@ -68,7 +68,7 @@ def test_every_pair_gets_a_line_and_a_file(
     assert "passed (of 12, the rest not needed): 8 of 8 crossings are good" in lines[0]
     assert "EI ± 10 %" in lines[0]
     assert "FAILED (of 12, the rest not needed): 0 of 5 crossings are good" in lines[1]
-    found = {path: load_certificate(path) for path in folder.iterdir()}
+    found = {path: load_validation(path) for path in folder.iterdir()}
     assert len(found) == 4
     assert {one.seed for one in found.values()} == {4}
     known = load_site(site)

@@ -10,9 +10,9 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.cli import main as cli
-from services.cli import watched as watched_module
+from services.cli import realm_model
+from services.cli.realm_model import RealmModel
 from services.cli.watch_page import bars, page, silent_trucks
-from services.cli.watched import Watched
 from tests.unit.cli.watching import (
     NOW_NS,
     NOW_S,
@@ -38,7 +38,7 @@ def site(project: Path) -> Site:
 
 
 def drawn(
-    watched: Watched, width: int = 120, height: int = 40, listened: Listened | None = None
+    watched: RealmModel, width: int = 120, height: int = 40, listened: Listened | None = None
 ) -> list[str]:
     """The lines of the page, without colours."""
     file = io.StringIO()
@@ -105,7 +105,7 @@ def test_bars_say_which_element_is_weak() -> None:
 
 
 def test_lines_for_a_pipe(site: Site) -> None:
-    watched = Watched()
+    watched = RealmModel()
     said = [one for one in drives(watched, "truck-1") if one is not None]
     said += [
         one
@@ -132,8 +132,8 @@ def test_lines_for_a_pipe(site: Site) -> None:
     ]
 
 
-def test_a_truck_that_comes_back_is_said_again() -> None:
-    watched = Watched()
+def test_returning_truck_is_announced_again() -> None:
+    watched = RealmModel()
     assert drives(watched, "truck-1", ago_s=60.0).count("truck-1 drives") == 1
     assert silent_trucks(watched, NOW_S) == {"truck-1"}
     assert drives(watched, "truck-1").count("truck-1 drives") == 1
@@ -141,7 +141,7 @@ def test_a_truck_that_comes_back_is_said_again() -> None:
 
 
 def test_old_samples_are_explained() -> None:
-    watched = Watched()
+    watched = RealmModel()
     drives(watched, "truck-1", lag_s=1356.0)
     lines = drawn(watched)
     assert line(lines, "truck-1").endswith("23 min")
@@ -154,14 +154,14 @@ def test_old_samples_are_explained() -> None:
 
 def test_an_empty_realm_names_the_others() -> None:
     listened = Listened()
-    assert any("Nobody drives yet." in one for one in drawn(Watched(), listened=listened))
+    assert any("No trucks yet." in one for one in drawn(RealmModel(), listened=listened))
     listened.elsewhere = {"sim-demo": {"truck-1"}}
-    lines = drawn(Watched(), listened=listened)
+    lines = drawn(RealmModel(), listened=listened)
     assert "nothing in realm live, but truck-1 in sim-demo: --realm sim-demo" in lines
 
 
 def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
-    watched = Watched()
+    watched = RealmModel()
     tell(watched, health("logger", ok=False, note="disk full"))
     tell(watched, health("worker"))
     tell(watched, progress("worker", "", "validating truck-1 on bridge-1", 0.3))
@@ -173,8 +173,8 @@ def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
 
 def test_what_it_keeps_is_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("_MOST_CROSSINGS", "_MOST_TRUCKS", "_MOST_BRIDGES", "_MOST_SERVICES"):
-        monkeypatch.setattr(watched_module, name, 5)
-    watched = Watched()
+        monkeypatch.setattr(realm_model, name, 5)
+    watched = RealmModel()
     for number in range(20):
         drives(watched, f"truck-{number}", ago_s=20.0 - number)
         tell(watched, estimate(result(site, f"c-{number}", entry=float(number))))
@@ -186,7 +186,7 @@ def test_what_it_keeps_is_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_what_cannot_be_read_is_left_out() -> None:
-    watched = Watched()
+    watched = RealmModel()
     for owner, stream in (
         ("vehicle", "accel"), ("vehicle", "gnss"), ("bridge", "crossing"), ("bridge", "estimate"),
         ("bridge", "state"), ("bridge", "alarm"), ("service", "health"), ("service", "progress"),
@@ -201,7 +201,7 @@ SENTENCE = "element 4 is 10 % weaker than before 2026-08-27, interval 8 to 12 %"
 
 
 def test_an_alarm_is_a_line_until_it_is_another(site: Site) -> None:
-    watched = Watched()
+    watched = RealmModel()
     said = [tell(watched, one) for one in (alarm(), alarm(), alarm(by="owner"), alarm(by="owner"))]
     assert said == [
         f"alarm of bridge-1: {SENTENCE}: stands",
@@ -241,8 +241,8 @@ def test_a_bridge_with_an_alarm_is_among_those_that_are_shown(site: Site) -> Non
 def test_where_there_is_no_room_an_alarm_that_stands_is_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(watched_module, "_MOST_BRIDGES", 2)
-    watched = Watched()
+    monkeypatch.setattr(realm_model, "_MOST_BRIDGES", 2)
+    watched = RealmModel()
     tell(watched, alarm("stands", raised=1.0))
     for number in range(4):
         tell(watched, alarm(f"old-{number}", by="owner", raised=2.0 + number))
@@ -260,7 +260,7 @@ def test_bad_options_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
 def test_absent_alarms_are_no_reassurance_on_the_page(site: Site) -> None:
     """The page cannot know whether bridges are watched, and says so until an alarm comes."""
     said = "No alarm was received; it is not known here whether driveby alarm serve watches"
-    watched = Watched()
+    watched = RealmModel()
     assert not any(one.startswith(said) for one in drawn(watched))
     tell(watched, bridge_state(site))
     assert line(drawn(watched), said).endswith("any bridge.")

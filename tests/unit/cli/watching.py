@@ -6,18 +6,18 @@ import numpy as np
 
 from schemas.alarms import Acknowledgement, Alarm, encode_alarm
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing, Header
+from schemas.results import CrossingResult, ResultHeader
 from schemas.results_on_the_wire import bridge_to_protobuf, crossing_to_protobuf
-from schemas.signals import AccelBatch, Channel, GnssFix, Identity, encode_accel, encode_gnss
+from schemas.signals import AccelBatch, AccelChannel, GnssFix, Identity, encode_accel, encode_gnss
 from schemas.site import Site
 from schemas.topics import Key
-from services.bus.listening import Heard
-from services.cli.watched import Watched
+from services.bus.realm_listener import BusMessage
+from services.cli.realm_model import RealmModel
 from tests.unit.viewer.found import RATIOS, results_of, some_crossing
 
 NOW_NS = 1_790_000_600_000_000_000
 NOW_S = 5000.0
-HEADER = Header("0.1.0", 1.79e9, "hash", {}, 1)
+HEADER = ResultHeader("0.1.0", 1.79e9, "hash", {}, 1)
 
 
 class Listened:
@@ -29,17 +29,17 @@ class Listened:
         self.elsewhere: dict[str, set[str]] = {}
 
 
-def heard(owner: Any, name: str, stream: str, payload: bytes) -> Heard:
-    return Heard(Key("live", owner, name, stream), Identity(1, 0), payload)
+def heard(owner: Any, name: str, stream: str, payload: bytes) -> BusMessage:
+    return BusMessage(Key("live", owner, name, stream), Identity(1, 0), payload)
 
 
-def tell(watched: Watched, message: Heard, ago_s: float = 0.0) -> str | None:
+def tell(watched: RealmModel, message: BusMessage, ago_s: float = 0.0) -> str | None:
     """A message that came so long before now."""
-    return watched.take(message, NOW_S - ago_s, NOW_NS - round(ago_s * 1e9))
+    return watched.ingest(message, NOW_S - ago_s, NOW_NS - round(ago_s * 1e9))
 
 
 def drives(
-    watched: Watched, name: str, *, ago_s: float = 0.0, lag_s: float = 0.1, channels: int = 4
+    watched: RealmModel, name: str, *, ago_s: float = 0.0, lag_s: float = 0.1, channels: int = 4
 ) -> list[str | None]:
     """Five seconds of a truck: 20 batches and 10 fixes a second."""
     names = ("sprung_front", "sprung_rear", "unsprung_front", "unsprung_rear")[:channels]
@@ -47,7 +47,7 @@ def drives(
     for number in range(100):
         since_s = ago_s + 4.95 - 0.05 * number
         time_ns = NOW_NS - round((since_s + lag_s + 0.05) * 1e9)
-        batch = {one: Channel(1000.0, np.zeros(50)) for one in names}
+        batch = {one: AccelChannel(1000.0, np.zeros(50)) for one in names}
         payload = encode_accel(AccelBatch(1, number, number, time_ns, batch))
         said.append(tell(watched, heard("vehicle", name, "accel", payload), since_s))
         if number % 2 == 0:
@@ -62,7 +62,7 @@ def state(
     vehicle: str,
     entry: float,
     bridge: str = "bridge-1",
-) -> Heard:
+) -> BusMessage:
     entry_ns = 1_790_000_000_000_000_000 + round(entry * 1e9)
     message = pb.Crossing(
         schema_version=1, crossing_id=crossing_id, vehicle=vehicle, bridge=bridge,
@@ -79,7 +79,7 @@ def result(
     bridge: str = "bridge-1",
     ratios: np.ndarray = RATIOS,
     **changes: Any,
-) -> Crossing:
+) -> CrossingResult:
     """With priors, as method pre gives them."""
     found = results_of(site, some_crossing(name, **changes), ratios=ratios)
     given = found.crossings[0].model_dump() | {"vehicle": vehicle, "bridge": bridge}
@@ -87,10 +87,10 @@ def result(
     for one, value in (given["parameters"] or {}).items():
         if one.startswith("EI_"):
             value["prior"] = {"distribution": "log_normal", "location": nominal, "scale": 0.55}
-    return Crossing.model_validate(given)
+    return CrossingResult.model_validate(given)
 
 
-def estimate(crossing: Crossing) -> Heard:
+def estimate(crossing: CrossingResult) -> BusMessage:
     payload = crossing_to_protobuf(crossing, HEADER).SerializeToString()
     return heard("bridge", crossing.bridge, "estimate", payload)
 
@@ -108,7 +108,7 @@ def bridge_state(
     *,
     crossings: int = 3,
     ratios: np.ndarray = RATIOS,
-) -> Heard:
+) -> BusMessage:
     found = results_of(site, some_crossing("a"), used="a", ratios=ratios).bridges["bridge-1"]
     used = tuple(f"c-{n}" for n in range(crossings))
     changes = {"verdict": "good", "crossings_used": used, "finding": finding}
@@ -123,7 +123,7 @@ def alarm(
     element: int = 4,
     since: float = 1.7878e9,
     raised: float = 1.7899e9,
-) -> Heard:
+) -> BusMessage:
     """An element has lost a tenth; acknowledged if it is said by whom."""
     note = Acknowledgement(by=by, time=raised + 1.0) if by else None
     found = Alarm(
@@ -134,7 +134,7 @@ def alarm(
     return heard("bridge", bridge, "alarm", encode_alarm(found, NOW_NS))
 
 
-def health(name: str, *, ok: bool = True, note: str = "", **figures: float) -> Heard:
+def health(name: str, *, ok: bool = True, note: str = "", **figures: float) -> BusMessage:
     message = pb.Health(
         schema_version=1, time_ns=NOW_NS - 12_000_000_000, service=name, ok=ok,
         figures=figures, note=note,
@@ -142,16 +142,16 @@ def health(name: str, *, ok: bool = True, note: str = "", **figures: float) -> H
     return heard("service", name, "health", message.SerializeToString())
 
 
-def progress(name: str, crossing_id: str, stage: str, fraction: float) -> Heard:
+def progress(name: str, crossing_id: str, stage: str, fraction: float) -> BusMessage:
     message = pb.Progress(
         schema_version=1, time_ns=NOW_NS, crossing_id=crossing_id, stage=stage, fraction=fraction
     )
     return heard("service", name, "progress", message.SerializeToString())
 
 
-def a_morning(site: Site) -> Watched:
+def a_morning(site: Site) -> RealmModel:
     """Three trucks, one of them gone; crossings good, doubtful, rejected and on their way."""
-    watched = Watched()
+    watched = RealmModel()
     drives(watched, "truck-1")
     drives(watched, "truck-2", lag_s=0.4)
     drives(watched, "truck-3", ago_s=300.0)
@@ -176,9 +176,9 @@ def a_morning(site: Site) -> Watched:
     return watched
 
 
-def a_fleet(site: Site) -> Watched:
+def a_fleet(site: Site) -> RealmModel:
     """Three trucks and four bridges: an alarm of one stands, that of another is acknowledged."""
-    watched = Watched()
+    watched = RealmModel()
     drives(watched, "truck-1")
     drives(watched, "truck-2", lag_s=0.4)
     drives(watched, "truck-3", ago_s=300.0)

@@ -161,8 +161,6 @@ def test_equal_ends_have_no_frame() -> None:
 
 def test_the_site_files_own_distance_agrees(shared_sites, csv_example) -> None:  # type: ignore[no-untyped-def]
     for path in [*shared_sites, csv_example / "site.toml"]:
-        if path.parent.name.startswith("d12_"):  # three axles are refused (test_site_axles)
-            continue
         bridge = load_site(path).bridges[0]
         assert bridge.ends_distance_m == pytest.approx(
             bridge_frame(bridge).ground_length_m, rel=1e-6

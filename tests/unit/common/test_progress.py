@@ -8,12 +8,12 @@ from rich.console import Console
 
 from schemas.settings import IdentificationSettings
 from schemas.site_file import load_site
+from services.catalogue.contents import summarise_recording
 from services.common.progress import parts_bar, reading_bar, steps_bar
 from services.drives.importing import import_command
 from services.drives.signals import signals_of_recording
-from services.drives.survey import survey
 from services.execution.offline import identify_recordings, site_of
-from services.identification.bridge_state import Counted, count_in, state_of, usable
+from services.identification.bridge_state import RecentCrossings, add_crossings, state_of, usable
 from services.recordings.recovery import recover_recording
 from services.recordings.writer import write_recording
 from services.report.bridge import bridge_reports
@@ -33,12 +33,12 @@ def recording(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("work", ["survey", "signals", "recover", "view"])
-def test_what_reads_a_recording_tells_how_far_it_is(recording: Path, work: str) -> None:
+def test_reading_a_recording_reports_progress(recording: Path, work: str) -> None:
     told: list[int] = []
     out = recording.with_name("out")
     match work:
         case "survey":
-            survey(recording, progress=told.append)
+            summarise_recording(recording, progress=told.append)
         case "signals":
             signals_of_recording(recording, told.append)
         case "recover":
@@ -86,7 +86,7 @@ def test_steps_are_a_bar_with_the_time_that_is_left() -> None:
 
 
 @pytest.mark.parametrize("work", ["view", "pictures", "report", "import"])
-def test_what_is_made_is_told_step_by_step_up_to_the_last(
+def test_each_step_is_reported_up_to_the_last(
     work: str, recording: Path, tmp_path: Path, project: Path
 ) -> None:
     told: list[tuple[int, int]] = []
@@ -138,7 +138,7 @@ def test_parts_are_a_bar_that_moves_within_each_and_never_back() -> None:
     assert ":" in last.partition("truck")[2]  # the time that is left
 
 
-def test_of_an_unknown_number_of_parts_no_time_is_said() -> None:
+def test_unknown_number_of_parts_shows_no_remaining_time() -> None:
     shown = io.StringIO()
     terminal = Console(file=shown, force_terminal=True, width=120, color_system=None)
     with parts_bar("crossing", 0, terminal) as report:
@@ -149,7 +149,7 @@ def test_of_an_unknown_number_of_parts_no_time_is_said() -> None:
     assert ":" not in last.partition("half")[2]
 
 
-def test_a_crossing_tells_how_far_it_is_up_to_the_end(project: Path) -> None:
+def test_crossing_reports_progress_up_to_the_end(project: Path) -> None:
     told: dict[str, list[float]] = {}
     stages: list[str] = []
 
@@ -167,14 +167,16 @@ def test_a_crossing_tells_how_far_it_is_up_to_the_end(project: Path) -> None:
     assert all(0.0 <= fraction <= 1.0 for fraction in fractions)
     assert stages[-1] == "done"
     of_bridge: list[float] = []
-    counted = count_in(Counted(), [one for one in map(usable, found.crossings) if one is not None])
+    counted = add_crossings(
+        RecentCrossings(), [one for one in map(usable, found.crossings) if one is not None]
+    )
     state_of(counted, "bridge", report=lambda stage, fraction: of_bridge.append(fraction))
     assert of_bridge == sorted(of_bridge)
     assert len(set(of_bridge)) > 4
     assert 0.0 <= of_bridge[0] < of_bridge[-1] < 1.0
 
 
-def test_printing_tells_how_much_of_the_usual_time_has_passed(tmp_path: Path) -> None:
+def test_progress_shows_the_share_of_the_usual_time(tmp_path: Path) -> None:
     """A browser that waits until it is told to go on, and then prints."""
     told: list[tuple[int, int]] = []
     go = tmp_path / "go"

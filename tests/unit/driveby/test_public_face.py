@@ -16,17 +16,20 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import driveby
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS
+from schemas.topics import Message
 from services.cli import main as cli
 from services.common import extras
 from services.notebook import identify as identifying
 from services.notebook import simulate as simulating
-from services.recordings.recording import Message, read_messages
+from services.recordings.recording import read_messages
 from services.recordings.writer import write_recording
-from services.simulation.drive import Drive, paper_site
+from services.simulation import drive as driving
+from services.simulation.drive import SimulatedDrive, paper_site
+from tests.unit.identification.test_fusing import crossing, write
 
 
 @pytest.fixture(scope="module")
-def simulation(scenario_6: Drive) -> driveby.Simulation:
+def simulation(scenario_6: SimulatedDrive) -> driveby.Simulation:
     """Without noise: least squares find what was put in."""
     return driveby.Simulation(scenario_6, paper_site())
 
@@ -172,6 +175,19 @@ def test_channels_of_two_rates_stand_in_one_table(simulation: driveby.Simulation
     assert not table["sprung_front"].isna().any()
 
 
+def with_gravity(path: Path, up: list[float]) -> None:
+    """Let the accelerometers of a file feel gravity, mounted this way up."""
+    heading, *lines = path.read_text().splitlines()
+    rows = [[float(cell) for cell in line.split(",")[1:]] for line in lines]
+    felt = np.array(rows) + 9.80665 * np.array(up)
+    times = [line.split(",")[0] for line in lines]
+    text = [
+        ",".join([time_s, *(f"{a:.6f}" for a in row)])
+        for time_s, row in zip(times, felt, strict=True)
+    ]
+    path.write_text("\n".join([heading, *text, ""]))
+
+
 def test_a_folder_is_read_as_its_site_file_says(csv_example: Path, tmp_path: Path) -> None:
     (plain,) = driveby.read(csv_example)
     assert plain.vehicle != ""
@@ -181,15 +197,18 @@ def test_a_folder_is_read_as_its_site_file_says(csv_example: Path, tmp_path: Pat
         "[sensor]", "[sensor]\nup = [1, 1, -1, -1]\ngravity_included = true"
     )
     site.write_text(text)
+    with_gravity(folder / "accel_00.csv", [1.0, 1.0, -1.0, -1.0])
     (turned,) = driveby.read(folder)
-    measured = plain.channels["unsprung_front"].acceleration_m_per_s2
+    measured = plain.channels["unsprung_front"].acceleration_m_per_s2 - 9.80665
     np.testing.assert_allclose(
-        turned.channels["unsprung_front"].acceleration_m_per_s2, -measured - 9.80665
+        turned.channels["unsprung_front"].acceleration_m_per_s2, -measured - 9.80665, atol=1e-9
     )
     elsewhere = site.rename(tmp_path / "elsewhere.toml")
     (raw,) = driveby.read(folder)
     assert raw.vehicle == ""
-    np.testing.assert_array_equal(raw.channels["unsprung_front"].acceleration_m_per_s2, measured)
+    np.testing.assert_allclose(
+        raw.channels["unsprung_front"].acceleration_m_per_s2, measured, atol=1e-9
+    )
     for site_given in (elsewhere, str(elsewhere), driveby.load_site(elsewhere)):
         (given,) = driveby.read(folder, site=site_given)
         np.testing.assert_array_equal(
@@ -260,6 +279,26 @@ def test_the_command_line_says_the_same(
     first, second = (arviz.from_netcdf(path).posterior for path in paths[2:])
     assert first.equals(second)
     assert first.equals(found.posterior())
+
+
+def test_results_are_short_in_a_notebook(
+    found: driveby.Identification, simulation: driveby.Simulation
+) -> None:
+    """All of it was 212,951 characters."""
+    (solution,) = found.solutions
+    for one in (found, solution, simulation, simulation.signals):
+        assert len(repr(one)) < 500
+    assert f"{solution.crossing.crossing_id}: good" in repr(found)
+    assert repr(solution) in repr(found)
+    many = found._replace(solutions=(solution,) * 1000)
+    assert repr(many).endswith("980 more")
+    for page in (found._repr_html_(), solution._repr_html_()):
+        assert len(page) < 5000
+        assert page.count("<tr>") == 8
+        assert "<td>EI_4</td><td>12.9 to 17.1</td>" in page
+    assert "980 more crossings" in many._repr_html_()
+    named = solution.crossing.model_copy(update={"vehicle": "<b>x</b>"})
+    assert "<b>x" not in solution._replace(crossing=named)._repr_html_()
 
 
 def test_draws_may_be_forgotten(
@@ -374,12 +413,12 @@ def test_simulate_is_the_command(tmp_path: Path) -> None:
     assert mine.read_bytes() == theirs.read_bytes()
 
 
-def test_simulate_is_exact_unless_told_otherwise(
-    scenario_6: Drive, monkeypatch: pytest.MonkeyPatch
+def test_simulate_is_exact_by_default(
+    scenario_6: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: dict[str, object] = {}
 
-    def spy(*_: object, **options: object) -> Drive:
+    def spy(*_: object, **options: object) -> SimulatedDrive:
         asked.update(options)
         return scenario_6
 
@@ -390,12 +429,32 @@ def test_simulate_is_exact_unless_told_otherwise(
     assert simulation.site != driveby.simulate(scenario=6, noise=1.0).site
 
 
+def test_simulate_drives_over_a_given_profile(
+    scenario_6: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def spy(*_: object, **options: object) -> SimulatedDrive:
+        asked.update(options)
+        return scenario_6
+
+    monkeypatch.setattr(simulating, "simulate_drive", spy)
+    x_m = np.arange(-50.0, 90.0, 0.05)
+    driveby.simulate(scenario=6, road=(x_m, 0.002 * np.sin(x_m)))
+    driven = driving._profile(-61.3, 75.2, asked["road_class"], 1)
+    assert np.allclose(np.diff(driven.x_m), 0.01)
+    assert (driven.x_m[0], driven.x_m[-1]) == pytest.approx((-62.0, 76.0))
+    inside = (driven.x_m > -50.0) & (driven.x_m < 89.0)
+    assert np.allclose(driven.height_m[inside], 0.002 * np.sin(driven.x_m[inside]), atol=1e-6)
+    assert np.ptp(driven.height_m[driven.x_m < -50.0]) == 0.0
+
+
 def test_simulate_computes_with_one_thread_of_blas(
-    scenario_6: Drive, monkeypatch: pytest.MonkeyPatch
+    scenario_6: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inside: list[int] = []
 
-    def spy(*_: object, **__: object) -> Drive:
+    def spy(*_: object, **__: object) -> SimulatedDrive:
         inside.extend(x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas")
         return scenario_6
 
@@ -441,6 +500,10 @@ def test_plot_draws_estimate_and_truth(
         (lambda: driveby.simulate(ei=[1.0, 0.5]), "gives 2 elements"),
         (lambda: driveby.simulate(ei=[0.0] * 7), "ei is 0, it must be from 0.001 to 1000"),
         (lambda: driveby.simulate(scenario=6, road="F"), 'road is "F"'),
+        (lambda: driveby.simulate(scenario=6, road=([0, 1], [0])), "road has shapes (2,) and (1,)"),
+        (lambda: driveby.simulate(scenario=6, road=([0, 0], [0, 1])), "that do not increase"),
+        (lambda: driveby.simulate(scenario=6, road=([0, 1], [0, np.nan])), "not finite numbers"),
+        (lambda: driveby.simulate(scenario=6, road=([0, 1], "ab")), "that are no numbers"),
         (lambda: driveby.simulate(scenario=6, speed=0.0), "speed is 0, it must be from 0.1 to 60"),
         (lambda: driveby.simulate(scenario=6, rate=0.0), "rate is 0, it must be from 50"),
         (lambda: driveby.simulate(scenario=6, noise=-1.0), "noise is -1"),
@@ -448,7 +511,7 @@ def test_plot_draws_estimate_and_truth(
         (lambda: driveby.simulate(scenario=6, site="no.toml"), "no.toml: no such file"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(call: Callable[[], object], words: str) -> None:
+def test_wrong_input_gives_one_line(call: Callable[[], object], words: str) -> None:
     with pytest.raises(driveby.InputError) as caught:
         call()
     assert words in str(caught.value)
@@ -485,3 +548,55 @@ def test_a_text_is_a_path(csv_example: Path) -> None:
     assert driveby.load_site(str(path)) == driveby.load_site(path)
     with pytest.raises(driveby.InputError, match=r"none\.toml: no such file"):
         driveby.load_site("none.toml")
+
+
+# -- fuse, survey, report
+
+
+def test_fused_bridge_is_that_of_the_command_line(tmp_path: Path) -> None:
+    one = write(tmp_path / "one.json", [crossing(n) for n in range(3)])
+    other = write(tmp_path / "other.json", [crossing(n) for n in range(2, 5)])
+    assert cli.main(["fuse", str(one), str(other), "--json", str(tmp_path / "a.json")]) == 0
+    fused = driveby.fuse(one, str(other))
+    fused.to_json(tmp_path / "b.json")
+    mine, theirs = (json.loads((tmp_path / n).read_text()) for n in ("a.json", "b.json"))
+    del mine["created"], theirs["created"]
+    assert mine == theirs
+    assert list(fused.bridges) == ["bridge-1"]
+    assert repr(fused).startswith("<Fusion bridge-1: 5 crossings fused, good")
+    assert "<td>EI_1</td>" in fused._repr_html_()
+    again = driveby.fuse(fused.results, baseline=fused.results)
+    assert again.bridges["bridge-1"].probability_of_loss is not None
+    with pytest.raises(driveby.InputError, match="no results given"):
+        driveby.fuse()
+
+
+def test_survey_is_that_of_the_command_line(
+    tmp_path: Path, project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site, out = project / "docs/site.example.toml", tmp_path / "a.json"
+    given = ["--crossings", "2", "--speed", "10", "--json", str(out)]
+    assert cli.main(["survey", "--site", str(site), *given]) == 0
+    found = driveby.survey(site, crossings=2, speed=10.0)
+    assert json.loads(out.read_text()) == json.loads(json.dumps(found.as_dict()))
+    assert repr(found) == capsys.readouterr().out.strip()
+    with pytest.raises(driveby.InputError, match="crossings is 0, it must be from 1 to 300"):
+        driveby.survey(site, crossings=0)
+    with pytest.raises(driveby.InputError, match='road is "F", it must be one of A, B, C, D, E'):
+        driveby.survey(site, road="F")
+
+
+def test_report_is_that_of_the_command_line(
+    found: driveby.Identification, sample: Path, tmp_path: Path
+) -> None:
+    found.to_json(tmp_path / "found.json")
+    shutil.copy(sample, tmp_path)
+    theirs = tmp_path / "theirs.html"
+    assert cli.main(["report", str(tmp_path / "found.json"), "-o", str(theirs)]) == 0
+    mine = driveby.report(found, output=tmp_path / "mine.html")
+    named = mine.read_text().replace(">identification; ", ">found.json; ")
+    assert named == theirs.read_text()
+    again = driveby.report(tmp_path / "found.json", output=tmp_path / "again.html")
+    assert again.read_text() == theirs.read_text()
+    with pytest.raises(driveby.InputError, match="the name of an HTML file"):
+        driveby.report(found, output=tmp_path / "mine.pdf")

@@ -20,5 +20,5 @@ def test_every_snippet_runs(project: Path, tmp_path: Path, monkeypatch: pytest.M
         line = text[: snippet.start(1)].count("\n")
         exec(compile("\n" * line + snippet[1], str(page), "exec"), names)  # noqa: S102
     written = {path.name for path in tmp_path.iterdir()}
-    assert written == {"recordings", "draws.nc", "crossing.png", "drive.mcap"}
+    assert written == {"recordings", "draws.nc", "crossing.png", "drive.mcap", "report.html"}
     assert str(names["figure"]).startswith("Figure(")

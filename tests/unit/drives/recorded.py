@@ -4,9 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from schemas.signals import AccelBatch, Channel, GnssFix, encode_accel, encode_gnss
-from schemas.topics import Key
-from services.recordings.recording import Message
+from schemas.signals import AccelBatch, AccelChannel, GnssFix, encode_accel, encode_gnss
+from schemas.topics import Key, Message
 
 S = 1_000_000_000
 START_NS = 1_700_000_000 * S
@@ -20,7 +19,7 @@ def drive(
         time_ns = START_NS + round(begin_s * S) + number * 50_000_000
         where = Key("live", "vehicle", vehicle, "accel")
         if number not in leave_out:
-            channel = Channel(1000.0, np.zeros(50))
+            channel = AccelChannel(1000.0, np.zeros(50))
             batch = AccelBatch(
                 boot_id, number, number * 50_000_000, time_ns, {"sprung_front": channel}
             )

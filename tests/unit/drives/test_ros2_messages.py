@@ -96,7 +96,7 @@ def test_a_velocity_may_have_a_covariance() -> None:
         (ros2.imu(STAMP_NS, 0.0, "f" * 5000), "at most 4096"),
     ],
 )
-def test_what_is_wrong_is_said(payload: bytes, why: str) -> None:
+def test_wrong_input_is_named(payload: bytes, why: str) -> None:
     with pytest.raises(ValueError, match=why):
         decode(IMU, payload)
 

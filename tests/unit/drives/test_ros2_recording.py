@@ -106,7 +106,7 @@ def test_a_channel_that_the_site_does_not_name_is_not_there(
     assert set(run.channels) == set(ros2.TOPICS) - {"unsprung_front"}
 
 
-def test_what_was_left_out_is_told(
+def test_excluded_data_are_reported(
     messages: list[ros2.Ros], site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lacking = [
@@ -426,7 +426,7 @@ def test_a_name_under_which_another_file_would_be_opened_is_refused(
     assert "as there is a ?, # or % in its path" in capsys.readouterr().err
 
 
-def test_messages_that_are_not_in_the_file_yet_are_told(
+def test_messages_not_yet_in_the_file_are_reported(
     messages: list[ros2.Ros], tmp_path: Path, complaint: Complaint
 ) -> None:
     """As a recorder leaves it that was killed: what came last is in the log beside the file."""

@@ -10,7 +10,7 @@ from schemas.signals import GnssFix, encode_gnss
 from schemas.site import Site
 from schemas.site_file import parse_site, site_toml
 from services.common.errors import InputError
-from services.drives.ros2_complaints import WRONG_RATE
+from services.drives.ros2_anomalies import WRONG_RATE
 from services.drives.ros2_messages import FIX, IMU, TWIST
 from services.drives.ros2_samples import RateError
 from services.drives.ros2_truck import Accel, Ros2Truck
@@ -42,7 +42,7 @@ def accelerations(of: Ros2Truck, make: Callable[[int], bytes], count: int = 20) 
     found: list[Accel | GnssFix] = []
     for number in range(count):
         stamp_ns = FIRST_NS + number * 1_000_000
-        found += of.take(FRONT, IMU, make(stamp_ns), stamp_ns)
+        found += of.convert(FRONT, IMU, make(stamp_ns), stamp_ns)
     found += of.finish()
     batches = [one.channels["sprung_front"].samples for one in found if isinstance(one, Accel)]
     return np.concatenate(batches) if batches else np.empty(0)
@@ -71,7 +71,7 @@ a = {{ topic = "{FRONT}" }}
     found: list[Accel | GnssFix] = []
     for number in range(20):
         stamp_ns = FIRST_NS + number * 2_000_000
-        found += one.take(FRONT, IMU, ros2.imu(stamp_ns, 1.5), stamp_ns)
+        found += one.convert(FRONT, IMU, ros2.imu(stamp_ns, 1.5), stamp_ns)
     found += one.finish()
     batches = [batch for batch in found if isinstance(batch, Accel)]
     assert {name for batch in batches for name in batch.channels} == {"a"}
@@ -106,11 +106,11 @@ def test_messages_of_another_frame_and_without_accelerometer_are_left_out() -> N
     of = truck(text)
     assert accelerations(of, lambda at: ros2.imu(at, 0.0, "rear")).size == 0
     kind = "messages of another frame, left out"
-    assert f"{FRONT}: 20 {kind} (the first 'rear', not 'front')" in of.complaints.news()
+    assert f"{FRONT}: 20 {kind} (the first 'rear', not 'front')" in of.anomalies.news()
     of = truck()
     none = np.array([-1.0, *np.zeros(8)])
     assert accelerations(of, lambda at: ros2.imu(at, 0.0, covariance=none)).size == 0
-    assert of.complaints.count(FRONT, "messages that say they have no acceleration, left out") == 20
+    assert of.anomalies.count(FRONT, "messages that say they have no acceleration, left out") == 20
 
 
 def test_a_topic_is_one_sensor_s() -> None:
@@ -123,13 +123,13 @@ def test_a_topic_is_one_sensor_s() -> None:
             for which in (0, 1):
                 stamp_ns = at + which * 300_000
                 payload = ros2.imu(stamp_ns, float(which), frames[which])
-                found += of.take(FRONT, IMU, payload, stamp_ns, publishers[which])
+                found += of.convert(FRONT, IMU, payload, stamp_ns, publishers[which])
         found += of.finish()
         batches = [one.channels["sprung_front"] for one in found if isinstance(one, Accel)]
         assert {batch.rate_hz for batch in batches} == {1000.0}
         samples = np.concatenate([batch.samples for batch in batches])
         np.testing.assert_allclose(samples, np.zeros(3000), atol=4e-15)
-        assert of.complaints.count(FRONT, "messages of a second sensor, left out") == 3000
+        assert of.anomalies.count(FRONT, "messages of a second sensor, left out") == 3000
 
 
 def test_a_sensor_that_was_started_anew_goes_on() -> None:
@@ -138,11 +138,11 @@ def test_a_sensor_that_was_started_anew_goes_on() -> None:
     for publisher, frame, begin in ((b"one", "a", 0), (b"two", "a", 4000), (b"two", "b", 8000)):
         for number in range(begin, begin + 2500):
             stamp_ns = FIRST_NS + number * 1_000_000
-            found += of.take(FRONT, IMU, ros2.imu(stamp_ns, 1.0, frame), stamp_ns, publisher)
+            found += of.convert(FRONT, IMU, ros2.imu(stamp_ns, 1.0, frame), stamp_ns, publisher)
     found += of.finish()
     batches = [one.channels["sprung_front"] for one in found if isinstance(one, Accel)]
     assert sum(batch.samples.size for batch in batches) == 7500
-    assert of.complaints.count(FRONT, "times that another sensor went on") == 2
+    assert of.anomalies.count(FRONT, "times that another sensor went on") == 2
 
 
 def drive(
@@ -152,7 +152,7 @@ def drive(
     found: list[Accel | GnssFix] = []
     for number in range(count):
         stamp_ns = FIRST_NS + round((begin_s + number / rate_hz) * 1e9)
-        found += of.take(FRONT, IMU, ros2.imu(stamp_ns, rate_hz), stamp_ns, publisher)
+        found += of.convert(FRONT, IMU, ros2.imu(stamp_ns, rate_hz), stamp_ns, publisher)
     return values(found)
 
 
@@ -170,12 +170,12 @@ def test_wrong_rate_ends_a_truck_only_where_nobody_takes_it() -> None:
     of = truck(wrong_rate=errors.append)
     assert drive(of, b"one", 0.0, 900, 400.0) == []
     assert [error.samples for error in errors] == [801]  # of two seconds
-    assert of.complaints.count(FRONT, WRONG_RATE) == 900
-    (refusals,) = of.complaints.refusals()
+    assert of.anomalies.count(FRONT, WRONG_RATE) == 900
+    (refusals,) = of.anomalies.refusals()
     assert (refusals.topic, refusals.refused, refusals.dropped) == (FRONT, 900, 0)
     assert "900 messages at a wrong rate, left out (its stamps give a rate of 400" in refusals.text
-    of.complaints.reported(FRONT)
-    assert of.complaints.refusals() == []
+    of.anomalies.reported(FRONT)
+    assert of.anomalies.refusals() == []
 
 
 def test_topic_of_a_stranger_with_a_wrong_rate_is_free_again() -> None:
@@ -205,12 +205,12 @@ def test_end_of_a_drive_is_not_lost_by_a_wrong_rate() -> None:
     rear = ros2.TOPICS["sprung_rear"]
     for number in range(50):
         stamp_ns = FIRST_NS + number * 2_500_000
-        of.take(FRONT, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns)
+        of.convert(FRONT, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns)
         stamp_ns = FIRST_NS + number * 1_000_000
-        of.take(rear, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns)
+        of.convert(rear, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns)
     left = of.finish()
     assert [tuple(one.channels) for one in left if isinstance(one, Accel)] == [("sprung_rear",)]
-    assert of.complaints.count(FRONT, WRONG_RATE) == 50
+    assert of.anomalies.count(FRONT, WRONG_RATE) == 50
 
 
 def test_a_clock_that_was_ahead_at_first_does_not_stop_the_truck_s_own() -> None:
@@ -220,7 +220,7 @@ def test_a_clock_that_was_ahead_at_first_does_not_stop_the_truck_s_own() -> None
     for ahead_s, count in ((3600, 3000), (0, 5000)):
         for number in range(count):
             stamp_ns = FIRST_NS + ahead_s * 10**9 + number * 1_000_000
-            found += of.take(FRONT, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns)
+            found += of.convert(FRONT, IMU, ros2.imu(stamp_ns, 0.0), stamp_ns)
     found += of.finish()
     times = [one.device_time_ns for one in found if isinstance(one, Accel)]
     assert times == sorted(set(times))
@@ -231,20 +231,20 @@ def test_stamps_must_be_near_the_time_of_sending() -> None:
     of = truck()
     payload = ros2.imu(FIRST_NS, 0.0)
     for sent_ns in (FIRST_NS + 1_000_000_001, FIRST_NS - 1_000_000_001, 0):
-        assert of.take(FRONT, IMU, payload, sent_ns) == []
-    assert of.complaints.count(FRONT, "stamps too far from when they were sent") == 3
-    of.take(FRONT, IMU, payload, FIRST_NS + 1_000_000_000)
-    assert of.complaints.count(FRONT, "stamps too far from when they were sent") == 3
+        assert of.convert(FRONT, IMU, payload, sent_ns) == []
+    assert of.anomalies.count(FRONT, "stamps too far from when they were sent") == 3
+    of.convert(FRONT, IMU, payload, FIRST_NS + 1_000_000_000)
+    assert of.anomalies.count(FRONT, "stamps too far from when they were sent") == 3
 
 
 def fixes(of: Ros2Truck, payloads: list[bytes]) -> list[GnssFix]:
     found: list[Accel | GnssFix] = []
     for number, payload in enumerate(payloads):
         stamp_ns = FIRST_NS + number * 100_000_000
-        found += of.take(ros2.FIX_TOPIC, FIX, payload, stamp_ns)
+        found += of.convert(ros2.FIX_TOPIC, FIX, payload, stamp_ns)
         if of.table.velocity is not None:
             twist = ros2.twist(stamp_ns, 6.0, 8.0)
-            found += of.take(ros2.VELOCITY_TOPIC, TWIST, twist, stamp_ns)
+            found += of.convert(ros2.VELOCITY_TOPIC, TWIST, twist, stamp_ns)
     found += of.finish()
     return [one for one in found if isinstance(one, GnssFix)]
 
@@ -276,11 +276,11 @@ def test_fixes_have_place_speed_and_accuracies() -> None:
         (place(2, latitude=91.0), "fixes without a latitude, left out"),
     ],
 )
-def test_what_is_no_place_is_left_out_and_told(bad: bytes, told: str) -> None:
+def test_invalid_positions_are_excluded_and_reported(bad: bytes, told: str) -> None:
     of = truck()
     found = fixes(of, [place(0), place(1), bad, place(3)])
     assert len(found) == 3
-    assert of.complaints.count(ros2.FIX_TOPIC, told) == 1
+    assert of.anomalies.count(ros2.FIX_TOPIC, told) == 1
 
 
 def test_slopes_of_positions_are_speeds_only_where_the_site_does_not_trust_them() -> None:
@@ -298,7 +298,7 @@ def test_a_jump_of_the_position_is_no_speed() -> None:
     of = truck(text, speed_noise=0.5)
     assert fixes(of, [place(0), place(1, latitude=60.0)]) == []
     told = "fixes with an impossible speed, left out"
-    assert of.complaints.count(ros2.FIX_TOPIC, told) == 2
+    assert of.anomalies.count(ros2.FIX_TOPIC, told) == 2
 
 
 def test_a_truck_needs_its_table() -> None:

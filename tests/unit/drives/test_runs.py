@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from schemas.signals import CHANNELS, decode_accel, decode_gnss, decode_info
 from schemas.site import Site
 from schemas.site_file import load_site, parse_site
+from schemas.topics import Message
 from services.drives.csv_import import read_folder
 from services.drives.runs import GnssTrack, Run, normalised, run_to_messages, sampling_rate_hz
-from services.recordings.recording import Message
 
 EXAMPLE = Path(__file__).parents[2] / "data" / "csv_example"
 START_S = 1_790_000_000.0
@@ -108,7 +108,7 @@ def test_missing_time_is_a_gap_between_batches_and_nothing_else_moves(
     assert times == pytest.approx((START_S + index / 200) * 1e9, abs=1500)
 
 
-def test_rates_are_whole_where_they_cannot_be_told_from_it() -> None:
+def test_rates_are_rounded_where_indistinguishable() -> None:
     index = np.arange(5000)
     for rate in (100.0, 200.0, 1000.0, 1600.0):
         stamps = np.round(START_S + index / rate, 3 if rate < 1000 else 6)

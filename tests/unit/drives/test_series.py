@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from schemas.signals import AccelBatch, Channel
+from schemas.signals import AccelBatch, AccelChannel
 from services.drives.signals import series_of_batches
 
 START_NS = 1_790_000_000_000_000_000
@@ -10,7 +10,7 @@ START_NS = 1_790_000_000_000_000_000
 
 def batch(sequence: int, start_ns: int, **channels: tuple[float, int]) -> AccelBatch:
     made = {
-        name: Channel(rate_hz, sequence + np.arange(size, dtype=np.float64) / 1000.0)
+        name: AccelChannel(rate_hz, sequence + np.arange(size, dtype=np.float64) / 1000.0)
         for name, (rate_hz, size) in channels.items()
     }
     return AccelBatch(1, sequence, start_ns - START_NS, start_ns, made)

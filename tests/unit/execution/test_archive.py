@@ -12,22 +12,30 @@ import pytest
 from mcap.writer import Writer
 
 from schemas.reasons import Reason
-from schemas.results import Crossing
+from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
+from schemas.topics import Message
 from services.common.errors import FailureError
 from services.common.stores import folder_at, put
-from services.execution import archive, overview
-from services.execution.archive import Archive, Asked, drives_of, identify_archive, is_failed
-from services.execution.dispatch import failed
-from services.execution.here import Here
-from services.execution.kept import Kept
+from services.execution import archive
+from services.execution.archive import (
+    ArchiveJob,
+    ArchiveResult,
+    group_into_drives,
+    identify_archive,
+    is_failed,
+)
+from services.execution.dispatch import failed_result
+from services.execution.inline import InlineExecutor
 from services.execution.offline import identify_recordings, site_of
+from services.execution.result_store import ResultStore
+from services.finding import order as overview
+from services.finding.crossing_data import CrossingData
 from services.identification.bridge_state import NOTHING_STORED, with_common_shares
-from services.identification.crossing_data import CrossingData
 from services.identification.identify import identify
-from services.identification.outputs import Work
-from services.recordings.away import Away, Recording, recording_at
-from services.recordings.recording import Message, read_messages
+from services.identification.outputs import IdentificationTask
+from services.recordings.recording import read_messages
+from services.recordings.remote import Recording, RemoteRecording, recording_at
 from services.recordings.writer import RecordingWriter, write_recording
 from tests.drives import EXACT, drives
 
@@ -42,26 +50,26 @@ class Counting:
 
     def __call__(
         self, data: CrossingData, settings: IdentificationSettings, **others: Any
-    ) -> Crossing:
+    ) -> CrossingResult:
         self.ids.append(data.crossing_id)
         return identify(data, settings, **others)
 
 
-def asked(*recordings: Recording) -> Asked:
-    return Asked(recordings, site_of([EXACT], None), LEAST_SQUARES, NOTHING_STORED, {})
+def asked(*recordings: Recording) -> ArchiveJob:
+    return ArchiveJob(recordings, site_of([EXACT], None), LEAST_SQUARES, NOTHING_STORED, {})
 
 
 def done(
-    into: Path, *recordings: Recording, identify: Callable[..., Crossing] = identify
-) -> tuple[Archive, list[Crossing]]:
-    crossings: list[Crossing] = []
+    into: Path, *recordings: Recording, identify: Callable[..., CrossingResult] = identify
+) -> tuple[ArchiveResult, list[CrossingResult]]:
+    crossings: list[CrossingResult] = []
     found = identify_archive(
-        asked(*recordings), Here(identify=identify), Kept(into), crossings.append
+        asked(*recordings), InlineExecutor(identify=identify), ResultStore(into), crossings.append
     )
     return found, sorted(crossings, key=lambda one: one.entry_time)
 
 
-def timeless(crossing: Crossing) -> Crossing:
+def timeless(crossing: CrossingResult) -> CrossingResult:
     diagnostics = {k: v for k, v in crossing.diagnostics.items() if k != "seconds"}
     return crossing.model_copy(update={"diagnostics": diagnostics})
 
@@ -101,12 +109,12 @@ def test_what_is_there_is_not_identified_again(five: list[Path], tmp_path: Path)
     assert all_five[:4] == first  # to the last bit, and with the seconds that they took then
 
 
-def test_who_is_killed_in_between_goes_on(five: list[Path], tmp_path: Path) -> None:
+def test_process_killed_midway_resumes(five: list[Path], tmp_path: Path) -> None:
     class KilledError(Exception):
         pass
 
     class Dying(Counting):
-        def __call__(self, *arguments: Any, **others: Any) -> Crossing:
+        def __call__(self, *arguments: Any, **others: Any) -> CrossingResult:
             if len(self.ids) == 3:
                 raise KilledError
             return super().__call__(*arguments, **others)
@@ -168,10 +176,12 @@ def test_a_recording_without_a_stream_is_a_line(same: list[Path], tmp_path: Path
     assert line.startswith(f"{mute}: no accelerations")
 
 
-def test_what_failed_is_told_and_tried_again(five: list[Path], tmp_path: Path) -> None:
-    def failing(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+def test_failure_is_logged_and_tried_again(five: list[Path], tmp_path: Path) -> None:
+    def failing(
+        data: CrossingData, settings: IdentificationSettings, **others: Any
+    ) -> CrossingResult:
         if "T001003" in data.crossing_id:
-            return failed(Work(0, data, settings))
+            return failed_result(IdentificationTask(0, data, settings))
         return identify(data, settings, **others)
 
     found, crossings = done(tmp_path / "into", *five, identify=failing)
@@ -196,7 +206,7 @@ def test_recordings_that_follow_each_other_are_one_drive(tmp_path: Path) -> None
     )
     problems: list[str] = []
     found: list[set[Recording]] = [
-        set(drive) for drive in drives_of([longer, *reversed(paths)], problems)
+        set(drive) for drive in group_into_drives([longer, *reversed(paths)], problems)
     ]
     assert found == [{paths[0]}, {longer, *paths[1:4]}, {paths[4]}, {paths[5]}]
     assert problems == []
@@ -236,7 +246,9 @@ def test_a_recording_that_is_being_written_waits_until_it_is_closed(
 def test_a_recording_that_changes_while_it_is_read_is_a_line(
     same: list[Path], tmp_path: Path
 ) -> None:
-    def changing(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+    def changing(
+        data: CrossingData, settings: IdentificationSettings, **others: Any
+    ) -> CrossingResult:
         with same[1].open("ab") as file:
             file.write(b"more")
         return identify(data, settings, **others)
@@ -244,7 +256,7 @@ def test_a_recording_that_changes_while_it_is_read_is_a_line(
     found, crossings = done(tmp_path / "into", *same[:2], identify=changing)
     assert len(crossings) == 4
     (line,) = found.problems
-    assert line.startswith(f"{same[1]}: has changed while it was read; ")
+    assert line.startswith(f"{same[1]}: changed while it was read; ")
 
 
 def test_a_message_that_is_none_at_the_second_reading_is_a_line(
@@ -294,7 +306,7 @@ def away(five: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> l
         put(folder, path.name, path.read_bytes())
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    return [Away(folder, path.name) for path in five]
+    return [RemoteRecording(folder, path.name) for path in five]
 
 
 def test_recordings_elsewhere_give_what_they_give_here(
@@ -303,7 +315,9 @@ def test_recordings_elsewhere_give_what_they_give_here(
     """They are copied drive by drive, and the copies removed."""
     at_once = []
 
-    def looking(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+    def looking(
+        data: CrossingData, settings: IdentificationSettings, **others: Any
+    ) -> CrossingResult:
         at_once.append(len(list((tmp_path / "temporary").rglob("*.mcap"))))
         return identify(data, settings, **others)
 
@@ -316,9 +330,7 @@ def test_recordings_elsewhere_give_what_they_give_here(
     assert there == crossings
 
 
-def test_what_is_wrong_elsewhere_is_told_by_its_address(
-    away: list[Recording], tmp_path: Path
-) -> None:
+def test_error_in_another_process_names_its_address(away: list[Recording], tmp_path: Path) -> None:
     folder = folder_at(f"memory://{tmp_path.name}/fleet")
     put(folder, "bad.mcap", b"no recording at all")
     whole = folder.files.cat_file(folder.path("drive-00004.mcap"))
@@ -331,7 +343,7 @@ def test_what_is_wrong_elsewhere_is_told_by_its_address(
     writer.finish()
     put(folder, "other.mcap", other.getvalue())
     names = ("gone.mcap", "bad.mcap", "cut.mcap", "other.mcap")
-    wrong = [Away(folder, name) for name in names]
+    wrong = [RemoteRecording(folder, name) for name in names]
     found, crossings = done(tmp_path / "into", *away[:2], *wrong)
     assert len(crossings) >= 4
     assert list((tmp_path / "temporary").iterdir()) == []
@@ -344,7 +356,7 @@ def test_what_is_wrong_elsewhere_is_told_by_its_address(
 
 def test_a_recording_by_its_address(tmp_path: Path) -> None:
     one = recording_at("memory://bucket/fleet/day/one.mcap")
-    assert isinstance(one, Away)
+    assert isinstance(one, RemoteRecording)
     assert str(one) == "memory://bucket/fleet/day/one.mcap"
     assert one.folder.path(one.name) == "/bucket/fleet/day/one.mcap"
     assert recording_at(tmp_path) == tmp_path
@@ -360,7 +372,7 @@ def test_without_room_for_a_copy_nothing_is_begun(
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def test_a_disk_that_gets_full_while_it_is_copied_to_is_told_as_that(
+def test_disk_filled_during_a_copy_is_reported_as_full(
     away: list[Recording], tmp_path: Path
 ) -> None:
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)

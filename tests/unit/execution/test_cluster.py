@@ -10,11 +10,11 @@ import pytest
 
 from services.common.errors import FailureError
 from services.execution import cluster
-from services.execution.cluster import Cluster
-from services.execution.cluster_worker import Refused, packed, unpacked
-from services.execution.dispatch import Finished, failed
-from services.execution.scheduler import Scheduler, connected, threads_of
-from services.identification.outputs import Work
+from services.execution.cluster import DaskExecutor
+from services.execution.cluster_worker import BatchRefused, packed, unpacked
+from services.execution.dispatch import TaskResult, failed_result
+from services.execution.scheduler import Scheduler, connect, threads_of
+from services.identification.outputs import IdentificationTask
 from tests.unit.execution.test_processes import works
 from tests.waiting import until
 
@@ -26,11 +26,13 @@ class Future:
 
     def __init__(self, batch: bytes) -> None:
         self.status: Literal["pending", "finished", "lost", "cancelled"] = "finished"
-        self.given: bytes | Refused | None = packed(failed(work) for work in unpacked(batch))
+        self.given: bytes | BatchRefused | None = packed(
+            failed_result(work) for work in unpacked(batch)
+        )
         """None: it does not come."""
         self.asked = 0
 
-    def result(self, timeout: float) -> bytes | Refused:
+    def result(self, timeout: float) -> bytes | BatchRefused:
         self.asked += 1
         if self.given is None:
             raise TimeoutError
@@ -77,7 +79,7 @@ def clients(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Client]]:
     """Those that will connect, the next one first; each that does is put off the list."""
     waiting = [Client(), Client()]
     monkeypatch.setattr(cluster, "_RETRY_S", 0.0)
-    monkeypatch.setattr(cluster, "connected", lambda *_: Scheduler(ADDRESS, waiting.pop(0)))
+    monkeypatch.setattr(cluster, "connect", lambda *_: Scheduler(ADDRESS, waiting.pop(0)))
     return waiting
 
 
@@ -85,13 +87,13 @@ def gone(*_: Any, **__: Any) -> Any:
     raise OSError("the connection is closed")
 
 
-def all_of(on: Cluster) -> list[Finished]:
-    found: list[Finished] = []
-    until(lambda: found.extend(on.finished(0.01)) or not on.is_busy)
+def all_of(on: DaskExecutor) -> list[TaskResult]:
+    found: list[TaskResult] = []
+    until(lambda: found.extend(on.collect(0.01)) or not on.is_busy)
     return found
 
 
-def is_each_once(found: list[Finished], given: list[Work]) -> bool:
+def is_each_once(found: list[TaskResult], given: list[IdentificationTask]) -> bool:
     return sorted(one.work.number for one in found) == sorted(work.number for work in given)
 
 
@@ -101,12 +103,12 @@ def test_a_result_that_goes_with_its_worker_is_waited_for(
     """The scheduler has it made again, and is not gone."""
     first = clients[0]
     given = works()
-    with Cluster(ADDRESS, batch=len(given)) as on:
+    with DaskExecutor(ADDRESS, batch=len(given)) as on:
         for work in given:
-            on.start(work)
+            on.submit(work)
         (future,) = first.sent
         future.status = "lost"
-        assert on.finished(0.01) == []
+        assert on.collect(0.01) == []
         future.status = "finished"
         assert is_each_once(all_of(on), given)
     assert len(clients) == 1
@@ -116,24 +118,24 @@ def test_a_result_that_goes_with_its_worker_is_waited_for(
 def test_a_batch_that_cannot_be_sent_goes_to_the_next_scheduler(clients: list[Client]) -> None:
     first, second = clients
     given = works()
-    with Cluster(ADDRESS, batch=len(given)) as on:
+    with DaskExecutor(ADDRESS, batch=len(given)) as on:
         first.submit = gone  # type: ignore[method-assign]
         for work in given:
-            on.start(work)
+            on.submit(work)
         assert is_each_once(all_of(on), given)
     assert (len(first.sent), len(second.sent)) == (0, 1)
 
 
 def test_an_answer_that_does_not_come_keeps_no_other_one_up(clients: list[Client]) -> None:
     (first, *_), given = clients, works()
-    with Cluster(ADDRESS, batch=1) as on:
+    with DaskExecutor(ADDRESS, batch=1) as on:
         for work in given:
-            on.start(work)
+            on.submit(work)
         late, other = first.sent
         there, late.given = late.given, None
-        assert on.finished() == []
+        assert on.collect() == []
         assert (late.asked, other.asked) == (1, 0)  # and the scheduler is looked after
-        (one,) = on.finished()
+        (one,) = on.collect()
         assert one.work.number == given[1].number
         late.given = there
         assert is_each_once([one, *all_of(on)], given)
@@ -142,10 +144,10 @@ def test_an_answer_that_does_not_come_keeps_no_other_one_up(clients: list[Client
 def test_a_worker_that_is_refused_may_have_gone_by_itself(clients: list[Client]) -> None:
     (first, *_), given = clients, works()
     first.retire_workers = gone  # type: ignore[method-assign]
-    with Cluster(ADDRESS, batch=len(given)) as on:
+    with DaskExecutor(ADDRESS, batch=len(given)) as on:
         for work in given:
-            on.start(work)
-        first.sent[0].given = Refused("tcp://127.0.0.1:1", "has driveby 0.0.9")
+            on.submit(work)
+        first.sent[0].given = BatchRefused("tcp://127.0.0.1:1", "has driveby 0.0.9")
         assert is_each_once(all_of(on), given)
     assert len(first.sent) == 2
 
@@ -157,16 +159,16 @@ def test_a_scheduler_that_goes_while_it_is_asked_is_waited_for(
     first, second = clients
     setattr(first, what, gone)
     given = works()
-    with Cluster(ADDRESS, batch=len(given)) as on:
+    with DaskExecutor(ADDRESS, batch=len(given)) as on:
         for work in given:
-            on.start(work)
+            on.submit(work)
         assert is_each_once(all_of(on), given)
     assert (first.status, len(second.sent)) == ("closed", 1)
     (line,) = caplog.messages
     assert line.startswith(ADDRESS)
 
 
-def test_who_waits_for_a_scheduler_leaves_no_thread_behind() -> None:
+def test_waiting_for_a_scheduler_leaves_no_thread() -> None:
     with socket.socket() as taken:  # bound, and nobody listens
         taken.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
@@ -174,5 +176,5 @@ def test_who_waits_for_a_scheduler_leaves_no_thread_behind() -> None:
         before = threading.active_count()
         for _ in range(2):
             with pytest.raises(FailureError, match="no scheduler answers"):
-                connected(address, None, 0.1)
+                connect(address, None, 0.1)
         assert threading.active_count() == before

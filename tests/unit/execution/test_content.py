@@ -9,25 +9,26 @@ import numpy as np
 import pytest
 
 from schemas.reasons import Reason
-from services.execution.content import content_of
-from services.identification.outputs import Work
+from services.execution import program
+from services.execution.task_hash import task_hash
+from services.identification.outputs import IdentificationTask
 from tests.unit.execution.test_processes import works
 
 PROGRAM = {"driveby": "0.1.0", "Python": "3.11.7"}
 _ELSEWHERE = """
-from services.execution.content import content_of
+from services.execution.task_hash import task_hash
 from tests.unit.execution.test_content import PROGRAM
 from tests.unit.execution.test_processes import works
-print(content_of(works()[0], PROGRAM))
+print(task_hash(works()[0], PROGRAM))
 """
 
 
 @pytest.fixture(scope="module")
-def work() -> Work:
+def work() -> IdentificationTask:
     return works()[0]
 
 
-def test_another_process_finds_the_same(work: Work, project: Path) -> None:
+def test_another_process_finds_the_same(work: IdentificationTask, project: Path) -> None:
     found = {
         subprocess.run(
             [sys.executable, "-c", _ELSEWHERE],
@@ -39,16 +40,16 @@ def test_another_process_finds_the_same(work: Work, project: Path) -> None:
         ).stdout.strip()
         for seed in ("1", "2")
     }
-    assert found == {content_of(work, PROGRAM)}
+    assert found == {task_hash(work, PROGRAM)}
 
 
-def test_what_changes_no_result_changes_nothing(work: Work) -> None:
+def test_what_changes_no_result_changes_nothing(work: IdentificationTask) -> None:
     threads = work.settings.model_copy(update={"threads": 7})
     for same in (work._replace(number=99), work._replace(settings=threads)):
-        assert content_of(same, PROGRAM) == content_of(work, PROGRAM)
+        assert task_hash(same, PROGRAM) == task_hash(work, PROGRAM)
 
 
-def test_whatever_is_another_makes_another(work: Work) -> None:
+def test_whatever_is_another_makes_another(work: IdentificationTask) -> None:
     data = work.data
     samples = data.samples
     assert samples is not None
@@ -69,11 +70,28 @@ def test_whatever_is_another_makes_another(work: Work) -> None:
             data=data._replace(samples=samples._replace(channels=samples.channels | {name: moved}))
         ),
     ]
-    contents = {content_of(one, PROGRAM) for one in (work, *changed)}
-    contents.add(content_of(work, PROGRAM | {"Python": "3.12.1"}))
+    contents = {task_hash(one, PROGRAM) for one in (work, *changed)}
+    contents.add(task_hash(work, PROGRAM | {"Python": "3.12.1"}))
     assert len(contents) == len(changed) + 2
 
 
-def test_what_is_not_known_is_refused(work: Work) -> None:
+def test_what_is_not_known_is_refused(work: IdentificationTask) -> None:
     with pytest.raises(TypeError, match="a set has no content"):
-        content_of(work._replace(certificate={1, 2}), PROGRAM)  # type: ignore[arg-type]
+        task_hash(work._replace(certificate={1, 2}), PROGRAM)  # type: ignore[arg-type]
+
+
+_DECIDING = """
+import sys
+import services.identification.identify, services.finding.finder
+print(*sorted({name.split(".")[1] for name in sys.modules if name.startswith("services.")}))
+"""
+
+
+def test_the_sources_that_decide_about_a_result_are_of_its_program(project: Path) -> None:
+    """All rooms that finder and identification stand on, but for what is common to everything."""
+    done = subprocess.run(
+        [sys.executable, "-c", _DECIDING], cwd=project, check=True, capture_output=True, text=True
+    )
+    counted = {Path(str(module.__file__)).parent.name for module in program._DECIDING}
+    assert set(done.stdout.split()) - {"common"} <= counted
+    assert {"pre_core", "schemas"} <= counted

@@ -13,23 +13,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.results import BridgeResult, Crossing
+from schemas.results import BridgeResult, CrossingResult
 from schemas.settings import IdentificationSettings
 from services.common.errors import FailureError
-from services.execution.dispatch import Finished, feed_all
-from services.execution.processes import Aftermath, Aside, Processes
-from services.execution.watch import Limits
+from services.execution.dispatch import TaskResult
+from services.execution.hang_watchdog import TaskLimits
+from services.execution.processes import BackgroundResult, BackgroundTask, ProcessExecutor
+from services.finding.crossing_data import CrossingData
 from services.identification.bridge_state import (
     NOTHING_STORED,
-    Counted,
     Fusing,
-    count_in,
+    RecentCrossings,
+    add_crossings,
     state_of,
     usable,
 )
-from services.identification.crossing_data import CrossingData
 from services.identification.engine import Engine
-from services.identification.outputs import Fuse, Work
+from services.identification.outputs import FusionTask, IdentificationTask
 from tests.unit.identification.test_engine_resume import (
     HEADER,
     SETTINGS,
@@ -42,25 +42,28 @@ from tests.unit.identification.test_engine_resume import (
 )
 from tests.unit.identification.test_fusing import crossing
 from tests.waiting import LONGEST_S, until
+from tests.working_engine import feed_all
 
 
 def nothing() -> None:
     """These searches have no kernels."""
 
 
-def quick(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+def quick(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
     others["report"]("half", 0.5)
     return Identifications()(data, settings, stopwatch=others["stopwatch"])
 
 
-def deadly(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+def deadly(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
     """The way back kills its process, always."""
     if data.stay.direction < 0:
         os.kill(os.getpid(), signal.SIGKILL)
     return quick(data, settings, **others)
 
 
-def deadly_once(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+def deadly_once(
+    data: CrossingData, settings: IdentificationSettings, **others: Any
+) -> CrossingResult:
     """Each crossing kills the first process that tries it."""
     mark = Path(os.environ["DEADLY_ONCE"]) / data.crossing_id
     if not mark.exists():
@@ -69,24 +72,26 @@ def deadly_once(data: CrossingData, settings: IdentificationSettings, **others: 
     return quick(data, settings, **others)
 
 
-def broken(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+def broken(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
     raise np.linalg.LinAlgError("singular")
 
 
-def slow(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+def slow(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
     """For ever."""
     while True:
         time.sleep(1.0)
 
 
-def busy(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+def busy(data: CrossingData, settings: IdentificationSettings, **others: Any) -> CrossingResult:
     """For ever, and with all of a processor; the way there only."""
     while data.stay.direction > 0:
         pass
     return quick(data, settings, **others)
 
 
-def busy_once(data: CrossingData, settings: IdentificationSettings, **others: Any) -> Crossing:
+def busy_once(
+    data: CrossingData, settings: IdentificationSettings, **others: Any
+) -> CrossingResult:
     mark = Path(os.environ["DEADLY_ONCE"]) / data.crossing_id
     while mark.exists():
         return quick(data, settings, **others)
@@ -94,17 +99,17 @@ def busy_once(data: CrossingData, settings: IdentificationSettings, **others: An
     return busy(data, settings, **others)
 
 
-def works() -> list[Work]:
+def works() -> list[IdentificationTask]:
     engine = Engine(SITE, SETTINGS, HEADER)
     said = [one for m in TWO for one in engine.feed(m.key, m.payload)]
-    return [one for one in said if isinstance(one, Work)]
+    return [one for one in said if isinstance(one, IdentificationTask)]
 
 
-def all_of(processes: Processes) -> list[Finished]:
-    found: list[Finished] = []
+def all_of(processes: ProcessExecutor) -> list[TaskResult]:
+    found: list[TaskResult] = []
     deadline = time.monotonic() + LONGEST_S
     while processes.is_busy and time.monotonic() < deadline:
-        found += processes.finished(0.1)
+        found += processes.collect(0.1)
     assert not processes.is_busy
     return found
 
@@ -116,7 +121,7 @@ def pairs() -> Iterator[Any]:
 @pytest.mark.parametrize("number", [1, 2])
 def test_the_bytes_are_those_of_one_process(number: int) -> None:
     told: list[tuple[str, str, float]] = []
-    with Processes(
+    with ProcessExecutor(
         number, identify=quick, prepare=nothing, report=lambda *how: told.append(how)
     ) as processes:
         processes.wait_until_warm()
@@ -143,24 +148,24 @@ def test_a_process_that_dies_twice_costs_its_own_crossing_only(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     first, second = works()
-    with Processes(1, identify=deadly, prepare=nothing) as processes:
+    with ProcessExecutor(1, identify=deadly, prepare=nothing) as processes:
         for work in (second, first):
-            processes.start(work)
+            processes.submit(work)
         results = {work.number: result for work, result in all_of(processes)}
     assert results[first.number].verdict == "good"
     assert results[second.number].reasons == ("failed",)
     assert results[second.number].speed_m_per_s == pytest.approx(10.0, rel=0.01)
     said = [record.getMessage() for record in caplog.records]
-    assert sum("tried once more" in text for text in said) == 1
+    assert sum("retrying once" in text for text in said) == 1
 
 
 def test_a_process_that_dies_once_costs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
-    with Processes(2, identify=deadly_once, prepare=nothing) as processes:
+    with ProcessExecutor(2, identify=deadly_once, prepare=nothing) as processes:
         for work in works():
-            processes.start(work)
+            processes.submit(work)
         results = [result for _, result in all_of(processes)]
     assert [result.verdict for result in results] == ["good", "good"]
     assert len(list(tmp_path.iterdir())) == 2
@@ -169,30 +174,33 @@ def test_a_process_that_dies_once_costs_nothing(
 @pytest.mark.parametrize(
     ("search", "limits", "why"),
     [
-        (slow, Limits(idle_s=1.0), "has done nothing for 1 s"),
-        (busy, Limits(processor_s=4.0), "has taken more than 4 s of processor time"),
+        (slow, TaskLimits(idle_s=1.0), "has done nothing for 1 s"),
+        (busy, TaskLimits(processor_s=4.0), "has taken more than 4 s of processor time"),
     ],
 )
 def test_a_hung_process_is_ended_and_its_crossing_fails_at_the_second_time(
-    search: Callable[..., Crossing], limits: Limits, why: str, caplog: pytest.LogCaptureFixture
+    search: Callable[..., CrossingResult],
+    limits: TaskLimits,
+    why: str,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     told: list[tuple[str, str, float]] = []
     (first, second) = works()
-    with Processes(
+    with ProcessExecutor(
         1, identify=search, prepare=nothing, limits=limits, report=lambda *how: told.append(how)
     ) as processes:
-        processes.start(first)
-        processes.start(second)
+        processes.submit(first)
+        processes.submit(second)
         assert (second.crossing_id, "waiting for a process", 0.0) in told
-        assert [one.crossing_id for one in processes.under_way] == [first.crossing_id]
+        assert [one.crossing_id for one in processes.running] == [first.crossing_id]
         assert processes.waiting == 1
         results = {work.number: result for work, result in all_of(processes)}
-        assert (processes.under_way, processes.waiting) == ([], 0)
+        assert (processes.running, processes.waiting) == ([], 0)
     assert results[first.number].reasons == ("failed",)
     said = [record.getMessage() for record in caplog.records]
-    hung = f"the process that works on {first.crossing_id} {why} and is ended"
+    hung = f"the process that works on {first.crossing_id} {why}; ending it"
     assert said.count(hung) == 2
-    assert sum(f"{first.crossing_id} died; tried once more" in text for text in said) == 1
+    assert sum(f"{first.crossing_id} died; retrying once" in text for text in said) == 1
     assert (results[second.number].verdict == "good") == (search is busy)
 
 
@@ -200,26 +208,28 @@ def test_a_process_that_is_hung_once_costs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
-    limits = Limits(processor_s=1.0)
-    with Processes(1, identify=busy_once, prepare=nothing, limits=limits) as processes:
-        processes.start(works()[0])
+    limits = TaskLimits(processor_s=8.0)
+    with ProcessExecutor(1, identify=busy_once, prepare=nothing, limits=limits) as processes:
+        processes.submit(works()[0])
         (finished,) = all_of(processes)
     assert finished.result.verdict == "good"
 
 
 def test_an_aside_that_is_hung_makes_room(caplog: pytest.LogCaptureFixture) -> None:
     (work, _) = works()
-    with Processes(1, identify=quick, prepare=nothing, limits=Limits(idle_s=1.0)) as processes:
-        processes.start_aside(Aside("for ever", partial(time.sleep, 1e6)))
-        processes.start(work)
+    with ProcessExecutor(
+        1, identify=quick, prepare=nothing, limits=TaskLimits(idle_s=1.0)
+    ) as processes:
+        processes.submit_background(BackgroundTask("for ever", partial(time.sleep, 1e6)))
+        processes.submit(work)
         (finished,) = all_of(processes)
     assert finished.result.verdict == "good"
 
 
 def test_an_error_in_a_process_is_a_verdict(caplog: pytest.LogCaptureFixture) -> None:
     (work, _) = works()
-    with Processes(1, identify=broken, prepare=nothing) as processes:
-        processes.start(work)
+    with ProcessExecutor(1, identify=broken, prepare=nothing) as processes:
+        processes.submit(work)
         (finished,) = all_of(processes)
     assert finished.work.number == work.number
     assert finished.result.reasons == ("failed",)
@@ -232,7 +242,7 @@ def die() -> None:
 
 def test_a_process_that_cannot_begin_is_a_failure() -> None:
     with (
-        Processes(1, identify=quick, prepare=die) as processes,
+        ProcessExecutor(1, identify=quick, prepare=die) as processes,
         pytest.raises(FailureError, match="died while it was started"),
     ):
         processes.wait_until_warm()
@@ -252,13 +262,13 @@ def sleep_at_the_second_start() -> None:
 def test_a_process_that_hangs_while_it_is_started_is_ended(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    limits = Limits(idle_s=1.0)
+    limits = TaskLimits(idle_s=1.0)
     with (
-        Processes(1, identify=quick, prepare=sleep_for_ever, limits=limits) as processes,
+        ProcessExecutor(1, identify=quick, prepare=sleep_for_ever, limits=limits) as processes,
         pytest.raises(FailureError, match="died while it was started"),
     ):
         processes.wait_until_warm()
-    assert "the process that is being started has done nothing for 1 s and is ended" in caplog.text
+    assert "the process that is being started has done nothing for 1 s; ending it" in caplog.text
 
 
 def test_one_that_hangs_at_a_later_start_costs_one_crossing(
@@ -267,14 +277,14 @@ def test_one_that_hangs_at_a_later_start_costs_one_crossing(
     """The first dies at its work, the second never begins."""
     monkeypatch.setenv("DEADLY_ONCE", str(tmp_path))
     first, second = works()
-    with Processes(
-        1, identify=deadly_once, prepare=sleep_at_the_second_start, limits=Limits(idle_s=1.0)
+    with ProcessExecutor(
+        1, identify=deadly_once, prepare=sleep_at_the_second_start, limits=TaskLimits(idle_s=1.0)
     ) as processes:
         processes.wait_until_warm()
-        processes.start(first)
+        processes.submit(first)
         (one,) = all_of(processes)
         (tmp_path / second.crossing_id).touch()  # it kills nobody
-        processes.start(second)
+        processes.submit(second)
         (other,) = all_of(processes)
     assert one.result.reasons == ("failed",)
     assert other.result.verdict == "good"
@@ -283,25 +293,25 @@ def test_one_that_hangs_at_a_later_start_costs_one_crossing(
 
 def test_more_than_a_few_wait_elsewhere() -> None:
     (work, _) = works()
-    with Processes(1, identify=slow, prepare=nothing) as processes:
+    with ProcessExecutor(1, identify=slow, prepare=nothing) as processes:
         full, room = [], []
         for _ in range(3):
             room.append(processes.has_room)
-            processes.start(work)
+            processes.submit(work)
             full.append(processes.is_full)
         assert full == [False, False, True]
         assert room == [True, True, False]
         assert processes.is_busy
-        assert processes.finished() == []
+        assert processes.collect() == []
 
 
 STARTER = """
 import os, signal, sys, time
-from services.execution.processes import Processes
+from services.execution.processes import ProcessExecutor
 from tests.unit.execution.test_processes import nothing, slow, works
-processes = Processes(1, identify=slow, prepare=nothing)
+processes = ProcessExecutor(1, identify=slow, prepare=nothing)
 processes.wait_until_warm()
-processes.start(works()[0])
+processes.submit(works()[0])
 import multiprocessing
 pid = multiprocessing.active_children()[0].pid
 print(pid, flush=True)
@@ -315,7 +325,7 @@ processes.close()
 
 @pytest.mark.process
 @pytest.mark.parametrize("end", ["close", "close one that is frozen", "kill"])
-def test_no_process_outlives_who_started_it(end: str) -> None:
+def test_no_process_outlives_its_parent(end: str) -> None:
     """Neither one that is closed in the middle of an identification, nor one that is killed.
 
     One that is frozen sees nothing of that, and its starter would wait for it when it ends.
@@ -341,7 +351,7 @@ def test_results_may_come_back_in_any_order() -> None:
         engine = Engine(SITE, SETTINGS, HEADER)
         said = [one for m in more for one in engine.feed(m.key, m.payload)]
         said += list(engine.finish())
-        found = [one for one in said if isinstance(one, Work)]
+        found = [one for one in said if isinstance(one, IdentificationTask)]
         assert len(found) == 3
         told = []
         for n in order:
@@ -362,28 +372,28 @@ def test_results_may_come_back_in_any_order() -> None:
 STATE = BridgeResult(verdict="rejected")  # type: ignore[call-arg]
 
 
-def fuse_of(number: int, bridge: str = "bridge-1") -> Fuse:
-    return Fuse("live", bridge, Counted((), number), NOTHING_STORED, 1.0 * number)
+def fuse_of(number: int, bridge: str = "bridge-1") -> FusionTask:
+    return FusionTask("live", bridge, RecentCrossings((), number), NOTHING_STORED, 1.0 * number)
 
 
-def named_by_number(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+def named_by_number(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
     """Tells which process made it of what, and when."""
     (Path(os.environ["DEADLY_ONCE"]) / f"{time.monotonic_ns()} {bridge} {counted.number}").touch()
     return STATE.model_copy(update={"crossings_left_out_count": counted.number})
 
 
-def after_a_signal(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+def after_a_signal(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
     state = named_by_number(counted, bridge, fusing)
     wait_for(str(Path(os.environ["DEADLY_ONCE"]) / "go on"))
     return state
 
 
-def dies(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+def dies(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
     os.kill(os.getpid(), signal.SIGKILL)
     raise AssertionError
 
 
-def dies_once(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+def dies_once(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
     mark = Path(os.environ["DEADLY_ONCE"]) / "died"
     if not mark.exists():
         mark.touch()
@@ -391,12 +401,12 @@ def dies_once(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
     return named_by_number(counted, bridge, fusing)
 
 
-def for_ever(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+def for_ever(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
     time.sleep(1e6)
     raise AssertionError
 
 
-def bad(counted: Counted, bridge: str, fusing: Fusing) -> BridgeResult:
+def bad(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
     raise np.linalg.LinAlgError("singular")
 
 
@@ -412,12 +422,12 @@ def begun(marks: Path) -> list[str]:
     return [name.partition(" ")[2] for name in names]
 
 
-def all_fused(processes: Processes) -> list[tuple[str, int | None]]:
+def all_fused(processes: ProcessExecutor) -> list[tuple[str, int | None]]:
     found = []
     deadline = time.monotonic() + LONGEST_S
     while processes.is_busy and time.monotonic() < deadline:
-        assert processes.finished(0.1) == []
-        for fuse, state in processes.fused():
+        assert processes.collect(0.1) == []
+        for fuse, state in processes.collect_fusions():
             found.append((fuse.bridge, state and state.crossings_left_out_count))
     assert not processes.is_busy
     return found
@@ -425,12 +435,12 @@ def all_fused(processes: Processes) -> list[tuple[str, int | None]]:
 
 def test_of_one_bridge_only_the_newest_waits_while_one_is_fused(marks: Path) -> None:
     """The first is under way; of the three behind it only the last is fused."""
-    with Processes(2, identify=quick, state_of=after_a_signal, prepare=nothing) as processes:
-        processes.fuse(fuse_of(1))
+    with ProcessExecutor(2, identify=quick, state_of=after_a_signal, prepare=nothing) as processes:
+        processes.submit_fusion(fuse_of(1))
         until(lambda: begun(marks) == ["bridge-1 1"], "the first")
         for number in (2, 3, 4):
-            processes.fuse(fuse_of(number))
-        processes.fuse(fuse_of(5, "other"))
+            processes.submit_fusion(fuse_of(number))
+        processes.submit_fusion(fuse_of(5, "other"))
         until(lambda: len(begun(marks)) == 2, "the other bridge's, in the other process")
         assert begun(marks) == ["bridge-1 1", "other 5"]
         assert not processes.is_idle
@@ -443,63 +453,66 @@ def test_of_one_bridge_only_the_newest_waits_while_one_is_fused(marks: Path) -> 
 
 def test_a_state_comes_before_the_crossings_that_wait(marks: Path) -> None:
     first, second = works()
-    with Processes(1, identify=quick, state_of=named_by_number, prepare=nothing) as processes:
-        processes.start(first)
-        processes.start(second)
-        finished: list[Finished] = []
+    with ProcessExecutor(1, identify=quick, state_of=named_by_number, prepare=nothing) as processes:
+        processes.submit(first)
+        processes.submit(second)
+        finished: list[TaskResult] = []
         deadline = time.monotonic() + LONGEST_S
         while not finished and time.monotonic() < deadline:
-            finished = processes.finished(0.1)
-        processes.fuse(fuse_of(1))
-        assert (processes.waiting, processes.under_way) == (1, [])
-        rest: list[Finished] = []
+            finished = processes.collect(0.1)
+        processes.submit_fusion(fuse_of(1))
+        assert (processes.waiting, processes.running) == (1, [])
+        rest: list[TaskResult] = []
         while processes.is_busy and time.monotonic() < deadline:
-            if now := processes.fused():
+            if now := processes.collect_fusions():
                 assert (len(now), rest) == (1, [])
-            rest += processes.finished(0.1)
+            rest += processes.collect(0.1)
     assert [work.number for work, _ in finished + rest] == [first.number, second.number]
     assert begun(marks) == ["bridge-1 1"]
 
 
 @pytest.mark.parametrize(
-    ("make", "limits"), [(dies, Limits()), (for_ever, Limits(idle_s=1.0)), (bad, Limits())]
+    ("make", "limits"),
+    [(dies, TaskLimits()), (for_ever, TaskLimits(idle_s=1.0)), (bad, TaskLimits())],
 )
 def test_what_cannot_be_fused_costs_its_own_state_only(
     make: Callable[..., BridgeResult],
-    limits: Limits,
+    limits: TaskLimits,
     marks: Path,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with Processes(1, identify=quick, state_of=make, prepare=nothing, limits=limits) as processes:
-        processes.fuse(fuse_of(1))
+    with ProcessExecutor(
+        1, identify=quick, state_of=make, prepare=nothing, limits=limits
+    ) as processes:
+        processes.submit_fusion(fuse_of(1))
         assert all_fused(processes) == [("bridge-1", None)]
-        processes.start(works()[0])
+        processes.submit(works()[0])
         (finished,) = all_of(processes)
     assert finished.result.verdict == "good"
     said = [record.getMessage() for record in caplog.records]
-    again = "the process that worked on the state of bridge-1 died; tried once more"
+    again = "the process that worked on the state of bridge-1 died; retrying once"
     assert said.count(again) == (make is not bad)
     assert any("the state of bridge-1 died again" in text for text in said) == (make is not bad)
 
 
 def test_a_process_that_dies_once_while_it_fuses_costs_nothing(marks: Path) -> None:
     """Meanwhile a newer set has come: that is the one that is tried."""
-    with Processes(1, identify=quick, state_of=dies_once, prepare=nothing) as processes:
-        processes.fuse(fuse_of(1))
-        processes.fuse(fuse_of(2))
+    with ProcessExecutor(1, identify=quick, state_of=dies_once, prepare=nothing) as processes:
+        processes.submit_fusion(fuse_of(1))
+        processes.submit_fusion(fuse_of(2))
         assert all_fused(processes) == [("bridge-1", 2)]
 
 
 def test_numbers_of_a_state_are_those_of_this_process() -> None:
     """To the last bit, of a fusion that has something to fuse."""
     three = [usable(crossing(number)) for number in range(3)]
-    counted = count_in(Counted(), [one for one in three if one is not None])
-    fuse = Fuse("live", "bridge-1", counted, NOTHING_STORED, 1.0)
-    with Processes(1, identify=quick, prepare=nothing) as processes:
-        processes.fuse(fuse)
+    counted = add_crossings(RecentCrossings(), [one for one in three if one is not None])
+    fuse = FusionTask("live", "bridge-1", counted, NOTHING_STORED, 1.0)
+    with ProcessExecutor(1, identify=quick, prepare=nothing) as processes:
+        processes.submit_fusion(fuse)
         deadline = time.monotonic() + LONGEST_S
-        while not (found := processes.fused()) and time.monotonic() < deadline:
-            processes.finished(0.1)
+        while not (found := processes.collect_fusions()) and time.monotonic() < deadline:
+            processes.collect(0.1)
     assert found == [(fuse, state_of(counted, "bridge-1", NOTHING_STORED))]
     assert found[0].state is not None
     assert found[0].state.between_crossing_std
@@ -516,37 +529,37 @@ def no_answer() -> None:
     raise np.linalg.LinAlgError("singular")
 
 
-def until_over(processes: Processes, number: int) -> list[Aftermath]:
-    found: list[Aftermath] = []
+def until_over(processes: ProcessExecutor, number: int) -> list[BackgroundResult]:
+    found: list[BackgroundResult] = []
     deadline = time.monotonic() + LONGEST_S
     while len(found) < number and time.monotonic() < deadline:
-        assert processes.finished(0.1) == []
-        found += processes.aftermaths()
+        assert processes.collect(0.1) == []
+        found += processes.collect_background()
     assert len(found) == number
     return found
 
 
 def test_what_is_computed_aside_comes_back_and_keeps_nobody_waiting() -> None:
-    with Processes(2, identify=quick, prepare=nothing) as processes:
-        assert processes.wants_aside
-        processes.start_aside(Aside("one", partial(two_of, 1)))
-        processes.start_aside(Aside("other", partial(two_of, 2)))
-        assert not processes.wants_aside
+    with ProcessExecutor(2, identify=quick, prepare=nothing) as processes:
+        assert processes.wants_background
+        processes.submit_background(BackgroundTask("one", partial(two_of, 1)))
+        processes.submit_background(BackgroundTask("other", partial(two_of, 2)))
+        assert not processes.wants_background
         assert not processes.is_busy  # nobody waits for it at the end
         assert not processes.is_full
         found = until_over(processes, 2)
-        assert processes.wants_aside
-    assert {(aside.name, outcome) for aside, outcome in found} == {("one", 2), ("other", 4)}
+        assert processes.wants_background
+    assert {(task.name, outcome) for task, outcome in found} == {("one", 2), ("other", 4)}
 
 
 @pytest.mark.parametrize("run", [die, no_answer])
 def test_what_cannot_be_computed_aside_costs_nothing_else(run: Callable[[], None]) -> None:
     (work, _) = works()
-    with Processes(1, identify=quick, prepare=nothing) as processes:
-        processes.start_aside(Aside("bad", run))
-        ((aside, outcome),) = until_over(processes, 1)
-        assert (aside.name, outcome) == ("bad", None)
-        processes.start(work)
+    with ProcessExecutor(1, identify=quick, prepare=nothing) as processes:
+        processes.submit_background(BackgroundTask("bad", run))
+        ((task, outcome),) = until_over(processes, 1)
+        assert (task.name, outcome) == ("bad", None)
+        processes.submit(work)
         (finished,) = all_of(processes)
     assert finished.result.verdict == "good"
 
@@ -562,16 +575,16 @@ def test_a_crossing_comes_before_whatever_waits_aside(tmp_path: Path) -> None:
     """Three wait; the crossing that comes then waits for the first only."""
     (work, _) = works()
     marks = [str(tmp_path / name) for name in "abc"]
-    with Processes(1, identify=quick, prepare=nothing) as processes:
+    with ProcessExecutor(1, identify=quick, prepare=nothing) as processes:
         for mark in marks:
-            processes.start_aside(Aside(mark, partial(wait_for, mark)))
-        processes.start(work)
+            processes.submit_background(BackgroundTask(mark, partial(wait_for, mark)))
+        processes.submit(work)
         Path(marks[0]).touch()
         (finished,) = all_of(processes)
         assert finished.result.verdict == "good"
-        assert [aside.name for aside, _ in processes.aftermaths()] == marks[:1]
-        processes.forget_asides()
+        assert [task.name for task, _ in processes.collect_background()] == marks[:1]
+        processes.cancel_background()
         Path(marks[1]).touch()
-        assert [aside.name for aside, _ in until_over(processes, 1)] == marks[1:2]
-        assert processes.finished(0.1) == []
-        assert processes.wants_aside
+        assert [task.name for task, _ in until_over(processes, 1)] == marks[1:2]
+        assert processes.collect(0.1) == []
+        assert processes.wants_background

@@ -5,23 +5,23 @@ import time
 
 import pytest
 
-from services.execution import watch
-from services.execution.watch import Limits, Watch, processor_time_s
+from services.execution import hang_watchdog
+from services.execution.hang_watchdog import HangWatchdog, TaskLimits, processor_time_s
 
-LIMITS = Limits(processor_s=10.0, idle_s=5.0)
+LIMITS = TaskLimits(processor_s=10.0, idle_s=5.0)
 
 
 @pytest.fixture
 def taken(monkeypatch: pytest.MonkeyPatch) -> list[float | None]:
     """What the process has taken so far; the last item is what is read."""
     values: list[float | None] = [100.0]
-    monkeypatch.setattr(watch, "processor_time_s", lambda pid: values[-1])
+    monkeypatch.setattr(hang_watchdog, "processor_time_s", lambda pid: values[-1])
     return values
 
 
 def test_processor_time_counts_and_no_clock(taken: list[float | None]) -> None:
     """A hundredth of a processor for an hour is no hang."""
-    one = Watch(1, LIMITS, 0.0)
+    one = HangWatchdog(1, LIMITS, 0.0)
     for second in range(1, 900):
         taken.append(100.0 + 0.01 * second)
         assert one.why_hung(float(second)) == ""
@@ -29,8 +29,8 @@ def test_processor_time_counts_and_no_clock(taken: list[float | None]) -> None:
     assert one.why_hung(900.0) == "has taken more than 10 s of processor time"
 
 
-def test_who_does_nothing_is_hung_after_a_while(taken: list[float | None]) -> None:
-    one = Watch(1, LIMITS, 0.0)
+def test_idle_process_counts_as_hung_after_its_limit(taken: list[float | None]) -> None:
+    one = HangWatchdog(1, LIMITS, 0.0)
     said = [one.why_hung(0.5 * n) for n in range(1, 12)]
     assert said == [""] * 10 + ["has done nothing for 5 s"]
     taken.append(100.01)
@@ -39,13 +39,13 @@ def test_who_does_nothing_is_hung_after_a_while(taken: list[float | None]) -> No
 
 def test_a_time_in_which_nobody_looked_hardly_counts(taken: list[float | None]) -> None:
     """The machine slept for an hour, or who looks was stopped."""
-    one = Watch(1, LIMITS, 0.0)
+    one = HangWatchdog(1, LIMITS, 0.0)
     assert one.why_hung(3600.0) == ""
     assert [one.why_hung(3600.0 + n) != "" for n in range(1, 6)] == [False] * 4 + [True]
 
 
-def test_where_nobody_tells_nothing_is_hung(taken: list[float | None]) -> None:
-    one = Watch(1, LIMITS, 0.0)
+def test_process_without_a_counter_never_counts_as_hung(taken: list[float | None]) -> None:
+    one = HangWatchdog(1, LIMITS, 0.0)
     taken.append(None)
     assert all(one.why_hung(float(n)) == "" for n in range(100))
 

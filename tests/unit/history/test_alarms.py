@@ -10,13 +10,13 @@ import pytest
 from schemas.alarms import Alarm, alarm_of, encode_alarm
 from schemas.proto import driveby_pb2 as pb
 from services.cli import main as cli
-from services.cli.alarm_service import Teller
+from services.cli.alarm_service import AlarmPublisher
 from services.common.errors import InputError
 from services.history import alarms
-from services.history.alarm_files import acknowledge, alarms_of, standing
-from services.history.alarms import Settings, check, watches
-from services.history.archive import add_results
-from services.history.watch_files import Watch, record_path
+from services.history.alarm_files import acknowledge, alarms_of, standing_alarms
+from services.history.alarms import AlarmSettings, check, monitoring_states
+from services.history.history_store import add_results
+from services.history.watch_files import MonitoringState, record_path
 from tests.fleet import WEEK_S, losses_of
 
 BEGIN_S = datetime(2025, 1, 6, tzinfo=UTC).timestamp()  # a Monday
@@ -43,7 +43,7 @@ def history(made: Path, tmp_path: Path) -> Path:
 
 
 def test_the_right_alarm_and_no_other(history: Path) -> None:
-    found = check(history, Settings(), AFTER_S)
+    found = check(history, AlarmSettings(), AFTER_S)
     (alarm,) = found.raised
     assert found.standing == (alarm,)
     assert (found.bridges, found.problems) == (2, ())
@@ -55,72 +55,72 @@ def test_the_right_alarm_and_no_other(history: Path) -> None:
 
 
 def test_an_alarm_is_raised_once_and_stands_over_any_restart(history: Path) -> None:
-    first = check(history, Settings(), AFTER_S)
-    again = check(history, Settings(), AFTER_S)
+    first = check(history, AlarmSettings(), AFTER_S)
+    again = check(history, AlarmSettings(), AFTER_S)
     assert (again.raised, again.standing, again.bridges) == ((), first.standing, 0)
-    everything = check(history, Settings(), AFTER_S, everything=True)
+    everything = check(history, AlarmSettings(), AFTER_S, everything=True)
     assert (everything.raised, everything.standing) == ((), first.standing)
     # Whatever would be found now: it stands until somebody acknowledges it.
-    sleepy = Settings(learning=500)
+    sleepy = AlarmSettings(learning=500)
     assert check(history, sleepy, AFTER_S, everything=True).standing == first.standing
 
 
 def test_two_processes_find_what_one_finds(history: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = check(history, Settings(), AFTER_S)
+    one = check(history, AlarmSettings(), AFTER_S)
     for path in (history / "alarms").rglob("*.json"):
         path.unlink()
     monkeypatch.setattr(alarms, "_BATCH", 1)
-    assert check(history, Settings(), AFTER_S, processes=2) == one
+    assert check(history, AlarmSettings(), AFTER_S, processes=2) == one
 
 
 def test_a_period_that_is_not_over_does_not_count(history: Path) -> None:
     before_s = BEGIN_S + (LOSES_AT + 0.9) * WEEK_S
-    assert check(history, Settings(), before_s).raised == ()
+    assert check(history, AlarmSettings(), before_s).raised == ()
     # Later the same crossings are looked at again, though nothing was added.
-    assert check(history, Settings(), AFTER_S).bridges == 2
+    assert check(history, AlarmSettings(), AFTER_S).bridges == 2
 
 
 def test_after_it_is_acknowledged_what_is_then_is_the_baseline(history: Path) -> None:
-    (alarm,) = check(history, Settings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
     noted = acknowledge(history, alarm, "owner", "props were put in", alarm.raised + WEEK_S)
     assert noted.acknowledged is not None
-    after = check(history, Settings(), AFTER_S, everything=True)
+    after = check(history, AlarmSettings(), AFTER_S, everything=True)
     assert (after.raised, after.standing) == ((), ())
     assert alarms_of(history, "sim-fleet", "bridge-2") == ([noted], [])
     with pytest.raises(InputError, match="is acknowledged already"):
         acknowledge(history, alarm, "somebody else", "", AFTER_S)
 
 
-def watch_now(history: Path, bridge: str = "bridge-1", now_s: float = AFTER_S) -> Watch:
-    found, problems = watches(history, now_s)
+def watch_now(history: Path, bridge: str = "bridge-1", now_s: float = AFTER_S) -> MonitoringState:
+    found, problems = monitoring_states(history, now_s)
     assert problems == []
     return found[("sim-fleet", bridge)]
 
 
 def test_only_a_watch_that_judged_says_that_nothing_has_changed(history: Path) -> None:
     assert watch_now(history).state == "never_checked"
-    check(history, Settings(learning=40), AFTER_S)
+    check(history, AlarmSettings(learning=40), AFTER_S)
     training = watch_now(history)
     assert (training.state, training.found_nothing) == ("training", False)
     assert training.sentence == ("Not watched yet: 24 of 40 training weeks, up to 2025-06-23.")
-    check(history, Settings(), AFTER_S)
+    check(history, AlarmSettings(), AFTER_S)
     assert watch_now(history).found_nothing
     assert watch_now(history).sentence == (
         "No alarm: 16 weeks judged, 2025-03-03 to 2025-06-23; none shows a change that is clearly "
         "larger than 5 %."
     )
     assert watch_now(history, "bridge-2").state == "alarm"
-    (alarm,) = standing(history)[0]
+    (alarm,) = standing_alarms(history)[0]
     acknowledge(history, alarm, "owner", "", AFTER_S)
     assert watch_now(history, "bridge-2").state == "acknowledged"
     where = record_path(history, "sim-fleet", "bridge-1")
     where.write_text("{")
-    found, problems = watches(history, AFTER_S)
+    found, problems = monitoring_states(history, AFTER_S)
     assert found[("sim-fleet", "bridge-1")].state == "never_checked"
     assert problems[0].startswith(f"{where}: not a record of a check: ")
     # A record that is lost or damaged beyond reading is made again.
     where.unlink()
-    assert check(history, Settings(), AFTER_S).bridges >= 1
+    assert check(history, AlarmSettings(), AFTER_S).bridges >= 1
     assert watch_now(history).found_nothing
 
 
@@ -129,7 +129,7 @@ def test_crossings_that_came_after_the_check_are_not_vouched_for(tmp_path: Path)
     warm = {one.crossing_id: 10.0 for one in found.crossings}
     first = found.model_copy(update={"crossings": found.crossings[:-4]})
     add_results(tmp_path, first, warm)
-    check(tmp_path, Settings(), AFTER_S - 2 * WEEK_S)
+    check(tmp_path, AlarmSettings(), AFTER_S - 2 * WEEK_S)
     assert watch_now(tmp_path, now_s=AFTER_S - 2 * WEEK_S).found_nothing
     # Two weeks later nothing has come: nothing is missing either.
     assert watch_now(tmp_path).found_nothing
@@ -139,14 +139,14 @@ def test_crossings_that_came_after_the_check_are_not_vouched_for(tmp_path: Path)
         "out_of_date",
         "Not watched since 2025-06-09: crossings were added after driveby alarm check was run.",
     )
-    check(tmp_path, Settings(), AFTER_S)
+    check(tmp_path, AlarmSettings(), AFTER_S)
     assert watch_now(tmp_path).found_nothing
 
 
 def test_an_unchanged_bridge_is_not_read_to_say_that_it_is_watched(
     history: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    check(history, Settings(), AFTER_S)
+    check(history, AlarmSettings(), AFTER_S)
     record = record_path(history, "sim-fleet", "bridge-1")
     added_s = (history / "crossings/realm=sim-fleet/bridge=bridge-1").stat().st_mtime
     monkeypatch.setattr(alarms, "read_partition", lambda where: 1 / 0)
@@ -170,7 +170,7 @@ def load_newest(record: Path) -> float:
 
 def test_a_year_passes_before_an_unknown_season_is_judged(tmp_path: Path) -> None:
     add_results(tmp_path, losses_of({"bridge-1": None}, BEGIN_S, 20))
-    check(tmp_path, Settings(), BEGIN_S + 20 * WEEK_S)
+    check(tmp_path, AlarmSettings(), BEGIN_S + 20 * WEEK_S)
     found = watch_now(tmp_path, now_s=BEGIN_S + 20 * WEEK_S)
     assert (found.state, found.sentence) == (
         "season",
@@ -198,7 +198,7 @@ def test_alarms_of_earlier_versions_are_read_and_their_acknowledgement_counts(
     noted = f'{{"edition": 1, "by": "owner", "time": {since_s + WEEK_S + 60.0}, "note": ""}}'
     (where / "20250421-4-weaker.ack.json").write_text(noted)
     (history / "alarms/checked.json").write_text('{"sim-fleet/bridge-1": [1, "week", 2, 0.01, 8]}')
-    found = check(history, Settings(), AFTER_S)
+    found = check(history, AlarmSettings(), AFTER_S)
     assert (found.bridges, found.raised, found.standing, found.problems) == (2, (), (), ())
     assert watch_now(history, "bridge-2").found_nothing
 
@@ -216,24 +216,24 @@ def test_the_smallest_change_of_interest_is_an_option(
 
 
 def test_damaged_files_of_alarms_get_a_line_and_what_stands_stands(history: Path) -> None:
-    (alarm,) = check(history, Settings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
     where = history / "alarms/realm=sim-fleet/bridge=bridge-2"
     (where / "noise.json").write_text("{")
     (where / f"{alarm.alarm_id}.ack.json").write_text('{"by": ""}')
     (history / "alarms/checked.json").write_text("[]")
-    found, problems = standing(history)
+    found, problems = standing_alarms(history)
     assert found == [alarm]
     assert len(problems) == 2
     assert any("noise.json: not an alarm: " in line for line in problems)
     assert any(f"{alarm.alarm_id}.ack.json: by: " in line for line in problems)
-    assert check(history, Settings(), AFTER_S).standing == (alarm,)
+    assert check(history, AlarmSettings(), AFTER_S).standing == (alarm,)
     newer = (where / f"{alarm.alarm_id}.json").read_text().replace('"edition": 1', '"edition": 2')
     (where / "20250101-1-weaker.json").write_text(newer)
-    assert any("20250101-1-weaker.json: edition: " in line for line in standing(history)[1])
+    assert any("20250101-1-weaker.json: edition: " in line for line in standing_alarms(history)[1])
 
 
 def test_alarms_on_the_wire(history: Path) -> None:
-    (alarm,) = check(history, Settings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
     for one in (alarm, acknowledge(history, alarm, "owner", "looked at", AFTER_S)):
         message = pb.Alarm.FromString(encode_alarm(one, 5))
         assert alarm_of(message, "sim-fleet") == one
@@ -243,7 +243,7 @@ def test_alarms_on_the_wire(history: Path) -> None:
         alarm_of(message, "sim-fleet")
 
 
-def test_each_alarm_is_told_when_it_is_raised_when_it_is_noted_and_after_a_restart(
+def test_alarm_is_published_when_raised_noted_and_restarted(
     history: Path,
 ) -> None:
     told: list[tuple[str, bool]] = []
@@ -252,18 +252,18 @@ def test_each_alarm_is_told_when_it_is_raised_when_it_is_noted_and_after_a_resta
         assert pb.Alarm.FromString(payload).alarm_id == alarm.alarm_id
         told.append((alarm.bridge, alarm.acknowledged is not None))
 
-    teller = Teller(put)
-    teller.tell(history, 1)
+    teller = AlarmPublisher(put)
+    teller.publish_changes(history, 1)
     assert told == []
-    (alarm,) = check(history, Settings(), AFTER_S).standing
-    teller.tell(history, 2)
-    teller.tell(history, 3)
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
+    teller.publish_changes(history, 2)
+    teller.publish_changes(history, 3)
     assert told == [("bridge-2", False)]
-    Teller(put).tell(history, 4)
+    AlarmPublisher(put).publish_changes(history, 4)
     assert told == [("bridge-2", False)] * 2
     acknowledge(history, alarm, "owner", "", AFTER_S)
-    teller.tell(history, 5)
-    teller.tell(history, 6)
+    teller.publish_changes(history, 5)
+    teller.publish_changes(history, 6)
     assert told == [("bridge-2", False), ("bridge-2", False), ("bridge-2", True)]
 
 
@@ -279,7 +279,7 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     ]
     assert cli.main(["alarm", "check", *there]) == 0
     said = capsys.readouterr().out
-    assert said.startswith("2 bridges looked at, 1 new alarm\nalarm 2025")
+    assert said.startswith("2 bridges checked, 1 new alarm\nalarm 2025")
     assert "-4-weaker of bridge-2, raised 2025-" in said
     how = "look at the bridge, then: driveby alarm ack BRIDGE --by NAME --note TEXT\n"
     assert said.endswith(how)
@@ -299,9 +299,9 @@ def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_pat
     assert "props; element 4 is" in capsys.readouterr().out
 
 
-def test_what_was_noted_while_nobody_told_is_told_at_the_start(history: Path) -> None:
+def test_unpublished_notes_are_published_at_the_start(history: Path) -> None:
     """Who heard the alarm stand shows it until it hears that somebody took note of it."""
-    (alarm,) = check(history, Settings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
     acknowledge(history, alarm, "owner", "", AFTER_S)
     told: list[tuple[str, bool]] = []
 
@@ -309,16 +309,16 @@ def test_what_was_noted_while_nobody_told_is_told_at_the_start(history: Path) ->
         told.append((alarm.bridge, alarm.acknowledged is not None))
 
     month_s = 30 * 86_400.0
-    Teller(put).tell(history, round((AFTER_S + month_s - 60.0) * 1e9))
+    AlarmPublisher(put).publish_changes(history, round((AFTER_S + month_s - 60.0) * 1e9))
     assert told == [("bridge-2", True)]
-    Teller(put).tell(history, round((AFTER_S + month_s + 60.0) * 1e9))
+    AlarmPublisher(put).publish_changes(history, round((AFTER_S + month_s + 60.0) * 1e9))
     assert told == [("bridge-2", True)]
 
 
 def test_an_acknowledgement_that_is_damaged_can_be_given_again(
     history: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (alarm,) = check(history, Settings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
     damaged = history / f"alarms/realm=sim-fleet/bridge=bridge-2/{alarm.alarm_id}.ack.json"
     damaged.write_text("{")
     words = ["alarm", "ack", "bridge-2", "--by", "owner", "--history", str(history)]
@@ -328,7 +328,7 @@ def test_an_acknowledgement_that_is_damaged_can_be_given_again(
     assert line.endswith("; move that file away and acknowledge again")
     damaged.rename(damaged.with_suffix(".damaged"))
     assert cli.main(words) == 0
-    assert standing(history) == ([], [])
+    assert standing_alarms(history) == ([], [])
 
 
 @pytest.mark.parametrize(
@@ -339,19 +339,19 @@ def test_an_acknowledgement_that_is_damaged_can_be_given_again(
         (["--by", "\n"], "--by: String should have at least 1 character"),
     ],
 )
-def test_what_is_too_long_to_be_said_gets_a_line(
+def test_invalid_acknowledgement_gives_one_line(
     history: Path, capsys: pytest.CaptureFixture[str], said: list[str], line: str
 ) -> None:
-    check(history, Settings(), AFTER_S)
+    check(history, AlarmSettings(), AFTER_S)
     assert cli.main(["alarm", "ack", "bridge-2", *said, "--history", str(history)]) == 2
     assert capsys.readouterr().err.startswith(f"driveby: {line}")
-    assert len(standing(history)[0]) == 1
+    assert len(standing_alarms(history)[0]) == 1
 
 
 def test_a_note_is_one_line_and_nothing_that_a_terminal_obeys(
     history: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    check(history, Settings(), AFTER_S)
+    check(history, AlarmSettings(), AFTER_S)
     words = ["alarm", "ack", "bridge-2", "--by", "an\nowner", "--note", "one\x1b[2J\ntwo"]
     assert cli.main([*words, "--history", str(history)]) == 0
     (line,) = capsys.readouterr().out.splitlines()
@@ -360,14 +360,14 @@ def test_a_note_is_one_line_and_nothing_that_a_terminal_obeys(
 
 
 def test_an_alarm_in_another_place_than_its_own_gets_a_line(history: Path) -> None:
-    (alarm,) = check(history, Settings(), AFTER_S).standing
+    (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
     path = history / f"alarms/realm=sim-fleet/bridge=bridge-2/{alarm.alarm_id}.json"
     copy = path.with_name("copy.json")
     copy.write_bytes(path.read_bytes())
     elsewhere = history / f"alarms/realm=live/bridge=bridge-2/{alarm.alarm_id}.json"
     elsewhere.parent.mkdir(parents=True)
     elsewhere.write_bytes(path.read_bytes())
-    found, problems = standing(history)
+    found, problems = standing_alarms(history)
     assert found == [alarm]
     for wrong in (copy, elsewhere):
         said = f"{wrong}: is alarm {alarm.alarm_id} of bridge-2 in realm sim-fleet, which"
@@ -377,7 +377,7 @@ def test_an_alarm_in_another_place_than_its_own_gets_a_line(history: Path) -> No
 def test_an_alarm_stands_though_its_crossings_are_gone(
     history: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    check(history, Settings(), AFTER_S)
+    check(history, AlarmSettings(), AFTER_S)
     (history / "crossings").unlink()
     there = ["--history", str(history)]
     assert cli.main(["alarm", "list", *there]) == 0
@@ -385,4 +385,4 @@ def test_an_alarm_stands_though_its_crossings_are_gone(
     assert cli.main(["alarm", "check", "--all", *there]) == 0
     assert "stands; element 4" in capsys.readouterr().out
     assert cli.main(["alarm", "ack", "bridge-2", "--by", "owner", *there]) == 0
-    assert standing(history) == ([], [])
+    assert standing_alarms(history) == ([], [])

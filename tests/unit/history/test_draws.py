@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pre_core.crossing import sampling
-from pre_core.search.crank_nicolson import CHAINS
+from pre_core.search.convergence import CHAINS
 from schemas.results import load_results
 from services.cli import main as cli
 from services.common import extras
@@ -23,16 +22,9 @@ def draws() -> Draws:
     return {name: rng.standard_normal((CHAINS, 30)) for name in NAMES}
 
 
-@pytest.mark.parametrize("by_chains", [False, True])
 def test_the_draws_are_those_of_the_result_and_of_what_is_printed(
-    by_chains: bool,
-    project: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if by_chains:  # as where weights fail
-        monkeypatch.setattr(sampling, "_weighted", lambda target, mixed, *_: (None, mixed, 0))
     sample = project / "recordings" / "sample" / "crossing.mcap"
     out, drawn = tmp_path / "out.json", tmp_path / "draws.npz"
     arguments = ["identify", str(sample), "--json", str(out), "--draws", str(drawn)]
@@ -61,16 +53,12 @@ def test_the_draws_are_those_of_the_result_and_of_what_is_printed(
     assert crossing.derived is not None
     giving = crossing.derived.probability_giving
     assert giving is not None
-    assert f"a bearing gives under load: {100.0 * giving.start:.0f} % at the start" in printed
-    assert "the truck's springs are believed to 100 %" in printed
-    assert ("pareto_k" in crossing.diagnostics) is not by_chains
-    if not by_chains:
-        return
-    # Neighbours along a chain are alike, across the chains they are not: the axes are not mixed up.
-    rigidity = arrays["EI_4"] - arrays["EI_4"].mean()
-    along = np.mean(rigidity[:, 1:] * rigidity[:, :-1]) / np.mean(rigidity**2)
-    across = np.mean(rigidity[1:] * rigidity[:-1]) / np.mean(rigidity**2)
-    assert along > across + 0.1
+    start = f"{100.0 * giving.start:.0f} % at the start"
+    assert f"probability of bearing compliance: {start}" in printed
+    assert "suspension weight: 100 %" in printed
+    # The state of the bridge, as the report has it, is not without the variability.
+    assert "\nwith between-crossing variability, as in reports: EI_4 0.4" in printed
+    assert "pareto_k" in crossing.diagnostics
 
 
 def of(
@@ -140,7 +128,7 @@ def test_no_crossing_has_draws(tmp_path: Path) -> None:
     assert opened(path).groups() == []
 
 
-def test_several_crossings_are_told_apart_by_name(draws: Draws, tmp_path: Path) -> None:
+def test_several_crossings_are_distinguished_by_name(draws: Draws, tmp_path: Path) -> None:
     path = tmp_path / "draws.npz"
     longer = {name: np.hstack([values, values]) for name, values in draws.items()}
     write_draws(path, [of("one", draws), of("rejected", {}), of("two", longer)])

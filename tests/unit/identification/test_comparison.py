@@ -9,9 +9,9 @@ from services.identification.comparison import (
     Comparison,
     Estimate,
     compare,
+    describe_comparison,
     estimate_of_state,
     sentences,
-    told,
 )
 
 EDGES_M = np.linspace(0.0, 30.0, 8)
@@ -105,7 +105,7 @@ def test_a_baseline_is_compared_with_and_its_errors_count() -> None:
     assert unchanged == ["No element has clearly changed: all are unchanged within 4 %."]
 
 
-def test_several_weak_elements_come_weakest_first_and_stiffer_ones_are_said() -> None:
+def test_weak_elements_come_first_and_stiffer_ones_are_named() -> None:
     ratios = np.array([1.0, 0.6, 1.0, 0.3, 1.0, 1.5, 1.0])
     found = compared(ratios)
     assert [element.number for element in found.weak] == [4, 2]
@@ -115,7 +115,7 @@ def test_several_weak_elements_come_weakest_first_and_stiffer_ones_are_said() ->
     assert said[2].startswith("Element 6, 21.4 to 25.7 m: 50 % stiffer than the other elements")
 
 
-def test_bridges_whose_elements_are_not_alike_are_compared_by_their_pattern() -> None:
+def test_bridges_of_unequal_elements_are_compared_by_pattern() -> None:
     nominal = np.array([10e9, 20e9, 30e9, 20e9, 10e9])
     mean = 0.9 * nominal
     mean[2] *= 0.5
@@ -125,7 +125,7 @@ def test_bridges_whose_elements_are_not_alike_are_compared_by_their_pattern() ->
     assert found.weak[0].ratio == pytest.approx(0.5)
 
 
-def test_where_nothing_can_be_compared_that_is_said() -> None:
+def test_lack_of_comparable_data_is_reported() -> None:
     two = estimate(np.ones(2))
     assert compare(two, NOMINAL[:2], EDGES_M[:3]) is None
     assert compare(two, NOMINAL[:2], EDGES_M[:3], two) is not None
@@ -204,18 +204,18 @@ def test_of_elements_that_trade_with_each_other_nothing_is_taken_for_common() ->
 LEVEL = ElementState(mean=0.9, std=0.09, q025=0.75, q975=1.08)
 
 
-def test_of_what_is_not_resolved_is_never_said_that_it_agrees() -> None:
+def test_unresolved_elements_are_never_said_to_agree() -> None:
     found = compared()
-    assert told(found) == sentences(found)
-    assert told(found, frozenset({1, 5}), LEVEL) == [
+    assert describe_comparison(found) == sentences(found)
+    assert describe_comparison(found, frozenset({1, 5}), LEVEL) == [
         "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements, interval 57 to 63 %.",
         "The loss may as well be in element 5, beside it and not resolved.",
         "Elements 1 and 5 are not resolved (standard deviation above 25 %).",
         "As a whole the bridge is at 0.90 of nominal ± 10 %.",
     ]
     sound = compared(np.ones(7))
-    assert told(sound, frozenset({7})) == [
+    assert describe_comparison(sound, frozenset({7})) == [
         "Element 7 is not resolved (standard deviation above 25 %)."
     ]
-    every = told(sound, frozenset(range(1, 8)))
+    every = describe_comparison(sound, frozenset(range(1, 8)))
     assert every == ["No single element is resolved (standard deviation above 25 %)."]

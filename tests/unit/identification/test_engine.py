@@ -11,18 +11,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing, Header
+from schemas.results import CrossingResult, ResultHeader
 from schemas.settings import IdentificationSettings
 from schemas.signals import CHANNELS, VehicleInfo, decode_accel, encode_accel, encode_info
 from schemas.site import Site
 from schemas.site_file import site_hash, vehicle_toml
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.identification import traffic
+from services.finding import traffic
 from services.identification.outputs import Output
-from services.recordings.recording import Message
-from services.simulation.drive import Drive, paper_site
+from services.simulation.drive import SimulatedDrive, paper_site
 from tests.working_engine import WorkingEngine
 
 Floats = NDArray[np.float64]
@@ -37,7 +36,7 @@ HASTY = IdentificationSettings(method="random_walk", particles=4, steps=1)
 
 
 def engine(site: Site = SITE, chosen: IdentificationSettings = HASTY) -> WorkingEngine:
-    header = Header("0", 0.0, site_hash(site), chosen.model_dump(mode="json"), chosen.seed)
+    header = ResultHeader("0", 0.0, site_hash(site), chosen.model_dump(mode="json"), chosen.seed)
     return WorkingEngine(site, chosen, header)
 
 
@@ -88,7 +87,7 @@ def fed(
     return [*outputs, *one.finish()]
 
 
-def results_in(outputs: list[Output]) -> list[Crossing]:
+def results_in(outputs: list[Output]) -> list[CrossingResult]:
     return [output.result for output in outputs if output.result is not None]
 
 
@@ -96,7 +95,7 @@ def states_in(outputs: list[Output]) -> list[pb.Crossing]:
     return [pb.Crossing.FromString(o.payload) for o in outputs if o.key.stream == "crossing"]
 
 
-def rejected(run: Run, site: Site = SITE) -> Crossing:
+def rejected(run: Run, site: Site = SITE) -> CrossingResult:
     """The one crossing of a run, which must be rejected, without a number."""
     outputs = fed(messages_of(run, site=site), site)
     (crossing,) = results_in(outputs)
@@ -113,7 +112,7 @@ def rejected(run: Run, site: Site = SITE) -> Crossing:
 
 
 @pytest.fixture(scope="module")
-def crossing_messages(scenario_6: Drive) -> list[Message]:
+def crossing_messages(scenario_6: SimulatedDrive) -> list[Message]:
     return messages_of(scenario_6.run)
 
 
@@ -128,7 +127,7 @@ def hasty_outputs(crossing_messages: list[Message]) -> list[Output]:
     return fed(crossing_messages)
 
 
-def test_one_crossing_is_found_and_told_in_order(outputs: list[Output]) -> None:
+def test_one_crossing_is_found_and_published_in_order(outputs: list[Output]) -> None:
     assert [output.key.stream for output in outputs] == [
         "crossing",
         "crossing",
@@ -259,7 +258,7 @@ def test_a_lost_batch_is_waited_for_and_then_given_up() -> None:
     assert times == [pytest.approx(8.44 + 1.0 + 10.0, abs=0.2)]
 
 
-def test_a_truck_without_accelerations_is_told_in_the_end() -> None:
+def test_truck_without_accelerations_is_reported_at_the_end() -> None:
     run = drive(lambda t: 10.0 * t - 50.0, 200.0)
     one = engine()
     found = []
@@ -318,7 +317,7 @@ def test_samples_that_are_missing_all_over_the_bridge_are_a_gap() -> None:
 
 @pytest.mark.parametrize(("begin_s", "stop_s"), [(4.5, 4.85), (8.7, 9.0)])
 def test_a_gap_beside_the_bridge_does_no_harm(
-    scenario_6: Drive, begin_s: float, stop_s: float
+    scenario_6: SimulatedDrive, begin_s: float, stop_s: float
 ) -> None:
     """The crossing is from 3 to 6.44 s: 2 s earlier, gaps lie in front of it and behind it."""
     run = scenario_6.run
@@ -363,7 +362,9 @@ def test_turning_back_on_the_bridge() -> None:
 
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("begins", [True, False])
-def test_half_a_crossing_is_told_when_the_recording_ends(*, direction: int, begins: bool) -> None:
+def test_half_a_crossing_is_published_at_the_recordings_end(
+    *, direction: int, begins: bool
+) -> None:
     shift = 0.0 if begins else -80.0
     crossing = rejected(drive(lambda t: 15.0 + direction * (8.0 * t + shift), 10.0))
     assert crossing.reasons == ("incomplete_crossing",)
@@ -442,7 +443,7 @@ def with_second_truck() -> Site:
 
 
 def test_two_trucks_and_two_realms_do_not_mix(
-    crossing_messages: list[Message], scenario_6: Drive
+    crossing_messages: list[Message], scenario_6: SimulatedDrive
 ) -> None:
     site = with_second_truck()
     second = messages_of(later(scenario_6.run, 60.0), site=site, vehicle="truck-2")
@@ -646,7 +647,7 @@ def test_a_truck_that_leaves_the_bus_on_the_bridge_may_come_back() -> None:
     [(0.0, ("channel_stuck",)), (1e4, ("channels_alike",))],
 )
 def test_absurd_accelerations_get_a_verdict(
-    scenario_6: Drive, value: float, reasons: tuple[str, ...]
+    scenario_6: SimulatedDrive, value: float, reasons: tuple[str, ...]
 ) -> None:
     run = scenario_6.run
     noise = np.random.default_rng(0).uniform(0.5, 1.0, run.accel_time_s.size)
@@ -667,7 +668,7 @@ def test_what_fails_inside_is_a_verdict(
     assert (crossing.verdict, crossing.reasons) == ("rejected", ("failed",))
 
 
-def test_channels_of_different_rates_are_identified(scenario_6: Drive) -> None:
+def test_channels_of_different_rates_are_identified(scenario_6: SimulatedDrive) -> None:
     """Body sensors at half the rate of the axles'; the body moves slowly."""
     messages = []
     for message in messages_of(scenario_6.run):

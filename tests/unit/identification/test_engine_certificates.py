@@ -5,16 +5,16 @@ from collections.abc import Iterable
 
 import pytest
 
-from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
-from services.execution.dispatch import dispatched
-from services.execution.here import Here
-from services.history.store import known_crossings
-from services.identification import engine as under_test
+from schemas.topics import Message
+from schemas.validation_records import VehicleBridgePair
+from services.execution.dispatch import dispatch
+from services.execution.inline import InlineExecutor
+from services.identification import waiting as under_test
 from services.identification.engine import Engine
-from services.identification.known import search_hash
-from services.identification.outputs import Output, Wanted, Work
-from services.recordings.recording import Message
+from services.identification.known import CrossingRecord, search_hash
+from services.identification.outputs import IdentificationTask, Output, ValidationRequest
+from services.ledger.crossing_log import known_crossings
 from tests.unit.identification.test_engine_resume import (
     HEADER,
     SETTINGS,
@@ -22,13 +22,13 @@ from tests.unit.identification.test_engine_resume import (
     THERE_AND_BACK,
     TWO,
     WHOLE,
+    EngineOutput,
     Identifications,
-    Said,
     messages_of,
     said_by,
 )
 
-PAIR = Pair("truck-1", "bridge-1")
+PAIR = VehicleBridgePair("truck-1", "bridge-1")
 DIGEST = "0123456789abcdef"
 FIVE = messages_of(
     *THERE_AND_BACK, (60.0, -60.0), (80.0, 140.0), (90.0, 140.0), (110.0, -60.0),
@@ -39,18 +39,27 @@ FIVE = messages_of(
 class Asking:
     """An engine that asks for certificates, whose works are done at once."""
 
-    def __init__(self, certificates: dict[Pair, str] | None = None) -> None:
-        self.engine = Engine(SITE, SETTINGS, HEADER, certificates=certificates, are_required=True)
-        self.here = Here(identify=Identifications(), stopwatch=lambda: 0.0)
-        self.wanted: list[Pair] = []
+    def __init__(
+        self, certificates: dict[VehicleBridgePair, str] | None = None, *, has_room: bool = True
+    ) -> None:
+        self.engine = Engine(
+            SITE,
+            SETTINGS,
+            HEADER,
+            certificates=certificates,
+            are_required=True,
+            has_room=lambda: has_room,
+        )
+        self.here = InlineExecutor(identify=Identifications(), stopwatch=lambda: 0.0)
+        self.wanted: list[VehicleBridgePair] = []
 
     def fed(self, messages: Iterable[Message]) -> list[Output]:
         return [o for m in messages for o in self.told(self.engine.feed(m.key, m.payload))]
 
-    def told(self, said: Iterable[Output | Work | Wanted]) -> list[Output]:
-        return list(dispatched(self.engine, self.here, said, self.wanted.append))
+    def told(self, said: Iterable[Output | IdentificationTask | ValidationRequest]) -> list[Output]:
+        return list(dispatch(self.engine, self.here, said, self.wanted.append))
 
-    def resumed(self, said: Said) -> list[Output]:
+    def resumed(self, said: EngineOutput) -> list[Output]:
         return self.told(self.engine.resume(known(said)))
 
     def released(self) -> list[Output]:
@@ -136,8 +145,8 @@ def test_one_that_is_known_before_holds_up_nothing() -> None:
 
 def test_where_nobody_asks_results_name_one_that_is_known() -> None:
     engine = Engine(SITE, SETTINGS, HEADER, certificates={PAIR: DIGEST})
-    here = Here(identify=Identifications())
-    outputs = [o for m in TWO for o in dispatched(engine, here, engine.feed(m.key, m.payload))]
+    here = InlineExecutor(identify=Identifications())
+    outputs = [o for m in TWO for o in dispatch(engine, here, engine.feed(m.key, m.payload))]
     assert {o.result.certificate for o in outputs if o.result} == {DIGEST}
     assert {o.result.certificate for o in WHOLE if o.result} == {None}
 
@@ -162,7 +171,7 @@ def test_another_pair_is_not_held_up() -> None:
     """A second truck on the same bridge, which has its certificate."""
     second = SITE.vehicles[0].model_copy(update={"id": "truck-2"})
     site = SITE.model_copy(update={"vehicles": (*SITE.vehicles, second)})
-    other = Pair("truck-2", "bridge-1")
+    other = VehicleBridgePair("truck-2", "bridge-1")
     asking = Asking()
     asking.engine = Engine(site, SETTINGS, HEADER, certificates={other: DIGEST}, are_required=True)
     asking.fed(TWO)
@@ -172,7 +181,7 @@ def test_another_pair_is_not_held_up() -> None:
     assert asking.engine.waiting() == {PAIR: [ONE, OTHER]}
 
 
-def test_the_pairs_that_drive_most_and_latest_are_told_first() -> None:
+def test_busiest_and_latest_pairs_are_printed_first() -> None:
     names = ("truck-1", "truck-2", "truck-3")
     site = SITE.model_copy(
         update={"vehicles": tuple(SITE.vehicles[0].model_copy(update={"id": n}) for n in names)}
@@ -184,24 +193,22 @@ def test_the_pairs_that_drive_most_and_latest_are_told_first() -> None:
         asking.fed(m._replace(key=m.key._replace(identifier=name)) for m in messages)
 
     one_way = [m for m in TWO if m.log_time_ns < TWO[-1].log_time_ns - 25_000_000_000]
-    pairs = [Pair(name, "bridge-1") for name in names]
+    pairs = [VehicleBridgePair(name, "bridge-1") for name in names]
     drives("truck-1", one_way)
     drives("truck-2", one_way)
-    assert asking.engine.pairs_that_wait() == [pairs[1], pairs[0]]
+    assert asking.engine.waiting_pairs() == [pairs[1], pairs[0]]
     drives("truck-3", TWO)
-    assert asking.engine.pairs_that_wait() == [pairs[2], pairs[1], pairs[0]]
+    assert asking.engine.waiting_pairs() == [pairs[2], pairs[1], pairs[0]]
     drives("truck-1", TWO)
-    assert asking.engine.pairs_that_wait() == [pairs[0], pairs[2], pairs[1]]
+    assert asking.engine.waiting_pairs() == [pairs[0], pairs[2], pairs[1]]
 
 
-def test_while_there_is_no_room_they_wait_untold_and_nobody_is_held_up() -> None:
+def test_results_wait_for_room_and_delay_no_process() -> None:
     """Only those of which there is a recording, should too many wait; and they go on in order."""
-    asking = Asking({PAIR: DIGEST})
-    asking.engine.has_room = lambda: False
+    asking = Asking({PAIR: DIGEST}, has_room=False)
     assert len([o for o in asking.fed(TWO) if o.result]) == 2
-    asking = Asking({PAIR: DIGEST})
-    asking.engine.has_room = lambda: False
-    asking.engine.recorded = frozenset({"truck-1"})
+    asking = Asking({PAIR: DIGEST}, has_room=False)
+    asking.engine.note_recorded({"truck-1"})
     outputs = asking.fed(TWO)
     assert names(outputs) == of_one(ONE, "DETECTED", "COMPLETE") + of_one(
         OTHER, "DETECTED", "COMPLETE"
@@ -241,14 +248,14 @@ def test_a_run_that_was_cut_off_while_they_went_on_goes_on(number: int) -> None:
     assert sorted(said_by(before) + said_by(after)) == sorted(said_by(whole()))
 
 
-def known(said: Said) -> list[under_test.Known]:
+def known(said: EngineOutput) -> list[CrossingRecord]:
     return known_crossings(said, search_hash(HEADER))
 
 
-def test_those_that_have_waited_too_long_are_told_to_be_given_up(
+def test_overdue_crossings_are_reported_as_given_up(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(under_test, "MOST_WAITING", 3)
+    monkeypatch.setattr(under_test, "MAX_WAITING_CROSSINGS", 3)
     asking = Asking()
     with caplog.at_level(logging.WARNING):
         told = names(asking.fed(FIVE))

@@ -7,23 +7,28 @@ import numpy as np
 import pytest
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import BridgeResult, Crossing, Header
+from schemas.results import BridgeResult, CrossingResult, ResultHeader
 from schemas.results_on_the_wire import crossing_to_protobuf, state_to_bridge
 from schemas.settings import IdentificationSettings
 from schemas.signals import decode_accel, encode_accel
 from schemas.site_file import site_hash
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.execution.here import Here
-from services.history.store import known_crossings
+from services.execution.inline import InlineExecutor
+from services.finding.crossing_data import CrossingData
 from services.identification.bridge_state import state_of
-from services.identification.crossing_data import CrossingData, Passing, rejected
 from services.identification.engine import Engine
 from services.identification.identify import Stopwatch
 from services.identification.known import search_hash
-from services.identification.outputs import Fuse, Output, Wanted, Work
-from services.recordings.recording import Message
+from services.identification.outputs import (
+    FusionTask,
+    IdentificationTask,
+    Output,
+    ValidationRequest,
+)
+from services.identification.result_parts import CrossingTimes, rejected
+from services.ledger.crossing_log import known_crossings
 from services.simulation.drive import paper_site
 from tests.working_engine import WorkingEngine
 
@@ -31,8 +36,8 @@ REALM = "sim-test"
 START_S = 1_767_225_600.0
 SITE = paper_site()
 SETTINGS = IdentificationSettings(method="least_squares")
-HEADER = Header("0", 0.0, site_hash(SITE), SETTINGS.model_dump(mode="json"), SETTINGS.seed)
-Said = list[tuple[Key, bytes]]
+HEADER = ResultHeader("0", 0.0, site_hash(SITE), SETTINGS.model_dump(mode="json"), SETTINGS.seed)
+EngineOutput = list[tuple[Key, bytes]]
 
 
 @dataclass
@@ -49,10 +54,10 @@ class Identifications:
         stopwatch: Stopwatch,
         report: object = None,
         keep: object = None,
-    ) -> Crossing:
+    ) -> CrossingResult:
         self.made += 1
         stay = data.stay
-        passing = Passing(stay.entry_s, stay.exit_s, 10.0)
+        passing = CrossingTimes(stay.entry_s, stay.exit_s, 10.0)
         whole = data.samples is not None and not any(
             channel.size == 0 or np.isnan(channel).any()
             for channel in data.samples.channels.values()
@@ -60,14 +65,16 @@ class Identifications:
         if not whole:
             return rejected(data, settings, passing, ["gap_on_bridge"])  # type: ignore[list-item]
         one = {"unit": "N·m²", "mean": 1.0, "std": 0.1, "q025": 0.8, "q50": 1.0, "q975": 1.2}
-        return Crossing.model_validate(
+        return CrossingResult.model_validate(
             rejected(data, settings, passing, ["failed"]).model_dump()  # type: ignore[list-item]
             | {"verdict": "good", "reasons": (), "reason_texts": (), "parameters": {"EI_1": one}}
         )
 
 
-def engine(counted: Identifications | None = None, header: Header = HEADER) -> WorkingEngine:
-    return WorkingEngine(SITE, SETTINGS, header, Here(identify=counted or Identifications()))
+def engine(counted: Identifications | None = None, header: ResultHeader = HEADER) -> WorkingEngine:
+    return WorkingEngine(
+        SITE, SETTINGS, header, InlineExecutor(identify=counted or Identifications())
+    )
 
 
 def messages_of(
@@ -103,15 +110,15 @@ def fed(one: WorkingEngine, messages: Iterable[Message]) -> list[Output]:
     return [output for m in messages for output in one.feed(m.key, m.payload)]
 
 
-def said_by(outputs: Iterable[Output]) -> Said:
+def said_by(outputs: Iterable[Output]) -> EngineOutput:
     return [(output.key, output.payload) for output in outputs]
 
 
 def resumed(
-    said: Said,
+    said: EngineOutput,
     messages: Iterable[Message],
     counted: Identifications | None = None,
-    header: Header = HEADER,
+    header: ResultHeader = HEADER,
 ) -> list[Output]:
     one = engine(counted, header)
     return [*one.resume(said), *fed(one, messages), *one.finish()]
@@ -164,7 +171,7 @@ def test_earlier_crossings_count_in_the_next_state() -> None:
     assert [out.crossing_id for out in state.crossings_left_out] == [first.crossing_id]
 
 
-def test_the_results_file_has_the_state_that_is_told() -> None:
+def test_results_file_has_the_published_state() -> None:
     """Not before: it may be told long after the result that it is about."""
     one = engine()
     results, used = [], []
@@ -179,19 +186,21 @@ def test_the_results_file_has_the_state_that_is_told() -> None:
     assert used == results
 
 
-def fuses_of(run: Engine, said: Iterable[Output | Work | Fuse | Wanted]) -> list[Fuse]:
+def fuses_of(
+    run: Engine, said: Iterable[Output | IdentificationTask | FusionTask | ValidationRequest]
+) -> list[FusionTask]:
     """What is to be fused when the works of a run are done; their states are told later."""
     found = []
     for one in said:
-        if isinstance(one, Work):
+        if isinstance(one, IdentificationTask):
             result = Identifications()(one.data, SETTINGS, stopwatch=lambda: 0.0)
             found += fuses_of(run, run.done(one, result))
-        elif isinstance(one, Fuse):
+        elif isinstance(one, FusionTask):
             found.append(one)
     return found
 
 
-def state_made_of(fuse: Fuse) -> BridgeResult:
+def state_made_of(fuse: FusionTask) -> BridgeResult:
     state = state_of(fuse.counted, fuse.bridge, fuse.fusing)
     assert state is not None
     return state
@@ -210,7 +219,7 @@ def test_a_state_that_was_made_before_a_result_does_not_count_it() -> None:
     assert resumed(said_by(outputs), []) == []
 
 
-def test_of_several_results_without_a_state_the_next_run_tells_one() -> None:
+def test_next_run_publishes_one_state_of_several_results() -> None:
     outputs = [o for o in WHOLE if o.key.stream != "state"]
     assert [o.payload for o in resumed(said_by(outputs), [])] == [WHOLE[11].payload]
 
@@ -222,11 +231,11 @@ def test_crossings_that_could_not_be_fused_are_a_warning_and_owed(
     first, second = (f for m in TWO for f in fuses_of(one, one.feed(m.key, m.payload)))
     assert list(one.fused(first, None)) == []
     assert one.bridges() == {}
-    assert "bridge-1: its crossings could not be fused" in caplog.text
+    assert "bridge-1: fusing its crossings failed" in caplog.text
     assert [o.payload for o in one.fused(second, state_made_of(second))] == [WHOLE[11].payload]
 
 
-def test_a_new_run_has_the_states_that_were_told() -> None:
+def test_new_run_has_the_published_states() -> None:
     """Nothing is fused for them once more."""
     told = state_to_bridge(bridge_states(WHOLE)[-1])[2]
     known = known_crossings(said_by(WHOLE), search_hash(HEADER))
@@ -248,7 +257,7 @@ def test_a_history_that_begins_on_the_bridge_is_no_second_crossing(begin_s: floa
 
 
 @pytest.mark.parametrize("told", [1, 3])
-def test_half_a_crossing_that_was_told_of_keeps_its_name(told: int) -> None:
+def test_published_half_crossing_keeps_its_name(told: int) -> None:
     whole = fed_all_alone(messages_of(*SLOW))
     after = resumed(said_by(whole[:told]), messages_of(*SLOW, begin_s=17.0))
     assert len([o for o in after if o.result]) == 1
@@ -340,7 +349,7 @@ def between(messages: list[Message], stream: str, begin_s: float, stop_s: float)
     ("stream", "begin_s", "stop_s"),
     [("accel", 7.0, 7.2), ("accel", 5.2, 5.4), ("accel", 9.0, 99.0), ("gnss", 5.0, 8.0)],
 )
-def test_who_lost_the_connection_may_bring_what_is_missing(
+def test_reconnected_truck_may_deliver_missing_messages(
     stream: str, begin_s: float, stop_s: float
 ) -> None:
     """Half a second behind the bridge the truck's token goes, and what is under way is lost."""
@@ -412,4 +421,4 @@ def test_one_batch_from_far_ahead_costs_no_crossing(
     changed = [m._replace(payload=encode_accel(ahead)) if m is bad else m for m in messages]
     (result,) = [o.result for o in fed_all_alone(changed) if o.result]
     assert result.verdict == "good"
-    assert ("truck-1: a device time" in caplog.text) == (number > 0)
+    assert ("truck-1: device time jumped ahead" in caplog.text) == (number > 0)

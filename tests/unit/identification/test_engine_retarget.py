@@ -2,13 +2,13 @@
 
 import pytest
 
-from schemas.certificates import Pair
 from schemas.proto import driveby_pb2 as pb
 from schemas.site import Site
 from schemas.site_file import site_hash
+from schemas.topics import Message
+from schemas.validation_records import VehicleBridgePair
 from services.identification.bridge_state import NOTHING_STORED
-from services.identification.outputs import Output, Wanted
-from services.recordings.recording import Message
+from services.identification.outputs import Output, ValidationRequest
 from tests.unit.identification.test_engine_certificates import DIGEST, ONE, OTHER, PAIR, Asking
 from tests.unit.identification.test_engine_resume import HEADER, SITE, START_S, TWO, bridge_states
 
@@ -34,7 +34,7 @@ def after(time_s: float) -> list[Message]:
     return [m for m in TWO if m.log_time_ns * 1e-9 - START_S >= time_s]
 
 
-def retargeted(one: Asking, site: Site, **certificates: str) -> list[Wanted]:
+def retargeted(one: Asking, site: Site, **certificates: str) -> list[ValidationRequest]:
     header = HEADER._replace(site_hash=site_hash(site))
     known = {PAIR: DIGEST} if certificates else {}
     return list(one.engine.retarget(site, header, NOTHING_STORED, known))
@@ -74,13 +74,13 @@ def test_states_of_bridges_begin_anew_as_after_a_new_start() -> None:
 def test_crossings_that_wait_are_those_of_the_new_file() -> None:
     one = Asking()
     one.fed(TWO)
-    assert retargeted(one, EDITED) == [Wanted(Pair("truck-1", "bridge-1"))]
+    assert retargeted(one, EDITED) == [ValidationRequest(VehicleBridgePair("truck-1", "bridge-1"))]
     assert one.engine.waiting() == {PAIR: [ONE, OTHER]}
     seen = []
     one.engine.certify(PAIR, DIGEST)
     while one.engine.has_released:
         said = list(one.engine.release())
-        seen += [one for one in said if not isinstance(one, (Output, Wanted))]
+        seen += [one for one in said if not isinstance(one, (Output, ValidationRequest))]
     assert [(work.data.vehicle, work.data.bridge) for work in seen] == [
         (EDITED.vehicles[0], EDITED.bridges[1])
     ] * 2

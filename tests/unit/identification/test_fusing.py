@@ -7,24 +7,34 @@ import pytest
 
 from schemas import fusion
 from schemas.reasons import BridgeReason, LeftOutReason, Reason
-from schemas.results import BridgeResult, Crossing, Header, load_results, results, results_json
+from schemas.results import (
+    BridgeResult,
+    CrossingResult,
+    ResultHeader,
+    load_results,
+    results,
+    results_json,
+)
 from services.cli.main import main
 from services.identification.bridge_state import (
     NOTHING_STORED,
-    Counted,
     Fusing,
+    RecentCrossings,
     States,
+    add_crossings,
     against,
-    count_in,
     state_of,
     usable,
     with_common_shares,
 )
-from services.identification.fusing import fused, source_of
+from services.identification.fusing import fused
+from services.identification.usable import source_of
 
 NOMINAL = 1.6e10
 ELEMENTS = 5
-AXLE = fusion.Axle(width_m=0.25, twin_distance_m=0.0, length_m=0.2, track_m=1.9, offset_m=0.0)
+AXLE = fusion.AxleFootprint(
+    width_m=0.25, twin_distance_m=0.0, length_m=0.2, track_m=1.9, offset_m=0.0
+)
 
 
 def likelihood(
@@ -61,13 +71,13 @@ def crossing(
     ratio: tuple[float, ...] = (1.0, 1.0, 0.6, 1.0, 1.0),
     verdict: str = "good",
     nominal: float = NOMINAL,
-) -> Crossing:
+) -> CrossingResult:
     of_all = {"unit": "N·m²", "std": 5e8, "q025": 1e9, "q975": 3e10}
     parameters = {
         f"EI_{n}": of_all | {"mean": r * NOMINAL, "q50": r * NOMINAL}
         for n, r in enumerate(ratio, start=1)
     }
-    return Crossing.model_validate(
+    return CrossingResult.model_validate(
         {
             "crossing_id": f"truck-1.bridge-1.{number:03d}",
             "realm": "sim-x",
@@ -90,8 +100,10 @@ def crossing(
     )
 
 
-def state(crossings: list[Crossing], fusing: Fusing = NOTHING_STORED) -> BridgeResult:
-    counted = count_in(Counted(), [one for one in map(usable, crossings) if one is not None])
+def state(crossings: list[CrossingResult], fusing: Fusing = NOTHING_STORED) -> BridgeResult:
+    counted = add_crossings(
+        RecentCrossings(), [one for one in map(usable, crossings) if one is not None]
+    )
     found = state_of(counted, "bridge-1", fusing)
     assert found is not None
     return found
@@ -186,19 +198,21 @@ def test_other_methods_and_older_results_are_not_fused() -> None:
 def test_a_state_is_made_anew_only_when_crossings_have_come() -> None:
     """A worker asks for all its bridges after every result."""
     states = States(NOTHING_STORED)
-    counted = count_in(Counted(), [one for one in map(usable, [crossing(0), crossing(1)]) if one])
+    counted = add_crossings(
+        RecentCrossings(), [one for one in map(usable, [crossing(0), crossing(1)]) if one]
+    )
     first = states.of(counted, "bridge-1", "here")
     assert first == state_of(counted, "bridge-1")
     assert states.of(counted, "bridge-1", "here") is first
     third = usable(crossing(2))
     assert third is not None
-    after = states.of(count_in(counted, [third]), "bridge-1", "here")
+    after = states.of(add_crossings(counted, [third]), "bridge-1", "here")
     assert after is not None
     assert len(after.crossings_used) == 3
 
 
 def test_nothing_is_fused_from_nothing() -> None:
-    assert state_of(Counted(), "bridge-1") is None
+    assert state_of(RecentCrossings(), "bridge-1") is None
     with pytest.raises(ValueError, match="no crossings"):
         fused([])
     assert source_of(crossing(0).model_copy(update={"fusion_likelihood": None})) is None
@@ -206,10 +220,10 @@ def test_nothing_is_fused_from_nothing() -> None:
     assert with_common_shares([one], {}) == [one]
 
 
-HEADER = Header("1", 1.8e9, "hash", {"method": "pre"}, 1)
+HEADER = ResultHeader("1", 1.8e9, "hash", {"method": "pre"}, 1)
 
 
-def write(path: Path, crossings: list[Crossing]) -> Path:
+def write(path: Path, crossings: list[CrossingResult]) -> Path:
     path.write_text(results_json(results(HEADER, crossings, {})), encoding="utf-8")
     return path
 

@@ -3,11 +3,11 @@
 import numpy as np
 
 from schemas.settings import IdentificationSettings
-from services.identification.crossing_data import beam_of, nominal_parameters
+from services.finding.streams import Samples
 from services.identification.pre_method import inputs_of
-from services.identification.streams import Samples
+from services.identification.result_parts import beam_of, nominal_parameters
 from services.simulation.drive import paper_site
-from services.simulation.worlds import continuous
+from services.simulation.out_of_model import continuous
 from tests.verdicts.steady import steady_crossing
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from schemas.site import Bridge
 from services.common.geodesy import bridge_frame, to_lat_lon
-from services.identification.crossing_data import CrossingData
+from services.finding.crossing_data import CrossingData
+from services.finding.streams import Fixes
 from services.identification.lane import lane_factor
-from services.identification.streams import Fixes
 from services.simulation.drive import paper_site
 
 SITE = paper_site()

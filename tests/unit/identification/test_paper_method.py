@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from pre_core import unknowns
+from pre_core import parameters
 from pre_core.paper import experiment
 from pre_core.paper.crossing import paper_window
 from pre_core.paper.residual import deflections_m
 from pre_core.physics.models import from_models
-from pre_core.search.loop import Ending
+from pre_core.search.loop import Termination
 from services.identification import paper_method
 
-FREE = unknowns.paper_subset(experiment.ELEMENTS)
+FREE = parameters.paper_subset(experiment.ELEMENTS)
 
 
 def test_the_spread_of_the_largest_deflection_is_that_where_it_is_largest() -> None:
@@ -23,7 +23,7 @@ def test_the_spread_of_the_largest_deflection_is_that_where_it_is_largest() -> N
         theta = from_models(experiment.TRUCK, beam)
         turned = rng.standard_normal((FREE.size, FREE.size)) * 1e-4 * theta[FREE][:, None]
         covariance = turned @ turned.T
-        fit = paper_method._Fit(theta, FREE, covariance, None, Ending.CONVERGED, {})
+        fit = paper_method._Fit(theta, FREE, covariance, None, Termination.CONVERGED, {})
         mean, std = paper_method._largest_deflection(window, fit)
         assert mean == deflections_m(window, theta).max()
         slopes = np.empty(FREE.size)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from pre_core.constants import MICRO_G_M_PER_S2
+from pre_core.diagnostics.noise_floor import NoiseSegment, density
 from schemas.signals import CHANNELS, decode_accel, decode_gnss, encode_accel, encode_gnss
 from schemas.site import Site
 from schemas.site_file import site_toml
+from schemas.topics import Message
 from services.drives.runs import GnssTrack, Run, run_to_messages
-from services.inspection.finding import Finding, State
-from services.inspection.inspect import of_run
-from services.inspection.noise import Still, density
+from services.inspection.finding import CheckFinding, CheckStatus
+from services.inspection.inspect import findings_of_run
 from services.inspection.recorded import recorded_runs
 from services.inspection.site import findings_of_site
-from services.recordings.recording import Message
 from services.recordings.writer import write_recording
 from tests.verdicts import faults
 from tests.verdicts.faults import Case, Truth
@@ -34,20 +34,20 @@ def sound() -> Case:
 
 def findings(
     folder: Path, run: Run, site: Site, change: Callable[[Message], Message] = lambda m: m
-) -> dict[str, list[Finding]]:
+) -> dict[str, list[CheckFinding]]:
     """What is said of a run as it was recorded, by name, but for what is in order."""
     path = folder / "run.mcap"
     messages = [change(m) for m in run_to_messages([run], site, "sim-check", site.vehicles[0].id)]
     write_recording(path, messages, site_toml=site_toml(site), reason="test", force=True)
     (recorded,) = recorded_runs(path, site, "site.toml")
-    found: dict[str, list[Finding]] = {}
-    for finding in of_run(recorded, site):
-        if finding.state is not State.OK:
+    found: dict[str, list[CheckFinding]] = {}
+    for finding in findings_of_run(recorded, site):
+        if finding.state is not CheckStatus.OK:
             found.setdefault(finding.name, []).append(finding)
     return found
 
 
-def test_nothing_is_said_against_a_sound_drive(tmp_path: Path) -> None:
+def test_sound_drive_has_no_complaint(tmp_path: Path) -> None:
     case = sound()
     assert findings(tmp_path, case.run, case.site) == {}
 
@@ -62,9 +62,9 @@ def test_what_is_recognised_before_a_fit_is_recognised_here(name: str, tmp_path:
     channels = fault.channels(case.run.channels, case.run.accel_time_s - case.entry_s)
     found = findings(tmp_path, case.run._replace(channels=channels), case.site)
     assert str(reason) in found, found
-    assert found[str(reason)][0].state is State.WRONG
+    assert found[str(reason)][0].state is CheckStatus.WRONG
     # One cause, one line: what follows from it is not said beside it.
-    wrong = [key for key, those in found.items() if those[0].state is State.WRONG]
+    wrong = [key for key, those in found.items() if those[0].state is CheckStatus.WRONG]
     assert wrong == [str(reason)]
 
 
@@ -99,7 +99,7 @@ def test_another_truck_than_declared(tmp_path: Path) -> None:
         other = with_vehicle(case.site, wheelbase_m=wheelbase_m)
         assert list(findings(tmp_path, case.run, other)) == ["wheelbase"]
     light = findings(tmp_path, case.run, with_vehicle(case.site, total_mass_kg=3300.0))
-    assert [finding.state for finding in light["spring_over_mass"]] == [State.WRONG] * 2
+    assert [finding.state for finding in light["spring_over_mass"]] == [CheckStatus.WRONG] * 2
 
 
 def test_missing_channels_samples_and_rates(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_receiver_that_is_not_as_declared(tmp_path: Path) -> None:
     case = sound()
     track = case.run.gnss
 
-    def seen(changed: GnssTrack) -> dict[str, list[Finding]]:
+    def seen(changed: GnssTrack) -> dict[str, list[CheckFinding]]:
         return findings(tmp_path, case.run._replace(gnss=changed), case.site)
 
     rng = np.random.default_rng(3)
@@ -184,7 +184,7 @@ def test_bridges_that_lie_beside_the_road(tmp_path: Path) -> None:
     turned = moved(site, start_latitude_deg=3e-5)
     assert "bridge_angle" in findings(tmp_path, run, turned)
     far = moved(site, start_latitude_deg=1.0, end_latitude_deg=1.0)
-    assert findings(tmp_path, run, far)["bridge_crossed"][0].state is State.OPEN
+    assert findings(tmp_path, run, far)["bridge_crossed"][0].state is CheckStatus.OPEN
 
 
 def test_a_recording_that_begins_too_late(tmp_path: Path) -> None:
@@ -218,26 +218,26 @@ def standstill(noise_ug: float, rate_hz: float = 500.0) -> Run:
 
 
 @pytest.mark.parametrize(("noise_ug", "is_wrong"), [(25.0, False), (40.0, True), (10.0, True)])
-def test_a_minute_of_standstill_tells_the_noise(
+def test_minute_of_standstill_measures_the_noise(
     noise_ug: float, is_wrong: bool, tmp_path: Path
 ) -> None:
     sensor = sound().site.sensor.model_copy(update={"rate_hz": (500.0,) * 4})
     site = sound().site.model_copy(update={"sensor": sensor})
     found = findings(tmp_path, standstill(noise_ug), site)
     assert ("noise" in found) == is_wrong
-    assert found["channels_in_place"][0].state is State.OPEN
+    assert found["channels_in_place"][0].state is CheckStatus.OPEN
 
 
 def test_density_is_that_of_the_noise_whatever_lines_are_on_it() -> None:
     run = standstill(25.0)
     for values in run.channels.values():
-        found = density(Still(values, 500.0, True))
+        found = density(NoiseSegment(values, 500.0, True))
         assert found is not None
         assert found.ug_per_rthz == pytest.approx(25.0, rel=0.03)
         assert found.falls == pytest.approx(1.0, abs=0.1)
     # At 200 Hz a driving truck's wheels hide it.
-    assert density(Still(run.channels[U1], 200.0, False)) is None
-    assert density(Still(run.channels[U1][:1000], 500.0, True)) is None
+    assert density(NoiseSegment(run.channels[U1], 200.0, False)) is None
+    assert density(NoiseSegment(run.channels[U1][:1000], 500.0, True)) is None
 
 
 def test_motion_is_not_taken_for_noise(tmp_path: Path) -> None:
@@ -250,36 +250,59 @@ def test_motion_is_not_taken_for_noise(tmp_path: Path) -> None:
     channels = case.run.channels | {U1: values + np.resize(shaken, values.size)}
     found = findings(tmp_path, case.run._replace(channels=channels), case.site)
     (noise,) = found["noise"]
-    assert noise.state is State.OPEN
+    assert noise.state is CheckStatus.OPEN
     assert "the truck's own motion hides it" in noise.text
 
 
 def test_the_site_file_alone() -> None:
     site = sound().site
 
-    def states(changed: Site) -> dict[str, State]:
+    def states(changed: Site) -> dict[str, CheckStatus]:
         return {f.name: f.state for f in findings_of_site(changed, changed.vehicles[0])}
 
     usual = states(site)
-    assert usual.pop("tyres") is State.OPEN
-    assert usual.pop("cg_height") is State.OPEN
-    assert set(usual.values()) == {State.OK}
-    assert states(with_vehicle(site, front_axle_to_cg_m=2.1))["axle_loads"] is State.WRONG
-    assert states(with_vehicle(site, total_mass_kg_spread=0.1))["total_mass"] is State.WRONG
-    assert states(with_vehicle(site, total_mass_kg=95_300.0))["total_mass"] is State.WRONG
-    assert states(with_vehicle(site, wheelbase_m=15.0))["wheelbase_declared"] is State.WRONG
+    assert usual.pop("tyres") is CheckStatus.OPEN
+    assert usual.pop("cg_height") is CheckStatus.OPEN
+    assert set(usual.values()) == {CheckStatus.OK}
+    assert states(with_vehicle(site, front_axle_to_cg_m=2.1))["axle_loads"] is CheckStatus.WRONG
+    assert states(with_vehicle(site, total_mass_kg_spread=0.1))["total_mass"] is CheckStatus.WRONG
+    assert states(with_vehicle(site, total_mass_kg=95_300.0))["total_mass"] is CheckStatus.WRONG
+    assert states(with_vehicle(site, wheelbase_m=15.0))["wheelbase_declared"] is CheckStatus.WRONG
     known = with_vehicle(site, twin_tyre_distance_m=(0.0, 0.33))  # type: ignore[arg-type]
-    assert states(known)["tyres"] is State.OK
-    assert states(with_vehicle(site, cg_height_m=1.1))["cg_height"] is State.OK
+    assert states(known)["tyres"] is CheckStatus.OK
+    assert states(with_vehicle(site, cg_height_m=1.1))["cg_height"] is CheckStatus.OK
     crawling = site.bridges[0].model_copy(update={"survey_speed_m_per_s": 2.0})
-    assert states(site.model_copy(update={"bridges": (crawling,)}))["survey_speed"] is State.WRONG
+    assert (
+        states(site.model_copy(update={"bridges": (crawling,)}))["survey_speed"]
+        is CheckStatus.WRONG
+    )
     slow = site.sensor.model_copy(
         update={"rate_hz": (50.0,) * 4, "noise_density_ug_per_rthz": (0.0,) * 4}
     )
     quiet = states(site.model_copy(update={"sensor": slow}))
-    assert quiet["sampling_rate"] is quiet["noise_declared"] is State.WRONG
+    assert quiet["sampling_rate"] is quiet["noise_declared"] is CheckStatus.WRONG
     long = site.bridges[0].model_copy(update={"span_m": 33.0})
-    assert states(site.model_copy(update={"bridges": (long,)}))["bearings_distance"] is State.WRONG
+    assert (
+        states(site.model_copy(update={"bridges": (long,)}))["bearings_distance"]
+        is CheckStatus.WRONG
+    )
+
+
+def test_lane_and_torsion_are_a_line_each_where_declared() -> None:
+    site = sound().site
+
+    def lines(**more: float) -> list[str]:
+        bridge = site.bridges[0].model_copy(update=more)
+        changed = site.model_copy(update={"bridges": (bridge,)})
+        found = findings_of_site(changed, changed.vehicles[0])
+        return [f.text.split(": ", 1)[1] for f in found if f.name in ("lane", "torsion")]
+
+    assert lines() == []
+    assert lines(lane_offset_m=-1.5, torsional_frequency_ratio=2.0, deck_gyration_m=2.3) == [
+        "lane 1.5 ± 0.3 m right of the axis: the deck twists",
+        "torsion with frequency ratio 2, radius of gyration 2.3 m",
+    ]
+    assert lines(lane_offset_m=0.2) == ["lane 0.2 ± 0.3 m left of the axis: not known to be off it"]
 
 
 def test_every_name_is_snake_case_and_says_one_thing() -> None:

@@ -16,9 +16,9 @@ from schemas.signals import decode_accel
 from schemas.site import Site
 from schemas.site_file import site_toml
 from schemas.site_sensors import PlacedSensor
+from services.catalogue.contents import summarise_recording
 from services.drives.runs import Run, run_to_messages
 from services.drives.signals import signals_of_recording
-from services.drives.survey import survey
 from services.recordings.recording import read_messages
 from services.recordings.writer import write_recording
 from services.report.bridge import bridge_reports
@@ -186,11 +186,12 @@ def test_report_lists_the_sensors() -> None:
     plain = site.model_copy(
         update={"vehicles": (site.vehicles[0].model_copy(update={"sensors": ()}),)}
     )
-    assert "Sensors" not in page(bridge_reports([(Path("a.json"), results, plain)], None))
+    text = page(bridge_reports([(Path("a.json"), results, plain)], None))
+    assert f"{truck}: front and rear on body and axles" in text
 
 
 def test_page_of_a_recording_lists_the_sensors(tmp_path: Path) -> None:
-    text = recording_page(survey(recorded(tmp_path)))
+    text = recording_page(summarise_recording(recorded(tmp_path)))
     assert "8 accelerometers at" in text
     assert "  - unsprung_front_right: axle 1, 0.4 m to the right, 35.4 µg/√Hz" in text
 

@@ -11,15 +11,14 @@ from hypothesis import strategies as st
 
 from schemas.events import Event, EventKind
 from schemas.signals import GnssFix, Identity, encode_gnss, encode_identity
-from schemas.topics import Key
-from services.bus.subscription import Received
+from schemas.topics import Key, Message
+from services.bus.subscription import RawSample
 from services.logger import completeness, known_streams
 from services.logger import intake as module
 from services.logger.clocks import TruckClock
 from services.logger.completeness import KNOWN_AGE_S, known_on_disk
 from services.logger.intake import GAP_PATIENCE_S, Intake
 from services.logger.known_streams import MAX_BOOTS, MAX_STREAMS_OF_ONE
-from services.recordings.recording import Message
 from services.recordings.writer import write_recording
 
 NOW_NS = 1_700_000_000_000_000_000
@@ -38,11 +37,11 @@ def message(
     speed: float = 10.0,
     realm: str = "live",
     **flags: bool,
-) -> Received:
+) -> RawSample:
     device_ns = sequence * S // 10 if device_ns is None else device_ns
     wall_ns = NOW_NS + device_ns if wall_ns is None else wall_ns
     fix = GnssFix(boot_id, sequence, device_ns, wall_ns, 50.0, 8.0, 100.0, speed)
-    return Received(
+    return RawSample(
         f"driveby/v1/{realm}/vehicle/{vehicle}/gnss",
         encode_gnss(fix),
         encode_identity(boot_id, sequence),
@@ -64,14 +63,14 @@ def kinds(events: list[tuple[Key, Event]]) -> list[EventKind]:
 
 
 @pytest.mark.parametrize("step_ns", [-HOUR_NS, DAY_NS])
-def test_a_step_of_the_trucks_clock_is_told_and_loses_nothing(step_ns: int) -> None:
+def test_truck_clock_step_is_reported_and_loses_nothing(step_ns: int) -> None:
     intake = make()
     written = []
     for sequence in range(100):
         device_ns = sequence * S // 10
         wall_ns = NOW_NS + device_ns + (step_ns if sequence >= 60 else 0)
         one = message(sequence, device_ns=device_ns, wall_ns=wall_ns)
-        written.append(intake.take(one, NOW_NS + device_ns))
+        written.append(intake.accept(one, NOW_NS + device_ns))
     assert [one.sequence for one in written if one is not None] == list(range(100))
     [(where, event)] = intake.report(*at(10.0))
     assert where.identifier == event.vehicle == "truck-1"
@@ -81,13 +80,13 @@ def test_a_step_of_the_trucks_clock_is_told_and_loses_nothing(step_ns: int) -> N
 
 
 @pytest.mark.parametrize("step_ns", [-HOUR_NS, DAY_NS])
-def test_a_step_of_the_loggers_clock_is_told_once_and_loses_nothing(step_ns: int) -> None:
+def test_logger_clock_step_is_reported_once_and_loses_nothing(step_ns: int) -> None:
     intake = make()
     events = []
     for sequence in range(100):
         now_s = sequence / 10
         now_ns = NOW_NS + round(now_s * S) + (step_ns if sequence >= 60 else 0)
-        assert intake.take(message(sequence), now_ns) is not None
+        assert intake.accept(message(sequence), now_ns) is not None
         events += intake.report(now_ns, now_s)
     [(_, event)] = events
     assert (event.kind, event.vehicle) == (EventKind.CLOCK_STEP, "")
@@ -97,8 +96,8 @@ def test_a_step_of_the_loggers_clock_is_told_once_and_loses_nothing(step_ns: int
 def test_late_and_repeated_messages_are_no_clock_steps() -> None:
     intake = make()
     for sequence in (0, 1, 5, 3, 4, 2, 5, 6):
-        intake.take(message(sequence), NOW_NS + sequence * S // 10)
-    intake.take(message(0, boot_id=2, wall_ns=NOW_NS + DAY_NS), NOW_NS + DAY_NS)
+        intake.accept(message(sequence), NOW_NS + sequence * S // 10)
+    intake.accept(message(0, boot_id=2, wall_ns=NOW_NS + DAY_NS), NOW_NS + DAY_NS)
     assert EventKind.CLOCK_STEP not in kinds(intake.report(*at(86_400.0)))
 
 
@@ -143,14 +142,14 @@ def test_a_minute_in_which_all_came_late_changes_neither() -> None:
     assert found.offset_s == pytest.approx(1.005, abs=0.005)
 
 
-def test_drift_is_told_when_it_is_known_and_when_it_has_moved() -> None:
+def test_drift_is_reported_when_known_and_when_changed() -> None:
     intake = make()
     told = []
     for number in range(40 * 600):
         now_s = number / 10
         behind_ns = round(2 * S + 100e-6 * now_s * S)
         one = message(number, device_ns=number * S // 10, wall_ns=at(now_s)[0] - behind_ns)
-        intake.take(one, at(now_s)[0])
+        intake.accept(one, at(now_s)[0])
         if number % 10 == 0:
             told += intake.report(*at(now_s))
     assert set(kinds(told)) == {EventKind.CLOCK_DRIFT}
@@ -164,58 +163,58 @@ def test_drift_is_told_when_it_is_known_and_when_it_has_moved() -> None:
 def test_a_replays_old_times_say_nothing_of_clocks() -> None:
     intake = make()
     for number in range(1000):
-        intake.take(message(number, realm="replay-x"), NOW_NS + DAY_NS + number * S)
+        intake.accept(message(number, realm="replay-x"), NOW_NS + DAY_NS + number * S)
     assert intake.clock_figures() == {}
 
 
 def test_payload_and_attachment_must_agree() -> None:
     intake = make()
     forged = message(7)._replace(attachment=encode_identity(1, 8))
-    assert intake.take(forged, NOW_NS) is None
+    assert intake.accept(forged, NOW_NS) is None
     [(_, event)] = intake.report(*at(0.0))
     assert event.kind == EventKind.REFUSED
     assert "the payload says 1, 7 where its attachment says 1, 8" in event.text
-    assert intake.take(message(8), NOW_NS) is not None
+    assert intake.accept(message(8), NOW_NS) is not None
 
 
 def test_a_sequence_that_begins_again_with_other_content_is_refused_not_dropped() -> None:
     intake = make()
-    assert intake.take(message(3), NOW_NS) is not None
-    assert intake.take(message(3), NOW_NS) is None
+    assert intake.accept(message(3), NOW_NS) is not None
+    assert intake.accept(message(3), NOW_NS) is None
     assert intake.counts == {"received": 2, "accepted": 1, "duplicates": 1}
-    assert intake.take(message(3, speed=11.0), NOW_NS) is None
+    assert intake.accept(message(3, speed=11.0), NOW_NS) is None
     [(_, event)] = intake.report(*at(0.0))
     assert "sequence 3 again, with another content" in event.text
 
 
 def test_an_impossible_rate_is_refused_but_no_replay_and_no_clock_that_stands_still() -> None:
     intake = make()
-    flood = [intake.take(message(n, wall_ns=NOW_NS), NOW_NS + n) for n in range(7000)]
+    flood = [intake.accept(message(n, wall_ns=NOW_NS), NOW_NS + n) for n in range(7000)]
     assert sum(one is not None for one in flood) == 6000
     [(_, event)] = intake.report(*at(0.0))
     assert "more than 500 messages a second" in event.text
     # What we asked a truck for comes as fast as it can.
-    assert intake.take(message(9000, wall_ns=NOW_NS, recovered=True), NOW_NS + 7000) is not None
-    fast = [intake.take(message(n, vehicle="fast"), NOW_NS + n) for n in range(20_000)]
+    assert intake.accept(message(9000, wall_ns=NOW_NS, recovered=True), NOW_NS + 7000) is not None
+    fast = [intake.accept(message(n, vehicle="fast"), NOW_NS + n) for n in range(20_000)]
     assert None not in fast
     for n in range(20_000):
         now_ns = NOW_NS + n * S // 10
-        assert intake.take(message(n, vehicle="frozen", wall_ns=NOW_NS), now_ns) is not None
+        assert intake.accept(message(n, vehicle="frozen", wall_ns=NOW_NS), now_ns) is not None
 
 
 def test_a_flood_of_boots_takes_bounded_memory_and_harms_its_own_stream_only() -> None:
     intake = make()
-    intake.take(message(0, boot_id=1), NOW_NS)
+    intake.accept(message(0, boot_id=1), NOW_NS)
     for boot_id in range(2, 500):
-        intake.take(message(0, boot_id=boot_id), NOW_NS)
+        intake.accept(message(0, boot_id=boot_id), NOW_NS)
     assert len(intake.seen.streams) == MAX_BOOTS
-    assert intake.take(message(1, boot_id=1), NOW_NS) is not None
-    assert intake.take(message(0, boot_id=7, vehicle="truck-2"), NOW_NS) is not None
+    assert intake.accept(message(1, boot_id=1), NOW_NS) is not None
+    assert intake.accept(message(0, boot_id=7, vehicle="truck-2"), NOW_NS) is not None
     # An hour later the boot that was silent longest makes room for a new one.
-    intake.take(message(1, boot_id=3), NOW_NS)
+    intake.accept(message(1, boot_id=3), NOW_NS)
     later = NOW_NS + HOUR_NS + 1
-    assert intake.take(message(2, boot_id=1), later) is not None
-    assert intake.take(message(0, boot_id=1000), later) is not None
+    assert intake.accept(message(2, boot_id=1), later) is not None
+    assert intake.accept(message(0, boot_id=1000), later) is not None
     assert intake.forgotten == [(GNSS, 2)]
     assert len(intake.seen.streams) == MAX_BOOTS + 1
 
@@ -224,30 +223,30 @@ def test_a_flood_of_vehicles_takes_bounded_memory(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(known_streams, "MAX_STREAMS", 20)
     intake = make()
     for number in range(100):
-        intake.take(message(0, vehicle=f"truck-{number}"), NOW_NS)
+        intake.accept(message(0, vehicle=f"truck-{number}"), NOW_NS)
     assert len(intake.seen.streams) == len(intake._streams) == 20
     assert intake.counts["refused"] == 80
     for second in range(5):
         assert len(intake.report(*at(second))) <= module._MAX_REFUSED_SOURCES
         for number in range(10_000):
-            intake.take(message(0, vehicle=f"v-{number}"), NOW_NS)
+            intake.accept(message(0, vehicle=f"v-{number}"), NOW_NS)
     assert len(intake._refused) <= module._MAX_REFUSED_SOURCES
-    assert len(intake._refused_told_s) <= module._MAX_REFUSED_SOURCES
+    assert len(intake._refused_reported_s) <= module._MAX_REFUSED_SOURCES
 
 
 def test_a_vehicle_that_shows_itself_in_8400_realms_locks_out_no_other() -> None:
     """Its certificate gives it its own name in every realm."""
     intake = make()
-    assert intake.take(message(0, vehicle="truck-2"), NOW_NS) is not None
+    assert intake.accept(message(0, vehicle="truck-2"), NOW_NS) is not None
     for number in range(8400):
-        intake.take(message(0, vehicle="truck-evil", realm=f"sim-{number}"), NOW_NS)
+        intake.accept(message(0, vehicle="truck-evil", realm=f"sim-{number}"), NOW_NS)
     assert len(intake.seen.streams) == MAX_STREAMS_OF_ONE + 1
     later = NOW_NS + S
-    assert intake.take(message(1, vehicle="truck-2"), later) is not None
-    assert intake.take(message(0, vehicle="truck-3"), later) is not None
+    assert intake.accept(message(1, vehicle="truck-2"), later) is not None
+    assert intake.accept(message(0, vehicle="truck-3"), later) is not None
     for number in range(200):  # as many sources of refusals as are told apart
-        intake.take(message(0, vehicle="truck-evil", realm=f"sim-{number + 9000}"), later)
-    intake.take(message(5, vehicle="truck-3")._replace(attachment=None), later)
+        intake.accept(message(0, vehicle="truck-evil", realm=f"sim-{number + 9000}"), later)
+    intake.accept(message(5, vehicle="truck-3")._replace(attachment=None), later)
     evil, honest = intake.report(*at(1.0))
     assert (evil[1].vehicle, evil[1].messages) == ("truck-evil", 8400 - MAX_STREAMS_OF_ONE + 200)
     assert f"more than {MAX_STREAMS_OF_ONE} streams of vehicle truck-evil" in evil[1].text
@@ -258,24 +257,24 @@ def test_streams_age_out_where_room_is_short(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(known_streams, "MAX_STREAMS", 20)
     intake = make()
     for number in range(21):
-        intake.take(message(0, vehicle=f"truck-{number}"), NOW_NS)
+        intake.accept(message(0, vehicle=f"truck-{number}"), NOW_NS)
     assert intake.counts["refused"] == 1
     [(_, event)] = intake.report(*at(0.0))
     assert "more than 20 streams of all vehicles" in event.text
     later = NOW_NS + HOUR_NS + S
     for number in range(1, 20):  # all but truck-0 go on
-        assert intake.take(message(1, vehicle=f"truck-{number}"), later) is not None
-    assert intake.take(message(0, vehicle="truck-20"), later) is not None
+        assert intake.accept(message(1, vehicle=f"truck-{number}"), later) is not None
+    assert intake.accept(message(0, vehicle="truck-20"), later) is not None
     assert intake.forgotten == [(GNSS._replace(identifier="truck-0"), 1)]
     assert len(intake._streams) == 20
-    assert intake.take(message(0, vehicle="truck-21"), later) is None
+    assert intake.accept(message(0, vehicle="truck-21"), later) is None
     assert "clock_offset_s/truck-0" not in intake.clock_figures()
     # The same within one vehicle, where the newest realm counts.
     for number in range(MAX_STREAMS_OF_ONE + 1):
         realm = f"sim-{number}"
         then = NOW_NS + (2 if number == MAX_STREAMS_OF_ONE else 0) * HOUR_NS
         monkeypatch.setattr(known_streams, "MAX_STREAMS", 8000)
-        assert intake.take(message(0, vehicle="truck-x", realm=realm), then) is not None
+        assert intake.accept(message(0, vehicle="truck-x", realm=realm), then) is not None
     assert intake.forgotten[-1][0].realm == "sim-0"
 
 
@@ -287,68 +286,68 @@ def test_a_flood_of_bridges_locks_out_no_vehicle(monkeypatch: pytest.MonkeyPatch
         with contextlib.suppress(ValueError):
             intake._streams.of(where, Identity(1, 0), NOW_NS)
     assert len(intake._streams) == 20
-    assert intake.take(message(0), NOW_NS) is not None
+    assert intake.accept(message(0), NOW_NS) is not None
 
 
 def test_a_flood_of_holes_takes_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_RUNS", 10)
     intake = make()
     for sequence in range(0, 200, 2):
-        intake.take(message(sequence), NOW_NS)
+        intake.accept(message(sequence), NOW_NS)
     assert intake.seen.streams[(GNSS, 1)].runs == 10
     # What fills a hole or goes on is taken as before.
-    assert intake.take(message(3), NOW_NS) is not None
-    assert intake.take(message(19), NOW_NS) is not None
+    assert intake.accept(message(3), NOW_NS) is not None
+    assert intake.accept(message(19), NOW_NS) is not None
 
 
-def test_refusals_are_told_once_a_minute_and_all_counted() -> None:
+def test_refusals_are_logged_once_a_minute_and_all_counted() -> None:
     intake = make()
     told = []
     for second in range(200):
-        intake.take(message(1)._replace(attachment=None), NOW_NS)
+        intake.accept(message(1)._replace(attachment=None), NOW_NS)
         told += intake.report(*at(float(second)))
     told += intake.report(*at(200.0), closing=True)
     assert [event.messages for _, event in told] == [1, 60, 60, 60, 19]
 
 
-def test_what_is_lost_is_told_and_no_gap_any_more() -> None:
+def test_lost_messages_are_reported_and_no_longer_a_gap() -> None:
     intake = make()
     for sequence in (0, 1, 8, 9):
-        intake.take(message(sequence), NOW_NS)
+        intake.accept(message(sequence), NOW_NS)
     intake.report(*at(0.0))
     [(_, gap)] = intake.report(*at(GAP_PATIENCE_S))
     assert (gap.kind, gap.messages, intake.counts["missing"]) == (EventKind.GAP, 6, 6)
-    intake.take(message(2, recovered=True), NOW_NS)
-    intake.take(message(3, recovered=True), NOW_NS)
-    intake.lose(GNSS, 1, 2, 7, NOW_NS)
+    intake.accept(message(2, recovered=True), NOW_NS)
+    intake.accept(message(3, recovered=True), NOW_NS)
+    intake.mark_lost(GNSS, 1, 2, 7, NOW_NS)
     events = intake.report(*at(20.0))
     assert sorted(kinds(events)) == [EventKind.LOST, EventKind.RECOVERED]
     [lost] = [event for _, event in events if event.kind == EventKind.LOST]
     assert (lost.first_sequence, lost.last_sequence, lost.messages) == (4, 7, 4)
     assert (intake.counts["missing"], intake.counts["lost"]) == (0, 4)
     assert intake.settled == [(GNSS, 1, 4, 7)]
-    intake.lose(GNSS, 1, 2, 7, NOW_NS)
+    intake.mark_lost(GNSS, 1, 2, 7, NOW_NS)
     assert intake.report(*at(21.0)) == []
 
 
 def test_a_bad_message_from_a_spool_is_not_asked_for_for_ever() -> None:
     intake = make()
-    intake.take(message(0), NOW_NS)
+    intake.accept(message(0), NOW_NS)
     bad = message(1)._replace(payload=b"\xff")
-    assert intake.take(bad, NOW_NS) is None
+    assert intake.accept(bad, NOW_NS) is None
     assert intake.settled == []  # the truck's own copy may be better
-    assert intake.take(bad._replace(recovered=True, spooled=True), NOW_NS) is None
+    assert intake.accept(bad._replace(recovered=True, spooled=True), NOW_NS) is None
     assert intake.settled == [(GNSS, 1, 1, 1)]
     assert intake.counts["refused"] == 2
 
 
-def test_a_hole_that_shrinks_is_told_once() -> None:
+def test_shrinking_gap_is_reported_once() -> None:
     intake = make()
     for sequence in (0, 100):
-        intake.take(message(sequence), NOW_NS)
+        intake.accept(message(sequence), NOW_NS)
     told = intake.report(*at(0.0))
     for second in range(1, 30):
-        intake.take(message(second, recovered=True), NOW_NS)
+        intake.accept(message(second, recovered=True), NOW_NS)
         told += intake.report(*at(float(second)))
     gaps = [event for _, event in told if event.kind == EventKind.GAP]
     assert [(gap.first_sequence, gap.last_sequence) for gap in gaps] == [(6, 99)]
@@ -374,7 +373,7 @@ def test_anything_goes_in_and_only_what_is_right_comes_out(
 ) -> None:
     intake = make()
     for one in received:
-        taken = intake.take(Received(*one, one[3]), NOW_NS)
+        taken = intake.accept(RawSample(*one, one[3]), NOW_NS)
         if taken is not None:
             assert taken.key == GNSS
             assert Identity(taken.boot_id, taken.sequence) == (1, 1)
@@ -409,8 +408,8 @@ def test_what_is_on_disk_is_known_and_not_written_again(tmp_path: Path) -> None:
     intake = make()
     for known in found:
         assert intake.adopt(*known, NOW_NS)
-    assert intake.take(message(9), NOW_NS) is None
-    assert intake.take(message(10), NOW_NS) is not None
+    assert intake.accept(message(9), NOW_NS) is None
+    assert intake.accept(message(10), NOW_NS) is not None
     assert intake.counts["duplicates"] == 1
 
 

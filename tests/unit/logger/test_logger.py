@@ -8,18 +8,18 @@ import pytest
 
 from schemas.events import EventKind, decode_event
 from schemas.signals import GnssFix, encode_gnss, encode_identity
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services import logger
-from services.bus.subscription import Received
+from services.bus.subscription import RawSample
+from services.catalogue.index import read_catalog, update_catalog
 from services.common.disk import DISK
 from services.common.errors import InputError
 from services.common.stores import folder_at
-from services.history.catalog import mend, stored
 from services.logger.backlog import Backlog
+from services.logger.file_layout import RecordingTarget
 from services.logger.intake import GAP_PATIENCE_S, Intake
-from services.logger.places import Place
 from services.logger.writer import FileWriter
-from services.recordings.recording import Message, read_info, read_messages
+from services.recordings.recording import read_info, read_messages
 from services.recordings.writer import RecordingWriter
 from tests.waiting import LONGEST_S, until
 
@@ -34,9 +34,9 @@ def fix(sequence: int, boot_id: int = 1, **fields: float) -> bytes:
 
 def received(
     sequence: int, *, key: str = KEY, payload: bytes | None = None, boot_id: int = 1
-) -> Received:
+) -> RawSample:
     attachment = encode_identity(boot_id, sequence)
-    return Received(key, payload or fix(sequence, boot_id), attachment, False)
+    return RawSample(key, payload or fix(sequence, boot_id), attachment, False)
 
 
 def make_intake() -> Intake:
@@ -51,7 +51,7 @@ def at(now_s: float) -> tuple[int, float]:
 def test_a_good_message_is_written_as_it_came() -> None:
     intake = make_intake()
     payload = fix(7)
-    message = intake.take(received(7, payload=payload), NOW_NS + 5)
+    message = intake.accept(received(7, payload=payload), NOW_NS + 5)
     where = Key("live", "vehicle", "truck-1", "gnss")
     assert message == Message(where, payload, 1, 7, NOW_NS + 7, NOW_NS + 5)
     assert intake.report(*at(0.0)) == []
@@ -70,10 +70,10 @@ def test_a_good_message_is_written_as_it_came() -> None:
         (received(0, key=KEY.replace("gnss", "accel")), "accel"),
     ],
 )
-def test_bad_messages_are_refused_counted_and_reported(bad: Received, reason: str) -> None:
+def test_bad_messages_are_refused_counted_and_reported(bad: RawSample, reason: str) -> None:
     intake = make_intake()
-    assert intake.take(bad, NOW_NS) is None
-    assert intake.take(bad, NOW_NS) is None
+    assert intake.accept(bad, NOW_NS) is None
+    assert intake.accept(bad, NOW_NS) is None
     assert intake.counts["refused"] == 2
     [(where, event)] = intake.report(*at(0.0))
     assert where.realm == "live"
@@ -82,11 +82,11 @@ def test_bad_messages_are_refused_counted_and_reported(bad: Received, reason: st
     assert intake.report(*at(1.0)) == []
 
 
-def test_identity_tells_duplicates() -> None:
+def test_identity_detects_duplicates() -> None:
     intake = make_intake()
     other_realm = KEY.replace("live", "sim-a")
     same = [received(0), received(0)._replace(recovered=True), received(0)]
-    assert [intake.take(one, NOW_NS) is not None for one in same] == [True, False, False]
+    assert [intake.accept(one, NOW_NS) is not None for one in same] == [True, False, False]
     assert intake.counts["duplicates"] == 2
     for different in (
         received(1),
@@ -94,13 +94,13 @@ def test_identity_tells_duplicates() -> None:
         received(0, key=other_realm),
         received(0, key=KEY.replace("truck-1", "truck-2")),
     ):
-        assert intake.take(different, NOW_NS) is not None
+        assert intake.accept(different, NOW_NS) is not None
 
 
 def test_a_gap_is_reported_when_it_lasts_and_its_end_too() -> None:
     intake = make_intake()
     for sequence in (10, 11, 15, 16):
-        intake.take(received(sequence), NOW_NS)
+        intake.accept(received(sequence), NOW_NS)
     assert intake.report(*at(0.0)) == []
     assert intake.report(*at(GAP_PATIENCE_S - 0.1)) == []
     [(where, gap)] = intake.report(*at(GAP_PATIENCE_S))
@@ -110,15 +110,15 @@ def test_a_gap_is_reported_when_it_lasts_and_its_end_too() -> None:
     assert (gap.vehicle, gap.stream, gap.boot_id) == ("truck-1", "gnss", 1)
     assert intake.report(*at(100.0)) == []
     for sequence in (12, 13, 14):
-        assert intake.take(received(sequence), NOW_NS) is not None
+        assert intake.accept(received(sequence), NOW_NS) is not None
     [(_, recovered)] = intake.report(*at(101.0))
     assert (recovered.kind, recovered.messages) == (EventKind.RECOVERED, 3)
 
 
 def test_a_gap_at_the_end_is_reported_before_the_file_is_closed() -> None:
     intake = make_intake()
-    intake.take(received(0), NOW_NS)
-    intake.take(received(2), NOW_NS)
+    intake.accept(received(0), NOW_NS)
+    intake.accept(received(2), NOW_NS)
     [(_, gap)] = intake.report(*at(0.0), closing=True)
     assert gap.kind == EventKind.GAP
 
@@ -126,12 +126,12 @@ def test_a_gap_at_the_end_is_reported_before_the_file_is_closed() -> None:
 def test_what_the_logger_says_itself_is_not_taken_twice() -> None:
     intake = make_intake()
     own = received(0, key="driveby/v1/live/service/logger/event", boot_id=99)
-    assert intake.take(own, NOW_NS) is None
+    assert intake.accept(own, NOW_NS) is None
     assert sum(intake.counts.values()) == 0
 
 
-def place(folder: Path, file: Path | None = None) -> Place:
-    return Place(folder, file, None, "site = 1\n")
+def place(folder: Path, file: Path | None = None) -> RecordingTarget:
+    return RecordingTarget(folder, file, None, "site = 1\n")
 
 
 def messages(number: int, vehicle: str = "truck-1") -> list[Message]:
@@ -211,7 +211,7 @@ def test_a_full_queue_is_counted_and_holds_nobody_up(
     assert len(list(read_messages(tmp_path / "a.mcap"))) == sum(taken)
 
 
-def test_a_write_error_is_told_and_what_was_synced_stays(tmp_path: Path) -> None:
+def test_write_error_is_reported_and_synced_data_stay(tmp_path: Path) -> None:
     is_full = False
 
     def sync(descriptor: int) -> None:
@@ -251,9 +251,9 @@ def test_what_has_come_is_written_or_counted_before_the_file_is_closed(
 
     class Backlog:
         def __init__(self, *arguments: object) -> None:
-            self.waiting: list[Received] = []
+            self.waiting: list[RawSample] = []
 
-        def receive(self, timeout_s: float = 0.0) -> Received | None:
+        def receive(self, timeout_s: float = 0.0) -> RawSample | None:
             return self.waiting.pop(0) if self.waiting else None
 
         def close(self) -> None:
@@ -284,9 +284,9 @@ def test_a_file_that_is_closed_has_its_row_in_the_catalogue(tmp_path: Path) -> N
     for message in messages(3) + messages(2, "truck-2"):
         assert writer.put(message)
     writer.finish("done", {})
-    rows = stored(folder_at(str(tmp_path))).rows
+    rows = read_catalog(folder_at(str(tmp_path))).rows
     assert sorted((row.vehicles, row.messages) for row in rows.values()) == [
         (("truck-1",), 3),
         (("truck-2",), 2),
     ]
-    assert mend(folder_at(str(tmp_path))) == (rows, 0, ())
+    assert update_catalog(folder_at(str(tmp_path))) == (rows, 0, ())

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas import spool as wire
-from schemas.signals import Channel, GnssFix, Identity, decode_accel, encode_identity
-from schemas.spool import Held, Query
+from schemas.signals import AccelChannel, GnssFix, Identity, decode_accel, encode_identity
+from schemas.spool import SpoolBoot, SpoolQuery
 from schemas.topics import Key
-from services.bus.subscription import Received, Seen
+from services.bus.subscription import RawSample, SeenSequences
 from services.common.intervals import Intervals
 from services.logger import spool_listing, spool_recovery
 from services.logger.spool_recovery import SpoolRecovery, shortfall
@@ -46,7 +46,7 @@ def test_every_missing_number_is_fetched_confirmed_or_lost(
     seen: set[int], held: set[int], durable: int, ripe: int, gone: set[int]
 ) -> None:
     """What is gone from this logger's disk is on none, whatever the truck was told."""
-    boot = Held(1, 31, intervals(held).ranges(), durable, 0)
+    boot = SpoolBoot(1, 31, intervals(held).ranges(), durable, 0)
     found = shortfall(boot, intervals(seen), ripe, intervals(gone).ranges())
     missing = set(range(ripe)) - seen
     safe = {n for n in missing if n <= durable} - gone
@@ -64,7 +64,7 @@ def test_near_holes_are_asked_for_at_once_from_the_first_to_the_last() -> None:
 @given(
     st.lists(
         st.builds(
-            lambda boot, numbers, durable, dropped: Held(
+            lambda boot, numbers, durable, dropped: SpoolBoot(
                 boot,
                 max(numbers, default=0) + 1,
                 intervals(numbers).ranges(),
@@ -79,7 +79,7 @@ def test_near_holes_are_asked_for_at_once_from_the_first_to_the_last() -> None:
         unique_by=lambda held: held.boot_id,
     )
 )
-def test_contents_round_trip(boots: list[Held]) -> None:
+def test_contents_round_trip(boots: list[SpoolBoot]) -> None:
     assert wire.decode_contents(wire.encode_contents(1, boots)) == sorted(boots)
 
 
@@ -89,7 +89,7 @@ def test_any_answer_and_any_query_is_read_or_a_value_error(
 ) -> None:
     for call in (
         lambda: wire.decode_contents(payload),
-        lambda: wire.decode_page(payload, Query(1, 2, 3)),
+        lambda: wire.decode_page(payload, SpoolQuery(1, 2, 3)),
         lambda: wire.parse_query(parameters),
         lambda: wire.parse_spool_key(next(iter(parameters), "")),
     ):
@@ -103,7 +103,7 @@ def test_any_answer_and_any_query_is_read_or_a_value_error(
 
 @given(st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
 def test_queries_and_pages_round_trip(boot_id: int, first: int, last: int) -> None:
-    query = Query(boot_id, first, last)
+    query = SpoolQuery(boot_id, first, last)
     parts = dict(part.split("=") for part in query.parameters().split(";"))
     assert wire.parse_query(parts) == query
     assert wire.decode_page(wire.encode_page(query, None), query) is None
@@ -124,10 +124,10 @@ class Logger:
     """The part of a logger that asks; `seen` is what it has."""
 
     def __init__(self, router: zenoh.Session) -> None:
-        self.seen = Seen()
+        self.seen = SeenSequences()
         self.confirmed: set[int] = set()
         self.lost: set[int] = set()
-        self.received: list[Received] = []
+        self.received: list[RawSample] = []
 
         def settle(into: set[int]) -> Callable[[Key, int, int, int], None]:
             def call(where: Key, boot_id: int, first: int, last: int) -> None:
@@ -164,7 +164,7 @@ class Logger:
 def drive(gateway: Gateway, batches: int) -> None:
     for number in range(batches):
         now = {"device_time_ns": number * 50_000_000, "wall_time_ns": time.time_ns()}
-        gateway.accel({"sprung_front": Channel(1000.0, np.full(50, float(number)))}, **now)
+        gateway.accel({"sprung_front": AccelChannel(1000.0, np.full(50, float(number)))}, **now)
 
 
 def test_what_an_earlier_boot_left_is_fetched_in_pages(
@@ -187,7 +187,7 @@ def test_what_an_earlier_boot_left_is_fetched_in_pages(
     gateway.close()
 
 
-def test_what_has_just_been_said_is_not_asked_for(
+def test_recent_messages_are_not_requested(
     router: zenoh.Session, client: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It may still be on its way; only what is missing for a round is fetched."""
@@ -216,7 +216,7 @@ def test_what_no_one_has_is_lost_and_what_was_confirmed_is_not(
     drive_on = 0
     while not spool.dropped():
         gateway.accel(
-            {"sprung_front": Channel(1000.0, np.zeros(50))},
+            {"sprung_front": AccelChannel(1000.0, np.zeros(50))},
             device_time_ns=drive_on, wall_time_ns=time.time_ns(),
         )  # fmt: skip
         drive_on += 1
@@ -282,7 +282,7 @@ def test_a_refused_batch_uses_up_no_number(
     drive(gateway, 1)
     with pytest.raises(ValueError, match="not finite"):
         gateway.accel(
-            {"sprung_front": Channel(1000.0, np.full(50, np.nan))},
+            {"sprung_front": AccelChannel(1000.0, np.full(50, np.nan))},
             device_time_ns=0, wall_time_ns=time.time_ns(),
         )  # fmt: skip
     with pytest.raises(ValueError, match="latitude"):
@@ -342,13 +342,13 @@ def test_a_thousand_boots_take_turns(
     router: zenoh.Session, client: zenoh.Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A step that compared 9,000 at once held up everything else for 10.6 s."""
-    boots = [Held(boot_id, 10, [(0, 9)], -1, 0) for boot_id in range(1, 1001)]
+    boots = [SpoolBoot(boot_id, 10, [(0, 9)], -1, 0) for boot_id in range(1, 1001)]
     contents = wire.encode_contents(1, boots)
     compared: set[int] = set()
     in_step: list[int] = []
     real = shortfall
 
-    def counted(boot: Held, *arguments: Any) -> Any:
+    def counted(boot: SpoolBoot, *arguments: Any) -> Any:
         compared.add(boot.boot_id)
         in_step[-1] += 1
         return real(boot, *arguments)
@@ -377,12 +377,12 @@ def test_endless_answers_are_read_once_and_complained_of_a_few_times(
     router: zenoh.Session, client: zenoh.Session, monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture, tmp_path: Path,
 ) -> None:  # fmt: skip
-    contents = wire.encode_contents(1, [Held(1, 10, [(0, 9)], -1, 0)])
+    contents = wire.encode_contents(1, [SpoolBoot(1, 10, [(0, 9)], -1, 0)])
     decoded: list[bytes] = []
     rounds: list[int] = []
     real = wire.decode_contents
 
-    def decode(payload: bytes) -> list[Held]:
+    def decode(payload: bytes) -> list[SpoolBoot]:
         decoded.append(payload)
         return real(payload)
 
@@ -428,7 +428,9 @@ def test_a_page_without_end_is_given_up(
     router: zenoh.Session, client: zenoh.Session, size: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     """It filled 1.4 GB, for its deadline was looked at only when nothing waited."""
-    contents = wire.encode_contents(1, [Held(1, 10, [(0, 9)], -1, 0), Held(2, 1, [], 0, 0)])
+    contents = wire.encode_contents(
+        1, [SpoolBoot(1, 10, [(0, 9)], -1, 0), SpoolBoot(2, 1, [], 0, 0)]
+    )
     sent: list[int] = []
 
     def answer(query: zenoh.Query) -> None:
@@ -453,7 +455,7 @@ def test_a_page_without_end_is_given_up(
 
 def test_a_truck_in_many_realms_leaves_room_for_the_others(router: zenoh.Session) -> None:
     logger = Logger(router)
-    boots = [Held(1, 10, [(0, 9)], 9, 0)]
+    boots = [SpoolBoot(1, 10, [(0, 9)], 9, 0)]
     for number in range(2000):
         where = ACCEL._replace(realm=f"sim-{number}", identifier="truck-evil")
         logger.recovery._compare(where, boots)
@@ -468,12 +470,12 @@ def test_a_boot_that_is_gone_from_disk_and_truck_is_lost(router: zenoh.Session) 
     logger = Logger(router)
     logger.recovery._gone = {(ACCEL, 1): intervals({0, 1, 2}), (ACCEL, 2): intervals({5, 6})}
     logger.seen.numbers(ACCEL, 2).add_range(0, 4)
-    boots = [Held(2, 7, [(6, 6)], 6, 0), Held(3, 1, [(0, 0)], 0, 0)]
+    boots = [SpoolBoot(2, 7, [(6, 6)], 6, 0), SpoolBoot(3, 1, [(0, 0)], 0, 0)]
     for _ in range(2):
         logger.recovery._with_holes = None
         logger.recovery._compare(ACCEL, boots)
     assert logger.seen.streams[(ACCEL, 1)].ranges() == [(0, 2)]
     assert logger.lost == {0, 1, 2, 5}
     assert [query for _, query in logger.recovery._trucks[("live", "truck-1")].todo] == [
-        Query(2, 6, 6)
+        SpoolQuery(2, 6, 6)
     ]

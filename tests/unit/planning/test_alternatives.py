@@ -3,7 +3,7 @@
 import pytest
 
 from schemas.site import Bridge, Site
-from services.identification.checks import axle_loads_kg
+from schemas.site_vehicle import axle_loads_kg
 from services.planning.alternatives import Plan, alternatives, as_planned, with_noise, with_tyres
 from services.planning.crossings import axles_of
 from services.planning.survey import middle_elements

@@ -6,13 +6,13 @@ from scipy.stats import chisquare, kstest, lognorm, norm, truncnorm
 
 from pre_core.constants import NORMAL_975
 from pre_core.diagnostics.calibration import (
-    group_p_value,
+    bonferroni_p_value,
     pooled_share,
     rank,
     rank_from_quantiles,
     root_mean_square,
+    truncated_covariance,
     uniformity,
-    without_negative,
 )
 
 
@@ -71,10 +71,10 @@ def test_p_values_of_uniform_ranks_are_uniform_and_of_a_group_not_too_small() ->
     rng = np.random.default_rng(3)
     p = np.array([uniformity(rng.uniform(size=200), 10).p_value for _ in range(600)])
     assert kstest(p, "uniform").pvalue > 0.001
-    groups = np.array([group_p_value(row) for row in p.reshape(-1, 6)])
+    groups = np.array([bonferroni_p_value(row) for row in p.reshape(-1, 6)])
     # No more groups fail at 10 % than 10 %, but for chance: 100 groups.
     assert np.mean(groups < 0.1) < 0.2
-    assert group_p_value(np.array([0.5, 0.001])) == pytest.approx(0.002)
+    assert bonferroni_p_value(np.array([0.5, 0.001])) == pytest.approx(0.002)
 
 
 def test_standard_error_of_a_share_knows_that_elements_of_a_crossing_are_alike() -> None:
@@ -99,7 +99,7 @@ def test_root_mean_square_sees_intervals_that_are_too_narrow() -> None:
 @pytest.mark.parametrize("centre", [0.0, 0.7, 2.0, 9.0])
 def test_covariance_of_a_normal_cut_off_at_zero(centre: float) -> None:
     covariance = np.array([[2.0, 0.9, 0.0], [0.9, 1.3, -0.4], [0.0, -0.4, 0.7]])
-    found = without_negative(covariance, 1, centre)
+    found = truncated_covariance(covariance, 1, centre)
     std = np.sqrt(1.3)
     cut = truncnorm(-centre / std, np.inf, loc=centre, scale=std)
     assert found[1, 1] == pytest.approx(float(cut.var()), rel=1e-9)

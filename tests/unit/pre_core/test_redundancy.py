@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core.diagnostics.redundancy import Leftover, apart, leftover
+from pre_core.diagnostics.redundancy import RedundancyResidual, motion_ratio, redundancy_residual
 
 Floats = NDArray[np.float64]
 STEP_S = 0.002
@@ -25,8 +25,8 @@ def corners(seed: int = 1, seconds: float = 8.0) -> Floats:
     return np.array([heave + p * pitch + r * roll for p, r in signs]) + noise
 
 
-def judged(acceleration: Floats) -> Leftover:
-    return leftover(PARITY, acceleration, STEP_S, 0.01, 0.0005, 2.5)
+def judged(acceleration: Floats) -> RedundancyResidual:
+    return redundancy_residual(PARITY, acceleration, STEP_S, 0.01, 0.0005, 2.5)
 
 
 def test_sound_sensors_leave_their_noise_alone() -> None:
@@ -52,7 +52,7 @@ def test_delays_alone_are_expected_by_their_spread() -> None:
         signals = corners(seed)
         late = 0.004 * rng.standard_normal((4, 1))
         signals = signals - late * np.gradient(signals, STEP_S, axis=1)
-        found = leftover(PARITY, signals, STEP_S, 1e-4, 0.004, 2.5)
+        found = redundancy_residual(PARITY, signals, STEP_S, 1e-4, 0.004, 2.5)
         assert found.power < found.expected
 
 
@@ -89,6 +89,6 @@ def test_loose_sensor_is_nobodys_gain() -> None:
 
 def test_sides_that_move_apart_are_compared_by_size() -> None:
     one = corners()[0]
-    assert apart(one, one, STEP_S) == pytest.approx(1.0)
-    assert apart(one, -3.0 * one, STEP_S) == pytest.approx(3.0)
-    assert apart(one, np.zeros_like(one), STEP_S) == np.inf
+    assert motion_ratio(one, one, STEP_S) == pytest.approx(1.0)
+    assert motion_ratio(one, -3.0 * one, STEP_S) == pytest.approx(3.0)
+    assert motion_ratio(one, np.zeros_like(one), STEP_S) == np.inf

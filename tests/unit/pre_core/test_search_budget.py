@@ -6,14 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pre_core.crossing import optimum
-from pre_core.search.loop import Ending
+from pre_core.crossing import optimum, walk
+from pre_core.crossing.fit import Optimum
+from pre_core.physics.tandem import NO_LEAD
+from pre_core.search.loop import Termination
 
 
-def found(chi2: float, evaluations: int, ending: Ending = Ending.CONVERGED) -> Any:
+def found(chi2: float, evaluations: int, ending: Termination = Termination.CONVERGED) -> Any:
     """A stand-in for an optimum, as the choice among them sees it."""
-    unknown: Any = SimpleNamespace(y=np.zeros(1))
-    return optimum.Optimum(unknown, unknown, ending, chi2, evaluations, 1)
+    on_two_axles = SimpleNamespace(lead=NO_LEAD)
+    unknown: Any = SimpleNamespace(y=np.zeros(1), lines_hz=(), crossing=on_two_axles)
+    return Optimum(unknown, unknown, ending, chi2, evaluations, 1)
 
 
 def test_the_walk_has_a_reach_however_little_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -23,13 +26,13 @@ def test_the_walk_has_a_reach_however_little_is_known(monkeypatch: pytest.Monkey
     def look(shift: float, start: Any) -> Any:
         seen.append(shift)
         assert len(seen) < 1000
-        return optimum._Place(-abs(shift), shift, start, np.zeros(0, np.int64)), 1
+        return walk.Placement(-abs(shift), shift, start, np.zeros(0, np.int64)), 1
 
     bridge = SimpleNamespace(bridge=np.arange(3))
-    monkeypatch.setattr(optimum, "_looking", lambda problem, y, way: look)
-    monkeypatch.setattr(optimum, "layout", lambda problem: bridge)
+    monkeypatch.setattr(walk, "_local_fit", lambda problem, y, way: look)
+    monkeypatch.setattr(walk, "layout", lambda problem: bridge)
     problem: Any = SimpleNamespace(receiver_rows=np.array([[1e-9]]))
-    _, evaluations = optimum._walk(problem, np.zeros(4), optimum._SIMPLEST)
+    _, evaluations = walk.scan_offsets(problem, np.zeros(4), optimum._SIMPLEST)
     assert max(map(abs, seen)) < 40.0
     assert evaluations < 200
 
@@ -44,21 +47,22 @@ def test_a_search_that_finds_no_fit_ends_within_its_budget(
         budgets.append(most)
         return found(5.0, each)
 
-    monkeypatch.setattr(optimum, "_from_places", from_places)
-    monkeypatch.setattr(optimum, "prepare", lambda inputs: (None, None))
+    monkeypatch.setattr(optimum, "_refine_candidates", from_places)
+    monkeypatch.setattr(optimum, "build_problem", lambda inputs: (found(0.0, 0).problem, None))
     monkeypatch.setattr(optimum, "levels_at", lambda problem, y: np.zeros(1))
-    monkeypatch.setattr(optimum, "_is_accepted", lambda problem, chi2: chi2 < 1.5)
+    monkeypatch.setattr(optimum, "line_at", lambda problem, y: 0.0)
+    monkeypatch.setattr(optimum, "is_accepted", lambda problem, chi2: chi2 < 1.5)
     inputs: Any = None
     best = optimum.find_optimum(inputs)
     assert min(budgets) > 0
     assert best.evaluations == each * len(budgets)
     assert best.evaluations < optimum._MOST_EVALUATIONS + each
-    assert best.ending is Ending.STEPS_EXHAUSTED
+    assert best.ending is Termination.STEPS_EXHAUSTED
 
 
 def test_a_fit_that_took_long_is_a_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(optimum, "_from_places", lambda *_: found(1.0, 300_000))
-    monkeypatch.setattr(optimum, "prepare", lambda inputs: (None, None))
-    monkeypatch.setattr(optimum, "_is_accepted", lambda problem, chi2: chi2 < 1.5)
+    monkeypatch.setattr(optimum, "_refine_candidates", lambda *_: found(1.0, 300_000))
+    monkeypatch.setattr(optimum, "build_problem", lambda inputs: (found(0.0, 0).problem, None))
+    monkeypatch.setattr(optimum, "is_accepted", lambda problem, chi2: chi2 < 1.5)
     inputs: Any = None
-    assert optimum.find_optimum(inputs).ending is Ending.CONVERGED
+    assert optimum.find_optimum(inputs).ending is Termination.CONVERGED

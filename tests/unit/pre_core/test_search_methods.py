@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares as least_squares_of_scipy
 
-from pre_core import unknowns
+from pre_core import parameters
 from pre_core.paper import experiment, least_squares, random_walk, residual
 from pre_core.paper.crossing import paper_window
-from pre_core.paper.residual import Window
+from pre_core.paper.residual import PaperWindow
 from pre_core.physics.models import from_models
-from pre_core.search import approximation, crank_nicolson, levenberg_marquardt, loop
-from pre_core.search.loop import Ending
-from services.validation.paper import DERIVED, NAMES, table_columns
+from pre_core.search import levenberg_marquardt, loop
+from pre_core.search.loop import Termination
+from studies.paper.scenarios import DERIVED, NAMES, table_columns
 
 NOMINAL = from_models(experiment.TRUCK, experiment.beam(np.ones(experiment.ELEMENTS)))
-FREE = unknowns.paper_subset(experiment.ELEMENTS)
+FREE = parameters.paper_subset(experiment.ELEMENTS)
 PARTICLES = 12
 
 State = Any
@@ -33,19 +33,22 @@ Step = Callable[[State], tuple[State, Any]]
 class Method(NamedTuple):
     """A search bound to data: `bind(window, seed, threads)` gives its init and step."""
 
-    bind: Callable[[Window, int, int], tuple[Callable[[], State], Step]]
+    bind: Callable[[PaperWindow, int, int], tuple[Callable[[], State], Step]]
     steps: int  # enough to see it move
-    endings: frozenset[Ending]  # how it may end on sound data
-    descends: bool = True  # a sampler goes up and down
+    endings: frozenset[Termination]  # how it may end on sound data
 
 
-def bind_random_walk(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
+def bind_random_walk(
+    window: PaperWindow, seed: int, threads: int
+) -> tuple[Callable[[], State], Step]:
     bound = random_walk.problem(window, NOMINAL, FREE, seed, threads=threads)
     return partial(random_walk.init, bound, PARTICLES), partial(random_walk.step, bound)
 
 
-def bind_least_squares(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
-    bound = least_squares.Problem(window, NOMINAL, FREE)
+def bind_least_squares(
+    window: PaperWindow, seed: int, threads: int
+) -> tuple[Callable[[], State], Step]:
+    bound = least_squares.LeastSquaresProblem(window, NOMINAL, FREE)
     work = residual.workspace(window)
     start = NOMINAL[FREE] * np.random.default_rng(seed).uniform(0.8, 1.2, FREE.size)
     return (
@@ -54,7 +57,7 @@ def bind_least_squares(window: Window, seed: int, threads: int) -> tuple[Callabl
     )
 
 
-def small_rows(window: Window) -> levenberg_marquardt.Rows:
+def small_rows(window: PaperWindow) -> levenberg_marquardt.Rows:
     """Rows (k, 4) of three unknowns, not linear; not finite where the window's data are not."""
     sound = 1.0 + 0.0 * float(np.mean(window.acceleration))
 
@@ -68,40 +71,20 @@ def small_rows(window: Window) -> levenberg_marquardt.Rows:
 LOWER = np.array([-np.inf, -np.inf, 0.0])  # of small_rows: the third is held by its bound
 
 
-def bind_bounded(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
+def bind_bounded(window: PaperWindow, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
     """Levenberg and Marquardt's steps of any problem, with bounds."""
     rows = small_rows(window)
     start = np.random.default_rng(seed).uniform(0.5, 1.5, 3)
     return (
-        partial(levenberg_marquardt.begin, rows, start),
+        partial(levenberg_marquardt.initial_state, rows, start),
         partial(levenberg_marquardt.descend, rows, lower=LOWER),
     )
 
 
-def bind_chains(window: Window, seed: int, threads: int) -> tuple[Callable[[], State], Step]:
-    """Chains on what belongs to small_rows, the third unknown positive or exactly zero."""
-    rows = small_rows(window)
-
-    def target(y: np.ndarray) -> np.ndarray:
-        return -0.5 * np.sum(rows(y) ** 2, axis=1)
-
-    mixed = approximation.mixture(
-        np.array([0.6, 0.3, 0.0]),
-        np.diag([0.2, 0.6, 0.1]),
-        np.array([2]),
-        np.array([0.1, 0.0, 0.0]),
-        seed,
-        np.array([-np.inf, -np.inf, 0.0]),
-    )
-    assert len(mixed.parts) == 2
-    return partial(crank_nicolson.init, target, mixed), partial(crank_nicolson.step, target, mixed)
-
-
 METHODS = {
-    "random_walk": Method(bind_random_walk, 30, frozenset({Ending.STEPS_EXHAUSTED})),
-    "least_squares": Method(bind_least_squares, 30, frozenset({Ending.CONVERGED})),
-    "levenberg_marquardt": Method(bind_bounded, 30, frozenset({Ending.CONVERGED})),
-    "crank_nicolson": Method(bind_chains, 30, frozenset({Ending.STEPS_EXHAUSTED}), descends=False),
+    "random_walk": Method(bind_random_walk, 30, frozenset({Termination.STEPS_EXHAUSTED})),
+    "least_squares": Method(bind_least_squares, 30, frozenset({Termination.CONVERGED})),
+    "levenberg_marquardt": Method(bind_bounded, 30, frozenset({Termination.CONVERGED})),
 }
 
 
@@ -110,14 +93,14 @@ def method(request: pytest.FixtureRequest) -> Method:
     return METHODS[request.param]
 
 
-def data_of(scenario: int) -> Window:
+def data_of(scenario: int) -> PaperWindow:
     return paper_window(
         experiment.TRUCK, experiment.beam(experiment.scenario_ratios(scenario)), 0.0, 0
     )
 
 
 @pytest.fixture(scope="module")
-def window() -> Window:
+def window() -> PaperWindow:
     return data_of(6)
 
 
@@ -147,15 +130,17 @@ def check_pure(init: Callable[[], State], step: Step) -> None:
         first = following
 
 
-def test_a_step_follows_from_the_state_alone(method: Method, window: Window):
+def test_a_step_follows_from_the_state_alone(method: Method, window: PaperWindow):
     check_pure(*method.bind(window, 3, 2))
 
 
-def test_a_step_with_a_memory_is_caught(window: Window):
+def test_a_step_with_a_memory_is_caught(window: PaperWindow):
     init, step = bind_random_walk(window, 3, 2)
     generator = np.random.default_rng(0)
 
-    def remembers(state: random_walk.State) -> tuple[random_walk.State, random_walk.Info]:
+    def remembers(
+        state: random_walk.RandomWalkState,
+    ) -> tuple[random_walk.RandomWalkState, random_walk.RandomWalkInfo]:
         following, info = step(state)
         return following._replace(ratios=following.ratios * generator.uniform()), info
 
@@ -163,10 +148,12 @@ def test_a_step_with_a_memory_is_caught(window: Window):
         check_pure(init, remembers)
 
 
-def test_a_step_that_changes_its_argument_is_caught(window: Window):
+def test_a_step_that_changes_its_argument_is_caught(window: PaperWindow):
     init, step = bind_random_walk(window, 3, 2)
 
-    def scribbles(state: random_walk.State) -> tuple[random_walk.State, random_walk.Info]:
+    def scribbles(
+        state: random_walk.RandomWalkState,
+    ) -> tuple[random_walk.RandomWalkState, random_walk.RandomWalkInfo]:
         state.ratios[0] = 1.0
         return step(state)
 
@@ -174,31 +161,35 @@ def test_a_step_that_changes_its_argument_is_caught(window: Window):
         check_pure(init, scribbles)
 
 
-def test_the_seed_decides(method: Method, window: Window):
-    ends = [frozen(loop.run(*method.bind(window, seed, 2), method.steps)[0]) for seed in (5, 5, 6)]
+def test_the_seed_decides(method: Method, window: PaperWindow):
+    ends = [
+        frozen(loop.run_search(*method.bind(window, seed, 2), method.steps)[0])
+        for seed in (5, 5, 6)
+    ]
     assert ends[0] == ends[1]
     assert ends[0] != ends[2]
 
 
-def test_the_number_of_threads_changes_nothing(method: Method, window: Window):
+def test_the_number_of_threads_changes_nothing(method: Method, window: PaperWindow):
     ends = {
-        frozen(loop.run(*method.bind(window, 5, threads), method.steps)[0]) for threads in (1, 2, 3)
+        frozen(loop.run_search(*method.bind(window, 5, threads), method.steps)[0])
+        for threads in (1, 2, 3)
     }
     assert len(ends) == 1
 
 
-def test_a_stopped_and_resumed_search_is_the_uninterrupted_one(method: Method, window: Window):
+def test_a_stopped_and_resumed_search_is_the_uninterrupted_one(method: Method, window: PaperWindow):
     init, step = method.bind(window, 2, 2)
-    whole, infos, _ = loop.run(init, step, 6)
-    half, first_infos, _ = loop.run(init, step, 2)
+    whole, infos, _ = loop.run_search(init, step, 6)
+    half, first_infos, _ = loop.run_search(init, step, 2)
     _, other_step = method.bind(window, 2, 2)  # as a new process would
-    resumed, last_infos, _ = loop.run(lambda: stored(half), other_step, 4)
+    resumed, last_infos, _ = loop.run_search(lambda: stored(half), other_step, 4)
     assert frozen(resumed) == frozen(whole)
     assert first_infos + last_infos == infos
 
 
-@pytest.mark.parametrize("name", [name for name, one in METHODS.items() if one.descends])
-def test_the_objective_never_grows(name: str, window: Window):
+@pytest.mark.parametrize("name", METHODS)
+def test_the_objective_never_grows(name: str, window: PaperWindow):
     method = METHODS[name]
     init, step = method.bind(window, 7, 2)
     state = init()
@@ -212,63 +203,66 @@ def test_the_objective_never_grows(name: str, window: Window):
     assert objective[-1] < objective[0]
 
 
-def test_sound_data_end_as_announced(method: Method, window: Window):
-    _, infos, ending = loop.run(*method.bind(window, 1, 2), method.steps)
+def test_sound_data_end_as_announced(method: Method, window: PaperWindow):
+    _, infos, ending = loop.run_search(*method.bind(window, 1, 2), method.steps)
     assert ending in method.endings
     assert len(infos) <= method.steps
     assert all(info.ending is None for info in infos[:-1])
 
 
-def test_too_few_steps_are_an_ending_of_their_own(method: Method, window: Window):
+def test_too_few_steps_are_an_ending_of_their_own(method: Method, window: PaperWindow):
     init, step = method.bind(window, 1, 2)
-    assert loop.run(init, step, 1)[2] is Ending.STEPS_EXHAUSTED
-    assert loop.run(init, step, 1, at_the_end=Ending.STEPS_DONE)[2] is Ending.STEPS_DONE
+    assert loop.run_search(init, step, 1)[2] is Termination.STEPS_EXHAUSTED
+    assert (
+        loop.run_search(init, step, 1, at_the_end=Termination.STEPS_DONE)[2]
+        is Termination.STEPS_DONE
+    )
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
 def test_an_objective_that_is_not_finite_is_an_ending_not_an_exception(
-    method: Method, window: Window, poison: float
+    method: Method, window: PaperWindow, poison: float
 ):
     broken = window._replace(acceleration=np.full_like(window.acceleration, poison))
-    _, infos, ending = loop.run(*method.bind(broken, 1, 2), method.steps)
-    assert ending is Ending.NOT_FINITE
+    _, infos, ending = loop.run_search(*method.bind(broken, 1, 2), method.steps)
+    assert ending is Termination.NOT_FINITE
     assert len(infos) == 1
 
 
-def test_progress_is_told_once_a_step(method: Method, window: Window):
+def test_progress_is_reported_once_a_step(method: Method, window: PaperWindow):
     told = []
-    _, infos, _ = loop.run(
+    _, infos, _ = loop.run_search(
         *method.bind(window, 1, 2), 3, progress=lambda count, info: told.append((count, info))
     )
     assert told == list(enumerate(infos, start=1))
 
 
 def test_every_ending_is_a_sentence():
-    assert all(ending.value.endswith(".") and ending.value[0].isupper() for ending in Ending)
-    assert len({ending.value for ending in Ending}) == len(Ending)
+    assert all(ending.value.endswith(".") and ending.value[0].isupper() for ending in Termination)
+    assert len({ending.value for ending in Termination}) == len(Termination)
 
 
 @pytest.mark.parametrize("differences", [levenberg_marquardt.FORWARD, levenberg_marquardt.CENTRAL])
-def test_every_evaluation_of_a_step_is_counted(differences: levenberg_marquardt.Differences):
+def test_every_evaluation_of_a_step_is_counted(differences: levenberg_marquardt.DifferenceScheme):
     evaluated = []
 
     def rows(y: np.ndarray) -> np.ndarray:
         evaluated.append(len(y))
         return np.column_stack([np.exp(y) - 2.0, y[:, :1] * y[:, 1:2], np.ones(len(y))])
 
-    state = levenberg_marquardt.begin(rows, np.zeros(3), differences)
+    state = levenberg_marquardt.initial_state(rows, np.zeros(3), differences)
     evaluated.clear()
     _, info = levenberg_marquardt.descend(rows, state)
     assert info.accepted
     assert info.evaluations == sum(evaluated)
 
 
-def test_least_squares_ends_with_central_differences(window: Window):
+def test_least_squares_ends_with_central_differences(window: PaperWindow):
     """The reference estimate shows what for: tests/process_replay/test_reference.py."""
     init, step = bind_least_squares(window, 3, 1)
     assert init().differences == levenberg_marquardt.FORWARD
-    state, infos, ending = loop.run(init, step, least_squares.MAX_STEPS)
-    assert ending is Ending.CONVERGED
+    state, infos, ending = loop.run_search(init, step, least_squares.MAX_STEPS)
+    assert ending is Termination.CONVERGED
     assert state.differences == levenberg_marquardt.CENTRAL
     assert state.objective <= min(info.objective for info in infos) * (1.0 + 1e-8)
 
@@ -278,7 +272,7 @@ def test_slopes_are_of_sixth_order():
     at = np.array([0.3, -0.2])
 
     def error(speed: float) -> float:
-        slopes = levenberg_marquardt.slopes(lambda y: np.sin(speed * y), at)
+        slopes = levenberg_marquardt.sixth_order_jacobian(lambda y: np.sin(speed * y), at)
         return float(np.abs(slopes - np.diag(speed * np.cos(speed * at))).max() / speed)
 
     assert error(1.0) < 1e-13
@@ -287,7 +281,7 @@ def test_slopes_are_of_sixth_order():
     order = np.polyfit(np.log(speeds), np.log(errors), 1)[0]
     assert order == pytest.approx(6.0, abs=0.2)
     scale = 300.0
-    sixth = levenberg_marquardt.slopes(lambda y: (scale * y) ** 6, at)
+    sixth = levenberg_marquardt.sixth_order_jacobian(lambda y: (scale * y) ** 6, at)
     expected = np.diag(6.0 * scale**6 * at**5)
     np.testing.assert_allclose(sixth, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
 
@@ -297,14 +291,16 @@ def test_the_covariance_of_linear_rows_is_that_of_the_textbook():
     matrix = rng.standard_normal((30, 4)) * np.array([1.0, 1e-3, 10.0, 0.1])
     data = rng.standard_normal(30)
     bottom, squares, _, _ = np.linalg.lstsq(matrix, data, rcond=None)
-    found = levenberg_marquardt.covariance(lambda y: y @ matrix.T - data, bottom)
+    found = levenberg_marquardt.gauss_newton_covariance(lambda y: y @ matrix.T - data, bottom)
     expected = np.linalg.inv(matrix.T @ matrix) * squares[0] / 26.0
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=0.0)
 
 
 def test_a_kink_leaves_least_squares_stuck():
-    state = levenberg_marquardt.begin(lambda y: 1.0 + np.abs(y), np.zeros(1))
-    assert levenberg_marquardt.descend(lambda y: 1.0 + np.abs(y), state)[1].ending is Ending.STUCK
+    state = levenberg_marquardt.initial_state(lambda y: 1.0 + np.abs(y), np.zeros(1))
+    assert (
+        levenberg_marquardt.descend(lambda y: 1.0 + np.abs(y), state)[1].ending is Termination.STUCK
+    )
 
 
 # Bounds
@@ -340,15 +336,15 @@ def test_bounds_against_scipy(seed: int):
         assert np.all(y >= lower)
         return rows(y)
 
-    near = levenberg_marquardt.minimised(within, start, 200, 1e-12, lower)
-    assert near.ending is Ending.CONVERGED
+    near = levenberg_marquardt.minimise(within, start, 200, 1e-12, lower)
+    assert near.ending is Termination.CONVERGED
     # Forward differences leave a slope; central ones, which reach beyond a bound, next to none.
-    found = loop.run(
-        lambda: levenberg_marquardt.begin(rows, near.state.y, levenberg_marquardt.CENTRAL),
+    found = loop.run_search(
+        lambda: levenberg_marquardt.initial_state(rows, near.state.y, levenberg_marquardt.CENTRAL),
         lambda state: levenberg_marquardt.descend(rows, state, lower),
         200,
     )
-    assert found.ending is Ending.CONVERGED
+    assert found.ending is Termination.CONVERGED
     expected = scipys(rows, np.maximum(start, 1e-3), lower)
     np.testing.assert_allclose(found.state.y, expected, atol=1e-5)
     np.testing.assert_allclose(near.state.y, expected, atol=1e-3)
@@ -374,10 +370,10 @@ def test_slopes_that_are_led_on_end_at_the_same_bottom_for_less(seed: int) -> No
         return y @ matrix.T + (y**2) @ bent.T - aim
 
     start = np.where(np.arange(12) < 2, 0.5, 2.0)
-    exact = levenberg_marquardt.minimised(rows, start, 100, 1e-9, lower)
+    exact = levenberg_marquardt.minimise(rows, start, 100, 1e-9, lower)
     counted, asked = asked, 0
-    found = levenberg_marquardt.minimised(rows, start, 100, 1e-9, lower, is_followed=True)
-    assert found.ending is Ending.CONVERGED
+    found = levenberg_marquardt.minimise(rows, start, 100, 1e-9, lower, is_followed=True)
+    assert found.ending is Termination.CONVERGED
     assert asked == 13 + sum(info.evaluations for info in found.infos)
     assert asked < 0.85 * counted
     # Forward differences leave this much.
@@ -396,7 +392,7 @@ def test_a_point_far_off_is_turned_back_from_without_a_word(is_followed: bool) -
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         start = np.array([0.69, -0.69])
-        found = levenberg_marquardt.minimised(rows, start, 50, 1e-9, is_followed=is_followed)
+        found = levenberg_marquardt.minimise(rows, start, 50, 1e-9, is_followed=is_followed)
     np.testing.assert_allclose(found.state.y, np.arctanh(0.5), atol=1e-4)
 
 
@@ -408,9 +404,9 @@ def test_at_its_bounds_a_search_ends_at_once():
         return y @ matrix.T + np.array([1.0, 1.0, 1.0])
 
     lower = np.zeros(2)
-    state = levenberg_marquardt.begin(rows, np.zeros(2))
+    state = levenberg_marquardt.initial_state(rows, np.zeros(2))
     _, info = levenberg_marquardt.descend(rows, state, lower)
-    assert info.ending is Ending.CONVERGED
+    assert info.ending is Termination.CONVERGED
     assert info.evaluations == 0
     assert levenberg_marquardt.descend(rows, state)[1].accepted
 
@@ -418,7 +414,7 @@ def test_at_its_bounds_a_search_ends_at_once():
 # The random walk
 
 
-def test_no_particle_of_the_random_walk_ever_climbs(window: Window):
+def test_no_particle_of_the_random_walk_ever_climbs(window: PaperWindow):
     init, step = bind_random_walk(window, 9, 2)
     state = init()
     moved = np.zeros(PARTICLES, dtype=bool)
@@ -440,15 +436,15 @@ def test_a_descent_ends_with_the_first_step_that_gains_too_little() -> None:
     def rows(y: np.ndarray) -> np.ndarray:
         return np.column_stack([np.sinh(y[:, 0]), np.full(y.shape[0], 100.0)])
 
-    found = levenberg_marquardt.minimised(rows, np.array([3.0]), 200, 1.0)
-    assert found.ending is Ending.CONVERGED
+    found = levenberg_marquardt.minimise(rows, np.array([3.0]), 200, 1.0)
+    assert found.ending is Termination.CONVERGED
     objectives = [info.objective for info in found.infos]
     gains = -np.diff([np.sinh(3.0) ** 2 + 1e4, *objectives])
     assert np.all(gains[:-1] >= 1.0)
     assert gains[-1] < 1.0
 
 
-def test_the_random_walk_begins_in_the_papers_prior(window: Window):
+def test_the_random_walk_begins_in_the_papers_prior(window: PaperWindow):
     bound = random_walk.problem(window, NOMINAL, FREE, 0)
     ratios = random_walk.init(bound, 2000).ratios
     assert ratios.shape == (2000, 19)
@@ -458,17 +454,17 @@ def test_the_random_walk_begins_in_the_papers_prior(window: Window):
     assert np.abs(ratios.mean(axis=0) - 1.0).max() < 5 * 0.4 / np.sqrt(12 * 2000)
 
 
-def test_the_particles_objective_is_their_own(window: Window):
+def test_the_particles_objective_is_their_own(window: PaperWindow):
     """Early stopping of an evaluation must not leave a wrong J with an accepted particle."""
     init, step = bind_random_walk(window, 4, 2)
-    state, _, _ = loop.run(init, step, 25)
+    state, _, _ = loop.run_search(init, step, 25)
     theta = np.repeat(NOMINAL[None, :], PARTICLES, axis=0)
     theta[:, FREE] *= state.ratios
     rows = residual.residual_batch(window, residual.workspace(window), theta)
     assert np.sum(rows**2, axis=1) == pytest.approx(state.objective, rel=1e-9)
 
 
-def test_impossible_particles_are_never_kept(window: Window):
+def test_impossible_particles_are_never_kept(window: PaperWindow):
     """A step as large as the values themselves proposes negative masses all the time."""
     bound = random_walk.problem(window, NOMINAL, FREE, 0, step_ratio=0.5)
     first = random_walk.init(bound, 60)
@@ -476,19 +472,19 @@ def test_impossible_particles_are_never_kept(window: Window):
     state, info = random_walk.step(bound, anything_is_better)
     assert 0.1 < info.acceptance < 0.9
     assert np.all(state.ratios > 0.0)
-    assert np.all(state.ratios[:, 0] * NOMINAL[unknowns.D_1] < window.wheelbase_m)
+    assert np.all(state.ratios[:, 0] * NOMINAL[parameters.D_1] < window.wheelbase_m)
 
 
 # Least squares
 
 
-def worst_accuracy(window: Window, truth: np.ndarray, seed: int) -> float:
+def worst_accuracy(window: PaperWindow, truth: np.ndarray, seed: int) -> float:
     """The smallest S_A of all twenty parameters from a random start in the paper's prior."""
     init, step = bind_least_squares(window, seed, 1)
-    state, _, ending = loop.run(init, step, least_squares.MAX_STEPS)
-    if ending is not Ending.CONVERGED:
+    state, _, ending = loop.run_search(init, step, least_squares.MAX_STEPS)
+    if ending is not Termination.CONVERGED:
         return -np.inf
-    bound = least_squares.Problem(window, NOMINAL, FREE)
+    bound = least_squares.LeastSquaresProblem(window, NOMINAL, FREE)
     ratios = least_squares.untransform(bound, state.y)[None, :] / NOMINAL[FREE]
     found = table_columns(ratios, nominal=NOMINAL, free=FREE, window=window)[0]
     return float(1.0 - np.abs(found - truth).max())
@@ -508,7 +504,7 @@ def test_least_squares_finds_everything_from_anywhere_in_the_prior(scenario: int
     assert min(accuracy) >= 0.999
 
 
-def test_wrong_data_and_wrong_truths_are_not_called_found(window: Window):
+def test_wrong_data_and_wrong_truths_are_not_called_found(window: PaperWindow):
     """The check above must be able to fail."""
     truth = truth_of(6)
     assert worst_accuracy(window, truth, 0) >= 0.999
@@ -523,9 +519,9 @@ def test_wrong_data_and_wrong_truths_are_not_called_found(window: Window):
     assert worst_accuracy(heavier, truth, 0) < 0.999
 
 
-def test_derived_masses_follow_from_d_1_and_the_axles(window: Window):
+def test_derived_masses_follow_from_d_1_and_the_axles(window: PaperWindow):
     ratios = np.ones((1, FREE.size))
-    ratios[0, list(FREE).index(unknowns.D_1)] = 1.2
+    ratios[0, list(FREE).index(parameters.D_1)] = 1.2
     columns = table_columns(ratios, nominal=NOMINAL, free=FREE, window=window)[0]
     found = dict(zip(NAMES, columns, strict=True))
     d_1, wheelbase = 1.215, 4.4  # Table 1

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pre_core.crossing.splines import value_at
-from pre_core.crossing.trajectory import Trajectory, fit_trajectory, motion_at, passing_time_s
+from pre_core.crossing.trajectory import Trajectory, arrival_time_s, fit_trajectory, motion_at
 
 Floats = NDArray[np.float64]
 
@@ -118,16 +118,16 @@ def test_passing_times_of_an_accelerated_drive(direction: int) -> None:
     trajectory = fitted(fixes, direction * travel, direction * (4.0 + 0.5 * fixes))
     for distance in (0.01, 3.0, 20.0, 47.0):
         exact = -8.0 + np.sqrt(64.0 + 4.0 * distance)
-        found = passing_time_s(trajectory, direction * distance, direction, 0.0, 8.0)
+        found = arrival_time_s(trajectory, direction * distance, direction, 0.0, 8.0)
         assert found == pytest.approx(exact, abs=1e-8)
 
 
 def test_a_place_that_is_not_passed_has_no_time() -> None:
     fixes = np.arange(0.0, 8.05, 0.1)
     trajectory = fitted(fixes, 5.0 * fixes, np.full(fixes.size, 5.0))
-    assert np.isnan(passing_time_s(trajectory, 41.0, 1, 0.0, 8.0))
+    assert np.isnan(arrival_time_s(trajectory, 41.0, 1, 0.0, 8.0))
     # Passed before the search begins: its first moment.
-    assert passing_time_s(trajectory, 4.0, 1, 2.0, 8.0) == 2.0
+    assert arrival_time_s(trajectory, 4.0, 1, 2.0, 8.0) == 2.0
 
 
 def test_the_first_of_several_passages_counts() -> None:
@@ -135,5 +135,5 @@ def test_the_first_of_several_passages_counts() -> None:
     fixes = np.arange(0.0, 8.05, 0.1)
     position = 6.0 * np.sin(0.9 * fixes)
     trajectory = fitted(fixes, position, 5.4 * np.cos(0.9 * fixes))
-    found = passing_time_s(trajectory, 3.0, 1, 0.0, 8.0)
+    found = arrival_time_s(trajectory, 3.0, 1, 0.0, 8.0)
     assert found == pytest.approx(np.arcsin(0.5) / 0.9, abs=0.05)

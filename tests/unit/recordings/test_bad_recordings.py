@@ -13,11 +13,11 @@ import zstandard
 from mcap.writer import MCAP0_MAGIC
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.topics import Key, topic
+from schemas.topics import Key, Message, topic
 from services.common.errors import InputError
 from services.recordings import mcap_scan
 from services.recordings import recording as recording_module
-from services.recordings.recording import Message, read_info, read_messages
+from services.recordings.recording import read_info, read_messages
 from services.recordings.recovery import recover_recording
 from services.recordings.writer import write_recording
 from services.replay import run as replay

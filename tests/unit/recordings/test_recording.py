@@ -14,16 +14,10 @@ from mcap.reader import make_reader
 
 from schemas.messages import descriptors
 from schemas.signals import GnssFix, encode_gnss, encode_location
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.common.errors import InputError
 from services.recordings.mcap_file import McapWriter
-from services.recordings.recording import (
-    Message,
-    read_identities,
-    read_info,
-    read_messages,
-    read_site,
-)
+from services.recordings.recording import read_identities, read_info, read_messages, read_site
 from services.recordings.writer import RecordingWriter, write_recording
 
 START_NS = 1_700_000_000_000_000_000

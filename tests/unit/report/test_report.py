@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.reasons import Reason
-from schemas.results import Results, results_json
+from schemas.reasons import REASON_TEXTS, BridgeReason, Reason
+from schemas.results import Prior, Results, results_json
 from schemas.site import Site
 from schemas.site_file import load_site, site_toml
+from services.cli.identify import _fit_lines
 from services.common.errors import FailureError
+from services.common.language import ENGLISH, language_of
 from services.report import pdf
-from services.report.bridge import _ADVICE, bridge_reports
+from services.report.advice import next_steps
+from services.report.bridge import bridge_reports
 from services.report.html import Html, inlined_svg, joined, tag
 from services.report.page import page
 from services.report.place import ends_of, start_of
@@ -52,9 +55,12 @@ class Seen(HTMLParser):
         return " ".join(" ".join(self.words).split())
 
 
-def reported(site: Site, *results: Results, baseline: Path | None = None) -> Seen:
+def reported(
+    site: Site, *results: Results, baseline: Path | None = None, language: str = "en"
+) -> Seen:
     files = [(Path(f"{n}.json"), one, site) for n, one in enumerate(results)]
-    return Seen(page(bridge_reports(files, baseline)))
+    words = language_of(language)
+    return Seen(page(bridge_reports(files, baseline, language=words), language=words))
 
 
 def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: Site) -> None:
@@ -74,20 +80,24 @@ def test_the_first_page_names_the_weak_element_its_loss_and_its_interval(site: S
     assert "2 crossings: 2 good. The numbers below are of the newest usable one." in text
     assert "The other good crossing agrees with them: at most 0.0 standard deviations apart" in text
     assert "class A of ISO 8608, IRI 2.4 m/km" in text
-    assert "never a condition rating" in text
-    assert "Have somebody look at element 4 (12.9 to 17.1 m from the south-west end)." in text
+    assert "not a condition rating" in text
+    assert "Have element 4 (12.9 to 17.1 m from the south-west end) inspected." in text
     assert "Was it built unlike the others? Then the difference is no damage." in text
     assert "Drive again on another day, in the other direction and with another truck:" in text
     assert "Keep these results as a baseline" in text
     # Where there is no baseline that is said, and what it means.
     assert "each other (no baseline is stored)" in text
-    assert "A loss that all elements share cannot be seen without a baseline." in text
+    assert "A loss that all elements share cannot be detected without a baseline." in text
     # The evidence.
-    assert "misfit (χ² per degree of freedom) 1.02" in text
-    assert "springs believed 100 %" in text
-    assert "bearings held against turning 3 % at the start, 4 % at the end" in text
-    assert "agreement (R-hat) 1 " in text
-    assert "truck-1, from south-west to north-east, 10.0 m/s" in text
+    assert "misfit (χ² per degree of freedom) 1.02 1.02 of the residuals" in text
+    assert "suspension weight (%) 100 100 100 %" in text
+    assert "rotational restraint (%) 3 and 4 3 and 4 probability" in text
+    assert "R-hat 1 1 agreement" in text
+    assert "truck-1 south-west to north-east 10.0 pre good yes" in text
+    # What measured, and when.
+    assert "truck-1: 9.5 t, wheelbase 4.4 m, axle loads" in text
+    assert "front and rear on body and axles" in text
+    assert "Computed 2026-09-21 " in text
 
 
 def test_a_nominal_value_that_is_too_high_is_no_damage_everywhere(site: Site) -> None:
@@ -95,7 +105,7 @@ def test_a_nominal_value_that_is_too_high_is_no_damage_everywhere(site: Site) ->
     text = reported(site, sound).text
     assert "No element is clearly less stiff." in text
     assert "No element stands out: all agree within 1 %." in text
-    assert "The middle of all is 0.86 of the nominal value" in text
+    assert "The median of all is 0.86 of the nominal value" in text
 
 
 def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) -> None:
@@ -111,7 +121,7 @@ def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) ->
         "element 7 (25.7 to 30.0 m from the south-west end, 0.0 to 4.3 m from the north-east end)"
     )
     assert last in text
-    assert ", and at the bearing there." in text
+    assert ", and at the bearing there inspected." in text
     assert "Keep these results" not in text
     assert "built unlike" not in text
     assert "No baseline is stored" not in text
@@ -119,36 +129,89 @@ def test_a_baseline_shows_what_all_elements_share(site: Site, tmp_path: Path) ->
     assert "No element has clearly changed: all are unchanged within 1 %." in unchanged
 
 
+def test_before_and_after_stand_beside_each_other_with_the_change(
+    site: Site, tmp_path: Path
+) -> None:
+    then = tmp_path / "then.json"
+    earlier = fused(site, KNOWN)
+    then.write_text(results_json(earlier))
+    ratios = np.ones(7)
+    ratios[3] = 0.7 * 0.4
+    now = results_of(site, some_crossing("z", entry=9e6), used="z", ratios=ratios)
+    found = reported(site, now, baseline=then)
+    assert (
+        "Compared with the baseline then.json: 3 crossings on 2026-09-21, by truck-1, a "
+        "measurement that is good" in found.text
+    )
+    assert "Element From–to (m) Before (GN·m²) After (GN·m²) Change (95 % interval)" in found.text
+    old = earlier.bridges[site.bridges[0].id].elements["EI_4"]
+    new = now.bridges[site.bridges[0].id].elements["EI_4"]
+    before, after = (
+        f"{one.mean / 1e9:.2f} ({one.q025 / 1e9:.2f}–{one.q975 / 1e9:.2f})" for one in (old, new)
+    )
+    change = round(100.0 * (new.mean / old.mean - 1.0))
+    assert f"4 12.9–17.1 {before} {after} −{abs(change)} % (" in found.text
+    assert "Repeat the survey in the same season" not in found.text.partition("What to do")[0]
+    assert "Repeat the survey in the same season" in found.text
+
+
+def test_wide_tables_and_figures_scroll_on_a_phone(site: Site) -> None:
+    found = reported(site, results_of(site, some_crossing("a"), used="a"))
+    facts = found.attributes.count(("class", "facts"))
+    wide = found.attributes.count(("class", "wide"))
+    figures = found.tags.count("figure") - found.attributes.count(("class", "sketch"))
+    assert wide == found.tags.count("table") - facts + figures
+
+
+def test_every_finding_has_a_next_step(site: Site) -> None:
+    suspect = some_crossing("a", verdict="suspect", reasons=("position_outage",))
+    kinds = {
+        "weak": fused(site, KNOWN),
+        "sound": results_of(site, some_crossing("a"), used="a", ratios=np.ones(7)),
+        "open": fused(site, [0.6] * 7),
+        "doubtful": results_of(site, suspect, used="a"),
+        "nothing": results_of(
+            site, some_crossing("a", verdict="rejected", reasons=("speed_too_low",))
+        ),
+    }
+    for kind, found in kinds.items():
+        (report,) = bridge_reports([(Path("x.json"), found, site)], None)
+        assert report.finding.kind == kind
+        assert list(next_steps(report, ENGLISH)), kind
+    twins = reported(site, kinds["open"]).text
+    assert "Use a truck with single tyres at the rear if you can" in twins
+
+
 def test_a_suspect_result_is_doubtful_and_says_why(site: Site) -> None:
     suspect = some_crossing("a", verdict="suspect", reasons=("position_outage",))
     found = reported(site, results_of(site, suspect, used="a"))
     assert ("class", "finding doubtful") in found.attributes
-    assert "Doubtful: to be looked at, not to be relied upon." in found.text
-    assert "The reasons: The receiver gave no position" in found.text
-    assert "Look at the satellite receiver and its antenna." in found.text
+    assert "Doubtful. Do not rely on these values." in found.text
+    assert f"The reasons: {REASON_TEXTS[Reason.POSITION_OUTAGE]}" in found.text
+    assert "Check the satellite receiver and its antenna." in found.text
     assert "less stiff?" in found.text
     assert ("class", "weak") not in found.attributes
 
 
-def test_where_all_are_rejected_it_says_why_nothing_can_be_said(site: Site) -> None:
+def test_all_rejected_crossings_give_the_reasons(site: Site) -> None:
     why = (("speed_too_low",), ("speed_too_low", "model_misfit"))
     rejected = [
         some_crossing(name, verdict="rejected", reasons=reasons)
         for name, reasons in zip("ab", why, strict=True)
     ]
     found = reported(site, results_of(site, *rejected))
-    assert "Nothing can be said about this bridge." in found.text
+    assert "No statement on this bridge is possible." in found.text
     assert (
         "The truck was too slow for its axles to feel the bridge's stiffness. (2 of 2)"
         in found.text
     )
     assert "Drive again, at 5 m/s or more." in found.text
     assert "neither that the bridge is sound nor that it is damaged" in found.text
-    assert "svg" not in found.tags  # no picture without a number
+    assert found.tags.count("svg") == 1  # the sketch, and no picture without a number
     assert "GN·m²" not in found.text
 
 
-def test_crossings_that_do_not_agree_are_said_not_to(site: Site) -> None:
+def test_inconsistent_crossings_are_reported(site: Site) -> None:
     one = results_of(site, some_crossing("a"), used="a")
     other = results_of(site, some_crossing("b", entry=60.0), used="b", ratios=1.5 * RATIOS)
     merged = other.model_copy(update={"crossings": one.crossings + other.crossings})
@@ -165,7 +228,7 @@ def test_what_single_crossings_say_of_a_weak_element_shows_how_far_they_scatter(
     third = results_of(site, some_crossing("c", verdict="suspect", reasons=("position_outage",)))
     everything = one.crossings + other.crossings + third.crossings
     merged = other.model_copy(update={"crossings": everything})
-    said = "By each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff; one alone"
+    said = "By each of the 2 good crossings alone, element 4 is 50 to 60 % less stiff; all"
     assert said in reported(site, merged).text
     assert "crossings alone" not in reported(site, one).text
 
@@ -400,7 +463,7 @@ KNOWN = [0.02] * 7
 def test_on_paper_the_first_page_of_an_end_that_is_weak_is_one_sheet(
     site: Site, tmp_path: Path
 ) -> None:
-    """The longest: fused, and a bearing to be looked at. Then a sheet for each crossing."""
+    """The longest: fused, and a bearing to be looked at. Then a sheet for all crossings."""
     try:
         browser = pdf.find_browser()
     except FailureError as error:
@@ -417,15 +480,15 @@ def test_on_paper_the_first_page_of_an_end_that_is_weak_is_one_sheet(
     assert "at the bearing there" in html.read_text()
     pdf.write_pdf(html, tmp_path / "r.pdf", browser)
     printed = (tmp_path / "r.pdf").read_bytes()
-    assert len(re.findall(rb"/Type\s*/Page\b", printed)) == 1 + len(found.crossings)
+    assert len(re.findall(rb"/Type\s*/Page\b", printed)) == 2
 
 
-def test_crossings_that_were_fused_are_said_to_be_and_how_they_agree(site: Site) -> None:
+def test_fused_crossings_are_listed_with_their_agreement(site: Site) -> None:
     text = reported(site, fused(site, KNOWN, left_out=("suspect", "disagrees"))).text
     assert "One element is clearly less stiff." in text
     assert "The numbers below are of all 3 together, a measurement that is good." in text
     assert "Left out: 1 suspect; 1 disagrees with the others beyond its uncertainty." in text
-    assert "From crossing to crossing EI changes by 1.2 % (0.0 to 4.0 %)" in text
+    assert "Between-crossing variability of EI: 1.2 % (0.0 to 4.0 %)" in text
     assert "confirms them" not in text
 
 
@@ -439,7 +502,7 @@ def test_a_state_that_is_suspect_is_doubtful_though_its_crossings_are_good(site:
 
 def test_a_loss_beside_unresolved_elements_may_be_theirs(site: Site) -> None:
     text = reported(site, fused(site, [0.6, 0.4, 0.3, 0.05, 0.1, 0.1, 0.5])).text
-    assert "Less stiff about element 4; which one is not certain." in text
+    assert "Less stiff near element 4; the exact element is uncertain." in text
     assert "The loss may as well be in element 3, beside it and not resolved." in text
     assert (
         "Elements 1, 2, 3 and 7 are not resolved (standard deviation above 25 %). "
@@ -452,11 +515,14 @@ def test_a_loss_beside_unresolved_elements_may_be_theirs(site: Site) -> None:
 def test_where_no_element_is_resolved_none_is_called_sound(site: Site) -> None:
     found = reported(site, fused(site, [0.6] * 7))
     assert ("class", "finding open") in found.attributes
-    assert "Single elements cannot be told, only the bridge as a whole." in found.text
+    assert (
+        "Only the stiffness of the whole bridge could be determined, not that of elements."
+        in found.text
+    )
     assert "No single element is resolved" in found.text
     assert "No element" not in found.text
     few = reported(site, fused(site, [0.6, 0.05, 0.05, 0.5, 0.05, 0.05, 0.05])).text
-    assert "No element is clearly less stiff, of those that can be told." in few
+    assert "No element is clearly less stiff, of those that could be determined." in few
 
 
 def test_suspect_crossings_that_were_not_used_are_not_called_nothing(site: Site) -> None:
@@ -464,26 +530,29 @@ def test_suspect_crossings_that_were_not_used_are_not_called_nothing(site: Site)
     rejected = some_crossing("b", verdict="rejected", reasons=("sensor_saturated",), entry=60.0)
     alone = reported(site, results_of(site, suspect))
     assert ("class", "finding doubtful") in alone.attributes
-    assert "The only crossing was suspect. What it says stands in the evidence" in alone.text
+    assert "The only crossing was suspect. Its values are listed in the evidence" in alone.text
     assert "nothing was measured" not in alone.text
     both = reported(site, results_of(site, suspect, rejected)).text
     assert "None of the 2 crossings is good, 1 is suspect." in both
     nothing = reported(site, results_of(site, rejected)).text
-    assert "The only crossing was rejected, and no number of it means anything." in nothing
+    assert "The only crossing was rejected; there are no usable values." in nothing
     assert nothing.index("An accelerometer reached") < nothing.index("Quality")
 
 
 def test_something_is_to_be_done_about_every_reason() -> None:
-    assert set(_ADVICE) == set(Reason)
+    for code in ("en", "de"):
+        language = language_of(code)
+        assert set(language.advice) == set(Reason)
+        assert set(language.bridge_advice) == set(BridgeReason)
+        assert all(text.strip() for text in language.advice.values())
+        assert all(text.strip() for text in language.bridge_advice.values())
 
 
-def test_a_single_crossing_in_a_state_is_said_to_have_wider_intervals(site: Site) -> None:
+def test_state_of_one_crossing_reports_its_wider_intervals(site: Site) -> None:
     one = fused(site, KNOWN, crossings_used=["c"])
-    assert (
-        "allow for how a bridge changes from one crossing to the next" in reported(site, one).text
-    )
+    assert "include the between-crossing variability" in reported(site, one).text
     alone = results_of(site, some_crossing("a"), used="a")
-    assert "allow for how a bridge" not in reported(site, alone).text
+    assert "between-crossing variability" not in reported(site, alone).text
 
 
 @pytest.mark.parametrize(
@@ -522,13 +591,13 @@ def test_no_change_has_no_sign(site: Site) -> None:
 
 def test_the_words_that_are_used_are_explained_and_no_others(site: Site) -> None:
     good = reported(site, results_of(site, some_crossing("a"), some_crossing("b"), used="b")).text
-    words = good.partition(" Words ")[2]
+    words = good.rpartition(" Words ")[2]
     for word in ("Verdict:", "EI:", "95 % interval:", "Misfit, χ²:", "Draws:", "IRI, class"):
         assert word in words
     assert "Channel:" not in words
-    assert "Scatter: One crossing alone knows less than all together" in words
+    assert "Scatter: One crossing is less precise than all together" in words
     rejected = some_crossing("a", verdict="rejected", reasons=("channel_swapped",))
-    words = reported(site, results_of(site, rejected)).text.partition(" Words ")[2]
+    words = reported(site, results_of(site, rejected)).text.rpartition(" Words ")[2]
     assert "sprung_front and sprung_rear are on the body above an axle" in words
     assert "IRI" not in words
     assert "Draws" not in words
@@ -540,7 +609,34 @@ def test_of_a_rejected_crossing_stands_what_to_do_next(site: Site) -> None:
     said = "Two channels seem to be exchanged: sprung_front and sprung_rear."
     content["crossings"][0]["reason_texts"] = [said]
     text = reported(site, Results.model_validate(content)).text
-    assert f"no number of it means anything. {said}" in text
+    assert f"there are no usable values. {said}" in text
     what = text.partition("What to do next")[2].partition("What this does not mean")[0]
-    assert "Look at the wiring of these sensors." in what
+    assert "Check the wiring of these sensors." in what
     assert "run driveby check on the recording" in what
+
+
+@pytest.mark.parametrize(
+    ("prior", "words"),
+    [
+        ("log_normal", "torsion declared the lane is off the axis, so the deck twists"),
+        ("half_normal", "torsion 100 % probability that the deck twists under this lane"),
+    ],
+)
+def test_declared_torsion_is_no_probability(site: Site, prior: str, words: str) -> None:
+    plain = results_of(site, some_crossing("a"), used="a")
+    known = plain.crossings[0]
+    assert known.parameters is not None
+    assert known.derived is not None
+    torsion = known.parameters["EI_1"].model_copy(
+        update={"prior": Prior(distribution=prior, location=1e-9, scale=0.5)}  # type: ignore[arg-type]
+    )
+    crossing = known.model_copy(
+        update={
+            "parameters": {**known.parameters, "torsion": torsion},
+            "derived": known.derived.model_copy(update={"probability_torsion": 1.0}),
+        }
+    )
+    assert words in reported(site, plain.model_copy(update={"crossings": (crossing,)})).text
+    printed = " ".join(_fit_lines(crossing))
+    assert ("declared" in printed) is (prior == "log_normal")
+    assert ("probability that the deck twists" in printed) is (prior == "half_normal")

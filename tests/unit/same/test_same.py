@@ -10,8 +10,7 @@ import rerun as rr
 from pyarrow import parquet
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.topics import Key
-from services.recordings.recording import Message
+from schemas.topics import Key, Message
 from services.recordings.writer import write_recording
 from tests.same.__main__ import FAILED, compared
 from tests.same.canonical import name_of

@@ -11,19 +11,19 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from schemas.errors import InputError
-from schemas.fusion import Axle, Bends, Coordinate, FusionLikelihood, Stretch
+from schemas.fusion import AxleFootprint, Bends, Coordinate, FusionLikelihood, Stretch
 from schemas.proto import driveby_pb2 as pb
 from schemas.reasons import REASON_TEXTS, Reason, texts
 from schemas.results import (
     BridgeResult,
     Covariance,
-    Crossing,
+    CrossingResult,
     Derived,
-    Header,
     Parameter,
     Prior,
+    ResultHeader,
     Results,
-    Road,
+    RoadResult,
     load_results,
     results,
     results_json,
@@ -36,7 +36,7 @@ from schemas.results_on_the_wire import (
     state_to_bridge,
 )
 
-HEADER = Header("0.1.0", 1790010003.25, "0123456789abcdef", {"method": "pre", "draws": 10}, 7)
+HEADER = ResultHeader("0.1.0", 1790010003.25, "0123456789abcdef", {"method": "pre", "draws": 10}, 7)
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 names = st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), min_size=1, max_size=12)
@@ -58,10 +58,10 @@ parameters = st.builds(
 
 
 @st.composite
-def roads(draw: st.DrawFn) -> Road:
+def roads(draw: st.DrawFn) -> RoadResult:
     size = draw(st.integers(1, 4))
     profile = st.lists(numbers, min_size=size, max_size=size).map(tuple)
-    return Road(
+    return RoadResult(
         x_m=draw(profile),
         front_m=draw(profile),
         rear_m=draw(profile),
@@ -81,7 +81,7 @@ def covariances(draw: st.DrawFn) -> Covariance:
 
 
 @st.composite
-def crossings(draw: st.DrawFn) -> Crossing:
+def crossings(draw: st.DrawFn) -> CrossingResult:
     verdict = draw(st.sampled_from(["good", "suspect", "rejected"]))
     reasons = draw(st.lists(st.sampled_from(Reason), min_size=verdict != "good", unique=True))
     estimated = draw(st.dictionaries(names, parameters, min_size=1, max_size=3))
@@ -116,7 +116,7 @@ def crossings(draw: st.DrawFn) -> Crossing:
         "road": draw(st.none() | roads()),
         "fusion_likelihood": draw(st.none() | likelihoods()),
     }
-    return Crossing(**values)
+    return CrossingResult(**values)
 
 
 @st.composite
@@ -136,7 +136,7 @@ def likelihoods(draw: st.DrawFn) -> FusionLikelihood:
     count = draw(st.integers(0, 2)) if knots else 0
     m = len(bridge) + len(truck) + knots + (1 + count if knots else 0)
     moves = len(bridge) + 1
-    axle = Axle(width_m=0.25, twin_distance_m=0.0, length_m=0.2, track_m=1.9, offset_m=0.0)
+    axle = AxleFootprint(width_m=0.25, twin_distance_m=0.0, length_m=0.2, track_m=1.9, offset_m=0.0)
 
     def some(count: int) -> tuple[float, ...]:
         return tuple(draw(st.lists(numbers, min_size=count, max_size=count)))
@@ -166,7 +166,7 @@ def likelihoods(draw: st.DrawFn) -> FusionLikelihood:
     )
 
 
-def a_crossing(**changes: object) -> Crossing:
+def a_crossing(**changes: object) -> CrossingResult:
     value = Parameter(unit="N·m²", mean=1.5e10, std=1e8, q025=1.3e10, q50=1.5e10, q975=1.7e10)
     values: dict[str, Any] = {
         "crossing_id": "truck-1_bridge-1_1790010003",
@@ -182,7 +182,7 @@ def a_crossing(**changes: object) -> Crossing:
         "reasons": ("no_noise_model",),
         "parameters": {"EI_1": value},
     }
-    return Crossing(**{**values, **changes})
+    return CrossingResult(**{**values, **changes})
 
 
 def a_bridge() -> BridgeResult:
@@ -216,13 +216,13 @@ def a_bridge() -> BridgeResult:
 
 
 @given(crossings())
-def test_a_crossing_survives_the_wire(crossing: Crossing) -> None:
+def test_a_crossing_survives_the_wire(crossing: CrossingResult) -> None:
     payload = crossing_to_protobuf(crossing, HEADER).SerializeToString(deterministic=True)
     assert estimate_to_crossing(pb.Estimate.FromString(payload)) == (crossing, HEADER)
 
 
 @given(st.lists(crossings(), max_size=2))
-def test_results_survive_the_file(found: list[Crossing]) -> None:
+def test_results_survive_the_file(found: list[CrossingResult]) -> None:
     content = results(HEADER, found, {"bridge-1": a_bridge()})
     text = results_json(content)
     assert Results.model_validate_json(text) == content
@@ -312,7 +312,7 @@ def test_matrix_and_profiles_must_have_the_right_size() -> None:
     with pytest.raises(ValidationError, match="2 × 2"):
         Covariance(names=("a", "b"), matrix=((1.0, 2.0),))
     with pytest.raises(ValidationError, match="as long as x_m"):
-        Road(x_m=(0, 1), front_m=(0, 1), rear_m=(0,), mean_m=(0, 1))
+        RoadResult(x_m=(0, 1), front_m=(0, 1), rear_m=(0,), mean_m=(0, 1))
 
 
 def test_reading_a_file_that_is_none(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`[[vehicle.axles]]`: two become pairs, more are refused in one line."""
+"""`[[vehicle.axles]]`: two become pairs, a tandem keeps them, others are refused in one line."""
 
 from math import hypot
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 from schemas.errors import InputError
 from schemas.site import Vehicle
 from schemas.site_file import faults_of_site, load_site, parse_site, site_hash, site_toml
-from schemas.vehicle_info import differences, own_part
+from schemas.vehicle_info import differences, vehicle_part
 from services.identification.footprints import footprints_of
 
 TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
@@ -177,7 +177,7 @@ def test_both_spellings_are_refused_by_both_keys(key: str, value: str, other: st
 @pytest.mark.parametrize(
     ("parts", "line"),
     [
-        ((HEAD, FRONT), "vehicle.axles is "),
+        ((HEAD, FRONT), "vehicle.axles has 1 entry"),
         (
             (HEAD, FRONT + "tyre = 3\n", REAR),
             "vehicle.axles[0].tyre is not a known field, did you mean tyres?",
@@ -228,11 +228,11 @@ def test_both_spellings_are_refused_by_both_keys(key: str, value: str, other: st
         ),
         (
             (HEAD, FRONT, REAR, "[[vehicle.bogies]]\naxles = [1, 2]\n"),
-            "vehicle.axles has a bogie: identification with more than two axles is not there yet",
+            "vehicle.bogies joins axles of a truck of two, it must be of axles 2 and 3",
         ),
         (
             (HEAD, FRONT, REAR, REAR.replace("= 5.0", "= 6.3")),
-            "vehicle.axles has 3 axles: identification with more than two axles is not there yet",
+            "vehicle.bogies does not join axles 2 and 3, they must share their load by an",
         ),
         (
             (HEAD, "track_m = 'wide'\n", FRONT, REAR),
@@ -244,23 +244,98 @@ def test_what_is_wrong_with_axles_is_one_line(parts: tuple[str, ...], line: str)
     assert complaint(*parts).startswith(line)
 
 
-def test_a_tandem_is_refused_by_its_axles_alone(shared: Path) -> None:
-    path = shared / "crossings" / "d12_tandem_8_runs" / "site.toml"
-    (line,) = faults_of_site(path.read_text(), "site.toml")
-    assert line == (
-        "site.toml: vehicle.axles has 3 axles: identification with more than two axles is not "
-        "there yet, it must be a truck of two axles"
+LAST = REAR.replace("= 5.0", "= 6.3").replace("10000", "9800").replace("1100", "1200")
+TANDEM_HEAD = HEAD.replace("16000", "25800")
+BOGIE = "[[vehicle.bogies]]\naxles = [2, 3]\nequalised = true\n"
+SENSORS = "".join(
+    f'[[vehicle.sensors]]\nchannel = "{name}"\n{place}\nnoise_density_ug_per_rthz = 25\n'
+    for name, place in (
+        ("front", 'on = "body"\nposition_m = 0.0'),
+        ("rear", 'on = "body"\nposition_m = 5.65'),
+        ("axle_2", 'on = "axle"\naxle = 2'),
+        ("axle_3", 'on = "axle"\naxle = 3'),
     )
+)
+
+
+def test_a_tandem_keeps_its_axles_next_to_pairs() -> None:
+    vehicle = vehicle_of(TANDEM_HEAD, FRONT, REAR, LAST, BOGIE, SENSORS)
+    tandem = vehicle.tandem
+    assert tandem is not None
+    assert (tandem.gap_m, tandem.share) == pytest.approx((1.3, 0.5))
+    assert vehicle.wheelbase_m == pytest.approx(5.65)
+    assert vehicle.length_m == 6.3
+    assert vehicle.unsprung_mass_kg == (600.0, 2300.0)
+    assert vehicle.tyre_stiffness_n_per_m == (2.0e6, 8.0e6)
+    assert vehicle.sprung_mass_kg == 25800 - 2900
+    # Of 22.9 t sprung 17.5 t are on the tandem.
+    assert vehicle.front_axle_to_cg_m == pytest.approx(5.65 * 17500 / 22900)
+
+
+def test_shares_move_the_force_of_a_tandem() -> None:
+    bogie = BOGIE + "shares = [0.55, 0.45]\nshare_spread = 0.02\n"
+    vehicle = vehicle_of(TANDEM_HEAD, FRONT, REAR, LAST, bogie, SENSORS)
+    assert vehicle.wheelbase_m == pytest.approx(0.55 * 5.0 + 0.45 * 6.3)
+    assert vehicle.nominal("tandem_share") == pytest.approx((0.55,))
+    assert vehicle.spread("tandem_share") == 0.02
+    swapped = BOGIE.replace("[2, 3]", "[3, 2]") + "shares = [0.45, 0.55]\n"
+    again = vehicle_of(TANDEM_HEAD, FRONT, REAR, LAST, swapped, SENSORS)
+    assert again.tandem_share == pytest.approx(0.55)
+
+
+def test_a_tandem_is_written_as_it_was_read() -> None:
+    text = TANDEM_HEAD + "track_m = 1.85\n" + FRONT + REAR + LAST + BOGIE + SENSORS + BEHIND
+    site = parse_site(text, "a")
+    again = parse_site(site_toml(site), "b")
+    assert again == site
+    assert site_hash(again) == site_hash(site)
+    assert [axle.track_m for axle in site.vehicles[0].axles] == [1.85] * 3
+    first, second = footprints_of(site.vehicles[0])
+    assert (first.twin_distance_m, second.track_m) == (0.33, 1.85)
+    assert differences(vehicle_part(text, "truck-x"), site.vehicles[0]) == []
+
+
+@pytest.mark.parametrize(
+    ("parts", "line"),
+    [
+        ((BOGIE.replace("true", "false"), SENSORS), "vehicle.bogies[0].equalised is false"),
+        (
+            (BOGIE + "shares = [0.9, 0.1]\n", SENSORS),
+            "vehicle.bogies[0].shares give one axle 90% of the force, it must be at most 80%",
+        ),
+        ((BOGIE.replace("[2, 3]", "[1, 2]"), SENSORS), "vehicle.bogies does not join axles 2 and"),
+        ((BOGIE,), "vehicle.sensors is missing, it must place two accelerometers on the body"),
+        (
+            (BOGIE, SENSORS.replace("axle = 3", "axle = 1")),
+            "vehicle.sensors has none on axle 3, one in the middle or two are expected",
+        ),
+        (
+            (BOGIE, SENSORS.replace("axle = 3", "axle = 4")),
+            "vehicle.sensors[3].axle is 4, it must be the number of an axle, 1 to 3",
+        ),
+        ((LAST.replace("= 6.3", "= 7.6"), BOGIE, SENSORS), "vehicle.axles has 4 axles, it must be"),
+    ],
+)
+def test_other_trucks_of_many_axles_are_refused(parts: tuple[str, ...], line: str) -> None:
+    assert complaint(TANDEM_HEAD, FRONT, REAR, LAST, *parts).startswith(line)
+
+
+def test_the_shared_tandem_is_read(shared: Path) -> None:
+    path = shared / "crossings" / "d12_tandem_8_runs" / "site.toml"
+    assert faults_of_site(path.read_text(), "site.toml") == []
+    tandem = load_site(path).vehicles[0].tandem
+    assert tandem is not None
+    assert tandem.gap_m == pytest.approx(1.35)
 
 
 def test_a_truck_that_says_its_axles_is_the_truck_of_the_pairs() -> None:
     text = HEAD + FRONT + REAR
     known = vehicle_of(text)
-    own = own_part(text + BEHIND, "truck-x")
+    own = vehicle_part(text + BEHIND, "truck-x")
     assert "bridge" not in own
     assert parse_site(own + BEHIND[: BEHIND.index("[sensor]")], "a").vehicles[0] == known
     assert differences(own, known) == []
-    lighter = own_part(text.replace("1100", "300") + BEHIND, "truck-x")
+    lighter = vehicle_part(text.replace("1100", "300") + BEHIND, "truck-x")
     assert [one.field for one in differences(lighter, known)][-1] == "unsprung_mass_kg"
 
 
@@ -270,3 +345,33 @@ def test_the_two_sided_crossings_have_two_axles(shared: Path) -> None:
     assert vehicle.twin_tyre_distance_m == (0.0, 0.0)
     assert vehicle.front_axle_to_cg_m == pytest.approx(3.1, abs=0.15)
     assert len(vehicle.channels) == 8
+
+
+def _with_bogie(keys: str) -> str:
+    return f"{REAR}{REAR.replace('5.0', '6.3')}[[vehicle.bogies]]\n{keys}\n"
+
+
+@pytest.mark.parametrize(
+    ("parts", "line"),
+    [
+        (FRONT, "vehicle.axles has 1 entry, it must be two [[vehicle.axles]], or three of which"),
+        (
+            FRONT + "".join(REAR.replace("5.0", f"{5 + k}.0") for k in range(20)),
+            "vehicle.axles has 21 entries, it must be two [[vehicle.axles]], or three of which",
+        ),
+        (
+            FRONT + _with_bogie("axles = [2]"),
+            "vehicle.bogies[0].axles has 1 entry, it must be a list of the numbers of its axles",
+        ),
+        (
+            FRONT + _with_bogie("equalised = true"),
+            "vehicle.bogies[0].axles is missing, it must be a list of the numbers of its axles",
+        ),
+        (
+            FRONT + _with_bogie("axles = [2, 3]") + "[[vehicle.bogies]]\naxles = [2, 3]\n" * 20,
+            "vehicle.bogies has 21 entries, it must be one [[vehicle.bogies]], with axles = [2, 3]",
+        ),
+    ],
+)
+def test_wrong_number_of_axles_is_one_clear_line(parts: str, line: str) -> None:
+    assert complaint(HEAD, parts).startswith(line)

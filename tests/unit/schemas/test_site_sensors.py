@@ -187,7 +187,23 @@ def test_a_part_seen_from_one_side_is_refused(
         ),
         (
             text_of(axles=tuple((f"a{k}", 1 + k % 2, 0.0) for k in range(31))),
-            "vehicle.sensors is ",
+            "vehicle.sensors has 33 entries, it must be at most 32 [[vehicle.sensors]]",
+        ),
+        (
+            TEXT[:BRIDGE] + "sensors = []\n" + TEXT[BRIDGE:],
+            "vehicle.sensors is [], it must be [[vehicle.sensors]] with all accelerometers",
+        ),
+        (
+            text_of().replace('"f"', '"time_s"'),
+            'vehicle.sensors[0].channel is "time_s", it must be another name: that is the time',
+        ),
+        (
+            text_of(body=(*BODY, ("far", 50.0, 0.0))),
+            "vehicle.sensors[2].position_m is 50, it must be a length from -5 to 14 m",
+        ),
+        (
+            text_of(axles=(*AXLES, ("wide", 1, -3.0))),
+            "vehicle.sensors[4].lateral_m is -3, it must be a length from -2 to 2 m",
         ),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 from schemas.errors import InputError
 from schemas.signals import MAX_SITE_BYTES
 from schemas.site_file import parse_site, vehicle_toml
-from schemas.vehicle_info import differences, own_part
+from schemas.vehicle_info import differences, vehicle_part
 
 TEXT = (Path(__file__).parents[2] / "data" / "csv_example" / "site.toml").read_text()
 SITE = parse_site(TEXT, "site.toml")
@@ -29,17 +29,17 @@ def test_of_a_site_file_a_truck_says_its_own_part_only() -> None:
         + "[bridge]",
     )
     parse_site(two, "two")  # it is one
-    said = own_part(two, "truck-y")
+    said = vehicle_part(two, "truck-y")
     assert "truck-x" not in said
     assert "bridge" not in said
     bridge = TEXT[TEXT.index("[bridge]") : TEXT.index("[sensor]")]
     assert parse_site(said + bridge, "said").vehicles[0].id == "truck-y"
-    assert parse_site(own_part(TEXT, "truck-x") + bridge, "said") == SITE
+    assert parse_site(vehicle_part(TEXT, "truck-x") + bridge, "said") == SITE
 
 
-def test_what_is_only_its_own_is_said_as_it_is() -> None:
-    assert own_part(OWN, "truck-x") == OWN
-    assert own_part('# mine\n[vehicle]\nid = "t"\n', "t") == '# mine\n[vehicle]\nid = "t"\n'
+def test_own_vehicle_text_is_returned_unchanged() -> None:
+    assert vehicle_part(OWN, "truck-x") == OWN
+    assert vehicle_part('# mine\n[vehicle]\nid = "t"\n', "t") == '# mine\n[vehicle]\nid = "t"\n'
 
 
 @pytest.mark.parametrize(
@@ -53,9 +53,9 @@ def test_what_is_only_its_own_is_said_as_it_is() -> None:
         ('[vehicle]\nid = "other"\ncg_height_m = inf\n[bridge]\n', "is not TOML"),
     ],
 )
-def test_what_cannot_be_said_is_one_line(text: str, said: str) -> None:
+def test_text_without_the_vehicle_gives_one_line(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        own_part(text, "other")
+        vehicle_part(text, "other")
 
 
 def test_the_same_truck_differs_in_nothing() -> None:
@@ -73,7 +73,7 @@ def test_the_same_truck_differs_in_nothing() -> None:
         ("tyre_stiffness_n_per_m", [480.0e3, 4.3e6]),
     ],
 )
-def test_another_truck_is_told_by_name(field: str, value: object) -> None:
+def test_other_truck_is_named(field: str, value: object) -> None:
     (found,) = differences(changed(**{field: value}), TRUCK)
     assert found.field == field
 
@@ -119,4 +119,4 @@ def test_values_known_exactly_may_still_be_rounded() -> None:
     ],
 )
 def test_what_says_nothing_sensible_says_nothing(text: str) -> None:
-    assert [d for d in differences(text, TRUCK) if d.said != 30000] == []
+    assert [d for d in differences(text, TRUCK) if d.declared != 30000] == []

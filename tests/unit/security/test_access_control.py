@@ -23,9 +23,7 @@ def meets(expressions: list[str]) -> bool:
         ("truck", False, False),
     ],
 )
-def test_alarms_are_heard_by_who_looks_and_said_by_who_judges(
-    role: str, hears: bool, says: bool
-) -> None:
+def test_roles_publish_and_read_alarms_as_granted(role: str, hears: bool, says: bool) -> None:
     subject = Subject(role, "x")
     assert (meets(read_by(subject)), meets(published_by(subject))) == (hears, says)
 

@@ -99,7 +99,7 @@ def test_private_keys_are_never_readable_by_others_while_they_are_made(
     assert (tmp_path / "certs" / "truck-1").stat().st_mode & 0o777 == 0o700
 
 
-def test_certificates_say_who_it_is_and_for_what(folder: Path) -> None:
+def test_certificates_name_subject_and_purpose(folder: Path) -> None:
     authority = read_certificate(folder / "authority" / AUTHORITY)
     basic = authority.extensions.get_extension_for_class(x509.BasicConstraints)
     assert basic.critical
@@ -184,7 +184,7 @@ def test_renewal_replaces_one_key_and_keeps_the_hosts(folder: Path) -> None:
 
 def test_a_revoked_name_is_not_issued_again(folder: Path) -> None:
     certs_command(folder=folder, revoke=["truck-1"])
-    with pytest.raises(InputError, match="its old key would come alive again"):
+    with pytest.raises(InputError, match="its old key would become valid again"):
         certs_command(folder=folder, trucks=["truck-1"])
     with pytest.raises(InputError, match="has no certificate here"):
         certs_command(folder=folder, renew=["truck-1"])
@@ -213,7 +213,7 @@ def test_a_revoked_name_is_not_issued_again(folder: Path) -> None:
         ({"revoke": ["truck-1"], "renew": ["truck-1"]}, "either renew or revoke"),
     ],
 )
-def test_what_is_wrong_is_said_and_nothing_is_made(
+def test_wrong_input_is_named_and_nothing_is_written(
     folder: Path, arguments: dict[str, list[str]], message: str
 ) -> None:
     before = contents(folder)
@@ -265,7 +265,7 @@ def test_bad_credentials_are_named_before_anybody_connects(folder: Path, tmp_pat
     refused(r"expired on \d{4}-\d\d-\d\d; renew it")
 
 
-def test_time_is_told(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_validity_in_time_is_checked(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     now = datetime.now(UTC)
     with pytest.raises(InputError, match="is this machine's clock right"):
         check_credentials(folder / "truck-1", now - timedelta(days=2))
@@ -293,7 +293,7 @@ def test_a_service_uses_its_own_credentials(folder: Path) -> None:
     "listen",
     ["tcp/0.0.0.0:0", "tcp/[::]:0", "tcp/192.0.2.1:7447", "tcp/somewhere:7447", "ws/0.0.0.0:0"],
 )
-def test_nobody_else_can_connect_unless_it_is_said(listen: str) -> None:
+def test_listening_beyond_loopback_needs_insecure(listen: str) -> None:
     with pytest.raises(InputError, match=r"say --insecure if that is wanted"):
         open_session(listen=listen)
 

@@ -4,15 +4,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core import unknowns
-from services.simulation.drawn import Truth, _motion, default_site, draw_truth, drive, true_values
+from pre_core import parameters
+from services.simulation.drawn import (
+    CrossingTruth,
+    _motion,
+    default_site,
+    draw_truth,
+    drive,
+    true_values,
+)
 
 SEEDS = range(600)
 SITE = default_site()
 
 
 @pytest.fixture(scope="module")
-def truths() -> list[Truth]:
+def truths() -> list[CrossingTruth]:
     return [draw_truth(SITE, seed) for seed in SEEDS]
 
 
@@ -21,7 +28,7 @@ def test_the_same_seed_gives_the_same_truth_and_another_another() -> None:
     assert true_values(draw_truth(SITE, 3)) != true_values(draw_truth(SITE, 4))
 
 
-def test_logarithms_have_the_spreads_of_the_site(truths: list[Truth]) -> None:
+def test_logarithms_have_the_spreads_of_the_site(truths: list[CrossingTruth]) -> None:
     values = [true_values(truth) for truth in truths]
     vehicle, bridge = SITE.vehicles[0], SITE.bridges[0]
     expected = {
@@ -40,7 +47,7 @@ def test_logarithms_have_the_spreads_of_the_site(truths: list[Truth]) -> None:
         assert logs.std() == pytest.approx(spread, rel=4.0 / np.sqrt(2.0 * n)), name
 
 
-def test_what_no_residual_shows_is_drawn_too(truths: list[Truth]) -> None:
+def test_what_no_residual_shows_is_drawn_too(truths: list[CrossingTruth]) -> None:
     masses = [t.car.body_mass_kg + sum(t.car.unsprung_mass_kg) for t in truths]
     nominal = SITE.vehicles[0].total_mass_kg
     assert np.std(np.log(np.array(masses) / nominal)) == pytest.approx(0.01, rel=0.15)
@@ -59,7 +66,7 @@ def half_normal_where_there(values: NDArray[np.float64], scale: float, absent: f
     assert np.mean(there) == pytest.approx(np.sqrt(2.0 / np.pi), rel=0.12)
 
 
-def test_support_springs_and_bearings_may_be_there(truths: list[Truth]) -> None:
+def test_support_springs_and_bearings_may_be_there(truths: list[CrossingTruth]) -> None:
     scale = SITE.bridges[0].support_rotational_stiffness_nm_per_rad_scale_at_zero
     springs = np.array([t.beam.support_rotational_stiffness_nm_per_rad for t in truths])
     compliance = np.array([t.beam.support_compliance_m_per_n for t in truths])
@@ -69,7 +76,7 @@ def test_support_springs_and_bearings_may_be_there(truths: list[Truth]) -> None:
     assert abs(np.mean((springs[:, 0] > 0.0) == (springs[:, 1] > 0.0)) - 0.5) < 0.1
 
 
-def test_tyres_have_some_damping(truths: list[Truth]) -> None:
+def test_tyres_have_some_damping(truths: list[CrossingTruth]) -> None:
     for wheel in range(2):
         damping = np.array([t.car.tyre_damping_ns_per_m[wheel] for t in truths])
         half_normal_where_there(damping, 1000.0, 0.0)
@@ -88,7 +95,7 @@ def test_what_the_site_knows_of_bearings_and_tyres_is_drawn() -> None:
     assert abs(logs.mean()) < 0.08
 
 
-def test_all_kinds_of_drives_come(truths: list[Truth]) -> None:
+def test_all_kinds_of_drives_come(truths: list[CrossingTruth]) -> None:
     how = [t.conditions for t in truths]
     assert {c.road_class for c in how} == {"A", "B"}
     assert {c.forward for c in how} == {True, False}
@@ -153,5 +160,5 @@ def test_a_crossing_is_measured_with_the_errors_that_were_drawn() -> None:
         assert shifted / factor == pytest.approx(errors.delay_s[c], abs=5e-5)
         assert bias == pytest.approx(errors.bias_m_per_s2[c], abs=1e-3)
     assert erring.site.sensor.noise_density_ug_per_rthz == (0.0,) * 4
-    names = unknowns.names(7)
+    names = parameters.names(7)
     assert set(names) < set(true_values(truth))

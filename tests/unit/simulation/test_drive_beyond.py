@@ -14,36 +14,36 @@ from services.cli import main as cli
 from services.common.errors import InputError
 from services.execution.offline import identify_recordings, site_of
 from services.simulation.drive import (
-    Beyond,
-    Drive,
-    Left,
+    DepartedVehicle,
+    OutOfModelEffects,
+    SimulatedDrive,
     beam_of,
     paper_site,
     simulate_command,
     simulate_drive,
     truck_of,
-    with_beyond,
+    with_effects,
     write_drive,
 )
-from services.simulation.worlds import continuous
-from services.validation.paper import models
+from services.simulation.out_of_model import continuous
 from services.viewer.crossing_view import view_of_crossing
+from studies.paper.scenarios import models
 
 BEFORE_S = 3.0
 
 
-def driven(beyond: Beyond, site: Site | None = None) -> Drive:
+def driven(beyond: OutOfModelEffects, site: Site | None = None) -> SimulatedDrive:
     known = paper_site() if site is None else site
     sound = np.ones(known.bridges[0].elements)
     return simulate_drive(known, sound, road_class="A", seed=1, rate_hz=200.0, beyond=beyond)
 
 
 @pytest.fixture(scope="module")
-def plain() -> Drive:
-    return driven(Beyond())
+def plain() -> SimulatedDrive:
+    return driven(OutOfModelEffects())
 
 
-def differences(one: Drive, other: Drive) -> tuple[float, float]:
+def differences(one: SimulatedDrive, other: SimulatedDrive) -> tuple[float, float]:
     """Largest difference of any channel before the entry, and after it. The converter's low-pass
     filter reaches less than a quarter of a second ahead."""
     entry = round(BEFORE_S * one.run.rate_hz)
@@ -57,12 +57,14 @@ def differences(one: Drive, other: Drive) -> tuple[float, float]:
 @pytest.mark.parametrize(
     "beyond",
     [
-        Beyond(support_rotational_stiffness_nm_per_rad=(5e8, 0.0)),
-        Beyond(support_compliance_m_per_n=(0.0, 3e-10)),
-        Beyond(left=Left(3e5, 17.0, 0.1)),
+        OutOfModelEffects(support_rotational_stiffness_nm_per_rad=(5e8, 0.0)),
+        OutOfModelEffects(support_compliance_m_per_n=(0.0, 3e-10)),
+        OutOfModelEffects(left=DepartedVehicle(3e5, 17.0, 0.1)),
     ],
 )
-def test_what_the_bridge_has_is_felt_on_the_bridge(plain: Drive, beyond: Beyond) -> None:
+def test_what_the_bridge_has_is_felt_on_the_bridge(
+    plain: SimulatedDrive, beyond: OutOfModelEffects
+) -> None:
     before, after = differences(plain, driven(beyond))
     assert before < 1e-6
     assert after > 2e-3
@@ -71,21 +73,23 @@ def test_what_the_bridge_has_is_felt_on_the_bridge(plain: Drive, beyond: Beyond)
 @pytest.mark.parametrize(
     "beyond",
     [
-        Beyond(friction_share=0.05),
-        Beyond(bilinear_damping=0.2),
-        Beyond(air_spring_exponent=1.38),
+        OutOfModelEffects(friction_share=0.05),
+        OutOfModelEffects(bilinear_damping=0.2),
+        OutOfModelEffects(air_spring_exponent=1.38),
     ],
 )
-def test_what_the_truck_has_is_felt_before_too(plain: Drive, beyond: Beyond) -> None:
+def test_what_the_truck_has_is_felt_before_too(
+    plain: SimulatedDrive, beyond: OutOfModelEffects
+) -> None:
     before, after = differences(plain, driven(beyond))
     assert before > 1e-3
     assert after > 1e-3
 
 
-def test_a_lorry_the_other_way_or_long_ago_is_another_swing(plain: Drive) -> None:
-    soon = driven(Beyond(left=Left(3e5, 17.0, 0.1)))
-    back = driven(Beyond(left=Left(3e5, -17.0, 0.1)))
-    late = driven(Beyond(left=Left(3e5, 17.0, 100.0)))
+def test_a_lorry_the_other_way_or_long_ago_is_another_swing(plain: SimulatedDrive) -> None:
+    soon = driven(OutOfModelEffects(left=DepartedVehicle(3e5, 17.0, 0.1)))
+    back = driven(OutOfModelEffects(left=DepartedVehicle(3e5, -17.0, 0.1)))
+    late = driven(OutOfModelEffects(left=DepartedVehicle(3e5, 17.0, 100.0)))
     # On a symmetric bridge the odd modes swing alike, the even ones the other way round.
     assert differences(soon, back)[1] > 1e-4
     assert differences(plain, late)[1] < 1e-5
@@ -93,10 +97,10 @@ def test_a_lorry_the_other_way_or_long_ago_is_another_swing(plain: Drive) -> Non
 
 def test_friction_is_a_share_of_what_the_springs_carry() -> None:
     site = paper_site()
-    car, _ = with_beyond(
+    car, _ = with_effects(
         truck_of(site.vehicles[0]),
         beam_of(site.bridges[0], np.ones(7)),
-        Beyond(friction_share=0.08, friction_load_growth=1.0),
+        OutOfModelEffects(friction_share=0.08, friction_load_growth=1.0),
     )
     carried = np.array(static_axle_loads_n(car, 9.80665)) - 9.80665 * np.array(car.unsprung_mass_kg)
     np.testing.assert_allclose(car.dry_friction_n, 0.08 * carried)
@@ -115,7 +119,7 @@ def two_spans() -> Site:
 def test_several_spans_are_driven_and_refused_by_the_papers_methods(
     two_spans: Site, tmp_path: Path
 ) -> None:
-    drive = driven(Beyond(), two_spans)
+    drive = driven(OutOfModelEffects(), two_spans)
     path = tmp_path / "spans.mcap"
     write_drive(path, drive, two_spans)
     for method in ("least_squares", "random_walk"):
@@ -139,7 +143,8 @@ def test_few_elements_have_fewer_modes_than_are_kept() -> None:
     site = paper_site()
     bridge = site.bridges[0].model_copy(update={"elements": 2, "interior_supports_m": (15.0,)})
     drive = driven(
-        Beyond(), parse_site(site_toml(site.model_copy(update={"bridges": (bridge,)})), "s")
+        OutOfModelEffects(),
+        parse_site(site_toml(site.model_copy(update={"bridges": (bridge,)})), "s"),
     )
     assert np.isfinite(drive.run.channels["unsprung_front"]).all()
 
@@ -147,9 +152,9 @@ def test_few_elements_have_fewer_modes_than_are_kept() -> None:
 def test_options_of_simulate_reach_the_truth(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    told: list[Beyond] = []
+    told: list[OutOfModelEffects] = []
 
-    def keeping(*, beyond: Beyond, **others: object) -> int:
+    def keeping(*, beyond: OutOfModelEffects, **others: object) -> int:
         told.append(beyond)
         return 0
 
@@ -168,8 +173,10 @@ def test_options_of_simulate_reach_the_truth(
         == 0
     )
     assert told == [
-        Beyond(),
-        Beyond((2e8, 0.0), (2.5e-10, 1.25e-10), Left(3e5, 17.0, 0.1), 0.08, 1.0, 0.2, 1.38),
+        OutOfModelEffects(),
+        OutOfModelEffects(
+            (2e8, 0.0), (2.5e-10, 1.25e-10), DepartedVehicle(3e5, 17.0, 0.1), 0.08, 1.0, 0.2, 1.38
+        ),
     ]
 
 
@@ -186,7 +193,9 @@ def test_a_recording_with_all_of_it_is_written(tmp_path: Path) -> None:
         direction="end_to_start",
         gps_noise=True,
         rate=200.0,
-        beyond=Beyond((2e8, 0.0), (2.5e-10, 0.0), Left(3e5, 17.0, 0.1), 0.08, 1.0, 0.2, 1.38),
+        beyond=OutOfModelEffects(
+            (2e8, 0.0), (2.5e-10, 0.0), DepartedVehicle(3e5, 17.0, 0.1), 0.08, 1.0, 0.2, 1.38
+        ),
         output=path,
         console=Console(quiet=True),
     )

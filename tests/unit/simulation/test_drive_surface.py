@@ -16,25 +16,31 @@ from pre_core.physics.road import (
 )
 from pre_core.physics.sensors import Accelerometer, measure_acceleration
 from pre_core.physics.simulate import Motion, WheelRoad, constant_speed
-from pre_core.physics.surface import Footprint, felt_by, random_surface, spectra, surface_density
+from pre_core.physics.surface import (
+    Footprint,
+    axle_profile,
+    random_surface,
+    spectra,
+    surface_density,
+)
 from schemas.signals import CHANNELS
 from schemas.site import Site
 from schemas.site_file import site_toml
+from services.catalogue.contents import summarise_recording
 from services.cli import main as cli
 from services.common.errors import InputError
-from services.drives.survey import survey
 from services.simulation import drive as simulation
 from services.simulation.drive import (
-    BETWEEN_RUNS_S,
     LONGEST_STEP_S,
     SETTLE_S,
-    Drive,
+    SimulatedDrive,
     paper_site,
     simulate_drive,
 )
+from services.simulation.schedule import BETWEEN_RUNS_S, Schedule
 from services.simulation.wheel_paths import (
     AxleRoads,
-    OnSurface,
+    SurfaceOptions,
     WheelPaths,
     roads_of_surface,
     wheel_paths_of,
@@ -63,7 +69,7 @@ class Spy:
         patch.setattr(simulation, "simulate", keeping)
 
 
-def driven(**how: Any) -> Drive:
+def driven(**how: Any) -> SimulatedDrive:
     return simulate_drive(SITE, np.ones(7), road_class="A", seed=3, rate_hz=RATE_HZ, **how)
 
 
@@ -129,7 +135,7 @@ def test_each_axle_drives_over_the_road_that_its_tyres_feel(
         (drive.road, SINGLE),
         (drive.rear_road, TWIN._replace(offset_m=0.1 * sign)),
     ):
-        np.testing.assert_array_equal(profile.height_m, felt_by(surface, axle).height_m)
+        np.testing.assert_array_equal(profile.height_m, axle_profile(surface, axle).height_m)
     spacing = float(drive.road.x_m[1] - drive.road.x_m[0])
     apart = level(drive.road.height_m - drive.rear_road.height_m, spacing)
     assert apart == pytest.approx(expected_level(*paths[:2]), rel=0.15)
@@ -180,7 +186,7 @@ def a_site(**tyres: Any) -> Site:
 def test_tyres_are_the_sites_the_askers_or_common_ones() -> None:
     nothing = SITE.vehicles[0]
     assert wheel_paths_of(nothing) == WheelPaths(SINGLE, TWIN)
-    asked = OnSurface("single", 0.01, 0.2)
+    asked = SurfaceOptions("single", 0.01, 0.2)
     assert wheel_paths_of(nothing, asked) == WheelPaths(SINGLE, SINGLE._replace(offset_m=0.01), 0.2)
     known = a_site(
         tyre_width_m=(0.3, 0.2),
@@ -189,17 +195,17 @@ def test_tyres_are_the_sites_the_askers_or_common_ones() -> None:
         track_m=(2.0, 1.8),
         rear_axle_offset_m=-0.02,
     ).vehicles[0]
-    assert wheel_paths_of(known, OnSurface(wander_m=0.1)) == WheelPaths(
+    assert wheel_paths_of(known, SurfaceOptions(wander_m=0.1)) == WheelPaths(
         Footprint(0.3, 0.0, 0.15, 2.0), Footprint(0.2, 0.31, 0.18, 1.8, -0.02), 0.1
     )
     singles = a_site(twin_tyre_distance_m=(0.0, 0.0)).vehicles[0]
     assert wheel_paths_of(singles).rear == SINGLE._replace(offset_m=0.005)
     for asked, words in (
         (
-            OnSurface("twin"),
+            SurfaceOptions("twin"),
             f"--tyres: the site file tells it, {known.id} has twin_tyre_distance_m",
         ),
-        (OnSurface(None, 0.0), "--rear-offset: the site file tells it, .* rear_axle_offset_m"),
+        (SurfaceOptions(None, 0.0), "--rear-offset: the site file tells it, .* rear_axle_offset_m"),
     ):
         with pytest.raises(InputError, match=words):
             wheel_paths_of(known, asked)
@@ -210,8 +216,10 @@ def test_options_of_simulate_reach_the_road(
 ) -> None:
     told: list[tuple[object, ...]] = []
 
-    def keeping(*, surface: object, runs: int, drive_seed: int | None, **others: object) -> int:
-        told.append((surface, runs, drive_seed))
+    def keeping(
+        *, surface: object, schedule: Schedule, drive_seed: int | None, **others: object
+    ) -> int:
+        told.append((surface, schedule.runs, drive_seed))
         return 0
 
     monkeypatch.setattr("services.simulation.drive.simulate_command", keeping)
@@ -222,8 +230,8 @@ def test_options_of_simulate_reach_the_road(
     assert cli.main([*begin, *options.split(), "--drive-seed", "7"]) == 0
     assert told == [
         (None, 1, None),
-        (OnSurface(None, None, 0.0), 1, None),
-        (OnSurface("single", -0.01, 0.1), 12, 7),
+        (SurfaceOptions(None, None, 0.0), 1, None),
+        (SurfaceOptions("single", -0.01, 0.1), 12, 7),
     ]
 
 
@@ -231,10 +239,10 @@ def test_several_runs_over_one_surface_are_one_recording(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Minutes apart, each a crossing; the road is one, the place on it and the noise are not."""
-    drives: list[Drive] = []
+    drives: list[SimulatedDrive] = []
     real = simulation.simulate_drive
 
-    def keeping(*arguments: Any, **named: Any) -> Drive:
+    def keeping(*arguments: Any, **named: Any) -> SimulatedDrive:
         drives.append(real(*arguments, **named))
         return drives[-1]
 
@@ -247,7 +255,7 @@ def test_several_runs_over_one_surface_are_one_recording(
     correlation = np.corrcoef(one.road.height_m, other.road.height_m)[0, 1]
     assert 0.9 < correlation < 1.0 - 1e-6
     assert not np.array_equal(one.run.channels[CHANNELS[2]], other.run.channels[CHANNELS[2]])
-    found = survey(path)
+    found = summarise_recording(path)
     first, second = found.passings
     apart_s = 1e-9 * (second.entry_ns - first.entry_ns)
     assert apart_s == pytest.approx(BETWEEN_RUNS_S, abs=0.2)
@@ -263,7 +271,7 @@ def test_the_first_of_several_runs_is_the_only_one_of_one(tmp_path: Path) -> Non
     np.testing.assert_array_equal(alone.road.height_m, other.road.height_m)
 
 
-def test_what_the_site_tells_is_not_asked_again(
+def test_values_of_the_site_file_are_not_requested_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     site = tmp_path / "site.toml"

@@ -21,10 +21,10 @@ from services.simulation.wide_cases import (
 from services.simulation.wide_crossings import (
     PAIR_NAMES,
     RTK,
-    Case,
-    Driven,
     SatelliteErrors,
-    Sensor,
+    WideCase,
+    WideDrivenRun,
+    WideSensor,
     drive_case,
     middle_channels,
     site_of,
@@ -36,7 +36,7 @@ GRAVITY = 9.80665
 QUIET = SatelliteErrors(0.0, 0.0, 0.0)
 
 
-def short(case: Case, sensors: tuple[Sensor, ...] | None = None) -> Case:
+def short(case: WideCase, sensors: tuple[WideSensor, ...] | None = None) -> WideCase:
     """The same case with perfect sensors and receiver, and a fast truck."""
     perfect = middle_sensors(case.truck.axles[1].position_m, 0.0) if sensors is None else sensors
     runs = tuple(run._replace(speed_m_per_s=20.0, change_m_per_s=0.0) for run in case.runs)
@@ -44,11 +44,11 @@ def short(case: Case, sensors: tuple[Sensor, ...] | None = None) -> Case:
 
 
 @pytest.fixture(scope="module")
-def driven() -> Driven:
+def driven() -> WideDrivenRun:
     return drive_case(short(draw_wide(1)), 0)
 
 
-def test_same_case_gives_the_same_run(driven: Driven) -> None:
+def test_same_case_gives_the_same_run(driven: WideDrivenRun) -> None:
     again = drive_case(short(draw_wide(1)), 0)
     for name in PAIR_NAMES:
         np.testing.assert_array_equal(again.run.channels[name], driven.run.channels[name])
@@ -58,7 +58,7 @@ def test_same_case_gives_the_same_run(driven: Driven) -> None:
     )
 
 
-def test_recording_has_road_before_and_behind_the_bridge(driven: Driven) -> None:
+def test_recording_has_road_before_and_behind_the_bridge(driven: WideDrivenRun) -> None:
     case = short(draw_wide(1))
     speed = case.runs[0].speed_m_per_s
     time_s = driven.run.accel_time_s
@@ -105,7 +105,7 @@ def test_receiver_errors_are_those_that_are_stated() -> None:
         assert speed.std() == pytest.approx(errors.speed_m_per_s, rel=0.35)
 
 
-def test_sensor_has_gain_delay_bias_and_noise(driven: Driven) -> None:
+def test_sensor_has_gain_delay_bias_and_noise(driven: WideDrivenRun) -> None:
     case = short(draw_wide(1))
     true = driven.run.channels["unsprung_rear"]
     flawed = [
@@ -119,11 +119,11 @@ def test_sensor_has_gain_delay_bias_and_noise(driven: Driven) -> None:
     assert noise.std() == pytest.approx(100e-6 * GRAVITY * np.sqrt(250.0), rel=0.05)
 
 
-def test_mean_of_left_and_right_is_the_middle(driven: Driven) -> None:
+def test_mean_of_left_and_right_is_the_middle(driven: WideDrivenRun) -> None:
     case = short(draw_wide(1))
     rear_m = case.truck.axles[1].position_m
     pairs = tuple(
-        Sensor(f"{on}-{position}-{axle}-{side}", on, position, axle, side * 0.8, 0, 0.0)
+        WideSensor(f"{on}-{position}-{axle}-{side}", on, position, axle, side * 0.8, 0, 0.0)
         for on, position, axle in (
             ("axle", 0.0, 2),
             ("axle", 0.0, 1),

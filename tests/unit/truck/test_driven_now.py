@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 
 from schemas.signals import NS_PER_S
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.bus import playback
 from services.cli import main as cli
 from services.logger import _health_line
-from services.recordings.recording import Message
-from services.truck import _driven_now, _tell, _times
+from services.truck import _driven_now, _log_timing, _times
 from tests.unit.bus.test_playback import Clock, Delivered
 from tests.unit.identification.test_engine_resume import THERE, engine, fed, messages_of
 
@@ -42,7 +41,7 @@ def test_a_pause_is_waited_for_unless_it_is_skipped(monkeypatch: pytest.MonkeyPa
         def put(message: Message, came_s: list[float] = came_s, clock: Clock = clock) -> None:
             came_s.append(clock.now_s - 1000.0)
 
-        playback.play(
+        playback.publish_paced(
             TWO_RUNS["gnss"], put, Delivered(), speed=1.0, stop=clock,  # type: ignore[arg-type]
             longest_gap_s=longest_gap_s,
         )  # fmt: skip
@@ -91,15 +90,15 @@ def test_runs_that_are_one_drive_now_are_as_many_crossings() -> None:
 def said(caplog: pytest.LogCaptureFixture, speed: float, *, skip_gaps: bool) -> str:
     caplog.clear()
     with caplog.at_level(logging.INFO):
-        _tell(_times(TWO_RUNS, speed, skip_gaps=skip_gaps))
+        _log_timing(_times(TWO_RUNS, speed, skip_gaps=skip_gaps))
     return caplog.text
 
 
-def test_who_waits_is_told_for_how_long(caplog: pytest.LogCaptureFixture) -> None:
+def test_waiting_time_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     text = said(caplog, 1.0, skip_gaps=False)
     assert (
         "nothing was recorded for up to 600 s (between runs): of the 603 s that the drive takes, "
-        "600 s are spent waiting; --skip-gaps passes over them" in text
+        "600 s are spent waiting; --skip-gaps skips them" in text
     )
     assert "stamped" not in text
 
@@ -115,11 +114,11 @@ def test_times_of_long_ago_are_explained(caplog: pytest.LogCaptureFixture) -> No
 
 def test_a_drive_as_it_was_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
-        _tell(_times(recorded(0.0, 1.0, 2.0), 1.0, skip_gaps=False))
+        _log_timing(_times(recorded(0.0, 1.0, 2.0), 1.0, skip_gaps=False))
     assert caplog.text == ""
 
 
-def test_a_long_lag_is_explained_where_it_is_told() -> None:
+def test_long_lag_is_explained_where_it_is_reported() -> None:
     assert "lag 0.20 s, queue 0" in _health_line({"lag_s": 0.2})
     assert (
         "lag 1356.00 s (samples so old when they came: played faster than real, sent late, or a "

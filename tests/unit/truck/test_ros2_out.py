@@ -8,11 +8,11 @@ from schemas.events import Event, EventKind
 from schemas.signals import GnssFix
 from schemas.site_file import parse_site, site_toml, vehicle_toml
 from services.common.errors import FailureError
-from services.drives.ros2_complaints import UNPUBLISHED
+from services.drives.ros2_anomalies import UNPUBLISHED
 from services.drives.ros2_truck import Ros2Truck
 from services.simulation.drive import paper_site
 from services.truck.gateway import Gateway
-from services.truck.ros2 import _Out
+from services.truck.ros2 import _InfoFirstPublisher
 from services.truck.spool import Spool
 from tests import ros2
 
@@ -27,12 +27,12 @@ def test_time_that_no_message_holds_is_counted_and_the_next_fix_goes_out(tmp_pat
     site = parse_site(site_toml(paper_site()) + ros2.ROS2, "site.toml")
     truck = Ros2Truck(site, "site.toml", "truck-1")
     gateway = Gateway(nobody, "sim-ros", "truck-1", Spool(tmp_path))
-    out = _Out(gateway, vehicle_toml(site, "truck-1"), truck)
+    out = _InfoFirstPublisher(gateway, vehicle_toml(site, "truck-1"), truck)
     out.put(FIX._replace(device_time_ns=1 << 64))
     out.put(FIX)
     out.put(FIX._replace(device_time_ns=1 << 64))
     gateway.close()
-    assert truck.complaints.count(ros2.FIX_TOPIC, UNPUBLISHED) == 2
+    assert truck.anomalies.count(ros2.FIX_TOPIC, UNPUBLISHED) == 2
     assert out.sent == 3  # what the truck is, and the fix in its two forms
 
 

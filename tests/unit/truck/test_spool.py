@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from schemas.spool import Held
+from schemas.spool import SpoolBoot
 from services.common.errors import InputError
 from services.truck.spool import Spool
 
@@ -52,7 +52,7 @@ def test_what_was_appended_is_read_again_in_pages(tmp_path: Path) -> None:
     assert sequences(spool, spool.boot_id) == list(range(50))
     assert spool.read("accel", spool.boot_id + 1, 0, 9) == ([], None)
     assert spool.read("info", spool.boot_id, 0, 9) == ([], None)
-    assert spool.contents("gnss") == [Held(spool.boot_id, 10, [(0, 9)], -1, 0)]
+    assert spool.contents("gnss") == [SpoolBoot(spool.boot_id, 10, [(0, 9)], -1, 0)]
     assert spool.streams() == ["accel", "gnss"]
     spool.close()
 
@@ -199,7 +199,7 @@ def test_what_a_logger_has_is_freed(tmp_path: Path) -> None:
     assert last == 299
     # Segments in which another stream is not durable yet stay.
     spool.confirm({("accel", boot): 299})
-    assert spool.contents("gnss") == [Held(boot, 10, [(0, 9)], -1, 0)]
+    assert spool.contents("gnss") == [SpoolBoot(boot, 10, [(0, 9)], -1, 0)]
     spool.close()
     spool = Spool(tmp_path, budget_bytes=MIB)
     [held] = spool.contents("accel")
@@ -250,7 +250,7 @@ def test_a_full_disk_leaves_the_spool_usable(
         spool.append("accel", 5, payload(5))
     monkeypatch.setattr(os, "write", real)
     fill(spool, 6, 9)
-    assert spool.contents("accel") == [Held(spool.boot_id, 10, [(0, 4), (6, 9)], -1, 0)]
+    assert spool.contents("accel") == [SpoolBoot(spool.boot_id, 10, [(0, 4), (6, 9)], -1, 0)]
     assert sequences(spool, spool.boot_id) == [0, 1, 2, 3, 4, 6, 7, 8, 9]
     spool.close()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from services.viewer.crossing_view import CrossingView, ParameterRow
-from services.viewer.deflection import passage_of
+from services.viewer.deflection import deflection_frames
 
 G = 9.80665
 SPAN, RIGIDITY = 30.0, 15.6e9
@@ -39,7 +39,7 @@ def simply_supported(x: np.ndarray, load_n: float, at: float) -> np.ndarray:
 
 @pytest.mark.parametrize("forward", [True, False])
 def test_a_uniform_beam_bends_as_the_textbook_says(forward: bool):
-    found = passage_of(view(forward=forward))
+    found = deflection_frames(view(forward=forward))
     assert found is not None
     sign = 1.0 if forward else -1.0
     assert found.front_m - found.rear_m == pytest.approx(np.full(160, sign * WHEELBASE))
@@ -57,7 +57,7 @@ def test_a_uniform_beam_bends_as_the_textbook_says(forward: bool):
 
 
 def test_it_rests_while_the_truck_is_beside_it():
-    found = passage_of(view())
+    found = deflection_frames(view())
     assert found is not None
     beside = (found.front_m < 0.0) | (found.rear_m > SPAN)
     assert beside.sum() >= 4
@@ -65,17 +65,17 @@ def test_it_rests_while_the_truck_is_beside_it():
 
 
 def test_interior_supports_and_bearings_that_give_are_in_it():
-    held = passage_of(view(interior_supports_m=(15.0,)))
+    held = deflection_frames(view(interior_supports_m=(15.0,)))
     assert held is not None
     middle = int(np.argmin(np.abs(held.x_m - 15.0)))
     assert np.abs(held.deflection_m[:, middle]).max() < 1e-12
-    sunk = passage_of(view({**TRUCK, "f_start": 1e-9}))
+    sunk = deflection_frames(view({**TRUCK, "f_start": 1e-9}))
     assert sunk is not None
     assert sunk.deflection_m[:, 0].min() == pytest.approx(-1e-9 * 9000.0 * G, rel=0.2)
 
 
 def test_without_a_value_that_it_takes_there_is_none():
     for name in TRUCK:
-        assert passage_of(view({k: v for k, v in TRUCK.items() if k != name})) is None
-    assert passage_of(view(rigidity_nm2=None)) is None
-    assert passage_of(view(interior_supports_m=(14.0,))) is None
+        assert deflection_frames(view({k: v for k, v in TRUCK.items() if k != name})) is None
+    assert deflection_frames(view(rigidity_nm2=None)) is None
+    assert deflection_frames(view(interior_supports_m=(14.0,))) is None

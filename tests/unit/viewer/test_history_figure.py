@@ -3,19 +3,19 @@
 import matplotlib
 import numpy as np
 
-from services.history.past import Statement
+from services.history.bridge_history import Statement
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.drawing import STYLE
-from services.viewer.history_figure import History, Mark, Point, draw_history
+from services.viewer.history_figure import AlarmMark, HistoryView, PeriodPoint, draw_history
 
 WEEK_S = 7 * 86_400.0
 BEGIN_S = 1.7364e9
 
 
-def weeks(*ratios: float) -> tuple[Point, ...]:
+def weeks(*ratios: float) -> tuple[PeriodPoint, ...]:
     """Of two elements; that of the second one is given, the other stays."""
     return tuple(
-        Point(
+        PeriodPoint(
             BEGIN_S + number * WEEK_S,
             (16e9, 16e9 * ratio),
             (15.5e9, 15.5e9 * ratio),
@@ -27,19 +27,21 @@ def weeks(*ratios: float) -> tuple[Point, ...]:
     )
 
 
-def mark(acknowledged: str = "", note: str = "") -> Mark:
+def mark(acknowledged: str = "", note: str = "") -> AlarmMark:
     since_s = BEGIN_S + 150 * WEEK_S
-    return Mark(2, False, since_s, since_s + 3 * WEEK_S, "element 2 is weaker", acknowledged, note)
+    return AlarmMark(
+        2, False, since_s, since_s + 3 * WEEK_S, "element 2 is weaker", acknowledged, note
+    )
 
 
-def drawn(history: History) -> matplotlib.figure.Figure:
+def drawn(history: HistoryView) -> matplotlib.figure.Figure:
     with matplotlib.rc_context(STYLE):
         return draw_history(history)
 
 
 def test_the_newest_estimate_is_in_its_panel_however_few_are_like_it() -> None:
     """A loss of a third in the last of three years' weeks, which is less than one in a hundred."""
-    figure = drawn(History("bridge-1", "week", weeks(*[1.0] * 150, 0.66), (), ()))
+    figure = drawn(HistoryView("bridge-1", "week", weeks(*[1.0] * 150, 0.66), (), ()))
     _, second = figure.axes[:2]
     (points,) = [line for line in second.lines if line.get_marker() == "o"]
     low, high = second.get_ylim()
@@ -50,16 +52,22 @@ def test_the_newest_estimate_is_in_its_panel_however_few_are_like_it() -> None:
 
 def test_the_head_says_what_to_do_while_an_alarm_stands() -> None:
     points = weeks(*[1.0] * 150, 0.9, 0.9, 0.9)
-    said = [text.get_text() for text in drawn(History("b-1", "week", points, (mark(),), ())).texts]
+    said = [
+        text.get_text() for text in drawn(HistoryView("b-1", "week", points, (mark(),), ())).texts
+    ]
     assert "ALARM: element 2 is weaker" in said
     assert "Look at the bridge, then: driveby alarm ack b-1 --by NAME --note TEXT" in said
     noted = mark("the owner, 2025-06-23", "props were put in")
-    said = [text.get_text() for text in drawn(History("b-1", "week", points, (noted,), ())).texts]
+    said = [
+        text.get_text() for text in drawn(HistoryView("b-1", "week", points, (noted,), ())).texts
+    ]
     assert "noted: element 2 is weaker (the owner, 2025-06-23)" in said
     assert "“props were put in”" in said
     assert not any("driveby" in text for text in said)
     long = mark("the owner, 2025-06-23", "x" * 500)
-    said = [text.get_text() for text in drawn(History("b-1", "week", points, (long,), ())).texts]
+    said = [
+        text.get_text() for text in drawn(HistoryView("b-1", "week", points, (long,), ())).texts
+    ]
     assert max(map(len, said)) < 110
 
 
@@ -68,11 +76,29 @@ def test_the_head_is_green_only_where_a_watch_found_nothing() -> None:
     for is_reassuring in (True, False):
         long = " ".join(["not watched"] * 20)
         said = (Statement(long, is_reassuring),)
-        texts = drawn(History("b-1", "week", points, (), said)).texts
+        texts = drawn(HistoryView("b-1", "week", points, (), said)).texts
         about = [text for text in texts if "not watched" in text.get_text()]
         assert len(about) == 3
         assert " ".join(text.get_text() for text in about) == long
         green = VERDICT_COLOURS["good"]
         assert {text.get_color() == green for text in about} == {is_reassuring}
-    texts = drawn(History("b-1", "week", points, (), ())).texts
+    texts = drawn(HistoryView("b-1", "week", points, (), ())).texts
     assert not any(text.get_color() == VERDICT_COLOURS["good"] for text in texts)
+
+
+def test_every_good_interval_is_within_its_panel() -> None:
+    wide = weeks(*[1.0] * 150)
+    widest = wide[-1]._replace(low=(12e9, 15e9), high=(24e9, 17e9))
+    figure = drawn(HistoryView("b-1", "week", (*wide[:-1], widest), (), ()))
+    for axes in figure.axes[:2]:
+        low, high = axes.get_ylim()
+        assert low < 75.0
+        assert high > 150.0
+        figure.canvas.draw()
+        assert len([tick for tick in axes.get_yticks() if low <= tick <= high]) >= 3
+
+
+def test_one_week_is_shown_over_weeks_not_years() -> None:
+    (first, _) = drawn(HistoryView("b-1", "week", weeks(1.0), (), ())).axes
+    begin, end = first.get_xlim()
+    assert end - begin < 20.0

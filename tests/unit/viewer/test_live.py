@@ -11,12 +11,12 @@ import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Crossing, Header, lowest_element
+from schemas.results import CrossingResult, ResultHeader, lowest_element
 from schemas.results_on_the_wire import bridge_to_protobuf, crossing_to_protobuf
 from schemas.signals import (
     CHANNELS,
     AccelBatch,
-    Channel,
+    AccelChannel,
     GnssFix,
     Identity,
     encode_accel,
@@ -25,13 +25,13 @@ from schemas.signals import (
 from schemas.site import Site
 from schemas.site_file import load_site
 from schemas.topics import Key
-from services.bus.listening import Heard
+from services.bus.realm_listener import BusMessage
 from services.cli import main as cli
 from services.common.errors import FailureError
 from services.viewer.crossing_view import elements_of_result
 from services.viewer.live import APPLICATION, live_command
 from services.viewer.live_parts import PERIOD_S, extremes
-from services.viewer.live_picture import MOST_TRUCKS, LivePicture
+from services.viewer.live_view import MOST_TRUCKS, LiveView
 from tests.endpoints import free_port
 from tests.unit.cli.watching import alarm
 from tests.unit.viewer.found import results_of, some_crossing
@@ -39,19 +39,19 @@ from tests.unit.viewer.found import results_of, some_crossing
 START_NS = 1_790_000_000_000_000_000
 """When the truck of `found.some_crossing` comes onto the bridge."""
 EXIT_NS = START_NS + 4_000_000_000
-HEADER = Header("0.1.0", 1.79e9, "hash", {}, 1)
+HEADER = ResultHeader("0.1.0", 1.79e9, "hash", {}, 1)
 
 
 class Live(NamedTuple):
     """A picture that is drawn into a file, and its clock."""
 
-    picture: LivePicture
+    picture: LiveView
     recording: rr.RecordingStream
     clock: list[float]
     path: Path
 
     def hears(self, owner: Any, stream: str, payload: bytes, name: str = "truck-1") -> None:
-        self.picture.take(Heard(Key("live", owner, name, stream), Identity(1, 0), payload))
+        self.picture.ingest(BusMessage(Key("live", owner, name, stream), Identity(1, 0), payload))
 
     def drawn(self) -> list[Chunk]:
         """All that has been drawn; nothing more can be."""
@@ -71,7 +71,7 @@ def made(path: Path, site: Site | None) -> Live:
     recording = rr.RecordingStream(APPLICATION)
     recording.save(path)
     clock = [100.0]
-    return Live(LivePicture(recording, site, lambda: clock[0]), recording, clock, path)
+    return Live(LiveView(recording, site, lambda: clock[0]), recording, clock, path)
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def batch(number: int) -> bytes:
     samples = np.full(50, 0.1)
     samples[7 + number % 30] = 9.0
     first_ns = START_NS + number * 50_000_000
-    channels = {name: Channel(1000.0, samples) for name in CHANNELS}
+    channels = {name: AccelChannel(1000.0, samples) for name in CHANNELS}
     return encode_accel(AccelBatch(1, number, number * 50_000_000, first_ns, channels))
 
 
@@ -117,11 +117,11 @@ def state(which: pb.CrossingState, bridge: str = "bridge-1") -> bytes:
     ).SerializeToString()
 
 
-def result(site: Site, **changes: Any) -> Crossing:
+def result(site: Site, **changes: Any) -> CrossingResult:
     return results_of(site, some_crossing("a", **changes)).crossings[0]
 
 
-def estimate(crossing: Crossing) -> bytes:
+def estimate(crossing: CrossingResult) -> bytes:
     return crossing_to_protobuf(crossing, HEADER).SerializeToString()
 
 
@@ -252,7 +252,7 @@ def test_a_result_is_drawn_and_the_next_takes_its_place(live: Live, site: Site) 
     assert "No element stands out" in texts[2]
 
 
-def test_a_rejected_crossing_says_why_and_whose_numbers_are_shown(live: Live, site: Site) -> None:
+def test_rejected_crossing_names_reason_and_source_of_numbers(live: Live, site: Site) -> None:
     bad = result(site, verdict="rejected", reasons=("channel_missing",), entry=-60.0)
     live.hears("bridge", "estimate", estimate(bad))
     live.hears("bridge", "estimate", estimate(result(site)))
@@ -285,12 +285,12 @@ def test_the_state_of_a_bridge_over_the_day(live: Live, site: Site) -> None:
 
 
 def test_an_alarm_heads_the_text_of_its_bridge_while_it_stands(live: Live, site: Site) -> None:
-    live.picture.take(alarm())
-    live.picture.take(alarm("elsewhere"))
+    live.picture.ingest(alarm())
+    live.picture.ingest(alarm("elsewhere"))
     assert live.picture.is_empty  # nobody drives: an alarm of months ago is no reason for a tab
     live.hears("bridge", "estimate", estimate(result(site)))
-    live.picture.take(alarm(by="owner"))
-    live.picture.take(alarm())
+    live.picture.ingest(alarm(by="owner"))
+    live.picture.ingest(alarm())
     chunks = live.drawn()
     heads = "### Alarm\n\n**Element 4 is 10 % weaker than before 2026-08-27, interval 8 to 12 %.**"
     raised = f"{heads} Raised 2026-09-20, not acknowledged.\n\n"
@@ -301,13 +301,13 @@ def test_an_alarm_heads_the_text_of_its_bridge_while_it_stands(live: Live, site:
     assert not any("elsewhere" in chunk.entity_path for chunk in chunks)
 
 
-def test_without_a_site_file_the_result_tells_the_elements(tmp_path: Path, site: Site) -> None:
+def test_result_defines_the_elements_without_a_site_file(tmp_path: Path, site: Site) -> None:
     nominal = site.bridges[0].nominal_flexural_rigidity_nm2[0]
     prior = {"distribution": "log_normal", "location": nominal, "scale": 0.55}
     given = result(site).model_dump()
     for name, value in given["parameters"].items():
         value["prior"] = prior if name.startswith("EI_") else None
-    told = Crossing.model_validate(given)
+    told = CrossingResult.model_validate(given)
     elements = elements_of_result(told)
     assert elements is not None
     assert sum(elements.lengths_m) == pytest.approx(30.0)
@@ -323,11 +323,11 @@ def test_without_a_site_file_the_result_tells_the_elements(tmp_path: Path, site:
     assert lowest_element(result(site)) is None
 
 
-def test_an_interval_that_means_nothing_is_not_said(site: Site) -> None:
+def test_meaningless_interval_is_not_printed(site: Site) -> None:
     given = result(site, reasons=("no_noise_model",), verdict="suspect").model_dump()
     for value in given["parameters"].values():
         value["prior"] = {"distribution": "uniform", "location": 1.56e10, "scale": 0.2}
-    assert str(lowest_element(Crossing.model_validate(given))) == "EI_4 0.400 of nominal"
+    assert str(lowest_element(CrossingResult.model_validate(given))) == "EI_4 0.400 of nominal"
 
 
 def test_of_many_trucks_all_have_positions_and_some_accelerations(live: Live) -> None:
@@ -377,5 +377,5 @@ def test_a_port_that_is_taken_is_not_shared(tmp_path: Path) -> None:
         with pytest.raises(FailureError, match=f"port {port}: .*; give another --port"):
             live_command(
                 endpoint="tcp/127.0.0.1:1", realm="live", site=None, tls=None, show=None,
-                address="127.0.0.1", port=port, say=print,
+                address="127.0.0.1", port=port, print_line=print,
             )  # fmt: skip

@@ -13,8 +13,9 @@ from schemas.results import results_json
 from schemas.site import Site
 from schemas.site_file import load_site, site_toml
 from services.recordings.writer import write_recording
+from services.viewer import rerun_file
 from services.viewer.bridge_figure import draw_bridge
-from services.viewer.bridge_view import views_of_bridges
+from services.viewer.bridge_view import origin_of, view_of_bridge, views_of_bridges
 from services.viewer.crossing_view import CrossingView, view_of_crossing
 from services.viewer.drawing import STYLE
 from services.viewer.layout import blueprint, crossing_root, tab_name
@@ -56,6 +57,29 @@ def view_of(site: Site, verdict: str, **changes: object) -> CrossingView:
     return view_of_crossing(found.crossings[0], site.bridges[0])._replace(**changes)
 
 
+def test_reasons_of_a_bridge_name_their_crossing(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts: dict[str, str] = {}
+
+    class Recording:
+        """A stand-in that keeps nothing."""
+
+        def log(self, *_: object, **__: object) -> None:
+            """Ignore an entity."""
+
+    def kept(_: object, entity: str, text: str) -> None:
+        texts[entity] = text
+
+    monkeypatch.setattr(rerun_file, "log_markdown", kept)
+    bad = some_crossing("b", verdict="rejected", reasons=("speed_too_low",), entry=60.0)
+    found = results_of(site, some_crossing("a"), bad, used="a")
+    view = view_of_bridge(site.bridges[0], found, None)
+    rerun_file._log_overview(Recording(), view)  # type: ignore[arg-type]
+    (text,) = texts.values()
+    assert "- 2026-09-21 14:14 → bridge-1, rejected, not used: The truck was too slow" in text
+
+
 def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
     tmp_path: Path, site: Site
 ) -> None:
@@ -65,6 +89,30 @@ def test_the_overview_has_the_picture_of_the_bridge_and_the_finding(
     (text,) = value(found["/bridge/bridge-1/finding"], "text")  # type: ignore[misc]
     assert "Element 4, 12.9 to 17.1 m: 60 % less stiff than the other elements" in text
     assert "Doubtful" not in text
+
+
+@pytest.mark.parametrize(
+    ("used", "between", "origin"),
+    [
+        (("a",), 0.02, "Numbers of one crossing, with between-crossing variability."),
+        (("a",), None, "Numbers of one crossing."),
+        (("a", "b"), 0.02, "Numbers of 2 crossings fused."),
+    ],
+)
+def test_numbers_name_the_crossings_that_they_are_of(
+    site: Site, used: tuple[str, ...], between: float | None, origin: str
+) -> None:
+    """A single crossing has narrower intervals than the state, and other means."""
+    found = results_of(site, *(some_crossing(name) for name in used), used="a")
+    state = found.bridges["bridge-1"].model_copy(
+        update={"crossings_used": used, "between_crossing_std": between}
+    )
+    view = view_of_bridge(
+        site.bridges[0], found.model_copy(update={"bridges": {"bridge-1": state}}), None
+    )
+    assert origin_of(view) == origin
+    written = " ".join(" ".join(text.get_text() for text in draw_bridge(view).texts).split())
+    assert origin in written
 
 
 def test_a_doubtful_state_and_its_bars_have_no_colour(tmp_path: Path, site: Site) -> None:
@@ -92,7 +140,7 @@ def test_the_strip_of_a_doubtful_crossing_is_grey(site: Site) -> None:
         assert np.ptp(strip, axis=2).max() <= most
 
 
-def test_tabs_tell_crossings_apart(site: Site) -> None:
+def test_tabs_distinguish_crossings(site: Site) -> None:
     good = view_of(site, "good")
     assert tab_name(good) == "2026-09-21 14:13 → bridge-1, good"
     back = view_of(site, "suspect", forward=False, entry_time_s=good.entry_time_s + 60.0)
@@ -101,7 +149,7 @@ def test_tabs_tell_crossings_apart(site: Site) -> None:
 
 def test_the_verdict_says_doubt_first_and_the_misfit_once(site: Site) -> None:
     text = verdict_markdown(view_of(site, "suspect"))
-    assert text.splitlines()[2] == "**Doubtful: to be looked at, not to be relied upon.**"
+    assert text.splitlines()[2] == "**Doubtful. Do not rely on these values.**"
     assert text.count("χ²") == 1
     assert "Doubtful" not in verdict_markdown(view_of(site, "good"))
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.patches import Rectangle
 
-from schemas.results import Crossing, Results
+from schemas.results import CrossingResult, Results
 from schemas.site import Site
 from schemas.site_file import load_site
 from services.cli import main as cli
@@ -83,7 +83,7 @@ def test_what_is_doubtful_looks_doubtful(site: Site) -> None:
         red, green, blue = to_rgb(bars(figure)[0].get_facecolor())
         assert red == green == blue
         assert "doubtful" in written(figure).lower()
-        assert "The receiver gave no position" in written(figure)
+        assert "The receiver reported no position" in written(figure)
         assert_words_apart(figure)
 
 
@@ -188,7 +188,7 @@ def test_what_is_not_resolved_is_an_empty_bar_and_agrees_with_nothing(site: Site
         wide["parameters"][f"EI_{n}"] |= {"std": 0.5 * wide["parameters"][f"EI_{n}"]["mean"]}
     level = {"unit": "1", "mean": 0.97, "std": 0.1, "q025": 0.8, "q50": 0.97, "q975": 1.2}
     wide["derived"] |= {"ei_level": level}
-    view = view_of_crossing(Crossing.model_validate(wide), site.bridges[0])
+    view = view_of_crossing(CrossingResult.model_validate(wide), site.bridges[0])
     assert view.unresolved == {1, 7}
     figure = draw_crossing(view, element_truth=None, road_truth=None)
     empty = [to_rgb(bar.get_facecolor()) == (1.0, 1.0, 1.0) for bar in bars(figure)]

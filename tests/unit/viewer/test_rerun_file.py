@@ -10,12 +10,12 @@ import pyarrow as pa
 import pytest
 from rerun.chunk import Chunk, RrdReader
 
-from schemas.results import Crossing, Header, results, results_json
+from schemas.results import CrossingResult, ResultHeader, results, results_json
 from schemas.results_on_the_wire import crossing_to_protobuf
 from schemas.signals import (
     CHANNELS,
     AccelBatch,
-    Channel,
+    AccelChannel,
     GnssFix,
     encode_accel,
     encode_gnss,
@@ -23,15 +23,15 @@ from schemas.signals import (
 )
 from schemas.site import Site
 from schemas.site_file import parse_site
-from schemas.topics import Key
+from schemas.topics import Key, Message
 from services.common.errors import InputError
-from services.recordings.recording import Message
 from services.recordings.writer import write_recording
 from services.viewer import rerun_file
 from services.viewer.crossing_view import CrossingView, view_of_crossing
-from services.viewer.layout import crossing_root
+from services.viewer.layout import blueprint, crossing_root
 from services.viewer.rerun_crossing import front_axle_chainage, verdict_markdown
 from services.viewer.rerun_file import acceleration_series
+from services.viewer.rerun_parts import CHAINAGE
 from services.viewer.rerun_places import bridges_near_tracks, bridges_of_site
 from services.viewer.strip import STRIP_HEIGHT, STRIP_WIDTH, rigidity_strip
 from services.viewer.vehicle_signals import VehicleSignals, signals_of_messages
@@ -94,7 +94,7 @@ def accel(count: int = 40, channels: tuple[str, ...] = CHANNELS) -> list[AccelBa
                 sequence,
                 first_ns - START_NS,
                 first_ns,
-                {name: Channel(RATE_HZ, np.sin(phase / 30.0)) for name in channels},
+                {name: AccelChannel(RATE_HZ, np.sin(phase / 30.0)) for name in channels},
             )
         )
     return batches
@@ -116,7 +116,7 @@ def gnss(count: int = 20) -> list[GnssFix]:
     ]
 
 
-def crossing(**changes: object) -> Crossing:
+def crossing(**changes: object) -> CrossingResult:
     def parameter(value: float, unit: str) -> dict[str, object]:
         return {
             "unit": unit,
@@ -153,10 +153,10 @@ def crossing(**changes: object) -> Crossing:
             "mean_m": (1e-3 * np.sin(x_m)).tolist(),
         },
     }
-    return Crossing.model_validate({**fields, **changes})
+    return CrossingResult.model_validate({**fields, **changes})
 
 
-def rejected() -> Crossing:
+def rejected() -> CrossingResult:
     return crossing(verdict="rejected", reasons=["channel_missing"], parameters=None, road=None)
 
 
@@ -241,6 +241,23 @@ def test_crossing_is_on_both_timelines(drive):
     assert scalars(road) == pytest.approx(1e3 * view.road.front_m)
     difference = rows(chunks, f"{crossing_root(view)}/road_difference/front_minus_rear")
     assert scalars(difference) == pytest.approx(np.full(69, 1e-2))
+
+
+def test_whole_drive_is_a_picture_over_its_own_time(drive):
+    chunks, _ = drive
+    assert "drive/truck-1/picture" in paths(chunks)
+
+
+def test_play_drives_at_the_speed_of_the_truck_and_on_the_bridge(site: Site) -> None:
+    view = view_of_crossing(crossing(), site.bridges[0])
+    panel = blueprint({}, [view]).time_panel
+    assert panel.timeline == CHAINAGE
+    assert panel.play_state == "playing"
+    assert panel.fps == pytest.approx(1e3 * view.speed_m_per_s)
+    assert panel.loop_mode == "selection"
+    ends = panel.time_selection
+    assert (ends.min.value, ends.max.value) == (0, 30_000)
+    assert blueprint({}, []).time_panel.play_state == "paused"
 
 
 def test_ticks_of_chainage_count_from_a_round_place(drive):
@@ -368,7 +385,7 @@ def messages() -> list[Message]:
 
 
 def estimate() -> Message:
-    header = Header("0", START_NS / 1e9, "0" * 16, {}, 0)
+    header = ResultHeader("0", START_NS / 1e9, "0" * 16, {}, 0)
     payload = crossing_to_protobuf(crossing(), header).SerializeToString()
     time_ns = START_NS + 2_000_000_000
     return Message(
@@ -395,7 +412,7 @@ def test_recording_with_its_results_becomes_a_rerun_file(tmp_path: Path, site: S
 
 def test_results_are_drawn_with_the_site_of_the_recording_beside_them(tmp_path: Path):
     file = tmp_path / "run.json"
-    header = Header("0", START_NS / 1e9, "0" * 16, {}, 0)
+    header = ResultHeader("0", START_NS / 1e9, "0" * 16, {}, 0)
     file.write_text(results_json(results(header, [crossing()], {})))
     rrd = tmp_path / "out.rrd"
     with pytest.raises(InputError, match="same folder"):
@@ -416,7 +433,7 @@ def test_what_cannot_be_opened_is_bad_input(tmp_path: Path, name: str):
 
 
 @pytest.mark.parametrize("web", [False, True])
-def test_viewer_is_told_to_listen_on_loopback_only(web: bool):
+def test_viewer_listens_on_loopback_only(web: bool):
     arguments = viewer_arguments(Path("a.rrd"), web=web)
     assert arguments[arguments.index("--bind") + 1] == "127.0.0.1"
     assert ("--web-viewer" in arguments) == web
@@ -499,6 +516,7 @@ def test_rerun_file_has_its_layout_and_draws_without_complaint(tmp_path: Path, s
             "TimeSeries",
         }
         assert complaints(viewer) == []
+        viewer.set_time(play_state="paused")
         open_tab(viewer, "EI (GN·m²)")
         assert coloured(pixels(picture(viewer, view_named(viewer, "EI (GN·m²)")))) > 20_000  # bars
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from pre_core.crossing.left_over import AFTER, BEFORE, ON, LeftOver
+from pre_core.crossing.fitted_residuals import AFTER, BEFORE, ON, FittedResiduals
 from pre_core.diagnostics import quality
 from schemas.results import Results
 from schemas.settings import IdentificationSettings
@@ -17,7 +17,7 @@ from services.viewer.rerun_residuals import band_names
 from services.viewer.residuals import _by_band, residual_cells
 from services.viewer.view import write_views
 
-Cells = dict[tuple[int, int, int], quality.Cell]
+Cells = dict[tuple[int, int, int], quality.ResidualBin]
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +30,14 @@ def fitted(sample: Path) -> tuple[Results, Cells]:
     """The sample's result, and the cells that its verdict was made from."""
     judged: list[Cells] = []
 
-    of_rows = quality.cells
+    of_rows = quality.residual_bins
 
     def kept(*arguments: Any) -> Cells:
         judged.append(of_rows(*arguments))
         return judged[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quality, "cells", kept)
+        patch.setattr(quality, "residual_bins", kept)
         found = identify_recordings(
             [sample], site_of([sample], None), IdentificationSettings(draws=400)
         )
@@ -86,7 +86,7 @@ def test_a_tone_shows_where_and_in_which_band_it_was() -> None:
     stretch = np.repeat([BEFORE, ON, AFTER], 1000)
     time_s = 0.01 * np.arange(1000)
     white[1000:2000, 1] += 2.0 * np.sin(2.0 * np.pi * 8.0 * time_s)  # front body, on the bridge
-    cells = _by_band(LeftOver(white, stretch, 0.01, 1.0))
+    cells = _by_band(FittedResiduals(white, stretch, 0.01, 1.0))
     assert band_names(cells) == ["0–6", "6–12", "12–30", "over 30"]
     loud = np.argwhere(cells.excess_std > 4.5).tolist()
     assert loud == [[1, ON, 1]]

@@ -12,40 +12,40 @@ import pytest
 import zenoh
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import Header
+from schemas.results import ResultHeader
 from schemas.settings import IdentificationSettings
 from schemas.topics import Key
 from services import worker
 from services.bus.publisher import Publisher
 from services.common.errors import FailureError
-from services.execution.here import Here
-from services.history.result_files import ResultFiles
+from services.execution.inline import InlineExecutor
 from services.identification.engine import Engine
 from services.identification.outputs import Output
+from services.ledger.runs import ResultFiles
 from services.simulation.drive import paper_site
-from services.worker.arrivals import Arrivals, Arrived, Gone, Token
-from tests.unit.worker.test_certificates import Places, certificates
+from services.worker.arrivals import ArrivalQueue, DepartedTruck, LivenessToken, TruckMessage
+from tests.unit.worker.test_validation_runner import Places, certificates
 
 REALM = "live"
 SETTINGS = IdentificationSettings(method="least_squares")
-HEADER = Header("0", 0.0, "abc", SETTINGS.model_dump(mode="json"), SETTINGS.seed)
+HEADER = ResultHeader("0", 0.0, "abc", SETTINGS.model_dump(mode="json"), SETTINGS.seed)
 
 
-def message(at_s: float, number: int = 0, truck: str = "truck-1", boot_id: int = 1) -> Arrived:
+def message(at_s: float, number: int = 0, truck: str = "truck-1", boot_id: int = 1) -> TruckMessage:
     payload = pb.AccelBatch(device_time_ns=number).SerializeToString()
-    return Arrived(Key(REALM, "vehicle", truck, "accel"), boot_id, payload, at_s)
+    return TruckMessage(Key(REALM, "vehicle", truck, "accel"), boot_id, 0, payload, at_s)
 
 
-def token(at_s: float, *, is_alive: bool, truck: str = "truck-1") -> Token:
-    return Token(REALM, truck, is_alive, at_s)
+def token(at_s: float, *, is_alive: bool, truck: str = "truck-1") -> LivenessToken:
+    return LivenessToken(REALM, truck, is_alive, at_s)
 
 
-def gone(*, for_good: bool = False, truck: str = "truck-1") -> Gone:
-    return Gone(REALM, truck, for_good)
+def gone(*, for_good: bool = False, truck: str = "truck-1") -> DepartedTruck:
+    return DepartedTruck(REALM, truck, for_good)
 
 
 def test_the_first_second_of_a_truck_is_put_in_order_of_time() -> None:
-    arrivals = Arrivals()
+    arrivals = ArrivalQueue()
     history = [message(0.0, 5), message(0.4, 2), message(0.9, 7)]
     assert [arrivals.add(one) for one in history] == [[], [], []]
     assert arrivals.due(0.99) == []
@@ -56,15 +56,35 @@ def test_the_first_second_of_a_truck_is_put_in_order_of_time() -> None:
     assert arrivals.add(message(3.0, 1, boot_id=2)) == []  # that boot is new
 
 
+def test_history_with_gaps_waits_for_what_is_still_to_come() -> None:
+    arrivals = ArrivalQueue()
+    first, last = (message(0.0, n)._replace(sequence=n) for n in (3, 5))
+    for one in (first, last):
+        arrivals.add(one)
+    assert arrivals.due(5.0) == []
+    between = message(5.0, 4)._replace(sequence=4)
+    assert arrivals.add(between) == []
+    assert arrivals.due(5.0) == [first, between, last]
+
+
+def test_history_whose_gaps_stay_is_processed_after_ten_seconds() -> None:
+    arrivals = ArrivalQueue()
+    history = [message(0.0, n)._replace(sequence=n) for n in (3, 5)]
+    for one in history:
+        arrivals.add(one)
+    assert arrivals.due(9.9) == []
+    assert arrivals.due(10.0) == history
+
+
 def test_what_is_malformed_is_looked_at_all_the_same() -> None:
-    arrivals = Arrivals()
+    arrivals = ArrivalQueue()
     broken = message(0.0)._replace(payload=b"\xff\xff")
     arrivals.add(broken)
     assert arrivals.due(1.0) == [broken]
 
 
 def test_a_truck_whose_token_has_gone() -> None:
-    arrivals = Arrivals()
+    arrivals = ArrivalQueue()
     arrivals.note(token(0.0, is_alive=True))
     arrivals.add(message(0.0))
     assert arrivals.gone(500.0) == []
@@ -78,7 +98,7 @@ def test_a_truck_whose_token_has_gone() -> None:
 
 @pytest.mark.parametrize("back_s", [502.0, 600.0])
 def test_a_truck_whose_token_comes_back(back_s: float) -> None:
-    arrivals = Arrivals()
+    arrivals = ArrivalQueue()
     arrivals.note(token(500.0, is_alive=False))
     before = arrivals.gone(back_s)
     assert before == ([] if back_s < 503.0 else [gone()])
@@ -87,7 +107,7 @@ def test_a_truck_whose_token_comes_back(back_s: float) -> None:
 
 
 def test_a_truck_without_token_has_gone_when_it_is_silent() -> None:
-    arrivals = Arrivals()
+    arrivals = ArrivalQueue()
     arrivals.add(message(0.0))
     arrivals.add(message(9.0))
     assert arrivals.gone(18.9) == []
@@ -100,8 +120,8 @@ def test_a_truck_without_token_has_gone_when_it_is_silent() -> None:
     assert arrivals.gone(110.0) == [gone()]  # and not for good: it has spoken
 
 
-def test_who_is_in_a_hurry_waits_as_for_a_token() -> None:
-    arrivals = Arrivals()
+def test_hurried_queue_waits_as_for_a_token() -> None:
+    arrivals = ArrivalQueue()
     arrivals.add(message(0.0))
     arrivals.hurry()
     assert arrivals.gone(2.9) == []
@@ -111,8 +131,10 @@ def test_who_is_in_a_hurry_waits_as_for_a_token() -> None:
 NOBODY_WAITS = certificates(Path("not made"), Places())
 
 
-def service_of(engine: Engine, files: ResultFiles) -> worker.Service:
-    return worker.Service("w", engine, Here(), NOBODY_WAITS, Publisher(None, REALM), files)
+def service_of(engine: Engine, files: ResultFiles) -> worker.WorkerService:
+    return worker.WorkerService(
+        "w", engine, InlineExecutor(), NOBODY_WAITS, Publisher(None, REALM), files
+    )
 
 
 class Watched(Engine):
@@ -121,7 +143,7 @@ class Watched(Engine):
     def __init__(self, stop: threading.Event, last: bytes) -> None:
         super().__init__(paper_site(), SETTINGS, HEADER)
         self.stop, self.last = stop, last
-        self.seen: list[Gone | bytes] = []
+        self.seen: list[DepartedTruck | bytes] = []
 
     def feed(self, key: Key, payload: bytes) -> Iterator[Output]:
         self.seen.append(payload)
@@ -130,7 +152,7 @@ class Watched(Engine):
         return iter(())
 
     def gone(self, realm: str, vehicle: str, *, for_good: bool = False) -> Iterator[Output]:
-        self.seen.append(Gone(realm, vehicle, for_good))
+        self.seen.append(DepartedTruck(realm, vehicle, for_good))
         return iter(())
 
 
@@ -140,13 +162,13 @@ def files(tmp_path: Path) -> ResultFiles:
 
 
 @pytest.mark.parametrize("away_s", [1.0, 50.0])
-def test_who_is_back_in_the_queue_has_not_gone(
+def test_requeued_crossing_is_not_lost(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch, away_s: float
 ) -> None:
     """All this came during an identification of a quarter of an hour, and is looked at after it."""
-    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
+    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
     monkeypatch.setattr("services.worker.time.monotonic", lambda: 1000.0)
-    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     with_token = [
         token(0.0, is_alive=True),
         message(0.0, 1),
@@ -174,9 +196,9 @@ def test_a_truck_without_token_that_goes_on_talking_does_not_hold_up_the_end(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A message every tenth of a second, each of which says that it has not gone yet."""
-    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
+    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
     monkeypatch.setattr("services.worker.time.monotonic", lambda: 10.0)
-    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     for number in range(1000):
         queued.put(message(0.1 * number, number))
     stop = threading.Event()
@@ -185,14 +207,14 @@ def test_a_truck_without_token_that_goes_on_talking_does_not_hold_up_the_end(
     assert engine.seen == [message(0.0, number).payload for number in range(131)]
 
 
-def test_who_fell_silent_just_before_a_stop_is_decided_before_the_end(
+def test_truck_silent_before_a_stop_is_decided_before_the_end(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
+    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
     moments = itertools.count(10.0, 0.04)
     monkeypatch.setattr("services.worker.time.monotonic", lambda: next(moments))
     monkeypatch.setattr(worker, "_POLL_S", 0.001)
-    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     queued.put(message(8.9, 1))
     queued.put(message(10.0, 2))
     stop = threading.Event()
@@ -207,7 +229,7 @@ def test_a_receiver_that_fails_in_any_way_is_not_taken_for_a_quiet_one(
     def take_all(*_: object) -> None:
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr(worker, "_take_all", take_all)
+    monkeypatch.setattr(worker, "_receive_all", take_all)
     closing, failed = threading.Event(), threading.Event()
     bus = cast("zenoh.Session", None)
     worker._receive(bus, REALM, queue.Queue(), closing, failed)
@@ -226,13 +248,13 @@ class Broken(Watched):
 def test_an_error_of_the_program_is_not_blamed_on_a_message(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
-    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
+    queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     queued.put(message(0.0, 1))
     queued.put(message(2.0, 2))
     stop = threading.Event()
     engine = Broken(stop, message(0.0, 1).payload)
-    with pytest.raises(FailureError, match="could not be worked out: singular"):
+    with pytest.raises(FailureError, match="could not be processed: singular"):
         worker._serve(service_of(engine, files), queued, stop, None)
     assert "refused" not in caplog.text
 
@@ -240,8 +262,8 @@ def test_an_error_of_the_program_is_not_blamed_on_a_message(
 def test_a_malformed_message_is_refused_and_named(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(worker, "_say_health", lambda *_: None)
-    queued: queue.Queue[Arrived | Token] = queue.Queue()
+    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
+    queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     queued.put(message(0.0)._replace(payload=b"\xff"))
     queued.put(message(2.0)._replace(payload=b"\xfe"))
     engine = Engine(paper_site(), SETTINGS, HEADER)

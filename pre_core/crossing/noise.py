@@ -1,0 +1,444 @@
+"""Propagation of sensor noise, suspension noise and profile mismatch to the residuals.
+
+Three residuals are taken at every row, all as displacements: the profile mismatch and the two body
+equations divided by k_s (by a constant with reduced suspension weight: `body_divisors`). White
+acceleration noise of densities n_s, n_u enters them as
+
+    s^2 R_i   : [1 + (m_u s^2 + c_s s + k_s)/K] n_u - [(c_s s + k_s)/K] n_s,  K = k_u + c_u s
+    s^2 b_i   : [(m_ii s^2 + c_s s)/k_s + 1] n_s - [c_s s/k_s + 1] n_u + [m_12 s^2/k_s] n_s'
+
+(front less rear in the mismatch; n_s' is the noise of the other body sensor). The front's residuals
+of a row are taken when the front wheel was at the rear wheel's present place, so that a sensor in
+both counts as two.
+
+Friction and nonlinear dampers put a force into the body equations that is noise of its own, of a
+level that the residuals determine (`force_noise`). The mismatch is then computed from inertia
+alone, s^2 R_i: [1 + m_u s^2/K] n_u + [m_ii s^2/K] n_s + [m_12 s^2/K] n_s'. Both forms differ by
+(k_s/K) b_i and contain the same information; but the quiet combination of residuals depends on the
+truck, and each form has it in a residual of its own where it is needed. Friction is correlated over
+a tenth of a second; Bohman's window, which keeps its covariance positive, truncates this, so that
+the residuals' covariance vanishes beyond it and the filter's length.
+
+Where the two axles follow different profiles, their difference is noise of the mismatch alone
+(`crossing.mismatch`).
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.crossing import mismatch as _mismatch
+from pre_core.crossing.mismatch import Mismatch
+from pre_core.crossing.rows import RESIDUALS, RowFilter, phases
+from pre_core.crossing.whittle import maximum_likelihood_levels
+from pre_core.parameters import C_S1, C_U1, D_1, K_S1, K_U1, KAPPA, M_U1, SHARE
+from pre_core.physics import tandem
+from pre_core.physics.tandem import NO_LEAD, Lead
+from pre_core.physics.vehicle import masses_above_axles
+
+FloatArray = NDArray[np.float64]
+
+DOUBTED_SPRING_N_PER_M = 4e5
+"""Divisor of body equations with reduced suspension weight. Divided by the estimated stiffness, the
+suspension noise would decrease with it: a bias that can be corrected only as well as its level is
+known. (Friction of 2 to 10 %: EI 0.4 standard deviations too low.) With full weight the divisor is
+the stiffness: the sensor noise is known."""
+_SOURCES = 6  # s1, s2, u1, u2; and the other body sensor at the front's and at the rear's moment
+_FEW_FREQUENCIES = 48
+"""Midpoints of even intervals up to half the residuals' rate, for a trace that is computed
+repeatedly."""
+_MANY_FREQUENCIES = 512
+"""Number of frequencies that resolves the phase between the axles."""
+_FORCE_CENTRES_HZ = np.arange(0.0, 60.0, 4.0)
+FORCE_SHAPES = _FORCE_CENTRES_HZ.size
+"""Number of bumps, a few hertz wide, in the spectrum of the force noise: that of dry friction falls
+by six decades from the body's bounce to the residuals' highest frequency."""
+FORCE_MEMORY_S = 0.3
+"""End of the force noise's covariance, which gives the bumps their width."""
+_MIDDLE_BAND, _TOP_BAND = (0.22, 0.54), (0.65, 0.757)
+"""Bands relative to half the residuals' rate: 12 to 30 and 36 to 42 Hz for sensors of 250 Hz and
+more."""
+_EVENLY = 3.0
+"""Largest ratio of the middle to the top band of sensor noise. Noise of two to ten times the
+declared density has up to 1.6 before the truck is found; friction, bilinear dampers and mismatch 4
+to 100."""
+_BELIEVED_HZ = 30.0
+"""Highest frequency of the suspension weight."""
+DOUBTED, DOUBTED_OF_A_MISFIT = 60.0, 15.0
+"""Gain in twice the log-likelihood of an axle's residuals that reduces its suspension weight: the
+second where nothing else explains a misfit. Of 400 axles with sensor noise alone twelve gained more
+than 15, none more than 60."""
+_ALIKE = 0.05
+"""Sensitivity to the mismatch of unequal tyres below which tyres count as equal; the visible part
+is then an axle's offset, whose long waves are twice as large, and short ones hardly distinguish
+them."""
+
+
+class NoisePath(NamedTuple):
+    """Parameters of a truck that determine how sensor noise enters the residuals."""
+
+    theta: FloatArray
+    m_11: float
+    m_22: float
+    m_12: float
+    is_inertial: bool
+    """Computation of the tyre force, see `residuals.GriddedCrossing`."""
+    lead: Lead = NO_LEAD
+    """Front axle of a truck with a tandem: then the masses above are not used, and the body has no
+    equations."""
+    total_mass_kg: float = 0.0
+    gap_m: float = 0.0
+    """Distance between the axles of the tandem."""
+
+
+def noise_path(
+    theta: FloatArray,
+    total_mass_kg: float,
+    wheelbase_m: float,
+    is_inertial: bool,
+    lead: Lead = NO_LEAD,
+) -> NoisePath:
+    """Return the noise path of theta (p,); `wheelbase_m` is between the compared axles."""
+    if lead.ahead_m > 0.0:
+        return NoisePath(theta, 0.0, 0.0, 0.0, True, lead, total_mass_kg, wheelbase_m)
+    m_s = total_mass_kg - theta[M_U1] - theta[M_U1 + 1]
+    masses = masses_above_axles(m_s, theta[D_1], wheelbase_m, theta[KAPPA])
+    return NoisePath(theta, *masses, is_inertial)
+
+
+def force_masses(truck: NoisePath) -> FloatArray:
+    """Return the masses (2, 2) in kg that multiply the body's readings in the axles' forces."""
+    if truck.lead.ahead_m == 0.0:
+        return np.array([[truck.m_11, truck.m_12], [truck.m_12, truck.m_22]])
+    load = tandem.shared_load(truck.lead, truck.theta, truck.total_mass_kg, truck.gap_m)
+    share = truck.theta[SHARE]
+    return np.outer([share, 1.0 - share], [load.bogie_1, load.bogie_2])
+
+
+def no_force_noise() -> FloatArray:
+    """Return zero levels (2, shapes) of force noise."""
+    return np.zeros((2, FORCE_SHAPES))
+
+
+def _force_shapes(omega: FloatArray) -> FloatArray:
+    """Return spectra (shapes, f) of B(t) cos(omega_k t), B Bohman's window, a half at their tops.
+
+    B is the half wave cos(pi t/T) convolved with itself, so that its spectrum is a square.
+    """
+    centre = 2.0 * np.pi * _FORCE_CENTRES_HZ[:, None]
+    return _bohman(omega - centre) + _bohman(omega + centre)
+
+
+def _bohman(omega: FloatArray) -> FloatArray:
+    """Return the spectrum of Bohman's window ending at +-`FORCE_MEMORY_S`, a half at zero."""
+    turn = omega * FORCE_MEMORY_S
+    apart = 1.0 - (turn / np.pi) ** 2
+    near = np.abs(apart) < 1e-6
+    wave = np.where(near, 0.25 * np.pi, np.cos(0.5 * turn) / np.where(near, 1.0, apart))
+    return np.asarray(0.5 * wave**2)
+
+
+def _estimation(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
+    """Return the truck's equations as factors of its accelerations: (4, 4, f).
+
+    Rows are s² times the input profiles R_1, R_2 and the body equations; columns s1, s2, u1, u2.
+    """
+    s = 1j * omega
+    theta = truck.theta
+    if truck.lead.ahead_m > 0.0:
+        return tandem.profile_equations(truck.lead, theta, truck.total_mass_kg, truck.gap_m, omega)
+    out = np.zeros((4, 4, omega.size), dtype=np.complex128)
+    for w, m_ii in enumerate((truck.m_11, truck.m_22)):
+        c, k = theta[C_S1 + w], theta[K_S1 + w]
+        tyre, m_u = theta[K_U1 + w] + theta[C_U1 + w] * s, theta[M_U1 + w]
+        if truck.is_inertial:
+            out[w, 2 + w] = 1.0 + m_u * s**2 / tyre
+            out[w, w] = m_ii * s**2 / tyre
+            out[w, 1 - w] = truck.m_12 * s**2 / tyre
+        else:
+            out[w, 2 + w] = 1.0 + (m_u * s**2 + c * s + k) / tyre
+            out[w, w] = -(c * s + k) / tyre
+        over = body_divisors(truck)[w]
+        out[2 + w, w] = (m_ii * s**2 + c * s + k) / over
+        out[2 + w, 2 + w] = -(c * s + k) / over
+        out[2 + w, 1 - w] = truck.m_12 * s**2 / over
+    return out
+
+
+def _responses(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
+    """Return the response (3, 6, f) from the noise of six sources to displacement residuals."""
+    estimation = _estimation(truck, omega)
+    out = np.zeros((RESIDUALS, _SOURCES, omega.size), dtype=np.complex128)
+    for w, sign in ((0, 1.0), (1, -1.0)):
+        # The other axle's body sensor enters at another time: sources 4 and 5.
+        for source, channel in ((w, w), (2 + w, 2 + w), (4 + w, 1 - w)):
+            out[0, source] = sign * estimation[w, channel]
+            if truck.lead.ahead_m == 0.0:
+                out[1 + w, source] = estimation[2 + w, channel]
+    return out
+
+
+def body_divisors(truck: NoisePath) -> FloatArray:
+    """Return the divisors (2,) of the body equations, in N/m."""
+    if truck.is_inertial:
+        return np.full(2, DOUBTED_SPRING_N_PER_M)
+    return truck.theta[K_S1 : K_S1 + 2]
+
+
+def noise_spectrum(
+    truck: NoisePath,
+    density: FloatArray,
+    force: FloatArray,
+    road: Mismatch | None,
+    omega: FloatArray,
+) -> NDArray[np.complex128]:
+    """Return one-sided spectra of the residuals' noise as accelerations: (3, 3, f).
+
+    `force` (2, shapes) in N²/Hz is the nonlinear force of springs and dampers, `road` the mismatch.
+    """
+    responses = _responses(truck, omega)
+    sources = np.concatenate([density, density[[1, 0]]])
+    weighted = responses * (sources**2)[None, :, None]
+    spectrum = np.asarray(np.einsum("icf,jcf->ijf", weighted, responses.conj()))
+    if truck.lead.ahead_m > 0.0:  # residuals that are zero, of any noise of their own
+        spectrum[[1, 2], [1, 2]] += float(density @ density)
+    elif force.any():
+        spectrum[[1, 2], [1, 2]] += _force_noise_spectra(truck, force, omega)
+    if road is not None:
+        spectrum[0, 0] += omega**4 * _mismatch.spectrum(road, omega)
+    return spectrum
+
+
+def _body_spectra(
+    truck: NoisePath, density: FloatArray, force: FloatArray, omega: FloatArray
+) -> FloatArray:
+    """Return the spectra of the body equations (2, f) from `_spectrum`."""
+    return np.asarray(noise_spectrum(truck, density, force, None, omega)[[1, 2], [1, 2]].real)
+
+
+def _force_noise_spectra(truck: NoisePath, force: FloatArray, omega: FloatArray) -> FloatArray:
+    """Return the contribution of force noise to the spectra of the body equations: (2, f)."""
+    over = body_divisors(truck)[:, None]
+    return np.asarray((force @ _force_shapes(omega)) * omega**4 / over**2)
+
+
+class _AliasedBands(NamedTuple):
+    """Bands up to half the rate of the rows, and those that alias to them."""
+
+    below: FloatArray
+    above: FloatArray
+    power_below: FloatArray
+    power_above: FloatArray
+
+
+def _folded(rows: RowFilter, count: int) -> _AliasedBands:
+    half = 0.5 / (rows.every * rows.step_s)
+    step = 2.0 * np.pi * half / count
+    below = step * (np.arange(count, dtype=np.float64) + 0.5)
+    above = 4.0 * np.pi * half - below
+    power_below, power_above = (
+        np.interp(omega, rows.omega, rows.power) for omega in (below, above)
+    )
+    return _AliasedBands(below, above, power_below, power_above)
+
+
+def _folded_spectrum(
+    at: _AliasedBands,
+    truck: NoisePath,
+    density: FloatArray,
+    force: FloatArray,
+    road: Mismatch | None,
+) -> NDArray[np.complex128]:
+    """Return spectra of the rows (f, 3, 3), including aliases."""
+    both = np.concatenate([at.below, at.above])
+    power = np.concatenate([at.power_below, at.power_above])
+    whole = noise_spectrum(truck, density, force, road, both) * power
+    low, high = np.split(whole, 2, axis=2)
+    return np.moveaxis(low + high.conj(), 2, 0)
+
+
+def noise_power(
+    rows: RowFilter,
+    trucks: list[NoisePath],
+    density: FloatArray,
+    force: FloatArray,
+    which: list[int],
+    road: Mismatch | None = None,
+) -> FloatArray:
+    """Return tr(C_0^-1 C) per row for other trucks, less that of the first: (w,).
+
+    `which` (w,) counts from the second truck on; `density` is (trucks, 4), `force` (2, shapes). The
+    rows' spectra are those of an endless record, aliased at half the rate of the rows.
+    """
+    at = _folded(rows, _FEW_FREQUENCIES)
+    folded = partial(_folded_spectrum, at, force=force, road=road)
+    first = np.linalg.inv(folded(trucks[0], density[0]))
+    traces = [
+        np.einsum("fij,fji->", first, folded(trucks[1 + k], density[1 + k])).real for k in which
+    ]
+    return np.asarray(traces) / _FEW_FREQUENCIES - RESIDUALS
+
+
+def mismatch_power(
+    rows: RowFilter,
+    trucks: list[NoisePath],
+    gains: FloatArray,
+    delays_s: FloatArray,
+    density: FloatArray,
+    force: FloatArray,
+    road: Mismatch,
+    wheelbase_m: float,
+    which: list[int],
+) -> FloatArray:
+    """Return E[r' C_0^-1 (r_k - r)] per row by the mismatch alone: (w,).
+
+    The wheels respond to their own profiles, so that the mismatch is both in the residuals and in
+    the accelerations: errors in variables, which would bias towards trucks that respond less to it.
+    With r the residuals of the first truck and r_k those of another (of channels with `gains` and
+    `delays_s`, (trucks, 4) each), E = M_k M_0^-1 - 1 describes how the latter mixes the input
+    profiles, which differ by d; the front is taken when it was at the rear's present place.
+    """
+    at = _folded(rows, _MANY_FREQUENCIES)
+
+    def crossed(omega: FloatArray, power: FloatArray) -> NDArray[np.complex128]:
+        """(w, 3, f): E[(r_k - r)_l conj(r_0)], of which r_0, the mismatch, is d itself."""
+        s = 1j * omega
+
+        def estimation(k: int) -> NDArray[np.complex128]:
+            channel = (1.0 + gains[k])[:, None] * np.exp(np.outer(delays_s[k], s))
+            return np.moveaxis(_estimation(trucks[k], omega) * channel, 2, 0)
+
+        inverse = np.linalg.inv(estimation(0))
+        of_all = omega**4 * power * _mismatch.spectrum(road, omega)
+        of_front = omega**4 * power * _mismatch.front_cross_spectrum(road, omega)
+        of_rear = of_front - of_all  # rear profile with d
+        turn = np.exp(s * wheelbase_m / road.speed_m_per_s)
+        out = np.empty((len(which), RESIDUALS, omega.size), dtype=np.complex128)
+        for number, k in enumerate(which):
+            e = np.moveaxis(estimation(1 + k) @ inverse, 0, 2) - np.eye(4)[:, :, None]
+            out[number, 0] = of_front * (e[0, 0] - turn * e[1, 0])
+            out[number, 0] += of_rear * (turn.conj() * e[0, 1] - e[1, 1])
+            out[number, 1] = of_front * e[2, 0] + of_rear * turn.conj() * e[2, 1]
+            out[number, 2] = of_front * turn * e[3, 0] + of_rear * e[3, 1]
+        return out
+
+    weight = np.linalg.inv(_folded_spectrum(at, trucks[0], density, force, road))[:, 0]
+    both = crossed(at.below, at.power_below) + crossed(at.above, at.power_above).conj()
+    return np.einsum("fl,wlf->w", weight, both).real / _MANY_FREQUENCIES
+
+
+def mismatch_levels(
+    rows: RowFilter,
+    truck: NoisePath,
+    density: FloatArray,
+    road: Mismatch,
+    stretches: list[FloatArray],
+    roads: list[FloatArray],
+) -> tuple[FloatArray, float, FloatArray]:
+    """Return levels (s,) in m³ of segments of mismatch residuals, and their gain.
+
+    The gain is that of their likelihood over zero; the third value holds the levels (s,) of the
+    declared axles on a surface as rough as the road.
+
+    Each segment (m,) is of consecutive filtered residuals without effect of a bridge; `roads` are
+    residuals of one axle's profile there, treated as the front one, which bound an axle's offset.
+    """
+    omega, shapes = rows.omega, road.shapes
+    table = np.concatenate([shapes.density, shapes.road[None, :]])
+    shape = omega**4 * _mismatch.density_at(road, omega, table) * rows.power
+    longest = max(stretch.size for stretch in stretches)
+    memory = min(_mismatch.correlation_time_s(road), longest * rows.every * rows.step_s)
+    turn = phases(rows, memory)
+    sensors = noise_spectrum(truck, density, no_force_noise(), None, omega)[0, 0].real * rows.power
+    of_sensors, of_shapes = (sensors @ turn).real, (shape @ turn).real
+    whole = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[-1:]) for one in roads]
+    metres = rows.every * rows.step_s * road.speed_m_per_s
+    surface = _mismatch.surface_level(shapes, whole, [metres * one.size for one in roads])
+    expected = surface * shapes.expected_m
+    usual = np.array([np.inf, expected[1]])
+    parts = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[:-1]) for one in stretches]
+    level, gain = _mismatch.estimate_levels(parts, usual)
+    if level[0] >= _ALIKE * expected[0]:
+        return level, gain, expected
+    alike = [part._replace(shapes=part.shapes[1:]) for part in parts]
+    level, gain = _mismatch.estimate_levels(alike, usual[1:])
+    return np.concatenate([[0.0], level]), gain, expected
+
+
+def force_noise(
+    rows: RowFilter,
+    truck: NoisePath,
+    density: FloatArray,
+    body: FloatArray,
+    enough: float = DOUBTED,
+) -> FloatArray:
+    """Return levels (2, shapes) of suspension noise in N²/Hz from body equations (2, m).
+
+    They are the most likely levels in addition to sensor noise (`whittle`). An axle that gains at
+    most `enough` in likelihood has linear suspension within sensor noise, and level zero.
+    """
+    _, shown, sensors, shapes = _body_periodogram(rows, truck, density, body)
+    over = body_divisors(truck)
+    levels = no_force_noise()
+    for axle in range(2):
+        shape = shapes / over[axle] ** 2
+        seen, known = shown[axle], sensors[axle]
+        level = np.full(FORCE_SHAPES, seen.mean()) / shape.mean(axis=1)
+        level, gain = maximum_likelihood_levels(seen, known, shape, level)
+        if gain > enough:
+            levels[axle] = level
+    return levels
+
+
+def _body_periodogram(
+    rows: RowFilter, truck: NoisePath, density: FloatArray, body: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return frequencies (f,) and spectra of the body equations' residuals (2, m).
+
+    These are their periodogram (2, f), the expected sensor noise (2, f), and each shape of force
+    noise (shapes, f).
+    """
+    m = body.shape[1]
+    window = np.hanning(m)
+    apart = rows.every * rows.step_s
+    shown = np.abs(np.fft.rfft(body * window, axis=1)[:, 1:]) ** 2
+    shown *= 2.0 * apart / np.sum(window**2)
+    omega = np.asarray(2.0 * np.pi * np.fft.rfftfreq(m, apart)[1:], dtype=np.float64)
+    shapes = np.zeros((FORCE_SHAPES, omega.size))
+    sensors = np.zeros((2, omega.size))
+    interval = (rows.omega[1] - rows.omega[0]) / (2.0 * np.pi)
+    for at in (omega, 4.0 * np.pi * (0.5 / apart) - omega):  # frequencies above half the rate alias
+        power = np.interp(at, rows.omega, rows.power) / interval
+        sensors += _body_spectra(truck, density, no_force_noise(), at) * power
+        shapes += _force_shapes(at) * at**4 * power
+    return omega, shown, sensors, shapes
+
+
+def noise_power_ratio(
+    rows: RowFilter, truck: NoisePath, density: FloatArray, body: FloatArray
+) -> float:
+    """Return the ratio of sensor noise power to its declared value, from body equations (2, m).
+
+    It is the smaller ratio of both axles in the highest band, which contains noise only. The result
+    is 1.0 where lower frequencies exceed it by a factor of `_EVENLY`, as with friction or wrong
+    parameters of the truck.
+    """
+    omega, shown, sensors, _ = _body_periodogram(rows, truck, density, body)
+    share = omega * (rows.every * rows.step_s / np.pi)
+    ratio = shown / sensors
+    low, top = (
+        np.median(ratio[:, (share > begin) & (share < end)], axis=1) / np.log(2.0)
+        for begin, end in (_MIDDLE_BAND, _TOP_BAND)
+    )
+    return float(top.min()) if np.all(low < _EVENLY * top) else 1.0
+
+
+def suspension_weight(
+    rows: RowFilter, truck: NoisePath, density: FloatArray, force: FloatArray
+) -> float:
+    """Return the suspension weight, 0 to 1, for sensor densities (4,) and force (2, shapes)."""
+    low = rows.omega[rows.omega < 2.0 * np.pi * _BELIEVED_HZ]
+    sensors = _body_spectra(truck, density, no_force_noise(), low)
+    return float((sensors / _body_spectra(truck, density, force, low)).mean())

@@ -1,0 +1,213 @@
+"""A cheap density close to the posterior of one crossing, which is refined as draws are weighted.
+
+Its coordinates x are those of y, with c = EI_nominal/EI in place of ln EI and the damping itself in
+place of its logarithm: deflections are linear in c, and the decay of a vibration nearly so in the
+damping. The density is a normal likelihood in x times the exact priors: log-normal, half-normal,
+and point masses of absence. It starts as the Gauss-Newton approximation at the optimum. Where draws
+of it have been weighted by the posterior, a quadratic regression of the log weights moves and bends
+the normal likelihood (cf. Opper and Archambeau 2009), so that the next draws weigh more alike.
+"""
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.crossing import compliances
+from pre_core.crossing.fit import Optimum
+from pre_core.crossing.posterior import layout, log_odds_of_absence
+from pre_core.parameters import ALPHA, BETA, RHO_A
+from pre_core.search.convergence import CHAINS
+
+FloatArray = NDArray[np.float64]
+
+_LOWEST = 8.0
+"""Largest drop of a log weight, below the median of the latest draws, that the regression sees: far
+tails are not parabolic."""
+_BATCHES_SEEN = 3
+"""Number of latest batches that the regression uses."""
+_NUISANCES = 3
+"""Number of principal directions of the other coordinates whose curvature is regressed, too."""
+_SHRINKAGE = (1e1, 1e2, 1e3, 1e4, 1e5)
+"""Ridge factors from which the evidence chooses, for slopes and for curvatures."""
+_FLATTEST, _STEEPEST = 0.4, 6.0
+"""Range of the curvature after one refinement, relative to the one before."""
+
+
+class SurrogateCoordinates(NamedTuple):
+    """The coordinates x (f,) of a surrogate; `curved` are x = exp(-sigma y), the others x = y."""
+
+    curved: NDArray[np.int64]
+    sigma: FloatArray  # of `curved`; negative where x increases with y
+    half_normal: NDArray[np.int64]
+    log_odds: FloatArray  # (f,) as in `posterior.log_odds_of_absence`
+    watched: NDArray[np.int64]
+    """Coordinates in which the posterior deviates from a normal in x."""
+    inflation: float
+
+
+class Surrogate(NamedTuple):
+    """The normal likelihood exp(linear x - x precision x / 2) of x (f,)."""
+
+    precision: FloatArray  # (f, f)
+    linear: FloatArray  # (f,)
+
+
+def coordinates(found: Optimum, inflation: float) -> SurrogateCoordinates:
+    """Return the coordinates of an optimum's posterior, for noise `inflation` times as large."""
+    priors = found.problem.priors
+    where = layout(found.problem)
+    kept = np.flatnonzero(priors.estimated)
+    damping = np.flatnonzero(np.isin(kept, (ALPHA, BETA)) & ~priors.half_normal[kept])
+    spread = priors.spread[kept]
+    curved = np.concatenate([where.elements, damping])
+    mass = np.flatnonzero(kept == RHO_A)
+    delays = np.arange(where.delays.start, where.delays.stop)
+    return SurrogateCoordinates(
+        curved,
+        np.concatenate([spread[where.elements], -spread[damping]]),
+        where.half_normal,
+        log_odds_of_absence(found.problem, inflation),
+        np.unique(np.concatenate([curved, mass, where.half_normal, delays])),
+        inflation,
+    )
+
+
+def transform(of: SurrogateCoordinates, y: FloatArray) -> FloatArray:
+    """Return the coordinates x (k, f) of points y (k, f), or of one point (f,)."""
+    x = y.copy()
+    x[..., of.curved] = np.exp(-of.sigma * y[..., of.curved])
+    return x
+
+
+def log_prior(of: SurrogateCoordinates, y: FloatArray) -> FloatArray:
+    """Return the log prior (k,) of the curved coordinates of y (k, f), up to a constant."""
+    return np.asarray(-0.5 * np.sum((y[:, of.curved] / of.inflation) ** 2, axis=1))
+
+
+def log_likelihood(surrogate: Surrogate, x: FloatArray) -> FloatArray:
+    """Return the surrogate's log likelihood (k,) at x (k, f), up to a constant.
+
+    It contains the priors of all but the curved coordinates.
+    """
+    return np.asarray(x @ surrogate.linear - 0.5 * np.sum((x @ surrogate.precision) * x, axis=1))
+
+
+def gauss_newton_surrogate(found: Optimum, of: SurrogateCoordinates) -> Surrogate:
+    """Return the surrogate that has the residuals' values and slopes at an optimum."""
+    state = found.state
+    kept = compliances.without_priors(found.problem, state.residual.size, of.curved)
+    centre, jacobian = transform(of, state.y), state.jacobian[kept]
+    jacobian[:, of.curved] /= -of.sigma * centre[of.curved]
+    precision = jacobian.T @ jacobian / of.inflation**2
+    return Surrogate(
+        precision, precision @ centre - jacobian.T @ state.residual[kept] / of.inflation**2
+    )
+
+
+def draw(
+    surrogate: Surrogate,
+    of: SurrogateCoordinates,
+    centre: FloatArray,
+    count: int,
+    seed: int,
+    number: int,
+) -> FloatArray:
+    """Return draws y (count, f); `count` is a multiple of CHAINS, `number` distinguishes batches.
+
+    The chains start about `centre` (f,) in x.
+    """
+    density = compliances.from_normal(
+        surrogate.precision,
+        surrogate.linear,
+        of.curved,
+        of.half_normal,
+        of.sigma,
+        of.log_odds,
+        of.inflation,
+        centre[of.curved],
+        np.zeros(surrogate.linear.size),
+    )
+    first = number * CHAINS
+    return np.concatenate(
+        [compliances.draws(density, count // CHAINS, seed, first + k) for k in range(CHAINS)]
+    )
+
+
+def refine(
+    surrogate: Surrogate,
+    of: SurrogateCoordinates,
+    x: FloatArray,
+    log_target: FloatArray,
+    latest: int,
+) -> Surrogate:
+    """Return the surrogate whose likelihood is closest to the target at draws x (k, f).
+
+    `log_target` (k,) is the target's log likelihood in the sense of `log_likelihood`; the last
+    `latest` draws are those of `surrogate`, and give the scale of x.
+    """
+    x, log_target = x[-_BATCHES_SEEN * latest :], log_target[-_BATCHES_SEEN * latest :]
+    excess = log_target - log_likelihood(surrogate, x)
+    level = np.median(excess[-latest:])
+    seen = excess > level - _LOWEST
+    if not np.isfinite(level) or seen.sum() <= x.shape[1]:
+        return surrogate  # too few possible draws
+    mean, spread = x[-latest:].mean(axis=0), x[-latest:].std(axis=0)
+    spread[spread == 0.0] = np.inf  # absent in all draws
+    z = (x - mean) / spread
+    along = _directions(of, z[-latest:])
+    slope, curvature = _regress(z[seen], along, np.minimum(excess[seen] - level, _LOWEST))
+    change = (along @ curvature @ along.T) / np.outer(spread, spread)
+    precision = _limit_change(surrogate.precision, surrogate.precision - change)
+    gradient = surrogate.linear - surrogate.precision @ mean + slope / spread
+    return Surrogate(precision, gradient + precision @ mean)
+
+
+def _directions(of: SurrogateCoordinates, z: FloatArray) -> FloatArray:
+    """Return directions (f, d) along which curvature is regressed, from scaled draws z (k, f)."""
+    f = z.shape[1]
+    others = np.setdiff1d(np.arange(f), of.watched)
+    variance, vectors = np.linalg.eigh(np.cov(z[:, others].T))
+    main = np.zeros((f, _NUISANCES))
+    main[others] = vectors[:, -_NUISANCES:] / np.sqrt(variance[-_NUISANCES:])
+    return np.column_stack([np.eye(f)[:, of.watched], main])
+
+
+def _regress(z: FloatArray, along: FloatArray, excess: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return slope (f,) and curvature (d, d) of log weights (k,) over z (k, f) and z @ along.
+
+    Ridge regression; the factors of slopes and curvatures are those of the largest evidence.
+    """
+    u = z @ along
+    first, second = np.triu_indices(along.shape[1])
+    columns = np.column_stack([z, u[:, first] * u[:, second]])
+    columns -= columns.mean(axis=0)
+    excess = excess - excess.mean()
+    gram, image, square = columns.T @ columns, columns.T @ excess, float(excess @ excess)
+    f = z.shape[1]
+    best, found = -np.inf, np.zeros(columns.shape[1])
+    for flat, bent in product(_SHRINKAGE, _SHRINKAGE):
+        if bent < flat:
+            continue
+        ridge = np.concatenate([np.full(f, flat), np.full(first.size, bent)])
+        root = np.linalg.cholesky(gram + np.diag(ridge))
+        half = np.linalg.solve(root, image)
+        unexplained = square - float(half @ half)
+        evidence = 0.5 * float(np.log(ridge).sum()) - float(np.log(np.diag(root)).sum())
+        evidence -= 0.5 * excess.size * np.log(unexplained)
+        if evidence > best:
+            best, found = evidence, np.linalg.solve(root.T, half)
+    curvature = np.zeros((along.shape[1], along.shape[1]))
+    curvature[first, second] = found[f:]
+    return found[:f], curvature + curvature.T
+
+
+def _limit_change(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return the precision `after` (f, f) with its ratio to the one `before` limited."""
+    root = np.linalg.cholesky(before)
+    inverse = np.linalg.inv(root)
+    ratio, vectors = np.linalg.eigh(inverse @ after @ inverse.T)
+    half = root @ vectors
+    limited = (half * np.clip(ratio, _FLATTEST, _STEEPEST)) @ half.T
+    return np.asarray(0.5 * (limited + limited.T))

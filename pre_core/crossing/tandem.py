@@ -1,0 +1,197 @@
+"""Kernels of a crossing of a truck whose tandem is compared, and of any number of wheels.
+
+The two axles of the tandem take the places of the front and the rear axle of `residuals`; the
+truck's front axle, `Lead`, is a third load ahead of them. Its own inertia force m_u z'' is small:
+it follows from the profile that the tandem found at the same place (`lead_motion`), and is
+corrected as the estimate of truck and bridge improves.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.kernels.lanes import Lanes, fma, fma_scalar, kernel, load, mul, store
+from pre_core.parameters import C_U1, K_U1, M_U1, SHARE
+from pre_core.physics.tandem import Lead, lead_response, shared_load
+
+if TYPE_CHECKING:
+    from pre_core.crossing.residuals import Buffers, GriddedCrossing
+
+FloatArray = NDArray[np.float64]
+
+_LEAD_BAND_HZ = (0.2, 0.4)
+"""Band from which on the front axle's motion is computed; below it the axle follows the road, whose
+curvature is negligible there."""
+_SMOOTH_S = 0.5
+"""Duration of the tapers at both ends of the record, against the wrap of the filter."""
+
+
+@kernel
+def is_loaded(part: NDArray[np.int64], i: int) -> bool:
+    """Return whether any wheel of `part` (wheels, n) is on the bridge at sample i."""
+    loaded = False
+    for w in range(part.shape[0]):
+        loaded = loaded or part[w, i] >= 0
+    return loaded
+
+
+@kernel
+def are_parts_equal(part: NDArray[np.int64], i: int, j: int) -> bool:
+    """Return whether each wheel of `part` (wheels, n) is in the same part at samples i and j."""
+    equal = True
+    for w in range(part.shape[0]):
+        equal = equal and part[w, i] == part[w, j]
+    return equal
+
+
+@kernel
+def add_tyre_damping(
+    force: FloatArray, slope: float, bend: float, soft: float, road: FloatArray
+) -> None:
+    """Add to `road` (n,), the negative profile, the part of a tyre's deflection due to damping.
+
+    k_u delta + c_u delta' = F is solved by delta = (F - tau F' + tau² F'')/k_u for small tau =
+    c_u/k_u; `slope` is tau/(12 step), `bend` (tau/step)², `soft` 1/k_u.
+    """
+    n = force.size
+    for i in range(2, n - 2):
+        rate = 8.0 * (force[i + 1] - force[i - 1]) - (force[i + 2] - force[i - 2])
+        second = force[i + 1] - 2.0 * force[i] + force[i - 1]
+        road[i] += (slope * rate - bend * second) * soft
+    for i in range(2):
+        road[i] += slope * soft * 12.0 * (force[i + 1] - force[i])
+        last = n - 1 - i
+        road[last] += slope * soft * 12.0 * (force[last] - force[last - 1])
+
+
+@kernel
+def wheels(
+    crossing: "GriddedCrossing",
+    work: "Buffers",
+    theta: FloatArray,
+    gap: float,
+    gravity: float,
+    speeding: FloatArray,
+) -> None:
+    """Compute minus the profile (`road`) and `load` of the tandem, and the front axle's `load`.
+
+    For theta (p,) and accelerations `speeding` (n,) of the truck. `body` is zero: no equation has
+    the bogie's springs, and the front spring's lower end is not measured. `gravity` is over the
+    common gain.
+    """
+    lead = crossing.lead
+    on = shared_load(lead, theta, crossing.total_mass_kg, gap)
+    transfer = crossing.total_mass_kg * crossing.cg_height_m / on.lever_m * gravity
+    weight = gravity * crossing.gravity_m_per_s2
+    front, rear = work.corrected[0, 2], work.corrected[1, 2]
+    n = front.size
+    of_lead = work.load[2]
+    own = crossing.lead_acceleration
+    static = weight * (on.lead_kg + lead.unsprung_mass_kg)
+    for i in range(n):
+        inertial = on.lead_1 * front[i] + on.lead_2 * rear[i] - transfer * speeding[i]
+        of_lead[i] = -static - inertial - lead.unsprung_mass_kg * own[i]
+    for w in range(2):
+        share = theta[SHARE] if w == 0 else 1.0 - theta[SHARE]
+        m_u, k_u = theta[M_U1 + w], theta[K_U1 + w]
+        tau = theta[C_U1 + w] / k_u
+        z_u, a_u = work.corrected[2 + w, 0], work.corrected[2 + w, 2]
+        static = weight * (share * on.bogie_kg + m_u)
+        road, of_wheel, force, body = work.road[w], work.load[w], work.sharp[w], work.body[w]
+        soft = 1.0 / k_u
+        for i in range(n):
+            bogie = on.bogie_1 * front[i] + on.bogie_2 * rear[i] + transfer * speeding[i]
+            force[i] = share * bogie + m_u * a_u[i]
+        for i in range(n):
+            of_wheel[i] = -static - force[i]
+        for i in range(n):
+            road[i] = -z_u[i] - force[i] * soft
+        if tau != 0.0:
+            slope = tau / (12.0 * crossing.step_s)
+            add_tyre_damping(force, slope, (tau / crossing.step_s) ** 2, soft, road)
+        body[:] = 0.0
+
+
+@kernel
+def _cubic(cubics: FloatArray, part: int, group: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Return the coefficients of a group of modes in a part; zeros for a wheel off the bridge."""
+    zero = (0.0, 0.0, 0.0, 0.0)
+    if part < 0:
+        return zero, zero, zero, zero
+    here = cubics[part, group]
+    return load(here, 0), load(here, 1), load(here, 2), load(here, 3)
+
+
+@kernel
+def _value(c: tuple[Lanes, Lanes, Lanes, Lanes], x: float) -> Lanes:
+    return fma_scalar(fma_scalar(fma_scalar(c[3], x, c[2]), x, c[1]), x, c[0])
+
+
+@kernel
+def advance(work: "Buffers", begin: int, stop: int) -> None:
+    """March all modes under three wheels, each in one part, over samples `begin` to `stop`.
+
+    As `modal_response.advance` and `advance_with_ends`: `work.state` is updated and the deflections
+    under the wheels are added to `work.lanes`.
+    """
+    part = work.part[:, begin]
+    last = work.cubics.shape[0] - 1
+    at_end = work.at_end[begin]
+    for g in range(work.feedback.shape[0]):
+        of_1, of_2 = _cubic(work.cubics, part[0], g), _cubic(work.cubics, part[1], g)
+        of_3 = _cubic(work.cubics, part[2], g)
+        first, final = _cubic(work.cubics, 0, g), _cubic(work.cubics, last, g)
+        at_first, at_last = _value(first, 0.0), _value(final, 1.0)
+        feedback, state = work.feedback[g], work.state[g]
+        f_1, f_2 = load(feedback, 0), load(feedback, 1)
+        n_0, n_1, n_2 = load(feedback, 2), load(feedback, 3), load(feedback, 4)
+        w_1, w_2 = load(state, 0), load(state, 1)
+        for n in range(stop - begin):
+            i = begin + n
+            a, b = _value(of_1, work.place[0, i]), _value(of_2, work.place[1, i])
+            c = _value(of_3, work.place[2, i])
+            p = fma(a, load(work.force[0], n), mul(b, load(work.force[1], n)))
+            p = fma(c, load(work.force[2], n), p)
+            if at_end:
+                p = fma_scalar(at_first, work.end_force[0, i], p)
+                p = fma_scalar(at_last, work.end_force[1, i], p)
+                a_0, a_1 = work.end_share[0, 0, i], work.end_share[0, 1, i]
+                b_0, b_1 = work.end_share[1, 0, i], work.end_share[1, 1, i]
+                a = fma_scalar(at_first, a_0, fma_scalar(at_last, a_1, a))
+                b = fma_scalar(at_first, b_0, fma_scalar(at_last, b_1, b))
+            w = fma(f_1, w_1, fma(f_2, w_2, p))
+            q = fma(n_0, w, fma(n_1, w_1, mul(n_2, w_2)))
+            w_2 = w_1
+            w_1 = w
+            store(work.lanes[0], n, fma(a, q, load(work.lanes[0], n)))
+            store(work.lanes[1], n, fma(b, q, load(work.lanes[1], n)))
+            if at_end:
+                c_0, c_1 = work.end_share[2, 0, i], work.end_share[2, 1, i]
+                c = fma_scalar(at_first, c_0, fma_scalar(at_last, c_1, c))
+            store(work.lanes[2], n, fma(c, q, load(work.lanes[2], n)))
+        store(state, 0, w_1)
+        store(state, 1, w_2)
+
+
+def lead_motion(lead: Lead, step_s: float, profile: FloatArray, force: FloatArray) -> FloatArray:
+    """Return the acceleration (n,) of the front axle over a profile (n,) in m, at even samples.
+
+    `profile` includes the deflection of a bridge under the axle. `force` (n,) is that of its
+    springs on the body, known by inertia: whatever friction there is, m_u z'' + k_u z = k_u u - F.
+    Near the resonance of axle and tyre, where this amplifies errors of the profile, less than the
+    whole answer is taken; waves below `_LEAD_BAND_HZ` are left out.
+    """
+    n = profile.size
+    ground = profile - force / lead.tyre_stiffness_n_per_m
+    curvature = np.zeros(n)
+    curvature[1:-1] = (ground[2:] - 2.0 * ground[1:-1] + ground[:-2]) / step_s**2
+    taper = np.ones(n)
+    ramp = min(n // 2, round(_SMOOTH_S / step_s))
+    taper[:ramp] = 0.5 - 0.5 * np.cos(np.pi * np.arange(ramp) / ramp)
+    taper[-ramp:] = taper[:ramp][::-1]
+    hz = np.fft.rfftfreq(n, step_s)
+    low, high = _LEAD_BAND_HZ
+    passed = np.clip((hz - low) / (high - low), 0.0, 1.0)
+    response = lead_response(lead, np.asarray(2.0 * np.pi * hz))
+    return np.asarray(np.fft.irfft(passed * response * np.fft.rfft(taper * curvature), n))

@@ -1,0 +1,72 @@
+"""The noise density of an accelerometer, from a stretch of its samples.
+
+At standstill nearly all that a sensor shows is its noise; lines of an engine are few, and the
+median over frequencies does not see them. While driving only what lies above the wheels' motion is
+noise, of a sensor of at least 400 Hz.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.constants import MICRO_G_M_PER_S2
+
+Floats = NDArray[np.float64]
+
+_PIECE_S: Final = 1.0
+_FEWEST_PIECES: Final = 5
+_STANDING_BAND_HZ: Final = 20.0
+_DRIVING_BAND: Final = 0.3
+_TOP_OF_BAND: Final = 0.42
+"""Share of the rate above which a sensor's own filter removes its noise."""
+_MEDIAN_OF_POWER: Final = 0.71
+"""Ratio of the median over a dozen pieces to the mean; ln 2 for very many pieces."""
+_WHEELS_HZ: Final = 120.0
+"""Wheels hop at ten hertz, and what frames and brackets do has died away."""
+
+
+class NoiseSegment(NamedTuple):
+    """A stretch of samples (n,) of one channel, gaps left out, and whether the truck stood."""
+
+    values: Floats
+    rate_hz: float
+    is_standing: bool
+
+
+class Density(NamedTuple):
+    """One-sided density of a stretch."""
+
+    ug_per_rthz: float
+    falls: float
+    """Ratio of power in the lower half of the band to that in the upper half: 1 for sensor noise,
+    larger for motion of wheels or frame."""
+
+
+def density(still: NoiseSegment) -> Density | None:
+    """Return the noise density of one channel; None if there is too little, or only motion."""
+    low = _STANDING_BAND_HZ if still.is_standing else _DRIVING_BAND * still.rate_hz
+    high = _TOP_OF_BAND * still.rate_hz
+    if high <= low or (not still.is_standing and low < _WHEELS_HZ):
+        return None
+    size = round(_PIECE_S * still.rate_hz)
+    count = still.values.size // size
+    pieces = still.values[: count * size].reshape(count, size)
+    pieces = pieces[np.isfinite(pieces).all(axis=1)]
+    if pieces.shape[0] < _FEWEST_PIECES:
+        return None
+    window = np.hanning(size)
+    centred = window * (pieces - pieces.mean(axis=1, keepdims=True))
+    power = np.abs(np.fft.rfft(centred, axis=1)) ** 2
+    power *= 2.0 / (still.rate_hz * float(window @ window))
+    frequency = np.fft.rfftfreq(size, 1.0 / still.rate_hz)
+    middle = 0.5 * (low + high)
+    # An impact is in some pieces, an engine's line at some frequencies: medians see neither.
+    typical = np.median(power, axis=0)
+    lower = typical[(frequency >= low) & (frequency < middle)]
+    upper = typical[(frequency >= middle) & (frequency <= high)]
+    whole = float(np.median(np.concatenate([lower, upper]))) / _MEDIAN_OF_POWER
+    return Density(
+        float(np.sqrt(whole)) / MICRO_G_M_PER_S2,
+        float(np.median(lower) / max(np.median(upper), np.finfo(float).tiny)),
+    )

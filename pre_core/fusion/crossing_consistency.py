@@ -1,0 +1,126 @@
+"""Detection of crossings that contradict the others of the same bridge.
+
+Each crossing gets a change of the bridge's compliances of its own, with everything else as all
+others determine it. The uncertainty of that change follows from the crossing and the others, and a
+bridge varies between crossings. By how much is unknown before the outlier is removed, which would
+pass for variability: so crossings are first tested with a usual one. Outliers, at most a third of
+all, are accepted again if the variability of the others explains them. The most consistent
+crossings show too little variability, and each accepted one adds to it, so this repeats until none
+is accepted. The others are excluded.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from pre_core.fusion.information import (
+    BridgePriors,
+    CrossingInformation,
+    JointInformation,
+    leave_one_out_change,
+    posterior_information,
+    squared_distance,
+)
+from pre_core.fusion.joint import build_joint
+from pre_core.fusion.path_groups import FusionInput
+from pre_core.fusion.variability import variability_posterior
+
+FloatArray = NDArray[np.float64]
+
+_USUAL_CHANGE = 0.03
+_SUSPICIOUS, _INCOMPATIBLE = 1e-3, 1e-4
+"""Probability of such an outlier among all crossings below which it is tested with the variability
+of the others, and below which it is then excluded."""
+_FEWEST = 3
+"""Fewest crossings of which one can be excluded: of two that contradict each other either may be
+wrong; of more, a third may be."""
+_UNLIKELY = 1e-6
+
+
+class ConsistencyResult(NamedTuple):
+    """Names of the consistent and of the excluded crossings."""
+
+    agree: tuple[str, ...]
+    left_out: tuple[str, ...]
+    disagree: bool
+    """Whether the kept ones contradict each other, too few to find the wrong one."""
+
+
+def select_consistent(
+    parts: Sequence[FusionInput], joint: JointInformation, priors: BridgePriors
+) -> ConsistencyResult:
+    """Return the consistent and the excluded crossings of `joint`."""
+    names = joint.names
+    if len(names) == 1:
+        return ConsistencyResult(names, (), False)
+    nothing_more = np.array([[0.0, 0.0, 1.0]])
+    chances = np.array(_tail_probabilities(joint, priors, names, names, nothing_more))
+    if len(names) < _FEWEST:
+        return ConsistencyResult(names, (), bool(chances.min() < _SUSPICIOUS / len(names)))
+    worst = np.argsort(chances)[: len(names) // _FEWEST]
+    odd = {names[i] for i in worst if chances[i] < _SUSPICIOUS / len(names)}
+    if odd:
+        # An outlier must not affect the estimated variability.
+        joint = build_joint(parts, priors, trusted=set(names) - odd)
+    back = odd
+    while odd and back:
+        inside = [name for name in names if name not in odd]
+        found = variability_posterior(joint._replace(ready=joint.select(inside)), priors)
+        changes = np.column_stack([found.tau, found.rho, found.weight])[found.weight > _UNLIKELY]
+        of = zip(
+            sorted(odd),
+            _tail_probabilities(joint, priors, sorted(odd), inside, changes),
+            strict=True,
+        )
+        back = {name for name, chance in of if chance >= _INCOMPATIBLE / len(names)}
+        odd = odd - back
+    agree = tuple(name for name in names if name not in odd)
+    return ConsistencyResult(agree, tuple(sorted(odd)), False)
+
+
+def _tail_probabilities(
+    joint: JointInformation,
+    priors: BridgePriors,
+    names: Sequence[str],
+    beside: Sequence[str],
+    changes: FloatArray,
+) -> list[float]:
+    """Return for each of `names` the probability of its distance from `beside`, without itself.
+
+    `changes` (k, 3) are tau, rho, and their probability. A usual change, independent for each
+    element, is always added, however small the variability of the others.
+    """
+    elements = joint.layout.elements
+    precision, linear = posterior_information(joint, priors, joint.select(beside))
+    at = np.diag(joint.centre[elements])
+    out = []
+    for name, one in zip(names, joint.select(names), strict=True):
+        whole, pull = precision, linear
+        if name not in beside:
+            whole, pull = posterior_information(joint, priors, [*joint.select(beside), one])
+        sharp, need = _crossing_change(one, whole, pull, elements)
+        chance = 0.0
+        for tau, rho, weight in changes:
+            own = _USUAL_CHANGE**2 + (1.0 - rho) * tau**2
+            change = at @ (own * np.eye(elements.size) + rho * tau**2) @ at
+            spread = sharp + sharp @ change @ sharp
+            chance += float(weight * chdtrc(elements.size, squared_distance(need, spread)))
+        out.append(chance)
+    return out
+
+
+def _crossing_change(
+    one: CrossingInformation, precision: FloatArray, linear: FloatArray, elements: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """Return precision (e, e) and linear part (e,) of a crossing's own change of the compliances.
+
+    They follow from the sum of all, this one included. Trucks, wheel-path groups and the other
+    bridge parameters are as all others determine them, so that poorly determined ones do not count.
+    """
+    across = np.zeros((linear.size, elements.size))
+    across[one.places] = one.precision[:, elements]
+    own = one.precision[np.ix_(elements, elements)]
+    return leave_one_out_change(across, own, one.linear[elements], (precision, linear))

@@ -1,0 +1,118 @@
+"""Information of crossings, and its sum with the priors, each once."""
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.fusion.likelihood import Coordinates
+from pre_core.fusion.path_groups import PathGroupKey, SharedMismatch
+
+FloatArray = NDArray[np.float64]
+
+_ROUGH_SPREAD = 0.6
+"""Standard deviation of a normal prior of c that replaces the log-normal one in evidence ratios."""
+_ROUNDED = 1e-10
+
+
+class BridgePriors(NamedTuple):
+    """Priors in the order of the likelihoods' bridge coordinates, which have `elements` last."""
+
+    coordinates: Coordinates
+    mass_powers: FloatArray  # (b,)
+    log_odds: FloatArray  # (b,) of absence; `posterior.log_odds_of_absence`
+    elements: int
+
+
+class JointLayout(NamedTuple):
+    """Indices of the bridge, of each truck and of each wheel-path group among all coordinates."""
+
+    bridge: int
+    elements: NDArray[np.int64]
+    trucks: dict[str, NDArray[np.int64]]
+    """Coordinates of each truck, the error of its mass last."""
+    tracks: dict[PathGroupKey, NDArray[np.int64]]
+    size: int
+
+
+class CrossingInformation(NamedTuple):
+    """A crossing's likelihood with its own part of the long waves integrated out."""
+
+    precision: FloatArray
+    linear: FloatArray
+    places: NDArray[np.int64]
+    """Indices of its coordinates among all."""
+
+
+class JointInformation(NamedTuple):
+    """Crossings in common coordinates, ready to be added."""
+
+    names: tuple[str, ...]
+    layout: JointLayout
+    ready: tuple[CrossingInformation, ...]
+    prior: FloatArray
+    """Prior precision (n, n) of trucks and wheel-path groups."""
+    centre: FloatArray
+    """Bridge coordinates (b,) to which changes of compliances are relative."""
+    shared: tuple[SharedMismatch, ...]
+
+    def select(self, names: Collection[str] | None) -> tuple[CrossingInformation, ...]:
+        """Return the crossings of these names; None: all."""
+        if names is None:
+            return self.ready
+        ready = zip(self.names, self.ready, strict=True)
+        return tuple(one for name, one in ready if name in names)
+
+
+def posterior_information(
+    joint: JointInformation, priors: BridgePriors, ready: Sequence[CrossingInformation]
+) -> tuple[FloatArray, FloatArray]:
+    """Return precision (n, n) and linear part (n,) of all coordinates with priors of the bridge."""
+    return add_bridge_priors(joint, priors, *sum_information(joint, ready))
+
+
+def add_bridge_priors(
+    joint: JointInformation, priors: BridgePriors, precision: FloatArray, linear: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return a sum (n, n), (n,) of crossings with normal priors of the bridge's parameters."""
+    layout = joint.layout
+    precision, linear = precision.copy(), linear.copy()
+    single = np.arange(layout.bridge - priors.elements)
+    precision[single, single] += 1.0
+    rough = _ROUGH_SPREAD**-2
+    precision[layout.elements, layout.elements] += rough
+    linear[layout.elements] += rough
+    return precision, linear
+
+
+def sum_information(
+    joint: JointInformation, ready: Sequence[CrossingInformation]
+) -> tuple[FloatArray, FloatArray]:
+    """Return precision (n, n) and linear part (n,) of all coordinates without bridge priors."""
+    precision, linear = joint.prior.copy(), np.zeros(joint.layout.size)
+    for one in ready:
+        precision[np.ix_(one.places, one.places)] += one.precision
+        linear[one.places] += one.linear
+    return precision, linear
+
+
+def leave_one_out_change(
+    across: FloatArray,
+    precision: FloatArray,
+    linear: FloatArray,
+    whole: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Return precision (e, e) and linear part (e,) of the deviation of one crossing from all.
+
+    Its own are `precision` and `linear`, and `across` (n, e) couples all n coordinates to them;
+    `whole` are precision and linear part of the sum of all, this one included.
+    """
+    explained = np.linalg.solve(whole[0], np.column_stack([across, whole[1]]))
+    conditional = precision - across.T @ explained[:, :-1]
+    return 0.5 * (conditional + conditional.T), linear - across.T @ explained[:, -1]
+
+
+def squared_distance(linear: FloatArray, spread: FloatArray) -> float:
+    """Return the squared distance from zero of a linear part (e,) with covariance (e, e)."""
+    return float(linear @ np.linalg.pinv(spread, _ROUNDED, hermitian=True) @ linear)

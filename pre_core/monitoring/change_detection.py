@@ -1,0 +1,267 @@
+"""Change detection: train the baseline, compare every later period, until an alarm."""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pre_core.constants import NORMAL_975
+from pre_core.monitoring.baseline import (
+    LEVEL_SPREAD,
+    BaselineState,
+    Innovation,
+    Period,
+    Scales,
+    adopt_change,
+    change_of,
+    compress_shared_errors,
+    filter_step,
+    initial_baseline,
+    predict_state,
+    scales_compared,
+    select_scales,
+    standardised,
+    update_state,
+    with_change,
+)
+from pre_core.monitoring.chart import (
+    LARGEST,
+    Verdict,
+    chart_verdict,
+    empty_chart,
+    log_ratio,
+    select_chart_scales,
+    skip_period,
+    update_chart,
+)
+
+FloatArray = NDArray[np.float64]
+
+SMALLEST_CHANGE = 0.05
+SEASON_DAYS = 364.0
+"""Time from the first period after which the season is known without a thermometer."""
+PROBABILITY = 0.975
+"""Probability with which a change must exceed the smallest one of interest."""
+_UNLIKELY, _WORTHWHILE = 1e-6, 0.75
+"""Posterior weight below which scales are dropped, once fewer than the second share remain."""
+
+
+class AlarmRules(NamedTuple):
+    """Conditions of an alarm."""
+
+    false_alarms_per_year: float = 0.01
+    """Tolerated false alarms of one bridge, over all its elements and both directions."""
+    periods_per_year: float = 52.0
+    learning: int = 8
+    """Number of training periods before the first comparison."""
+    at_least: float = SMALLEST_CHANGE
+    """Smallest change of EI of interest."""
+
+    @property
+    def smallest(self) -> tuple[float, float]:
+        """The range of changes of ln EI that are too small to be of interest."""
+        return float(np.log1p(-self.at_least)), float(np.log1p(self.at_least))
+
+    @property
+    def threshold(self) -> float:
+        """The logarithm of the mean number of periods until a false alarm."""
+        return float(np.log(self.periods_per_year / self.false_alarms_per_year))
+
+
+class AcknowledgedChange(NamedTuple):
+    """An acknowledged change, by numbers of periods."""
+
+    since: int
+    """First period of the changed bridge."""
+    at: int
+    """Period before which it was acknowledged."""
+
+
+class Change(NamedTuple):
+    """A detected change and the period in which it began."""
+
+    element: int
+    """Number of the element, from 0."""
+    direction: Literal["weaker", "stiffer"]
+    raised_at: int
+    """Number of the period that raised it."""
+    since: int
+    """Number of the period in which it most likely began."""
+    sum: float
+    """Chart's statistic when raised, in standard deviations like `MonitoringResult.threshold`."""
+    ratio: FloatArray  # (n,) EI now over EI before, of every element
+    low: FloatArray
+    """Lower ends (n,) of its 95 % intervals; `high` are the upper ones."""
+    high: FloatArray
+
+
+class MonitoringResult(NamedTuple):
+    """Result of monitoring over all periods."""
+
+    standardised: FloatArray
+    """Innovations (periods, n) over their standard deviations; NaN during an alarm."""
+    judged: NDArray[np.bool_]
+    """Flags (periods,) of the periods that were compared with the baseline; others only trained it.
+    """
+    statistic: FloatArray
+    """Chart statistic sqrt(2 ln R), (periods,); 0 where there is none."""
+    threshold: float
+    """Threshold of the statistic."""
+    usual_change: float
+    """Root mean square of q, of ln EI."""
+    usual_wander: float
+    """Root mean square of the slow component."""
+    change: Change | None
+    """The first change that was not acknowledged."""
+
+
+class PeriodDifference(NamedTuple):
+    """Ratio of EI in a later period to EI in an earlier one, of every element (n,)."""
+
+    ratio: FloatArray
+    low: FloatArray
+    """Lower ends of the 95 % intervals; `high` are the upper ones."""
+    high: FloatArray
+
+
+def judged_periods(periods: Sequence[Period], learning: int) -> NDArray[np.bool_]:
+    """Return flags (periods,) of the periods that can be compared with earlier ones.
+
+    These are periods of known temperature after `learning` of known temperature, and any period a
+    year after the first, when the season is known without a thermometer.
+    """
+    out = np.zeros(len(periods), dtype=bool)
+    warm = 0
+    for number, period in enumerate(periods):
+        is_year = period.time_days - periods[0].time_days >= SEASON_DAYS
+        has_temperature = period.temperature_deg_c is not None
+        out[number] = number >= learning and (is_year or (has_temperature and warm >= learning))
+        warm += has_temperature
+    return out
+
+
+def detect_change(
+    periods: Sequence[Period], rules: AlarmRules, acknowledged: Sequence[AcknowledgedChange] = ()
+) -> MonitoringResult:
+    """Compare each period with all earlier ones, until an alarm.
+
+    `acknowledged`, in order, are acknowledged changes, whose state is the baseline of later
+    periods. During an alarm the baseline is not updated.
+    """
+    count = len(periods)
+    n = periods[0].observation.value.size if count else 0
+    is_judged = judged_periods(periods, rules.learning)
+    rows, statistic = np.full((count, n), np.nan), np.zeros(count)
+    threshold = _in_deviations(rules.threshold)
+    if not is_judged.any():
+        return MonitoringResult(rows, is_judged, statistic, threshold, 0.0, 0.0, None)
+    some = compress_shared_errors(periods)
+    state = initial_baseline(some, scales_compared())
+    chart, notes = empty_chart(state), list(acknowledged)
+    kept_for = {note.since for note in notes}
+    before: dict[int, BaselineState] = {}
+    """States before the periods in which a change may have begun."""
+    found: Change | None = None
+    standing = state
+    for number, period in enumerate(some):
+        if found is None:
+            before[number] = state
+            state, kept = predict_state(state, period.time_days)
+            innovation = filter_step(state, period)
+            rows[number] = standardised(state, innovation)
+            inflation = max(1.0, (np.abs(rows[number]).max() / LARGEST) ** 2)
+            wander = state.places["wander"]
+            weight: FloatArray | None = None
+            if is_judged[number]:
+                # An outlier would move the baseline, and sound periods would pass for a change.
+                after = state
+                if inflation == 1.0:
+                    after, weight = update_state(state, innovation)
+                chart = update_chart(chart, number, kept, wander, weight, innovation, inflation)
+                state = after
+                ratio, _ = log_ratio(chart, state, number)
+                statistic[number] = _in_deviations(ratio)
+                if ratio > rules.threshold:
+                    verdict = chart_verdict(chart, state, number, rules.smallest)
+                    if verdict.probability >= PROBABILITY:
+                        found = _found(verdict, number, statistic[number])
+                        standing = _since(before[found.since], some[found.since : number + 1])
+            else:
+                wider = innovation._replace(covariance=inflation * innovation.covariance)
+                state, weight = update_state(state, wider)
+                chart = skip_period(chart, kept, wander, weight, innovation)
+            likely = state.log_weight > np.log(_UNLIKELY)
+            if likely.mean() < _WORTHWHILE:
+                state, chart = select_scales(state, likely), select_chart_scales(chart, likely)
+            stay = {*chart.begins, *kept_for}
+            before = {begin_at: one for begin_at, one in before.items() if begin_at in stay}
+        else:  # an alarm stands: later periods estimate its size and nothing else
+            standing = _since(standing, [period], is_first=False)
+        if notes and number + 1 >= notes[0].at:
+            note = notes.pop(0)
+            if note.since in before:
+                state = adopt_change(_since(before[note.since], some[note.since : number + 1]))
+            elif found is not None:
+                state = adopt_change(standing)
+            found, chart = None, empty_chart(state)
+    if found is not None:
+        mean, covariance = change_of(standing)
+        half = NORMAL_975 * np.sqrt(np.diag(covariance))
+        found = found._replace(
+            ratio=np.exp(mean), low=np.exp(mean - half), high=np.exp(mean + half)
+        )
+    return MonitoringResult(rows, is_judged, statistic, threshold, *_usual(state), found)
+
+
+def compare_periods(first: Period, last: Period) -> PeriodDifference:
+    """Compare two periods directly, temperature and season included.
+
+    Shared errors cancel; errors of one of them count.
+    """
+    plain = [period._replace(temperature_deg_c=0.0) for period in (first, last)]
+    motionless = Scales(np.zeros(1), np.zeros(1), np.ones(1), np.zeros(1))
+    state = initial_baseline(plain, motionless)
+    at = state.places["slope"]
+    state.covariance[:, at, at] = 0.0
+    state = _since(state, plain[:1], changes=False)
+    mean, covariance = change_of(_since(state, plain[1:]))
+    half = NORMAL_975 * np.sqrt(np.diag(covariance))
+    return PeriodDifference(np.exp(mean), np.exp(mean - half), np.exp(mean + half))
+
+
+def _since(
+    state: BaselineState, periods: Sequence[Period], *, is_first: bool = True, changes: bool = True
+) -> BaselineState:
+    """Return the state after some periods; in the first of them everything may have changed."""
+    if is_first and changes:
+        state = with_change(state, LEVEL_SPREAD)
+    for number, period in enumerate(periods):
+        state, _ = predict_state(state, period.time_days)
+        innovation = filter_step(state, period)
+        if (is_first and number == 0) or not _is_wild(state, innovation):
+            state, _ = update_state(state, innovation)
+    return state
+
+
+def _is_wild(state: BaselineState, innovation: Innovation) -> bool:
+    return bool(np.abs(standardised(state, innovation)).max() > LARGEST)
+
+
+def _usual(state: BaselineState) -> tuple[float, float]:
+    weight = np.exp(state.log_weight)
+    return (
+        float(np.sqrt(weight @ state.scales.change**2)),
+        float(np.sqrt(weight @ state.scales.wander**2)),
+    )
+
+
+def _in_deviations(log_of_ratio: float) -> float:
+    """Return the standard deviations of a normal as unlikely: ln R = z²/2."""
+    return float(np.sqrt(2.0 * max(0.0, log_of_ratio)))
+
+
+def _found(verdict: Verdict, number: int, statistic: float) -> Change:
+    empty = np.zeros(0)
+    direction: Literal["weaker", "stiffer"] = "stiffer" if verdict.is_stiffer else "weaker"
+    return Change(verdict.element, direction, number, verdict.begin, statistic, empty, empty, empty)

@@ -1,0 +1,108 @@
+"""Load-equalised tandems of a site file: the axles of `[[vehicle.axles]]` that are compared.
+
+Behind a front axle, two axles that share one spring force feel nearly the same road and need no
+spring to be believed. A tandem on springs of its own is refused: friction of a few per cent of the
+load hides the difference of the deflections under its axles.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from schemas.site_axle_tables import Axle, Bogie
+from schemas.site_errors import error_at
+
+AXLES: Final = 3
+_FIRST: Final = 2
+"""Number of the first axle of the tandem."""
+_LARGEST_UNEVENNESS: Final = 0.8
+"""Largest share of one axle; beyond it the other one carries too little to be compared."""
+
+
+class Tandem(NamedTuple):
+    """A truck's front axle and the two equalised ones behind it."""
+
+    lead: Axle
+    first: Axle
+    second: Axle
+    share: float
+    """Share of the spring force on the first axle of the tandem."""
+    share_spread: float
+
+    @property
+    def axles(self) -> tuple[Axle, Axle]:
+        """The compared axles."""
+        return self.first, self.second
+
+    @property
+    def gap_m(self) -> float:
+        """Distance between the compared axles."""
+        return self.second.position_m - self.first.position_m
+
+    @property
+    def force_m(self) -> float:
+        """Distance of the shared spring force behind the front axle."""
+        return self.share * self.first.position_m + (1.0 - self.share) * self.second.position_m
+
+
+def tandem_of(axles: Sequence[Axle], bogies: Sequence[Bogie]) -> Tandem:
+    """Return the tandem of a truck with more than two axles; raise a FieldError without one."""
+    if len(axles) != AXLES:
+        raise error_at(
+            "axles",
+            f"has {len(axles)} axles, it must be two, or three of which the last two share their "
+            "load by an equalised bogie",
+        )
+    if len(bogies) != 1 or sorted(bogies[0].axles) != [_FIRST, _FIRST + 1]:
+        raise error_at(
+            "bogies",
+            "does not join axles 2 and 3, they must share their load by an equalised bogie: "
+            "friction in springs of their own hides what the bridge does",
+        )
+    bogie = bogies[0]
+    if not bogie.equalised:
+        raise error_at(
+            "bogies.0.equalised",
+            "is false, it must be true: friction in springs that do not share their load hides "
+            "what the bridge does",
+        )
+    shares = bogie.shares or (1.0, 1.0)
+    of_axle = dict(zip(bogie.axles, shares, strict=True))
+    share = of_axle[_FIRST] / math.fsum(shares)
+    if max(share, 1.0 - share) > _LARGEST_UNEVENNESS:
+        raise error_at(
+            "bogies.0.shares",
+            f"give one axle {max(share, 1.0 - share):.0%} of the force, it must be at most "
+            f"{_LARGEST_UNEVENNESS:.0%}",
+        )
+    lead, first, second = axles
+    return Tandem(lead, first, second, share, bogie.share_spread)
+
+
+def joined(tandem: Tandem) -> Axle:
+    """Return the axle that stands for both axles of the tandem: at their force, with their sums."""
+    first, second = tandem.axles
+    together: dict[str, float] = {
+        key: getattr(first, key) + getattr(second, key)
+        for key in (
+            "unsprung_mass_kg",
+            "suspension_stiffness_n_per_m",
+            "suspension_damping_ns_per_m",
+            "tyre_stiffness_n_per_m",
+            "tyre_damping_ns_per_m",
+        )
+    }
+    load: float | None = None
+    spread = first.load_kg_spread
+    if first.load_kg is not None and second.load_kg is not None:
+        load = first.load_kg + second.load_kg
+        errors = (first.load_kg * first.load_kg_spread, second.load_kg * second.load_kg_spread)
+        spread = math.hypot(*errors) / load
+    return first.model_copy(
+        update={
+            **together,
+            "position_m": tandem.force_m,
+            "load_kg": load,
+            "load_kg_spread": spread,
+        }
+    )

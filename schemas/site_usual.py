@@ -1,0 +1,227 @@
+"""Usual ranges of what a site file implies: frequencies, damping, deflection; and likely slips.
+
+What no truck or bridge can have is refused (`schemas.site_physics`). What is only unlikely is named
+here, with the value that was probably meant: a stiffness in kN/m for N/m, a mass in t, a damping
+ratio for a Rayleigh coefficient.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Final, NamedTuple
+
+from schemas.site import Bridge, Sensor, Site, Vehicle
+
+_G_M_PER_S2: Final = 9.80665
+_FIRST_HZ: Final = (0.25, 4.0)
+"""First natural frequency over 100 Hz/L, L in m: a rule of thumb for road bridges."""
+_DAMPING: Final = (0.002, 0.15)
+_DEFLECTION: Final = (0.0, 1.0 / 250.0)
+"""Under the truck at rest in the middle, over the span."""
+_BOUNCE_HZ: Final = (0.7, 6.0)
+_PITCH_HZ: Final = (0.5, 10.0)
+_HOP_HZ: Final = (4.0, 40.0)
+_SUSPENSION: Final = (0.01, 1.5)
+"""Damping ratio of the body on its springs."""
+_NOISE_UG: Final = (0.5, 5000.0)
+_FAR: Final = 2.0
+"""Factor beyond a range at which a value is taken to be wrong, not only unusual."""
+_MOST_BRIDGES: Final = 50
+"""Largest number of bridges with warnings: a fleet's site file has thousands."""
+
+_STIFFNESS: Final = (("kN/m", 1e3),)
+_RIGIDITY: Final = (("kN·m²", 1e3), ("MN·m²", 1e6), ("GN·m²", 1e9))
+
+
+class Slip(NamedTuple):
+    """A key that may be in another unit, and the quantity that follows from a factor."""
+
+    key: str
+    value: float
+    quantity: Callable[[float], float]
+    units: tuple[tuple[str, float], ...]
+
+
+class Implied(NamedTuple):
+    """A quantity that a site file implies, and its usual range."""
+
+    name: str
+    text: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    meant: str
+    """Probable intention; empty where there is none to suggest or the value is usual."""
+
+    @property
+    def is_unusual(self) -> bool:
+        """Return whether it is out of its range."""
+        return not self.low <= self.value <= self.high
+
+    @property
+    def is_far(self) -> bool:
+        """Return whether it is far out of its range."""
+        return self.value < self.low / _FAR or self.value > self.high * _FAR
+
+    @property
+    def advice(self) -> str:
+        """Return what is usual, and what was probably meant."""
+        usual = f"usual is {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
+        return f"{usual}: {self.meant}" if self.meant else f"{usual}: check units and values"
+
+
+def implied_by(site: Site, vehicle: Vehicle) -> Iterator[Implied]:
+    """Yield what a site file implies of a truck, its sensors and the bridges under it."""
+    yield from of_truck(vehicle)
+    yield from of_sensors(site.sensor, vehicle)
+    for bridge in site.bridges[:_MOST_BRIDGES]:
+        yield from of_bridge(bridge, vehicle)
+
+
+def warnings_of(site: Site) -> list[str]:
+    """Return a line for everything that is unusual."""
+    found = (one for vehicle in site.vehicles for one in implied_by(site, vehicle))
+    return list(dict.fromkeys(f"{one.text}: {one.advice}" for one in found if one.is_unusual))
+
+
+def of_truck(vehicle: Vehicle) -> Iterator[Implied]:
+    """Yield bounce, pitch and wheel hop of a truck, and the damping of its springs."""
+    base = vehicle.wheelbase_m
+    arms = (vehicle.front_axle_to_cg_m, vehicle.cg_to_rear_axle_m)
+    loads = (arms[1] / base, arms[0] / base)
+    springs, tyres = vehicle.suspension_stiffness_n_per_m, vehicle.tyre_stiffness_n_per_m
+    axles = vehicle.unsprung_mass_kg
+    for k, where in enumerate(("front", "rear")):
+        body = vehicle.sprung_mass_kg * loads[k]
+        key = f"suspension_stiffness_n_per_m[{k}]"
+        value = _hz(springs[k], body)
+        slips: tuple[Slip, ...] = (Slip(key, springs[k], _power(value, 0.5), _STIFFNESS),)
+        text = f"{vehicle.id}: body bounces at {value:.3g} Hz on its {where} springs"
+        yield _implied(f"bounce_{where}", text, value, _BOUNCE_HZ, "Hz", slips)
+        damping = vehicle.suspension_damping_ns_per_m[k]
+        value = damping / (2.0 * math.sqrt(springs[k] * body))
+        text = f"{vehicle.id}: damping ratio {value:.3g} of the body on its {where} springs"
+        slips = (
+            Slip(
+                f"suspension_damping_ns_per_m[{k}]", damping, _power(value, 1.0), (("kN·s/m", 1e3),)
+            ),
+            Slip(key, springs[k], _power(value, -0.5), _STIFFNESS),
+        )
+        yield _implied(f"suspension_damping_{where}", text, value, _SUSPENSION, "", slips)
+        axle, tyre = axles[k], tyres[k]
+        value = _hz(springs[k] + tyre, axle)
+        text = f"{vehicle.id}: {where} axle hops at {value:.3g} Hz on its tyres"
+        slips = (
+            Slip(
+                f"tyre_stiffness_n_per_m[{k}]",
+                tyre,
+                partial(_hop_hz, springs[k], tyre, axle),
+                _STIFFNESS,
+            ),
+        )
+        yield _implied(f"hop_{where}", text, value, _HOP_HZ, "Hz", slips)
+    inertia = vehicle.pitch_inertia_ratio * vehicle.sprung_mass_kg * arms[0] * arms[1]
+    value = _hz(springs[0] * arms[0] ** 2 + springs[1] * arms[1] ** 2, inertia)
+    text = f"{vehicle.id}: body pitches at {value:.3g} Hz"
+    yield _implied("pitch", text, value, _PITCH_HZ, "Hz", ())
+
+
+def of_sensors(sensor: Sensor, vehicle: Vehicle) -> Iterator[Implied]:
+    """Yield the noise densities that are unusual; 0 is a simulation without noise."""
+    declared = tuple(one.noise_density_ug_per_rthz for one in vehicle.sensors)
+    for density in dict.fromkeys(declared or sensor.noise_density_ug_per_rthz):
+        units = (("mg/√Hz", 1e3), ("m/s²/√Hz", 1e6 / _G_M_PER_S2))
+        slips = (Slip("noise_density_ug_per_rthz", density, _power(density, 1.0), units),)
+        text = f"{vehicle.id}: noise {density:.3g} µg/√Hz"
+        found = _implied("noise_usual", text, density, _NOISE_UG, "µg/√Hz", slips)
+        if density > 0.0 and found.is_unusual:
+            yield found
+
+
+def of_bridge(bridge: Bridge, vehicle: Vehicle) -> Iterator[Implied]:
+    """Yield first frequency and damping of a bridge, and what a truck does to it."""
+    span, rigidity, mass = bridge.uniform()
+    per_element = bridge.flexural_rigidity_per_element_nm2 is not None
+    key = "flexural_rigidity_" + ("per_element_nm2" if per_element else "nm2")
+    first_hz = math.pi / (2.0 * span**2) * math.sqrt(rigidity / mass)
+    usual = 100.0 / span
+    slips: tuple[Slip, ...] = (
+        Slip(key, rigidity, _power(first_hz, 0.5), _RIGIDITY),
+        Slip("mass_per_length_kg_per_m", mass, _power(first_hz, -0.5), (("t/m", 1e3),)),
+    )
+    text = f"{bridge.id}: first natural frequency {first_hz:.3g} Hz"
+    limits = (_FIRST_HZ[0] * usual, _FIRST_HZ[1] * usual)
+    yield _implied("first_frequency", text, first_hz, limits, "Hz", slips)
+    yield _damping(bridge, first_hz)
+    weight = vehicle.total_mass_kg * _G_M_PER_S2
+    deflection = weight * span**3 / (48.0 * rigidity)
+    slips = (Slip(key, rigidity, _power(deflection / span, -1.0), _RIGIDITY),)
+    text = (
+        f"{bridge.id}: bends by {1e3 * deflection:.3g} mm under {vehicle.id} at rest, 1/"
+        f"{span / deflection:.0f} of the span"
+    )
+    yield _implied("static_deflection", text, deflection / span, _DEFLECTION, "", slips)
+    ratio = vehicle.wheelbase_m / span
+    text = f"{bridge.id}: wheelbase of {vehicle.id} is {ratio:.2g} of the span"
+    yield _implied("wheelbase_over_span", text, ratio, (0.0, 1.0), "", ())
+
+
+def _damping(bridge: Bridge, first_hz: float) -> Implied:
+    """Return the damping ratio of the first mode; no damping at all is a simulation's."""
+    omega = 2.0 * math.pi * first_hz
+    alpha, beta = bridge.rayleigh_alpha_per_s, bridge.rayleigh_beta_s
+    value = 0.5 * (alpha / omega + beta * omega)
+    low, high = _DAMPING
+    meant = ""
+    if value > high and low <= alpha / (2.0 * omega) + beta <= high:
+        meant = (
+            f"rayleigh_beta_s is {beta:g}: a damping ratio? then it is {2.0 * beta / omega:.3g} s"
+        )
+    elif 0.0 < value < low and low <= alpha + 0.5 * beta * omega <= high:
+        meant = (
+            f"rayleigh_alpha_per_s is {alpha:g}: a damping ratio? then it is "
+            f"{2.0 * alpha * omega:.3g} 1/s"
+        )
+    elif value > high:
+        larger = "rayleigh_beta_s" if beta * omega > alpha / omega else "rayleigh_alpha_per_s"
+        meant = f"{larger} is too large"
+    text = f"{bridge.id}: damping ratio {value:.3g} of the first mode"
+    return Implied("damping_ratio", text, value, low if value > 0.0 else 0.0, high, "", meant)
+
+
+def _implied(
+    name: str,
+    text: str,
+    value: float,
+    limits: tuple[float, float],
+    unit: str,
+    slips: tuple[Slip, ...],
+) -> Implied:
+    low, high = limits
+    meant = "" if low <= value <= high else _meant(value, limits, slips)
+    return Implied(name, text, value, low, high, unit, meant)
+
+
+def _meant(value: float, limits: tuple[float, float], slips: tuple[Slip, ...]) -> str:
+    """Return the first key that, in another unit, brings the value into its range."""
+    for slip in slips:
+        for unit, factor in slip.units:
+            if limits[0] <= slip.quantity(factor) <= limits[1]:
+                return (
+                    f"{slip.key} is {slip.value:g}: in {unit}? then it is {slip.value * factor:g}"
+                )
+    return ""
+
+
+def _power(value: float, exponent: float) -> Callable[[float], float]:
+    """Return how a quantity follows from a factor of what it goes with a power of."""
+    return lambda factor: value * factor**exponent
+
+
+def _hop_hz(spring: float, tyre: float, axle_kg: float, factor: float) -> float:
+    return _hz(spring + factor * tyre, axle_kg)
+
+
+def _hz(stiffness: float, inertia: float) -> float:
+    return math.sqrt(stiffness / inertia) / (2.0 * math.pi)

@@ -1,0 +1,1 @@
+"""Contents of recordings: of one file, and of a folder of them."""

@@ -1,0 +1,215 @@
+"""Contents of a recording, without any identification: trucks, times, gaps, crossings.
+
+One pass over the file. A crossing is a stay on a bridge of the site file, detected in the positions
+as the worker does it; whether it can be identified is another question.
+"""
+
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+from schemas.signals import NS_PER_S
+from schemas.site import Site
+from schemas.site_file import parse_site
+from schemas.topics import Key, Message, topic
+from services.common.errors import InputError
+from services.common.intervals import Intervals
+from services.common.progress import Offset, no_progress
+from services.finding.bridges import Bridges, DetectedCrossing, detect_crossings
+from services.finding.drive import DriveMessages, Drives
+from services.finding.streams import boot_of
+from services.recordings.recording import RecordingInfo, read_info
+
+LONGEST_SILENCE_S = 1.0
+"""Silence in s that counts as a gap: a truck sends batches of 50 to 100 ms."""
+
+
+class Gap(NamedTuple):
+    """A silence of one stream while its truck was on; times in ns."""
+
+    vehicle: str
+    stream: str
+    begin_ns: int
+    end_ns: int
+
+
+class StreamSummary(NamedTuple):
+    """Statistics of one kind of message of one truck."""
+
+    messages: int
+    missing: int
+    """Number of absent sequence numbers between the first and the last one."""
+    rate_hz: float | None
+    """Messages per second while the stream is active; None for occasional messages."""
+
+
+class TruckSummary(NamedTuple):
+    """One truck in one realm; times in ns."""
+
+    realm: str
+    vehicle: str
+    boots: int
+    first_ns: int
+    last_ns: int
+    streams: dict[str, StreamSummary]
+    channel_rates_hz: dict[str, float]
+    """Declared rate of each accelerometer, Hz."""
+
+
+class RecordingSummary(NamedTuple):
+    """Contents of one recording; times in ns."""
+
+    path: Path
+    size_bytes: int
+    info: RecordingInfo
+    site: Site | None
+    site_error: str | None
+    """Reason in one line why the stored site file is unusable."""
+    first_ns: int
+    """First time of measurement; a latched message may be hours older than the file."""
+    last_ns: int
+    trucks: tuple[TruckSummary, ...]
+    gaps: tuple[Gap, ...]
+    passings: tuple[DetectedCrossing, ...]
+    """Detected crossings in order of time."""
+
+
+def summarise_recording(
+    path: Path,
+    site: Site | None = None,
+    on_message: Callable[[Message], object] = lambda message: None,
+    progress: Offset = no_progress,
+) -> RecordingSummary:
+    """Summarise a recording; InputError if it is missing or not MCAP.
+
+    `site` replaces the site file that the recording carries. `take` is called with every message of
+    a logged topic, `progress` with the number of bytes read. An undecodable message is counted and
+    otherwise ignored.
+    """
+    streams: dict[tuple[Key, int], _StreamArrivals] = {}
+    drives = Drives(most_batches=1)
+
+    def note(message: Message) -> None:
+        on_message(message)
+        where = message.key
+        arrivals = streams.setdefault((where, message.boot_id), _StreamArrivals([], Intervals()))
+        if arrivals.sequences.add(message.sequence):
+            arrivals.times_ns.append(message.log_time_ns)
+        drives.add(message)
+
+    info = read_info(path, note, progress)
+    known, site_error = (site, None) if site is not None else _own_site(path, info.site_toml)
+    times = [t for (where, _), h in streams.items() if not _is_latched(where) for t in h.times_ns]
+    return RecordingSummary(
+        path,
+        path.stat().st_size,
+        info,
+        known,
+        site_error,
+        min(times, default=info.first_time_ns),
+        max(times, default=info.last_time_ns),
+        _trucks(streams, _rates(drives.all())),
+        _gaps(streams),
+        () if known is None else _passings(known, drives.all()),
+    )
+
+
+class _StreamArrivals(NamedTuple):
+    times_ns: list[int]
+    sequences: Intervals
+
+
+def _rates(drives: Iterable[DriveMessages]) -> dict[tuple[str, str], dict[str, float]]:
+    """Return the rates of each truck's channels, as its first batch declares them."""
+    rates: dict[tuple[str, str], dict[str, float]] = {}
+    for drive in drives:
+        for batch in drive.batches():
+            declared = {name: channel.rate_hz for name, channel in batch.channels.items()}
+            rates.setdefault((drive.realm, drive.vehicle), declared)
+    return rates
+
+
+def _is_latched(where: Key) -> bool:
+    return topic(where.owner, where.stream).latched
+
+
+def _own_site(path: Path, text: str | None) -> tuple[Site | None, str | None]:
+    if text is None:
+        return None, None
+    try:
+        return parse_site(text, f"{path}: site.toml"), None
+    except InputError as error:
+        return None, str(error)
+
+
+def _trucks(
+    streams: dict[tuple[Key, int], _StreamArrivals], rates: dict[tuple[str, str], dict[str, float]]
+) -> tuple[TruckSummary, ...]:
+    by_truck: dict[tuple[str, str], dict[tuple[str, int], _StreamArrivals]] = {}
+    for (where, boot_id), arrivals in streams.items():
+        if where.owner == "vehicle":
+            of_one = by_truck.setdefault((where.realm, where.identifier), {})
+            of_one[(where.stream, boot_id)] = arrivals
+    found = []
+    for (realm, vehicle), of_truck in sorted(by_truck.items()):
+        moving = [h for (stream, _), h in of_truck.items() if not topic("vehicle", stream).latched]
+        times = [t for arrivals in moving or of_truck.values() for t in arrivals.times_ns]
+        names = sorted({stream for stream, _ in of_truck})
+        found.append(
+            TruckSummary(
+                realm,
+                vehicle,
+                len({boot_id for _, boot_id in of_truck}),
+                min(times),
+                max(times),
+                {
+                    name: _stream(name, [h for (n, _), h in of_truck.items() if n == name])
+                    for name in names
+                },
+                rates.get((realm, vehicle), {}),
+            )
+        )
+    return tuple(found)
+
+
+def _stream(name: str, of_truck: list[_StreamArrivals]) -> StreamSummary:
+    steps = [
+        b - a for arrivals in of_truck for a, b in pairwise(sorted(arrivals.times_ns)) if b > a
+    ]
+    has_rate = topic("vehicle", name).nominal_rate_hz is not None and steps
+    return StreamSummary(
+        sum(arrivals.sequences.size for arrivals in of_truck),
+        sum(b - a + 1 for arrivals in of_truck for a, b in arrivals.sequences.holes()),
+        NS_PER_S / median(steps) if has_rate else None,
+    )
+
+
+def _gaps(streams: dict[tuple[Key, int], _StreamArrivals]) -> tuple[Gap, ...]:
+    """Return the silences within a boot; between two boots the truck was off."""
+    found = []
+    for (where, _), arrivals in streams.items():
+        if topic(where.owner, where.stream).nominal_rate_hz is None or where.owner != "vehicle":
+            continue
+        times = sorted(arrivals.times_ns)
+        found += [
+            Gap(where.identifier, where.stream, before, after)
+            for before, after in pairwise(times)
+            if after - before > LONGEST_SILENCE_S * NS_PER_S
+        ]
+    return tuple(sorted(found, key=lambda gap: (gap.begin_ns, gap.vehicle, gap.stream)))
+
+
+def _passings(site: Site, drives: Iterable[DriveMessages]) -> tuple[DetectedCrossing, ...]:
+    trucks = {vehicle.id: vehicle for vehicle in site.vehicles}
+    bridges = Bridges(site.bridges, site.receiver)
+    found = [
+        passing
+        for drive in drives
+        if drive.vehicle in trucks and drive.fixes
+        for passing in detect_crossings(
+            bridges, drive.realm, trucks[drive.vehicle], boot_of(drive.fixes)
+        )
+    ]
+    return tuple(sorted(found, key=lambda passing: (passing.entry_ns, passing.vehicle)))

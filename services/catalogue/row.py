@@ -1,0 +1,188 @@
+"""The catalogue's row of one recording, computed when it is closed."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from itertools import pairwise
+from typing import BinaryIO, Final, NamedTuple
+
+from schemas.signals import NS_PER_S, decode_accel, decode_gnss
+from schemas.topics import Key, topic
+from services.common.errors import InputError
+from services.common.stores import Entry, Folder, opened
+from services.finding.bridges import Box
+from services.recordings.mcap_ranges import ChunkIndexes, chunk_messages, read_index
+from services.recordings.mcap_scan import RawMessage
+from services.recordings.recording import our_channel
+
+LONGEST_SILENCE_S: Final = 1.0
+"""Silence in s that counts as a gap: a truck sends batches of 50 to 100 ms."""
+_BLOCK_BYTES = 1 << 20
+
+
+class CatalogRow(NamedTuple):
+    """One recording; times in ns since 1970 UTC."""
+
+    path: str
+    """Path relative to the folder of the catalogue, with forward slashes."""
+    size_bytes: int
+    modified_ns: int
+    """Time of modification; 0 where the store does not give one."""
+    content: bytes
+    """SHA-256 of the whole file."""
+    realms: tuple[str, ...]
+    vehicles: tuple[str, ...]
+    first_ns: int
+    """First time of measurement; 0 without one, as for `last_ns`."""
+    last_ns: int
+    messages: int
+    rates_hz: dict[str, float]
+    """Rate of each accelerometer, as its first batch declares it; observed rate of `gnss`."""
+    gaps: int
+    """Number of silences of more than a second while a truck was on."""
+    gap_s: float
+    """Total length of the gaps in s."""
+    box: Box | None
+    """Box round all positions of its trucks; None without positions."""
+
+    @property
+    def day(self) -> str:
+        """Day of its first time, UTC."""
+        return f"{datetime.fromtimestamp(self.first_ns / NS_PER_S, UTC):%Y-%m-%d}"
+
+
+def row_of(folder: Folder, entry: Entry) -> CatalogRow:
+    """Read a closed recording once for its row, and once for its hash.
+
+    Raise InputError if it is unreadable, still open or truncated, or has no driveby message.
+    """
+    where = f"{folder.name}/{entry.name}"
+    with opened(folder, entry.name) as file:
+        index = read_index(file, entry.size_bytes)
+        if index is None:
+            raise InputError(
+                f"{where}: has no index: it is being written, or was cut off "
+                "(driveby recover makes it whole)"
+            )
+        builder = _RowBuilder()
+        try:
+            for key, boot_id, message in _messages(where, file, index):
+                builder.add(key, boot_id, message)
+        except ValueError as error:
+            raise InputError(f"{where}: {error} (driveby recover makes it whole)") from None
+        if not builder.messages:
+            raise InputError(f"{where}: holds no driveby message; a recording is expected")
+        content = file_sha256(file)
+    return builder.row(entry, content)
+
+
+def file_sha256(file: BinaryIO) -> bytes:
+    """Return the SHA-256 of a file."""
+    digest = hashlib.sha256()
+    file.seek(0)
+    while block := file.read(_BLOCK_BYTES):
+        digest.update(block)
+    return digest.digest()
+
+
+def _messages(
+    where: str, file: BinaryIO, index: ChunkIndexes
+) -> Iterator[tuple[Key, int, RawMessage]]:
+    ours = {n: known for n, c in index.channels.items() if (known := our_channel(where, c))}
+    for chunk in index.chunks:
+        for message in chunk_messages(file, chunk, ours):
+            yield *ours[message.channel_id], message
+
+
+class _RowBuilder:
+    """Accumulator of one recording's row."""
+
+    def __init__(self) -> None:
+        self.messages = 0
+        self._times: dict[tuple[Key, int], list[int]] = {}
+        self._rates: dict[str, float] = {}
+        self._realms: set[str] = set()
+        self._positions: list[tuple[float, float]] = []
+
+    def add(self, key: Key, boot_id: int, message: RawMessage) -> None:
+        self.messages += 1
+        self._realms.add(key.realm)
+        if key.owner != "vehicle":
+            return
+        row = topic(key.owner, key.stream)
+        if not row.latched:
+            self._times.setdefault((key, boot_id), []).append(message.log_time_ns)
+        try:
+            if key.stream == "gnss":
+                fix = decode_gnss(message.data)
+                self._positions.append((fix.latitude_deg, fix.longitude_deg))
+            elif key.stream == "accel" and not any(name != "gnss" for name in self._rates):
+                channels = decode_accel(message.data).channels
+                self._rates |= {name: channel.rate_hz for name, channel in channels.items()}
+        except ValueError:
+            return  # it counts as a message and is otherwise ignored
+
+    def row(self, entry: Entry, content: bytes) -> CatalogRow:
+        gaps = [gap for key, times in self._times.items() for gap in _gaps(key[0], times)]
+        every = [t for times in self._times.values() for t in (min(times), max(times))]
+        steps = sorted(
+            b - a
+            for (key, _), times in self._times.items()
+            if key.stream == "gnss"
+            for a, b in pairwise(sorted(times))
+            if b > a
+        )
+        rates = dict(self._rates)
+        if steps:
+            rates["gnss"] = round(NS_PER_S / steps[len(steps) // 2], 2)
+        return CatalogRow(
+            entry.name,
+            entry.size_bytes,
+            entry.modified_ns,
+            content,
+            tuple(sorted(self._realms)),
+            tuple(sorted({key.identifier for key, _ in self._times})),
+            min(every, default=0),
+            max(every, default=0),
+            self.messages,
+            rates,
+            len(gaps),
+            round(sum(gaps) / NS_PER_S, 3),
+            _box(self._positions),
+        )
+
+
+def _gaps(key: Key, times: list[int]) -> list[int]:
+    """Return the silences within a boot in ns; between two boots the truck was off."""
+    if topic(key.owner, key.stream).nominal_rate_hz is None:
+        return []
+    steps = (b - a for a, b in pairwise(sorted(times)))
+    return [step for step in steps if step > LONGEST_SILENCE_S * NS_PER_S]
+
+
+def _box(positions: list[tuple[float, float]]) -> Box | None:
+    """Return the smallest box round all positions, across the meridian of 180° if smaller."""
+    if not positions:
+        return None
+    south, north = min(p[0] for p in positions), max(p[0] for p in positions)
+    west, east = min(p[1] for p in positions), max(p[1] for p in positions)
+    turned = [p[1] % 360.0 for p in positions]
+    if max(turned) - min(turned) < east - west:
+        west, east = min(turned), max(turned)
+        if west > 180.0:
+            west, east = west - 360.0, east - 360.0
+    return Box(south, west, north, east)
+
+
+def details_text(row: CatalogRow) -> str:
+    """Return the fields without a column of their own, as JSON."""
+    fields = {
+        "realms": row.realms,
+        "vehicles": row.vehicles,
+        "rates_hz": row.rates_hz,
+        "gaps": row.gaps,
+        "gap_s": row.gap_s,
+        "messages": row.messages,
+    }
+    return json.dumps(fields, separators=(",", ":"))

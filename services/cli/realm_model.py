@@ -1,0 +1,318 @@
+"""State of a realm for `driveby watch`: messages in; trucks, crossings, bridges out.
+
+No bus, no terminal, no clock: the time is given with each message.
+"""
+
+from collections import deque
+from typing import Final, NamedTuple
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from schemas.alarms import Alarm, alarm_of
+from schemas.proto import driveby_pb2 as pb
+from schemas.results import (
+    BridgeResult,
+    CrossingResult,
+    LowestElement,
+    lowest_element,
+    verdict_line,
+)
+from schemas.results_on_the_wire import estimate_to_crossing, state_to_bridge
+from schemas.signals import decode_accel, decode_gnss
+from services.bus.realm_listener import BusMessage
+from services.common.errors import one_line
+from services.identification.comparison import Estimate, compare, estimate_of_state
+from services.viewer.crossing_view import ResultElements, elements_of_result, view_of_crossing
+
+_RATE_S: Final = 5.0
+"""Duration in s over which rates are computed."""
+SILENT_S: Final = 3.0
+"""Silence in s after which a truck does not drive."""
+_MOST_CROSSINGS: Final = 200
+_MOST_TRUCKS: Final = 200
+_MOST_BRIDGES: Final = 200
+_MOST_SERVICES: Final = 50
+
+_STATES: Final = {
+    pb.DETECTED: "on the bridge",
+    pb.COMPLETE: "complete",
+    pb.WAITING_NOT_VALIDATED: "waits for a certificate",
+    pb.IDENTIFYING: "identifying",
+    pb.DONE: "done",
+}
+
+
+class TruckRow:
+    """State of one truck, by its last messages."""
+
+    def __init__(self) -> None:
+        self.batches: deque[float] = deque(maxlen=1000)
+        self.fixes: deque[float] = deque(maxlen=1000)
+        self.channels: dict[str, float] = {}
+        """Rate of each accelerometer in Hz."""
+        self.speed_m_per_s: float | None = None
+        self.lag_s = 0.0
+        """Age of its newest samples at their arrival, s."""
+        self.received_s = 0.0
+
+    def rates(self, now_s: float) -> tuple[float, float]:
+        """Return batches and fixes per second."""
+        counts = [sum(now_s - s <= _RATE_S for s in times) for times in (self.batches, self.fixes)]
+        return counts[0] / _RATE_S, counts[1] / _RATE_S
+
+
+class CrossingRow(NamedTuple):
+    """One crossing."""
+
+    crossing_id: str
+    vehicle: str
+    bridge: str
+    forward: bool
+    entry_ns: int
+    state: str
+    """State on the way to its result; then the verdict."""
+    fraction: float | None = None
+    ratios: tuple[float, ...] = ()
+    """EI of each element over nominal."""
+    weak: frozenset[int] = frozenset()
+    """Numbers of the elements that are clearly weaker than the others."""
+    lowest: LowestElement | None = None
+    reason: str = ""
+    """Codes of its reasons."""
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether it has its result."""
+        return self.state in ("good", "suspect", "rejected", "done")
+
+
+class BridgeRow(NamedTuple):
+    """One bridge, by all crossings up to now."""
+
+    used: int
+    verdict: str
+    ratios: tuple[float, ...]
+    weak: frozenset[int]
+    lowest: str
+    finding: str
+
+
+class ServiceRow(NamedTuple):
+    """One service, by its last `health`."""
+
+    ok: bool
+    time_ns: int
+    figures: dict[str, float]
+    note: str
+
+
+class RealmModel:
+    """State of one realm, of bounded size."""
+
+    def __init__(self) -> None:
+        self.trucks: dict[str, TruckRow] = {}
+        self.crossings: dict[str, CrossingRow] = {}
+        """Crossings by identity, in the order of their first messages."""
+        self.bridges: dict[str, BridgeRow] = {}
+        self.alarms: dict[str, Alarm] = {}
+        """The last alarm of each bridge, acknowledged or not."""
+        self.services: dict[str, ServiceRow] = {}
+        self.work: dict[str, str] = {}
+        """Present work of a service besides crossings, such as a site validation."""
+        self._elements: dict[str, ResultElements] = {}
+
+    def ingest(self, message: BusMessage, now_s: float, now_ns: int) -> str | None:
+        """Add a message at a time: steady clock in s, wall clock in ns.
+
+        Return a line on what is new for a reader of a log. Undecodable messages are skipped.
+        """
+        key, _, payload = message
+        try:
+            match (key.owner, key.stream):
+                case ("vehicle", "accel" | "gnss"):
+                    return self._take_signal(key.identifier, key.stream, payload, now_s, now_ns)
+                case ("bridge", "crossing"):
+                    return self._take_state(pb.Crossing.FromString(payload))
+                case ("bridge", "estimate"):
+                    return self._take_result(
+                        estimate_to_crossing(pb.Estimate.FromString(payload))[0]
+                    )
+                case ("bridge", "state"):
+                    bridge, _, state = state_to_bridge(pb.BridgeState.FromString(payload))
+                    return self._take_bridge(bridge, state)
+                case ("bridge", "alarm"):
+                    return self._take_alarm(alarm_of(pb.Alarm.FromString(payload), key.realm))
+                case ("service", "health"):
+                    return self._take_health(key.identifier, pb.Health.FromString(payload))
+                case ("service", "progress"):
+                    self._take_progress(key.identifier, pb.Progress.FromString(payload))
+        except (ValueError, DecodeError):
+            pass
+        return None
+
+    @property
+    def waiting(self) -> int:
+        """Return the number of crossings without a result whose truck has left."""
+        return sum(not row.is_over and row.state != "on the bridge" for row in self.rows())
+
+    def rows(self) -> list[CrossingRow]:
+        """Return the crossings, the newest first."""
+        return sorted(self.crossings.values(), key=lambda row: row.entry_ns, reverse=True)
+
+    def _take_signal(
+        self, vehicle: str, stream: str, payload: bytes, now_s: float, now_ns: int
+    ) -> str | None:
+        truck = self.trucks.get(vehicle)
+        is_new = truck is None or now_s - truck.received_s > SILENT_S
+        if truck is None:
+            if len(self.trucks) >= _MOST_TRUCKS:
+                self.trucks.pop(min(self.trucks, key=lambda name: self.trucks[name].received_s))
+            truck = self.trucks[vehicle] = TruckRow()
+        truck.received_s = now_s
+        if stream == "accel":
+            batch = decode_accel(payload)
+            truck.channels = {name: one.rate_hz for name, one in batch.channels.items()}
+            truck.batches.append(now_s)
+            lasts_s = max(one.samples.size / one.rate_hz for one in batch.channels.values())
+            truck.lag_s = (now_ns - batch.wall_time_ns) * 1e-9 - lasts_s
+        else:
+            truck.speed_m_per_s = decode_gnss(payload).speed_m_per_s
+            truck.fixes.append(now_s)
+        return f"{vehicle} drives" if is_new else None
+
+    def _take_state(self, message: pb.Crossing) -> str | None:
+        state = _STATES.get(message.state, "")
+        row = self.crossings.get(message.crossing_id)
+        if not state or (row is not None and (row.is_over or row.state == state)):
+            return None
+        forward = message.direction != pb.END_TO_START
+        if row is None:
+            self._make_room()
+            row = CrossingRow(
+                message.crossing_id, message.vehicle, message.bridge, forward,
+                message.entry_time_ns, state,
+            )  # fmt: skip
+        self.crossings[row.crossing_id] = row._replace(state=state, fraction=None)
+        return f"{route_text(row)}: {state}"
+
+    def _take_result(self, crossing: CrossingResult) -> str:
+        row = CrossingRow(
+            crossing.crossing_id,
+            crossing.vehicle,
+            crossing.bridge,
+            crossing.direction == "start_to_end",
+            round(crossing.entry_time * 1e9),
+            crossing.verdict,
+            lowest=lowest_element(crossing),
+            reason=", ".join(crossing.reasons),
+        )
+        elements = elements_of_result(crossing)
+        if elements is not None:
+            if len(self._elements) >= _MOST_BRIDGES:
+                self._elements.pop(next(iter(self._elements)))
+            self._elements[crossing.bridge] = elements
+            row = _with_elements(row, crossing, elements)
+        self._make_room()
+        self.crossings[row.crossing_id] = row
+        return f"{route_text(row)}: {verdict_line(crossing)}"
+
+    def _take_bridge(self, bridge: str, state: BridgeResult) -> str | None:
+        elements = self._elements.get(bridge)
+        ratios: tuple[float, ...] = ()
+        weak = frozenset[int]()
+        lowest = state.weakest_element or ""
+        if elements is not None and len(state.elements) == elements.elements:
+            nominal = elements.nominal_flexural_rigidity_nm2
+            over = [
+                LowestElement(name, one.mean / ei, one.q025 / ei, one.q975 / ei)
+                for (name, one), ei in zip(state.elements.items(), nominal, strict=True)
+            ]
+            ratios = tuple(one.ratio for one in over)
+            edges_m = np.concatenate(([0.0], np.cumsum(elements.lengths_m)))
+            compared = compare(estimate_of_state(state), np.array(nominal), edges_m)
+            weak = frozenset(one.number for one in (compared.weak if compared else ()))
+            lowest = str(min(over, key=lambda one: one.ratio))
+        if bridge not in self.bridges and len(self.bridges) >= _MOST_BRIDGES:
+            self.bridges.pop(next(iter(self.bridges)))
+        used = len(state.crossings_used)
+        row = BridgeRow(used, state.verdict or "", ratios, weak, lowest, state.finding or "")
+        if self.bridges.get(bridge) == row:
+            return None
+        self.bridges[bridge] = row
+        crossings = f"{used} crossing{'' if used == 1 else 's'}"
+        return f"{bridge} by {crossings}: {row.finding or row.lowest or row.verdict}"
+
+    def _take_alarm(self, alarm: Alarm) -> str | None:
+        before = self.alarms.get(alarm.bridge)
+        if before == alarm:
+            return None  # it is republished after a restart of its service
+        if before is None and len(self.alarms) >= _MOST_BRIDGES:
+            self.alarms.pop(min(self.alarms, key=lambda name: _weight(self.alarms[name])))
+        self.alarms[alarm.bridge] = alarm
+        return f"alarm of {alarm.bridge}: {alarm.sentence()}: {alarm_state(alarm)}"
+
+    def _take_health(self, name: str, message: pb.Health) -> str:
+        if name not in self.services and len(self.services) >= _MOST_SERVICES:
+            self.services.pop(next(iter(self.services)))
+        service = ServiceRow(message.ok, message.time_ns, dict(message.figures), message.note)
+        self.services[name] = service
+        figures = service_figures(service)
+        return f"{name} is {'well' if service.ok else 'NOT WELL'}{figures and f': {figures}'}"
+
+    def _take_progress(self, service: str, message: pb.Progress) -> None:
+        row = self.crossings.get(message.crossing_id)
+        if row is not None and not row.is_over:
+            self.crossings[row.crossing_id] = row._replace(fraction=message.fraction)
+        elif not message.crossing_id and message.fraction < 1.0:
+            self.work[service] = f"{message.stage}, {message.fraction:.0%}"
+        else:
+            self.work.pop(service, None)
+
+    def _make_room(self) -> None:
+        if len(self.crossings) >= _MOST_CROSSINGS:
+            self.crossings.pop(min(self.crossings, key=lambda name: self.crossings[name].entry_ns))
+
+
+def route_text(row: CrossingRow) -> str:
+    """Return vehicle, bridge and direction."""
+    return f"{row.vehicle} {'→' if row.forward else '←'} {row.bridge}"
+
+
+def _weight(alarm: Alarm) -> tuple[bool, float]:
+    """Return a weight whose least goes first: acknowledged before standing, then the oldest."""
+    return alarm.acknowledged is None, alarm.raised
+
+
+def alarm_state(alarm: Alarm) -> str:
+    """Return whether an alarm stands, or who acknowledged it."""
+    note = alarm.acknowledged
+    return "stands" if note is None else f"acknowledged by {one_line(note.by)}"
+
+
+def service_figures(service: ServiceRow) -> str:
+    """Return the figures of a service that are shown besides its health."""
+    known = service.figures
+    parts = []
+    if "rate_per_s" in known:
+        parts.append(f"{known['rate_per_s']:.0f} messages/s")
+    parts += [f"{name} {known[name]:.0f}" for name in ("queue", "lost", "dropped") if name in known]
+    if service.note:
+        parts.append(service.note)
+    return ", ".join(parts)
+
+
+def _with_elements(
+    row: CrossingRow, crossing: CrossingResult, elements: ResultElements
+) -> CrossingRow:
+    view = view_of_crossing(crossing, elements)
+    if view.rigidity_nm2 is None or view.interval_nm2 is None:
+        return row
+    ratios = tuple((view.rigidity_nm2 / view.nominal_nm2).tolist())
+    weak: frozenset[int] = frozenset()
+    if view.verdict == "good" and view.interval_has_meaning:
+        low, high = np.asarray(view.interval_nm2).T
+        found = Estimate(view.rigidity_nm2, low, high, view.scale_error)
+        compared = compare(found, view.nominal_nm2, view.element_edges_m)
+        weak = frozenset(one.number for one in (compared.weak if compared else ()))
+    return row._replace(ratios=ratios, weak=weak)

@@ -1,0 +1,105 @@
+"""Modules run like `python -m`, in a process that ends with its parent.
+
+    python -m services.common.child_process MODULE ARGUMENT…
+
+Standard input is a pipe into which nothing is ever written. It ends when the parent closes it or
+dies, however it dies. A child that survived would rename recordings which the next logger is about
+to read. (Linux can kill a child with its parent, but takes the thread that started it for the
+parent.)
+"""
+
+import multiprocessing
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from multiprocessing.process import BaseProcess
+from typing import NamedTuple
+
+from services.common.errors import EXIT_INTERRUPTED
+
+_CLEAN_UP_S = 2.0
+"""Time to remove incomplete files; then the process ends in any case."""
+_POLL_S = 0.1
+"""Longest delay of the parent's end while a child works."""
+_NICE = 15
+"""Priority of children that run gently."""
+
+
+class ChildOutput(NamedTuple):
+    """Exit code and output of a child that has ended."""
+
+    code: int
+    out: str
+    log: str
+    """Standard error."""
+
+
+def run_gently(arguments: Sequence[str], closing: threading.Event) -> ChildOutput | None:
+    """Run a module with its arguments at low priority; return None if it was interrupted.
+
+    It is interrupted when `closing` is set, and ends with this process, even if this one is killed.
+    """
+    its_end, our_end = os.pipe()
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "services.common.child_process", *arguments],
+            stdin=its_end,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    finally:
+        os.close(its_end)
+    with process, os.fdopen(our_end, "wb") as leash:
+        os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
+        while True:
+            try:
+                out, log = process.communicate(timeout=_POLL_S)
+            except subprocess.TimeoutExpired:
+                if closing.is_set():
+                    leash.close()
+                    process.communicate()
+                    return None
+                continue
+            if process.returncode == EXIT_INTERRUPTED:
+                return None
+            return ChildOutput(process.returncode, out, log)
+
+
+def end_with_parent() -> None:
+    """Let this process of a pool end at once when its parent dies: an initializer.
+
+    Otherwise it would finish its work for nobody, and then wait for more for ever.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_after, args=(parent,), name="leash", daemon=True).start()
+
+
+def _end_after(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(EXIT_INTERRUPTED)
+
+
+def _end_with_standard_input() -> None:
+    while os.read(0, 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(_CLEAN_UP_S)
+    os._exit(EXIT_INTERRUPTED)
+
+
+def main(module: str, *arguments: str) -> None:
+    """Run the module; its exit code is that of this process."""
+    threading.Thread(target=_end_with_standard_input, name="leash", daemon=True).start()
+    sys.argv = [module, *arguments]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

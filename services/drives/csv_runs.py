@@ -1,0 +1,113 @@
+"""Runs of CSV files: in the form of the contract directly, in any other by map or guess.
+
+The exact reader comes first; only files that it refuses, or whose numbers contradict it, are read
+as a vendor's table. Guesses that change numbers must be confirmed.
+"""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from schemas.site import Site
+from services.common.errors import InputError
+from services.common.progress import Steps, no_step_progress
+from services.drives.csv_import import read_folder, read_pair
+from services.drives.plausible import check_plausible
+from services.drives.runs import Run
+from services.drives.tables.findings import Target
+from services.drives.tables.mapping import ImportMap
+from services.drives.tables.reading import Understood, understand
+from services.finding.placed import rates_hz
+
+_log = logging.getLogger(__name__)
+_MOST_SHOWN = 3
+_OTHER_FORM = (": line 1: ", "holds no accel_NN.csv", "is not UTF-8 text")
+"""Errors of the exact reader for files of another form."""
+
+
+class HowToRead(NamedTuple):
+    """Options for files that are not in the form of the contract."""
+
+    mapping: ImportMap | None = None
+    zone: str | None = None
+    start: str | None = None
+    accepts_guesses: bool = False
+    reading: Steps = no_step_progress
+    """Callback for the number of files read."""
+
+
+AS_WRITTEN = HowToRead()
+
+
+def csv_runs(
+    sources: Sequence[Path], site: Site, vehicle_id: str, how: HowToRead = AS_WRITTEN
+) -> list[Run]:
+    """Return the runs of a folder or of a pair of files, axes and gravity as the site declares.
+
+    Raise InputError, in one line, if they cannot be read, or only by unconfirmed guesses.
+    """
+    found = understood_runs(sources, site, vehicle_id, how)
+    conversions = found.conversions()
+    if conversions and not how.accepts_guesses:
+        shown = "; ".join(conversions[:_MOST_SHOWN])
+        more = len(conversions) - _MOST_SHOWN
+        raise InputError(
+            f"{sources[0]}: is read by guesses that change numbers ({shown}"
+            f"{f'; and {more} more' if more > 0 else ''}): driveby import --preview shows them, "
+            "--yes or a map (--preview --write-map MAP.toml, then --map MAP.toml) confirms them"
+        )
+    for guess in found.guesses:
+        _log.log(logging.INFO if guess.kind == "form" else logging.WARNING, "%s", guess.text)
+    return found.runs
+
+
+def understood_runs(
+    sources: Sequence[Path], site: Site, vehicle_id: str, how: HowToRead = AS_WRITTEN
+) -> Understood:
+    """Return the runs with all guesses, confirmed or not."""
+    if len(sources) > 2:
+        raise InputError(f"{len(sources)} files given, a folder or accel.csv gps.csv expected")
+    vehicle = site.vehicle(vehicle_id)
+    exact: InputError | None = None
+    if how.mapping is None:
+        try:
+            runs = exact_runs(sources, vehicle.channels, how.reading)
+            for run in runs:
+                check_plausible(run, site, vehicle)
+        except InputError as error:
+            exact = error
+            if not all(path.exists() for path in sources):
+                raise
+        else:
+            return Understood(runs, [], ImportMap())
+    declared = next(iter(rates_hz(site.sensor, vehicle).values()))
+    target = Target(site, vehicle, declared, how.zone, how.start)
+    try:
+        found = understand(sources, how.mapping or ImportMap(), target)
+        for run in found.runs:
+            check_plausible(run, site, None)
+    except InputError as error:
+        raise _better(exact, error) from error
+    return found
+
+
+def exact_runs(
+    sources: Sequence[Path], channels: tuple[str, ...] | None, reading: Steps = no_step_progress
+) -> list[Run]:
+    """Return the runs of files in the form of the contract; InputError for other files."""
+    if len(sources) == 1 and sources[0].suffix == ".csv":
+        raise InputError(f"{sources[0]}: the positions are missing, give accel.csv and gps.csv")
+    if len(sources) == 1:
+        return read_folder(sources[0], reading, channels)
+    return [read_pair(sources[0], sources[1], channels)]
+
+
+def _better(exact: InputError | None, general: InputError) -> InputError:
+    """Return the more helpful error: the exact one where the files have the contract's form."""
+    if exact is None:
+        return general
+    if "no such file" in str(exact) or "holds no table" in str(general):
+        return exact
+    is_other_form = any(words in str(exact) for words in _OTHER_FORM)
+    return general if is_other_form or "--" in str(general) else exact

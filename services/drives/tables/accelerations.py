@@ -1,0 +1,122 @@
+"""Accelerations of tables in m/s², with axes and gravity as the site file declares them."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.signals import CHANNELS, MAX_ACCELERATION_M_PER_S2
+from services.common.errors import InputError
+from services.drives.tables import judged
+from services.drives.tables.findings import Findings, Target
+from services.drives.tables.judged import Gravity
+from services.drives.tables.mapping import ColumnMap
+from services.drives.tables.parts import TablePart
+from services.drives.tables.units import ACCELERATION, G, unit_of
+
+Floats = NDArray[np.float64]
+
+
+def scaled(
+    channels: Mapping[str, Floats],
+    rate_hz: float,
+    owner: Mapping[str, TablePart],
+    target: Target,
+    found: Findings,
+) -> dict[str, Floats]:
+    """Return accelerations in m/s²."""
+    units: dict[str, str] = {}
+    heads: dict[str, str] = {}
+    for name in channels:
+        part = owner[name]
+        declared_as = part.given.columns.get(name, ColumnMap()).unit
+        head = unit_of(part.placed[name].unit or "")
+        if declared_as is not None:
+            units[name] = declared_as
+        elif head in ACCELERATION:
+            units[name] = head
+            if head != "m/s2":
+                heads[name] = head
+    for head in dict.fromkeys(heads.values()):
+        names = [name for name, one in heads.items() if one == head]
+        found.guess(owner[names[0]], f"by the header in {head}: {', '.join(names)}")
+    rest = {name: values for name, values in channels.items() if name not in units}
+    if rest:
+        site, vehicle = target.site, target.vehicle
+        ratio = judged.noise_ratio(rest, rate_hz, site, vehicle)
+        unit = judged.unit_by_numbers(rest, ratio)
+        first = owner[next(iter(rest))]
+        if unit is None:
+            if all(owner[name].placed[name].why != "exact" for name in rest):
+                raise judged.refuse_unit(str(first.sheet.path), ratio)
+            unit = judged.UnitFound("m/s2", "as their names want it")
+        for name in rest:
+            units[name] = unit.unit
+        if unit.unit != "m/s2":
+            found.guess(first, f"accelerations are in {unit.unit}: {unit.why}")
+    for name, unit_name in units.items():
+        if unit_name not in ACCELERATION:
+            raise InputError(
+                f"{owner[name].sheet.path}: {name} of the map is in {unit_name}, it must be "
+                f"one of {', '.join(ACCELERATION)}"
+            )
+        found.column(owner[name], name, unit=unit_name)
+    scaled_to = {name: values * ACCELERATION[units[name]] for name, values in channels.items()}
+    for name, values in scaled_to.items():
+        if np.abs(values).max() > MAX_ACCELERATION_M_PER_S2:
+            raise InputError(
+                f"{owner[name].sheet.path}: {name} reaches {np.abs(values).max():.3g} m/s², at "
+                f"most {MAX_ACCELERATION_M_PER_S2:g} expected: give its unit in a map (--map)"
+            )
+    return scaled_to
+
+
+def as_declared(
+    channels: Mapping[str, Floats], owner: Mapping[str, TablePart], target: Target, found: Findings
+) -> dict[str, Floats]:
+    """Return accelerations with gravity and axes as the site file declares them."""
+    sensor = target.site.sensor
+    is_placed = bool(target.vehicle.sensors)
+    signs = {} if is_placed else dict(zip(CHANNELS, sensor.up, strict=True))
+    site = {n: Gravity(sensor.gravity_included, signs.get(n, 1)) for n in channels}
+    declared_as = {}
+    for name in channels:
+        one = owner[name].given.columns.get(name, ColumnMap())
+        declared_as[name] = Gravity(
+            site[name].is_included if one.gravity_included is None else one.gravity_included,
+            site[name].up if one.up is None else one.up,
+        )
+    where = str(next(iter(owner.values())).sheet.path)
+    seen = judged.gravity_of(channels, declared_as, where)
+    for name, gravity in seen.items():
+        part = owner[name]
+        one = part.given.columns.get(name, ColumnMap())
+        if gravity != declared_as[name] and (
+            one.gravity_included is not None or one.up is not None
+        ):
+            raise InputError(
+                f"{part.sheet.path}: {name} of the map is said to "
+                f"{'have' if declared_as[name].is_included else 'be without'} gravity, its mean is "
+                f"{float(np.mean(channels[name])):.3g} m/s²"
+            )
+        found.column(part, name, gravity_included=gravity.is_included, up=gravity.up)
+    for gravity in dict.fromkeys(seen.values()):
+        names = [name for name in channels if seen[name] == gravity != declared_as[name]]
+        if names:
+            text = f"{_described(gravity)} {', '.join(names)}, [sensor] says otherwise"
+            found.guess(owner[names[0]], text)
+    declared = {}
+    for name, values in channels.items():
+        own, wanted = seen[name], site[name]
+        if own == wanted:
+            declared[name] = values
+            continue
+        upward = own.up * values - (G if own.is_included else 0.0)
+        declared[name] = wanted.up * (upward + (G if wanted.is_included else 0.0))
+    return declared
+
+
+def _described(gravity: Gravity) -> str:
+    if not gravity.is_included:
+        return "no gravity is in"
+    return "gravity is in" if gravity.up > 0 else "gravity is in, and downward in"

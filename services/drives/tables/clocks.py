@@ -1,0 +1,101 @@
+"""Start times of tables, and agreement between the clocks of one run's files."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.common.errors import InputError
+from services.drives.tables.findings import Findings, Target
+from services.drives.tables.parts import TablePart
+from services.drives.tables.stamps import start_of, to_utc, zone_of
+
+Floats = NDArray[np.float64]
+
+_MOST_QUARTERS: Final = 4 * 14
+"""Largest difference between UTC and a country's clocks, in quarters of an hour."""
+
+
+def begins(
+    parts: Sequence[TablePart], run: str, runs: int, target: Target, found: Findings
+) -> dict[str, float]:
+    """Return the seconds to be added to the times of each file."""
+    add_s: dict[str, float] = {}
+    zoned = [p for p in parts if not p.times.is_relative and not p.times.needs_zone]
+    for part in parts:
+        given_time = part.given.time
+        where = str(part.sheet.path)
+        add_s[part.name] = given_time.offset_s or 0.0
+        if part.times.is_relative:
+            add_s[part.name] += _start(part, run, runs, target, found)
+        elif part.times.needs_zone and target.zone is None and given_time.zone is None:
+            if not any(_overlap(part, other) for other in zoned):
+                raise InputError(
+                    f"{where}: times have no zone: give --zone UTC, --zone +01:00 or --zone "
+                    "Europe/Berlin (in a map: zone in [file.time])"
+                )
+            found.time(part, zone="UTC")
+            found.guess(part, "times without a zone are UTC, as the other file's are")
+        elif part.times.needs_zone:  # days of a spreadsheet
+            first_s = np.array([np.nanmin(part.times.time_s)])
+            zone = zone_of(given_time.zone or target.zone or "", where)
+            add_s[part.name] += float(to_utc(first_s, zone)[0] - first_s[0])
+        if part.times.is_relative and len(parts) > 1 and all(p.times.is_relative for p in parts):
+            found.guess(part, "times count from the same start as those of the other files", "lost")
+        if target.zone is not None and given_time.zone is None and part.times.format in (
+            "date", "excel_days",
+        ):  # fmt: skip
+            found.time(part, zone=target.zone)
+    return add_s
+
+
+def _start(part: TablePart, run: str, runs: int, target: Target, found: Findings) -> float:
+    """Return the start of a drive whose times count from it."""
+    given_time = part.given.time.start
+    if isinstance(given_time, dict):
+        given_time = given_time.get(run)
+    where = f"{part.sheet.path}: start"
+    zone = None if target.zone is None else zone_of(target.zone, "--zone")
+    if given_time is not None:
+        return start_of(given_time, zone, where)
+    if target.start is None or runs > 1:
+        several = 'of each run in [file.time] of a map, start = { 01 = "…" } (--map)'
+        how = several if runs > 1 else "with --start 2026-05-01T09:30:00+02:00"
+        raise InputError(
+            f"{part.sheet.path}: times count from the start of the drive, give that {how}"
+        )
+    start_s = start_of(target.start, zone, "--start")
+    text = target.start
+    if zone is not None and not re.search(r"(Z|[+-]\d\d:?\d\d)$|^[\d.]+$", text):
+        text = str(start_s)
+    found.time(part, start=text)
+    return start_s
+
+
+def _overlap(one: TablePart, other: TablePart) -> bool:
+    a, b = one.times.time_s, other.times.time_s
+    return bool(np.nanmin(a) <= np.nanmax(b) and np.nanmin(b) <= np.nanmax(a))
+
+
+def check_overlap(
+    source: str, time_s: Floats, part: TablePart, fixes: Mapping[str, Floats]
+) -> None:
+    """Raise InputError if positions and accelerations are not of one time."""
+    other_s = fixes["time_s"]
+    if other_s[0] <= time_s[-1] and time_s[0] <= other_s[-1]:
+        return
+    apart_s = float(other_s[0] - time_s[0])
+    quarters = round(apart_s / 900.0)
+    name = Path(source).name
+    if not 0 < abs(quarters) <= _MOST_QUARTERS or abs(apart_s - 900.0 * quarters) > 60.0:
+        raise InputError(
+            f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, the clocks of both must agree"
+        )
+    raise InputError(
+        f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, {abs(quarters) / 4:g} h: another "
+        f"time zone: the clocks must agree; set offset_s = {-900.0 * quarters:.0f} in its "
+        "[file.time] of a map (--map), or zone"
+    )

@@ -1,0 +1,208 @@
+"""Assignment of a table's columns to quantities: by name, or by position without names."""
+
+import re
+import unicodedata
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.common.errors import InputError
+from services.drives.tables.dialect import Sheet
+from services.drives.tables.mapping import POSITION_COLUMNS, ColumnName, FileMap
+from services.drives.tables.units import unit_in
+
+TIME: Final = "time_s"
+DATE: Final = "date"
+WEEK: Final = "week"
+
+_EXACT: Final = {name: name for name in (TIME, *POSITION_COLUMNS)}
+_WORDS: Final = {
+    TIME: "time timestamp t zeit zeitstempel utc uhrzeit epoch datetime datumzeit unixtime tow "
+    "itow sow sample index samples",
+    DATE: "date datum",
+    WEEK: "week gpsweek wn woche gpswoche",
+    "latitude_deg": "latitude lat breite breitengrad",
+    "longitude_deg": "longitude lon long lng laenge laengengrad länge längengrad",
+    "altitude_m": "altitude alt height elevation ele hoehe höhe h msl",
+    "speed_mps": "speed velocity geschwindigkeit sog v vel groundspeed tempo speedoverground",
+}
+_BODY: Final = {"body", "sprung", "aufbau", "frame", "chassis", "rahmen", "cabin", "oben", "upper"}
+_AXLE: Final = {"axle", "unsprung", "wheel", "achse", "rad", "hub", "radtraeger", "unten", "lower"}
+_FRONT: Final = {"front", "vorn", "vorne", "va", "f", "v", "fr", "vorderachse"}
+_REAR: Final = {"rear", "back", "hinten", "hinter", "ha", "r", "h", "re", "hinterachse"}
+_FILLERS: Final = frozenset(
+    [
+        "gps",
+        "gnss",
+        "acc",
+        "accel",
+        "acceleration",
+        "beschleunigung",
+        "deg",
+        "m",
+        "s",
+        "z",
+        "az",
+        "value",
+        "wgs84",
+        "ms",
+        "utc",
+        "unix",
+        "of",
+        "the",
+        "in",
+        "seconds",
+    ]
+)
+
+
+class Placed(NamedTuple):
+    """Column of a quantity, from 0, the unit in its header, and the reason for the choice."""
+
+    column: int
+    unit: str | None
+    why: str
+    """One of "exact", "given", "name" and "order"."""
+
+
+def placed_columns(
+    sheet: Sheet, given: FileMap, channels: Sequence[str]
+) -> tuple[dict[str, Placed], list[str]]:
+    """Return the column of each quantity, and the names of unused columns.
+
+    Columns of a table without known names are assigned by their order if their number fits: a time
+    and the accelerations, or a time, latitude, longitude, and further altitude and speed.
+    """
+    found = _given(sheet, given, channels)
+    assigned = {one.column for one in found.values()}
+    for column, head in enumerate(sheet.header):
+        if column in assigned:
+            continue
+        name, unit = unit_in(head)
+        if column < len(sheet.units) and sheet.units[column]:
+            unit = sheet.units[column]
+        quantity, why = _quantity(head, name, channels)
+        if quantity is None or quantity in found:
+            continue
+        found[quantity] = Placed(column, unit, why)
+        assigned.add(column)
+    if not set(found) - {TIME, DATE, WEEK}:
+        found |= _by_order(sheet, found, channels)
+    used = {one.column for one in found.values()}
+    unused = [head for column, head in enumerate(sheet.header) if column not in used]
+    return found, unused
+
+
+def column_number(sheet: Sheet, column: ColumnName, key: str) -> int:
+    """Return the number, from 0, of a column that a map names; InputError if it does not exist."""
+    if isinstance(column, int):
+        if column > sheet.width:
+            raise InputError(
+                f"{sheet.path}: {key} of the map is column {column}, the file has {sheet.width}"
+            )
+        return column - 1
+    if column not in sheet.header:
+        known = ", ".join(sheet.header[:12]) or "no header"
+        raise InputError(
+            f'{sheet.path}: {key} of the map is column "{column}", the file has {known}'
+        )
+    return sheet.header.index(column)
+
+
+def _given(sheet: Sheet, given: FileMap, channels: Sequence[str]) -> dict[str, Placed]:
+    """Return the columns that the map names."""
+    known = (*POSITION_COLUMNS, *channels)
+    found = {}
+    for quantity, one in given.columns.items():
+        if quantity not in known:
+            raise InputError(
+                f"{sheet.path}: the map's columns.{quantity} is not known, it must be one of "
+                f"{', '.join(known)}"
+            )
+        if one.column is not None:
+            number = column_number(sheet, one.column, f"columns.{quantity}")
+            found[quantity] = Placed(number, _head_unit(sheet, number), "given")
+        elif quantity in sheet.header:
+            number = sheet.header.index(quantity)
+            found[quantity] = Placed(number, _head_unit(sheet, number), "exact")
+    for quantity, column in (
+        (TIME, given.time.column),
+        (DATE, given.time.date_column),
+        (WEEK, given.time.week_column),
+    ):
+        if column is not None:
+            number = column_number(sheet, column, f"time of {quantity}")
+            found[quantity] = Placed(number, _head_unit(sheet, number), "given")
+    return found
+
+
+def _head_unit(sheet: Sheet, column: int) -> str | None:
+    if column < len(sheet.units) and sheet.units[column]:
+        return sheet.units[column]
+    return unit_in(sheet.header[column])[1] if column < len(sheet.header) else None
+
+
+def _quantity(head: str, name: str, channels: Sequence[str]) -> tuple[str | None, str]:
+    """Return the quantity of a column by its name, and how certain that is."""
+    if head in channels or head in _EXACT:
+        return head, "exact"
+    words = _words(name)
+    plain = "".join(words)
+    for channel in channels:
+        if plain == "".join(_words(channel)):
+            return channel, "name"
+    words_used = [word for word in words if word not in _FILLERS] or words
+    for quantity, known in _WORDS.items():
+        if "".join(words_used) in known.split() or (
+            len(words_used) == 1 and words_used[0] in known.split()
+        ):
+            return quantity, "name"
+    sides = [
+        [part for part, known in pair if known & set(words)]
+        for pair in (
+            (("sprung", _BODY), ("unsprung", _AXLE)),
+            (("front", _FRONT), ("rear", _REAR)),
+        )
+    ]
+    if all(len(side) == 1 for side in sides):
+        channel = f"{sides[0][0]}_{sides[1][0]}"
+        if channel in channels:
+            return channel, "name"
+    return None, ""
+
+
+def _by_order(sheet: Sheet, found: dict[str, Placed], channels: Sequence[str]) -> dict[str, Placed]:
+    """Return columns by their order; InputError if their number does not fit."""
+    used = {one.column for one in found.values()}
+    free = [column for column in range(sheet.width) if column not in used]
+    wanted: list[str] = [] if TIME in found else [TIME]
+    first = sheet.values(free[len(wanted)]) if len(free) > len(wanted) else None
+    is_fixed = first is not None and _is_smooth(first)
+    if len(free) - len(wanted) == len(channels) and not (is_fixed and len(channels) == 4):
+        wanted += channels
+    elif is_fixed and 2 <= len(free) - len(wanted) <= 4:
+        wanted += POSITION_COLUMNS[: len(free) - len(wanted)]
+    else:
+        heads = ", ".join(sheet.header[:8]) or f"{sheet.width} columns without names"
+        raise InputError(
+            f"{sheet.path}: no column is known by its name ({heads}): assign them in "
+            "[file.columns] of a map (--map), or skip = true in its [[file]]"
+        )
+    return {
+        name: Placed(column, _head_unit(sheet, column), "order")
+        for name, column in zip(wanted, free, strict=False)
+    }
+
+
+def _is_smooth(values: NDArray[np.float64]) -> bool:
+    """Return whether a column hardly changes against its size, as a latitude does."""
+    known = values[np.isfinite(values)]
+    return known.size > 1 and bool(np.ptp(known) < 0.02 * np.abs(known).max())
+
+
+def _words(name: str) -> list[str]:
+    plain = unicodedata.normalize("NFC", name).lower()
+    plain = re.sub(r"(?<=[a-zäöüß])(?=[0-9])|(?<=[0-9])(?=[a-zäöüß])", " ", plain)
+    return [word for word in re.split(r"[^a-z0-9äöüß]+", plain) if word]

@@ -1,0 +1,103 @@
+"""Selection of a table's rows: complete ones, each time once, in order of time."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.common.errors import InputError
+from services.drives.tables.findings import Findings, Target
+from services.drives.tables.mapping import POSITION_COLUMNS
+from services.drives.tables.parts import TablePart
+from services.drives.tables.stamps import kept_rows
+
+Floats = NDArray[np.float64]
+
+_HELD: Final = 0.5
+"""Share of fixes equal to their predecessor where fixes are held between measurements."""
+
+
+def samples(
+    parts: Sequence[TablePart], begin: Mapping[str, float], target: Target, found: Findings
+) -> tuple[Floats, dict[str, Floats]]:
+    """Return times and channels of all files with accelerations."""
+    read = [_samples_of(part, begin[part.name], target, found) for part in parts]
+    time_s, channels = read[0]
+    for part, (other_s, others) in zip(parts[1:], read[1:], strict=True):
+        common, here, there = np.intersect1d(
+            np.rint(time_s * 1e5), np.rint(other_s * 1e5), return_indices=True
+        )
+        if common.size < 0.9 * max(time_s.size, other_s.size):
+            raise InputError(
+                f"{part.sheet.path}: is not sampled at the times of {parts[0].name}: "
+                f"{common.size} of {other_s.size} times are common, one table of all channels "
+                "is expected"
+            )
+        if (lost := max(time_s.size, other_s.size) - common.size) > 0:
+            found.guess(part, f"{lost} samples are not in every file, left out", "lost")
+        time_s = time_s[here]
+        channels = {n: v[here] for n, v in channels.items()}
+        channels |= {n: v[there] for n, v in others.items()}
+    if time_s.size < 2:
+        raise InputError(f"{parts[0].sheet.path}: has {time_s.size} samples, at least 2 needed")
+    return time_s, channels
+
+
+def _samples_of(
+    part: TablePart, begin_s: float, target: Target, found: Findings
+) -> tuple[Floats, dict[str, Floats]]:
+    names = part.channels()
+    values = np.column_stack([part.columns[name] for name in names])
+    whole = np.isfinite(values).all(axis=1) & np.isfinite(part.times.time_s)
+    if not whole.any():
+        raise InputError(f"{part.sheet.path}: no row has all of {', '.join(names)}")
+    if not whole.all():
+        first = part.sheet.numbers[int(np.flatnonzero(~whole)[0])]
+        text = f"{int((~whole).sum())} rows with empty cells left out, a gap (first: line {first})"
+        found.guess(part, text, "lost")
+    values, time_s = values[whole], part.times.time_s[whole]
+    declared = target.declared_hz
+    even = part.given.time.even
+    kept = kept_rows(time_s, values, declared, even=even, where=str(part.sheet.path))
+    if kept.repeated:
+        found.guess(part, f"{kept.repeated} repeated rows left out", "lost")
+    if kept.late:
+        found.guess(part, f"{kept.late} rows not later than the row before left out", "lost")
+    if kept.is_even and even is None:
+        found.guess(part, f"stamps are rounded: samples even at {declared:g} Hz")
+    found.time(part, even=kept.is_even)
+    channels = {n: np.ascontiguousarray(values[kept.rows, k]) for k, n in enumerate(names)}
+    return kept.time_s + begin_s, channels
+
+
+def fixes(part: TablePart, begin_s: float, found: Findings) -> dict[str, Floats]:
+    """Return the fixes as in the file, by quantity, and `time_s`."""
+    names = [name for name in POSITION_COLUMNS if name in part.columns]
+    table = np.column_stack([part.times.time_s, *(part.columns[name] for name in names)])
+    there = np.isfinite(table[:, :3]).all(axis=1) & np.any(table[:, 1:3] != 0.0, axis=1)
+    if "speed_mps" in names:
+        there &= np.isfinite(table[:, 1 + names.index("speed_mps")])
+    if not part.channels() and not there.all():
+        found.guess(part, f"{int((~there).sum())} rows without a fix left out", "lost")
+    table = table[there]
+    if not table.size:
+        raise InputError(f"{part.sheet.path}: has no fix, at least 2 expected")
+    held = part.given.held_fixes
+    is_held = np.concatenate([[False], np.all(np.diff(table[:, 1:3], axis=0) == 0, axis=1)])
+    if held is None and part.channels():
+        held = float(is_held.mean()) > _HELD
+        if held:
+            found.guess(part, "a fix is repeated until the next one: its first row counts")
+    if held:
+        table = table[~is_held]
+    found.file(part, held_fixes=bool(held))
+    kept = kept_rows(table[:, 0], table[:, 1:3], 0.0, even=False, where=str(part.sheet.path))
+    if kept.repeated + kept.late:
+        count = kept.repeated + kept.late
+        found.guess(part, f"{count} fixes with a repeated or earlier time left out", "lost")
+    table = table[kept.rows]
+    if table.shape[0] < 2:
+        raise InputError(f"{part.sheet.path}: has 1 fix, at least 2 expected")
+    columns = {name: table[:, 1 + k] for k, name in enumerate(names)}
+    return columns | {"time_s": kept.time_s + begin_s}

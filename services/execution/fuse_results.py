@@ -1,0 +1,140 @@
+"""Fusion of the crossings of several results files, each crossing once."""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Final, NamedTuple
+
+from schemas.results import BridgeResult, CrossingResult, ResultHeader, Results, results
+from schemas.settings import IdentificationSettings
+from services.common.errors import InputError
+from services.common.progress import Parts
+from services.identification.bridge_state import (
+    Fusing,
+    RecentCrossings,
+    add_crossings,
+    state_of,
+    usable,
+    with_common_shares,
+)
+from services.recordings.recording import program_version
+
+
+class FusedElements(NamedTuple):
+    """Elements of a bridge, as its newest crossing has them."""
+
+    id: str
+    lengths_m: tuple[float, ...]
+    nominal_flexural_rigidity_nm2: tuple[float, ...]
+
+
+_ONE_REALM: Final = (
+    "fuse one realm at a time (import --realm NAME files the drives of a campaign in one)"
+)
+
+
+class FusedResults(NamedTuple):
+    """Results of several files as one, with the fused bridges."""
+
+    results: Results
+    bridges: dict[str, FusedElements]
+    """Bridges with a state, by name."""
+    unfused: dict[str, int]
+    """Numbers of crossings of bridges without a crossing that can be fused."""
+    repeated: int
+    """Number of results of crossings that a newer file has too."""
+
+
+class CrossingsToFuse(NamedTuple):
+    """Crossings of one realm in order of time, the newest result of each."""
+
+    last: Results
+    """Newest file."""
+    crossings: tuple[CrossingResult, ...]
+    repeated: int
+
+    @property
+    def by_bridge(self) -> dict[str, list[CrossingResult]]:
+        """Return the crossings of each bridge, by its name."""
+        names = sorted({crossing.bridge for crossing in self.crossings})
+        return {name: [one for one in self.crossings if one.bridge == name] for name in names}
+
+
+def crossings_to_fuse(name: str, files: Sequence[Results]) -> CrossingsToFuse:
+    """Return the crossings of the files; raise InputError if they are of several realms.
+
+    `name` is the place that errors begin with.
+    """
+    ordered = sorted(files, key=lambda one: one.created)
+    crossings = {c.crossing_id: c for one in ordered for c in one.crossings}
+    realms = sorted({crossing.realm for crossing in crossings.values()})
+    if len(realms) > 1:
+        raise InputError(f"{name}: crossings of {', '.join(realms)}; {_ONE_REALM}")
+    repeated = sum(len(one.crossings) for one in ordered) - len(crossings)
+    by_time = sorted(crossings.values(), key=lambda crossing: crossing.entry_time)
+    return CrossingsToFuse(ordered[-1], tuple(by_time), repeated)
+
+
+def fuse_crossings(
+    name: str,
+    found: CrossingsToFuse,
+    stored: tuple[str, Results] | None,
+    report: Parts,
+    *,
+    fuse_suspect: bool,
+) -> FusedResults:
+    """Fuse the crossings of each bridge.
+
+    `stored` is a baseline with the name of its file. Raise InputError if it does not fit, or if no
+    crossing can be fused; `name` is the place that such an error begins with.
+    """
+    baselines = {} if stored is None else stored[1].bridges
+    fusing = Fusing(baselines, fuse_suspect, IdentificationSettings().threads)
+    elements_of = {bridge: _elements(bridge, of) for bridge, of in found.by_bridge.items()}
+    for bridge, elements in elements_of.items():
+        if stored is not None and elements is not None and bridge in baselines:
+            _check_baseline(stored[0], baselines[bridge], elements)
+    states: dict[str, BridgeResult] = {}
+    bridges: dict[str, FusedElements] = {}
+    unfused: dict[str, int] = {}
+    for bridge, of in found.by_bridge.items():
+        state, elements = _state(bridge, of, fusing, report), elements_of[bridge]
+        if state is None or elements is None:
+            unfused[bridge] = len(of)
+        else:
+            states[bridge], bridges[bridge] = state, elements
+    if not states:
+        raise InputError(f"{name}: no crossing that could be fused; identify with method pre")
+    last = found.last
+    header = ResultHeader(program_version(), time.time(), last.site_hash, last.settings, last.seed)
+    every = results(header, with_common_shares(list(found.crossings), states), states)
+    return FusedResults(every, bridges, unfused, found.repeated)
+
+
+def _state(
+    name: str, crossings: list[CrossingResult], fusing: Fusing, report: Parts
+) -> BridgeResult | None:
+    counts = [one for one in map(usable, crossings) if one is not None]
+    state = state_of(add_crossings(RecentCrossings(), counts), name, fusing, partial(report, name))
+    report(name, "done", 1.0)
+    return state
+
+
+def _check_baseline(path: str, baseline: BridgeResult, elements: FusedElements) -> None:
+    stored, now = len(baseline.elements), len(elements.lengths_m)
+    if stored != now:
+        raise InputError(
+            f"{path}: {elements.id} has {stored} elements there and {now} in the results, "
+            "the baseline must have the same"
+        )
+
+
+def _elements(name: str, crossings: list[CrossingResult]) -> FusedElements | None:
+    """Return the bridge of the newest crossing that can be fused."""
+    for crossing in reversed(crossings):
+        of = crossing.fusion_likelihood
+        if of is not None:
+            lengths = of.element_lengths_m
+            nominal = tuple(c.location for c in of.bridge[-len(lengths) :])
+            return FusedElements(name, lengths, nominal)
+    return None

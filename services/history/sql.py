@@ -1,0 +1,106 @@
+"""SQL queries of a whole history, by DuckDB over its Parquet files, which it only reads."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from services.common.errors import InputError
+from services.common.parquet_files import FILES
+from services.history.history_store import (
+    CROSSINGS,
+    EDITION,
+    KEY,
+    bridges_of,
+    file_error,
+)
+
+if TYPE_CHECKING:
+    import duckdb
+
+
+class QueryResult(NamedTuple):
+    """Result of a query: a table."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    problems: tuple[str, ...]
+    """Skipped files, one line each."""
+
+
+_PARTITIONS: Final = "realm=*/bridge=*"
+_OVERVIEW = """
+SELECT realm, bridge, count(DISTINCT crossing_id) AS crossings,
+       count(DISTINCT crossing_id) FILTER (verdict = 'good') AS good,
+       count(DISTINCT vehicle) AS trucks,
+       min(entry_s) AS first_s, max(entry_s) AS last_s
+FROM crossings WHERE entry_s BETWEEN 0 AND 2e11 GROUP BY realm, bridge ORDER BY realm, bridge
+"""
+_EDITIONS: Final = """
+SELECT DISTINCT min(decode(value)) FILTER (decode(key) = $2)
+FROM parquet_kv_metadata($1) GROUP BY file_name
+"""
+
+
+def overview(folder: Path) -> QueryResult:
+    """Return a row for each bridge: number of crossings and trucks, first and last time."""
+    found = query(folder, _OVERVIEW)
+    rows = tuple((*row[:5], *(_day(time_s) for time_s in row[5:])) for row in found.rows)
+    names = ("realm", "bridge", "crossings", "good", "trucks", "first", "last")
+    return found._replace(columns=names, rows=rows)
+
+
+def query(folder: Path, question: str) -> QueryResult:
+    """Return the result of an SQL query on the table `crossings`.
+
+    Raise InputError if there is no history, or DuckDB rejects the query.
+    """
+    if not bridges_of(folder):
+        raise InputError(f"{folder}: is no history; driveby history add RESULTS creates one")
+    files = f"{folder / CROSSINGS}/{_PARTITIONS}/{FILES}"
+    try:
+        return _run_query(question, files, ())
+    except InputError:
+        # One invalid file fails the whole query: only then is each one checked.
+        good, problems = _files(folder)
+        if not problems or not good:
+            raise
+        return _run_query(question, good, problems)
+
+
+def _run_query(question: str, files: str | list[str], problems: tuple[str, ...]) -> QueryResult:
+    import duckdb
+
+    with duckdb.connect(":memory:") as connection:
+        try:
+            asked = connection.extract_statements(question)
+            if [one.type for one in asked] != [duckdb.StatementType.SELECT]:
+                raise InputError("--sql: one question that begins with SELECT … is expected")
+            _check_editions(connection, files)
+            crossings = connection.read_parquet(files, hive_partitioning=True, union_by_name=True)
+            crossings.create_view("crossings")
+            found = connection.sql(question)
+            return QueryResult(tuple(found.columns), tuple(found.fetchall()), problems)
+        except duckdb.Error as error:
+            raise InputError(f"--sql: {' '.join(str(error).split())[:300]}") from None
+
+
+def _check_editions(connection: "duckdb.DuckDBPyConnection", files: str | list[str]) -> None:
+    """Raise InputError for a file of another format version: its columns may differ in meaning."""
+    found = connection.execute(_EDITIONS, [files, KEY]).fetchall()
+    if any(edition != EDITION for (edition,) in found):
+        raise InputError(f"a file is of another edition than {EDITION} of {KEY}")
+
+
+def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
+    good, problems = [], []
+    for path in sorted((folder / CROSSINGS).glob(f"{_PARTITIONS}/{FILES}")):
+        wrong = file_error(path)
+        if wrong is None:
+            good.append(str(path))
+        else:
+            problems.append(wrong)
+    return good, tuple(problems)
+
+
+def _day(time_s: float) -> str:
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"

@@ -1,0 +1,170 @@
+"""Complete crossings that wait for a site validation or a free process."""
+
+import logging
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import NamedTuple
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.validation_records import VehicleBridgePair
+from services.finding.crossing_data import Complete, CrossingData
+from services.identification.outputs import (
+    IdentificationTask,
+    Output,
+    ValidationRequest,
+    crossing_output,
+)
+
+_log = logging.getLogger(__name__)
+MAX_WAITING_CROSSINGS = 100
+"""Maximum number of waiting crossings: half a megabyte each, or more."""
+
+
+class Pending(NamedTuple):
+    """A complete crossing, with the messages about its identification."""
+
+    work: IdentificationTask
+    identifying: Output | None
+    """Message at the start of its identification; None if an earlier run has published it."""
+    done: Output
+    """Message with its result: the truck's clock may have been forgotten by then."""
+
+    @property
+    def pair(self) -> VehicleBridgePair:
+        """Return truck and bridge."""
+        return VehicleBridgePair(self.work.data.vehicle.id, self.work.data.bridge.id)
+
+
+def pending_of(
+    one: Complete, work: IdentificationTask, reported: Collection[pb.CrossingState]
+) -> Pending:
+    """Return a crossing with its messages, less those that have been `reported`."""
+    found = one.detection
+
+    def output(state: pb.CrossingState) -> Output:
+        return crossing_output(found, state, found.exit_ns)
+
+    identifying = None if pb.IDENTIFYING in reported else output(pb.IDENTIFYING)
+    return Pending(work, identifying, output(pb.DONE))
+
+
+class FromRecording(NamedTuple):
+    """A complete crossing from a recording."""
+
+    messages: tuple[Output, ...]
+    """Messages of its detection and completion that earlier runs have not published."""
+    pending: Pending
+    entry_ns: int
+    """Entry in ns since 1970 UTC."""
+    exit_ns: int
+
+
+class Waiting:
+    """Crossings that wait, in the order of detection; at most `MAX_WAITING_CROSSINGS`.
+
+    Parameters
+    ----------
+    certificates
+        Hashes of the known validation records; results name them.
+    are_required
+        Whether a crossing of a pair without a validation record waits for one.
+    has_room
+        Whether a crossing would be started soon. Otherwise those of recorded trucks wait too, so
+        that the caller is not delayed.
+    """
+
+    def __init__(
+        self,
+        certificates: Mapping[VehicleBridgePair, str],
+        *,
+        are_required: bool,
+        has_room: Callable[[], bool],
+    ) -> None:
+        self._certificates = dict(certificates)
+        self._are_required = are_required
+        self._has_room = has_room
+        self._recorded: frozenset[str] = frozenset()
+        self._wanted: set[VehicleBridgePair] = set()
+        self._pending: deque[Pending] = deque()
+
+    def retarget(
+        self,
+        certificates: Mapping[VehicleBridgePair, str],
+        retargeted: Callable[[CrossingData], CrossingData | None],
+    ) -> Iterator[ValidationRequest]:
+        """Continue with the data and records of another site file; yield validation requests."""
+        self._certificates = dict(certificates)
+        self._wanted.clear()
+        self._pending = deque(
+            one._replace(work=one.work._replace(data=data))
+            for one in self._pending
+            if (data := retargeted(one.work.data)) is not None
+        )
+        for pair in self.by_pair():
+            if not self.is_certified(pair):
+                self._wanted.add(pair)
+                yield ValidationRequest(pair)
+
+    def note_recorded(self, vehicles: Collection[str]) -> None:
+        """Record which trucks a logger records: nothing is lost where their crossings wait."""
+        self._recorded = frozenset(vehicles)
+
+    def is_certified(self, pair: VehicleBridgePair) -> bool:
+        """Return whether the crossings of a pair may be identified."""
+        return not self._are_required or pair in self._certificates
+
+    def certify(self, pair: VehicleBridgePair, certificate: str) -> None:
+        """Accept the hash of a pair's passed validation record."""
+        self._certificates[pair] = certificate
+
+    def certified(self, work: IdentificationTask) -> IdentificationTask:
+        """Return a task with the validation record of its pair, where there is one."""
+        pair = VehicleBridgePair(work.data.vehicle.id, work.data.bridge.id)
+        return work._replace(certificate=self._certificates.get(pair))
+
+    def must_wait(self, pair: VehicleBridgePair) -> bool:
+        """Return whether a crossing that is complete now has to wait."""
+        for_room = pair.vehicle in self._recorded and not self._has_room()
+        return not self.is_certified(pair) or for_room or pair in self.by_pair()
+
+    def keep(self, pending: Pending) -> Iterator[ValidationRequest]:
+        """Add a crossing; yield the validation request for its pair, once for a pair."""
+        self._pending.append(pending)
+        if len(self._pending) > MAX_WAITING_CROSSINGS:
+            _log.warning(
+                "%s has waited too long and is abandoned here: it is taken from the logger's "
+                "recording later, or `driveby identify` gives its result from there",
+                self._pending.popleft().work.crossing_id,
+            )
+        if not self.is_certified(pending.pair) and pending.pair not in self._wanted:
+            self._wanted.add(pending.pair)
+            yield ValidationRequest(pending.pair)
+
+    def by_pair(self) -> dict[VehicleBridgePair, list[str]]:
+        """Return the ids of the crossings by pair, in the order of detection."""
+        found: dict[VehicleBridgePair, list[str]] = {}
+        for one in self._pending:
+            found.setdefault(one.pair, []).append(one.work.crossing_id)
+        return found
+
+    def pairs(self) -> list[VehicleBridgePair]:
+        """Return the pairs by number of waiting crossings, descending; then the latest first."""
+        count: Counter[VehicleBridgePair] = Counter()
+        latest: dict[VehicleBridgePair, int] = {}
+        for number, one in enumerate(self._pending):
+            count[one.pair] += 1
+            latest[one.pair] = number
+        return sorted(count, key=lambda pair: (-count[pair], -latest[pair]))
+
+    @property
+    def has_released(self) -> bool:
+        """Return whether a crossing may continue."""
+        return any(self.is_certified(one.pair) for one in self._pending)
+
+    def release(self) -> Pending | None:
+        """Return and remove the first crossing that may continue, if there is one."""
+        for place, one in enumerate(self._pending):
+            if self.is_certified(one.pair):
+                del self._pending[place]
+                return one
+        return None

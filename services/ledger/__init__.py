@@ -1,0 +1,1 @@
+"""Results on disk: what a worker has published, and which crossings only recordings hold."""

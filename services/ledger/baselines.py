@@ -1,0 +1,51 @@
+"""Stored states of bridges, with which new ones are compared."""
+
+import logging
+from pathlib import Path
+
+from schemas.results import BridgeResult, load_results
+from schemas.site import Bridge, Site
+from services.common.errors import InputError
+from services.common.outputs import add_input
+
+_log = logging.getLogger(__name__)
+
+
+def baselines_of(
+    site: Site, beside: Path | None, given: Path | None = None
+) -> dict[str, BridgeResult]:
+    """Return the states, by bridge, of a given results file, or of the files that the site names.
+
+    A name in a site file is a path relative to the folder `beside` it. A site file that a recording
+    carries has no folder (None); its baselines may be absent, which is a warning.
+
+    Raise InputError if a file is no results file or has no state of the bridge.
+    """
+    if given is not None:
+        there = load_results(given).bridges
+        found = {b.id: stored_state(given, b) for b in site.bridges if b.id in there}
+        if not found:
+            names = ", ".join(bridge.id for bridge in site.bridges)
+            raise InputError(f"{given}: has no state of {names} to compare with")
+        return found
+    out = {}
+    for bridge in site.bridges:
+        if bridge.baseline is None:
+            continue
+        path = (beside or Path()) / bridge.baseline
+        if beside is None and not path.is_file():
+            _log.warning("the baseline %s of %s is not there; see --baseline", path, bridge.id)
+            continue
+        out[bridge.id] = stored_state(path, bridge)
+    return out
+
+
+def stored_state(path: Path, bridge: Bridge) -> BridgeResult:
+    """Return a bridge's state from a results file; InputError if it has none with its elements."""
+    add_input(path)
+    state = load_results(path).bridges.get(bridge.id)
+    if state is None or len(state.elements) != bridge.elements:
+        raise InputError(
+            f"{path}: has no state of {bridge.id} with {bridge.elements} elements to compare with"
+        )
+    return state

@@ -1,0 +1,58 @@
+"""The site file that results belong to: results do not contain the position of their bridge."""
+
+import logging
+from pathlib import Path
+
+from schemas.results import Results
+from schemas.site import Site
+from schemas.site_file import load_site, parse_site, site_hash
+from services.common.errors import InputError
+from services.recordings.recording import read_site
+
+_log = logging.getLogger(__name__)
+
+
+def site_of_results(path: Path, results: Results, site: Path | None = None) -> Site:
+    """Return the given site file, or the one of a recording in the folder of the results.
+
+    A site file other than that of the results is accepted with a warning, so that a corrected name
+    of a bridge appears in the report. Raise InputError if there is none, or if it lacks a bridge of
+    the results.
+    """
+    known, name = (load_site(site), str(site)) if site is not None else _site_nearby(path, results)
+    missing = wanted_bridges(results) - {bridge.id for bridge in known.bridges}
+    if missing:
+        raise InputError(f"{path}: has results of {min(missing)}, which {name} does not know")
+    if site_hash(known) != results.site_hash:
+        _log.warning("%s: computed with another site file than %s", path, name)
+    return known
+
+
+def wanted_bridges(results: Results) -> set[str]:
+    """Return the bridges that results refer to."""
+    return {crossing.bridge for crossing in results.crossings} | set(results.bridges)
+
+
+def site_within(recording: Path) -> Site | None:
+    """Return the site file stored in a recording; None if there is none."""
+    toml = read_site(recording)
+    return None if toml is None else parse_site(toml, str(recording))
+
+
+def _site_nearby(path: Path, results: Results) -> tuple[Site, str]:
+    possible: list[tuple[Site, str]] = []
+    for recording in sorted(path.absolute().parent.glob("*.mcap")):
+        try:
+            site = site_within(recording)
+        except InputError:
+            continue  # another one may be the right one
+        if site is not None and site_hash(site) == results.site_hash:
+            return site, str(recording)
+        if site is not None and wanted_bridges(results) <= {bridge.id for bridge in site.bridges}:
+            possible.append((site, str(recording)))
+    if possible:
+        return possible[0]
+    raise InputError(
+        f"{path}: results do not say where their bridge is: give --site, or put the recording "
+        "(.mcap) that they come from into the same folder"
+    )

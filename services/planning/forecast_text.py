@@ -1,0 +1,185 @@
+"""Forecasts of surveys as JSON and as text."""
+
+from collections.abc import Iterator
+from itertools import accumulate
+from typing import Any
+
+from pre_core.survey.detection import DETECTION_PROBABILITY, FALSE_ALARM
+from services.planning.advice import advice, mismatch_in_words, percent, tyres_of, warnings
+from services.planning.crossings import scale_error
+from services.planning.survey import (
+    MOST_CROSSINGS,
+    PlanForecast,
+    SurveyExpectation,
+    SurveyForecast,
+)
+
+
+def as_json(found: SurveyForecast) -> dict[str, Any]:
+    """Return the complete forecast, elements from the bridge's start."""
+    site = found.planned.plan.site
+    return {
+        "vehicle": site.vehicles[0].id,
+        "bridge": site.bridges[0].id,
+        "loss": found.question.loss,
+        "false_alarm": FALSE_ALARM,
+        "sure": DETECTION_PROBABILITY,
+        "crossings": found.question.crossings,
+        "speed_m_per_s": found.question.speed_m_per_s,
+        "road_class": found.road.road_class,
+        "wander_m": found.road.wander_m,
+        "scale_error": scale_error(site),
+        "planned": _outlook_json(found.planned),
+        "alternatives": [_outlook_json(one) for one in found.others],
+        "rougher_road": None if found.rougher is None else _outlook_json(found.rougher),
+        "speeds": [one._asdict() for one in found.speeds],
+        "growth": [_expected_json(one) for one in found.growth],
+        "warnings": list(warnings(found)),
+        "advice": advice(found),
+    }
+
+
+def _outlook_json(one: PlanForecast) -> dict[str, Any]:
+    bridge = one.plan.site.bridges[0]
+    return {
+        "name": one.plan.name,
+        "element_lengths_m": list(bridge.lengths_m),
+        "middle_element": one.middle + 1,
+        "one_crossing": _expected_json(one.once),
+        "all_crossings": _expected_json(one.expected),
+        "crossings_needed": {"middle": one.needed_middle, "ends": one.needed_ends},
+    }
+
+
+def _expected_json(one: SurveyExpectation) -> dict[str, Any]:
+    return {
+        "crossings": one.crossings,
+        "std_ln_ei": one.std.tolist(),
+        "level_std": one.level_std,
+        "probability_seen": one.seen.tolist(),
+        "probability_seen_among_others": one.seen_among_others.tolist(),
+        "smallest_loss": one.smallest_loss.tolist(),
+    }
+
+
+def lines_of(found: SurveyForecast) -> Iterator[str]:
+    """Yield the printed lines, at most 80 characters but for warnings and advice."""
+    question, planned = found.question, found.planned
+    vehicle, bridge = planned.plan.site.vehicles[0], planned.plan.site.bridges[0]
+    speeds = [crossing.speed_m_per_s for crossing in planned.plan.tracks[0]]
+    tonnes = vehicle.total_mass_kg / 1e3
+    yield f"{vehicle.id} ({tonnes:.1f} t, {tyres_of(planned)}) over {bridge.id}"
+    yield (
+        f"({bridge.span_m:g} m, {bridge.elements} elements), road of class "
+        f"{found.road.road_class}, {question.crossings} crossings at {speeds[0]:.1f} to "
+        f"{speeds[-1]:.1f} m/s"
+    )
+    if found.road.is_surface:
+        yield mismatch_in_words(found)
+    false = percent(FALSE_ALARM)
+    yield f"loss to detect: {percent(question.loss)}; false alarms: {false} per element"
+    yield ""
+    yield from _aligned(_elements(found))
+    yield (
+        f"mean of all elements: ± {_percent(planned.once.level_std)} by 1 crossing, "
+        f"± {_percent(planned.expected.level_std)} by {question.crossings}"
+    )
+    yield "±: standard deviation of EI, near 55 % the prior's; seen: probability that the"
+    yield "loss is detected against the nominal value; vs others: against the others;"
+    yield f"smallest: loss that is detected with {percent(DETECTION_PROBABILITY)} probability"
+    yield ""
+    yield from _aligned(_comparison(found))
+    yield f"by {question.crossings} crossings; mean ±: of what all elements share; mid ±, seen,"
+    wanted = percent(DETECTION_PROBABILITY)
+    yield f"smallest: at midspan; needed, ends: crossings until it is seen with {wanted}"
+    yield f"at midspan, at both ends (elsewhere between them); –: more than {MOST_CROSSINGS};"
+    yield "t: within the legal axle and total loads; the other way: in the other lane;"
+    yield "elements: longer ones"
+    yield ""
+    for line in warnings(found):
+        yield f"warning: {line}"
+    yield advice(found)
+
+
+def _aligned(rows: list[list[str]]) -> Iterator[str]:
+    """Yield rows with their first cells aligned left, the others right."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    for first, *cells in rows:
+        aligned = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
+        yield "  ".join([first.ljust(widths[0]), *aligned]).rstrip()
+
+
+def _elements(found: SurveyForecast) -> list[list[str]]:
+    planned, count = found.planned, found.question.crossings
+    ends = list(accumulate(planned.plan.site.bridges[0].lengths_m, initial=0.0))
+    once, whole = planned.once, planned.expected
+    heads = [
+        "element",
+        "from m",
+        "to m",
+        "± by 1",
+        f"± by {count}",
+        "seen",
+        "vs others",
+        "smallest",
+    ]
+    return [
+        heads,
+        *(
+            [
+                f"EI_{e + 1}",
+                f"{ends[e]:.2f}",
+                f"{ends[e + 1]:.2f}",
+                _percent(once.std[e]),
+                _percent(whole.std[e]),
+                _percent(whole.seen[e]),
+                _percent(whole.seen_among_others[e]),
+                _percent(whole.smallest_loss[e]),
+            ]
+            for e in range(len(ends) - 1)
+        ),
+    ]
+
+
+def _comparison(found: SurveyForecast) -> list[list[str]]:
+    rows = [["what if", "mean ±", "mid ±", "seen", "smallest", "needed", "ends"]]
+    rows += [_cells(one, one.plan.name) for one in (found.planned, *found.others)]
+    rows += [
+        [
+            f"at {at.speed_m_per_s:g} m/s",
+            _percent(at.level_std),
+            _percent(at.std_middle),
+            _percent(at.seen_middle),
+            _percent(at.smallest_middle),
+            "",
+            "",
+        ]
+        for at in found.speeds
+    ]
+    if found.rougher is not None:
+        name = f"road of class {chr(ord(found.road.road_class) + 1)}"
+        rows.append(_cells(found.rougher, name))
+    return rows
+
+
+def _cells(one: PlanForecast, name: str) -> list[str]:
+    e = one.middle
+    return [
+        name,
+        _percent(one.expected.level_std),
+        _percent(one.expected.std[e]),
+        _percent(one.expected.seen[e]),
+        _percent(one.expected.smallest_loss[e]),
+        _count(one.needed_middle),
+        _count(one.needed_ends),
+    ]
+
+
+def _count(crossings: int | None) -> str:
+    return "–" if crossings is None else str(crossings)
+
+
+def _percent(share: float) -> str:
+    """Return two significant digits."""
+    value = 100.0 * share
+    return f"{value:.1f} %" if value < 9.95 else f"{value:.0f} %"

@@ -1,0 +1,45 @@
+"""Forecast of a survey of a site's first bridge by its first truck, from a few wishes."""
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from schemas.site import Site
+from services.finding.placed import middle_site
+from services.planning.alternatives import with_noise, with_tyres
+from services.planning.crossings import PlannedRoad
+from services.planning.survey import SurveyForecast, SurveyQuestion, forecast_survey
+
+_SPEEDS: Final = (5.0, 20.0)
+_USUAL_M_PER_S: Final = 10.0
+_ROAD_CLASS: Final = "A"
+
+
+class SurveyWishes(NamedTuple):
+    """Wishes of a survey; None: as in the site file, or the usual one."""
+
+    loss: float = 0.2
+    crossings: int = 12
+    speeds_m_per_s: tuple[float, float] | None = None
+    """Slowest and fastest possible speed."""
+    road_class: str | None = None
+    tyres: str | None = None
+    noise_ug_per_rthz: float | None = None
+    wander_m: float = 0.12
+
+
+def plan_survey(
+    given: Site, wishes: SurveyWishes, report: Callable[[int, int], None]
+) -> SurveyForecast:
+    """Return the forecast; `report` receives the finished and all jobs."""
+    site = middle_site(given)
+    if wishes.tyres is not None:
+        site = with_tyres(site, wishes.tyres)
+    if wishes.noise_ug_per_rthz is not None:
+        site = with_noise(site, (wishes.noise_ug_per_rthz,) * 4)
+    speeds = wishes.speeds_m_per_s or _SPEEDS
+    wanted = site.bridges[0].survey_speed_m_per_s or _USUAL_M_PER_S
+    question = SurveyQuestion(
+        wishes.loss, wishes.crossings, min(max(wanted, speeds[0]), speeds[1]), speeds
+    )
+    road_class = wishes.road_class or site.bridges[0].road_class or _ROAD_CLASS
+    return forecast_survey(site, PlannedRoad(road_class, wishes.wander_m), question, report)

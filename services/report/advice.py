@@ -1,0 +1,79 @@
+"""Advice on the next steps, for every finding and every reason."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+
+from schemas.results import CrossingResult
+from services.common.language import Language
+from services.report.bridge import BridgeReport
+from services.report.place import position_of
+
+
+def next_steps(report: BridgeReport, language: Language) -> Iterator[str]:
+    """Yield the steps after a finding."""
+    match report.finding.kind:
+        case "weak":
+            yield from _inspect(report, language)
+            yield from _drive_again(report, language)
+        case "sound":
+            yield language.text("advice.sound")
+        case "open":
+            yield language.text("advice.open")
+            yield language.text("advice.open_truck")
+        case kind:
+            yield language.text("advice.rejected" if kind == "nothing" else "advice.suspect")
+            yield from advice_of_state(report, language)
+            yield from advice(report.crossings, language)
+            yield language.text("advice.check")
+            yield language.text("advice.twice")
+            return
+    yield language.text("advice.keep" if report.before is None else "advice.next_survey")
+
+
+def advice(crossings: Iterable[CrossingResult], language: Language) -> list[str]:
+    """Return the advice on the reasons of crossings, for the most frequent one first."""
+    counted = Counter(reason for crossing in crossings for reason in crossing.reasons)
+    return list(dict.fromkeys(language.advice[code] for code, _ in counted.most_common()))
+
+
+def advice_of_state(report: BridgeReport, language: Language) -> list[str]:
+    """Return the advice on the reasons of the bridge's state."""
+    state = report.view.state
+    return [] if state is None else [language.bridge_advice[code] for code in state.reasons]
+
+
+def _inspect(report: BridgeReport, language: Language) -> Iterator[str]:
+    """Yield where to inspect."""
+    elements = () if report.view.comparison is None else report.view.comparison.elements
+    weak = [one for one in elements if one.is_weak]
+    places = ", ".join(
+        language.text(
+            "advice.place",
+            number=one.number,
+            position=position_of(one, report.bridge, language),
+        )
+        for one in weak
+    )
+    at_end = any(one.number in (1, len(elements)) for one in weak)
+    step = language.text("advice.inspect_bearing" if at_end else "advice.inspect", places=places)
+    yield step if report.before is not None else f"{step} {language.text('advice.unlike')}"
+
+
+def _drive_again(report: BridgeReport, language: Language) -> Iterator[str]:
+    """Yield how another crossing would add information."""
+    used = report.used
+    days = {f"{datetime.fromtimestamp(one.entry_time, UTC):%Y-%m-%d}" for one in used}
+    once = [
+        language.text(f"advice.{key}")
+        for key, values in (
+            ("another_day", days),
+            ("other_direction", {one.direction for one in used}),
+            ("another_truck", {one.vehicle for one in used}),
+        )
+        if len(values) < 2
+    ]
+    if once:
+        yield language.text("advice.again", how=language.listed(once))

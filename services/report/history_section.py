@@ -1,0 +1,124 @@
+"""The section on a bridge's history: its periods next to each other."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+
+import matplotlib
+import numpy as np
+
+from schemas.alarms import Alarm
+from services.common.language import ENGLISH, Language
+from services.history.bridge_history import BridgeHistory, statements
+from services.report.html import Html, inlined_svg, table, tag
+from services.viewer.drawing import STYLE, figure_bytes
+from services.viewer.history_figure import HistoryView, draw_history, history_view
+
+
+def history_summary(past: BridgeHistory, language: Language = ENGLISH) -> str:
+    """Return number of crossings and state of alarms, for the first page."""
+    standing = sum(alarm.acknowledged is None for alarm in past.alarms)
+    alarms = language.choice("history.alarms", standing)
+    if not standing:
+        which = "no_alarm" if past.watch.found_nothing else "not_watched"
+        alarms = language.text(f"history.{which}")
+    return language.text("history.summary", how_much=_how_much(past, language), alarms=alarms)
+
+
+def history_section(past: BridgeHistory, prefix: str, language: Language = ENGLISH) -> Html:
+    """Return the section; empty for a history without values.
+
+    Its figure and the sentences on monitoring are English.
+    """
+    drawn = history_view(past)
+    if not drawn.points:
+        return Html("")
+    with matplotlib.rc_context(STYLE):
+        svg = figure_bytes(draw_history(drawn), "svg")
+    wording = language.text(
+        "history.from_to",
+        how_much=_how_much(past, language),
+        first=_day(past.periods[0].begin_s),
+        last=_day(past.periods[-1].end_s),
+    )
+    label = language.text("history.figure", summary=wording)
+    how = language.text("history.how", unit=language.text(past.unit))
+    return tag(
+        "section",
+        tag("h2", language.text("history.heading")),
+        tag("p", wording),
+        *_alarms(past, language),
+        tag("figure", inlined_svg(svg, prefix, label), class_="wide"),
+        _elements(drawn, language),
+        tag("p", how, class_="note"),
+        class_="past",
+    )
+
+
+def _how_much(past: BridgeHistory, language: Language) -> str:
+    number = sum(one.crossings for one in past.periods)
+    many = len(past.periods)
+    unit = language.text(past.unit if many == 1 else f"{past.unit}s")
+    return language.text("history.how_much", number=number, periods=many, unit=unit)
+
+
+def _alarms(past: BridgeHistory, language: Language) -> Iterator[Html]:
+    lines = []
+    for alarm in past.alarms:
+        note = alarm.acknowledged
+        state = language.text("history.stands")
+        if note is not None:
+            values = {"by": note.by, "day": _day(note.time), "note": note.note}
+            which = "acknowledged_note" if note.note else "acknowledged"
+            state = language.text(f"history.{which}", **values)
+        sentence = alarm_sentence(alarm, language)
+        raised = _day(alarm.raised)
+        line = language.text("history.alarm", day=raised, alarm=sentence, state=state)
+        lines.append(tag("li", line))
+    if lines:
+        yield tag("ul", *lines)
+    for wording in statements(past):
+        yield tag(
+            "p", wording.text, class_="reassuring" if wording.is_reassuring else "not-watched"
+        )
+
+
+def alarm_sentence(alarm: Alarm, language: Language) -> str:
+    """Return an alarm in words; in English those of the alarm itself."""
+    ends = sorted(100.0 * abs(1.0 - end) for end in (alarm.ratio_q025, alarm.ratio_q975))
+    return language.text(
+        f"history.{alarm.direction}",
+        element=alarm.element,
+        change=100.0 * abs(1.0 - alarm.ratio),
+        since=_day(alarm.since),
+        low=ends[0],
+        high=ends[1],
+    )
+
+
+def _elements(drawn: HistoryView, language: Language) -> Html:
+    """Return the table of medians, and of the newest period."""
+    newest = drawn.points[-1]
+    heads = [
+        language.text("table.element"),
+        language.text("history.median", unit=language.text(f"{drawn.unit}s")),
+        language.text("history.newest", unit=language.text(drawn.unit)),
+        language.text("table.interval"),
+        language.text("history.of_median"),
+    ]
+    rows = []
+    for n, mean in enumerate(newest.mean):
+        usual = float(np.median([p.mean[n] for p in drawn.points if len(p.mean) > n]))
+        rows.append(
+            [
+                str(n + 1),
+                language.number(usual / 1e9, ".2f"),
+                language.number(mean / 1e9, ".2f"),
+                language.text("cell.range", low=newest.low[n] / 1e9, high=newest.high[n] / 1e9),
+                language.number(mean / usual, ".3f"),
+            ]
+        )
+    return table(heads, rows)
+
+
+def _day(time_s: float) -> str:
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d}"

@@ -1,0 +1,23 @@
+"""Names of the effects that `worlds` adds to a crossing; the command's help lists them."""
+
+from typing import Final
+
+EVERYTHING: Final = "everything"
+SURFACE: Final = "surface"
+AMONG_ALL: Final = (
+    "free",
+    "sprung",
+    "sinking",
+    "swing",
+    "tyres",
+    "friction",
+    "bilinear",
+    "air",
+    "spans",
+)
+TORSION: Final = "torsion"
+LEFT_AND_RIGHT: Final = "left-and-right"
+ON_SURFACES: Final = (SURFACE, TORSION, LEFT_AND_RIGHT)
+"""Not parts of everything, whose answers on such a road would say little of the rest."""
+ALONE: Final = (*AMONG_ALL, *ON_SURFACES)
+EFFECTS: Final = (*ALONE, EVERYTHING)

@@ -1,0 +1,52 @@
+"""The kinds of surveys that `driveby validate --surveys` simulates.
+
+A table of plain values: the command's help names them, so nothing heavy is imported here.
+"""
+
+from typing import Final, NamedTuple
+
+_LORRY_KG, _EMPTY_KG, _LOADED_KG = 16_300.0, 7_300.0, 24_000.0
+
+
+class SurveyKind(NamedTuple):
+    """Conditions of a survey."""
+
+    crossings: int
+    changes: float = 0.0
+    """Relative standard deviation of EI from crossing to crossing; common to all elements in every
+    other survey, each element's own in the others."""
+    tyres: str | None = None
+    """Behind, on a road that is a surface; None: both axles feel one groove."""
+    offset_m: float = 0.005
+    wander_m: float = 0.12
+    masses_kg: tuple[float | None, ...] = (None,)
+    """Total masses of the trucks that take turns; None for the site's."""
+    both_ways: bool = False
+    elements: int | None = None
+    everything: bool = False
+    """Springs that rub, bearings that give, damped tyres, a lorry that has just left."""
+    scenario: int | None = None
+    """EI is that of this scenario of the paper, all elements at one level that is drawn; None: each
+    element's is drawn."""
+    noise_ug_per_rthz: float = 25.0
+
+
+KINDS: Final = {
+    "steady": SurveyKind(16),
+    "changing-2": SurveyKind(16, 0.02),
+    "changing-5": SurveyKind(16, 0.05),
+    "twin": SurveyKind(12, tyres="twin", masses_kg=(_LORRY_KG,)),
+    "single-5": SurveyKind(12, tyres="single", masses_kg=(_LORRY_KG,)),
+    "single-10": SurveyKind(8, tyres="single", offset_m=0.01, masses_kg=(_LORRY_KG,)),
+    "loaded-and-empty": SurveyKind(16, tyres="twin", masses_kg=(_LOADED_KG, _EMPTY_KG)),
+    "two-trucks": SurveyKind(12, tyres="twin", masses_kg=(_LORRY_KG, 12_000.0)),
+    "both-ways": SurveyKind(12, tyres="twin", masses_kg=(_LORRY_KG,), both_ways=True),
+    "five-elements": SurveyKind(12, tyres="twin", masses_kg=(_LORRY_KG,), elements=5),
+    "three-elements": SurveyKind(12, tyres="twin", masses_kg=(_LORRY_KG,), elements=3),
+    "everything": SurveyKind(16, tyres="twin", masses_kg=(_LORRY_KG,), everything=True),
+    "scenario-1": SurveyKind(16, scenario=1, noise_ug_per_rthz=100.0),
+    "scenario-4": SurveyKind(16, scenario=4, noise_ug_per_rthz=100.0),
+    "scenario-10": SurveyKind(16, scenario=10, noise_ug_per_rthz=100.0),
+    "scenario-5": SurveyKind(16, scenario=5, noise_ug_per_rthz=100.0),
+    "scenario-11": SurveyKind(16, scenario=11, noise_ug_per_rthz=100.0),
+}

@@ -1,0 +1,203 @@
+"""Drawn crossings of trucks with a tandem behind the front axle, equalised or on its own springs.
+
+The owner knows the axles' places and the total mass, weighs each axle, and has all other values
+within SITE_ERROR, as in `wide_cases`.
+"""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from pre_core.constants import STANDARD_GRAVITY_M_PER_S2
+from services.simulation.two_sided import Deck, WideAxle, WideBogie, WideTruck, static_axle_loads_n
+from services.simulation.wide_cases import (
+    SINGLE,
+    TWIN,
+    WANDER_M,
+    WEAK,
+    declared_bridge,
+    disturbed,
+    rigid_body,
+    with_errors,
+)
+from services.simulation.wide_crossings import WideCase, WideRun, WideSensor
+
+TOTAL_MASS_KG: Final = (17e3, 26e3)
+AHEAD_M: Final = (3.6, 5.0)
+GAP_M: Final = (1.2, 1.45)
+SPAN_M: Final = (22.0, 38.0)
+SPEED_M_PER_S: Final = (8.5, 13.0)
+SHARE: Final = (0.47, 0.53)
+FRICTION_SHARE: Final = (0.02, 0.1)
+OFFSET_M: Final = 0.005
+"""Lateral offset of the tandem's second axle from the first."""
+_LOAD_ERROR: Final = 0.01
+
+
+class TandemOptions(NamedTuple):
+    """Choices for a drawn tandem; None: drawn."""
+
+    equalised: bool = True
+    friction_share: float | None = None
+    """Dry friction of the springs over their static load."""
+    offset_m: float = OFFSET_M
+    outer_share: float = 0.5
+    """Share of the outer twin tyre in a side's load."""
+    tyres: str = "twin"
+    runs: int = 1
+    noise_ug: float = 25.0
+    road_class: str = "A"
+
+
+USUAL: Final = TandemOptions()
+
+
+def draw_tandem(seed: int, options: TandemOptions = USUAL) -> WideCase:
+    """Draw a truck with a tandem, declared as such, on a bridge with one weak element or none."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 0x7A2D]))
+    u = rng.uniform
+    truck = tandem_truck_of(rng, options)
+    span = round(float(u(*SPAN_M)), 1)
+    elements = 5 if span < 26.0 else 7
+    mass = 4400.0 * float(np.sqrt(span / 30.0) * u(0.8, 1.25))
+    rigidity = mass * (2.0 * float(u(90.0, 115.0)) * span / np.pi) ** 2
+    ratios = np.ones(elements)
+    is_weak, element, weak = u() < 0.7, int(rng.integers(elements)), u(*WEAK)
+    if is_weak:
+        ratios[element] = weak
+    deck = Deck(
+        span,
+        tuple((rigidity * ratios).tolist()),
+        mass,
+        float(0.7 * np.exp(0.2 * rng.standard_normal())),
+        float(0.005 * np.exp(0.2 * rng.standard_normal())),
+    )
+    runs = tuple(
+        WideRun(
+            float(u(*SPEED_M_PER_S)),
+            bool(u() < 0.5) if options.runs == 1 else True,
+            WANDER_M * float(rng.standard_normal()),
+            float(u(0.05, 0.4)),
+            float(u(8.0, 16.0)),
+        )
+        for _ in range(options.runs)
+    )
+    sensors = with_errors(tandem_sensors(truck, options.noise_ug), rng)
+    return WideCase(
+        f"tandem-{seed}",
+        seed,
+        truck,
+        deck,
+        float(rigidity),
+        0.0,
+        options.road_class,
+        int(rng.integers(1 << 31)),
+        False,
+        sensors,
+        runs,
+        {
+            "vehicle": declared_tandem(truck, sensors, rng),
+            "bridge": declared_bridge(deck, float(rigidity), rng),
+            "sensor": {"rate_hz": 500.0},
+        },
+    )
+
+
+def tandem_truck_of(rng: np.random.Generator, options: TandemOptions) -> WideTruck:
+    """Draw a loaded lorry of three axles whose springs and tyres fit its load."""
+    u = rng.uniform
+    total = float(u(*TOTAL_MASS_KG))
+    ahead, gap, share = float(u(*AHEAD_M)), float(u(*GAP_M)), float(u(*SHARE))
+    vary = np.exp(0.1 * rng.standard_normal(10))
+    own = np.array([650.0, 1050.0, 1050.0]) * vary[:3]
+    body_kg = total - float(own.sum())
+    force_m = ahead + (1.0 - share) * gap
+    front_share = float(u(0.26, 0.36))
+    carried = body_kg * np.array(
+        [front_share, (1.0 - front_share) * share, (1.0 - front_share) * (1.0 - share)]
+    )
+    stiffness = carried * np.array([56.0, 105.0, 105.0]) * vary[3:6]
+    damping = 0.3 * np.sqrt(stiffness * carried) * vary[6]
+    tyre = np.array([2.0e6, 3.7e6, 3.7e6]) * np.sqrt(total / 24.8e3) * vary[7:10]
+    rubs = options.friction_share
+    rubs = float(u(*FRICTION_SHARE)) if rubs is None else rubs
+    behind: dict[str, Any] = dict(TWIN if options.tyres == "twin" else SINGLE)
+    cg = (1.0 - front_share) * force_m
+    axles = []
+    for i, (place, kind, offset, roll) in enumerate(
+        (
+            (0.0, dict(SINGLE) | {"track_m": 2.05, "spring_track_m": 0.84}, 0.0, 1.0e5),
+            (ahead, behind, OFFSET_M, 1.2e5),
+            (ahead + gap, behind, OFFSET_M + options.offset_m, 1.2e5),
+        )
+    ):
+        axles.append(
+            WideAxle(
+                place,
+                float(own[i]),
+                float(stiffness[i]),
+                float(damping[i]),
+                float(tyre[i]),
+                tyre_damping_ns_per_m=0.0 if i == 0 else float(u(0.0, 1000.0)),
+                anti_roll_nm_per_rad=roll,
+                offset_m=offset,
+                outer_share=0.5 if i == 0 else options.outer_share,
+                friction_n=rubs * float(carried[i]) * STANDARD_GRAVITY_M_PER_S2,
+                **kind,
+            )
+        )
+    body = rigid_body(body_kg, cg, cg * (force_m - cg) * float(u(0.85, 1.15)))
+    bogies = (WideBogie((1, 2), (share, 1.0 - share)),) if options.equalised else ()
+    return WideTruck((body,), tuple(axles), bogies)
+
+
+def tandem_sensors(truck: WideTruck, noise_ug: float) -> tuple[WideSensor, ...]:
+    """Return two sensors on the body, above the front axle and the tandem, and two on its axles."""
+    middle = 0.5 * (truck.axles[1].position_m + truck.axles[2].position_m)
+    return (
+        WideSensor("sprung_front", "body", 0.0, noise_ug_per_rthz=noise_ug),
+        WideSensor("sprung_rear", "body", round(middle, 3), noise_ug_per_rthz=noise_ug),
+        WideSensor("unsprung_2", "axle", axle=2, noise_ug_per_rthz=noise_ug),
+        WideSensor("unsprung_3", "axle", axle=3, noise_ug_per_rthz=noise_ug),
+    )
+
+
+def declared_tandem(
+    truck: WideTruck, sensors: tuple[WideSensor, ...], rng: np.random.Generator
+) -> dict[str, Any]:
+    """Return the vehicle's table, with an equalised bogie, as its owner would write it."""
+    weighed = static_axle_loads_n(truck) / STANDARD_GRAVITY_M_PER_S2
+    axles = [
+        {
+            "position_m": axle.position_m,
+            "tyres": "twin" if axle.twin_distance_m > 0.0 else "single",
+            "tyre_width_m": axle.tyre_width_m,
+            "twin_tyre_distance_m": axle.twin_distance_m,
+            "track_m": axle.track_m,
+            "load_kg": round(float(load * (1.0 + _LOAD_ERROR * rng.standard_normal())), 1),
+            "unsprung_mass_kg": disturbed(axle.mass_kg, rng),
+            "suspension_stiffness_n_per_m": disturbed(axle.suspension_stiffness_n_per_m, rng),
+            "suspension_damping_ns_per_m": disturbed(axle.suspension_damping_ns_per_m, rng),
+            "tyre_stiffness_n_per_m": disturbed(axle.tyre_stiffness_n_per_m, rng),
+        }
+        for axle, load in zip(truck.axles, weighed, strict=True)
+    ]
+    placed = [
+        {
+            "channel": sensor.channel,
+            "on": sensor.on,
+            **({"axle": sensor.axle} if sensor.on == "axle" else {"position_m": sensor.position_m}),
+            "lateral_m": sensor.lateral_m,
+            "noise_density_ug_per_rthz": sensor.noise_ug_per_rthz,
+        }
+        for sensor in sensors
+    ]
+    return {
+        "id": "tandem-truck",
+        "gps_antenna_to_front_axle_m": 0.0,
+        "cg_height_m": 1.3,
+        "total_mass_kg": round(truck.total_mass_kg, 1),
+        "axles": axles,
+        "bogies": [{"axles": [2, 3], "equalised": True}],
+        "sensors": placed,
+    }

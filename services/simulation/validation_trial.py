@@ -1,0 +1,437 @@
+"""Site validation: simulated crossings of one truck on one bridge, and the rule that judges them.
+
+Before real crossings of a pair of vehicle and bridge count, simulated ones of this very pair are
+identified as a worker would identify them, and the answers compared with the truth. Truck, bridge,
+sensors and receiver are those of the site file, all unknown values drawn from its priors, with its
+own survey speed and a road of its class; a 2-D surface where the site file describes tyres on
+different wheel paths. In every third crossing the bridge is undamaged except for one element of
+half its rigidity, so that the trial includes what is to be detected.
+
+`judged` is the rule; studies/site-validation.md argues it, studies/scripts/certificate_rates.py
+computes how often it errs. It looks at crossings in the order of their seeds, however they were
+computed, so one seed gives one certificate.
+"""
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from functools import partial
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from pre_core.constants import NORMAL_975
+from pre_core.diagnostics.calibration import root_mean_square
+from schemas.results import CrossingResult
+from schemas.settings import IdentificationSettings
+from schemas.site import Bridge, Site, Vehicle
+from schemas.validation_records import (
+    METHOD_EDITION,
+    ValidationConditions,
+    ValidationCrossing,
+    ValidationFigures,
+    ValidationRecord,
+    VehicleBridgePair,
+    pair_hash,
+)
+from services.common.errors import FailureError
+from services.finding.placed import middle_sensor, middle_site
+from services.recordings.recording import program_version
+from services.simulation.drawn import CrossingTruth, draw_truth, drive, identify_simulated
+from services.simulation.drive import beam_of
+from services.simulation.out_of_model import WANDER_M
+from services.simulation.wheel_paths import SurfaceOptions, wheel_paths_of
+
+_log = logging.getLogger(__name__)
+
+SEED: Final = 1
+CROSSINGS: Final = 12
+FEWEST: Final = 8
+"""Fewest crossings after which a trial without objection may pass."""
+FEWEST_GOOD: Final = 8
+"""Fewest `good` crossings of all; below, the method is too rarely certain of its answer."""
+LEAST_COVERAGE: Final = 0.85
+"""Smallest coverage of all 95 % intervals. Those of one crossing are dependent: see
+studies/site-validation.md."""
+LARGEST_RMS_Z: Final = 1.5
+LARGEST_Z_GOOD: Final = 5.0
+"""Largest normal score of a `good` crossing, as in docs/validation.md."""
+SURE_COVERAGE: Final = 0.93
+SURE_RMS_Z: Final = 1.2
+"""Largest RMS score at which `FEWEST` crossings, all good, suffice."""
+WEAK_RATIO: Final = 0.5
+TAKEN_FOR_SOUND: Final = 0.75
+"""Lower end of the interval of a weak element above which its loss counts as missed."""
+FOUND_BELOW: Final = 0.9
+_SPEED_M_PER_S: Final = 10.0
+_ROAD_CLASS: Final = "B"
+"""Road class where the site file has none."""
+_STEADY_M_PER_S2: Final = 0.1
+"""Largest change of speed: a survey is driven evenly."""
+_SEEDS: Final = 1000
+"""Distance of the crossings' seeds between two seeds of trials."""
+_ALL_SEEDS: Final = 1 << 63
+
+
+class TrialOutcome(NamedTuple):
+    """Result of a trial and its reason in one sentence."""
+
+    passed: bool
+    reason: str
+
+
+class TrialCrossing(NamedTuple):
+    """One crossing of a trial, which may be computed in another process."""
+
+    number: int
+    run: Callable[[], ValidationCrossing]
+
+
+class ValidationTrial:
+    """A running site validation: the crossings to compute and their results.
+
+    Compute what `next_run` returns, anywhere, pass each result to `add`, in any order, and stop as
+    soon as there is a `judgement`.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        pair: VehicleBridgePair,
+        settings: IdentificationSettings,
+        seed: int = SEED,
+    ) -> None:
+        """Begin a trial; raise KeyError if the site has no such pair."""
+        self.pair = pair
+        self._site = site
+        self._settings = settings
+        self._seed = seed
+        self._alone = single_pair_site(site, pair)
+        self._started = 0
+        self._tried: dict[int, ValidationCrossing] = {}
+        self._judged: list[ValidationCrossing] = []
+        self.judgement: TrialOutcome | None = None
+
+    def next_run(self) -> TrialCrossing | None:
+        """Return the next crossing to compute; None if all have been given."""
+        if self._started == CROSSINGS:
+            return None
+        number = self._started
+        self._started += 1
+        single = self._settings.model_copy(update={"threads": 1})
+        run = partial(one_crossing, self._alone, single, self._seed_of(number), number)
+        return TrialCrossing(number, run)
+
+    def _seed_of(self, number: int) -> int:
+        return (self._seed * _SEEDS + number) % _ALL_SEEDS
+
+    def add(self, number: int, tried: ValidationCrossing) -> None:
+        """Add the result of a crossing; ignore those after the judgement."""
+        self._tried[number] = tried
+        while self.judgement is None and len(self._judged) in self._tried:
+            self._judged.append(self._tried[len(self._judged)])
+            self.judgement = judge_trial(self._judged)
+
+    def give_up(self, number: int) -> None:
+        """Note that a crossing could not be computed."""
+        self.add(number, _not_simulated(self._alone, self._seed_of(number)))
+
+    @property
+    def share(self) -> float:
+        """The share of crossings that have been judged; 1 when it is over."""
+        return 1.0 if self.judgement is not None else len(self._judged) / CROSSINGS
+
+    def certificate(self, created: float) -> ValidationRecord:
+        """Return the record, `created` s after 1970 UTC; raise ValueError before judgement."""
+        if self.judgement is None:
+            raise ValueError(f"{self.pair}: the trial is not over")
+        vehicle, bridge = self._alone.vehicles[0], self._alone.bridges[0]
+        return ValidationRecord(
+            version=program_version(),
+            created=created,
+            hash=pair_hash(self._site, self.pair, self._settings),
+            method_edition=METHOD_EDITION,
+            vehicle=vehicle.id,
+            bridge=bridge.id,
+            settings=self._settings.model_dump(mode="json"),
+            seed=self._seed,
+            conditions=conditions_of(vehicle, bridge, self._site),
+            planned=CROSSINGS,
+            crossings=tuple(self._judged),
+            figures=figures_of(self._judged),
+            passed=self.judgement.passed,
+            reason=self.judgement.reason,
+        )
+
+
+def run_trial(trial: ValidationTrial, pool: ProcessPoolExecutor, processes: int) -> Iterator[float]:
+    """Run a trial to its judgement, `processes` crossings at a time; yield the completed share.
+
+    Raise FailureError if a process died.
+    """
+    under_way: dict[Future[ValidationCrossing], int] = {}
+    while trial.judgement is None:
+        while len(under_way) < processes and (one := trial.next_run()) is not None:
+            under_way[pool.submit(one.run)] = one.number
+        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+            number = under_way.pop(future)
+            try:
+                trial.add(number, future.result())
+            except BrokenExecutor as error:
+                raise FailureError(
+                    f"{trial.pair}: a process that simulated a crossing died, perhaps for want of "
+                    "memory"
+                ) from error
+            except Exception:  # any error counts against the method and does not end the trial
+                _log.exception("simulated crossing %d of %s failed", number, trial.pair)
+                trial.give_up(number)
+        yield trial.share
+    for future in under_way:
+        future.cancel()
+
+
+def single_pair_site(site: Site, pair: VehicleBridgePair) -> Site:
+    """Return the site with this vehicle and this bridge only; raise KeyError if they are unknown.
+
+    The vehicle's sensors are reduced to its centre readings, which are simulated.
+    """
+    chosen = {
+        "vehicles": (site.vehicle(pair.vehicle),),
+        "bridges": (site.bridge(pair.bridge),),
+    }
+    return middle_site(site.model_copy(update=chosen))
+
+
+def conditions_of(vehicle: Vehicle, bridge: Bridge, site: Site) -> ValidationConditions:
+    """Return road, speed and sensors from the site file, or the usual ones."""
+    sensor = middle_sensor(site.sensor, vehicle)
+    twin = vehicle.twin_tyre_distance_m is not None and vehicle.twin_tyre_distance_m[1] > 0.0
+    return ValidationConditions(
+        speed_m_per_s=bridge.survey_speed_m_per_s or _SPEED_M_PER_S,
+        road_class=bridge.road_class or _ROAD_CLASS,
+        road="surface" if twin or vehicle.rear_axle_offset_m else "groove",
+        # A simulated truck has one rate, the lowest of its sensors'.
+        rate_hz=min(sensor.rate_hz),
+        noise_density_ug_per_rthz=sensor.noise_density_ug_per_rthz,
+    )
+
+
+def one_crossing(
+    site: Site, settings: IdentificationSettings, seed: int, number: int
+) -> ValidationCrossing:
+    """Draw, simulate and identify the crossing `number` of the site's only pair."""
+    bridge = site.bridges[0]
+    conditions = conditions_of(site.vehicles[0], bridge, site)
+    truth, weak = _truth(site, conditions, seed, number)
+    nominal = np.array(bridge.nominal_flexural_rigidity_nm2)
+    went_in = {
+        "seed": seed,
+        "direction": "start_to_end" if truth.conditions.forward else "end_to_start",
+        "weak_element": None if weak is None else weak + 1,
+        "ei_ratio": tuple((truth.beam.flexural_rigidity_nm2 / nominal).tolist()),
+    }
+    try:
+        drawn = drive(site, truth, seed, noise_ug_per_rthz=conditions.noise_density_ug_per_rthz)
+    except FailureError as error:
+        _log.warning("crossing %d was not simulated: %s", seed, error)
+        return _not_simulated(site, seed)
+    found = identify_simulated([drawn.run], drawn.site, settings)
+    if len(found) != 1:
+        return ValidationCrossing.model_validate(went_in | {"verdict": "not_found"})
+    return ValidationCrossing.model_validate(went_in | _came_out(found[0].result, nominal.tolist()))
+
+
+def _not_simulated(site: Site, seed: int) -> ValidationCrossing:
+    """Return the result of a crossing that could not be computed."""
+    elements = site.bridges[0].elements
+    return ValidationCrossing(
+        seed=seed, direction="start_to_end", ei_ratio=(1.0,) * elements, verdict="not_simulated"
+    )
+
+
+def _truth(
+    site: Site, conditions: ValidationConditions, seed: int, number: int
+) -> tuple[CrossingTruth, int | None]:
+    """Return the truth of a crossing, and the index of its weak element, if any."""
+    vehicle, bridge = site.vehicles[0], site.bridges[0]
+    truth = draw_truth(site, seed)
+    how = truth.conditions
+    truth = truth._replace(
+        conditions=how._replace(
+            road_class=conditions.road_class,
+            speed_m_per_s=conditions.speed_m_per_s,
+            change_m_per_s=min(how.change_m_per_s, _STEADY_M_PER_S2 * how.period_s / (2.0 * np.pi)),
+            rate_hz=conditions.rate_hz,
+        ),
+        paths=wheel_paths_of(vehicle, SurfaceOptions(None, None, WANDER_M))
+        if conditions.road == "surface"
+        else None,
+    )
+    if number % 3 != 1:
+        return truth, None
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 0x5EA4]))
+    weak = int(rng.integers(bridge.elements))
+    ratios = np.ones(bridge.elements)
+    ratios[weak] = WEAK_RATIO
+    sound = beam_of(bridge, ratios).flexural_rigidity_nm2
+    return truth._replace(beam=truth.beam._replace(flexural_rigidity_nm2=sound)), weak
+
+
+def _came_out(result: CrossingResult, nominal: list[float]) -> dict[str, object]:
+    came: dict[str, object] = {
+        "verdict": result.verdict,
+        "reasons": tuple(str(reason) for reason in result.reasons),
+        "evaluations": int(
+            sum(result.diagnostics.get(key, 0.0) for key in ("iterations", "chain_evaluations"))
+        ),
+    }
+    if result.parameters is None:
+        return came
+    elements = [result.parameters[f"EI_{e + 1}"] for e in range(len(nominal))]
+    for key in ("q025", "q50", "q975"):
+        came[f"ei_ratio_{key}"] = tuple(
+            getattr(element, key) / sound for element, sound in zip(elements, nominal, strict=True)
+        )
+    return came
+
+
+class CrossingErrors(NamedTuple):
+    """Errors of one crossing with an answer, element by element."""
+
+    z: np.ndarray[tuple[int], np.dtype[np.float64]]
+    std_log: np.ndarray[tuple[int], np.dtype[np.float64]]
+    is_covered: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+
+def errors_of(tried: ValidationCrossing) -> CrossingErrors:
+    """Return the errors of a crossing with an answer."""
+    truth, low, middle, high = (
+        np.array(values)
+        for values in (
+            tried.ei_ratio,
+            tried.ei_ratio_q025,
+            tried.ei_ratio_q50,
+            tried.ei_ratio_q975,
+        )
+    )
+    std_log = np.log(high / low) / (2.0 * NORMAL_975)
+    return CrossingErrors(
+        np.log(middle / truth) / np.maximum(std_log, 1e-12),
+        std_log,
+        (low <= truth) & (truth <= high),
+    )
+
+
+def figures_of(tried: Sequence[ValidationCrossing]) -> ValidationFigures:
+    """Return the statistics of crossings."""
+    answered = [one for one in tried if one.is_answered]
+    errors = [errors_of(one) for one in answered]
+    z = np.concatenate([e.z for e in errors]) if errors else np.empty(0)
+    good = [
+        float(np.abs(e.z).max())
+        for one, e in zip(answered, errors, strict=True)
+        if one.verdict == "good"
+    ]
+    weak = [one for one in answered if one.weak_element is not None]
+    return ValidationFigures(
+        crossings=len(tried),
+        good=len(good),
+        intervals=z.size,
+        covered=sum(int(e.is_covered.sum()) for e in errors),
+        rms_z=root_mean_square(z) if z.size else None,
+        largest_z_good=max(good, default=None),
+        std=float(np.median(np.concatenate([e.std_log for e in errors]))) if errors else None,
+        weak=len(weak),
+        weak_found=sum(_of_weak(one.ei_ratio_q975, one) < FOUND_BELOW for one in weak),
+        evaluations=sum(one.evaluations or 0 for one in tried),
+    )
+
+
+def _of_weak(values: tuple[float, ...], tried: ValidationCrossing) -> float:
+    assert tried.weak_element is not None  # noqa: S101 - asked of such only
+    return values[tried.weak_element - 1]
+
+
+def judge_trial(
+    tried: Sequence[ValidationCrossing], planned: int = CROSSINGS
+) -> TrialOutcome | None:
+    """Return whether the first crossings of a trial pass or fail; None if there are too few.
+
+    A trial ends early where further crossings cannot save it, or where there is no objection.
+    """
+    figures = figures_of(tried)
+    elements = len(tried[0].ei_ratio) if tried else 0
+    against = _against(tried, figures, planned, elements)
+    if against is not None:
+        return TrialOutcome(False, against)
+    is_sure = (
+        figures.good == figures.crossings >= FEWEST
+        and figures.covered >= SURE_COVERAGE * figures.intervals
+        and (figures.rms_z or 0.0) <= SURE_RMS_Z
+    )
+    if figures.crossings < planned and not is_sure:
+        return None
+    return TrialOutcome(True, _for(figures))
+
+
+def _against(
+    tried: Sequence[ValidationCrossing], figures: ValidationFigures, planned: int, elements: int
+) -> str | None:
+    """Return an objection that no further crossing could remove."""
+    for one in tried:
+        if one.verdict != "good":
+            continue
+        worst = float(np.abs(errors_of(one).z).max())
+        if worst > LARGEST_Z_GOOD:
+            return (
+                f"crossing {one.seed} is called good and is wrong by {worst:.1f} standard "
+                f"deviations, at most {LARGEST_Z_GOOD:g} are allowed"
+            )
+        if one.weak_element is not None and _of_weak(one.ei_ratio_q025, one) > TAKEN_FOR_SOUND:
+            return (
+                f"crossing {one.seed} is called good and takes element {one.weak_element}, of "
+                "half its rigidity, for a sound one"
+            )
+    others = figures.crossings - figures.good
+    if others > planned - FEWEST_GOOD:
+        return (
+            f"{figures.good} of {figures.crossings} crossings are good, at least {FEWEST_GOOD} of "
+            f"{planned} must be ({_why_not(tried)})"
+        )
+    # All remaining intervals may contain the truth, with zero errors.
+    to_come = (planned - figures.crossings) * elements
+    missed = figures.intervals - figures.covered
+    if missed > (1.0 - LEAST_COVERAGE) * (figures.intervals + to_come):
+        return (
+            f"{missed} of {figures.intervals} intervals of 95 % miss the truth, at most "
+            f"{100 * (1.0 - LEAST_COVERAGE):.0f} % may"
+        )
+    squares = figures.intervals * (figures.rms_z or 0.0) ** 2
+    if squares > LARGEST_RMS_Z**2 * (figures.intervals + to_come):
+        return (
+            f"errors are {figures.rms_z:.2f} standard deviations (root mean square), at most "
+            f"{LARGEST_RMS_Z:g} are allowed"
+        )
+    return None
+
+
+def _why_not(tried: Sequence[ValidationCrossing]) -> str:
+    """Return the reasons of crossings that are not good, the most frequent first."""
+    found = [
+        reason for one in tried if one.verdict != "good" for reason in one.reasons or (one.verdict,)
+    ]
+    return ", ".join(sorted(set(found), key=lambda reason: (-found.count(reason), reason)))
+
+
+def _for(figures: ValidationFigures) -> str:
+    weak = f", a weak element stands out in {figures.weak_found} of {figures.weak}"
+    return (
+        f"{figures.good} of {figures.crossings} crossings are good, {figures.covered} of "
+        f"{figures.intervals} intervals of 95 % hold the truth{weak if figures.weak else ''}"
+    )

@@ -1,1 +1,0 @@
-"""Is what the methods say true? Against the paper, a known truth, and a bound."""

@@ -1,0 +1,71 @@
+"""Detection of edits of the site file while a worker runs."""
+
+import logging
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from schemas.results import BridgeResult
+from schemas.site import Site
+from schemas.site_file import parse_site, read_site_text, site_hash
+from services.common.errors import InputError
+from services.ledger.baselines import baselines_of
+
+_log = logging.getLogger(__name__)
+CHECK_EVERY_S: Final = 2.0
+_Signature = tuple[int, int, int]
+"""File, size, and time of the last change in ns."""
+
+
+class EditedSite(NamedTuple):
+    """A valid site file that differs from the previous one."""
+
+    text: str
+    site: Site
+    hash: str
+    baselines: dict[str, BridgeResult]
+
+
+class SiteFileWatcher:
+    """Watcher of the site file, which reports each error once."""
+
+    def __init__(self, path: Path, site: Site) -> None:
+        self._path = path
+        self._hash = site_hash(site)
+        self._seen = self._signature()
+        self._refused = ""
+        self._next_check_s = 0.0
+
+    def edited(self, now_s: float, *, is_asked: bool = False) -> EditedSite | None:
+        """Return the present file, if it was edited since the last call; by any steady clock.
+
+        If `is_asked`, it is read at once, whether it seems to have changed or not. An invalid file
+        is a warning, and the previous one stays in use.
+        """
+        if now_s < self._next_check_s and not is_asked:
+            return None
+        self._next_check_s = now_s + CHECK_EVERY_S
+        seen = self._signature()
+        if seen == self._seen and not is_asked:
+            return None
+        self._seen = seen
+        try:
+            text = read_site_text(self._path)
+            site = parse_site(text, str(self._path))
+            baselines = baselines_of(site, self._path.parent)
+        except InputError as error:
+            if str(error) != self._refused or is_asked:
+                _log.warning("%s; keeping the previous site file", error)
+            self._refused = str(error)
+            return None
+        self._refused = ""
+        if (found := site_hash(site)) == self._hash:
+            return None
+        self._hash = found
+        return EditedSite(text, site, found, baselines)
+
+    def _signature(self) -> _Signature | None:
+        try:
+            status = self._path.stat()
+        except OSError:
+            return None  # an editor is about to replace it
+        return status.st_ino, status.st_size, status.st_mtime_ns

@@ -1,0 +1,1 @@
+"""Studies of the program: they run from the checkout and are not part of the wheel."""

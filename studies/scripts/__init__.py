@@ -1,0 +1,1 @@
+"""Measurements behind the pages that `driveby validate` does not print."""

@@ -1,0 +1,1 @@
+"""Validation of method `pre` against simulated crossings of known truth."""

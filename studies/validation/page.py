@@ -1,0 +1,315 @@
+"""The page docs/validation.md, from the results of a validation of method `pre`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from studies.validation.calibration import SMALLEST_P, Aim, Record, by_condition
+from studies.validation.uncertainty import (
+    JUDGED,
+    ValidationOutcome,
+    aims,
+    control_checks,
+    largest_z,
+    noises,
+    number,
+    percent,
+    reasons_of,
+    scenario_rows,
+    summary,
+)
+from studies.validation.worlds import HEADINGS, cells, lines_of
+
+_HEAD = """# Validation of method `pre`
+
+Is the uncertainty true? This page is written by
+
+    {command} --page docs/validation.md
+
+(`make validate`: 200 crossings, 64 of each effect); every figure on it comes from that run. Nothing
+here was shown on a real bridge: no public record of one is known.
+
+## The aims
+
+{aims}
+"""
+
+_DRAWN = """
+## Crossings drawn from the priors
+
+{crossings} crossings, seeds 0 to {last}. For each, everything that the method calls unknown is
+drawn from what its site file says of it: the truck (log-normal, 15 %), EI of every element
+(log-normal, 0.55 of ln EI), mass per length (10 %), Rayleigh damping (50 %), support springs
+and how far bearings give (half-normal, or absent as likely as not), tyre damping (half-normal),
+wheelbase (0.2 %), gains (1 %) and delays (0.5 ms) of the channels, the total mass
+(1 %) and the gain common to all channels (1 %), the receiver's slow error (1.5 m), noise and
+latency (0.1 s), the height of the centre of gravity (15 %). No draw is cut off or thrown away.
+Biases of the sensors are 0.03 m/s², roads of ISO class A or B; 5 to 25 m/s in both directions,
+four in ten with accelerations of 0.1 to 1 m/s²; 200 to 2000 Hz; 25 to 100 µg/√Hz, declared as it
+is; one or ten fixes a second.
+
+The truth is computed on ten finite elements in each element with 40 modes and steps of 0.1 ms,
+felt through a tyre's contact patch, measured, put into messages and read by the same engine that
+reads a recording. The method shares with it neither mesh, nor time step, nor integrator, nor the
+position. What the two do share is the model: a linear half-car on a beam at rest. Whether a real
+truck and a real bridge are so is not shown here.
+
+![Errors, coverage, ranks and widths]({image})
+
+Errors are judged in ln EI, in which the prior is normal: z = (ln median − ln truth) over the
+standard deviation that the 2.5 and 97.5 % quantiles give. The scale error (total mass, common
+gain) is part of both the interval and the truth. The bound is the Cramér-Rao bound of the same
+rows, receiver and priors at the truth; the variance of a support spring is that of a normal cut
+off at zero there. Standard errors are taken between crossings, because elements of one crossing
+are not independent.
+
+{elements}
+
+| | least | 5 % | median | 95 % | most |
+| --- | --: | --: | --: | --: | --: |
+{distributions}
+
+Where it holds:
+
+| crossings | number | good | coverage | rms z |
+| --- | --: | --: | --: | --: |
+{conditions}
+
+Verdicts and reasons: {reasons}.
+
+Ranks: were the intervals true, the share of the posterior that lies below the truth would be
+uniform. Each parameter is tested by χ² over ten bins; a group fails if the smallest of its
+p-values times their number is below {smallest_p:g}.
+"""
+
+_CONTROL = """
+## A check that can fail
+
+The same crossings, seeds 0 to {last}, with the noise declared half of what it is: {good} of
+{count} are `good`, {named} of {count} say so (`noise_above_declared`, `model_misfit` or
+`residuals_coloured`).
+"""
+
+_SCENARIOS = """
+## The paper's scenarios
+
+One crossing each at 10 m/s over a road of class A with the errors of a receiver (1.5 m slow, 0.4
+m and 0.07 m/s white); the truck is the site file's. EI over the sound value, mean ± standard
+deviation; the paper's Table 7 (no noise, exact position; its ± is the spread of particles)
+beside it.
+
+| scenario | element | truth | paper | {columns} |
+| --: | --- | --: | --: | {rules} |
+{rows}
+
+{verdicts}
+"""
+
+_WORLDS = """
+## More physics than the method has
+
+Crossings whose truck and bridge are drawn as above, but on free and rigid bearings and undamped
+tyres; then with one effect, or with all but the surface, torsion and left-and-right, which are on
+roads of their own. What is drawn from which range is written in
+`services/simulation/out_of_model.py`; no range is a prior of the method. Answered is what is not
+rejected; covered is the share of the 95 % intervals of EI that hold the truth, of all that were
+answered and of those that are `good`; z is the error over the standard deviation: its mean over all
+elements and that of the worst element, its root mean square (rms), and its largest size where the
+verdict is `good` (max); std is the median relative standard deviation of EI, for the surface also
+over the Cramér-Rao bound at the truth with the roads' mismatch in its noise (of bound).
+
+| {headings} |
+| --- |{rules}
+{rows}
+
+{reasons}
+"""
+
+_JUDGED = """
+## Crossings of an independent simulator
+
+Files from a program that shares no code with this one. Each EI is allowed to be off by the
+larger of a share of its value and a number of standard deviations.
+
+| run | verdict | χ² | at the truth | allowed | error | largest \\|z\\| | std/bound |
+| --- | --- | --: | --: | --- | --: | --: | --: |
+{rows}
+"""
+
+_NOT_JUDGED = """
+## Crossings of an independent simulator
+
+Not judged in this run: the folder with them was not there.
+"""
+
+_ELSEWHERE = """
+## Other evidence
+
+Each page has its figures with their commands. No real bridge is among them.
+
+| what | against | page |
+| --- | --- | --- |
+| beam, modes, moving loads | closed forms, another integrator, orders of convergence | [forward problem](../studies/forward-problem.md) |
+| truck on bridge, the paper's search | the paper's tables, a simulator that shares no code | [reproduction](../studies/reproduction.md) |
+| verdicts, weights or chains | faults, one by one | [faults](../studies/faults.md) |
+| fused intervals, forecasts, weak elements | surveys simulated whole | [surveys](../studies/surveys.md) |
+| sensors left and right | a simulator with two sides | [sensors](../studies/sensors.md) |
+| site validation | made-up errors | [error rates](../studies/site-validation.md) |
+| alarms | simulated years of bridges | [alarms](../studies/alarms.md) |
+| services | load, kills, archives | [load](../studies/load.md) |
+| speed | peers, and plain NumPy | [benchmarks](../studies/benchmarks.md) |
+| the tests | one wrong token at a time | [mutants](../studies/mutants.md) |
+"""  # noqa: E501 - a row of Markdown is one line
+
+
+def validation_page(outcome: ValidationOutcome, image: str = "images/calibration.png") -> str:
+    """Return the page as Markdown."""
+    text = _HEAD.format(command=_command(outcome), aims=_aims(aims(outcome)))
+    if len(outcome.drawn) > 1:
+        text += _drawn(outcome, image)
+    if outcome.control:
+        text += _control(outcome)
+    if outcome.scenarios:
+        text += _scenarios(outcome)
+    if outcome.worlds:
+        text += _worlds(outcome.worlds)
+    text += _judged(outcome) if outcome.judged else _NOT_JUDGED
+    return text + _ELSEWHERE
+
+
+def _command(outcome: ValidationOutcome) -> str:
+    """Return the command, with its numbers of crossings."""
+    effects = dict.fromkeys(record["effect"] for record in outcome.worlds)
+    each = len(outcome.worlds) // max(1, len(effects))
+    return (
+        f"driveby validate --method pre --crossings {len(outcome.drawn)} "
+        f"--control {len(outcome.control)} --out-of-model {each}"
+    )
+
+
+def _worlds(records: Sequence[Record]) -> str:
+    lines = lines_of(records)
+    of_effect = {
+        line.effect: [record for record in records if record["effect"] == line.effect]
+        for line in lines
+    }
+    reasons = [f"{effect}: {', '.join(reasons_of(of))}" for effect, of in of_effect.items()]
+    return _WORLDS.format(
+        headings=" | ".join(HEADINGS),
+        rules=" --: |" * (len(HEADINGS) - 1),
+        rows="\n".join(f"| {' | '.join(cells(line))} |" for line in lines),
+        reasons="Verdicts and reasons: " + "; ".join(reasons) + ".",
+    )
+
+
+def _aims(checks: list[Aim]) -> str:
+    rows = ["| aim | measured | wanted | |", "| --- | --: | --: | --- |"]
+    for check in checks:
+        measured = "none" if check.measured is None else f"{check.measured:.3g}"
+        note = f" ({check.note})" if check.note else ""
+        wanted = _wanted(check)
+        name = check.name.replace("|", "\\|")
+        rows.append(
+            f"| {name} | {measured}{note} | {wanted} | {'met' if check.is_met else '**missed**'} |"
+        )
+    return "\n".join(rows)
+
+
+def _wanted(check: Aim) -> str:
+    if check.low == check.high:
+        return f"{check.low:g}"
+    if check.low == 0.0:
+        return f"≤ {check.high:g}"
+    # Shares and p-values end at one in any case.
+    return f"≥ {check.low:g}" if check.high == 1.0 else f"{check.low:g} to {check.high:g}"
+
+
+def _drawn(outcome: ValidationOutcome, image: str) -> str:
+    records = outcome.drawn
+    found = summary(records)
+    return _DRAWN.format(
+        crossings=len(records),
+        last=len(records) - 1,
+        image=image,
+        elements=_elements(found),
+        distributions="\n".join(
+            f"| {_LABELS[key]} | " + " | ".join(_short(v) for v in values.values()) + " |"
+            for key, values in found["distributions"].items()
+            if values is not None
+        ),
+        conditions="\n".join(
+            f"| {name} | {count} | {percent(good)} | {percent(covered)} | {number(rms)} |"
+            for name, count, good, covered, rms in by_condition(records)
+        ),
+        reasons=", ".join(reasons_of(records)),
+        smallest_p=SMALLEST_P,
+    )
+
+
+_LABELS = {
+    "chi2_per_dof": "χ² per degree of freedom",
+    "r_hat": "R-hat",
+    "ess": "effective sample size",
+    "acceptance": "acceptance",
+    "seconds": "seconds, one process of two",
+    "starts": "starts of the search",
+    "road_z": "rms error of the road over its std",
+}
+
+
+def _short(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+
+
+def _elements(found: dict[str, Any]) -> str:
+    head = "| element | " + " | ".join(str(e + 1) for e in range(found["elements"])) + " |"
+    rules = "| --- |" + " --: |" * found["elements"]
+    rows = [
+        ("within the 95 % interval", [percent(v) for v in found["coverage"]]),
+        ("rms z", [number(v) for v in found["rms"]]),
+        ("mean std over mean bound", [number(v) for v in found["std_over_bound"]]),
+        ("median bound of ln EI", [percent(v) for v in found["bound"]]),
+    ]
+    return "\n".join([head, rules, *(f"| {name} | {' | '.join(cells)} |" for name, cells in rows)])
+
+
+def _control(outcome: ValidationOutcome) -> str:
+    good, named = control_checks(outcome.control)
+    count = len(outcome.control)
+    return _CONTROL.format(
+        last=count - 1,
+        count=count,
+        good=round(count * (good.measured or 0.0)),
+        named=round(count * (named.measured or 0.0)),
+    )
+
+
+def _scenarios(outcome: ValidationOutcome) -> str:
+    columns = [f"{noise:g} µg/√Hz" for noise in noises(outcome)]
+    verdicts = [
+        f"{line['scenario']} at {line['noise_ug_per_rthz']:g}: {line['verdict']}"
+        + (f" ({', '.join(line['reasons'])})" if line["reasons"] else "")
+        for line in outcome.scenarios
+        if line["verdict"] != "good"
+    ]
+    return _SCENARIOS.format(
+        columns=" | ".join(columns),
+        rules=" | ".join("--:" for _ in columns),
+        rows="\n".join(f"| {' | '.join(row)} |" for row in scenario_rows(outcome)),
+        verdicts="Not good: " + "; ".join(verdicts) + "." if verdicts else "All are `good`.",
+    )
+
+
+def _judged(outcome: ValidationOutcome) -> str:
+    rows = []
+    for line in outcome.judged:
+        tolerance = JUDGED[line["folder"]]
+        elements = [e for e in line["elements"].values() if "mean" in e]
+        error = max((abs(e["mean"] / e["truth"] - 1.0) for e in elements), default=None)
+        ratio = max((e["std"] / e["bound"] for e in elements), default=None)
+        rows.append(
+            f"| {line['folder']} {line['run']} | {line['verdict']} | "
+            f"{number(line['chi2_per_dof'])} | {number(line['chi2_at_truth'])} | "
+            f"{tolerance.share:.0%} or {tolerance.stds:g} std | {percent(error)} | "
+            f"{number(largest_z(line))} | {number(ratio)} |"
+        )
+    return _JUDGED.format(rows="\n".join(rows))

@@ -1,0 +1,148 @@
+"""Validation of method `pre`: run all parts, print their tables, write page and figure."""
+
+import json
+from typing import TYPE_CHECKING
+
+from schemas.settings import IdentificationSettings
+from schemas.site_file import load_site
+from services.common.files import check_writable, make_folder, write_atomically
+from services.common.progress import progress_bar
+from services.finding.placed import middle_site
+from services.simulation.drawn import default_site
+from services.simulation.validation_options import IntervalOptions
+from studies.validation.calibration import Aim, by_condition, ranks_of, scores
+from studies.validation.uncertainty import (
+    ValidationOutcome,
+    aims,
+    as_json,
+    largest_z,
+    noises,
+    number,
+    percent,
+    reasons_of,
+    run_parts,
+    scenario_rows,
+)
+from studies.validation.worlds import HEADINGS, cells, lines_of, read_records, run_worlds
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_FIGURE = "calibration.png"
+
+
+def run(asked: IntervalOptions, console: "Console") -> int:
+    """Run all parts, print their tables, write the requested files; 1 if an aim was missed."""
+    for path in (asked.json, asked.page):
+        if path is not None:
+            check_writable(path)
+    if asked.out_of_model:
+        read_records(asked.records)
+        make_folder(asked.records.parent)
+    if asked.figures is not None:
+        make_folder(asked.figures)
+        check_writable(asked.figures / _FIGURE)
+    outcome = _outcome(asked, console)
+    if asked.json is not None:
+        write_atomically(asked.json, json.dumps(as_json(outcome), indent=1) + "\n")
+    if asked.figures is not None and len(outcome.drawn) > 1:
+        from studies.validation.figure import calibration_figure
+
+        calibration_figure(
+            asked.figures / _FIGURE,
+            scores(outcome.drawn),
+            ranks_of(outcome.drawn),
+            f"{len(outcome.drawn)} simulated crossings whose truth was drawn from the priors",
+        )
+    if asked.page is not None:
+        from studies.validation.page import validation_page
+
+        write_atomically(asked.page, validation_page(outcome))
+    all_checks = aims(outcome)
+    print_outcome(console, outcome, all_checks)
+    return 0 if all(check.is_met for check in all_checks) else 1
+
+
+def _outcome(asked: IntervalOptions, console: "Console") -> ValidationOutcome:
+    known = default_site() if asked.site is None else middle_site(load_site(asked.site))
+    with progress_bar(console) as bar:
+        task = bar.add_task("crossings", total=None)
+        outcome = run_parts(
+            known,
+            crossings=asked.crossings,
+            control=asked.control,
+            scenarios=asked.scenarios,
+            folder=asked.truth,
+            processes=asked.processes,
+            progress=lambda done, jobs: bar.update(task, completed=done, total=jobs),
+        )
+        if not asked.out_of_model:
+            return outcome
+        task = bar.add_task("crossings with more physics", total=None)
+        return outcome._replace(
+            worlds=run_worlds(
+                known,
+                asked.effects,
+                asked.out_of_model,
+                asked.records,
+                IdentificationSettings(method="pre", threads=1),
+                asked.processes,
+                lambda done, jobs: bar.update(task, completed=done, total=jobs),
+            )
+        )
+
+
+def print_outcome(console: "Console", outcome: ValidationOutcome, all_checks: list[Aim]) -> None:
+    """Print the tables of all parts, at most 80 characters wide, and the aims."""
+    from rich.table import Table
+
+    def table(*columns: str) -> Table:
+        made = Table(box=None, pad_edge=False, header_style="bold")
+        for k, column in enumerate(columns):
+            made.add_column(column, justify="left" if k == 0 else "right", no_wrap=True)
+        return made
+
+    if len(outcome.drawn) > 1:
+        console.print("[bold]crossings drawn from the priors[/]", highlight=False)
+        shown = table("", "crossings", "good", "coverage", "rms z")
+        for name, count, good, covered, rms in by_condition(outcome.drawn):
+            shown.add_row(name, str(count), f"{good:.0%}", percent(covered), number(rms))
+        console.print(shown)
+        for text in reasons_of(outcome.drawn):
+            console.print(f"  {text}", highlight=False)
+    if outcome.scenarios:
+        console.print("[bold]the paper's scenarios, EI / sound EI[/]", highlight=False)
+        shown = table(
+            "scenario", "element", "truth", "paper", *(f"{n:g} µg" for n in noises(outcome))
+        )
+        for row in scenario_rows(outcome):
+            shown.add_row(*row)
+        console.print(shown)
+    if outcome.worlds:
+        console.print("[bold]more physics than the method has[/]", highlight=False)
+        shown = table(*HEADINGS[:-2])
+        for world in lines_of(outcome.worlds):
+            shown.add_row(*(cell.replace(" %", "%") for cell in cells(world)[:-2]))
+        console.print(shown)
+    for line in outcome.judged:
+        worst = largest_z(line)
+        console.print(
+            f"{line['folder']} run {line['run']}: {line['verdict']}, chi2 "
+            f"{number(line['chi2_per_dof'])}, largest |z| {number(worst)}",
+            highlight=False,
+        )
+    if outcome.judged_from is None:
+        console.print("no crossings of an independent simulator here: that part is left out")
+    shown = table("aim", "measured", "from", "to", "")
+    for check in all_checks:
+        measured = "none" if check.measured is None else f"{check.measured:.3f}"
+        style = None if check.is_met else "bold red"
+        shown.add_row(
+            check.name,
+            f"{measured} {check.note}".strip(),
+            f"{check.low:g}",
+            f"{check.high:g}",
+            "met" if check.is_met else "MISSED",
+            style=style,
+        )
+    console.print(shown)

@@ -1,0 +1,163 @@
+"""The wheel on several Pythons, with the lowest and the newest versions of what it depends on.
+
+    python -m tests.matrix WHEEL --python python3.11 --python python3.13 [--lowest] [-o DIR]
+
+For each Python an empty environment gets the wheel with all extras and the tests' own packages.
+Then `driveby demo` runs in it, and a selection of the tests, copied to a folder in which the
+project's sources are not: they are rewritten as the wheel's modules are (setup.py), because
+`services` is called `driveby.services` there. `--lowest` adds an environment of the first Python
+with the lowest versions that pyproject.toml allows. The exit code is 1 if anything failed.
+"""
+
+import argparse
+import os
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+RUNNERS = ("hypothesis", "pytest", "pytest-benchmark", "pytest-timeout", "pytest-xdist")
+"""Packages that run the tests; the newest in every environment."""
+NEEDED_BY_TESTS = ("jsonschema", "pyyaml")
+"""Packages that the selected tests import. Moto, the S3 server, and s3fs allow no common version of
+botocore at times."""
+SELECTION = (
+    "tests/contract/test_decoders.py",
+    "tests/contract/test_topics.py",
+    "tests/unit/bus",
+    "tests/unit/common",
+    "tests/unit/execution",
+    "tests/unit/export",
+    "tests/unit/finding",
+    "tests/unit/history",
+    "tests/unit/identification",
+    "tests/unit/ledger",
+    "tests/unit/recordings",
+    "tests/unit/schemas",
+    "tests/verdicts/test_rows.py",
+)
+READS_SOURCES = (
+    "tests/contract/test_decoders.py::test_importing_signals_is_cheap",
+    "tests/unit/schemas/test_toml_text.py::test_only_one_place_parses_toml",
+)
+"""Tests that need the sources as they lie in a checkout."""
+COPIED = ("docs", "pyproject.toml", "recordings/sample", "tests")
+
+
+class Environment(NamedTuple):
+    """A Python and the versions to install into it."""
+
+    name: str
+    python: str
+    is_lowest: bool
+
+
+class Outcome(NamedTuple):
+    """What came out of one environment."""
+
+    environment: Environment
+    version: str
+    demo: str
+    tests: str
+    is_good: bool
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("wheel", type=Path)
+    parser.add_argument("--python", action="append", default=[], help="default: this one")
+    parser.add_argument("--lowest", action="store_true", help="lowest allowed versions as well")
+    parser.add_argument("-o", "--out", type=Path, default=Path("build/matrix"))
+    parser.add_argument("-k", default="", help="only the selected tests that match, as in pytest")
+    options = parser.parse_args()
+    pythons = options.python or [sys.executable]
+    wanted = [Environment(f"newest-{n}", python, False) for n, python in enumerate(pythons)]
+    wanted += [Environment("lowest", pythons[0], True)] if options.lowest else []
+    outcomes = []
+    for one in wanted:
+        outcomes.append(tried(one, options.wheel.resolve(), options.out.resolve(), options.k))
+        print(row(outcomes[-1]), flush=True)
+    print("\n| Python | versions | `driveby demo` | tests |\n| --- | --- | --- | --- |")
+    for outcome in outcomes:
+        print(row(outcome))
+    sys.exit(0 if all(outcome.is_good for outcome in outcomes) else 1)
+
+
+def row(outcome: Outcome) -> str:
+    versions = "lowest" if outcome.environment.is_lowest else "newest"
+    return f"| {outcome.version} | {versions} | {outcome.demo} | {outcome.tests} |"
+
+
+def lowest() -> Iterator[str]:
+    """Yield the lowest version that pyproject.toml allows of each package that it names."""
+    extras = PROJECT["optional-dependencies"]
+    named = [*PROJECT["dependencies"]]
+    named += [one for extra in extras if extra not in ("dev", "docs") for one in extras[extra]]
+    for requirement in named:
+        found = re.match(r"([\w-]+)(?:\[\w+\])?\s*>=\s*([\w.]+)", requirement)
+        if found:
+            yield f"{found[1]}=={found[2]}"
+
+
+def tried(one: Environment, wheel: Path, out: Path, matching: str) -> Outcome:
+    """Install the wheel into an empty environment, and run demo and tests in it."""
+    folder = out / one.name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    python = folder / "venv" / "bin" / "python"
+    variables = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    variables["NUMBA_CACHE_DIR"] = str(folder / "kernels")
+    with (folder / "log.txt").open("w") as log:
+
+        def run(*command: str | Path, cwd: Path = folder) -> tuple[int, float]:
+            began_s = time.monotonic()
+            done = subprocess.run(command, stdout=log, stderr=log, cwd=cwd, env=variables)
+            return done.returncode, time.monotonic() - began_s
+
+        if run(one.python, "-m", "venv", folder / "venv")[0]:
+            return Outcome(one, one.python, "", "no environment", False)
+        version = subprocess.run(
+            [python, "--version"], capture_output=True, text=True, check=True
+        ).stdout.split()[1]
+        bounds = folder / "lowest.txt"
+        bounds.write_text("\n".join(lowest()) if one.is_lowest else "")
+        install = [python, "-m", "pip", "install", "--quiet", "-c", bounds]
+        code, _ = run(*install, f"{wheel}[all]", *RUNNERS, *NEEDED_BY_TESTS)
+        if code:
+            return Outcome(one, version, "", f"cannot be installed: {folder / 'log.txt'}", False)
+        checkout = folder / "tests-only"
+        copied(checkout)
+        demo, demo_s = run(python.with_name("driveby"), "demo", cwd=folder)
+        command = [python, "-m", "pytest", "-n", "2", "--dist", "loadgroup", "-q", *SELECTION]
+        command += [f"--deselect={name}" for name in READS_SOURCES]
+        code, _ = run(*command, *(["-k", matching] if matching else []), cwd=checkout)
+    last = (folder / "log.txt").read_text().strip().splitlines()[-1].strip("= ")
+    said = f"{'runs' if demo == 0 else f'exit code {demo}'} ({demo_s:.0f} s)"
+    return Outcome(one, version, said, last, code == 0 and demo == 0)
+
+
+def copied(checkout: Path) -> None:
+    """Copy the tests and what they read, importing the modules under the wheel's names."""
+    setup = runpy.run_path(str(ROOT / "setup.py"))
+    rewritten: Callable[[bytes, str], bytes] = setup["moved_inside"]
+    for name in COPIED:
+        source, target = ROOT / name, checkout / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, target)
+    for path in (checkout / "tests").rglob("*.py"):
+        path.write_bytes(rewritten(path.read_bytes(), str(path)))
+
+
+if __name__ == "__main__":
+    main()

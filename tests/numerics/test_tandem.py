@@ -1,0 +1,236 @@
+"""Trucks with a tandem: contact forces, residuals and noise against an independent simulation.
+
+The truth is `services.simulation.two_sided`, which shares no physics, mesh or integrator with the
+formulas tested here: a body that rolls, axles of two to four tyres, an equaliser, dry friction.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from pre_core.constants import MICRO_G_M_PER_S2, STANDARD_GRAVITY_M_PER_S2
+from pre_core.crossing import posterior
+from pre_core.crossing.posterior import ChainageFixes, Priors
+from pre_core.crossing.preparation import (
+    CrossingInputs,
+    build_problem,
+    off_bridge_residuals,
+    update_noise,
+)
+from pre_core.crossing.rows import RESIDUALS
+from pre_core.parameters import (
+    C_S1,
+    C_U1,
+    D_1,
+    EI_1,
+    K_S1,
+    K_U1,
+    KAPPA,
+    M_U1,
+    RHO_A,
+    SHARE,
+    names,
+    table,
+)
+from pre_core.physics.surface import Footprint
+from pre_core.physics.tandem import Lead, shared_load
+from pre_core.physics.vehicle import masses_above_axles
+from services.simulation.tandem_cases import TandemOptions, draw_tandem
+from services.simulation.two_sided import WideTruck, axle_row, body_row
+from services.simulation.wide_crossings import (
+    SatelliteErrors,
+    WideCase,
+    WideDrivenRun,
+    drive_case,
+)
+
+EXACT = SatelliteErrors(0.0, 0.0, 0.0)
+DENSITY = 25.0 * MICRO_G_M_PER_S2
+
+
+class Driven(NamedTuple):
+    """A noise-free crossing of a drawn truck over one profile, and its case."""
+
+    case: WideCase
+    run: WideDrivenRun
+
+
+@cache
+def driven(friction: float = 0.08) -> Driven:
+    case = draw_tandem(3, TandemOptions(friction_share=friction))
+    sensors = tuple(
+        one._replace(gain_error=0.0, delay_s=0.0, bias_m_per_s2=0.0, noise_ug_per_rthz=0.0)
+        for one in case.sensors
+    )
+    run = case.runs[0]._replace(beside_m=0.0, change_m_per_s=0.3, forward=True)
+    case = case._replace(sensors=sensors, runs=(run,), receiver=EXACT, is_one_road=True)
+    return Driven(case, drive_case(case, 0))
+
+
+def lead_of(truck: WideTruck) -> Lead:
+    front = truck.axles[0]
+    middle = round(0.5 * (truck.axles[1].position_m + truck.axles[2].position_m), 3)
+    return Lead(
+        truck.axles[1].position_m,
+        middle,
+        front.mass_kg,
+        front.tyre_stiffness_n_per_m,
+        front.tyre_damping_ns_per_m,
+    )
+
+
+def gap_of(truck: WideTruck) -> float:
+    return truck.axles[2].position_m - truck.axles[1].position_m
+
+
+def theta_of(case: WideCase) -> np.ndarray:
+    """Return the truth as a vector of parameters."""
+    truck, deck = case.truck, case.deck
+    body, lead = truck.bodies[0], lead_of(truck)
+    theta = np.zeros(len(names(len(deck.flexural_rigidity_nm2))))
+    theta[D_1] = body.cg_position_m
+    theta[SHARE] = truck.bogies[0].shares[0]
+    reach = body.cg_position_m * (lead.readings_apart_m - body.cg_position_m)
+    theta[KAPPA] = body.pitch_inertia_kg_m2 / (body.mass_kg * reach)
+    theta[K_S1] = truck.axles[0].suspension_stiffness_n_per_m
+    theta[C_S1] = truck.axles[0].suspension_damping_ns_per_m
+    behind = truck.axles[1:]
+    theta[K_S1 + 1] = sum(axle.suspension_stiffness_n_per_m for axle in behind)
+    theta[C_S1 + 1] = sum(axle.suspension_damping_ns_per_m for axle in behind)
+    for w, axle in enumerate(behind):
+        theta[M_U1 + w] = axle.mass_kg
+        theta[K_U1 + w] = axle.tyre_stiffness_n_per_m
+        theta[C_U1 + w] = axle.tyre_damping_ns_per_m
+    theta[RHO_A : RHO_A + 3] = (
+        deck.mass_per_length_kg_per_m,
+        deck.rayleigh_alpha_per_s,
+        deck.rayleigh_beta_s,
+    )
+    theta[EI_1:] = deck.flexural_rigidity_nm2
+    return theta
+
+
+def inputs_of(of: Driven, acceleration: np.ndarray | None = None) -> CrossingInputs:
+    """Return the crossing with the truth as its nominal values and an exact receiver."""
+    case, run = of.case, of.run.run
+    truck, deck = case.truck, case.deck
+    theta = theta_of(case)
+    rows = table(len(deck.flexural_rigidity_nm2), 2)
+    at_zero = (theta == 0.0) & np.array([row.may_be_zero for row in rows])
+    spread = np.where(at_zero, 1e-9, 0.1)
+    estimated = (theta > 0.0) & ~np.isin(np.arange(theta.size), range(C_S1, K_S1 + 2))
+    lead, gap = lead_of(truck), gap_of(truck)
+    response = of.run.response
+    shift = of.run.entry_s - np.interp(0.0, response.position_m, response.time_s)
+    time_s = run.accel_time_s
+    fix_s = time_s[::10]
+    position = np.interp(fix_s - shift, response.time_s, response.position_m) - lead.ahead_m
+    speed = np.interp(
+        fix_s - shift, response.time_s, np.gradient(response.position_m, response.time_s)
+    )
+    step_s = 1.0 / run.rate_hz
+    signals = np.stack(list(run.channels.values())) if acceleration is None else acceleration
+    return CrossingInputs(
+        signals,
+        0.0,
+        step_s,
+        1,
+        deck.span_m,
+        np.full(len(deck.flexural_rigidity_nm2), deck.span_m / len(deck.flexural_rigidity_nm2)),
+        (),
+        truck.total_mass_kg,
+        truck.bodies[0].cg_height_m,
+        np.full(4, DENSITY),
+        run.rate_hz,
+        ChainageFixes(fix_s - time_s[0], position, speed, 1e-3, 1e-3, 1e-3),
+        Priors(
+            theta,
+            spread,
+            at_zero,
+            estimated,
+            np.zeros(theta.size),
+            gap,
+            1e-3,
+            0.01,
+            0.01,
+            0.0005,
+        ),
+        3,
+        1,
+        (Footprint(), Footprint()),
+        lead=lead,
+    )
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.08])
+def test_contact_forces_follow_from_inertia_alone(friction: float) -> None:
+    of = driven(friction)
+    truck, response = of.case.truck, of.run.response
+    theta, lead, gap = theta_of(of.case), lead_of(truck), gap_of(truck)
+    a_1, a_2 = (
+        response.acceleration @ body_row(truck, place, 0.0)
+        for place in (0.0, lead.readings_apart_m)
+    )
+    on = shared_load(lead, theta, truck.total_mass_kg, gap)
+    share = theta[SHARE]
+    speed = np.gradient(response.position_m, response.time_s)
+    pull = np.gradient(speed, response.time_s)
+    transfer = truck.total_mass_kg * truck.bodies[0].cg_height_m / on.lever_m * pull
+    bogie = on.bogie_1 * a_1 + on.bogie_2 * a_2 + transfer
+    springs = (on.lead_1 * a_1 + on.lead_2 * a_2 - transfer, share * bogie, (1.0 - share) * bogie)
+    carried = (on.lead_kg, share * on.bogie_kg, (1.0 - share) * on.bogie_kg)
+    of_axle = np.repeat(np.arange(3), [2, 4, 4])
+    for i, axle in enumerate(truck.axles):
+        own = axle.mass_kg * (response.acceleration @ axle_row(truck, i, 0.0))
+        weight = STANDARD_GRAVITY_M_PER_S2 * (carried[i] + axle.mass_kg)
+        true = response.contact_force_n[:, of_axle == i].sum(axis=1)
+        moved = true[100:-100].std()
+        assert moved > 1000.0
+        np.testing.assert_allclose(
+            (-weight - springs[i] - own)[100:-100], true[100:-100], atol=2e-3 * moved
+        )
+
+
+def test_bogie_at_the_second_reading_has_the_masses_of_a_half_car() -> None:
+    theta = theta_of(driven().case)
+    theta[SHARE] = 0.5
+    lead = Lead(4.6, 5.275, 700.0, 2e6, 0.0)
+    on = shared_load(lead, theta, 24800.0, 1.35)
+    body_kg = 24800.0 - 700.0 - theta[M_U1] - theta[M_U1 + 1]
+    m_11, m_22, m_12 = masses_above_axles(body_kg, theta[D_1], 5.275, theta[KAPPA])
+    assert (on.lead_1, on.lead_2) == pytest.approx((m_11, m_12))
+    assert (on.bogie_1, on.bogie_2) == pytest.approx((m_12, m_22))
+    assert on.lead_kg + on.bogie_kg == pytest.approx(body_kg)
+
+
+def test_profiles_of_the_tandem_agree_at_the_truth() -> None:
+    problem, y = build_problem(inputs_of(driven()))
+    for _ in range(2):
+        problem = update_noise(problem, y, None)
+    white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
+    before, behind = off_bridge_residuals(problem, y)
+    on = slice(before.stop, behind.start)
+    assert np.sqrt(np.mean(white[before, 0] ** 2)) < 0.35
+    # On the bridge the front axle's motion is estimated, from profile and deflection; without the
+    # deflection it is 1.0, without any motion of that axle 1.7.
+    assert np.sqrt(np.mean(white[on, 0] ** 2)) < 0.4
+    assert not white[:, 1:].any()
+    stiff = y.copy()
+    where = posterior.layout(problem)
+    stiff[where.elements] += 1.0  # 10 %
+    worse = posterior.data_rows(problem, stiff[None, :])[0].reshape(-1, RESIDUALS)[on, 0]
+    assert np.sum((worse - white[on, 0]) ** 2) > 50.0
+
+
+def test_sensor_noise_has_unit_variance_once_whitened() -> None:
+    of = driven()
+    count = of.run.run.accel_time_s.size
+    rng = np.random.default_rng(5)
+    noise = DENSITY * np.sqrt(0.5 * of.run.run.rate_hz) * rng.standard_normal((4, count))
+    problem, y = build_problem(inputs_of(of, noise))
+    white = posterior.data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)[:, 0]
+    before, behind = off_bridge_residuals(problem, y)
+    off = np.concatenate([white[before], white[behind]])
+    assert np.mean(off**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / off.size))

@@ -1,0 +1,83 @@
+"""What a recording holds, against recordings of which that is known."""
+
+from pathlib import Path
+
+import pytest
+
+from schemas.site_file import load_site
+from schemas.topics import Key, Message
+from services.catalogue.contents import Gap, summarise_recording
+from services.common.errors import InputError
+from services.drives.importing import import_command
+from services.finding.stays import Passage
+from services.recordings.writer import write_recording
+from tests.unit.drives.recorded import START_NS, S, drive
+
+
+def test_trucks_times_rates_and_gaps(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    both = [*drive(leave_out=range(100, 130)), *drive("truck-2", leave_out=range(50, 55))]
+    write_recording(path, both, site_toml=None, reason="test")
+    found = summarise_recording(path)
+    first, second = found.trucks
+    assert (first.vehicle, second.vehicle) == ("truck-1", "truck-2")
+    assert first.streams["accel"] == (170, 30, pytest.approx(20.0))
+    assert first.streams["gnss"] == (100, 0, pytest.approx(10.0))
+    assert first.channel_rates_hz == {"sprung_front": 1000.0}
+    assert (first.first_ns, first.last_ns) == (START_NS, START_NS + 9_950_000_000)
+    # A quarter of a second is no gap, though the messages are missing.
+    assert second.streams["accel"].missing == 5
+    begin_ns = START_NS + 99 * 50_000_000
+    assert found.gaps == (Gap("truck-1", "accel", begin_ns, begin_ns + 31 * 50_000_000),)
+    assert (found.site, found.site_error, found.passings) == (None, None, ())
+
+
+def test_between_two_boots_a_truck_was_off(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    both = [*drive(), *drive(boot_id=8, begin_s=3600.0)]
+    write_recording(path, both, site_toml=None, reason="test")
+    found = summarise_recording(path)
+    assert found.gaps == ()
+    assert found.trucks[0].boots == 2
+    assert found.trucks[0].streams["accel"] == (400, 0, pytest.approx(20.0))
+
+
+def test_crossings_are_those_that_are_identified(
+    tmp_path: Path, project: Path, csv_example: Path
+) -> None:
+    """The sample has one crossing, whose entry the identification tells (docs/contract.md)."""
+    found = summarise_recording(project / "recordings/sample/crossing.mcap")
+    (passing,) = found.passings
+    assert (passing.vehicle, passing.bridge, passing.forward) == ("truck-1", "bridge-1", True)
+    assert passing.passage is Passage.THROUGH
+    assert passing.entry_ns / S == pytest.approx(1_767_225_602.644, abs=0.3)
+    # In the site file of another place there is no such bridge.
+    elsewhere = load_site(csv_example / "site.toml")
+    assert (
+        summarise_recording(project / "recordings/sample/crossing.mcap", elsewhere).passings == ()
+    )
+    path = tmp_path / "example.mcap"
+    import_command(
+        sources=[csv_example], site=csv_example / "site.toml", output=path, force=False,
+        vehicle=None, name=None,
+    )  # fmt: skip
+    assert [p.bridge for p in summarise_recording(path).passings] == [elsewhere.bridges[0].id]
+
+
+def test_unusable_site_file_is_reported_without_crossings(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    write_recording(path, drive(), site_toml="[bridge]\n", reason="test")
+    found = summarise_recording(path)
+    assert found.site is None
+    assert found.site_error is not None
+    assert found.site_error.startswith(f"{path}: site.toml: ")
+
+
+def test_what_cannot_be_decoded_is_counted_and_says_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    where = Key("live", "vehicle", "truck-1", "gnss")
+    broken = Message(where, b"\xff\xff", 7, 100, START_NS + 10 * S, START_NS)
+    write_recording(path, [*drive(), broken], site_toml=None, reason="test")
+    assert summarise_recording(path).trucks[0].streams["gnss"].messages == 101
+    with pytest.raises(InputError, match="no such file"):
+        summarise_recording(tmp_path / "none.mcap")

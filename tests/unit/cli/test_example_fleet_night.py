@@ -1,0 +1,46 @@
+"""The rehearsal of docs/examples/fleet_night raises the alarm that its page promises."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from services.history.alarm_files import standing_alarms
+
+
+@pytest.mark.slow
+@pytest.mark.process
+def test_nights_after_a_loss_of_stiffness_raise_an_alarm(project: Path, tmp_path: Path) -> None:
+    name = Path("docs/examples/fleet_night")
+    page = (project / name / "README.md").read_text()
+    commands = "\n".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
+    shutil.copytree(project / name, tmp_path / name)
+    shutil.copy(project / "docs" / "site.example.toml", tmp_path / "docs")
+    programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        ["sh", "-eu", "-c", commands],
+        cwd=tmp_path,
+        env=os.environ | {"PATH": programs},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    (alarm,), problems = standing_alarms(tmp_path / "history")
+    assert (alarm.bridge, alarm.element, problems) == ("bridge-1", 4, [])
+    assert alarm.direction == "weaker"
+    assert alarm.ratio == pytest.approx(0.7, abs=0.06)
+    assert "element 4 is " in done.stdout
+    assert list((tmp_path / "figures").glob("*.png"))
+    again = subprocess.run(
+        ["sh", name / "night.sh", "recordings", "docs/site.example.toml", "temperatures.csv"],
+        cwd=tmp_path,
+        env=os.environ | {"PATH": programs},
+        capture_output=True,
+        text=True,
+    )
+    assert again.returncode == 0, again.stderr
+    assert "12 crossings, 12 known from before" in again.stdout

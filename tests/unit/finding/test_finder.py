@@ -1,0 +1,68 @@
+"""Messages in, crossings out: each once as it begins and once with its data."""
+
+import numpy as np
+import pytest
+
+from services.finding.crossing_data import Complete, Detection, close_window, wide_window
+from services.finding.finder import Finder, Found, Name, Recognise, crossings_in
+from services.identification.engine import Engine
+from services.identification.outputs import IdentificationTask
+from tests.unit.identification.test_engine_resume import HEADER, SETTINGS, SITE, TWO
+
+
+def found(finder: Finder) -> list[Found]:
+    events = [one for m in TWO for one in finder.feed(m.key, m.payload)]
+    return [*events, *finder.finish()]
+
+
+def named(name: str, *, is_decided: bool) -> Recognise:
+    return lambda detection: Name(name, is_decided)
+
+
+def test_each_crossing_is_detected_once_and_complete_once() -> None:
+    events = found(Finder(SITE, wide_window))
+    assert [type(one) for one in events] == [Detection, Complete] * 2
+    for detection, complete in zip(events[::2], events[1::2], strict=True):
+        assert isinstance(detection, Detection)
+        assert isinstance(complete, Complete)
+        assert complete.data.crossing_id == detection.crossing_id
+        assert complete.detection.crossing_id == detection.crossing_id
+        assert complete.detection.entry_ns < complete.detection.exit_ns
+
+
+def test_a_finder_gives_the_data_that_an_engine_works_on() -> None:
+    engine = Engine(SITE, SETTINGS, HEADER)
+    said = [one for m in TWO for one in engine.feed(m.key, m.payload)]
+    works = [one.data for one in said if isinstance(one, IdentificationTask)]
+    alone = list(crossings_in(((m.key, m.payload) for m in TWO), SITE, close_window))
+    assert [one.crossing_id for one in alone] == [one.crossing_id for one in works]
+    assert [one.stay for one in alone] == [one.stay for one in works]
+    for one, other in zip(alone, works, strict=True):
+        assert one.samples is not None
+        assert other.samples is not None
+        for name, values in one.samples.channels.items():
+            np.testing.assert_array_equal(values, other.samples.channels[name])
+
+
+def test_a_stay_that_is_known_keeps_its_name() -> None:
+    events = found(Finder(SITE, wide_window, named("known", is_decided=False)))
+    names = {e.crossing_id if isinstance(e, Detection) else e.data.crossing_id for e in events}
+    assert names == {"known"}
+
+
+def test_a_stay_that_is_decided_elsewhere_is_not_found_again() -> None:
+    finder = Finder(SITE, wide_window, named("known", is_decided=True))
+    assert found(finder) == []
+    assert not finder.has_undecided(TWO[0].key.realm, TWO[0].key.identifier)
+
+
+@pytest.mark.parametrize(("recorded", "crossings"), [((), 2), (("truck-1",), 1)])
+def test_what_began_before_is_left_to_a_recording(
+    recorded: tuple[str, ...], crossings: int
+) -> None:
+    finder = Finder(SITE, wide_window)
+    finder.leave_to_recordings(recorded)
+    first_ns = TWO[0].log_time_ns
+    rest = [m for m in TWO if m.log_time_ns > first_ns + 7_500_000_000]
+    events = [one for m in rest for one in finder.feed(m.key, m.payload)]
+    assert sum(isinstance(one, Complete) for one in [*events, *finder.finish()]) == crossings

@@ -1,0 +1,62 @@
+"""Channels of a truck with a tandem that are inverted or exchanged are found before a fit."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pre_core.physics.simulate import Motion
+from schemas.reasons import Reason
+from schemas.site import Vehicle
+from services.finding.placed import middle_names
+from services.identification.signal_checks import reasons_before_fit
+from services.simulation.tandem_cases import draw_tandem
+from services.simulation.wide_crossings import drive_case, site_of
+
+Floats = NDArray[np.float64]
+
+
+@cache
+def recorded(seed: int) -> tuple[Vehicle, Floats, Motion]:
+    case = draw_tandem(seed)
+    found = drive_case(case, 0)
+    signals = np.stack(list(found.run.channels.values()))
+    speed = np.full(signals.shape[1], case.runs[0].speed_m_per_s)
+    travelled = np.cumsum(speed) / case.rate_hz
+    return site_of(case).vehicles[0], signals, Motion(travelled, speed, np.zeros_like(speed))
+
+
+def judged(seed: int, change: Callable[[Floats], Floats]) -> dict[Reason, str]:
+    vehicle, signals, motion = recorded(seed)
+    return dict(reasons_before_fit(vehicle, change(signals.copy()), 1.0 / 500.0, motion, 1))
+
+
+def inverted(*rows: int) -> Callable[[Floats], Floats]:
+    def change(signals: Floats) -> Floats:
+        signals[list(rows)] *= -1.0
+        return signals
+
+    return change
+
+
+@pytest.mark.parametrize("seed", [20, 23])
+def test_sound_channels_of_a_tandem_are_not_accused(seed: int) -> None:
+    assert judged(seed, lambda signals: signals) == {}
+
+
+@pytest.mark.parametrize("row", range(4))
+def test_inverted_channel_of_a_tandem_is_named(row: int) -> None:
+    names = middle_names(recorded(20)[0])
+    assert judged(20, inverted(row)) == {Reason.CHANNEL_INVERTED: names[row]}
+
+
+@pytest.mark.parametrize(("i", "k"), [(0, 1), (2, 3), (1, 2)])
+def test_exchanged_channels_of_a_tandem_are_named(i: int, k: int) -> None:
+    def exchange(signals: Floats) -> Floats:
+        signals[[i, k]] = signals[[k, i]]
+        return signals
+
+    names = middle_names(recorded(20)[0])
+    assert judged(20, exchange) == {Reason.CHANNEL_SWAPPED: f"{names[i]} and {names[k]}"}

@@ -1,0 +1,110 @@
+"""Languages of the report: complete, with the same values, and nothing left in English."""
+
+import string
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.reasons import LEFT_OUT_TEXTS, REASON_TEXTS, BridgeReason, Reason
+from schemas.results import results_json
+from schemas.site import Site
+from services.common.language import ENGLISH, LANGUAGES, Language, language_of
+from services.report.bridge import bridge_reports
+from services.report.history_section import alarm_sentence
+from services.report.page import page
+from tests.unit.history.test_bridge_history import alarm
+from tests.unit.report.test_report import KNOWN, fused, reported, site
+from tests.unit.viewer.found import RATIOS, results_of, some_crossing
+
+__all__ = ["site"]
+GERMAN = language_of("de")
+OTHERS = [language_of(code) for code in LANGUAGES if code != "en"]
+
+
+def fields(sentence: str) -> set[str]:
+    """Return the names of the values in a sentence."""
+    return {name for _, name, _, _ in string.Formatter().parse(sentence) if name}
+
+
+@pytest.mark.parametrize("language", OTHERS, ids=lambda language: language.code)
+def test_each_language_has_every_sentence_with_its_values(language: Language) -> None:
+    assert set(language.sentences) == set(ENGLISH.sentences)
+    for key, sentence in language.sentences.items():
+        assert sentence.strip(), key
+        assert fields(sentence) == fields(ENGLISH.sentences[key]), key
+    assert set(language.reasons) == set(Reason)
+    assert set(language.bridge_reasons) == set(BridgeReason)
+    assert set(language.left_out) == set(LEFT_OUT_TEXTS)
+    assert len(language.glossary) == len(ENGLISH.glossary)
+    for sentences in (language.reasons, language.bridge_reasons, language.left_out):
+        assert all(text.strip() for text in sentences.values())
+
+
+def test_numbers_are_written_as_in_the_language() -> None:
+    assert GERMAN.number(-1234.5, ",.1f") == "−1.234,5"
+    assert ENGLISH.number(-1234.5, ",.1f") == "−1,234.5"
+    assert GERMAN.text("level", mean=0.97, std=10.0).startswith(
+        "Als Ganzes liegt die Brücke beim 0,97"
+    )
+
+
+def test_details_of_a_reason_are_kept_in_another_language() -> None:
+    plain = REASON_TEXTS[Reason.CHANNEL_SWAPPED].removesuffix(".")
+    stored = f"{plain}: sprung_front and sprung_rear."
+    assert ENGLISH.reason("channel_swapped", stored) == stored
+    expected = "Zwei Kanäle scheinen vertauscht zu sein: sprung_front und sprung_rear."
+    assert GERMAN.reason("channel_swapped", stored) == expected
+    assert GERMAN.reason("channel_swapped", "<b>") == "Zwei Kanäle scheinen vertauscht zu sein."
+
+
+def test_english_alarms_in_a_report_are_those_of_the_alarm() -> None:
+    for direction in ("weaker", "stiffer"):
+        one = alarm().model_copy(update={"direction": direction})
+        assert alarm_sentence(one, ENGLISH) == one.sentence()
+
+
+def test_a_german_report_has_no_english_sentence(site: Site, tmp_path: Path) -> None:
+    then = tmp_path / "then.json"
+    then.write_text(results_json(results_of(site, some_crossing("a"), used="a")))
+    weak = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="b")
+    suspect = some_crossing("a", verdict="suspect", reasons=("position_outage",))
+    rejected = some_crossing("a", verdict="rejected", reasons=("speed_too_low",))
+    sound = results_of(site, some_crossing("a"), used="a", ratios=np.ones(7))
+    open_one = fused(site, [0.6] * 7, left_out=("disagrees",))
+    either = fused(site, [0.6, 0.4, 0.3, 0.05, 0.1, 0.1, 0.5])
+    disagreeing = fused(site, KNOWN, verdict="suspect", reasons=["crossings_disagree"])
+    changed = results_of(site, some_crossing("b"), used="b", ratios=0.7 * RATIOS)
+    texts = [
+        reported(site, results_of(site, suspect, used="a"), language="de").text,
+        *(reported(site, one, language="de").text for one in (weak, sound, open_one, either)),
+        reported(site, results_of(site, rejected), language="de").text,
+        reported(site, disagreeing, language="de").text,
+        reported(site, changed, baseline=then, language="de").text,
+    ]
+    english = [
+        *ENGLISH.sentences.values(),
+        *ENGLISH.advice.values(),
+        *REASON_TEXTS.values(),
+    ]
+    german = set(GERMAN.sentences.values())
+    parts = [
+        part.strip()
+        for sentence in english
+        if sentence not in german
+        for part, *_ in string.Formatter().parse(sentence)
+        if len(part.strip()) > 9
+    ]
+    for text in texts:
+        assert [part for part in parts if part in text] == []
+    assert "Ein Element ist deutlich weniger steif." in texts[1]
+    assert "Element 4, 12,9 bis 17,1 m: 60 % weniger steif als die anderen" in texts[1]
+    assert "Noch kein verlässliches Ergebnis." not in texts[1]
+
+
+def test_the_page_names_its_language(site: Site) -> None:
+    found = results_of(site, some_crossing("a"), used="a")
+    reports = bridge_reports([(Path("x.json"), found, site)], None, language=GERMAN)
+    text = page(reports, language=GERMAN)
+    assert '<html lang="de">' in text
+    assert 'content: "Seite " counter(page) " von " counter(pages) ""' in text

@@ -1,0 +1,88 @@
+"""What a site file implies is computed, and what is unusual is named with what was meant."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from schemas.errors import InputError
+from schemas.site_file import load_site, parse_site
+from schemas.site_usual import implied_by, warnings_of
+
+ROOT = Path(__file__).parents[3]
+TEXT = (ROOT / "docs/site.example.toml").read_text()
+SITE = parse_site(TEXT, "site.toml")
+
+
+def with_value(table: str, key: str, value: str) -> str:
+    """The example with another value of one key."""
+    begin = TEXT.index(f"[{table}]")
+    place = TEXT.index(f"\n{key} = ", begin) + 1
+    end = TEXT.index("\n", place)
+    return f"{TEXT[:place]}{key} = {value}{TEXT[end:]}"
+
+
+def scaled(table: str, key: str, factor: float) -> str:
+    tables = {"vehicle": SITE.vehicles, "bridge": SITE.bridges, "sensor": (SITE.sensor,)}
+    value = getattr(tables[table][0], key)
+    values = [v * factor for v in value] if isinstance(value, tuple) else value * factor
+    return with_value(table, key, repr(values))
+
+
+def test_quantities_are_those_of_the_formulas() -> None:
+    vehicle, bridge = SITE.vehicles[0], SITE.bridges[0]
+    found = {one.name: one.value for one in implied_by(SITE, vehicle)}
+    span, rigidity, mass = bridge.uniform()
+    assert found["first_frequency"] == pytest.approx(
+        (math.pi / span) ** 2 * math.sqrt(rigidity / mass) / (2 * math.pi)
+    )
+    force_n = 9.80665 * vehicle.total_mass_kg
+    assert found["static_deflection"] * span == pytest.approx(force_n * span**3 / 48 / rigidity)
+    share = vehicle.cg_to_rear_axle_m / vehicle.wheelbase_m
+    front_kg = vehicle.sprung_mass_kg * share
+    omega = 2 * math.pi * found["bounce_front"]
+    assert omega**2 * front_kg == pytest.approx(vehicle.suspension_stiffness_n_per_m[0])
+    hop = (2 * math.pi * found["hop_rear"]) ** 2 * vehicle.unsprung_mass_kg[1]
+    assert hop == pytest.approx(
+        vehicle.suspension_stiffness_n_per_m[1] + vehicle.tyre_stiffness_n_per_m[1]
+    )
+    omega = 2 * math.pi * found["first_frequency"]
+    assert found["damping_ratio"] == pytest.approx(
+        bridge.rayleigh_alpha_per_s / (2 * omega) + bridge.rayleigh_beta_s * omega / 2
+    )
+
+
+def test_known_sites_have_nothing_unusual(shared_sites: list[Path]) -> None:
+    assert warnings_of(SITE) == []
+    for path in (*shared_sites, ROOT / "tests/data/csv_example/site.toml"):
+        if "[[vehicle.axles]]" not in path.read_text():
+            assert warnings_of(load_site(path)) == [], path
+
+
+SLIPS = [
+    ("vehicle", "suspension_damping_ns_per_m", 1e-3, "in kN·s/m? then it is"),
+    ("vehicle", "suspension_stiffness_n_per_m", 1e-3, "in kN/m? then it is"),
+    ("vehicle", "tyre_stiffness_n_per_m", 1e-3, "in kN/m? then it is"),
+    ("vehicle", "unsprung_mass_kg", 1e-3, "in t? then it is"),
+    ("bridge", "flexural_rigidity_nm2", 1e-3, "in kN·m²? then it is"),
+    ("bridge", "flexural_rigidity_nm2", 1e-6, "in MN·m²? then it is"),
+    ("bridge", "mass_per_length_kg_per_m", 1e-3, "in t/m? then it is"),
+    ("sensor", "noise_density_ug_per_rthz", 1e-3, "in mg/√Hz? then it is"),
+]
+
+
+@pytest.mark.parametrize(("table", "key", "factor", "words"), SLIPS)
+def test_other_unit_is_an_error_or_a_warning_that_names_it(
+    table: str, key: str, factor: float, words: str
+) -> None:
+    try:
+        said = warnings_of(parse_site(scaled(table, key, factor), "site.toml"))
+    except InputError as error:
+        said = [str(error)]
+    assert any(key in line and words in line for line in said), said
+
+
+def test_damping_ratio_for_a_coefficient_is_named() -> None:
+    text = with_value("bridge", "rayleigh_beta_s", "0.04")
+    (line,) = warnings_of(parse_site(text, "site.toml"))
+    assert "rayleigh_beta_s is 0.04: a damping ratio? then it is 0.00" in line

@@ -1,0 +1,312 @@
+"""Which crossings are taken from recordings, when, and that none is twice."""
+
+import fcntl
+import os
+import time
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+from schemas.results import CrossingResult
+from schemas.topics import Key, Message
+from schemas.validation_records import VehicleBridgePair
+from services.execution.dispatch import collect, dispatch
+from services.execution.inline import InlineExecutor
+from services.execution.processes import BackgroundResult, BackgroundTask, ProcessExecutor
+from services.identification.engine import Engine
+from services.identification.known import search_hash
+from services.ledger.crossing_log import Ledger, known_crossings
+from services.recordings.writer import RecordingWriter
+from services.worker.backfill import Backfill, BackfillSource
+from tests.unit.identification.test_engine_resume import (
+    HEADER,
+    REALM,
+    SETTINGS,
+    SITE,
+    START_S,
+    TWO,
+    WHOLE,
+    EngineOutput,
+    Identifications,
+    said_by,
+)
+
+DAY_S = 86_400.0
+LONG_AGO_S = 1000.0
+"""More than any patience here."""
+
+
+class Reader:
+    """In the place of a process that reads: reads at once."""
+
+    def __init__(self) -> None:
+        self._over: list[BackgroundResult] = []
+        self.names: list[str] = []
+
+    def submit_background(self, task: BackgroundTask) -> None:
+        self.names.append(task.name)
+        self._over.append(BackgroundResult(task, task.run()))
+
+    def collect(self) -> list[object]:
+        return []
+
+    def collect_background(self) -> list[BackgroundResult]:
+        over, self._over = self._over, []
+        return over
+
+    def close(self) -> None:
+        """There is nothing to end."""
+
+
+class Worker:
+    """What a worker does with what it finds, without a bus."""
+
+    def __init__(self, folder: Path, said: EngineOutput = (), **engine: object) -> None:  # type: ignore[assignment]
+        known = known_crossings(said, search_hash(HEADER))
+        self.engine = Engine(SITE, SETTINGS, HEADER, **engine)  # type: ignore[arg-type]
+        self.ledger = Ledger(known, time.time())
+        self.recorded: set[str] = set()
+        noted = self.engine.note_recorded
+
+        def note_recorded(vehicles: Collection[str]) -> None:
+            self.recorded = set(vehicles)
+            noted(vehicles)
+
+        self.engine.note_recorded = note_recorded  # type: ignore[method-assign]
+        list(self.engine.resume(known))
+        self.reader = Reader()
+        self.backfill = Backfill(
+            BackfillSource(folder, REALM, 2.0 * DAY_S),
+            SITE,
+            SETTINGS,
+            self.ledger,
+            reader=lambda: cast(ProcessExecutor, self.reader),
+        )
+        self.here = InlineExecutor(identify=Identifications(), stopwatch=lambda: 0.0)
+        self.wanted: list[VehicleBridgePair] = []
+        self.said: EngineOutput = []
+        self._now_s = 0.0
+
+    def feed(self, messages: list[Message]) -> list[CrossingResult]:
+        return self._told(o for m in messages for o in self.engine.feed(m.key, m.payload))
+
+    def go_on(self, times: int = 20) -> list[CrossingResult]:
+        """The results of so many rounds, each long after the one before."""
+        results = []
+        for _ in range(times):
+            self._now_s += 20.0
+            said = self.backfill.advance(
+                self.engine, self._now_s, has_room=True, want=self.wanted.append
+            )
+            results += self._told(said)
+        return results
+
+    def _told(self, said: Iterator[object]) -> list[CrossingResult]:
+        results = []
+        outputs = dispatch(self.engine, self.here, said, self.wanted.append)  # type: ignore[arg-type]
+        for output in (*outputs, *collect(self.engine, self.here)):
+            self.said.append((output.key, output.payload))
+            self.ledger.note(output.key, output.payload)
+            if output.result is not None:
+                results.append(output.result)
+        return results
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Callable[..., Path]:
+    """Write what a logger would have, so many seconds ago."""
+
+    def write(
+        messages: list[Message],
+        name: str = "truck-1-20260101T000000Z.mcap",
+        ago_s: float = LONG_AGO_S,
+    ) -> Path:
+        path = tmp_path / REALM / "2026-01-01" / name
+        writer = RecordingWriter(path, reason="test", realm=REALM, site_toml=None)
+        now_ns = time.time_ns() - round(ago_s * 1e9)
+        for message in messages:
+            writer.write(message._replace(publish_time_ns=now_ns))
+        writer.finish("test", {})
+        os.utime(path, ns=(now_ns, now_ns))
+        return path
+
+    return write
+
+
+IDS = [o.result.crossing_id for o in WHOLE if o.result is not None]
+
+
+def ids(results: list[CrossingResult]) -> list[str]:
+    return [result.crossing_id for result in results]
+
+
+def test_what_nobody_sends_any_more_gets_its_result_once(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    record(TWO)
+    worker = Worker(tmp_path)
+    assert ids(worker.go_on()) == IDS
+    assert sorted(worker.said) == sorted(said_by(WHOLE))  # byte for byte, states too
+    assert worker.backfill.waiting == 0
+    assert worker.go_on() == []
+
+
+@pytest.mark.parametrize("number", range(len(WHOLE) + 1))
+def test_wherever_a_run_was_cut_off_the_next_says_the_rest(
+    tmp_path: Path, record: Callable[..., Path], number: int
+) -> None:
+    record(TWO)
+    before = said_by(WHOLE[:number])
+    worker = Worker(tmp_path, before)
+    again = list(worker.engine.resume(()))
+    worker.go_on()
+    estimates = [key for key, _ in (*before, *worker.said) if key.stream == "estimate"]
+    assert again == []
+    assert len(estimates) == 2
+    crossing_states = [one for one in (*before, *worker.said) if one[0].stream == "crossing"]
+    # What `resume` itself finishes has its own tests.
+    assert len(crossing_states) == len(set(crossing_states)) >= 7
+
+
+def test_what_another_search_has_identified_is_left_alone(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    """A site file that is edited never identifies again what has a result."""
+    record(TWO)
+    known = known_crossings(said_by(WHOLE[:6]), "another search")
+    worker = Worker(tmp_path)
+    worker.ledger = Ledger(known, time.time())
+    worker.backfill._ledger = worker.ledger
+    assert ids(worker.go_on()) == IDS[1:]
+
+
+def test_what_the_truck_itself_sends_is_no_second_crossing(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    """Whichever comes first; and in the moment between fetching and taking in, too."""
+    record(TWO)
+    first = Worker(tmp_path)
+    assert ids(first.feed(TWO)) == IDS
+    assert first.go_on() == []
+    other = Worker(tmp_path)
+    assert ids(other.go_on()) == IDS
+    assert other.feed(TWO) == []
+    between = Worker(tmp_path)
+    for _ in range(3):
+        between._now_s += 20.0
+        said = between.backfill.advance(
+            between.engine, between._now_s, has_room=False, want=between.wanted.append
+        )
+        assert list(said) == []
+    assert len(between.backfill._found) == 2
+    assert ids(between.feed(TWO)) == IDS
+    assert between.go_on() == []
+
+
+def test_a_history_that_begins_on_the_bridge_is_left_to_the_recording(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    """The truck is recorded, but keeps only what is from the middle of the bridge on."""
+    path = record(TWO, ago_s=10.0)
+    rest = [m for m in TWO if m.log_time_ns * 1e-9 - START_S > 7.5]
+    alone = Worker(tmp_path / "nowhere")
+    assert len(alone.feed(rest)) == 2
+    worker = Worker(tmp_path)
+    writer = path.open("r+b")
+    fcntl.flock(writer, fcntl.LOCK_EX)
+    assert worker.go_on(1) == []
+    assert worker.recorded == {"truck-1"}
+    assert ids(worker.feed(rest)) == IDS[1:]
+    writer.close()
+    (result,) = worker.go_on()
+    assert (result.crossing_id, result.verdict) == (IDS[0], "good")
+
+
+def test_without_a_certificate_they_stay_in_the_recording(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    record(TWO)
+    worker = Worker(tmp_path, are_required=True)
+    assert worker.go_on() == []
+    pair = VehicleBridgePair("truck-1", "bridge-1")
+    assert worker.wanted == [pair]
+    assert worker.backfill.waiting == 2
+    assert worker.said == []
+    worker.engine.certify(pair, "0123456789abcdef")
+    results = worker.go_on()
+    assert ids(results) == IDS
+    assert {result.certificate for result in results} == {"0123456789abcdef"}
+
+
+def test_company_on_the_bridge_is_found_in_recordings(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    """A truck that the site file does not know, at the same time."""
+    record(TWO)
+    theirs = [m._replace(key=m.key._replace(identifier="stranger")) for m in TWO if is_first(m)]
+    record(theirs, "stranger-20260101T000000Z.mcap")
+    worker = Worker(tmp_path)
+    seen: list[tuple[str, ...]] = []
+    inner = Identifications()
+
+    def identify(data, *arguments, **others):  # type: ignore[no-untyped-def]
+        seen.append(tuple(data.against))
+        return inner(data, *arguments, **others)
+
+    worker.here = InlineExecutor(identify=identify)
+    assert ids(worker.go_on()) == IDS
+    assert seen == [("other_truck_on_bridge",), ()]
+
+
+def is_first(message: Message) -> bool:
+    return message.key.stream == "gnss" and message.log_time_ns * 1e-9 - START_S < 20.0
+
+
+def test_older_recordings_and_other_files_are_not_read(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    record(TWO, ago_s=3.0 * DAY_S)
+    record(TWO, "_service-20260101T000000Z.mcap")
+    record(TWO, ".truck-1-20260101T000000Z.mcap")
+    worker = Worker(tmp_path)
+    assert worker.go_on() == []
+    assert worker.reader.names == []
+
+
+def test_one_that_may_still_become_whole_waits_until_nothing_more_is_recorded(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    path = record([m for m in TWO if not is_in_hole(m)], ago_s=10.0)
+    worker = Worker(tmp_path)
+    assert ids(worker.go_on()) == IDS[1:]
+    assert worker.backfill.waiting == 1
+    names = len(worker.reader.names)
+    assert worker.go_on() == []
+    assert len(worker.reader.names) == names  # it is not asked for again and again
+    os.utime(path, (time.time() - LONG_AGO_S,) * 2)
+    (result,) = worker.go_on()
+    assert (result.crossing_id, result.reasons) == (IDS[0], ("gap_on_bridge",))
+
+
+def test_what_a_spool_brings_later_makes_it_whole(
+    tmp_path: Path, record: Callable[..., Path]
+) -> None:
+    record([m for m in TWO if not is_in_hole(m)], ago_s=10.0)
+    worker = Worker(tmp_path)
+    assert ids(worker.go_on()) == IDS[1:]
+    record([m for m in TWO if is_in_hole(m)], "truck-1-20260101T001500Z.mcap", ago_s=6.0)
+    (result,) = worker.go_on()
+    assert (result.crossing_id, result.verdict) == (IDS[0], "good")
+
+
+def is_in_hole(message: Message) -> bool:
+    time_s = message.log_time_ns * 1e-9 - START_S
+    return message.key.stream == "accel" and 7.0 < time_s < 8.0
+
+
+def test_key_of_another_realm(tmp_path: Path, record: Callable[..., Path]) -> None:
+    """A folder of one realm holds what is of that realm."""
+    record([m._replace(key=Key("live", *m.key[1:])) for m in TWO])
+    assert Worker(tmp_path).go_on() == []
