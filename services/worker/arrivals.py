@@ -3,7 +3,7 @@
 from collections import defaultdict
 from typing import NamedTuple
 
-from schemas.topics import Key
+from schemas.topics import Key, is_from_recording, topic
 from services.common.intervals import Intervals
 from services.finding.streams import device_time_ns
 
@@ -22,8 +22,10 @@ _HISTORY_S = 1.0
 It sends its history stream by stream, in pieces that a busy machine delays: all is sorted by time
 before it is processed.
 """
-_LONGEST_HISTORY_S = 10.0
-"""Time in s after which a history is processed although sequences are missing in it."""
+_STALLED_HISTORY_S = 10.0
+"""Time in s without an older message after which a history is processed as it is."""
+_LONGEST_HISTORY_S = 60.0
+"""Time in s after which a history is processed in any case."""
 
 
 class TruckMessage(NamedTuple):
@@ -67,6 +69,50 @@ _Vehicle = tuple[str, str]
 """Realm and vehicle."""
 
 
+class _History:
+    """Messages of a new truck, collected until none of those that it still keeps are missing."""
+
+    def __init__(self, began_s: float) -> None:
+        self.messages: list[TruckMessage] = []
+        self._began_s = self._grew_s = began_s
+        self._sequences: defaultdict[str, Intervals] = defaultdict(Intervals)
+        """Received sequences by stream."""
+
+    def add(self, message: TruckMessage) -> None:
+        self.messages.append(message)
+        sequences = self._sequences[message.key.stream]
+        newest = sequences.highest
+        sequences.add(message.sequence)
+        if newest is not None and message.sequence < newest:
+            self._grew_s = message.received_s
+
+    def is_complete(self, now_s: float) -> bool:
+        if now_s - self._began_s < _HISTORY_S:
+            return False
+        return (
+            not self._has_missing()
+            or now_s - self._grew_s >= _STALLED_HISTORY_S
+            or now_s - self._began_s >= _LONGEST_HISTORY_S
+        )
+
+    def _has_missing(self) -> bool:
+        """Return whether sequences are missing between others or before the first.
+
+        A boot's sequences begin at 0, and a truck keeps as many as `cache` in the table of topics.
+        A replay may begin anywhere.
+        """
+        key = self.messages[0].key
+        return any(
+            sequences.runs > 1
+            or (
+                sequences.contiguous_from_zero is None
+                and sequences.size < topic("vehicle", stream).cache
+                and not is_from_recording(key.realm)
+            )
+            for stream, sequences in self._sequences.items()
+        )
+
+
 class ArrivalQueue:
     """Queue that puts messages into their order of processing.
 
@@ -76,10 +122,7 @@ class ArrivalQueue:
 
     def __init__(self) -> None:
         self._known: set[_Name] = set()
-        self._new: dict[_Name, list[TruckMessage]] = {}
-        self._since: dict[_Name, float] = {}
-        self._sequences: dict[_Name, defaultdict[str, Intervals]] = {}
-        """Received sequences of a new truck by stream."""
+        self._new: dict[_Name, _History] = {}
         self._alive: set[_Vehicle] = set()
         self._leaves: dict[_Vehicle, _Leave] = {}
         self._lost: dict[_Vehicle, float] = {}
@@ -94,10 +137,7 @@ class ArrivalQueue:
         name = (message.key.realm, message.key.identifier, message.boot_id)
         if name in self._known:
             return [message]
-        self._new.setdefault(name, []).append(message)
-        self._since.setdefault(name, message.received_s)
-        streams = self._sequences.setdefault(name, defaultdict(Intervals))
-        streams[message.key.stream].add(message.sequence)
+        self._new.setdefault(name, _History(message.received_s)).add(message)
         return []
 
     def note(self, token: LivenessToken) -> None:
@@ -112,20 +152,17 @@ class ArrivalQueue:
             self._leaves[truck] = _Leave(token.received_s, GONE_AFTER_S)
 
     def due(self, now_s: float) -> list[TruckMessage]:
-        """Return the messages of new trucks' histories that are complete, in order of time."""
-        due: list[TruckMessage] = []
-        for name in [name for name in self._since if self._is_complete(name, now_s)]:
-            self._known.add(name)
-            del self._since[name], self._sequences[name]
-            due += sorted(self._new.pop(name), key=_device_time_ns)
-        return due
+        """Return the messages of new trucks' histories that are complete, in order of time.
 
-    def _is_complete(self, name: _Name, now_s: float) -> bool:
-        collected_s = now_s - self._since[name]
-        if collected_s < _HISTORY_S:
-            return False
-        has_gaps = any(numbers.runs > 1 for numbers in self._sequences[name].values())
-        return not has_gaps or collected_s >= _LONGEST_HISTORY_S
+        Nothing is waited for behind a truck that has left.
+        """
+        left = {truck for truck, leave in self._leaves.items() if sum(leave) <= now_s}
+        due: list[TruckMessage] = []
+        for name, history in list(self._new.items()):
+            if name[:2] in left or history.is_complete(now_s):
+                self._known.add(name)
+                due += sorted(self._new.pop(name).messages, key=_device_time_ns)
+        return due
 
     def gone(self, now_s: float) -> list[DepartedTruck]:
         """Return the trucks found to have left since the last call."""

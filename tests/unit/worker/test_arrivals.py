@@ -14,7 +14,7 @@ import zenoh
 from schemas.proto import driveby_pb2 as pb
 from schemas.results import ResultHeader
 from schemas.settings import IdentificationSettings
-from schemas.topics import Key
+from schemas.topics import Key, topic
 from services import worker
 from services.bus.publisher import Publisher
 from services.common.errors import FailureError
@@ -56,24 +56,78 @@ def test_the_first_second_of_a_truck_is_put_in_order_of_time() -> None:
     assert arrivals.add(message(3.0, 1, boot_id=2)) == []  # that boot is new
 
 
+def numbered(at_s: float, number: int) -> TruckMessage:
+    return message(at_s, number)._replace(sequence=number)
+
+
 def test_history_with_gaps_waits_for_what_is_still_to_come() -> None:
     arrivals = ArrivalQueue()
-    first, last = (message(0.0, n)._replace(sequence=n) for n in (3, 5))
+    first, between, last = numbered(0.0, 0), numbered(5.0, 1), numbered(0.0, 2)
     for one in (first, last):
         arrivals.add(one)
     assert arrivals.due(5.0) == []
-    between = message(5.0, 4)._replace(sequence=4)
     assert arrivals.add(between) == []
     assert arrivals.due(5.0) == [first, between, last]
 
 
-def test_history_whose_gaps_stay_is_processed_after_ten_seconds() -> None:
+def test_history_whose_beginning_is_missing_waits_for_it() -> None:
+    """What a truck sends meanwhile may come before what it has kept."""
     arrivals = ArrivalQueue()
-    history = [message(0.0, n)._replace(sequence=n) for n in (3, 5)]
+    live = [numbered(0.02 * n, n) for n in range(50, 100)]
+    kept = [numbered(5.0, n) for n in range(50)]
+    for one in live:
+        assert arrivals.add(one) == []
+    assert arrivals.due(5.0) == []
+    for one in reversed(kept):
+        assert arrivals.add(one) == []
+    assert arrivals.due(5.0) == kept + live
+
+
+def test_history_without_what_the_truck_no_longer_keeps_is_complete() -> None:
+    arrivals = ArrivalQueue()
+    first = 700
+    kept = [numbered(0.0, n) for n in range(first, first + topic("vehicle", "accel").cache)]
+    for one in kept[1:]:
+        arrivals.add(one)
+    assert arrivals.due(1.0) == []
+    arrivals.add(kept[0])
+    assert arrivals.due(1.0) == kept
+
+
+def test_replay_may_begin_anywhere() -> None:
+    arrivals = ArrivalQueue()
+    key = Key("replay-1", "vehicle", "truck-1", "accel")
+    replayed = numbered(0.0, 700)._replace(key=key)
+    arrivals.add(replayed)
+    assert arrivals.due(1.0) == [replayed]
+
+
+def test_history_whose_gaps_stay_is_processed_ten_seconds_after_the_last_older_message() -> None:
+    arrivals = ArrivalQueue()
+    history = [numbered(0.0, 1), numbered(0.0, 5), numbered(8.0, 3), numbered(17.0, 6)]
     for one in history:
         arrivals.add(one)
-    assert arrivals.due(9.9) == []
-    assert arrivals.due(10.0) == history
+    assert arrivals.due(17.9) == []
+    assert len(arrivals.due(18.0)) == 4
+
+
+def test_no_history_is_collected_for_longer_than_a_minute() -> None:
+    arrivals = ArrivalQueue()
+    for n in range(60):
+        arrivals.add(numbered(float(n), 2 * (100 - n)))
+        assert arrivals.due(float(n)) == []
+    assert len(arrivals.due(60.0)) == 60
+
+
+def test_history_of_a_truck_that_has_left_is_processed_before_its_departure() -> None:
+    arrivals = ArrivalQueue()
+    arrivals.note(token(0.0, is_alive=True))
+    only = numbered(0.0, 700)
+    arrivals.add(only)
+    arrivals.note(token(2.0, is_alive=False))
+    assert arrivals.due(4.9) == []
+    assert arrivals.due(5.0) == [only]
+    assert arrivals.gone(5.0) == [gone()]
 
 
 def test_what_is_malformed_is_looked_at_all_the_same() -> None:
