@@ -8,7 +8,6 @@ from services.common.progress import reading_bar
 from services.recordings.recovery import (
     Recovery,
     describe,
-    put_aside,
     recover_recording,
     recovered_path,
 )
@@ -30,9 +29,9 @@ def recover_command(
         raise InputError("--set-aside goes with the usual name beside the recording, not with -o")
     target = output or recovered_path(source)
     with reading_bar("recovering", [source]) as next_file:
-        recovery = recover_recording(source, target, force=force, progress=next_file())
-    if set_aside:
-        put_aside(source)
+        recovery = recover_recording(
+            source, target, force=force, set_aside=set_aside, progress=next_file()
+        )
     plain = f"{target}: {describe(recovery)}"
     line = json.dumps(_as_json(target, recovery)) if as_json else plain
     return EXIT_LOSSY if recovery.is_lossy else EXIT_CLEAN, line

@@ -1,5 +1,6 @@
 """Recovery of a damaged recording: all valid content, and exact counts of the losses."""
 
+import contextlib
 import fcntl
 import time
 from collections.abc import Iterable
@@ -13,6 +14,7 @@ from schemas.messages import descriptors
 from schemas.topics import Key, check_realm, key, parse_key, topic
 from services.common.errors import FailureError, InputError
 from services.common.files import check_ordinary, check_writable, replaced_atomically
+from services.common.interrupts import interrupts_held
 from services.common.intervals import Intervals
 from services.common.progress import Offset, no_progress
 from services.recordings.mcap_file import McapWriter
@@ -91,6 +93,7 @@ def recover_recording(
     time_ns: int | None = None,
     *,
     force: bool = False,
+    set_aside: bool = False,
     progress: Offset = no_progress,
 ) -> Recovery:
     """Write the valid content of `source` to `target`, beside it first and then renamed.
@@ -98,7 +101,8 @@ def recover_recording(
     Messages, channels, metadata and attachments are copied unchanged, foreign topics too. A lost
     schema is taken from our own tables. Damage after the END sentinel affects only the index, which
     is rebuilt. Event and metadata `driveby.recovered` document the recovery in the file. Memory is
-    bounded whatever the file holds. `progress` receives the position in it.
+    bounded whatever the file holds. `progress` receives the position in it. With `set_aside` the
+    source is renamed then (see `put_aside`), and an interrupt does not leave both.
 
     Raise InputError if `source` is missing, is not MCAP, holds nothing readable, is being written,
     or is `target`, and if there is a recording at `target`, which only `force` replaces;
@@ -124,13 +128,19 @@ def recover_recording(
             ) from None
         if not any(not isinstance(item, Damage) for item in _read(source, file)):
             raise InputError(f"{source}: holds nothing of an MCAP recording that can be read")
-        with replaced_atomically(target, force=force) as temporary, temporary.open("wb") as out:
-            library = f"driveby {program_version()}"
-            writer = McapWriter(out.write, library=library, chunk_bytes=CHUNK_BYTES)
-            copy = _Copier(source, writer)
-            for item in _read(source, file, progress):
-                copy.take(item)
-            return copy.finish(source, source.stat().st_size, now_ns)
+        with contextlib.ExitStack() as renaming:
+            with replaced_atomically(target, force=force) as temporary:
+                with temporary.open("wb") as out:
+                    library = f"driveby {program_version()}"
+                    writer = McapWriter(out.write, library=library, chunk_bytes=CHUNK_BYTES)
+                    copy = _Copier(source, writer)
+                    for item in _read(source, file, progress):
+                        copy.take(item)
+                    recovery = copy.finish(source, source.stat().st_size, now_ns)
+                renaming.enter_context(interrupts_held())
+            if set_aside:
+                put_aside(source)
+        return recovery
 
 
 def _read(source: Path, file: BinaryIO, progress: Offset = no_progress) -> Iterable[object]:

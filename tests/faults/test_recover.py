@@ -1,6 +1,7 @@
 """`recover` under damage in every place: every intact chunk comes back, never an exception."""
 
 import random
+import signal
 import struct
 import subprocess
 import sys
@@ -376,6 +377,29 @@ def test_what_was_set_aside_is_recovered_to_the_same_place(tmp_path: Path) -> No
     expected = tmp_path / "a.recovered.mcap"
     assert recovered_path(tmp_path / "a.mcap") == expected
     assert recovered_path(tmp_path / "a.mcap.crashed") == expected
+
+
+def test_interrupt_between_the_two_names_leaves_the_recording_once(
+    whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A logger that ends interrupts the child that recovers for it, at any moment."""
+    path = damaged(tmp_path, whole.content[: whole.data_end // 2])
+    before = signal.getsignal(signal.SIGINT)
+    replace = Path.replace
+
+    def renamed_and_interrupted(self: Path, target: Path) -> Path:
+        done = replace(self, target)
+        signal.raise_signal(signal.SIGINT)
+        return done
+
+    monkeypatch.setattr(Path, "replace", renamed_and_interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        recover_recording(path, recovered_path(path), set_aside=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        path.name + ".crashed",
+        recovered_path(path).name,
+    ]
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_the_damaged_file_is_never_the_target(whole: Whole, tmp_path: Path) -> None:
