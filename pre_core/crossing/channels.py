@@ -31,12 +31,12 @@ MODEL_RATE_HZ = 340.0
 """Highest rate of the model. Residuals up to 42 Hz have within 3 % the information on EI of those
 up to 125 Hz (docs/method-pre.md)."""
 _RATE_SHARE = 2.0
-"""Largest rate of the model relative to the slowest sensor (`PASS`, `_SENSOR_PASS`)."""
-PASS, STOP = 0.215, 0.4
+"""Largest rate of the model relative to the slowest sensor (`PASS_BAND`, `_SENSOR_PASS`)."""
+PASS_BAND, STOP = 0.215, 0.4
 """Pass and stop frequency relative to the model's rate."""
 _SENSOR_PASS = 0.45
 """Pass band of the interpolation relative to a sensor's rate."""
-SEEN_ASIDE = 32
+INTERPOLATION_REACH = 32
 """Number of samples on each side of a time that `interpolate_at` needs."""
 _BLOCK = 4096
 """Number of output samples interpolated at once, which bounds memory."""
@@ -73,7 +73,7 @@ def channel_signals(
     every = int(np.ceil(fine_rate / min(MODEL_RATE_HZ, _RATE_SHARE * slowest_rate_hz) - 1e-9))
     smooth = _derivatives(fine, 1.0 / fine_rate)
     model_rate = fine_rate / every
-    taps = low_pass(PASS * model_rate / fine_rate, STOP * model_rate / fine_rate)
+    taps = low_pass(PASS_BAND * model_rate / fine_rate, STOP * model_rate / fine_rate)
     n = smooth.shape[2]
     count = (n - taps.size) // every + 1
     if count < 2:
@@ -129,18 +129,20 @@ def interpolate_at(samples: FloatArray, place: FloatArray) -> FloatArray:
     """Return samples (n,) at `place` (m,), in samples from the first, by a windowed sinc.
 
     Frequencies below 0.45 of the rate are unchanged. NaN without enough samples on both sides
-    (`SEEN_ASIDE`).
+    (`INTERPOLATION_REACH`).
     """
     beta = kaiser_beta(_STOP_BAND_DB)
     below = np.floor(place).astype(np.int64)
-    offsets = np.arange(1 - SEEN_ASIDE, SEEN_ASIDE + 1)
+    offsets = np.arange(1 - INTERPOLATION_REACH, INTERPOLATION_REACH + 1)
     result = np.full(place.size, np.nan)
-    inside = np.flatnonzero((below >= SEEN_ASIDE - 1) & (below + SEEN_ASIDE < samples.size))
+    inside = np.flatnonzero(
+        (below >= INTERPOLATION_REACH - 1) & (below + INTERPOLATION_REACH < samples.size)
+    )
     for begin in range(0, inside.size, _BLOCK):  # in blocks, to bound memory
         at = inside[begin : begin + _BLOCK]
         distance = offsets - (place[at] - below[at])[:, None]
         # The middle of the gap between the pass band and its image is half the rate.
-        weight = windowed_sinc(distance, 0.5, SEEN_ASIDE, beta, pedestal=1.0)
+        weight = windowed_sinc(distance, 0.5, INTERPOLATION_REACH, beta, pedestal=1.0)
         weight /= weight.sum(axis=1, keepdims=True)  # preserve a constant
         result[at] = np.einsum("mj,mj->m", weight, samples[below[at][:, None] + offsets])
     return result

@@ -33,7 +33,7 @@ FloatArray = NDArray[np.float64]
 _SETTLING = 500
 _SWEEPS = 60
 """Sweeps between two draws, because neighbouring elements are strongly correlated."""
-LEANING_SPREAD = 0.25
+MISMATCH_BIAS_SPREAD = 0.25
 """Relative uncertainty of the gradient correction for the mismatch: its level is known to 15 %, the
 tyres' widths and distance no better."""
 _SLICE_WIDTH = 1.0
@@ -57,7 +57,7 @@ class CompliancePosterior(NamedTuple):
     """Lower triangle M (others, others): M' M is the covariance of the others given the sampled."""
     others_linear: FloatArray
     others_sampled: FloatArray  # (others, k) block of the precision
-    leaning: FloatArray
+    bias_direction: FloatArray
     """Change (f,) of the optimum if the whole mismatch part of the gradient is removed."""
 
 
@@ -122,7 +122,7 @@ def from_normal(
     log_odds: FloatArray,
     inflation: float,
     centre: FloatArray,
-    leaning: FloatArray,
+    bias_direction: FloatArray,
 ) -> CompliancePosterior:
     """Return the density of a normal (f, f), (f,), c at `elements`, times priors, truncated.
 
@@ -142,7 +142,7 @@ def from_normal(
         np.linalg.inv(cholesky(precision[np.ix_(others, others)], lower=True)),
         linear[others],
         precision[np.ix_(others, sampled)],
-        leaning,
+        bias_direction,
     )
 
 
@@ -166,40 +166,46 @@ def mismatch_bias(found: Optimum) -> FloatArray:
 
 
 def draws(
-    of: CompliancePosterior, count: int, seed: int, stream: int, after: FloatArray | None = None
+    posterior: CompliancePosterior,
+    count: int,
+    seed: int,
+    stream: int,
+    after: FloatArray | None = None,
 ) -> FloatArray:
     """Return draws (count, f) of one Gibbs chain; `stream` distinguishes chains of one seed.
 
     A chain that continues `after` a draw (f,) of a similar density converges sooner.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1 << 21, stream)))
-    e = of.elements.size
+    e = posterior.elements.size
     if after is not None:
-        start = after[of.sampled]
+        start = after[posterior.sampled]
     else:
-        start = np.concatenate([np.log(of.centre) / -of.sigma, np.ones(of.sampled.size - e)])
+        start = np.concatenate(
+            [np.log(posterior.centre) / -posterior.sigma, np.ones(posterior.sampled.size - e)]
+        )
         start[:e] += 0.3 * rng.standard_normal(e)
-    sampled = np.empty((count, of.sampled.size))
+    sampled = np.empty((count, posterior.sampled.size))
     _gibbs(
-        of.precision,
-        of.linear,
-        of.log_odds,
-        of.sigma,
-        of.inflation,
+        posterior.precision,
+        posterior.linear,
+        posterior.log_odds,
+        posterior.sigma,
+        posterior.inflation,
         start,
         _SETTLING if after is None else _SWEEPS,
         rng,
         sampled,
     )
     x = sampled.copy()
-    x[:, :e] = np.exp(-of.sigma * sampled[:, :e])
-    mean = of.others_linear - x @ of.others_sampled.T
-    normal = rng.standard_normal((count, of.others.size))
+    x[:, :e] = np.exp(-posterior.sigma * sampled[:, :e])
+    mean = posterior.others_linear - x @ posterior.others_sampled.T
+    normal = rng.standard_normal((count, posterior.others.size))
     # With the covariance M' M the mean is M' M of the above, and the noise M' of a normal.
-    y = np.empty((count, of.sampled.size + of.others.size))
-    y[:, of.sampled] = sampled
-    y[:, of.others] = (mean @ of.others_root.T + normal) @ of.others_root
-    return y + LEANING_SPREAD * rng.standard_normal((count, 1)) * of.leaning
+    y = np.empty((count, posterior.sampled.size + posterior.others.size))
+    y[:, posterior.sampled] = sampled
+    y[:, posterior.others] = (mean @ posterior.others_root.T + normal) @ posterior.others_root
+    return y + MISMATCH_BIAS_SPREAD * rng.standard_normal((count, 1)) * posterior.bias_direction
 
 
 @kernel

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.noise import DOUBTED_OF_A_MISFIT, no_force_noise
+from pre_core.crossing.noise import FRICTION_GAIN_OF_MISFIT, no_force_noise
 from pre_core.crossing.posterior import (
     PosteriorProblem,
     all_rows,
@@ -34,19 +34,19 @@ from pre_core.search import levenberg_marquardt
 from pre_core.search.levenberg_marquardt import Rows, minimise
 from pre_core.search.loop import SearchResult, Termination
 
-_FREE = ((5.0, 8, 0.2), (1.0, 25, 0.1))
+_FREE_STAGES = ((5.0, 8, 0.2), (1.0, 25, 0.1))
 """Temperatures (factors of the noise), steps at each, and the gain in the sum of squares that ends
 it."""
-_PLAINLY_RUBS = 0.05
+_CLEAR_FRICTION_WEIGHT = 0.05
 """Suspension weight below which full weight is not tried: the friction is clear."""
-_LOST_CHI2 = 10.0
+_NO_FIT_CHI2 = 10.0
 """Limit of chi2 at five times the noise: sound starts of 90 drawn crossings had 1.6 at most, wrong
 ones 10 to 70."""
-_MOST_ROUNDS, _ROUNDS_ON_THE_WAY = 6, 2
+_MOST_ROUNDS, _EARLY_ROUNDS = 6, 2
 """Limit of alternating fits and noise estimates, finally and in earlier stages."""
-_MOST_STEPS, _STEPS_ON_THE_WAY = 25, 8
+_MOST_STEPS, _EARLY_STEPS = 25, 8
 """Limit of steps with mismatch, whose noise is estimated before every step; finally and earlier."""
-_ENOUGH_ON_TWO_ROADS = 0.5
+_MIN_GAIN_WITH_MISMATCH = 0.5
 """Gain in the sum of squares that ends a search with mismatch, far within the uncertainty of poorly
 determined parameters."""
 _SAME_LEVEL = 0.1
@@ -54,7 +54,7 @@ _SAME_LEVEL = 0.1
 _ACCEPTED_Z, _ACCEPTED_EXCESS = 3.0, 0.05
 """Limits of chi2 above one for an accepted minimum: chance in standard deviations, plus errors of
 the noise model."""
-_EXCESS_ON_TWO_ROADS = 0.25
+_EXCESS_WITH_MISMATCH = 0.25
 """Error of the noise model with mismatch, whose level follows from a few waves."""
 
 
@@ -65,7 +65,7 @@ class SearchStrategy(NamedTuple):
     """Number of the bridge's highest modes without initial vibration."""
     uses_suspension: bool
     """Whether the suspension equations have full weight; such a search stops at clear friction."""
-    most_places: int
+    max_candidates: int
     """Maximum number of candidate offsets from which all parameters are fitted."""
     differs: bool
     """Whether profile mismatch is modelled from the first step; its level may become zero."""
@@ -110,7 +110,7 @@ def chi2_stride(problem: PosteriorProblem) -> int:
     return RESIDUALS if problem.force.any() or has_tandem(problem) else 1
 
 
-def tempered(
+def tempered_residuals(
     problem: PosteriorProblem, y: FloatArray, directions: FloatArray, temperature: float
 ) -> Rows:
     """Return the function from steps v (k, d) along directions (f, d) from y (f,) to residuals."""
@@ -127,7 +127,7 @@ def _descend(
     is_free: bool = False,
 ) -> tuple[FloatArray, levenberg_marquardt.LMState, Termination, int]:
     """Minimise along `directions` (f, d) from y until a step gains less than `enough`."""
-    rows = tempered(problem, y, directions, temperature)
+    rows = tempered_residuals(problem, y, directions, temperature)
     start = np.zeros(directions.shape[1])
     lower = lower_bounds(problem, y, directions, is_free=is_free)
     found = minimise(rows, start, steps, enough, lower, is_followed=is_free)
@@ -161,10 +161,10 @@ def evaluations_of(
     return found.state.y.size + 1 + sum(info.evaluations for info in found.infos)
 
 
-def resting_mode_indices(problem: PosteriorProblem, way: SearchStrategy) -> NDArray[np.int64]:
+def resting_mode_indices(problem: PosteriorProblem, strategy: SearchStrategy) -> NDArray[np.int64]:
     """Return the indices (m,) in y of the modes without initial vibration."""
     swing = layout(problem).swing
-    return np.arange(swing.stop - 2 * way.modes_at_rest, swing.stop)
+    return np.arange(swing.stop - 2 * strategy.modes_at_rest, swing.stop)
 
 
 def _not_negative(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
@@ -178,20 +178,20 @@ def _not_negative(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
 def is_accepted(problem: PosteriorProblem, chi2: float) -> bool:
     """Return whether a minimum of this chi2 is accepted."""
     judged = problem.noise.reciprocal.size // chi2_stride(problem)
-    excess = _EXCESS_ON_TWO_ROADS if problem.mismatch.level_m3.any() else _ACCEPTED_EXCESS
+    excess = _EXCESS_WITH_MISMATCH if problem.mismatch.level_m3.any() else _ACCEPTED_EXCESS
     return chi2 < 1.0 + excess + _ACCEPTED_Z * float(np.sqrt(2.0 / judged))
 
 
-class Abandoned(Enum):
+class AbandonReason(Enum):
     """Reason why a strategy with full suspension weight has no optimum."""
 
-    RUBS = auto()
-    LOST = auto()
+    CLEAR_FRICTION = auto()
+    NO_FIT = auto()
 
 
 def fit_all(
-    problem: PosteriorProblem, y: FloatArray, way: SearchStrategy
-) -> tuple[Optimum | Abandoned, int]:
+    problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy
+) -> tuple[Optimum | AbandonReason, int]:
     """Fit all parameters from y (size,); return the optimum or why there is none, and evaluations.
 
     Negative stiffness and damping coordinates are fixed at zero, and the others brought to the
@@ -203,11 +203,11 @@ def fit_all(
     divergence.
     """
 
-    def believed(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
+    def refresh_at_full_weight(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
         return update_noise(problem, y, no_force_noise())
 
     def doubted(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
-        return update_noise(problem, y, doubted=DOUBTED_OF_A_MISFIT)
+        return update_noise(problem, y, friction_gain=FRICTION_GAIN_OF_MISFIT)
 
     front = points(problem, y[None, :]).position_m[0]
     crossing = problem.crossing
@@ -217,32 +217,39 @@ def fit_all(
     start = y.copy()
     start[layout(problem).swing] = 0.0
     free = np.eye(start.size)
-    first = np.delete(free, resting_mode_indices(problem, way), axis=1)
-    believing = update_noise(problem, start, no_force_noise())
-    believing, y, ending, evaluations = fit_stage(believing, start, first, _FREE[0], believed)
-    believing = update_noise(believing, y, no_force_noise())
-    problem = update_noise(believing, y)
-    has_friction = problem.force.any() and suspension_weight(problem, y) < _PLAINLY_RUBS
-    if way.uses_suspension and has_friction:
-        return Abandoned.RUBS, evaluations
-    if way.uses_suspension and chi2_per_dof(believing, y) > _LOST_CHI2:
-        return Abandoned.LOST, evaluations
-    if has_friction or (problem.force.any() and not way.uses_suspension):
-        problem = update_noise(believing, start)
-        problem, y, ending, used = fit_stage(problem, start, free, _FREE[0], update_noise)
+    first = np.delete(free, resting_mode_indices(problem, strategy), axis=1)
+    at_full_weight = update_noise(problem, start, no_force_noise())
+    at_full_weight, y, ending, evaluations = fit_stage(
+        at_full_weight, start, first, _FREE_STAGES[0], refresh_at_full_weight
+    )
+    at_full_weight = update_noise(at_full_weight, y, no_force_noise())
+    problem = update_noise(at_full_weight, y)
+    has_friction = problem.force.any() and suspension_weight(problem, y) < _CLEAR_FRICTION_WEIGHT
+    if strategy.uses_suspension and has_friction:
+        return AbandonReason.CLEAR_FRICTION, evaluations
+    if strategy.uses_suspension and chi2_per_dof(at_full_weight, y) > _NO_FIT_CHI2:
+        return AbandonReason.NO_FIT, evaluations
+    if has_friction or (problem.force.any() and not strategy.uses_suspension):
+        problem = update_noise(at_full_weight, start)
+        problem, y, ending, used = fit_stage(problem, start, free, _FREE_STAGES[0], update_noise)
         evaluations += used
     else:
-        for is_free, rounds in ((True, _ROUNDS_ON_THE_WAY), (False, _MOST_ROUNDS)):
+        for is_free, rounds in ((True, _EARLY_ROUNDS), (False, _MOST_ROUNDS)):
             y = y if is_free else _not_negative(problem, y)
             problem = update_noise(problem, y, no_force_noise())
             problem, y, ending, used = _fit_in_noise_rounds(
-                problem, y, first if is_free else free, rounds, believed, is_free=is_free
+                problem,
+                y,
+                first if is_free else free,
+                rounds,
+                refresh_at_full_weight,
+                is_free=is_free,
             )
             evaluations += used
     problem = update_noise(problem, y)
     y = _not_negative(problem, y)
     if not (problem.force.any() or is_accepted(problem, chi2_per_dof(problem, y))):
-        problem = update_noise(problem, y, doubted=DOUBTED_OF_A_MISFIT)
+        problem = update_noise(problem, y, friction_gain=FRICTION_GAIN_OF_MISFIT)
     if problem.force.any():
         problem, y, ending, used = _fit_in_noise_rounds(problem, y, free, _MOST_ROUNDS, doubted)
         evaluations += used
@@ -256,21 +263,21 @@ def _fit_in_noise_rounds(
     y: FloatArray,
     directions: FloatArray,
     rounds: int,
-    again: RefreshNoise,
+    refresh_noise: RefreshNoise,
     *,
     is_free: bool = False,
 ) -> tuple[PosteriorProblem, FloatArray, Termination, int]:
     """Fit from y until the noise estimated from the residuals converges.
 
-    `again` gives the problem with its noise at another y: without mismatch after a fit, in `rounds`
-    at most; with mismatch before every step (`_fit_in_noise_steps`).
+    `refresh_noise` gives the problem with its noise at another y: without mismatch after a fit, in
+    `rounds` at most; with mismatch before every step (`_fit_in_noise_steps`).
     """
-    temperature, steps, enough = _FREE[-1]
+    temperature, steps, enough = _FREE_STAGES[-1]
     evaluations = 0
     if problem.mismatch.level_m3.any():
-        most = _STEPS_ON_THE_WAY if is_free else _MOST_STEPS
+        most = _EARLY_STEPS if is_free else _MOST_STEPS
         problem, y, ending, evaluations = _fit_in_noise_steps(
-            problem, y, directions, temperature, most, again, is_free=is_free
+            problem, y, directions, temperature, most, refresh_noise, is_free=is_free
         )
         if problem.mismatch.level_m3.any():
             return problem, y, ending, evaluations
@@ -281,7 +288,7 @@ def _fit_in_noise_rounds(
         evaluations += used
         if not problem.force.any():
             break
-        before, problem = problem, again(problem, y)
+        before, problem = problem, refresh_noise(problem, y)
         if abs(before.force.sum() - problem.force.sum()) <= _SAME_LEVEL * before.force.sum():
             break
     return problem, y, ending, evaluations
@@ -291,16 +298,18 @@ def fit_stage(
     problem: PosteriorProblem,
     y: FloatArray,
     directions: FloatArray,
-    how: tuple[float, int, float],
-    again: RefreshNoise,
+    stage: tuple[float, int, float],
+    refresh_noise: RefreshNoise,
 ) -> tuple[PosteriorProblem, FloatArray, Termination, int]:
-    """Fit along directions (f, d) in an earlier stage: `how` is temperature, steps, least gain.
+    """Fit along directions (f, d) in an earlier stage: `stage` is temperature, steps, least gain.
 
-    With mismatch the noise is estimated by `again` before every step.
+    With mismatch the noise is estimated by `refresh_noise` before every step.
     """
-    temperature, steps, enough = how
+    temperature, steps, enough = stage
     if problem.mismatch.level_m3.any():
-        return _fit_in_noise_steps(problem, y, directions, temperature, steps, again, is_free=True)
+        return _fit_in_noise_steps(
+            problem, y, directions, temperature, steps, refresh_noise, is_free=True
+        )
     y, _, ending, used = _descend(problem, y, directions, temperature, steps, enough, is_free=True)
     return problem, y, ending, used
 
@@ -311,7 +320,7 @@ def _fit_in_noise_steps(
     directions: FloatArray,
     temperature: float,
     steps: int,
-    again: RefreshNoise,
+    refresh_noise: RefreshNoise,
     *,
     is_free: bool = False,
 ) -> tuple[PosteriorProblem, FloatArray, Termination, int]:
@@ -328,8 +337,8 @@ def _fit_in_noise_steps(
     damping: float | None = None
     last, share = np.zeros(1), 1.0
     for _ in range(steps):
-        problem = again(problem, y)
-        rows = tempered(problem, y, directions, temperature)
+        problem = refresh_noise(problem, y)
+        rows = tempered_residuals(problem, y, directions, temperature)
         here = levenberg_marquardt.initial_state(rows, np.zeros(directions.shape[1]))
         if damping is not None:
             here = here._replace(damping=damping)
@@ -349,7 +358,7 @@ def _fit_in_noise_steps(
         share = 0.5 * share if float(np.sum(step * last)) < 0.0 else min(1.0, 2.0 * share)
         y = y + share * (directions @ there.y)
         last, damping = step, there.damping
-        if here.objective - there.objective < _ENOUGH_ON_TWO_ROADS:
+        if here.objective - there.objective < _MIN_GAIN_WITH_MISMATCH:
             ending = Termination.CONVERGED
             break
     return problem, y, ending, evaluations

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.crossing.fit import chi2_per_dof
-from pre_core.crossing.noise import DOUBTED_OF_A_MISFIT, no_force_noise
+from pre_core.crossing.noise import FRICTION_GAIN_OF_MISFIT, no_force_noise
 from pre_core.crossing.posterior import PosteriorProblem, all_rows, data_rows, layout
 from pre_core.crossing.preparation import (
     CrossingInputs,
@@ -70,7 +70,7 @@ def fitted_residuals(inputs: CrossingInputs, found: FittedValues) -> FittedResid
             problem,
             y,
             no_force_noise() if found.uses_suspension else None,
-            DOUBTED_OF_A_MISFIT,
+            FRICTION_GAIN_OF_MISFIT,
             levels_at(problem, y) if found.differs else None,
         )
         y = _minimum(problem, y)

@@ -32,7 +32,7 @@ _WITHIN_HZ, _BESIDE_HZ = 0.4, 2.5
 """Half width of a line, and distance of its reference band."""
 _WITHIN_BINS = 2.5
 """Half width of a line in a short record, by Hann's window."""
-_PLAIN = 30.0
+_MIN_PROMINENCE = 30.0
 """Smallest peak of a line in the periodogram over the mean beside it. For noise alone the highest
 of a record is 10 times that; wheel hop has peaks 1 Hz wide and more."""
 _FEWEST = 40
@@ -51,7 +51,7 @@ class _Spectra(NamedTuple):
     power: FloatArray
 
 
-def waves(lines_hz: Sequence[float], count: int, apart_s: float) -> FloatArray:
+def line_waves(lines_hz: Sequence[float], count: int, apart_s: float) -> FloatArray:
     """Return orthonormal columns (count, w) that span waves of all frequencies at the residuals.
 
     Cosine and sine of each line, times cubic splines with knots a second apart.
@@ -66,12 +66,12 @@ def waves(lines_hz: Sequence[float], count: int, apart_s: float) -> FloatArray:
     return np.asarray(np.linalg.qr(columns)[0])
 
 
-def without(columns: FloatArray, rows: FloatArray) -> FloatArray:
+def project_out(columns: FloatArray, rows: FloatArray) -> FloatArray:
     """Return residuals (k, m) less their part in the span of orthonormal columns (m, w)."""
     return np.asarray(rows - (rows @ columns) @ columns.T)
 
 
-def strongest(white: FloatArray, apart_s: float) -> float:
+def strongest_line_hz(white: FloatArray, apart_s: float) -> float:
     """Return the frequency in Hz of the clearest line in residuals (m, kinds), 0 if there is none.
 
     Residuals are `apart_s` apart; frequencies above half their rate alias.
@@ -101,10 +101,10 @@ def _spectra(white: FloatArray, apart_s: float) -> _Spectra | None:
 
 def _is_narrow(hz: FloatArray, power: FloatArray, line_hz: float) -> bool:
     """Return whether the power about a line is clearly above that on either side."""
-    return bool(_plainness(hz, power[None, :], line_hz)[0] > _PLAIN)
+    return bool(_prominence(hz, power[None, :], line_hz)[0] > _MIN_PROMINENCE)
 
 
-def _plainness(hz: FloatArray, power: FloatArray, line_hz: float) -> FloatArray:
+def _prominence(hz: FloatArray, power: FloatArray, line_hz: float) -> FloatArray:
     """Return the peak at a line over the mean beside it, of each periodogram (k, f)."""
     apart = np.abs(hz - line_hz)
     within = max(_WITHIN_HZ, _WITHIN_BINS * float(hz[1] - hz[0]))
@@ -142,4 +142,4 @@ def unfolded_hz(signals: FloatArray, step_s: float, apart_s: float, hz: float) -
     at = np.arange(count // 2 + 1, dtype=np.float64) / (count * step_s)
     power = np.abs(np.fft.rfft(signals * np.hanning(count), axis=1)) ** 2
 
-    return max((hz, 1.0 / apart_s - hz), key=lambda one: float(_plainness(at, power, one).max()))
+    return max((hz, 1.0 / apart_s - hz), key=lambda one: float(_prominence(at, power, one).max()))

@@ -19,7 +19,7 @@ BODY = 0
 _ROUNDING = 1e-9
 
 
-class Places(NamedTuple):
+class SensorPlaces(NamedTuple):
     """Places of m sensors, all arrays (m,)."""
 
     axle: NDArray[np.int64]
@@ -42,8 +42,8 @@ class Reduction(NamedTuple):
     density 1 unless the sensors' densities are zero."""
 
 
-def reduction(
-    places: Places, density: FloatArray, wheelbase_m: float, in_the_middle_m: float
+def centre_reduction(
+    places: SensorPlaces, density: FloatArray, wheelbase_m: float, in_the_middle_m: float
 ) -> Reduction:
     """Return the reduction of sensors at `places` with one-sided noise `density` (m,).
 
@@ -92,7 +92,7 @@ def _exact(weights: FloatArray) -> FloatArray:
     return np.where(np.abs(weights - near) < _ROUNDING, near, weights)
 
 
-def middle(reduced: Reduction, acceleration: FloatArray) -> FloatArray:
+def centre_readings(reduced: Reduction, acceleration: FloatArray) -> FloatArray:
     """Return the centre readings (4, n) of accelerations (m, n) on one grid.
 
     A reading of a single sensor equals that sensor's bit for bit.

@@ -55,7 +55,7 @@ class MismatchSpectra(NamedTuple):
     cycles_per_m: FloatArray
     density: FloatArray
     """The spectrum of d, windowed."""
-    leaning: FloatArray
+    front_cross_spectrum_density: FloatArray
     """Cross spectrum (s, g) of the front axle's profile with d. The rear's is that less d's."""
     footprints: tuple[Footprint, Footprint]
     road: FloatArray
@@ -80,14 +80,14 @@ class Mismatch(NamedTuple):
 def mismatch_spectra(front: Footprint, rear: Footprint) -> MismatchSpectra:
     """Return the spectra of unequal tyres, and of a laterally shifted axle."""
     grid = _above_zero()
-    density, leaning, expected = [], [], []
+    density, front_cross_spectrum_density, expected = [], [], []
     for (one, other), larger in zip(
         _pairs(front, rear), (1.0, _LARGE_OFFSET_M / _OFFSET_M), strict=True
     ):
         of_front, _, common, difference = spectra(one, other, grid)
         at = np.interp(REFERENCE_CYCLES_PER_M, grid, difference)
         density.append(_windowed(difference / at))
-        leaning.append((of_front - common) / at)
+        front_cross_spectrum_density.append((of_front - common) / at)
         expected.append(at * larger**2)
     road = _windowed(of_front)
     spread = road / of_front
@@ -95,7 +95,7 @@ def mismatch_spectra(front: Footprint, rear: Footprint) -> MismatchSpectra:
     return MismatchSpectra(
         grid,
         np.stack(density),
-        np.stack(leaning),
+        np.stack(front_cross_spectrum_density),
         (front, rear),
         road,
         spread,
@@ -185,7 +185,9 @@ def spectrum(mismatch: Mismatch, omega: FloatArray) -> FloatArray:
 
 def front_cross_spectrum(mismatch: Mismatch, omega: FloatArray) -> FloatArray:
     """Return the cross spectrum (f,) in time of the front axle's profile with d, in m²/Hz."""
-    return mismatch.level_m3 @ density_at(mismatch, omega, mismatch.shapes.leaning)
+    return mismatch.level_m3 @ density_at(
+        mismatch, omega, mismatch.shapes.front_cross_spectrum_density
+    )
 
 
 def two_parameter_spectrum(mismatch: Mismatch) -> tuple[float, float]:
@@ -261,16 +263,16 @@ def surface_level(
 
 
 def estimate_levels(
-    segments: list[PeriodogramSegment], usual: FloatArray | None = None
+    segments: list[PeriodogramSegment], typical: FloatArray | None = None
 ) -> tuple[FloatArray, float]:
     """Return the most likely levels (s,) in m³ (Whittle's likelihood), and the gain over none.
 
-    `usual` (s,) are the means of their exponential priors, infinite without one; the gain is that
+    `typical` (s,) are the means of their exponential priors, infinite without one; the gain is that
     of `maximum_likelihood_levels`.
     """
     seen = np.concatenate([one.seen for one in segments])
     known = np.concatenate([one.sensors for one in segments])
     shape = np.concatenate([one.shapes for one in segments], axis=1)
     start = np.full(shape.shape[0], np.mean(seen) / np.mean(shape.sum(axis=0)))
-    claimed = 0.0 if usual is None else 2.0 / usual
+    claimed = 0.0 if typical is None else 2.0 / typical
     return maximum_likelihood_levels(seen, known, shape, start, claimed, _ENOUGH)

@@ -40,7 +40,7 @@ from pre_core.physics.vehicle import masses_above_axles
 
 FloatArray = NDArray[np.float64]
 
-DOUBTED_SPRING_N_PER_M = 4e5
+REDUCED_WEIGHT_SPRING_N_PER_M = 4e5
 """Divisor of body equations with reduced suspension weight. Divided by the estimated stiffness, the
 suspension noise would decrease with it: a bias that can be corrected only as well as its level is
 known. (Friction of 2 to 10 %: EI 0.4 standard deviations too low.) With full weight the divisor is
@@ -60,17 +60,17 @@ FORCE_MEMORY_S = 0.3
 _MIDDLE_BAND, _TOP_BAND = (0.22, 0.54), (0.65, 0.757)
 """Bands relative to half the residuals' rate: 12 to 30 and 36 to 42 Hz for sensors of 250 Hz and
 more."""
-_EVENLY = 3.0
+_EVEN_NOISE_RATIO = 3.0
 """Largest ratio of the middle to the top band of sensor noise. Noise of two to ten times the
 declared density has up to 1.6 before the truck is found; friction, bilinear dampers and mismatch 4
 to 100."""
-_BELIEVED_HZ = 30.0
+_SUSPENSION_BAND_HZ = 30.0
 """Highest frequency of the suspension weight."""
-DOUBTED, DOUBTED_OF_A_MISFIT = 60.0, 15.0
+FRICTION_GAIN, FRICTION_GAIN_OF_MISFIT = 60.0, 15.0
 """Gain in twice the log-likelihood of an axle's residuals that reduces its suspension weight: the
 second where nothing else explains a misfit. Of 400 axles with sensor noise alone twelve gained more
 than 15, none more than 60."""
-_ALIKE = 0.05
+_EQUAL_TYRES = 0.05
 """Sensitivity to the mismatch of unequal tyres below which tyres count as equal; the visible part
 is then an axle's offset, whose long waves are twice as large, and short ones hardly distinguish
 them."""
@@ -183,7 +183,7 @@ def _responses(truck: NoisePath, omega: FloatArray) -> NDArray[np.complex128]:
 def body_divisors(truck: NoisePath) -> FloatArray:
     """Return the divisors (2,) of the body equations, in N/m."""
     if truck.is_inertial:
-        return np.full(2, DOUBTED_SPRING_N_PER_M)
+        return np.full(2, REDUCED_WEIGHT_SPRING_N_PER_M)
     return truck.theta[K_S1 : K_S1 + 2]
 
 
@@ -360,7 +360,7 @@ def mismatch_levels(
     usual = np.array([np.inf, expected[1]])
     parts = [_mismatch.tapered_periodogram(one, of_sensors, of_shapes[:-1]) for one in stretches]
     level, gain = _mismatch.estimate_levels(parts, usual)
-    if level[0] >= _ALIKE * expected[0]:
+    if level[0] >= _EQUAL_TYRES * expected[0]:
         return level, gain, expected
     alike = [part._replace(shapes=part.shapes[1:]) for part in parts]
     level, gain = _mismatch.estimate_levels(alike, usual[1:])
@@ -372,12 +372,12 @@ def force_noise(
     truck: NoisePath,
     density: FloatArray,
     body: FloatArray,
-    enough: float = DOUBTED,
+    friction_gain: float = FRICTION_GAIN,
 ) -> FloatArray:
     """Return levels (2, shapes) of suspension noise in N²/Hz from body equations (2, m).
 
     They are the most likely levels in addition to sensor noise (`whittle`). An axle that gains at
-    most `enough` in likelihood has linear suspension within sensor noise, and level zero.
+    most `friction_gain` in likelihood has linear suspension within sensor noise, and level zero.
     """
     _, shown, sensors, shapes = _body_periodogram(rows, truck, density, body)
     over = body_divisors(truck)
@@ -387,7 +387,7 @@ def force_noise(
         seen, known = shown[axle], sensors[axle]
         level = np.full(FORCE_SHAPES, seen.mean()) / shape.mean(axis=1)
         level, gain = maximum_likelihood_levels(seen, known, shape, level)
-        if gain > enough:
+        if gain > friction_gain:
             levels[axle] = level
     return levels
 
@@ -422,8 +422,8 @@ def noise_power_ratio(
     """Return the ratio of sensor noise power to its declared value, from body equations (2, m).
 
     It is the smaller ratio of both axles in the highest band, which contains noise only. The result
-    is 1.0 where lower frequencies exceed it by a factor of `_EVENLY`, as with friction or wrong
-    parameters of the truck.
+    is 1.0 where lower frequencies exceed it by a factor of `_EVEN_NOISE_RATIO`, as with friction or
+    wrong parameters of the truck.
     """
     omega, shown, sensors, _ = _body_periodogram(rows, truck, density, body)
     share = omega * (rows.every * rows.step_s / np.pi)
@@ -432,13 +432,13 @@ def noise_power_ratio(
         np.median(ratio[:, (share > begin) & (share < end)], axis=1) / np.log(2.0)
         for begin, end in (_MIDDLE_BAND, _TOP_BAND)
     )
-    return float(top.min()) if np.all(low < _EVENLY * top) else 1.0
+    return float(top.min()) if np.all(low < _EVEN_NOISE_RATIO * top) else 1.0
 
 
 def suspension_weight(
     rows: RowFilter, truck: NoisePath, density: FloatArray, force: FloatArray
 ) -> float:
     """Return the suspension weight, 0 to 1, for sensor densities (4,) and force (2, shapes)."""
-    low = rows.omega[rows.omega < 2.0 * np.pi * _BELIEVED_HZ]
+    low = rows.omega[rows.omega < 2.0 * np.pi * _SUSPENSION_BAND_HZ]
     sensors = _body_spectra(truck, density, no_force_noise(), low)
     return float((sensors / _body_spectra(truck, density, force, low)).mean())

@@ -15,7 +15,7 @@ If the result is a misfit because of hum, the search is repeated without the hum
 import numpy as np
 
 from pre_core.crossing.fit import (
-    Abandoned,
+    AbandonReason,
     Optimum,
     SearchStrategy,
     fit_all,
@@ -36,8 +36,8 @@ from pre_core.crossing.preparation import (
     CrossingInputs,
     build_problem,
     levels_at,
-    line_at,
     off_bridge_residuals,
+    strongest_line_at_hz,
     update_noise,
     with_line,
 )
@@ -50,21 +50,21 @@ from pre_core.search.loop import Report, Termination
 
 _COARSE = ((300.0, 4), (100.0, 4), (30.0, 4))
 """Temperatures and steps of the first stage, with the bridge as a whole."""
-_COARSE_ON_TWO_ROADS = (*_COARSE, (10.0, 4))
+_COARSE_WITH_MISMATCH = (*_COARSE, (10.0, 4))
 """First stage with mismatch, which is noise from the beginning, estimated again after every step:
 with sensor noise alone the search would fail."""
 NOISY, HOPELESS_NOISE = 2.0, 25.0
 """Noise power ratio, even over the body equations, above which noise is inflated; above the second
 the sensor is another one, or broken."""
-_PLAINLY_DIFFERS = 200.0
+_CLEAR_MISMATCH = 200.0
 """Mean square of whitened residuals off the bridge after the first stage: of 100 drawn crossings of
 one profile 130 at most and mostly below 25, with twin tyres on the best class of road 200,000."""
-_PLAINLY_SPRUNG = 0.5
+_CLEAR_RESTRAINT = 0.5
 """Scales of their prior above which restraints, bearing compliance and torsion are tried without.
 """
 _MOST_MOVES = 4
 """Limit of moves from an optimum to a neighbouring one."""
-_APART_M = 0.2
+_SAME_MINIMUM_M = 0.2
 """Distance within which offsets lead to one minimum."""
 _HOPELESS_CHI2 = (1000.0, 25.0)
 """Values of chi2 above which no other offset is tried, after one candidate and after more. Of 70
@@ -76,21 +76,24 @@ beyond this a search has failed, and its numbers are not reliable."""
 _MOST_LINES = 3
 """Hum and its harmonics; a record with more lines is not one of a truck on a road."""
 _SIMPLEST = SearchStrategy(SWING_MODES, True, 1, False)
-_ON_ONE_ROAD = (SearchStrategy(SWING_MODES - 1, True, 4, False), SearchStrategy(0, False, 4, False))
-_ON_TWO_ROADS = (SearchStrategy(SWING_MODES, True, 1, True), SearchStrategy(0, False, 4, True))
+_WITHOUT_MISMATCH = (
+    SearchStrategy(SWING_MODES - 1, True, 4, False),
+    SearchStrategy(0, False, 4, False),
+)
+_WITH_MISMATCH = (SearchStrategy(SWING_MODES, True, 1, True), SearchStrategy(0, False, 4, True))
 """The simplest strategy first, then others until one ends at a fit, because each superfluous
 freedom may mislead. Of 40 drawn crossings and 36 with unexpected bearings, spans or tyres the first
 found all but one, which the second did. Strategies with mismatch precede the others where the
 residuals off the bridge show it."""
 
 
-def _whole_bridge(problem: PosteriorProblem, way: SearchStrategy) -> FloatArray:
+def _whole_bridge(problem: PosteriorProblem, strategy: SearchStrategy) -> FloatArray:
     """Return directions in which all elements change together, without restraint and compliance."""
     where = layout(problem)
     unit = np.eye(where.size)
     elements = where.elements
     ends = where.half_normal[where.half_normal >= where.bridge[0]]
-    held = [*elements, *ends, *resting_mode_indices(problem, way)]
+    held = [*elements, *ends, *resting_mode_indices(problem, strategy)]
     single = np.setdiff1d(np.arange(where.size), held)
     together = unit[:, elements].sum(axis=1) / np.sqrt(elements.size)
     return np.column_stack([unit[:, single], together])
@@ -102,13 +105,13 @@ def find_optimum(inputs: CrossingInputs, report: Report = lambda stage, fraction
     Its `ending` is STEPS_EXHAUSTED if the search took more than `_MOST_EVALUATIONS` without a fit.
     """
     problem, y = build_problem(inputs)
-    found = _by_ways(problem, y, report, _MOST_EVALUATIONS)
+    found = _run_strategies(problem, y, report, _MOST_EVALUATIONS)
     while not _is_final(found[-1]) and len(problem.lines_hz) < _MOST_LINES:
-        line_hz = line_at(found[-1].problem, found[-1].state.y)
+        line_hz = strongest_line_at_hz(found[-1].problem, found[-1].state.y)
         if line_hz == 0.0:
             break
         problem = with_line(problem, y, line_hz)
-        found += _by_ways(problem, y, report, _MOST_EVALUATIONS - _evaluations_of_all(found))
+        found += _run_strategies(problem, y, report, _MOST_EVALUATIONS - _evaluations_of_all(found))
     best = min(found, key=lambda one: (one.noise_power <= HOPELESS_NOISE, one.chi2_per_dof))
     evaluations = _evaluations_of_all(found)
     is_lost = evaluations > _MOST_EVALUATIONS and not _is_final(best)
@@ -121,12 +124,14 @@ def _evaluations_of_all(found: list[Optimum]) -> int:
     return sum(one.evaluations for one in found)
 
 
-def _by_ways(problem: PosteriorProblem, y: FloatArray, report: Report, most: int) -> list[Optimum]:
+def _run_strategies(
+    problem: PosteriorProblem, y: FloatArray, report: Report, max_evaluations: int
+) -> list[Optimum]:
     """Return what the ways led to, up to the first that is final or shows a line."""
-    simplest = _ON_TWO_ROADS[0] if has_tandem(problem) else _SIMPLEST
-    found = [_refine_candidates(problem, y, simplest, report, most)]
+    simplest = _WITH_MISMATCH[0] if has_tandem(problem) else _SIMPLEST
+    found = [_refine_candidates(problem, y, simplest, report, max_evaluations)]
     if not _has_ended(found[0]):
-        found += _try_other_strategies(problem, y, found[0], report, most)
+        found += _try_other_strategies(problem, y, found[0], report, max_evaluations)
     return found
 
 
@@ -134,31 +139,31 @@ def _has_ended(found: Optimum) -> bool:
     """Whether no other way is tried: this is final, or a line is to be silenced first."""
     if _is_final(found) or len(found.problem.lines_hz) == _MOST_LINES:
         return _is_final(found)
-    return line_at(found.problem, found.state.y) > 0.0
+    return strongest_line_at_hz(found.problem, found.state.y) > 0.0
 
 
 def _try_other_strategies(
-    problem: PosteriorProblem, y: FloatArray, first: Optimum, report: Report, most: int
+    problem: PosteriorProblem, y: FloatArray, first: Optimum, report: Report, max_evaluations: int
 ) -> list[Optimum]:
     """Return the optima of the other strategies, up to the first that is final."""
     differs = first.differs
     if first.ending is not Termination.NOT_FINITE:
         differs = bool(levels_at(first.problem, first.state.y).any())
-    believing, doubting = _ON_ONE_ROAD
-    ways = (*_ON_ONE_ROAD, *_ON_TWO_ROADS)
+    full_weight, reduced_weight = _WITHOUT_MISMATCH
+    strategies = (*_WITHOUT_MISMATCH, *_WITH_MISMATCH)
     if differs:
         # A suspension that is not linear resembles mismatch until its weight is reduced, which a
         # first stage shows.
-        ways = (doubting, *_ON_TWO_ROADS, believing)
+        strategies = (reduced_weight, *_WITH_MISMATCH, full_weight)
     found: list[Optimum] = []
     has_friction = first.stopped_by_friction
-    for way in ways:
-        if has_friction and way.uses_suspension:
+    for strategy in strategies:
+        if has_friction and strategy.uses_suspension:
             continue
-        left = most - _evaluations_of_all([first, *found])
-        if left <= 0:
+        evaluations_left = max_evaluations - _evaluations_of_all([first, *found])
+        if evaluations_left <= 0:
             break
-        found.append(_refine_candidates(problem, y, way, report, left))
+        found.append(_refine_candidates(problem, y, strategy, report, evaluations_left))
         has_friction = found[-1].stopped_by_friction
         if _has_ended(found[-1]):
             break
@@ -172,25 +177,33 @@ def _is_final(found: Optimum) -> bool:
 
 
 def _refine_candidates(
-    problem: PosteriorProblem, y: FloatArray, way: SearchStrategy, report: Report, most: int
+    problem: PosteriorProblem,
+    y: FloatArray,
+    strategy: SearchStrategy,
+    report: Report,
+    max_evaluations: int,
 ) -> Optimum:
     """Return the best optimum of a strategy; none, as without finite numbers, if it diverges."""
     try:
-        return _refine_likeliest(problem, y, way, report, most)
+        return _refine_likeliest(problem, y, strategy, report, max_evaluations)
     except (FloatingPointError, np.linalg.LinAlgError):
         return _no_optimum(problem, y, 0, 0)
 
 
 def _refine_likeliest(
-    problem: PosteriorProblem, y: FloatArray, way: SearchStrategy, report: Report, most: int
+    problem: PosteriorProblem,
+    y: FloatArray,
+    strategy: SearchStrategy,
+    report: Report,
+    max_evaluations: int,
 ) -> Optimum:
     """Return the best optimum reached from the most likely offsets.
 
     There is none, as without finite residuals, as soon as a candidate shows that the strategy is
-    wrong. After `most` evaluations no other candidate is tried.
+    wrong. After `max_evaluations` evaluations no other candidate is tried.
     """
-    force = no_force_noise() if way.uses_suspension else None
-    problem, y, evaluations = _find_truck(problem, y, way, report, force)
+    force = no_force_noise() if strategy.uses_suspension else None
+    problem, y, evaluations = _find_truck(problem, y, strategy, report, force)
     power = noise_power_ratio(problem, y)
     if power > HOPELESS_NOISE:
         return _no_optimum(problem, y, evaluations, 0)._replace(noise_power=power)
@@ -199,38 +212,38 @@ def _refine_likeliest(
         problem = update_noise(problem, y, force)
     else:
         power = 1.0
-    if not way.differs and _has_clear_mismatch(problem, y):
+    if not strategy.differs and _has_clear_mismatch(problem, y):
         return _no_optimum(problem, y, evaluations, 0, differs=True)
     report("finding the bridge", 0.2)
-    places, used = scan_offsets(problem, y, way)
+    places, used = scan_offsets(problem, y, strategy)
     evaluations += used
     best: Optimum | None = None
     has_friction = False
     tried: list[float] = []
     for place in places:
-        if any(abs(place.shift_m - other) < _APART_M for other in tried):
+        if any(abs(place.shift_m - other) < _SAME_MINIMUM_M for other in tried):
             continue
         tried.append(place.shift_m)
         report(f"freeing the elements, start {len(tried)}", 0.3 + 0.05 * len(tried))
-        found, used = fit_all(problem, shifted_to(problem, y, place), way)
+        found, used = fit_all(problem, shifted_to(problem, y, place), strategy)
         evaluations += used
         if isinstance(found, Optimum) and found.problem.mismatch.level_m3.any():
-            found, used = _refine_offset(found, way, most - evaluations)
+            found, used = _refine_offset(found, strategy, max_evaluations - evaluations)
             evaluations += used
         if not isinstance(found, Optimum):
-            has_friction = found is Abandoned.RUBS
+            has_friction = found is AbandonReason.CLEAR_FRICTION
             break
         if best is None or found.chi2_per_dof < best.chi2_per_dof:
             best = found
-        if is_accepted(best.problem, best.chi2_per_dof) or len(tried) == way.most_places:
+        if is_accepted(best.problem, best.chi2_per_dof) or len(tried) == strategy.max_candidates:
             break
         if best.chi2_per_dof > _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]:
             break
-        if evaluations > most:
+        if evaluations > max_evaluations:
             break
     if best is None:
         return _no_optimum(problem, y, evaluations, len(tried), has_friction=has_friction)
-    best, used = _with_free_ends(best, way)
+    best, used = _with_free_ends(best, strategy)
     evaluations += used
     return best._replace(
         evaluations=evaluations,
@@ -243,7 +256,7 @@ def _refine_likeliest(
 def _find_truck(
     problem: PosteriorProblem,
     y: FloatArray,
-    way: SearchStrategy,
+    strategy: SearchStrategy,
     report: Report,
     force: FloatArray | None,
 ) -> tuple[PosteriorProblem, FloatArray, int]:
@@ -252,25 +265,25 @@ def _find_truck(
     The profiles of a tandem differ less than a wrong truck makes them differ, so that its truck
     comes before its mismatch.
     """
-    whole = _whole_bridge(problem, way)
+    whole = _whole_bridge(problem, strategy)
 
     def with_force(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
         return update_noise(problem, y, force)
 
     evaluations = 0
-    if way.differs and not has_tandem(problem):
+    if strategy.differs and not has_tandem(problem):
         problem = update_noise(problem, y, force, mismatch=levels_at(problem, y))
-    for temperature, steps in _COARSE_ON_TWO_ROADS if way.differs else _COARSE:
+    for temperature, steps in _COARSE_WITH_MISMATCH if strategy.differs else _COARSE:
         report("finding the truck", 0.05)
         problem, y, _, used = fit_stage(problem, y, whole, (temperature, steps, 0.5), with_force)
         evaluations += used
         problem = update_noise(problem, y, force)
-    if way.differs and has_tandem(problem):
+    if strategy.differs and has_tandem(problem):
         problem = update_noise(problem, y, force, mismatch=levels_at(problem, y))
     return problem, y, evaluations
 
 
-def _with_free_ends(found: Optimum, way: SearchStrategy) -> tuple[Optimum, int]:
+def _with_free_ends(found: Optimum, strategy: SearchStrategy) -> tuple[Optimum, int]:
     """Return the better of an optimum with rotational restraints and one without, and evaluations.
 
     A bridge restrained at both ends with less than half its stiffness deflects nearly as one on
@@ -279,27 +292,31 @@ def _with_free_ends(found: Optimum, way: SearchStrategy) -> tuple[Optimum, int]:
     """
     where, y = layout(found.problem), found.state.y
     ends = np.intersect1d(where.half_normal, where.bridge)
-    if not np.any(y[ends] > _PLAINLY_SPRUNG):
+    if not np.any(y[ends] > _CLEAR_RESTRAINT):
         return found, 0
     start = y.copy()
     start[where.bridge] = 0.0
-    other, used = fit_all(found.problem, start, way)
+    other, used = fit_all(found.problem, start, strategy)
     if isinstance(other, Optimum) and other.chi2_per_dof < found.chi2_per_dof:
         found = other
     return found, used
 
 
-def _refine_offset(found: Optimum, way: SearchStrategy, most: int) -> tuple[Optimum, int]:
+def _refine_offset(
+    found: Optimum, strategy: SearchStrategy, max_evaluations: int
+) -> tuple[Optimum, int]:
     """Return the best of an optimum with mismatch and its neighbours, and the evaluations."""
     evaluations = 0
     for _ in range(_MOST_MOVES):
-        if evaluations > most:
+        if evaluations > max_evaluations:
             break
-        place, used = better_neighbour(found, way)
+        place, used = better_neighbour(found, strategy)
         evaluations += used
         if place is None:
             break
-        other, used = fit_all(found.problem, shifted_to(found.problem, found.state.y, place), way)
+        other, used = fit_all(
+            found.problem, shifted_to(found.problem, found.state.y, place), strategy
+        )
         evaluations += used
         if not isinstance(other, Optimum) or other.chi2_per_dof >= found.chi2_per_dof:
             break
@@ -332,4 +349,4 @@ def _has_clear_mismatch(problem: PosteriorProblem, y: FloatArray) -> bool:
     """Return whether residuals off the bridge exceed those of one profile after the first stage."""
     rows = data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)[:, 0]
     off = np.concatenate([rows[one] for one in off_bridge_residuals(problem, y)])
-    return off.size > 0 and float(off @ off) / off.size > _PLAINLY_DIFFERS
+    return off.size > 0 and float(off @ off) / off.size > _CLEAR_MISMATCH

@@ -17,7 +17,7 @@ from scipy.linalg import qr, solve_triangular
 from pre_core.crossing import noise as _noise
 from pre_core.crossing import splines
 from pre_core.crossing.layout import CHANNELS, ParameterLayout, parameter_layout
-from pre_core.crossing.lines import without
+from pre_core.crossing.lines import project_out
 from pre_core.crossing.mismatch import Mismatch
 from pre_core.crossing.noise import NoisePath, force_masses, noise_path
 from pre_core.crossing.residuals import (
@@ -50,7 +50,7 @@ _JERK_M_PER_S3 = 1.0
 _DEGREE = 5
 """Degree of the trajectory spline: load moves with its second derivative, which must not have
 kinks."""
-_AT_ONCE = 100
+_MAX_POINTS = 100
 """Number of points whose trajectories are evaluated at once, which bounds memory."""
 
 
@@ -103,7 +103,7 @@ class PosteriorProblem(NamedTuple):
     works: tuple[Buffers, ...]
     lines_hz: tuple[float, ...] = ()
     """Frequencies at the rows of the lines that are taken out of them, see `lines`."""
-    waves: FloatArray = np.zeros((0, 0))
+    line_waves: FloatArray = np.zeros((0, 0))
     """(m, w) orthonormal waves of these lines."""
 
 
@@ -233,7 +233,7 @@ def filtered_rows(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
     out = np.empty((RESIDUALS, row_count(problem.rows, problem.crossing.rows)))
     for kind in range(RESIDUALS):
         filter_rows(problem.rows.taps, problem.rows.every, residual[kind], out[kind])
-    return without(problem.waves, out) if problem.lines_hz else out
+    return project_out(problem.line_waves, out) if problem.lines_hz else out
 
 
 def filtered_rear_road(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
@@ -244,7 +244,7 @@ def filtered_rear_road(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
     out = np.empty(row_count(rows, crossing.rows))
     own = np.ascontiguousarray(heights[1, crossing.first_row :])
     filter_rows(rows.taps, rows.every, own, out)
-    return without(problem.waves, out) if problem.lines_hz else out
+    return project_out(problem.line_waves, out) if problem.lines_hz else out
 
 
 def noise_path_at(problem: PosteriorProblem, y: FloatArray) -> tuple[NoisePath, FloatArray]:
@@ -425,8 +425,10 @@ def largest_deflections_m(problem: PosteriorProblem, y: FloatArray) -> FloatArra
     Raise FloatingPointError for an impossible point.
     """
     found = [
-        largest_deflections(problem.crossing, problem.works, points(problem, y[n : n + _AT_ONCE]))
-        for n in range(0, y.shape[0], _AT_ONCE)
+        largest_deflections(
+            problem.crossing, problem.works, points(problem, y[n : n + _MAX_POINTS])
+        )
+        for n in range(0, y.shape[0], _MAX_POINTS)
     ]
     largest = np.concatenate(found)
     if np.isnan(largest).any():

@@ -10,7 +10,7 @@ from pre_core.crossing import lines
 from pre_core.crossing.channels import A, channel_signals
 from pre_core.crossing.mismatch import Mismatch, mismatch_spectra
 from pre_core.crossing.noise import (
-    DOUBTED,
+    FRICTION_GAIN,
     NoisePath,
     force_noise,
     mismatch_levels,
@@ -47,7 +47,7 @@ from pre_core.parameters import FIRST_OF_BRIDGE, TORSION
 from pre_core.physics.beam_basis import beam_basis, change_basis
 from pre_core.physics.bridge import FloatArray
 from pre_core.physics.simulate import rear_position_m
-from pre_core.physics.surface import COMMON_LORRY, Footprint
+from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint
 from pre_core.physics.tandem import NO_LEAD, Lead, shared_load
 from pre_core.physics.torsion import NO_TORSION, torsion_basis
 
@@ -59,7 +59,7 @@ _SWING_BEFORE_S = 0.1
 """Time before the truck's entry at which the initial vibration is defined, a margin for the search.
 """
 _MARGIN_M = 3.0  # of road before the first residual, a margin for the trajectory
-_SILENCED = 100.0
+_REDUCED_WEIGHT_FACTOR = 100.0
 """Factor of the suspension noise where its weight is reduced. It is not noise: it follows the
 truck's motion, and could pass for a heavier end or another centre of gravity. Without the factor EI
 was 0.34 standard deviations too low (the median of 36 crossings with friction) and the coverage 93
@@ -68,7 +68,7 @@ was 0.34 standard deviations too low (the median of 36 crossings with friction) 
 _FEWEST_ROWS = 24
 """Fewest residuals off the bridge, in one segment, that determine the mismatch."""
 _STEP_SAMPLES = 9
-MISMATCHED = 30.0
+MIN_MISMATCH_GAIN = 30.0
 """Smallest gain in twice the log-likelihood of the residuals off the bridge."""
 
 
@@ -91,7 +91,7 @@ class CrossingInputs(NamedTuple):
     priors: Priors
     parts: int
     threads: int
-    footprints: tuple[Footprint, Footprint] = COMMON_LORRY
+    footprints: tuple[Footprint, Footprint] = TYPICAL_FOOTPRINTS
     """Footprints of the front and the rear axle."""
     torsional_wave_speed_m_per_s: float = 0.0
     """Speed of torsional waves; positive where the deck may twist."""
@@ -195,14 +195,14 @@ def update_noise(
     problem: PosteriorProblem,
     y: FloatArray,
     force: FloatArray | None = None,
-    doubted: float = DOUBTED,
+    friction_gain: float = FRICTION_GAIN,
     mismatch: FloatArray | None = None,
 ) -> PosteriorProblem:
     """Return the problem with the noise for the truck at y (size,), and bridge coordinates for it.
 
     The suspension noise is `force` (2, shapes), by default that of the body equations at y if it is
-    at least `doubted` (`force_noise`). Mismatch levels are `mismatch` (s,), by default those of the
-    residuals off the bridge at y if the problem has levels already.
+    at least `friction_gain` (`force_noise`). Mismatch levels are `mismatch` (s,), by default those
+    of the residuals off the bridge at y if the problem has levels already.
     """
     where = layout(problem)
     unknowns = where.gains.stop
@@ -211,26 +211,26 @@ def update_noise(
         problem = _with_lead_motion(problem, y)
     if force is None:
         body = filtered_rows(problem, y)[1:]
-        force = force_noise(problem.rows, *noise_path_at(problem, y), body, doubted)
+        force = force_noise(problem.rows, *noise_path_at(problem, y), body, friction_gain)
     if mismatch is None:
         mismatch = problem.mismatch.level_m3
         if mismatch.any():
             mismatch = levels_at(problem, y)
     road = problem.mismatch._replace(level_m3=mismatch)
     is_inertial = bool(force.any())
-    at, trucks = _aside(problem, y, unknowns, is_inertial=is_inertial)
+    at, trucks = _displaced_points(problem, y, unknowns, is_inertial=is_inertial)
     density = problem.density * (1.0 + at.gain)
     count = row_count(problem.rows, problem.crossing.rows)
-    silenced = _SILENCED * force
-    differs = road if mismatch.any() else None
-    noise = whitener(problem.rows, count, trucks[0], density[0], silenced, differs)
+    residual_force = _REDUCED_WEIGHT_FACTOR * force
+    profile_noise = road if mismatch.any() else None
+    noise = whitener(problem.rows, count, trucks[0], density[0], residual_force, profile_noise)
     noise = _without_lines(problem, noise)
     truck = int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())
     changing = [*range(truck), *range(where.wheelbase, unknowns)]
     slope = np.zeros(unknowns)
-    power = noise_power(problem.rows, trucks, density, silenced, changing, differs)
+    power = noise_power(problem.rows, trucks, density, residual_force, changing, profile_noise)
     slope[changing] = 0.5 * count * power / _SLOPE_STEP
-    if differs is not None:
+    if profile_noise is not None:
         slope = np.concatenate([slope, np.zeros(where.delays.stop - unknowns)])
         slope += mismatch_gradient(problem._replace(force=force, mismatch=road), y)
     basis = change_basis(problem.crossing.basis, at.theta[0])
@@ -274,27 +274,27 @@ def replace_mismatch(
         row_count(problem.rows, problem.crossing.rows),
         truck,
         density,
-        _SILENCED * problem.force,
+        _REDUCED_WEIGHT_FACTOR * problem.force,
         mismatch,
     )
     return problem._replace(noise=_without_lines(problem, noise))
 
 
-def line_at(problem: PosteriorProblem, y: FloatArray) -> float:
+def strongest_line_at_hz(problem: PosteriorProblem, y: FloatArray) -> float:
     """Return the clearest line's frequency in Hz in the residuals at y (size,), 0 without any."""
     white = data_rows(problem, y[None, :])[0].reshape(-1, RESIDUALS)
     if not np.isfinite(white).all():
         return 0.0
-    return lines.strongest(white, problem.rows.every * problem.rows.step_s)
+    return lines.strongest_line_hz(white, problem.rows.every * problem.rows.step_s)
 
 
 def with_line(problem: PosteriorProblem, y: FloatArray, line_hz: float) -> PosteriorProblem:
     """Return the problem, before a search from y (size,), with one more line removed."""
     all_hz = (*problem.lines_hz, line_hz)
     count = row_count(problem.rows, problem.crossing.rows)
-    waves = lines.waves(all_hz, count, problem.rows.every * problem.rows.step_s)
+    line_waves = lines.line_waves(all_hz, count, problem.rows.every * problem.rows.step_s)
     one_road = np.zeros_like(problem.mismatch.level_m3)
-    problem = problem._replace(lines_hz=all_hz, waves=waves)
+    problem = problem._replace(lines_hz=all_hz, line_waves=line_waves)
     return update_noise(problem, y, no_force_noise(), mismatch=one_road)
 
 
@@ -320,17 +320,17 @@ def _without_lines(problem: PosteriorProblem, noise: Whitener) -> Whitener:
     """Return the whitener with the whitened columns that remove the problem's lines."""
     if not problem.lines_hz:
         return noise
-    waves = problem.waves
-    columns = np.zeros((waves.shape[1], RESIDUALS, RESIDUALS * waves.shape[0]))
+    line_waves = problem.line_waves
+    columns = np.zeros((line_waves.shape[1], RESIDUALS, RESIDUALS * line_waves.shape[0]))
     for kind in range(RESIDUALS):
-        columns[:, kind, kind::RESIDUALS] = waves.T
+        columns[:, kind, kind::RESIDUALS] = line_waves.T
     white = columns.reshape(-1, columns.shape[2])
     for column in white:
         solve(noise.factor, noise.reciprocal, column)
     return noise._replace(lines=np.ascontiguousarray(np.linalg.qr(white.T)[0]))
 
 
-def _aside(
+def _displaced_points(
     problem: PosteriorProblem, y: FloatArray, count: int, *, is_inertial: bool
 ) -> tuple[EvaluationPoints, list[NoisePath]]:
     """Return points and noise paths at y, and a step aside in the first `count` coordinates."""
@@ -348,7 +348,7 @@ def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
     """Return the part of the objective's gradient at `y` (size,) by the mismatch, shape (n,)."""
     where = layout(problem)
     is_inertial = bool(problem.force.any())
-    at, trucks = _aside(problem, y, where.delays.stop, is_inertial=is_inertial)
+    at, trucks = _displaced_points(problem, y, where.delays.stop, is_inertial=is_inertial)
     changing = [
         *range(int(problem.priors.estimated[:FIRST_OF_BRIDGE].sum())),
         *range(where.wheelbase, where.gains.stop),
@@ -360,7 +360,7 @@ def mismatch_gradient(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
         at.gain,
         at.delay_s,
         problem.density * (1.0 + at.gain[0]),
-        _SILENCED * problem.force,
+        _REDUCED_WEIGHT_FACTOR * problem.force,
         problem.mismatch,
         float(at.wheelbase_m[0]),
         changing,
@@ -374,10 +374,10 @@ def levels_at(problem: PosteriorProblem, y: FloatArray) -> FloatArray:
     """Return the mismatch levels (s,) of the residuals off the bridge at y (size,).
 
     They are zero where too few residuals exist, or where a mismatch explains them no better
-    (`MISMATCHED`).
+    (`MIN_MISMATCH_GAIN`).
     """
     level, gain, _ = _levels_off_bridge(problem, y)
-    return level if gain > MISMATCHED else np.zeros_like(level)
+    return level if gain > MIN_MISMATCH_GAIN else np.zeros_like(level)
 
 
 def mismatch_excess(problem: PosteriorProblem, y: FloatArray) -> float:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from pre_core.crossing import tandem
 from pre_core.crossing.channels import A_1, A_2, A_3, A, V, Z
-from pre_core.crossing.lines import without
-from pre_core.crossing.noise import DOUBTED_SPRING_N_PER_M
+from pre_core.crossing.lines import project_out
+from pre_core.crossing.noise import REDUCED_WEIGHT_SPRING_N_PER_M
 from pre_core.crossing.rows import RESIDUALS, RowFilter, row_count
 from pre_core.crossing.step_tables import PHASES as _PHASES
 from pre_core.crossing.step_tables import SINC_TAPS as _SINC_TAPS
@@ -238,7 +238,7 @@ def _wheels(
         a_other = work.corrected[1 - w, 2]
         road, load, body = work.road[w], work.load[w], work.body[w]
         soft = 1.0 / k_u
-        hard = 1.0 / DOUBTED_SPRING_N_PER_M if crossing.is_inertial else 1.0 / k
+        hard = 1.0 / REDUCED_WEIGHT_SPRING_N_PER_M if crossing.is_inertial else 1.0 / k
         for i in range(n):
             inertial = m_ii * a_s[i] + m_12 * a_other[i]
             load[i] = sign * transfer * speeding[i] - weight - inertial - m_u * a_u[i]
@@ -458,7 +458,7 @@ def _deflect(crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints,
                 work.under_lead[i] = (y[0] + y[1]) + (y[2] + y[3])
         begin = stop
     if crossing.torsion.ends_m.shape[0] > 0:
-        _twist_at_once(crossing, work, points, k, last)
+        _quasi_static_twist(crossing, work, points, k, last)
 
 
 @kernel
@@ -493,7 +493,7 @@ def _advance(work: Buffers, begin: int, stop: int) -> None:
 
 
 @kernel
-def _twist_at_once(
+def _quasi_static_twist(
     crossing: GriddedCrossing, work: Buffers, points: EvaluationPoints, k: int, last: int
 ) -> None:
     """Add the quasi-static twist, beyond the marched modes, to `road`."""
@@ -707,7 +707,7 @@ def evaluate_white(
     _in_threads(part, works, out.shape[0])
     if noise.lines.size:
         white = out[:, : noise.reciprocal.size]
-        white[:] = without(noise.lines, white)
+        white[:] = project_out(noise.lines, white)
 
 
 def _in_threads(

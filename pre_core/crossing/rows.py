@@ -15,9 +15,9 @@ from pre_core.kernels.lanes import summing
 FloatArray = NDArray[np.float64]
 
 RESIDUALS = 3
-EVERY = 3
+SAMPLES_PER_RESIDUAL = 3
 """Samples of the model per residual."""
-PASS = 1.0 / 8.0
+PASS_BAND = 1.0 / 8.0
 """Pass band relative to the model's rate; half amplitude at half the residuals' rate."""
 _STOP_BAND_DB = 70.0
 """Stop band: the leakage is 3e-4 of a signal, which must not alias in the decimation."""
@@ -37,12 +37,14 @@ class RowFilter(NamedTuple):
 
 
 def row_filter(step_s: float) -> RowFilter:
-    """Return the filter that passes frequencies below an eighth of the model's rate; see `PASS`."""
-    stop = 1.0 / EVERY - PASS
-    apart = EVERY * step_s
-    second_difference = np.zeros(2 * EVERY + 1)
-    second_difference[[0, EVERY, 2 * EVERY]] = np.array([1.0, -2.0, 1.0]) / apart**2
-    taps = np.convolve(low_pass(PASS, stop, _STOP_BAND_DB), second_difference)
+    """Return the filter that passes frequencies up to `PASS_BAND` of the model's rate."""
+    stop = 1.0 / SAMPLES_PER_RESIDUAL - PASS_BAND
+    apart = SAMPLES_PER_RESIDUAL * step_s
+    second_difference = np.zeros(2 * SAMPLES_PER_RESIDUAL + 1)
+    second_difference[[0, SAMPLES_PER_RESIDUAL, 2 * SAMPLES_PER_RESIDUAL]] = (
+        np.array([1.0, -2.0, 1.0]) / apart**2
+    )
+    taps = np.convolve(low_pass(PASS_BAND, stop, _STOP_BAND_DB), second_difference)
     interval = 1.1 * stop / step_s / _TABLE
     omega = 2.0 * np.pi * interval * (np.arange(_TABLE) + 0.5)
     # The taps are symmetric: their response is real except for a delay.
@@ -51,9 +53,9 @@ def row_filter(step_s: float) -> RowFilter:
     # Noise of an acceleration reaches displacements through 1/omega^2; the taps contain the second
     # difference, so that the product is finite at low frequencies.
     power = response**2 / omega**4 * interval
-    lags = (taps.size - 1) // EVERY + 1
+    lags = (taps.size - 1) // SAMPLES_PER_RESIDUAL + 1
     turn = np.exp(1j * np.outer(omega * apart, np.arange(lags)))
-    return RowFilter(taps, EVERY, step_s, np.asarray(omega), power, turn)
+    return RowFilter(taps, SAMPLES_PER_RESIDUAL, step_s, np.asarray(omega), power, turn)
 
 
 def row_count(rows: RowFilter, samples: int) -> int:

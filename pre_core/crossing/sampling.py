@@ -24,7 +24,7 @@ LogDensity = Callable[[FloatArray], FloatArray]
 
 _LARGEST_R_HAT = 1.05
 """Convergence limit of R-hat of rigidities and mass."""
-_WORTH = 1.0 / 3.0
+_MIN_EFFECTIVE_SHARE = 1.0 / 3.0
 """Required effective size of the draws, relative to the requested ones."""
 _BATCH_SHARE = 1.0 / 3.0
 """Size of a batch of weighted draws, relative to the requested ones."""
@@ -32,9 +32,9 @@ _MOST_BATCHES = 25
 _MOST_RUNS = 14
 """Limit of draws with mismatch, relative to the requested ones."""
 _LARGEST_PARETO_K = 0.7
-_IMPROBABLE = 0.02
+_NEGLIGIBLE_ODDS = 0.02
 """Odds below which torsion is omitted from the draws: it changes no interval and costs draws."""
-_AT_ONCE = 100
+_MAX_POINTS = 100
 """Number of points evaluated together: their residuals take some megabytes."""
 
 
@@ -91,7 +91,7 @@ def _improbable_torsion(found: Optimum, inflation: float) -> int | None:
     # Mass above zero over the density at zero, as in `compliances`.
     log_above = np.log(scale * np.sqrt(2.0 * np.pi)) + log_ndtr(at) + 0.5 * at * at
     log_odds = float(posterior.log_odds_of_absence(problem, inflation)[place])
-    return place if log_above - log_odds < np.log(_IMPROBABLE) else None
+    return place if log_above - log_odds < np.log(_NEGLIGIBLE_ODDS) else None
 
 
 def without_torsion(found: Optimum, place: int) -> Optimum:
@@ -119,9 +119,9 @@ def _single_profile_draws(
         rows = posterior.all_rows(problem, points)
         return np.asarray(-0.5 / inflation**2 * np.sum(rows * rows, axis=1))
 
-    of = surrogate.coordinates(found, inflation)
-    first = surrogate.gauss_newton_surrogate(found, of)
-    weighted = _importance_draws(target, of, first, found.state.y, draws, seed, report)
+    coordinates = surrogate.coordinates(found, inflation)
+    first = surrogate.gauss_newton_surrogate(found, coordinates)
+    weighted = _importance_draws(target, coordinates, first, found.state.y, draws, seed, report)
     return _resample_to_chains(weighted, _monitored_indices(problem), draws, seed)
 
 
@@ -134,7 +134,7 @@ class _WeightedDraws(NamedTuple):
 
 def _importance_draws(
     target: LogDensity,
-    of: surrogate.SurrogateCoordinates,
+    coordinates: surrogate.SurrogateCoordinates,
     now: surrogate.Surrogate,
     start: FloatArray,
     draws: int,
@@ -146,18 +146,20 @@ def _importance_draws(
     Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
     start about `start` (f,). All draws are weighted as of the mixture of the surrogates.
     """
-    centre = surrogate.transform(of, start)
+    centre = surrogate.transform(coordinates, start)
     count = convergence.CHAINS * -(-round(_BATCH_SHARE * draws) // convergence.CHAINS)
     used: list[surrogate.Surrogate] = []
     y, x = np.empty((0, centre.size)), np.empty((0, centre.size))
     log_target = np.empty(0)
     while True:
         report("weighting draws of the posterior", 0.5 + 0.02 * len(used))
-        new = surrogate.draw(now, of, centre, count, seed, len(used))
+        new = surrogate.draw(now, coordinates, centre, count, seed, len(used))
         used.append(now)
         log_posterior = _in_parts(target, new)
-        y, x = np.concatenate([y, new]), np.concatenate([x, surrogate.transform(of, new)])
-        log_target = np.concatenate([log_target, log_posterior - surrogate.log_prior(of, new)])
+        y, x = np.concatenate([y, new]), np.concatenate([x, surrogate.transform(coordinates, new)])
+        log_target = np.concatenate(
+            [log_target, log_posterior - surrogate.log_prior(coordinates, new)]
+        )
         log_density = np.stack([surrogate.log_likelihood(one, x) for one in used], axis=1)
         counts = np.full(len(used), count)
         worth = importance.pareto_smooth(
@@ -165,17 +167,19 @@ def _importance_draws(
         )
         if _is_enough(worth, draws) or len(used) == _MOST_BATCHES:
             return _WeightedDraws(y, worth)
-        now = surrogate.refine(now, of, x, log_target, count)
+        now = surrogate.refine(now, coordinates, x, log_target, count)
 
 
 def _in_parts(target: LogDensity, y: FloatArray) -> FloatArray:
     """Return the target (k,) at y (k, f), minus infinity where it is not finite."""
-    found = np.concatenate([target(y[i : i + _AT_ONCE]) for i in range(0, y.shape[0], _AT_ONCE)])
+    found = np.concatenate(
+        [target(y[i : i + _MAX_POINTS]) for i in range(0, y.shape[0], _MAX_POINTS)]
+    )
     return np.where(np.isfinite(found), found, -np.inf)
 
 
 def _is_enough(worth: importance.SmoothedWeights, draws: int) -> bool:
-    return worth.pareto_k <= _LARGEST_PARETO_K and worth.ess >= _WORTH * draws
+    return worth.pareto_k <= _LARGEST_PARETO_K and worth.ess >= _MIN_EFFECTIVE_SHARE * draws
 
 
 def _resample_to_chains(
@@ -216,7 +220,9 @@ def _mismatch_draws(found: Optimum, draws: int, seed: int, inflation: float) -> 
         kept.append(
             np.stack([compliances.draws(near, wanted, seed, one) for one in streams], axis=1)
         )
-        r_hat, ess, ending = _convergence(np.concatenate(kept)[:, :, monitored], _WORTH * draws)
+        r_hat, ess, ending = _convergence(
+            np.concatenate(kept)[:, :, monitored], _MIN_EFFECTIVE_SHARE * draws
+        )
         if ending is Termination.STEPS_DONE:
             break
     return PosteriorDraws(np.concatenate(kept), r_hat, ess, 1.0, 0, ending)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pre_core.crossing.channels import PASS, STOP
+from pre_core.crossing.channels import PASS_BAND, STOP
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
 
 FloatArray = NDArray[np.float64]
@@ -49,9 +49,9 @@ def sinc_table() -> FloatArray:
 
 def _sinc_design(half: int) -> tuple[float, int, float]:
     """Return cutoff, half length and Kaiser's beta of the sinc for the model's band."""
-    width = 1.0 - STOP - PASS
+    width = 1.0 - STOP - PASS_BAND
     attenuation = 14.36 * width * (2 * half - 1) + 7.95
-    return 0.5 * (PASS + 1.0 - STOP), half, kaiser_beta(attenuation)
+    return 0.5 * (PASS_BAND + 1.0 - STOP), half, kaiser_beta(attenuation)
 
 
 def _sinc_weights(phase: FloatArray) -> FloatArray:

@@ -42,7 +42,7 @@ class SurrogateCoordinates(NamedTuple):
     sigma: FloatArray  # of `curved`; negative where x increases with y
     half_normal: NDArray[np.int64]
     log_odds: FloatArray  # (f,) as in `posterior.log_odds_of_absence`
-    watched: NDArray[np.int64]
+    non_normal: NDArray[np.int64]
     """Coordinates in which the posterior deviates from a normal in x."""
     inflation: float
 
@@ -74,16 +74,16 @@ def coordinates(found: Optimum, inflation: float) -> SurrogateCoordinates:
     )
 
 
-def transform(of: SurrogateCoordinates, y: FloatArray) -> FloatArray:
+def transform(coords: SurrogateCoordinates, y: FloatArray) -> FloatArray:
     """Return the coordinates x (k, f) of points y (k, f), or of one point (f,)."""
     x = y.copy()
-    x[..., of.curved] = np.exp(-of.sigma * y[..., of.curved])
+    x[..., coords.curved] = np.exp(-coords.sigma * y[..., coords.curved])
     return x
 
 
-def log_prior(of: SurrogateCoordinates, y: FloatArray) -> FloatArray:
+def log_prior(coords: SurrogateCoordinates, y: FloatArray) -> FloatArray:
     """Return the log prior (k,) of the curved coordinates of y (k, f), up to a constant."""
-    return np.asarray(-0.5 * np.sum((y[:, of.curved] / of.inflation) ** 2, axis=1))
+    return np.asarray(-0.5 * np.sum((y[:, coords.curved] / coords.inflation) ** 2, axis=1))
 
 
 def log_likelihood(surrogate: Surrogate, x: FloatArray) -> FloatArray:
@@ -94,21 +94,21 @@ def log_likelihood(surrogate: Surrogate, x: FloatArray) -> FloatArray:
     return np.asarray(x @ surrogate.linear - 0.5 * np.sum((x @ surrogate.precision) * x, axis=1))
 
 
-def gauss_newton_surrogate(found: Optimum, of: SurrogateCoordinates) -> Surrogate:
+def gauss_newton_surrogate(found: Optimum, coords: SurrogateCoordinates) -> Surrogate:
     """Return the surrogate that has the residuals' values and slopes at an optimum."""
     state = found.state
-    kept = compliances.without_priors(found.problem, state.residual.size, of.curved)
-    centre, jacobian = transform(of, state.y), state.jacobian[kept]
-    jacobian[:, of.curved] /= -of.sigma * centre[of.curved]
-    precision = jacobian.T @ jacobian / of.inflation**2
+    kept = compliances.without_priors(found.problem, state.residual.size, coords.curved)
+    centre, jacobian = transform(coords, state.y), state.jacobian[kept]
+    jacobian[:, coords.curved] /= -coords.sigma * centre[coords.curved]
+    precision = jacobian.T @ jacobian / coords.inflation**2
     return Surrogate(
-        precision, precision @ centre - jacobian.T @ state.residual[kept] / of.inflation**2
+        precision, precision @ centre - jacobian.T @ state.residual[kept] / coords.inflation**2
     )
 
 
 def draw(
     surrogate: Surrogate,
-    of: SurrogateCoordinates,
+    coords: SurrogateCoordinates,
     centre: FloatArray,
     count: int,
     seed: int,
@@ -121,12 +121,12 @@ def draw(
     density = compliances.from_normal(
         surrogate.precision,
         surrogate.linear,
-        of.curved,
-        of.half_normal,
-        of.sigma,
-        of.log_odds,
-        of.inflation,
-        centre[of.curved],
+        coords.curved,
+        coords.half_normal,
+        coords.sigma,
+        coords.log_odds,
+        coords.inflation,
+        centre[coords.curved],
         np.zeros(surrogate.linear.size),
     )
     first = number * CHAINS
@@ -137,7 +137,7 @@ def draw(
 
 def refine(
     surrogate: Surrogate,
-    of: SurrogateCoordinates,
+    coords: SurrogateCoordinates,
     x: FloatArray,
     log_target: FloatArray,
     latest: int,
@@ -156,7 +156,7 @@ def refine(
     mean, spread = x[-latest:].mean(axis=0), x[-latest:].std(axis=0)
     spread[spread == 0.0] = np.inf  # absent in all draws
     z = (x - mean) / spread
-    along = _directions(of, z[-latest:])
+    along = _directions(coords, z[-latest:])
     slope, curvature = _regress(z[seen], along, np.minimum(excess[seen] - level, _LOWEST))
     change = (along @ curvature @ along.T) / np.outer(spread, spread)
     precision = _limit_change(surrogate.precision, surrogate.precision - change)
@@ -164,14 +164,14 @@ def refine(
     return Surrogate(precision, gradient + precision @ mean)
 
 
-def _directions(of: SurrogateCoordinates, z: FloatArray) -> FloatArray:
+def _directions(coords: SurrogateCoordinates, z: FloatArray) -> FloatArray:
     """Return directions (f, d) along which curvature is regressed, from scaled draws z (k, f)."""
     f = z.shape[1]
-    others = np.setdiff1d(np.arange(f), of.watched)
+    others = np.setdiff1d(np.arange(f), coords.non_normal)
     variance, vectors = np.linalg.eigh(np.cov(z[:, others].T))
     main = np.zeros((f, _NUISANCES))
     main[others] = vectors[:, -_NUISANCES:] / np.sqrt(variance[-_NUISANCES:])
-    return np.column_stack([np.eye(f)[:, of.watched], main])
+    return np.column_stack([np.eye(f)[:, coords.non_normal], main])
 
 
 def _regress(z: FloatArray, along: FloatArray, excess: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ from pre_core.crossing.fit import (
     evaluations_of,
     lower_bounds,
     resting_mode_indices,
-    tempered,
+    tempered_residuals,
 )
 from pre_core.crossing.posterior import (
     PosteriorProblem,
@@ -30,13 +30,13 @@ _WALK_TEMPERATURE = 3.0
 """Temperature of the offset scan, at which minima are wide."""
 _WALK_STEPS = 6
 """Steps at each offset, enough to compare it with the others."""
-_WALK_ENOUGH = 0.5
+_WALK_MIN_GAIN = 0.5
 """Gain in the sum of squares that ends the fit of an offset."""
 _STRIDE_M = 0.6
 """Distance of scanned offsets."""
 _REFINED_M = (0.3, 0.15)
 """Refinements about the best one."""
-_BESIDE_M, _BESIDE = 0.1, 6
+_NEIGHBOUR_M, _NEIGHBOURS = 0.1, 6
 """Distance and number of offsets tried on either side of an optimum with mismatch: a compliant
 bearing makes minima 0.2 m apart, which the truck of the scan does not distinguish."""
 _PATIENCE = 1.5  # strides beyond the best place
@@ -59,83 +59,83 @@ LocalFit = Callable[[float, FloatArray], tuple[Placement, int]]
 """Return the candidate at a shift in m from starting parameters, and the evaluations."""
 
 
-def _local_fit(problem: PosteriorProblem, y: FloatArray, way: SearchStrategy) -> LocalFit:
+def _local_fit(problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy) -> LocalFit:
     """Return a fit of the bridge alone at an offset, everything else to first order about y."""
     where = layout(problem)
     places = where.bridge
     free = np.eye(y.size)
     here = levenberg_marquardt.initial_state(
-        tempered(problem, y, free, _WALK_TEMPERATURE), np.zeros(y.size)
+        tempered_residuals(problem, y, free, _WALK_TEMPERATURE), np.zeros(y.size)
     ).jacobian
-    held = np.union1d(places, resting_mode_indices(problem, way))
+    held = np.union1d(places, resting_mode_indices(problem, strategy))
     others, _ = np.linalg.qr(np.delete(here, held, axis=1))
 
-    def look(shift: float, start: FloatArray) -> tuple[Placement, int]:
+    def fit_at(shift: float, start: FloatArray) -> tuple[Placement, int]:
         moved = y.copy()
         moved[where.trajectory] += shift
-        rows = tempered(problem, moved, free[:, places], _WALK_TEMPERATURE)
+        rows = tempered_residuals(problem, moved, free[:, places], _WALK_TEMPERATURE)
 
         def projected(v: FloatArray) -> FloatArray:
             values = rows(v)
             return np.asarray(values - (values @ others) @ others.T)
 
         lower = lower_bounds(problem, moved, free[:, places], is_free=True)
-        found = minimise(projected, start, _WALK_STEPS, _WALK_ENOUGH, lower, is_followed=True)
+        found = minimise(projected, start, _WALK_STEPS, _WALK_MIN_GAIN, lower, is_followed=True)
         place = Placement(found.state.objective, shift, found.state.y, places)
         return place, evaluations_of(found)
 
-    return look
+    return fit_at
 
 
 def scan_offsets(
-    problem: PosteriorProblem, y: FloatArray, way: SearchStrategy
+    problem: PosteriorProblem, y: FloatArray, strategy: SearchStrategy
 ) -> tuple[list[Placement], int]:
     """Return candidates along the road about y (size,), best first, and the evaluations."""
-    looking = _local_fit(problem, y, way)
+    local_fit = _local_fit(problem, y, strategy)
     nothing = np.zeros(layout(problem).bridge.size)
     evaluations = y.size + 1
-    seen: list[Placement] = []
+    candidates: list[Placement] = []
 
-    def look(shift: float, start: FloatArray) -> None:
+    def fit_at(shift: float, start: FloatArray) -> None:
         nonlocal evaluations
-        place, used = looking(shift, start)
+        place, used = local_fit(shift, start)
         evaluations += used
         if np.isfinite(place.objective):
-            seen.append(place)
+            candidates.append(place)
 
     def best() -> Placement:
-        return min(seen, key=lambda place: place.objective)
+        return min(candidates, key=lambda place: place.objective)
 
-    look(0.0, nothing)
+    fit_at(0.0, nothing)
     reach = min(_STRIDE_M + _REACH / problem.receiver_rows[-1, -1], _MOST_STRIDES * _STRIDE_M)
     for sign in (1.0, -1.0):
         shift = sign * _STRIDE_M
         while abs(shift) <= reach:
-            look(shift, nothing)
-            if seen and sign * (shift - best().shift_m) > _PATIENCE * _STRIDE_M:
+            fit_at(shift, nothing)
+            if candidates and sign * (shift - best().shift_m) > _PATIENCE * _STRIDE_M:
                 break
             shift += sign * _STRIDE_M
-    for stride in _REFINED_M if seen else ():
+    for stride in _REFINED_M if candidates else ():
         centre = best()
         for sign in (1.0, -1.0):
-            look(centre.shift_m + sign * stride, centre.bridge)
-    return sorted(seen, key=lambda place: place.objective), evaluations
+            fit_at(centre.shift_m + sign * stride, centre.bridge)
+    return sorted(candidates, key=lambda place: place.objective), evaluations
 
 
-def better_neighbour(found: Optimum, way: SearchStrategy) -> tuple[Placement | None, int]:
+def better_neighbour(found: Optimum, strategy: SearchStrategy) -> tuple[Placement | None, int]:
     """Return the best candidate near an optimum if it fits better; and the evaluations."""
     y = found.state.y
-    looking = _local_fit(found.problem, y, way)
+    local_fit = _local_fit(found.problem, y, strategy)
     nothing = np.zeros(layout(found.problem).bridge.size)
-    here, evaluations = looking(0.0, nothing)
+    here, evaluations = local_fit(0.0, nothing)
     evaluations += y.size + 1
     best = here
-    for number in range(-_BESIDE, _BESIDE + 1):
+    for number in range(-_NEIGHBOURS, _NEIGHBOURS + 1):
         if number:
-            place, used = looking(_BESIDE_M * number, nothing)
+            place, used = local_fit(_NEIGHBOUR_M * number, nothing)
             evaluations += used
             best = min(best, place, key=lambda one: one.objective)
-    return (best if best.objective < here.objective - _WALK_ENOUGH else None), evaluations
+    return (best if best.objective < here.objective - _WALK_MIN_GAIN else None), evaluations
 
 
 def shifted_to(problem: PosteriorProblem, y: FloatArray, place: Placement) -> FloatArray:

@@ -9,27 +9,29 @@ _PASSES = 200
 
 
 def maximum_likelihood_levels(
-    seen: FloatArray,
+    periodogram: FloatArray,
     known: FloatArray,
     shape: FloatArray,
     start: FloatArray,
-    claimed: FloatArray | float = 0.0,
-    enough: float = 0.0,
+    prior_power: FloatArray | float = 0.0,
+    tolerance: float = 0.0,
 ) -> tuple[FloatArray, float]:
     """Return the most likely levels (s,) of shapes (s, f) in a periodogram (f,), and their gain.
 
     `known` (f,) is the spectrum without them. The gain in log-likelihood over none of them is
     doubled, and halved because a taper correlates neighbours, so that every other frequency is
     independent. Every level is multiplied by the root of its explained over its claimed power
-    (`claimed` more, by a prior) until none changes by more than `enough`.
+    (`prior_power` more, by a prior) until none changes by more than `tolerance`.
     """
     level = start
     for _ in range(_PASSES):
         expected = known + level @ shape
-        change = np.sqrt((shape @ (seen / expected**2)) / (claimed + shape @ (1.0 / expected)))
+        change = np.sqrt(
+            (shape @ (periodogram / expected**2)) / (prior_power + shape @ (1.0 / expected))
+        )
         level = level * change
-        if np.abs(change[level > enough * level.max()] - 1.0).max(initial=0.0) < enough:
+        if np.abs(change[level > tolerance * level.max()] - 1.0).max(initial=0.0) < tolerance:
             break
     expected = known + level @ shape
-    gain = np.sum(np.log(known / expected) + seen / known - seen / expected)
+    gain = np.sum(np.log(known / expected) + periodogram / known - periodogram / expected)
     return level, float(gain)

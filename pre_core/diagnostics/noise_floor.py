@@ -38,7 +38,7 @@ class Density(NamedTuple):
     """One-sided density of a stretch."""
 
     ug_per_rthz: float
-    falls: float
+    falls_with_frequency: float
     """Ratio of power in the lower half of the band to that in the upper half: 1 for sensor noise,
     larger for motion of wheels or frame."""
 

@@ -392,7 +392,7 @@ class ResidualBin(NamedTuple):
     size: int
 
 
-def cell_excess(cell: ResidualBin, expected: float = 1.0) -> float:
+def bin_excess(cell: ResidualBin, expected: float = 1.0) -> float:
     """Return how far a bin's mean square exceeds `expected`, in standard deviations.
 
     Wilson and Hilferty: the cube root of chi squared over its degrees of freedom is nearly normal.

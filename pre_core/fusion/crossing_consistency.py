@@ -64,11 +64,11 @@ def select_consistent(
     odd = {names[i] for i in worst if chances[i] < _SUSPICIOUS / len(names)}
     if odd:
         # An outlier must not affect the estimated variability.
-        joint = build_joint(parts, priors, trusted=set(names) - odd)
+        joint = build_joint(parts, priors, consistent=set(names) - odd)
     back = odd
     while odd and back:
         inside = [name for name in names if name not in odd]
-        found = variability_posterior(joint._replace(ready=joint.select(inside)), priors)
+        found = variability_posterior(joint._replace(crossings=joint.select(inside)), priors)
         changes = np.column_stack([found.tau, found.rho, found.weight])[found.weight > _UNLIKELY]
         of = zip(
             sorted(odd),
@@ -85,22 +85,22 @@ def _tail_probabilities(
     joint: JointInformation,
     priors: BridgePriors,
     names: Sequence[str],
-    beside: Sequence[str],
+    reference: Sequence[str],
     changes: FloatArray,
 ) -> list[float]:
-    """Return for each of `names` the probability of its distance from `beside`, without itself.
+    """Return for each of `names` the probability of its distance from `reference`, without itself.
 
     `changes` (k, 3) are tau, rho, and their probability. A usual change, independent for each
     element, is always added, however small the variability of the others.
     """
     elements = joint.layout.elements
-    precision, linear = posterior_information(joint, priors, joint.select(beside))
+    precision, linear = posterior_information(joint, priors, joint.select(reference))
     at = np.diag(joint.centre[elements])
     out = []
     for name, one in zip(names, joint.select(names), strict=True):
         whole, pull = precision, linear
-        if name not in beside:
-            whole, pull = posterior_information(joint, priors, [*joint.select(beside), one])
+        if name not in reference:
+            whole, pull = posterior_information(joint, priors, [*joint.select(reference), one])
         sharp, need = _crossing_change(one, whole, pull, elements)
         chance = 0.0
         for tau, rho, weight in changes:

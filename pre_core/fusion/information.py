@@ -50,7 +50,7 @@ class JointInformation(NamedTuple):
 
     names: tuple[str, ...]
     layout: JointLayout
-    ready: tuple[CrossingInformation, ...]
+    crossings: tuple[CrossingInformation, ...]
     prior: FloatArray
     """Prior precision (n, n) of trucks and wheel-path groups."""
     centre: FloatArray
@@ -60,16 +60,16 @@ class JointInformation(NamedTuple):
     def select(self, names: Collection[str] | None) -> tuple[CrossingInformation, ...]:
         """Return the crossings of these names; None: all."""
         if names is None:
-            return self.ready
-        ready = zip(self.names, self.ready, strict=True)
-        return tuple(one for name, one in ready if name in names)
+            return self.crossings
+        crossings = zip(self.names, self.crossings, strict=True)
+        return tuple(one for name, one in crossings if name in names)
 
 
 def posterior_information(
-    joint: JointInformation, priors: BridgePriors, ready: Sequence[CrossingInformation]
+    joint: JointInformation, priors: BridgePriors, crossings: Sequence[CrossingInformation]
 ) -> tuple[FloatArray, FloatArray]:
     """Return precision (n, n) and linear part (n,) of all coordinates with priors of the bridge."""
-    return add_bridge_priors(joint, priors, *sum_information(joint, ready))
+    return add_bridge_priors(joint, priors, *sum_information(joint, crossings))
 
 
 def add_bridge_priors(
@@ -87,11 +87,11 @@ def add_bridge_priors(
 
 
 def sum_information(
-    joint: JointInformation, ready: Sequence[CrossingInformation]
+    joint: JointInformation, crossings: Sequence[CrossingInformation]
 ) -> tuple[FloatArray, FloatArray]:
     """Return precision (n, n) and linear part (n,) of all coordinates without bridge priors."""
     precision, linear = joint.prior.copy(), np.zeros(joint.layout.size)
-    for one in ready:
+    for one in crossings:
         precision[np.ix_(one.places, one.places)] += one.precision
         linear[one.places] += one.linear
     return precision, linear

@@ -93,11 +93,11 @@ def sample_joint(
 
 
 def build_joint(
-    parts: Sequence[FusionInput], priors: BridgePriors, trusted: Collection[str] | None = None
+    parts: Sequence[FusionInput], priors: BridgePriors, consistent: Collection[str] | None = None
 ) -> JointInformation:
     """Return crossings with their own variables integrated out, except the bridge's change.
 
-    Changes are relative to the estimate from all, or from the `trusted` of them by name.
+    Changes are relative to the estimate from all, or from the `consistent` of them by name.
     """
     parts = sorted(parts, key=lambda part: part.name)
     tracks = path_groups(parts)
@@ -108,15 +108,15 @@ def build_joint(
     centre = _nominal(layout)
     for number in range(_PASSES):
         bridge = centre if number else None
-        ready = tuple(
+        crossings = tuple(
             _crossing_information(
                 _linearised_about(part, tracks, bridge), layout, tracks, priors, centre
             )
             for part in parts
         )
-        joint = JointInformation(names, layout, ready, prior, centre, shared)
+        joint = JointInformation(names, layout, crossings, prior, centre, shared)
         # Without a change, crossings more precise than the bridge is constant would bias it.
-        of = varying_bridge(joint._replace(ready=joint.select(trusted)))
+        of = varying_bridge(joint._replace(crossings=joint.select(consistent)))
         before, centre = (
             centre,
             _most_likely(layout, priors, *marginalise_variability(joint, of, *_USUAL)[:2]),
@@ -157,11 +157,13 @@ def single_crossing_joint(part: FusionInput, priors: BridgePriors) -> JointInfor
     tracks = path_groups([part])
     layout = _layout_of([part], tracks, priors)
     centre = _nominal(layout)
-    ready = _crossing_information(
+    crossing = _crossing_information(
         _linearised_about(part, tracks, None), layout, tracks, priors, centre
     )
     shared = tuple(track.shared for track in tracks.values())
-    return JointInformation((part.name,), layout, (ready,), _prior(layout, tracks), centre, shared)
+    return JointInformation(
+        (part.name,), layout, (crossing,), _prior(layout, tracks), centre, shared
+    )
 
 
 def _nominal(layout: JointLayout) -> FloatArray:
@@ -239,16 +241,16 @@ def _crossing_information(
 
 
 def add_mass_parameter(
-    of: CrossingLikelihood, spread: float, priors: BridgePriors, centre: FloatArray
+    crossing: CrossingLikelihood, spread: float, priors: BridgePriors, centre: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return precision and linear part of bridge, truck, unit normal of the mass, and waves.
 
     The mass scales truck and bridge together; `centre` (b,) is the bridge that is scaled.
     """
-    b, t = len(of.bridge.names), len(of.truck.names)
-    heavier = of.root[:, :b] @ (spread * mass_sensitivity(priors, centre))[:, None]
-    root = np.hstack([of.root[:, : b + t], heavier, of.root[:, b + t :]])
-    return root.T @ root, root.T @ of.target
+    b, t = len(crossing.bridge.names), len(crossing.truck.names)
+    heavier = crossing.root[:, :b] @ (spread * mass_sensitivity(priors, centre))[:, None]
+    root = np.hstack([crossing.root[:, : b + t], heavier, crossing.root[:, b + t :]])
+    return root.T @ root, root.T @ crossing.target
 
 
 def mass_sensitivity(priors: BridgePriors, centre: FloatArray) -> FloatArray:

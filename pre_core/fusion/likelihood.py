@@ -24,14 +24,14 @@ from scipy.linalg import cho_factor, cho_solve, qr
 from pre_core import parameters
 from pre_core.crossing import posterior
 from pre_core.crossing.compliances import (
-    LEANING_SPREAD,
+    MISMATCH_BIAS_SPREAD,
     marginal,
     mismatch_bias,
     to_compliance_coordinates,
     without_priors,
 )
 from pre_core.crossing.fit import Optimum
-from pre_core.crossing.lines import without
+from pre_core.crossing.lines import project_out
 from pre_core.crossing.mismatch import CORRELATION_LENGTH_M, Mismatch
 from pre_core.crossing.preparation import off_bridge_residuals, replace_mismatch
 from pre_core.crossing.residuals import EvaluationPoints, GriddedCrossing, evaluate
@@ -176,7 +176,7 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
         led = np.zeros(linear.size)
         led[bridge.size : bridge.size + truck.size] = mismatch_bias(found)[truck]
         precision, linear = add_covariance(
-            precision, linear, led[:, None], np.array([[LEANING_SPREAD]])
+            precision, linear, led[:, None], np.array([[MISMATCH_BIAS_SPREAD]])
         )
     return CrossingLikelihood(
         *_as_root(precision, linear),
@@ -190,31 +190,31 @@ def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood
 
 
 def linearised_likelihood(
-    of: CrossingLikelihood, at: FloatArray, mismatch: FloatArray
+    crossing: CrossingLikelihood, at: FloatArray, mismatch: FloatArray
 ) -> CrossingLikelihood:
     """Return the normal about a bridge `at` (b,) in its coordinates, without offset and terms.
 
     `mismatch` is the precision (q, q) of the coefficients of d, on which the offset depends.
     """
-    if of.bends is None:
-        return of
-    truck = len(of.truck.names)
-    q = of.knots_m.size
+    if crossing.bends is None:
+        return crossing
+    truck = len(crossing.truck.names)
+    q = crossing.knots_m.size
     priors = np.zeros((truck + q, truck + q))
     priors[:truck, :truck] = np.eye(truck)
     priors[truck:, truck:] = mismatch
-    root, target = straightened_about(of.root, of.target, of.bends, at, priors)
-    return of._replace(root=root, target=target, bends=None)
+    root, target = straightened_about(crossing.root, crossing.target, crossing.bends, at, priors)
+    return crossing._replace(root=root, target=target, bends=None)
 
 
 def in_coordinates(
-    of: CrossingLikelihood, coordinates: Coordinates, elements: int
+    crossing: CrossingLikelihood, coordinates: Coordinates, elements: int
 ) -> CrossingLikelihood:
     """Return the likelihood for other nominal values and spreads of the bridge's parameters.
 
     These are the same parameters in the same order, `elements` of them last.
     """
-    mine = of.bridge
+    mine = crossing.bridge
     b = len(mine.names)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = coordinates.location / mine.location
@@ -223,15 +223,15 @@ def in_coordinates(
     # EI is location/x, so x scales with the location.
     factor[b - elements :] = 1.0 / ratio[b - elements :]
     aside[b - elements :] = 0.0
-    root = of.root.copy()
+    root = crossing.root.copy()
     root[:, :b] *= factor
-    target = of.target - of.root[:, :b] @ aside
-    bends = of.bends
+    target = crossing.target - crossing.root[:, :b] @ aside
+    bends = crossing.bends
     if bends is not None:
         bends = bends._replace(
             about=(bends.about - aside) / factor, size=bends.size / np.append(factor, 1.0)
         )
-    return of._replace(root=root, target=target, bridge=coordinates, bends=bends)
+    return crossing._replace(root=root, target=target, bridge=coordinates, bends=bends)
 
 
 def add_covariance(
@@ -351,7 +351,7 @@ def _white_knots(
         solve(problem.noise.factor, problem.noise.reciprocal, column)
         out[:, k] = column
     if problem.lines_hz:
-        out = without(problem.noise.lines, out.T).T
+        out = project_out(problem.noise.lines, out.T).T
     return out
 
 

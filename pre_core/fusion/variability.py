@@ -68,10 +68,10 @@ def varying_bridge(joint: JointInformation) -> VaryingBridge:
     """Return the crossings of `joint`, grouped by coordinates."""
     elements = joint.layout.elements
     alike: dict[bytes, list[CrossingInformation]] = {}
-    for one in joint.ready:
+    for one in joint.crossings:
         alike.setdefault(one.places.tobytes(), []).append(one)
     return VaryingBridge(
-        *sum_information(joint, joint.ready),
+        *sum_information(joint, joint.crossings),
         tuple(
             _SameLayout(
                 some[0].places,
@@ -84,20 +84,20 @@ def varying_bridge(joint: JointInformation) -> VaryingBridge:
 
 
 def marginalise_variability(
-    joint: JointInformation, of: VaryingBridge, tau: float, rho: float
+    joint: JointInformation, bridge: VaryingBridge, tau: float, rho: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return precision (n, n) and linear part (n,) of all coordinates if the bridge varies.
 
     The third value is the change of the log evidence.
     """
     if tau == 0.0:
-        return of.precision, of.linear, 0.0
+        return bridge.precision, bridge.linear, 0.0
     elements = joint.layout.elements
     e = elements.size
     root = np.linalg.cholesky((1.0 - rho) * np.eye(e) + rho) * tau
     root = joint.centre[elements][:, None] * root
-    precision, linear, evidence = of.precision.copy(), of.linear.copy(), 0.0
-    for some in of.alike:
+    precision, linear, evidence = bridge.precision.copy(), bridge.linear.copy(), 0.0
+    for some in bridge.alike:
         across = root.T @ some.across
         pull = some.linear @ root
         factor = np.linalg.cholesky(np.eye(e) + across[:, :, elements] @ root)

@@ -40,7 +40,7 @@ wrong; of more, a third may be."""
 class VehicleConsistency(NamedTuple):
     """Result of the comparison of trucks."""
 
-    strangers: tuple[str, ...]
+    misattributed: tuple[str, ...]
     """Names of misattributed crossings."""
     disagree: bool
     """Whether others contradict each other, without showing which is wrong."""
@@ -62,7 +62,7 @@ def find_misattributed(parts: Sequence[FusionInput], priors: BridgePriors) -> Ve
     trucks: dict[str, dict[str, _VehicleInformation]] = {}
     for part in sorted(parts, key=lambda part: part.name):
         trucks.setdefault(part.truck, {})[part.name] = _vehicle_information(part, priors)
-    strangers: list[str] = []
+    misattributed: list[str] = []
     disagree = False
     for information in trucks.values():
         most = len(information) // _FEWEST
@@ -78,14 +78,14 @@ def find_misattributed(parts: Sequence[FusionInput], priors: BridgePriors) -> Ve
                 break
             odd.append(name)
             del inside[name]
-        strangers += odd
-    return VehicleConsistency(tuple(sorted(strangers)), disagree)
+        misattributed += odd
+    return VehicleConsistency(tuple(sorted(misattributed)), disagree)
 
 
 def _vehicle_information(part: FusionInput, priors: BridgePriors) -> _VehicleInformation:
     """Return a crossing's information with bridge, mass error and change integrated out."""
     joint = single_crossing_joint(part, priors)
-    precision, linear = posterior_information(joint, priors, joint.ready)
+    precision, linear = posterior_information(joint, priors, joint.crossings)
     truck = joint.layout.trucks[part.truck][:-1]
     precision[truck, truck] -= 1.0  # without its prior, which counts once
     precision, linear = marginal(precision, linear, truck)

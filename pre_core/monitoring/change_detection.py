@@ -26,8 +26,8 @@ from pre_core.monitoring.baseline import (
     with_change,
 )
 from pre_core.monitoring.chart import (
-    LARGEST,
-    Verdict,
+    MAX_STANDARDISED,
+    ChartVerdict,
     chart_verdict,
     empty_chart,
     log_ratio,
@@ -170,7 +170,7 @@ def detect_change(
             state, kept = predict_state(state, period.time_days)
             innovation = filter_step(state, period)
             rows[number] = standardised(state, innovation)
-            inflation = max(1.0, (np.abs(rows[number]).max() / LARGEST) ** 2)
+            inflation = max(1.0, (np.abs(rows[number]).max() / MAX_STANDARDISED) ** 2)
             wander = state.places["wander"]
             weight: FloatArray | None = None
             if is_judged[number]:
@@ -239,13 +239,13 @@ def _since(
     for number, period in enumerate(periods):
         state, _ = predict_state(state, period.time_days)
         innovation = filter_step(state, period)
-        if (is_first and number == 0) or not _is_wild(state, innovation):
+        if (is_first and number == 0) or not _is_outlier(state, innovation):
             state, _ = update_state(state, innovation)
     return state
 
 
-def _is_wild(state: BaselineState, innovation: Innovation) -> bool:
-    return bool(np.abs(standardised(state, innovation)).max() > LARGEST)
+def _is_outlier(state: BaselineState, innovation: Innovation) -> bool:
+    return bool(np.abs(standardised(state, innovation)).max() > MAX_STANDARDISED)
 
 
 def _usual(state: BaselineState) -> tuple[float, float]:
@@ -261,7 +261,7 @@ def _in_deviations(log_of_ratio: float) -> float:
     return float(np.sqrt(2.0 * max(0.0, log_of_ratio)))
 
 
-def _found(verdict: Verdict, number: int, statistic: float) -> Change:
+def _found(verdict: ChartVerdict, number: int, statistic: float) -> Change:
     empty = np.zeros(0)
     direction: Literal["weaker", "stiffer"] = "stiffer" if verdict.is_stiffer else "weaker"
     return Change(verdict.element, direction, number, verdict.begin, statistic, empty, empty, empty)

@@ -29,9 +29,9 @@ FloatArray = NDArray[np.float64]
 
 STEP_SPREAD = 0.15
 """Prior standard deviation s of a step of one element's ln EI."""
-LARGEST = 4.0
+MAX_STANDARDISED = 4.0
 """Limit of an innovation, in standard deviations."""
-FEWEST = 3
+MIN_PERIODS = 3
 """Fewest periods since the change for an alarm."""
 _ALL_KEPT = 8
 """Number of latest beginnings that are all kept; of older ones, two in each doubling of the lag."""
@@ -47,7 +47,7 @@ class Chart(NamedTuple):
     score: FloatArray  # (m, c, n): sum of G' S^-1 e
 
 
-class Verdict(NamedTuple):
+class ChartVerdict(NamedTuple):
     """Result of the chart after a period."""
 
     log_ratio: float
@@ -156,13 +156,13 @@ def log_ratio(chart: Chart, state: BaselineState, number: int) -> tuple[float, F
     by_scale = 0.5 * chart.score**2 / (of_it + STEP_SPREAD**-2)
     by_scale = by_scale - 0.5 * np.log1p(STEP_SPREAD**2 * of_it)
     log = log_sum(by_scale + state.log_weight[:, None, None])
-    log[[number - begin + 1 < FEWEST for begin in chart.begins]] = -np.inf
+    log[[number - begin + 1 < MIN_PERIODS for begin in chart.begins]] = -np.inf
     return float(log_sum(log.ravel()) - np.log(n)), log
 
 
 def chart_verdict(
     chart: Chart, state: BaselineState, number: int, smallest: tuple[float, float]
-) -> Verdict:
+) -> ChartVerdict:
     """Return the chart's result; a change is of interest outside of `smallest` (of ln EI).
 
     The probability is that of the element's own change, with all elements free to change, averaged
@@ -183,6 +183,6 @@ def chart_verdict(
     element = int(share.sum(axis=0).argmax())
     at = int(share[:, element].argmax())
     is_stiffer = bool(np.sum(weight[:, at, 0] * mean[:, at, element]) > 0.0)
-    return Verdict(
+    return ChartVerdict(
         total, element, chart.begins[at], is_stiffer, float(min(1.0, np.sum(share * larger)))
     )

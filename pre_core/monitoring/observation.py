@@ -94,20 +94,20 @@ def observation(
     )
 
 
-def combine_observations(some: list[Observation], elements: int) -> Observation:
+def combine_observations(observations: list[Observation], elements: int) -> Observation:
     """Return several observations of one bridge as one, weighted by their own errors.
 
     Raise ValueError without any.
     """
-    if not some:
+    if not observations:
         raise ValueError("no observations to fuse")
-    if len(some) == 1:
-        return some[0]
-    weights = [np.linalg.inv(one.own) for one in some]
+    if len(observations) == 1:
+        return observations[0]
+    weights = [np.linalg.inv(one.own) for one in observations]
     covariance = np.linalg.inv(np.sum(weights, axis=0))
     value = np.zeros(elements)
     shared: dict[str, FloatArray] = {}
-    for one, weight in zip(some, weights, strict=True):
+    for one, weight in zip(observations, weights, strict=True):
         share = covariance @ weight
         value += share @ one.value
         for name, loading in one.shared:

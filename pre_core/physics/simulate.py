@@ -100,7 +100,7 @@ def _march(
     eigenvalues: FloatArray,
     modal_damping: FloatArray,
     cubics: FloatArray,
-    at_once: FloatArray,
+    quasi_static: FloatArray,
     element_lengths: FloatArray,
     element: NDArray[np.int64],
     place: FloatArray,
@@ -245,9 +245,9 @@ def _march(
                     qdd_new[k] = acceleration
                     q_new[k] = q_guess[k] + modal_quarter * acceleration
                     qd_new[k] = qd_guess[k] + modal_half * acceleration
-            if at_once.shape[0] > 0:
+            if quasi_static.shape[0] > 0:
                 for w in range(2):
-                    y[w] += at_once[n, w, 0] * p[0] + at_once[n, w, 1] * p[1]
+                    y[w] += quasi_static[n, w, 0] * p[0] + quasi_static[n, w, 1] * p[1]
             # The truck on the road and the deflected bridge.
             for i in range(4):
                 force[i] = free[i]

@@ -46,7 +46,7 @@ class Footprint(NamedTuple):
     """Distance of the axle to the left of the truck's path."""
 
 
-COMMON_LORRY = (Footprint(), Footprint(width_m=0.22, twin_distance_m=0.33))
+TYPICAL_FOOTPRINTS = (Footprint(), Footprint(width_m=0.22, twin_distance_m=0.33))
 """Front and rear axle of a typical lorry: single tyres, and twin tyres behind."""
 
 

@@ -68,8 +68,8 @@ def detection_probability(
 
 
 def minimum_detectable_loss(
-    std: FloatArray, sure: float = DETECTION_PROBABILITY, false_alarm: float = FALSE_ALARM
+    std: FloatArray, probability: float = DETECTION_PROBABILITY, false_alarm: float = FALSE_ALARM
 ) -> FloatArray:
-    """Return the losses (e,) detected with probability `sure`, with errors `std` (e,)."""
-    shift = (ndtri(sure) - ndtri(false_alarm)) * std
+    """Return the losses (e,) detected with probability `probability`, with errors `std` (e,)."""
+    shift = (ndtri(probability) - ndtri(false_alarm)) * std
     return np.asarray(shift / (1.0 + shift))

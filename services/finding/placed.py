@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pre_core.constants import MICRO_G_M_PER_S2
-from pre_core.crossing.middle import BODY, Places, Reduction, middle, reduction
+from pre_core.crossing.middle import (
+    BODY,
+    Reduction,
+    SensorPlaces,
+    centre_readings,
+    centre_reduction,
+)
 from pre_core.diagnostics.redundancy import RedundancyResidual, motion_ratio, redundancy_residual
 from schemas.errors import InputError
 from schemas.reasons import Reason
@@ -102,7 +108,7 @@ def middle_names(vehicle: Vehicle) -> tuple[str, ...]:
 
 def middle_of(vehicle: Vehicle, acceleration: Floats) -> Floats:
     """Return the middle readings (4, n) of all channels (m, n) of a vehicle, in its order."""
-    return middle(reduction_of(vehicle), acceleration) if vehicle.sensors else acceleration
+    return centre_readings(reduction_of(vehicle), acceleration) if vehicle.sensors else acceleration
 
 
 def middle_site(site: Site) -> Site:
@@ -199,13 +205,13 @@ def reduction_of(vehicle: Vehicle) -> Reduction:
 
 @lru_cache(maxsize=64)
 def _reduction(sensors: tuple[PlacedSensor, ...], wheelbase_m: float, first: int = 1) -> Reduction:
-    places = Places(
+    places = SensorPlaces(
         np.array([_part(one, first) for one in sensors]),
         np.array([one.position_m or 0.0 for one in sensors]),
         np.array([one.lateral_m for one in sensors]),
     )
     density = np.array([one.noise_density_ug_per_rthz for one in sensors])
-    return reduction(places, density, wheelbase_m, IN_THE_MIDDLE_M)
+    return centre_reduction(places, density, wheelbase_m, IN_THE_MIDDLE_M)
 
 
 def _part(sensor: PlacedSensor, first: int = 1) -> int:

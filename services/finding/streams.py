@@ -343,7 +343,8 @@ def _resampled(grid: _Grid, time_s: Floats) -> Floats:
     """Return the values of a grid at other times (n,); NaN in and near its gaps and ends.
 
     At times of its own samples (of most channels all) a value is itself. Between them it needs
-    `SEEN_ASIDE` unbroken samples on both sides: a spline through fewer would lose high frequencies.
+    `INTERPOLATION_REACH` unbroken samples on both sides: a spline through fewer would lose high
+    frequencies.
     """
     place = (time_s - grid.start_s) * grid.rate_hz
     nearest = np.rint(place).astype(np.int64)

@@ -232,7 +232,7 @@ def _of_the_rows(data: CrossingData, fit: Fit) -> list[Reason]:
     suspicious = {
         key: cell
         for key, cell in found.items()
-        if quality.cell_excess(cell, _slack(fit, *key)) > _FALSE_ALARM_Z
+        if quality.bin_excess(cell, _slack(fit, *key)) > _FALSE_ALARM_Z
     }
     reasons: list[Reason] = []
     if suspicious and _is_only_noise(fit, found):
@@ -273,7 +273,7 @@ def _is_only_noise(fit: Fit, found: dict[tuple[int, int, int], quality.ResidualB
         power = max(noise.mean_square, 1.0)
         powers.append(power)
         for key, cell in parts.items():
-            if quality.cell_excess(cell, power * _slack(fit, *key)) > _FALSE_ALARM_Z:
+            if quality.bin_excess(cell, power * _slack(fit, *key)) > _FALSE_ALARM_Z:
                 return False
     return max(powers) > _NOISY
 

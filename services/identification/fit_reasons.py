@@ -10,7 +10,7 @@ import numpy as np
 
 from pre_core import parameters
 from pre_core.crossing import posterior, shaking, slip, speeds
-from pre_core.crossing.compliances import LEANING_SPREAD, mismatch_bias
+from pre_core.crossing.compliances import MISMATCH_BIAS_SPREAD, mismatch_bias
 from pre_core.crossing.fit import Optimum, normal_approximation
 from pre_core.crossing.preparation import compared_length_m, mismatch_excess, rear_axle_chainage_m
 from pre_core.crossing.rows import RESIDUALS
@@ -74,7 +74,7 @@ def _fit(data: CrossingData, found: Optimum) -> Fit:
     estimated = [rows_of[i] for i in np.flatnonzero(problem.priors.estimated)]
     # A profile mismatch biases the truck as far as it is known.
     moved = mismatch_bias(found)
-    led = np.hypot(1.0, LEANING_SPREAD * moved)
+    led = np.hypot(1.0, MISMATCH_BIAS_SPREAD * moved)
     prior_z = {
         row.name: float(y[k] / led[k])
         for k, row in enumerate(estimated)

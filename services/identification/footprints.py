@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from pre_core.physics.surface import COMMON_LORRY, Footprint
+from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint
 from pre_core.physics.tandem import NO_LEAD, Lead
 from schemas.site import Vehicle
 from schemas.site_axle_tables import TYRES, Axle
@@ -14,7 +14,7 @@ _TRACK_M: Final = 1.83
 
 
 def footprints_of(
-    vehicle: Vehicle, usual: tuple[Footprint, Footprint] = COMMON_LORRY
+    vehicle: Vehicle, usual: tuple[Footprint, Footprint] = TYPICAL_FOOTPRINTS
 ) -> tuple[Footprint, Footprint]:
     """Return the footprints of the compared axles, as `usual` where the site file has no value.
 

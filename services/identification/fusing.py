@@ -140,7 +140,7 @@ def fused(
     vehicles = {part.truck: one.vehicle for part, one in zip(parts, alike, strict=True)}
     report("comparing trucks", 0.0)
     compared = find_misattributed(parts, priors)
-    parts = [part for part in parts if part.name not in compared.strangers]
+    parts = [part for part in parts if part.name not in compared.misattributed]
     report("putting crossings together", _COMPARED)
     joint = build_joint(parts, priors)
     judged = select_consistent(parts, joint, priors)
@@ -163,7 +163,7 @@ def fused(
         found.between_may_be_zero,
         _tracks(found, vehicles),
         judged.agree,
-        tuple(sorted([*compared.strangers, *judged.left_out])),
+        tuple(sorted([*compared.misattributed, *judged.left_out])),
         tuple(one.crossing_id for one in others),
         compared.disagree or judged.disagree,
     )

@@ -27,7 +27,7 @@ def noise_of(name: str, still: NoiseSegment | None, declared_ug: float) -> Check
         )
     ratio = found.ug_per_rthz / declared_ug if declared_ug > 0.0 else np.inf
     measured = f"{found.ug_per_rthz:.3g} µg/√Hz"
-    if not still.is_standing and ratio > _LOUDER_DRIVING and found.falls > _FALLS:
+    if not still.is_standing and ratio > _LOUDER_DRIVING and found.falls_with_frequency > _FALLS:
         return CheckFinding(
             "noise",
             CheckStatus.OPEN,

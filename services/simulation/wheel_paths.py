@@ -11,7 +11,7 @@ import numpy as np
 
 from pre_core.physics.road import Profile
 from pre_core.physics.simulate import Motion
-from pre_core.physics.surface import COMMON_LORRY, Footprint, axle_profile, random_surface
+from pre_core.physics.surface import TYPICAL_FOOTPRINTS, Footprint, axle_profile, random_surface
 from schemas.site import Bridge, Vehicle
 from services.common.errors import InputError
 from services.identification.footprints import footprints_of
@@ -21,7 +21,7 @@ REAR_OFFSET_M: Final = 0.005
 REACH_M: Final = 150.0
 """Extent of a surface beyond both ends of the bridge, or a multiple: runs within the same extent,
 fast or slow, either way, drive over the same road."""
-_SINGLE, _TWIN = COMMON_LORRY
+_SINGLE, _TWIN = TYPICAL_FOOTPRINTS
 _BEHIND: Final = {"single": _SINGLE, "twin": _TWIN}
 
 

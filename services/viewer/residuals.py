@@ -138,5 +138,5 @@ def _by_band(left: FittedResiduals) -> ResidualCells:
     found = quality.residual_bins(left.white, left.stretch, left.step_s, np.array(BANDS_HZ))
     for place, cell in found.items():
         if cell.size:
-            mean_square[place], excess[place] = cell.mean_square, quality.cell_excess(cell)
+            mean_square[place], excess[place] = cell.mean_square, quality.bin_excess(cell)
     return ResidualCells(mean_square, excess, BANDS_HZ)

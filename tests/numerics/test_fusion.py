@@ -28,7 +28,7 @@ from pre_core.fusion.variability import BETWEEN_SCALE
 from pre_core.parameters import EI_1, mass_powers
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
 from pre_core.physics.surface import (
-    COMMON_LORRY,
+    TYPICAL_FOOTPRINTS,
     axle_profile,
     random_surface,
     spectra,
@@ -43,7 +43,7 @@ from services.simulation.drawn import identify_simulated
 
 FloatArray = NDArray[np.float64]
 
-FRONT, REAR = COMMON_LORRY
+FRONT, REAR = TYPICAL_FOOTPRINTS
 
 
 def whole() -> mm.Mismatch:

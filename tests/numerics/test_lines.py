@@ -26,24 +26,24 @@ def hum(hz: float, amplitude: float, phase: float = 0.4) -> Floats:
 
 
 def test_noise_has_no_line() -> None:
-    found = [lines.strongest(noise(seed), APART_S) for seed in range(500)]
+    found = [lines.strongest_line_hz(noise(seed), APART_S) for seed in range(500)]
     assert found == [0.0] * 500
 
 
 @pytest.mark.parametrize("hz", [10.9, 16.7, 25.0, 33.3, 49.9])
 def test_a_line_is_found_where_it_is(hz: float) -> None:
-    found = lines.strongest(noise(1) + hum(hz, 0.8), APART_S)
+    found = lines.strongest_line_hz(noise(1) + hum(hz, 0.8), APART_S)
     assert found == pytest.approx(hz, abs=0.07)
 
 
 def test_a_line_in_one_kind_of_rows_is_found() -> None:
     rows = noise(2)
     rows[:, 0] += hum(30.0, 1.0)[:, 0]
-    assert lines.strongest(rows, APART_S) == pytest.approx(30.0, abs=0.07)
+    assert lines.strongest_line_hz(rows, APART_S) == pytest.approx(30.0, abs=0.07)
 
 
 def test_a_body_that_swings_below_ten_hertz_is_no_line() -> None:
-    assert lines.strongest(noise(3) + hum(6.0, 3.0), APART_S) == 0.0
+    assert lines.strongest_line_hz(noise(3) + hum(6.0, 3.0), APART_S) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -55,31 +55,31 @@ def test_a_resonance_is_no_line(seed: int, damping: float) -> None:
     hops = signal.lfilter([1.0], np.poly([pole, pole.conj()]).real, noise(seed)[:, 0])
     rows = noise(seed + 100)
     rows[:, 1] += 10.0 * hops / hops.std()
-    assert lines.strongest(rows, APART_S) == 0.0
+    assert lines.strongest_line_hz(rows, APART_S) == 0.0
 
 
 @pytest.mark.parametrize("part", [slice(300, 600), slice(450, 900)])
 def test_what_rings_on_the_bridge_alone_is_no_line(part: slice) -> None:
     rows = noise(4)
     rows[part] += hum(14.0, 3.0)[part]
-    assert lines.strongest(rows, APART_S) == 0.0
+    assert lines.strongest_line_hz(rows, APART_S) == 0.0
 
 
 def test_waves_take_out_hum_whose_amplitude_and_phase_drift() -> None:
     time = times()
-    waves = lines.waves([33.0], COUNT, APART_S)
-    assert waves.T @ waves == pytest.approx(np.eye(waves.shape[1]), abs=1e-12)
+    line_waves = lines.line_waves([33.0], COUNT, APART_S)
+    assert line_waves.T @ line_waves == pytest.approx(np.eye(line_waves.shape[1]), abs=1e-12)
     drifting = (1.0 + 0.5 * np.sin(0.7 * time)) * np.cos(2.0 * np.pi * 33.1 * time + 0.3 * time)
-    left = lines.without(waves, drifting[None, :])
+    left = lines.project_out(line_waves, drifting[None, :])
     assert np.sqrt(np.mean(left**2)) < 0.01
     beside = np.cos(2.0 * np.pi * 30.0 * time)[None, :]
-    assert np.mean(lines.without(waves, beside) ** 2) > 0.98 * np.mean(beside**2)
+    assert np.mean(lines.project_out(line_waves, beside) ** 2) > 0.98 * np.mean(beside**2)
 
 
 def test_two_lines_are_taken_out_together() -> None:
     rows = (hum(20.0, 1.0) + hum(40.0, 0.5)).T
-    waves = lines.waves([20.0, 40.0], COUNT, APART_S)
-    assert np.abs(lines.without(waves, rows)).max() < 1e-3
+    line_waves = lines.line_waves([20.0, 40.0], COUNT, APART_S)
+    assert np.abs(lines.project_out(line_waves, rows)).max() < 1e-3
 
 
 @pytest.mark.parametrize("hz", [25.0, 50.0, 60.0, 70.0])

@@ -10,9 +10,9 @@ from pre_core.crossing.channels import (
     A_1,
     A_2,
     A_3,
+    INTERPOLATION_REACH,
     MODEL_RATE_HZ,
-    PASS,
-    SEEN_ASIDE,
+    PASS_BAND,
     STOP,
     A,
     ModelSignals,
@@ -77,7 +77,7 @@ def test_the_models_rate(rate_hz: float) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
-@pytest.mark.parametrize("share", [None, 0.125, 0.99 * PASS])
+@pytest.mark.parametrize("share", [None, 0.125, 0.99 * PASS_BAND])
 def test_integrals_and_derivatives_of_a_sine(rate_hz: float, share: float | None) -> None:
     """At 10 Hz, at the end of what rows see and at the end of the pass band."""
     rate = model_rate_hz(rate_hz)
@@ -229,8 +229,10 @@ def test_reading_between_samples(share: float) -> None:
     n = 300
     samples = np.cos(2.0 * np.pi * share * np.arange(n) + 0.3)
     rng = np.random.default_rng(9)
-    place = np.concatenate([rng.uniform(SEEN_ASIDE, n - SEEN_ASIDE - 1, 500), [40.0, 41.0]])
+    place = np.concatenate(
+        [rng.uniform(INTERPOLATION_REACH, n - INTERPOLATION_REACH - 1, 500), [40.0, 41.0]]
+    )
     truth = np.cos(2.0 * np.pi * share * place + 0.3)
     np.testing.assert_allclose(interpolate_at(samples, place), truth, atol=RIPPLE)
-    ends = np.array([-1.0, 0.5, SEEN_ASIDE - 1.5, n - SEEN_ASIDE + 0.5, n + 3.0])
+    ends = np.array([-1.0, 0.5, INTERPOLATION_REACH - 1.5, n - INTERPOLATION_REACH + 0.5, n + 3.0])
     assert np.isnan(interpolate_at(samples, ends)).all()

@@ -18,13 +18,13 @@ from pre_core.crossing.noise import (
     noise_path,
     noise_spectrum,
 )
-from pre_core.crossing.preparation import MISMATCHED
+from pre_core.crossing.preparation import MIN_MISMATCH_GAIN
 from pre_core.crossing.rows import RESIDUALS, filter_rows, row_count, row_filter
 from pre_core.crossing.whitening import white_rows, whitener
 from pre_core.physics.models import from_models
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
 from pre_core.physics.surface import (
-    COMMON_LORRY,
+    TYPICAL_FOOTPRINTS,
     Footprint,
     axle_profile,
     random_surface,
@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 STEP_S = 3e-3
 SPEED = 10.0
-FRONT, REAR = COMMON_LORRY
+FRONT, REAR = TYPICAL_FOOTPRINTS
 QUIET = np.full(4, 1e-6)
 
 
@@ -132,7 +132,7 @@ def test_levels_of_drawn_surfaces() -> None:
             rows, truck(), QUIET, of_level(0.0), [filtered(drive.difference)],
             [filtered(drive.front)],
         )  # fmt: skip
-        assert gain > 10.0 * MISMATCHED
+        assert gain > 10.0 * MIN_MISMATCH_GAIN
         shapes = mm.mismatch_spectra(FRONT, REAR)
         found.append(mm.two_parameter_spectrum(mm.Mismatch(shapes, level, SPEED))[0])
     wanted = mm.two_parameter_spectrum(of_level(true_level("A")))[0]
@@ -156,7 +156,7 @@ def test_sensors_noise_is_no_mismatch() -> None:
         road = filtered(driven(1, 900).front)
         stretch = values[::RESIDUALS]
         gains.append(mismatch_levels(rows, one, density, of_level(0.0), [stretch], [road])[1])
-    assert max(gains) < MISMATCHED
+    assert max(gains) < MIN_MISMATCH_GAIN
 
 
 @pytest.mark.parametrize("unknown", [3, 5, 7])
@@ -210,7 +210,8 @@ def test_draws_of_compliances_against_quadrature() -> None:
         elements=np.array([0]), sigma=np.array([sigma]), sampled=np.array([0, 1]),
         others=np.array([2]), centre=np.array([1.0]), inflation=1.0, precision=precision,
         linear=linear, log_odds=np.array([-np.inf, odds]), others_root=np.array([[0.5]]),
-        others_linear=np.array([1.0]), others_sampled=np.array([[0.5, -0.4]]), leaning=np.zeros(3),
+        others_linear=np.array([1.0]), others_sampled=np.array([[0.5, -0.4]]),
+        bias_direction=np.zeros(3),
     )  # fmt: skip
     drawn = np.concatenate([draws(of, 1500, 3, stream) for stream in range(4)])
     y = np.linspace(-6.0, 6.0, 2401)

@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 from numpy.typing import NDArray
 
-from pre_core.crossing.channels import PASS, STOP
+from pre_core.crossing.channels import PASS_BAND, STOP
 from pre_core.crossing.residuals import _read
 from pre_core.crossing.step_tables import sinc_table
 from pre_core.kernels.windowed_sinc import kaiser_beta, windowed_sinc
@@ -33,7 +33,7 @@ def places() -> FloatArray:
 
 
 @pytest.mark.parametrize(
-    ("share", "error"), [(0.05, 2e-5), (0.125, 2e-5), (0.2, 1e-4), (PASS, 2e-4)]
+    ("share", "error"), [(0.05, 2e-5), (0.125, 2e-5), (0.2, 1e-4), (PASS_BAND, 2e-4)]
 )
 def test_sines_of_the_pass_band(share: float, error: float) -> None:
     """Cycles per sample: rows see up to an eighth."""
@@ -91,10 +91,10 @@ def test_images_are_gone() -> None:
     place = np.arange(0.0, 1.0, 1.0 / PHASES)
     offsets = (AT[None, :] - place[:, None]).ravel()
     weight = TABLE[:-1, 0].ravel() / PHASES
-    for share in np.linspace(1.0 - STOP, 2.0 + PASS, 100):
+    for share in np.linspace(1.0 - STOP, 2.0 + PASS_BAND, 100):
         response = abs(weight @ np.exp(2j * np.pi * share * offsets))
         of = abs(share - round(share))
-        assert response < (5e-5 if of <= PASS else 0.025), (share, response)
+        assert response < (5e-5 if of <= PASS_BAND else 0.025), (share, response)
 
 
 @pytest.mark.parametrize("stop_band_db", [60.0, 90.0])

@@ -15,8 +15,20 @@ from scipy.linalg import cholesky_banded, solve_banded
 
 from pre_core.constants import MICRO_G_M_PER_S2
 from pre_core.crossing.channels import A_1, A_2, A, V, Z, channel_signals
-from pre_core.crossing.noise import DOUBTED_SPRING_N_PER_M, NoisePath, no_force_noise, noise_power
-from pre_core.crossing.rows import EVERY, PASS, RowFilter, filter_rows, row_count, row_filter
+from pre_core.crossing.noise import (
+    REDUCED_WEIGHT_SPRING_N_PER_M,
+    NoisePath,
+    no_force_noise,
+    noise_power,
+)
+from pre_core.crossing.rows import (
+    PASS_BAND,
+    SAMPLES_PER_RESIDUAL,
+    RowFilter,
+    filter_rows,
+    row_count,
+    row_filter,
+)
 from pre_core.crossing.whitening import Whitener, white_rows, whitener
 from pre_core.parameters import C_S1, K_S1, K_U1, M_U1
 from pre_core.physics.models import from_models
@@ -82,7 +94,7 @@ def plain_residuals(signals: FloatArray, step_s: float, *, is_inertial: bool = T
         )
         tau = car.tyre_damping_ns_per_m[w] / k_u
         roads.append(unsprung[Z] + (force - tau * rate + tau**2 * bend) / k_u)
-        over = DOUBTED_SPRING_N_PER_M if is_inertial else k
+        over = REDUCED_WEIGHT_SPRING_N_PER_M if is_inertial else k
         bodies.append((mass * sprung[A] + m_12 * other[A] + pull) / over)
     return np.stack([roads[0] - roads[1], *bodies])
 
@@ -247,11 +259,11 @@ def test_pass_and_stop_band(rate_hz: float) -> None:
     response = np.abs(np.exp(-2j * np.pi * np.outer(frequency, k) / rate_hz) @ rows.taps)
     apart = rows.every / rate_hz
     second_difference = (2.0 * np.sin(np.pi * frequency * apart) / apart) ** 2
-    passes = frequency <= PASS * rate_hz
+    passes = frequency <= PASS_BAND * rate_hz
     np.testing.assert_allclose(response[passes] / second_difference[passes], 1.0, atol=2e-3)
     half = np.argmin(np.abs(frequency - 0.5 / apart))
     assert response[half] / second_difference[half] == pytest.approx(0.5, abs=0.02)
-    stops = frequency >= (1.0 / EVERY - PASS) * rate_hz
+    stops = frequency >= (1.0 / SAMPLES_PER_RESIDUAL - PASS_BAND) * rate_hz
     assert np.max(response[stops] * apart**2 / 4.0) < 10 ** (-65 / 20)
     # The power that the whitener integrates is that response, from noise of an acceleration.
     np.testing.assert_allclose(

@@ -7,7 +7,7 @@ import pytest
 
 from pre_core.crossing.mismatch import expected_levels
 from pre_core.physics.road import REFERENCE_CYCLES_PER_M
-from pre_core.physics.surface import COMMON_LORRY, spectra, surface_density
+from pre_core.physics.surface import TYPICAL_FOOTPRINTS, spectra, surface_density
 from pre_core.survey import detection
 from pre_core.survey.plan import (
     BridgePrior,
@@ -51,7 +51,7 @@ def of_elements(matrix: np.ndarray) -> np.ndarray:
 
 
 def test_levels_of_a_road_are_those_of_its_spectrum() -> None:
-    front, rear = COMMON_LORRY
+    front, rear = TYPICAL_FOOTPRINTS
     at = np.array([REFERENCE_CYCLES_PER_M])
     level = expected_levels(front, rear._replace(offset_m=0.005), "A")
     assert level[0] == pytest.approx(surface_density("A") * spectra(front, rear, at)[3][0])

@@ -182,7 +182,7 @@ def test_excess_is_a_standard_normal(size: int) -> None:
     """Wilson and Hilferty's approximation, at its mean, its spread and in its tail."""
     rng = np.random.default_rng(size)
     squares = rng.chisquare(size, 40_000) / size
-    z = np.array([quality.cell_excess(quality.ResidualBin(float(s), size)) for s in squares])
+    z = np.array([quality.bin_excess(quality.ResidualBin(float(s), size)) for s in squares])
     assert abs(z.mean()) < 0.03
     assert z.std() == pytest.approx(1.0, abs=0.03)
     assert np.mean(z > 3.0) < 0.003

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pre_core.crossing.middle import Places, Reduction, middle, reduction
+from pre_core.crossing.middle import (
+    Reduction,
+    SensorPlaces,
+    centre_readings,
+    centre_reduction,
+)
 
 Floats = NDArray[np.float64]
 WHEELBASE_M = 5.0
@@ -13,8 +18,8 @@ TOLERANCE_M = 0.05
 
 def reduced(rows: list[tuple[int, float, float, float]]) -> Reduction:
     axle, behind, lateral, density = np.array(rows).T
-    places = Places(axle.astype(np.int64), behind, lateral)
-    return reduction(places, density, WHEELBASE_M, TOLERANCE_M)
+    places = SensorPlaces(axle.astype(np.int64), behind, lateral)
+    return centre_reduction(places, density, WHEELBASE_M, TOLERANCE_M)
 
 
 def readings(rows: list[tuple[int, float, float, float]], count: int = 50) -> tuple[Floats, Floats]:
@@ -49,7 +54,7 @@ MIDDLE = [(0, 0.0, 0.0, 25.0), (0, 5.0, 0.0, 25.0)]
 def test_middle_of_a_rigid_truck_is_exact(body: list[tuple[int, float, float, float]]) -> None:
     rows = body + AXLES
     four, shown = readings(rows)
-    np.testing.assert_allclose(middle(reduced(rows), shown), four, atol=1e-12)
+    np.testing.assert_allclose(centre_readings(reduced(rows), shown), four, atol=1e-12)
 
 
 def test_average_of_two_sides_has_the_noise_of_both() -> None:
@@ -73,7 +78,7 @@ def test_noise_of_the_readings_is_the_density_that_is_stated() -> None:
     found = reduced(rows)
     noise = np.array([n for *_, n in rows])[:, None]
     shown = noise * np.random.default_rng(1).standard_normal((len(rows), 200_000))
-    np.testing.assert_allclose(middle(found, shown).std(axis=1), found.density, rtol=0.01)
+    np.testing.assert_allclose(centre_readings(found, shown).std(axis=1), found.density, rtol=0.01)
 
 
 def test_least_squares_is_the_quietest_of_all_unbiased_weights() -> None:
@@ -103,7 +108,7 @@ def test_four_sensors_in_the_middle_pass_bit_for_bit() -> None:
     shown = np.random.default_rng(2).standard_normal((4, 1000)) * 1e-3
     shown[:, 7] = -0.0  # of which a sum of products would make 0.0
     found = reduced(rows)
-    assert middle(found, shown).tobytes() == shown.tobytes()
+    assert centre_readings(found, shown).tobytes() == shown.tobytes()
     np.testing.assert_array_equal(found.weights, np.eye(4))
     np.testing.assert_array_equal(found.density, [25.0, 10.0, 3.0, 0.0])
     assert found.parities == ()

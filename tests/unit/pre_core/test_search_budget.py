@@ -50,7 +50,7 @@ def test_a_search_that_finds_no_fit_ends_within_its_budget(
     monkeypatch.setattr(optimum, "_refine_candidates", from_places)
     monkeypatch.setattr(optimum, "build_problem", lambda inputs: (found(0.0, 0).problem, None))
     monkeypatch.setattr(optimum, "levels_at", lambda problem, y: np.zeros(1))
-    monkeypatch.setattr(optimum, "line_at", lambda problem, y: 0.0)
+    monkeypatch.setattr(optimum, "strongest_line_at_hz", lambda problem, y: 0.0)
     monkeypatch.setattr(optimum, "is_accepted", lambda problem, chi2: chi2 < 1.5)
     inputs: Any = None
     best = optimum.find_optimum(inputs)
