@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from schemas.strict_model import Finite, StrictModel
 
-_MOST_COORDINATES = 400
+_MAX_COORDINATES = 400
 
 
 class Coordinate(StrictModel):
@@ -65,7 +65,7 @@ class FusionLikelihood(StrictModel):
     truck: tuple[Coordinate, ...]
     root: tuple[Finite, ...]
     """R, upper triangular, row by row."""
-    target: Annotated[tuple[Finite, ...], Field(max_length=_MOST_COORDINATES)]
+    target: Annotated[tuple[Finite, ...], Field(max_length=_MAX_COORDINATES)]
     """The vector z."""
     element_lengths_m: tuple[Finite, ...]
     mass_spread: Annotated[Finite, Field(ge=0)]

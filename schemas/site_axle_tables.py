@@ -6,7 +6,7 @@ from pydantic import Field, Strict, StrictBool
 
 from schemas.site_numbers import NotNegative, Number, Positive, Spread, Table, Track
 
-MOST_AXLES: Final = 20
+MAX_AXLES: Final = 20
 _LOAD_SPREAD: Final = 0.02
 
 
@@ -52,12 +52,12 @@ class Bogie(Table):
     """A group of axles that share their load, by their numbers from 1."""
 
     axles: Annotated[
-        tuple[Annotated[int, Strict(), Field(ge=1, le=MOST_AXLES)], ...],
-        Field(min_length=2, max_length=MOST_AXLES),
+        tuple[Annotated[int, Strict(), Field(ge=1, le=MAX_AXLES)], ...],
+        Field(min_length=2, max_length=MAX_AXLES),
     ]
     equalised: StrictBool = False
     """Whether the axles share one spring force by `shares`."""
-    shares: Annotated[tuple[Positive, ...], Field(max_length=MOST_AXLES)] | None = None
+    shares: Annotated[tuple[Positive, ...], Field(max_length=MAX_AXLES)] | None = None
     """Shares of the force, one for each axle; equal where absent."""
     share_spread: Spread = 0.05
 
@@ -65,5 +65,5 @@ class Bogie(Table):
 class Axles(Table):
     """The axles of a truck from front to rear, and its bogies."""
 
-    axles: Annotated[tuple[Axle, ...], Field(min_length=2, max_length=MOST_AXLES)]
-    bogies: Annotated[tuple[Bogie, ...], Field(max_length=MOST_AXLES)] = ()
+    axles: Annotated[tuple[Axle, ...], Field(min_length=2, max_length=MAX_AXLES)]
+    bogies: Annotated[tuple[Bogie, ...], Field(max_length=MAX_AXLES)] = ()

@@ -17,7 +17,7 @@ from schemas.site_ros2 import Ros2
 from schemas.site_sensors import PlacedSensor
 from schemas.toml_text import parse_toml, read_toml_text
 
-_MOST_FIELDS: Final = 100
+_MAX_FIELDS: Final = 100
 """Largest number of fields in a table and of values in a list."""
 _TABLES: Final[Tables] = {
     "vehicle": Vehicle,
@@ -116,10 +116,10 @@ def _too_many(table: dict[str, Any]) -> str | None:
             return f"has {len(tables)} [[{name}]], at most {MAX_TABLES} are expected"
         parts += [(f"[{name}]", part) for part in tables if isinstance(part, dict)]
     for name, part in parts:
-        if len(part) > _MOST_FIELDS:
+        if len(part) > _MAX_FIELDS:
             return f"{name} has {len(part)} fields, most of them unknown"
         for key, value in part.items() if name != "the file" else ():
-            if isinstance(value, list) and len(value) > _MOST_FIELDS:
+            if isinstance(value, list) and len(value) > _MAX_FIELDS:
                 return f"{name} {key} has {len(value)} values, at most {MAX_ELEMENTS} are expected"
     return None
 

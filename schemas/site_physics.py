@@ -26,7 +26,7 @@ _SPRING_HZ: Final = (0.1, 300.0)
 """
 _TYRE_HZ: Final = (0.1, 1000.0)
 """Natural frequency: lower bound for the body on the tyres, upper bound for the axle on them."""
-_MOST_DAMPING: Final = 20.0
+_MAX_DAMPING: Final = 20.0
 """Largest damping ratio of a suspension and of a tyre."""
 _WAVE_SPEED_M_PER_S: Final = 6000.0
 """Largest wave speed of bridge materials: 5100 in steel, 4000 in concrete."""
@@ -103,12 +103,12 @@ def _check_axle(vehicle: "Vehicle", k: int, body_kg: float) -> None:
     low, high = _stiffness(body_kg, _TYRE_HZ[0]), _stiffness(axle_kg, _TYRE_HZ[1])
     because = f"an axle of {axle_kg:.3g} kg swings on it at {_TYRE_HZ[1]:g} Hz at most"
     _check(f"tyre_stiffness_n_per_m.{k}", tyre, (low, high), "a stiffness", "N/m", because)
-    because = f"the damping ratio is {_MOST_DAMPING:g} then"
+    because = f"the damping ratio is {_MAX_DAMPING:g} then"
     for key, damping, stiffness, mass in (
         ("suspension_damping_ns_per_m", vehicle.suspension_damping_ns_per_m[k], spring, body_kg),
         ("tyre_damping_ns_per_m", vehicle.tyre_damping_ns_per_m[k], tyre, axle_kg),
     ):
-        most = 2.0 * _MOST_DAMPING * math.sqrt(stiffness * mass)
+        most = 2.0 * _MAX_DAMPING * math.sqrt(stiffness * mass)
         _check(f"{key}.{k}", damping, (0.0, most), "a damping", "N·s/m", because)
 
 

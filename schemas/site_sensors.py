@@ -14,7 +14,7 @@ from pydantic import Field, Strict
 from schemas.site_errors import error_at
 from schemas.site_numbers import Density, Identifier, Number, Rate, Table
 
-MOST_SENSORS: Final = 32
+MAX_SENSORS: Final = 32
 IN_THE_MIDDLE_M: Final = 0.05
 """Largest lateral distance of a sensor on the centre line, which is not known better."""
 _LARGEST_LEVER: Final = 3.0

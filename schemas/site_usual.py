@@ -26,7 +26,7 @@ _SUSPENSION: Final = (0.01, 1.5)
 _NOISE_UG: Final = (0.5, 5000.0)
 _FAR: Final = 2.0
 """Factor beyond a range at which a value is taken to be wrong, not only unusual."""
-_MOST_BRIDGES: Final = 50
+_MAX_BRIDGES: Final = 50
 """Largest number of bridges with warnings: a fleet's site file has thousands."""
 
 _STIFFNESS: Final = (("kN/m", 1e3),)
@@ -75,7 +75,7 @@ def implied_by(site: Site, vehicle: Vehicle) -> Iterator[Implied]:
     """Yield what a site file implies of a truck, its sensors and the bridges under it."""
     yield from of_truck(vehicle)
     yield from of_sensors(site.sensor, vehicle)
-    for bridge in site.bridges[:_MOST_BRIDGES]:
+    for bridge in site.bridges[:_MAX_BRIDGES]:
         yield from of_bridge(bridge, vehicle)
 
 

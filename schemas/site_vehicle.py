@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar, Final
 from pydantic import BeforeValidator, Field, model_validator
 
 from schemas.signals import CHANNELS
-from schemas.site_axle_tables import MOST_AXLES, Axle, Bogie
+from schemas.site_axle_tables import MAX_AXLES, Axle, Bogie
 from schemas.site_axles import REPLACED, in_pairs
 from schemas.site_errors import error_at
 from schemas.site_numbers import (
@@ -19,7 +19,7 @@ from schemas.site_numbers import (
     Track,
 )
 from schemas.site_physics import check_vehicle
-from schemas.site_sensors import MOST_SENSORS, PlacedSensor, check_places, check_sensors
+from schemas.site_sensors import MAX_SENSORS, PlacedSensor, check_places, check_sensors
 from schemas.site_tandem import Tandem, tandem_of
 
 _TYRE_DAMPING_NS_PER_M: Final = 1000.0
@@ -83,12 +83,12 @@ class Vehicle(WithSpreads):
     """Distance between the middles of the left and right wheels of each axle."""
     rear_axle_offset_m: Annotated[Number, Field(ge=-1, le=1)] | None = None
     """Distance of the rear axle's path to the left of the front axle's."""
-    sensors: Annotated[tuple[PlacedSensor, ...], Field(max_length=MOST_SENSORS)] = ()
+    sensors: Annotated[tuple[PlacedSensor, ...], Field(max_length=MAX_SENSORS)] = ()
     """Accelerometers by name and place; empty: four with the names of `CHANNELS`, on the centre
     line."""
-    axles: Annotated[tuple[Axle, ...], Field(max_length=MOST_AXLES)] = ()
+    axles: Annotated[tuple[Axle, ...], Field(max_length=MAX_AXLES)] = ()
     """Axles of a truck with a tandem; empty: two, in the pairs."""
-    bogies: Annotated[tuple[Bogie, ...], Field(max_length=MOST_AXLES)] = ()
+    bogies: Annotated[tuple[Bogie, ...], Field(max_length=MAX_AXLES)] = ()
 
     total_mass_kg_spread: Spread = 0.01
     wheelbase_m_spread: Spread = 0.002

@@ -37,7 +37,7 @@ MISMATCH_BIAS_SPREAD = 0.25
 """Relative uncertainty of the gradient correction for the mismatch: its level is known to 15 %, the
 tyres' widths and distance no better."""
 _SLICE_WIDTH = 1.0
-_MOST_WIDENINGS = 12
+_MAX_WIDENINGS = 12
 
 
 class CompliancePosterior(NamedTuple):
@@ -257,11 +257,11 @@ def _slice(
     level = _log_conditional(y, pull, own, sigma, inflation) + log(rng.random())
     low = y - _SLICE_WIDTH * rng.random()
     high = low + _SLICE_WIDTH
-    for _ in range(_MOST_WIDENINGS):
+    for _ in range(_MAX_WIDENINGS):
         if _log_conditional(low, pull, own, sigma, inflation) < level:
             break
         low -= _SLICE_WIDTH
-    for _ in range(_MOST_WIDENINGS):
+    for _ in range(_MAX_WIDENINGS):
         if _log_conditional(high, pull, own, sigma, inflation) < level:
             break
         high += _SLICE_WIDTH

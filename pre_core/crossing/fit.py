@@ -42,9 +42,9 @@ _CLEAR_FRICTION_WEIGHT = 0.05
 _NO_FIT_CHI2 = 10.0
 """Limit of chi2 at five times the noise: sound starts of 90 drawn crossings had 1.6 at most, wrong
 ones 10 to 70."""
-_MOST_ROUNDS, _EARLY_ROUNDS = 6, 2
+_MAX_ROUNDS, _EARLY_ROUNDS = 6, 2
 """Limit of alternating fits and noise estimates, finally and in earlier stages."""
-_MOST_STEPS, _EARLY_STEPS = 25, 8
+_MAX_STEPS, _EARLY_STEPS = 25, 8
 """Limit of steps with mismatch, whose noise is estimated before every step; finally and earlier."""
 _MIN_GAIN_WITH_MISMATCH = 0.5
 """Gain in the sum of squares that ends a search with mismatch, far within the uncertainty of poorly
@@ -234,7 +234,7 @@ def fit_all(
         problem, y, ending, used = fit_stage(problem, start, free, _FREE_STAGES[0], update_noise)
         evaluations += used
     else:
-        for is_free, rounds in ((True, _EARLY_ROUNDS), (False, _MOST_ROUNDS)):
+        for is_free, rounds in ((True, _EARLY_ROUNDS), (False, _MAX_ROUNDS)):
             y = y if is_free else _not_negative(problem, y)
             problem = update_noise(problem, y, no_force_noise())
             problem, y, ending, used = _fit_in_noise_rounds(
@@ -251,7 +251,7 @@ def fit_all(
     if not (problem.force.any() or is_accepted(problem, chi2_per_dof(problem, y))):
         problem = update_noise(problem, y, friction_gain=FRICTION_GAIN_OF_MISFIT)
     if problem.force.any():
-        problem, y, ending, used = _fit_in_noise_rounds(problem, y, free, _MOST_ROUNDS, doubted)
+        problem, y, ending, used = _fit_in_noise_rounds(problem, y, free, _MAX_ROUNDS, doubted)
         evaluations += used
     state = levenberg_marquardt.initial_state(lambda at: all_rows(problem, at), y)
     found = Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations, 1)
@@ -275,7 +275,7 @@ def _fit_in_noise_rounds(
     temperature, steps, enough = _FREE_STAGES[-1]
     evaluations = 0
     if problem.mismatch.level_m3.any():
-        most = _EARLY_STEPS if is_free else _MOST_STEPS
+        most = _EARLY_STEPS if is_free else _MAX_STEPS
         problem, y, ending, evaluations = _fit_in_noise_steps(
             problem, y, directions, temperature, most, refresh_noise, is_free=is_free
         )

@@ -35,7 +35,7 @@ _LARGE_OFFSET_M = 0.02
 centimetres. Without it an offset of a hand's width would pass for twin tyres."""
 _WORN = 0.9
 _GRID_CYCLES_PER_M = 0.02
-_MOST_CYCLES_PER_M = 24.0
+_MAX_CYCLES_PER_M = 24.0
 LONG_CYCLES_PER_M = 0.05
 """Wave number relevant for bridges, at which a mismatch is reported."""
 _EVERY_LONG, _OTHERS = 30, 50
@@ -138,7 +138,7 @@ def expected_levels(front: Footprint, rear: Footprint, road_class: str) -> Float
 
 def _above_zero() -> FloatArray:
     """Return the grid without its zero, where the spectrum of an offset has no limit."""
-    points = round(_MOST_CYCLES_PER_M / _GRID_CYCLES_PER_M) + 1
+    points = round(_MAX_CYCLES_PER_M / _GRID_CYCLES_PER_M) + 1
     grid = _GRID_CYCLES_PER_M * np.arange(points, dtype=np.float64)
     grid[0] = 0.02 * _GRID_CYCLES_PER_M
     return grid

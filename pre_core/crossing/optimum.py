@@ -62,7 +62,7 @@ one profile 130 at most and mostly below 25, with twin tyres on the best class o
 _CLEAR_RESTRAINT = 0.5
 """Scales of their prior above which restraints, bearing compliance and torsion are tried without.
 """
-_MOST_MOVES = 4
+_MAX_MOVES = 4
 """Limit of moves from an optimum to a neighbouring one."""
 _SAME_MINIMUM_M = 0.2
 """Distance within which offsets lead to one minimum."""
@@ -70,10 +70,10 @@ _HOPELESS_CHI2 = (1000.0, 25.0)
 """Values of chi2 above which no other offset is tried, after one candidate and after more. Of 70
 drawn sound crossings the first candidate was right in all; another one never reduced such a chi2 to
 a usable one."""
-_MOST_EVALUATIONS = 100_000
+_MAX_EVALUATIONS = 100_000
 """Limit of a whole search. The sample takes 2,000, a site file with two supports too many 65,000:
 beyond this a search has failed, and its numbers are not reliable."""
-_MOST_LINES = 3
+_MAX_LINES = 3
 """Hum and its harmonics; a record with more lines is not one of a truck on a road."""
 _SIMPLEST = SearchStrategy(SWING_MODES, True, 1, False)
 _WITHOUT_MISMATCH = (
@@ -102,19 +102,19 @@ def _whole_bridge(problem: PosteriorProblem, strategy: SearchStrategy) -> FloatA
 def find_optimum(inputs: CrossingInputs, report: Report = lambda stage, fraction: None) -> Optimum:
     """Return the optimum of the posterior; NOT_FINITE if no offset gave finite residuals.
 
-    Its `ending` is STEPS_EXHAUSTED if the search took more than `_MOST_EVALUATIONS` without a fit.
+    Its `ending` is STEPS_EXHAUSTED if the search took more than `_MAX_EVALUATIONS` without a fit.
     """
     problem, y = build_problem(inputs)
-    found = _run_strategies(problem, y, report, _MOST_EVALUATIONS)
-    while not _is_final(found[-1]) and len(problem.lines_hz) < _MOST_LINES:
+    found = _run_strategies(problem, y, report, _MAX_EVALUATIONS)
+    while not _is_final(found[-1]) and len(problem.lines_hz) < _MAX_LINES:
         line_hz = strongest_line_at_hz(found[-1].problem, found[-1].state.y)
         if line_hz == 0.0:
             break
         problem = with_line(problem, y, line_hz)
-        found += _run_strategies(problem, y, report, _MOST_EVALUATIONS - _evaluations_of_all(found))
+        found += _run_strategies(problem, y, report, _MAX_EVALUATIONS - _evaluations_of_all(found))
     best = min(found, key=lambda one: (one.noise_power <= HOPELESS_NOISE, one.chi2_per_dof))
     evaluations = _evaluations_of_all(found)
-    is_lost = evaluations > _MOST_EVALUATIONS and not _is_final(best)
+    is_lost = evaluations > _MAX_EVALUATIONS and not _is_final(best)
     if is_lost and best.ending is not Termination.NOT_FINITE:
         best = best._replace(ending=Termination.STEPS_EXHAUSTED)
     return best._replace(evaluations=evaluations, starts=sum(one.starts for one in found))
@@ -137,7 +137,7 @@ def _run_strategies(
 
 def _has_ended(found: Optimum) -> bool:
     """Whether no other way is tried: this is final, or a line is to be silenced first."""
-    if _is_final(found) or len(found.problem.lines_hz) == _MOST_LINES:
+    if _is_final(found) or len(found.problem.lines_hz) == _MAX_LINES:
         return _is_final(found)
     return strongest_line_at_hz(found.problem, found.state.y) > 0.0
 
@@ -307,7 +307,7 @@ def _refine_offset(
 ) -> tuple[Optimum, int]:
     """Return the best of an optimum with mismatch and its neighbours, and the evaluations."""
     evaluations = 0
-    for _ in range(_MOST_MOVES):
+    for _ in range(_MAX_MOVES):
         if evaluations > max_evaluations:
             break
         place, used = better_neighbour(found, strategy)

@@ -28,8 +28,8 @@ _MIN_EFFECTIVE_SHARE = 1.0 / 3.0
 """Required effective size of the draws, relative to the requested ones."""
 _BATCH_SHARE = 1.0 / 3.0
 """Size of a batch of weighted draws, relative to the requested ones."""
-_MOST_BATCHES = 25
-_MOST_RUNS = 14
+_MAX_BATCHES = 25
+_MAX_RUNS = 14
 """Limit of draws with mismatch, relative to the requested ones."""
 _LARGEST_PARETO_K = 0.7
 _NEGLIGIBLE_ODDS = 0.02
@@ -141,7 +141,7 @@ def _importance_draws(
     seed: int,
     report: Report,
 ) -> _WeightedDraws:
-    """Return weighted draws in batches until they suffice, or all of `_MOST_BATCHES`.
+    """Return weighted draws in batches until they suffice, or all of `_MAX_BATCHES`.
 
     Each batch is of a surrogate, `now` at first, that is refined by the draws so far; its chains
     start about `start` (f,). All draws are weighted as of the mixture of the surrogates.
@@ -165,7 +165,7 @@ def _importance_draws(
         worth = importance.pareto_smooth(
             importance.mixture_log_weights(log_target, log_density, counts)
         )
-        if _is_enough(worth, draws) or len(used) == _MOST_BATCHES:
+        if _is_enough(worth, draws) or len(used) == _MAX_BATCHES:
             return _WeightedDraws(y, worth)
         now = surrogate.refine(now, coordinates, x, log_target, count)
 
@@ -213,7 +213,7 @@ def _mismatch_draws(found: Optimum, draws: int, seed: int, inflation: float) -> 
     monitored = _monitored_indices(found.problem)
     kept: list[FloatArray] = []
     r_hat, ess, ending = np.inf, 0.0, Termination.STEPS_EXHAUSTED
-    for number in range(_MOST_RUNS):
+    for number in range(_MAX_RUNS):
         first = number * convergence.CHAINS
         streams = range(first, first + convergence.CHAINS)
         wanted = draws // convergence.CHAINS

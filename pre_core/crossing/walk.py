@@ -41,7 +41,7 @@ _NEIGHBOUR_M, _NEIGHBOURS = 0.1, 6
 bearing makes minima 0.2 m apart, which the truck of the scan does not distinguish."""
 _PATIENCE = 1.5  # strides beyond the best place
 _REACH = 3.0  # of the offset's spread
-_MOST_STRIDES = 60
+_MAX_STRIDES = 60
 """Limit of strides to either side, however uncertain the offset."""
 
 
@@ -107,7 +107,7 @@ def scan_offsets(
         return min(candidates, key=lambda place: place.objective)
 
     fit_at(0.0, nothing)
-    reach = min(_STRIDE_M + _REACH / problem.receiver_rows[-1, -1], _MOST_STRIDES * _STRIDE_M)
+    reach = min(_STRIDE_M + _REACH / problem.receiver_rows[-1, -1], _MAX_STRIDES * _STRIDE_M)
     for sign in (1.0, -1.0):
         shift = sign * _STRIDE_M
         while abs(shift) <= reach:

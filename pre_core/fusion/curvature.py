@@ -27,7 +27,7 @@ _LARGEST_COMPLIANCE = 0.5
 """Largest size of a compliance, relative to itself."""
 _PLAIN = 0.2
 """Smallest curvature term that is kept, if everything moves by its size, in standard deviations."""
-_MOST_BENDS = 40
+_MAX_BENDS = 40
 _FARTHEST = 3.0
 """Largest distance from the optimum, in sizes, at which the terms apply."""
 _PLACE_STEPS = 4
@@ -71,7 +71,7 @@ def curvature_terms(
     differences = (twice - once[first] - once[second] + here) / _STEP**2
     differences[first == second] *= 0.5
     weight, shapes = np.linalg.eigh(differences @ differences.T)
-    kept = np.flatnonzero(weight > _PLAIN**2)[::-1][:_MOST_BENDS]
+    kept = np.flatnonzero(weight > _PLAIN**2)[::-1][:_MAX_BENDS]
     shapes = shapes[:, kept].T
     return CurvatureTerms(about, size, shapes), differences.T @ shapes.T
 

@@ -52,7 +52,7 @@ _USUAL = (0.03, 0.3)
 """Values of tau and rho for the bridge about which likelihoods are linearised."""
 _SETTLED = 0.01
 """Tolerance of a compliance and of other coordinates, far below their uncertainty."""
-_MOST_STEPS, _ENOUGH = 60, 1e-6
+_MAX_STEPS, _ENOUGH = 60, 1e-6
 _PASSES = 12
 """Largest number of linearisations about the current estimate."""
 
@@ -148,7 +148,7 @@ def _most_likely(
         return np.concatenate([bridge(y) @ root.T - target, y], axis=1)
 
     lower = np.where(priors.coordinates.is_log, -np.inf, 0.0)
-    found = minimise(rows, np.zeros(layout.bridge), _MOST_STEPS, _ENOUGH, lower)
+    found = minimise(rows, np.zeros(layout.bridge), _MAX_STEPS, _ENOUGH, lower)
     return bridge(found.state.y[None, :])[0]
 
 

@@ -30,8 +30,8 @@ FloatArray = NDArray[np.float64]
 _APART_STEPS = 4
 """Step of the second difference that determines the shared fraction: waves of one to four metres.
 """
-_MOST_STEPS_BESIDE, _ALIGNMENTS, _FEWEST_RUNS = 6, 3, 2
-_LAGS = sorted(range(-_MOST_STEPS_BESIDE, _MOST_STEPS_BESIDE + 1), key=abs)
+_MAX_STEPS_BESIDE, _ALIGNMENTS, _FEWEST_RUNS = 6, 3, 2
+_LAGS = sorted(range(-_MAX_STEPS_BESIDE, _MAX_STEPS_BESIDE + 1), key=abs)
 _WANDERS_M, _HALVINGS = (0.01, 1.0), 12
 _NOTHING = 1e-9
 """Relative variance of a sum of waves that is rounding."""
@@ -137,9 +137,9 @@ def common_share(runs: Sequence[OffBridgeMismatch | None]) -> float:
     known = [run for run in runs if run is not None]
     if len(known) < _FEWEST_RUNS:
         return 0.0
-    first = min(round(run.begin_m / OFF_BRIDGE_STEP_M) for run in known) - _MOST_STEPS_BESIDE
+    first = min(round(run.begin_m / OFF_BRIDGE_STEP_M) for run in known) - _MAX_STEPS_BESIDE
     last = max(round(run.begin_m / OFF_BRIDGE_STEP_M) + run.value_m.size for run in known)
-    heights = np.full((len(known), last - first + _MOST_STEPS_BESIDE), np.nan)
+    heights = np.full((len(known), last - first + _MAX_STEPS_BESIDE), np.nan)
     for run, height in zip(known, heights, strict=True):
         begin = round(run.begin_m / OFF_BRIDGE_STEP_M) - first
         height[begin : begin + run.value_m.size] = run.value_m

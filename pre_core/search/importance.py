@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 FloatArray = NDArray[np.float64]
 
-_MOST_ROUNDS, _SAME_SCALE = 50, 1e-6
+_MAX_ROUNDS, _SAME_SCALE = 50, 1e-6
 """Limit of the rounds in which densities are scaled alike, and the change that ends them."""
 
 
@@ -41,7 +41,7 @@ def mixture_log_weights(
         own = slice(stop - count, stop)
         log_mean = logsumexp(log_target[own] - log_density[own, r]) - log_counts[r]
         log_scale[r] = -log_mean if np.isfinite(log_mean) else np.median(log_density[own, r])
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         log_mixture = logsumexp(log_density - log_scale + log_counts, axis=1)
         change = logsumexp(log_density - log_mixture[:, None], axis=0) - log_scale
         log_scale += change

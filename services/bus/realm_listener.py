@@ -44,11 +44,11 @@ _OF_BRIDGES: Final[dict[str, type[Message]]] = {
 }
 _SIGNALS_WAITING: Final = 12_000
 _OTHERS_WAITING: Final = 1_000
-_MOST_AT_ONCE: Final = 5_000
+_MAX_AT_ONCE: Final = 5_000
 """Largest number of messages of one stream before the others have their turn."""
-_MOST_SEEN: Final = 10_000
+_MAX_SEEN: Final = 10_000
 """Largest number of streams and boots with remembered sequences; beyond, all are forgotten."""
-_MOST_NAMED: Final = 100
+_MAX_NAMED: Final = 100
 """Largest number of trucks of other realms, more than anyone reads."""
 _TOKENS_WAITING: Final = 1_000
 
@@ -112,7 +112,7 @@ class OtherRealms:
             trucks.discard(key.identifier)
             if not trucks:
                 self.trucks.pop(key.realm, None)
-        elif sum(map(len, self.trucks.values())) < _MOST_NAMED:
+        elif sum(map(len, self.trucks.values())) < _MAX_NAMED:
             self.trucks.setdefault(key.realm, set()).add(key.identifier)
 
 
@@ -182,7 +182,7 @@ class RealmListener:
         self._elsewhere.look()
         is_silent = True
         for stream in self._streams:
-            for _ in range(_MOST_AT_ONCE):
+            for _ in range(_MAX_AT_ONCE):
                 received = next(stream)
                 if received is None:
                     break
@@ -226,7 +226,7 @@ class RealmListener:
                 _OF_BRIDGES[key.stream].FromString(received.payload)
         except (ValueError, DecodeError):
             return None  # the logger counts and reports refused messages
-        if len(self._seen.streams) > _MOST_SEEN:
+        if len(self._seen.streams) > _MAX_SEEN:
             self._seen = SeenSequences()
         return (
             BusMessage(key, identity, received.payload) if self._seen.add(key, identity) else None

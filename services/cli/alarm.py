@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from services.history.alarms import AlarmCheck, AlarmSettings
 
 _WHAT = ("check", "list", "ack", "serve")
-_MOST_LINES = 20
+_MAX_LINES = 20
 """Maximum number of listed bridges without monitoring."""
 _HOW = (
     "see it: driveby history BRIDGE --period week --figures DIR; look at the bridge, then: "
@@ -162,10 +162,10 @@ def _print_watches(folder: Path) -> None:
         return
     others = {name: one for name, one in found.items() if one.state not in ("watched", "alarm")}
     print(f"{len(found) - len(others)} of {len(found)} bridges watched")
-    for realm, bridge in list(others)[:_MOST_LINES]:
+    for realm, bridge in list(others)[:_MAX_LINES]:
         print(f"{bridge} in realm {realm}: {others[(realm, bridge)].sentence}")
-    if len(others) > _MOST_LINES:
-        print(f"and {len(others) - _MOST_LINES} more that are not watched")
+    if len(others) > _MAX_LINES:
+        print(f"and {len(others) - _MAX_LINES} more that are not watched")
 
 
 def _acknowledge(options: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from services.catalogue.row import CatalogRow
     from services.finding.bridges import DetectedCrossing
 
-_MOST_LINES = 40
+_MAX_LINES = 40
 _NS_PER_S = 1_000_000_000
 
 
@@ -115,7 +115,7 @@ def _csv(line: tuple[object, ...]) -> str:
 
 
 def _print_crossings(found: "CatalogScan") -> None:
-    for one in found.crossings[:_MOST_LINES]:
+    for one in found.crossings[:_MAX_LINES]:
         seconds = (one.exit_ns - one.entry_ns) / _NS_PER_S
         how = f"{seconds:.1f} s on it" if one.passage.value == "through" else one.passage.value
         direction = "start to end" if one.forward else "end to start"
@@ -123,8 +123,8 @@ def _print_crossings(found: "CatalogScan") -> None:
             f"{_time(one.entry_ns)}  {one.vehicle} over {one.bridge}, {direction}, {how}  "
             f"{' '.join(one.recordings)}"
         )
-    if len(found.crossings) > _MOST_LINES:
-        print(f"… and {len(found.crossings) - _MOST_LINES} more (--csv has all)")
+    if len(found.crossings) > _MAX_LINES:
+        print(f"… and {len(found.crossings) - _MAX_LINES} more (--csv has all)")
     number = len(found.crossings)
     print(
         f"{number} crossing{'s' if number != 1 else ''}; read {found.chunks_read} of "

@@ -38,7 +38,7 @@ from services.recordings.remote import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-_MOST_BRIDGES = 20
+_MAX_BRIDGES = 20
 """Maximum number of printed bridges; the file has all."""
 
 
@@ -164,7 +164,7 @@ def _print_summary(
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     for number, (name, state) in enumerate(found.bridges.items()):
-        if number == _MOST_BRIDGES:
+        if number == _MAX_BRIDGES:
             say(f"… and {len(found.bridges) - number} bridges more")
             break
         print_bridge(console, site.bridge(name), state)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from services.finding.bridges import DetectedCrossing
 
 _NS_PER_S: Final = 1_000_000_000  # schemas.signals has it too, and takes numpy to import
-_MOST_LINES: Final = 20
+_MAX_LINES: Final = 20
 """Maximum number of gaps and crossings of a recording in the listing."""
 
 
@@ -189,10 +189,10 @@ def _lines_of_truck(truck: "TruckSummary") -> Iterator[str]:
 def _some(what: str, all_of_them: "tuple[object, ...]", lines: Iterable[str]) -> Iterator[str]:
     number = len(all_of_them)
     yield _count(number, what) if number else f"no {what}s"
-    for _, line in zip(range(_MOST_LINES), lines, strict=False):
+    for _, line in zip(range(_MAX_LINES), lines, strict=False):
         yield f"  {line}"
-    if number > _MOST_LINES:
-        yield f"  … and {number - _MOST_LINES} more (--json has all)"
+    if number > _MAX_LINES:
+        yield f"  … and {number - _MAX_LINES} more (--json has all)"
 
 
 def _line_of_gap(gap: "Gap") -> str:

@@ -29,10 +29,10 @@ _RATE_S: Final = 5.0
 """Duration in s over which rates are computed."""
 SILENT_S: Final = 3.0
 """Silence in s after which a truck does not drive."""
-_MOST_CROSSINGS: Final = 200
-_MOST_TRUCKS: Final = 200
-_MOST_BRIDGES: Final = 200
-_MOST_SERVICES: Final = 50
+_MAX_CROSSINGS: Final = 200
+_MAX_TRUCKS: Final = 200
+_MAX_BRIDGES: Final = 200
+_MAX_SERVICES: Final = 50
 
 _STATES: Final = {
     pb.DETECTED: "on the bridge",
@@ -166,7 +166,7 @@ class RealmModel:
         truck = self.trucks.get(vehicle)
         is_new = truck is None or now_s - truck.received_s > SILENT_S
         if truck is None:
-            if len(self.trucks) >= _MOST_TRUCKS:
+            if len(self.trucks) >= _MAX_TRUCKS:
                 self.trucks.pop(min(self.trucks, key=lambda name: self.trucks[name].received_s))
             truck = self.trucks[vehicle] = TruckRow()
         truck.received_s = now_s
@@ -209,7 +209,7 @@ class RealmModel:
         )
         elements = elements_of_result(crossing)
         if elements is not None:
-            if len(self._elements) >= _MOST_BRIDGES:
+            if len(self._elements) >= _MAX_BRIDGES:
                 self._elements.pop(next(iter(self._elements)))
             self._elements[crossing.bridge] = elements
             row = _with_elements(row, crossing, elements)
@@ -233,7 +233,7 @@ class RealmModel:
             compared = compare(estimate_of_state(state), np.array(nominal), edges_m)
             weak = frozenset(one.number for one in (compared.weak if compared else ()))
             lowest = str(min(over, key=lambda one: one.ratio))
-        if bridge not in self.bridges and len(self.bridges) >= _MOST_BRIDGES:
+        if bridge not in self.bridges and len(self.bridges) >= _MAX_BRIDGES:
             self.bridges.pop(next(iter(self.bridges)))
         used = len(state.crossings_used)
         row = BridgeRow(used, state.verdict or "", ratios, weak, lowest, state.finding or "")
@@ -247,13 +247,13 @@ class RealmModel:
         before = self.alarms.get(alarm.bridge)
         if before == alarm:
             return None  # it is republished after a restart of its service
-        if before is None and len(self.alarms) >= _MOST_BRIDGES:
+        if before is None and len(self.alarms) >= _MAX_BRIDGES:
             self.alarms.pop(min(self.alarms, key=lambda name: _weight(self.alarms[name])))
         self.alarms[alarm.bridge] = alarm
         return f"alarm of {alarm.bridge}: {alarm.sentence()}: {alarm_state(alarm)}"
 
     def _take_health(self, name: str, message: pb.Health) -> str:
-        if name not in self.services and len(self.services) >= _MOST_SERVICES:
+        if name not in self.services and len(self.services) >= _MAX_SERVICES:
             self.services.pop(next(iter(self.services)))
         service = ServiceRow(message.ok, message.time_ns, dict(message.figures), message.note)
         self.services[name] = service
@@ -270,7 +270,7 @@ class RealmModel:
             self.work.pop(service, None)
 
     def _make_room(self) -> None:
-        if len(self.crossings) >= _MOST_CROSSINGS:
+        if len(self.crossings) >= _MAX_CROSSINGS:
             self.crossings.pop(min(self.crossings, key=lambda name: self.crossings[name].entry_ns))
 
 

@@ -31,9 +31,9 @@ _OLD_S: Final = 60.0
 """Age in s at arrival from which samples are old."""
 _LATE_S: Final = 150.0
 """Silence in s after which a service is unhealthy, as for `driveby health`."""
-_MOST_ALARMS: Final = 4
+_MAX_ALARMS: Final = 4
 """Maximum number of alarm lines at the head of a page, fewer on a low one."""
-_MOST_BRIDGES: Final = 4
+_MAX_BRIDGES: Final = 4
 _NO_ALARM: Final = (
     "No alarm was received; it is not known here whether driveby alarm serve watches any bridge."
 )
@@ -64,8 +64,8 @@ def page(
     """Return the page; without room it has the newest crossings and first trucks."""
     is_wide = width >= _WIDE
     trucks, rows = _sorted_trucks(model, now_s), model.rows()
-    alarms = _alarms(model.alarms.values(), max(1, min(_MOST_ALARMS, height // 10)))
-    taken = 11 + len(model.services) + 3 * min(len(model.bridges), _MOST_BRIDGES) + len(alarms)
+    alarms = _alarms(model.alarms.values(), max(1, min(_MAX_ALARMS, height // 10)))
+    taken = 11 + len(model.services) + 3 * min(len(model.bridges), _MAX_BRIDGES) + len(alarms)
     taken += bool(model.bridges) and not alarms
     room = max(8 - len(alarms), height - taken)
     most_trucks = max(2, min(len(trucks), room // 3))
@@ -198,9 +198,9 @@ def _crossings(rows: Sequence[CrossingRow], *, is_wide: bool) -> Table:
 def _bridges(bridges: dict[str, BridgeRow], standing: Set[str]) -> Table:
     """Return the bridges: with a standing alarm first, then by the latest message."""
     table = _table("bridge", "crossings", "EI", "by all crossings")
-    alarmed = [name for name in bridges if name in standing][-_MOST_BRIDGES:]
+    alarmed = [name for name in bridges if name in standing][-_MAX_BRIDGES:]
     quiet = [name for name in bridges if name not in standing]
-    for name in (*alarmed, *quiet[max(0, len(quiet) + len(alarmed) - _MOST_BRIDGES) :]):
+    for name in (*alarmed, *quiet[max(0, len(quiet) + len(alarmed) - _MAX_BRIDGES) :]):
         row = bridges[name]
         said = row.finding or row.lowest
         is_good = row.verdict in ("", "good")

@@ -21,7 +21,7 @@ from services.drives.tables.reading import Understood, understand
 from services.finding.placed import rates_hz
 
 _log = logging.getLogger(__name__)
-_MOST_SHOWN = 3
+_MAX_SHOWN = 3
 _OTHER_FORM = (": line 1: ", "holds no accel_NN.csv", "is not UTF-8 text")
 """Errors of the exact reader for files of another form."""
 
@@ -50,8 +50,8 @@ def csv_runs(
     found = understood_runs(sources, site, vehicle_id, how)
     conversions = found.conversions()
     if conversions and not how.accepts_guesses:
-        shown = "; ".join(conversions[:_MOST_SHOWN])
-        more = len(conversions) - _MOST_SHOWN
+        shown = "; ".join(conversions[:_MAX_SHOWN])
+        more = len(conversions) - _MAX_SHOWN
         raise InputError(
             f"{sources[0]}: is read by guesses that change numbers ({shown}"
             f"{f'; and {more} more' if more > 0 else ''}): driveby import --preview shows them, "

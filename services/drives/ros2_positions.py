@@ -22,7 +22,7 @@ _LARGEST_HOLE_S: Final = 1.1
 """Longest time in s between two velocities for interpolation; receivers send one a second."""
 _HALF_WINDOW_S: Final = 1.0
 """Time in s before and behind a fix over which its speed is a slope of positions."""
-_MOST_WAITING: Final = 1000
+_MAX_WAITING: Final = 1000
 _BACK: Final = 20
 """Number of past stamps after which the clock has been set back."""
 
@@ -78,7 +78,7 @@ class SpeedEstimator:
         self._velocities_behind = 0
         self._latest_velocity_ns = velocity.stamp_ns
         self._velocities.append(velocity)
-        if len(self._velocities) > _MOST_WAITING:
+        if len(self._velocities) > _MAX_WAITING:
             self._velocities.popleft()
         return self._ready()
 
@@ -111,7 +111,7 @@ class SpeedEstimator:
         return (
             self._latest_velocity_ns >= fix.stamp_ns
             or self._latest_ns > fix.stamp_ns + _PATIENCE_S * NS_PER_S
-            or len(self._waiting) > _MOST_WAITING
+            or len(self._waiting) > _MAX_WAITING
         )
 
     def _measured(self, fix: Fix) -> float | None:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Reader
 
-_MOST_DEFINITION_CHARACTERS: Final = 65_536
+_MAX_DEFINITION_CHARACTERS: Final = 65_536
 """Maximum length of a definition, ten times the longest known one with all comments."""
 _MEANS_SOMETHING = "?#%"
 """Special characters in the name by which rosbags opens an SQLite file: it would open another."""
@@ -185,7 +185,7 @@ def _hash_of_definition(connection: "Connection") -> str:
     definition = connection.msgdef
     if definition.format != MessageDefinitionFormat.MSG or not definition.data:
         return ""
-    if len(definition.data) > _MOST_DEFINITION_CHARACTERS:
+    if len(definition.data) > _MAX_DEFINITION_CHARACTERS:
         return "unreadable"
     try:
         types = get_typestore(Stores.EMPTY)

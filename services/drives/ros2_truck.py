@@ -47,7 +47,7 @@ _HANDOVER_S: Final = 1.0
 """Silence in s of a topic's sensor after which another one may continue there."""
 _REFUSED_S: Final = 10.0
 """Time in s by stamps for which a sensor with a wrong rate is excluded before a new measurement."""
-_MOST_REFUSED: Final = 1000
+_MAX_REFUSED: Final = 1000
 """Maximum number of remembered sensors with a wrong rate; the oldest is dropped first."""
 
 
@@ -196,7 +196,7 @@ class Ros2Truck:
             if source is not None:
                 refused = self._refused.setdefault(error.topic, {})
                 refused[source.publisher, source.frame] = source.stamp_ns
-                if len(refused) > _MOST_REFUSED:
+                if len(refused) > _MAX_REFUSED:
                     del refused[next(iter(refused))]
             reason = str(error).removeprefix(f"{error.topic}: ")
             self.anomalies.add(error.topic, WRONG_RATE, error.samples, example=reason)

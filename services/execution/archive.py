@@ -52,7 +52,7 @@ from services.recordings.remote import LocalRecording, Recording, RemoteRecordin
 _log = logging.getLogger(__name__)
 APART_NS: Final = round((LONGEST_STAY_S + 60.0) * NS_PER_S)
 """Recordings further apart in time have no crossing in common."""
-_MOST_UNSAVED = 20
+_MAX_UNSAVED = 20
 _LONGEST_UNSAVED_S = 10.0
 _WAIT_S = 0.1
 _NAMES = 2
@@ -376,7 +376,7 @@ class _UnsavedResults:
             self._since_s = self._since_s if self._unsaved else time.monotonic()
             self._unsaved.append(StoredResult(content, result))
         is_late = self._unsaved and time.monotonic() - self._since_s > _LONGEST_UNSAVED_S
-        if is_late or len(self._unsaved) >= _MOST_UNSAVED:
+        if is_late or len(self._unsaved) >= _MAX_UNSAVED:
             yield from self.saved()
 
     def saved(self) -> list[_StoredCrossing]:

@@ -30,11 +30,11 @@ EDITION: Final = "1"
 KEY: Final = "driveby.identified"
 BRIDGES: Final = "bridges.json"
 """Results file beside the results, with the bridges alone, of the run that ended last."""
-_MOST_AT_ONCE = 1000
+_MAX_AT_ONCE = 1000
 """Number of crossings read into memory at once, some 20 MB."""
 _MOST: Final = ReadLimits(rows=1_000_000, bytes=4 << 30)
 """Limits of a file; ours have some hundred rows, and 50 kB for each."""
-_MOST_BYTES: Final = 64 << 20
+_MAX_BYTES: Final = 64 << 20
 """Maximum size of one result as text."""
 _STRING: Final = "string"
 _BINARY: Final = "binary"
@@ -146,7 +146,7 @@ def kept_results(folder: Path, problem: Callable[[str], object]) -> Iterator[Res
     for header, crossing in _rows_of(folder, problem):
         some = waiting.setdefault(header, [])
         some.append(crossing)
-        if len(some) >= _MOST_AT_ONCE:
+        if len(some) >= _MAX_AT_ONCE:
             yield _as_file(header, waiting.pop(header), bridges)
     for header, some in waiting.items():
         yield _as_file(header, some, bridges)
@@ -238,7 +238,7 @@ def _crossing_of(compressed: bytes) -> CrossingResult:
 def _text_of(compressed: bytes) -> bytes:
     """Return the decompressed text; ValueError if it declares a size beyond any result."""
     size = zstandard.frame_content_size(compressed)
-    if not 0 <= size <= _MOST_BYTES:
+    if not 0 <= size <= _MAX_BYTES:
         raise ValueError(f"{size} bytes are no result")
     return zstandard.decompress(compressed)
 

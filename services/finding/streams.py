@@ -27,7 +27,7 @@ _CLOCK_ERROR = 1e-3
 """Relative error of the declared rate that does not yet indicate missing samples."""
 _WALL_CLOCK_S = 10.0
 """Duration in s of the fixes before a time from which the wall clock is read."""
-_MOST_NAMES = 10 * MAX_CHANNELS
+_MAX_NAMES = 10 * MAX_CHANNELS
 """Maximum number of channel names remembered of a boot."""
 _JITTER = 8.0
 """Multiple of the usual deviation of batch times that is not jitter."""
@@ -92,7 +92,7 @@ class Boot:
         if batch.device_time_ns >= self._forgotten_ns:
             self._batches.setdefault(batch.sequence, batch)
             # A truck that names other channels in every batch must not fill the memory.
-            if len(self._channels) <= _MOST_NAMES:
+            if len(self._channels) <= _MAX_NAMES:
                 self._channels.update(batch.channels)
 
     def add_fix(self, fix: GnssFix) -> bool:

@@ -17,9 +17,9 @@ from services.finding.streams import Fixes
 
 _LONGEST_OUTAGE_S: Final = 30.0
 """Gap in s between fixes after which a visit is another one: the truck may have detoured."""
-_MOST_TRUCKS: Final = 1000
+_MAX_TRUCKS: Final = 1000
 """Maximum number of remembered pairs of truck and bridge; the longest silent one is dropped."""
-_MOST_FIXES: Final = 2000
+_MAX_FIXES: Final = 2000
 """Maximum number of fixes of a truck at a bridge, 200 s at 10 Hz; the oldest are dropped."""
 
 
@@ -58,9 +58,9 @@ class Traffic:
             self._near.move_to_end(place)
             near[fix.wall_time_ns] = (*here, fix.speed_m_per_s, fix.altitude_m)
             if not for_ever:
-                while len(near) > _MOST_FIXES:
+                while len(near) > _MAX_FIXES:
                     near.popitem(last=False)
-                while len(self._near) > _MOST_TRUCKS:
+                while len(self._near) > _MAX_TRUCKS:
                     self._near.popitem(last=False)
 
     def others(

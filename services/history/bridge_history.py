@@ -142,14 +142,14 @@ def _comparison_sentence(found: PeriodComparison, unit: Unit) -> str:
     changed = ", ".join(
         f"element {one.element} {_percent(one.ratio)} (95 % interval {_percent(one.low)} to "
         f"{_percent(one.high)})"
-        for one in clear[:_MOST_ELEMENTS]
+        for one in clear[:_MAX_ELEMENTS]
     )
-    more = len(clear) - _MOST_ELEMENTS
+    more = len(clear) - _MAX_ELEMENTS
     others = f" and {more} more" if more > 0 else ""
     return f"EI from {first} to {last}: {changed}{others}. {rest}"
 
 
-_MOST_ELEMENTS = 3
+_MAX_ELEMENTS = 3
 
 
 def _deviations(one: ElementChange) -> float:

@@ -40,7 +40,7 @@ EDITION: Final = "1"
 KEY: Final = "driveby.history"
 CROSSINGS: Final = "crossings"
 _SIZES = struct.Struct("<HH")
-_MOST_FILES = 12
+_MAX_FILES = 12
 """Maximum number of files of one bridge; more are packed when a crossing is added."""
 _ELEMENT: Final = ("mean", "std", "q025", "q975")
 _PLAIN: Final = (
@@ -220,7 +220,7 @@ def write_batch(where: Path, rows: Iterable[HistoryRow]) -> Path:
     """Write crossings of one bridge as one file, completely or not at all; pack if it has many."""
     path = _write(where, rows)
     files = sorted(where.glob(FILES))
-    if len(files) > _MOST_FILES:
+    if len(files) > _MAX_FILES:
         _pack(where, files)
     return path
 

@@ -43,7 +43,7 @@ _SMALLEST_CHI2 = 0.6
 too wide."""
 _LARGEST_VEHICLE_Z = 4.0
 """Largest plausible distance of a truck's unknown from its prior, in standard deviations."""
-_MOST_NAMED = 3
+_MAX_NAMED = 3
 _LARGEST_POSITION_Z = 4.0
 """Largest plausible slow error of the receiver, in standard deviations."""
 _LARGEST_STEP_Z = {slip.DELAY: 6.0, slip.GAIN: 7.0}
@@ -315,7 +315,7 @@ def undeclared_axles(
 def odd_parameters(fit: Fit) -> str:
     """Return the names of implausible truck parameters, most deviating first, or ""."""
     far = {name: z for name, z in fit.prior_z.items() if abs(z) > _LARGEST_VEHICLE_Z}
-    named = sorted(far, key=lambda name: -abs(far[name]))[:_MOST_NAMED]
+    named = sorted(far, key=lambda name: -abs(far[name]))[:_MAX_NAMED]
     if not named:
         return ""
     values = ", ".join(f"{name} {far[name]:+.1f}" for name in named)

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 _LOWEST_RATE_HZ: Final = 0.9
 _SMALLEST_JUMP_M: Final = 5.0
-_MOST_NOISE: Final = 2.0
+_MAX_NOISE: Final = 2.0
 """Ratio to the declared noise."""
 _POOR_M: Final = 5.0
 """Accuracy in m at which a receiver determines no lane, and hardly a bridge."""
@@ -103,7 +103,7 @@ def _position_noise(x: Floats, y: Floats, declared: Receiver) -> CheckFinding:
         f"positions scatter by {noise:.2f} m from fix to fix, position_noise_m "
         f"{declared.position_noise_m:g}",
         "declare it in [receiver], or check the antenna",
-        is_wrong=noise > _MOST_NOISE * max(declared.position_noise_m, 0.01),
+        is_wrong=noise > _MAX_NOISE * max(declared.position_noise_m, 0.01),
     )
 
 
@@ -113,7 +113,7 @@ def _speed_noise(speed: Floats, declared: Receiver) -> CheckFinding:
         "speed_noise",
         f"speeds scatter by {noise:.3f} m/s, speed_noise_m_per_s {declared.speed_noise_m_per_s:g}",
         "declare it in [receiver]",
-        is_wrong=noise > _MOST_NOISE * max(declared.speed_noise_m_per_s, 0.003),
+        is_wrong=noise > _MAX_NOISE * max(declared.speed_noise_m_per_s, 0.003),
     )
 
 

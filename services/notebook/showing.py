@@ -9,7 +9,7 @@ from schemas.reasons import Reason
 from schemas.results import CrossingResult, Parameter
 from schemas.site import Bridge
 
-MOST_SHOWN: Final = 20
+MAX_SHOWN: Final = 20
 """Largest number of crossings that a notebook shows."""
 _GIGA: Final = 1e9
 
@@ -65,8 +65,8 @@ def as_html(crossing: CrossingResult, bridge: Bridge) -> str:
 
 def all_as_html(crossings: Sequence[tuple[CrossingResult, Bridge]]) -> str:
     """Return the first crossings, and how many there are."""
-    shown = "".join(as_html(*one) for one in crossings[:MOST_SHOWN])
-    rest = len(crossings) - MOST_SHOWN
+    shown = "".join(as_html(*one) for one in crossings[:MAX_SHOWN])
+    rest = len(crossings) - MAX_SHOWN
     more = f"<p>{rest} more crossings: .elements() has all</p>" if rest > 0 else ""
     return f"<p>{escape(counted([crossing for crossing, _ in crossings]))}</p>{shown}{more}"
 

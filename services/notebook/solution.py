@@ -20,7 +20,7 @@ from services.history.draws import (
     posterior,
     write_draws,
 )
-from services.notebook.showing import MOST_SHOWN, all_as_html, as_html, counted, one_line
+from services.notebook.showing import MAX_SHOWN, all_as_html, as_html, counted, one_line
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -96,9 +96,9 @@ class Identification(NamedTuple):
     def __repr__(self) -> str:
         """Return one line for each crossing, at most twenty."""
         lines = [f"<Identification {counted(self.results.crossings)}>"]
-        lines += map(repr, self.solutions[:MOST_SHOWN])
-        if len(self.solutions) > MOST_SHOWN:
-            lines.append(f"… {len(self.solutions) - MOST_SHOWN} more")
+        lines += map(repr, self.solutions[:MAX_SHOWN])
+        if len(self.solutions) > MAX_SHOWN:
+            lines.append(f"… {len(self.solutions) - MAX_SHOWN} more")
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:

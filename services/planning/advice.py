@@ -14,7 +14,7 @@ from services.inspection.site import (
     sampling,
 )
 from services.planning.crossings import axles_of
-from services.planning.survey import MOST_CROSSINGS, PlanForecast, SurveyForecast
+from services.planning.survey import MAX_CROSSINGS, PlanForecast, SurveyForecast
 
 _WORTH_NAMING: Final = 0.95
 """Share of the plan's smallest loss below which an alternative's loss is worth a sentence."""
@@ -56,7 +56,7 @@ def _of_the_plan(found: SurveyForecast) -> str:
     if planned.needed_middle is None:
         smallest = planned.expected.smallest_loss[planned.middle]
         return (
-            f"Not even {MOST_CROSSINGS} crossings {how} show {what}: {question.crossings} show one "
+            f"Not even {MAX_CROSSINGS} crossings {how} show {what}: {question.crossings} show one "
             f"of {percent(smallest)} or more, and give the overall stiffness to "
             f"± {percent(planned.expected.level_std)}."
         )
@@ -67,7 +67,7 @@ def _of_the_plan(found: SurveyForecast) -> str:
 
 def _ends(outlook: PlanForecast) -> str:
     if outlook.needed_ends is None:
-        return f"the ends would take more than {MOST_CROSSINGS}"
+        return f"the ends would take more than {MAX_CROSSINGS}"
     if outlook.needed_ends == outlook.needed_middle:
         return "the ends need no more"
     return f"the ends need {outlook.needed_ends}"

@@ -8,7 +8,7 @@ from pre_core.survey.detection import DETECTION_PROBABILITY, FALSE_ALARM
 from services.planning.advice import advice, mismatch_in_words, percent, tyres_of, warnings
 from services.planning.crossings import scale_error
 from services.planning.survey import (
-    MOST_CROSSINGS,
+    MAX_CROSSINGS,
     PlanForecast,
     SurveyExpectation,
     SurveyForecast,
@@ -92,7 +92,7 @@ def lines_of(found: SurveyForecast) -> Iterator[str]:
     yield f"by {question.crossings} crossings; mean ±: of what all elements share; mid ±, seen,"
     wanted = percent(DETECTION_PROBABILITY)
     yield f"smallest: at midspan; needed, ends: crossings until it is seen with {wanted}"
-    yield f"at midspan, at both ends (elsewhere between them); –: more than {MOST_CROSSINGS};"
+    yield f"at midspan, at both ends (elsewhere between them); –: more than {MAX_CROSSINGS};"
     yield "t: within the legal axle and total loads; the other way: in the other lane;"
     yield "elements: longer ones"
     yield ""

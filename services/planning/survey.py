@@ -24,7 +24,7 @@ from services.planning.crossings import CrossingSimulator, PlannedCrossing, Plan
 Floats = NDArray[np.float64]
 
 _JOINED_M: Final = 1e-6
-MOST_CROSSINGS: Final = 300
+MAX_CROSSINGS: Final = 300
 """Maximum number of crossings of a survey."""
 _COUNTS: Final = (1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200, 300)
 """Numbers of crossings in the figure."""
@@ -66,7 +66,7 @@ class PlanForecast(NamedTuple):
     middle: int
     """Element at the middle of the longest span; of two, the one with less information."""
     needed_middle: int | None
-    """Crossings needed to detect the loss there; None beyond MOST_CROSSINGS."""
+    """Crossings needed to detect the loss there; None beyond MAX_CROSSINGS."""
     needed_ends: int | None
     """The same at both ends."""
 
@@ -283,9 +283,9 @@ def _needed(
         seen = detection.detection_probability(loss, errors_of(crossings).of_nominal)
         return bool(seen[list(elements)].min() >= detection.DETECTION_PROBABILITY)
 
-    if not is_seen(MOST_CROSSINGS):
+    if not is_seen(MAX_CROSSINGS):
         return None
-    too_few, enough = 0, MOST_CROSSINGS
+    too_few, enough = 0, MAX_CROSSINGS
     while enough - too_few > 1:
         tried = (too_few + enough) // 2 if enough < 64 else round(np.sqrt(max(1, too_few) * enough))
         tried = min(max(tried, too_few + 1), enough - 1)

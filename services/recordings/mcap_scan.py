@@ -49,7 +49,7 @@ _SURE_BYTES = 64 << 20
 _LARGEST_RATIO = 1000
 """Largest ratio of all decompressed chunks to the file, beyond the first chunk. Constant signals in
 chunks of 64 KiB reach a tenth of it; more is a decompression bomb."""
-_MOST_OTHERS = 200_000
+_MAX_OTHERS = 200_000
 """Largest number of records other than messages in a chunk; MCAP has 65,536 channels and schemas.
 """
 
@@ -359,7 +359,7 @@ def _records_of(content: bytes, offset: int) -> Iterator[Item]:
     while at + _HEADER.size <= len(content):
         opcode, length = _HEADER.unpack_from(content, at)
         others += opcode != Opcode.MESSAGE
-        if opcode == 0 or others > _MOST_OTHERS:  # no record has the opcode 0
+        if opcode == 0 or others > _MAX_OTHERS:  # no record has the opcode 0
             text = f"damaged chunk at byte {offset}: no more messages {at} bytes into it"
             yield Damage(offset, 0, text, is_chunk=True, is_cut_off=False)
             return

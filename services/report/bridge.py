@@ -25,7 +25,7 @@ _LATEST_S = 7_258_118_400.0
 """The year 2200, as a Unix time in s."""
 _LARGEST_DEVIATION = 4.0
 """Standard deviations beyond which crossings do not agree."""
-_MOST_REASONS = 3
+_MAX_REASONS = 3
 """Maximum number of reasons in the box; all of them are listed below it."""
 
 
@@ -268,7 +268,7 @@ def reasons_of(crossing: CrossingResult, language: Language) -> list[str]:
 def _no_finding(crossings: Sequence[CrossingResult], language: Language) -> BridgeFinding:
     """Return the finding without a usable crossing: the most frequent reasons."""
     counted = Counter(text for crossing in crossings for text in reasons_of(crossing, language))
-    why = " ".join(text for text, _ in counted.most_common(_MOST_REASONS))
+    why = " ".join(text for text, _ in counted.most_common(_MAX_REASONS))
     suspect = sum(crossing.verdict == "suspect" for crossing in crossings)
     total = len(crossings)
     if not suspect:

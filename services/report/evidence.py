@@ -18,7 +18,7 @@ from services.viewer.crossing_view import view_of_crossing
 from services.viewer.crossings_figure import draw_crossings
 from services.viewer.drawing import STYLE, figure_bytes
 
-MOST_PICTURES = 12
+MAX_PICTURES = 12
 """Maximum number of crossings of a bridge in the figure, the newest ones."""
 _COLUMNS = 6
 """Maximum number of crossings next to each other in a table of measures."""
@@ -54,7 +54,7 @@ def evidence(report: BridgeReport, prefix: str, language: Language) -> Iterator[
 def pictured(report: BridgeReport) -> list[Numbered]:
     """Return the crossings in the figure, with their numbers."""
     known = enumerate(report.crossings, start=1)
-    return [one for one in known if one[1].parameters is not None][-MOST_PICTURES:]
+    return [one for one in known if one[1].parameters is not None][-MAX_PICTURES:]
 
 
 def facts(rows: Sequence[tuple[str, str]]) -> Html:

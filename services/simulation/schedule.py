@@ -9,7 +9,7 @@ from services.simulation.positions import START_TIME_S
 BETWEEN_RUNS_S: Final = 600.0
 """Time from the beginning of a run to that of the next."""
 _DAY_S: Final = 86_400.0
-_MOST_RUNS: Final = 1000
+_MAX_RUNS: Final = 1000
 """Largest number of all runs: a recording of simulated ones is made in memory."""
 _START_S: Final = (0.0, 4_102_444_800.0)
 """Earliest and latest start: 1970 and 2100."""
@@ -48,8 +48,8 @@ def schedule_of(runs: int, days: int, start: str | None) -> Schedule:
     """Return the schedule of these options; raise InputError for an impossible one."""
     from services.drives.tables.stamps import start_of
 
-    if runs * days > _MOST_RUNS:
-        raise InputError(f"--days: makes {runs * days} runs, it must be at most {_MOST_RUNS}")
+    if runs * days > _MAX_RUNS:
+        raise InputError(f"--days: makes {runs * days} runs, it must be at most {_MAX_RUNS}")
     start_s = None if start is None else start_of(start, None, "--start")
     if start_s is not None and not _START_S[0] <= start_s <= _START_S[1]:
         raise InputError(f'--start: is "{start}", it must be a time from 1970 to 2100')

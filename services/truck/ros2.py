@@ -53,15 +53,15 @@ _OVERHEAD_BYTES: Final = 500
 """Memory of a waiting message besides its content: 263 by `sys.getsizeof`, and the allocator's."""
 _AT_ONCE: Final = 50
 """Messages of a topic before another one has its turn."""
-_MOST_BYTES: Final = MAX_PAYLOAD_BYTES + 1024
+_MAX_BYTES: Final = MAX_PAYLOAD_BYTES + 1024
 """Largest message with its key and attachment."""
 _PAUSE_S: Final = 0.005
 _LOG_EVERY_S: Final = 10.0
 _EVENT_EVERY_S: Final = 60.0
 """Interval of events on refused and dropped messages, with counts by topic."""
-_MOST_PUBLISHERS: Final = 1000
+_MAX_PUBLISHERS: Final = 1000
 """Number of publishers with remembered sequences; beyond, all are forgotten."""
-_MOST_REFUSED: Final = 100
+_MAX_REFUSED: Final = 100
 """Number of reported types and hashes, because a hostile sender could invent any number."""
 
 
@@ -281,7 +281,7 @@ class _RosSubscriptions:
         key = str(sample.key_expr)
         attached = sample.attachment
         size = len(key) + len(sample.payload) + (0 if attached is None else len(attached))
-        if size > _MOST_BYTES:
+        if size > _MAX_BYTES:
             self._too_large[topic] += 1
             return
         attachment = None if attached is None else attached.to_bytes()
@@ -346,7 +346,7 @@ class _RosSubscriptions:
             return False
         if before is not None:
             anomalies.add(topic, "messages lost on the way", sequence - before - 1)
-        elif len(self._latest) >= _MOST_PUBLISHERS:
+        elif len(self._latest) >= _MAX_PUBLISHERS:
             self._latest.clear()
         self._latest[name] = sequence
         return True
@@ -354,6 +354,6 @@ class _RosSubscriptions:
     def _refuse(self, topic: str, why: str) -> None:
         self._truck.anomalies.add(topic, UNKNOWN_TYPE, example=f"the first {why}")
         line = f"{topic}: {why}"
-        if line not in self._refused and len(self._refused) < _MOST_REFUSED:
+        if line not in self._refused and len(self._refused) < _MAX_REFUSED:
             self._refused.add(line)
             _log.error("%s: %s", self._truck.table.vehicle, line)

@@ -42,7 +42,7 @@ from services.viewer.drawing import (
     write_figure,
 )
 
-_MOST_LISTED = 12
+_MAX_LISTED = 12
 _BEFORE, _AFTER = (0.02, 0.42), (0.42, 1.0)
 """Parts of an element that the bars of baseline and state take."""
 _SIGNS = {"good": "●", "suspect": "○", "rejected": "×"}
@@ -63,7 +63,7 @@ def draw_bridge(
 
     The heading and the list are English.
     """
-    listed = min(len(bridge.crossings), _MOST_LISTED + 1) if with_heading else 0
+    listed = min(len(bridge.crossings), _MAX_LISTED + 1) if with_heading else 0
     lines = _heading(bridge) if with_heading else []
     heading_in = 1.15 + 0.17 * max(0, len(lines) - 2) if with_heading else 0.35
     # On a page of its own the width limits the size of its text.
@@ -229,7 +229,7 @@ def _why_nothing(bridge: BridgeView) -> str:
 
 
 def _list_crossings(figure: Figure, bridge: BridgeView, top: float, step: float) -> None:
-    listed = bridge.crossings[-_MOST_LISTED:]
+    listed = bridge.crossings[-_MAX_LISTED:]
     more = len(bridge.crossings) - len(listed)
     rows = [_row(bridge, crossing) for crossing in reversed(listed)]
     for number, (sign, row) in enumerate(rows):

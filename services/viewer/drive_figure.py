@@ -30,7 +30,7 @@ from services.viewer.rerun_parts import channel_colour
 from services.viewer.vehicle_signals import VehicleSignals
 
 _HEIGHT_IN = 5.2
-_MOST_RANGES = 1500
+_MAX_RANGES = 1500
 """Largest number of ranges of values along the time."""
 _GAP_S = 3.0
 """Shortest time without values that interrupts a line."""
@@ -109,7 +109,7 @@ def _draw_curves(axes: Axes, title: str, curves: Mapping[str, Envelope]) -> None
 
 def _of_batches(batches: Sequence[AccelBatch], channel: str) -> Envelope:
     """Return the envelope of a channel, of a few batches each."""
-    size = -(-len(batches) // _MOST_RANGES) or 1
+    size = -(-len(batches) // _MAX_RANGES) or 1
     rows = []
     for first in range(0, len(batches), size):
         some = [b for b in batches[first : first + size] if channel in b.channels]
@@ -122,7 +122,7 @@ def _of_batches(batches: Sequence[AccelBatch], channel: str) -> Envelope:
 
 def _of_samples(time_s: FloatArray, values: FloatArray) -> Envelope:
     """Return the envelope of even samples (n,)."""
-    size = -(-values.size // _MOST_RANGES) or 1
+    size = -(-values.size // _MAX_RANGES) or 1
     first = np.arange(0, values.size, size)
     return Envelope(
         time_s[first],

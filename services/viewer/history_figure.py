@@ -32,11 +32,11 @@ from services.viewer.drawing import (
 )
 
 _PANEL_IN, _TEMPERATURE_IN = 0.92, 0.75
-_MOST_CHARACTERS = 100
+_MAX_CHARACTERS = 100
 """Maximum length of an acknowledgement's note, one line."""
 _LINE_CHARACTERS = 105
 """Maximum length of a line of a sentence."""
-_MOST_PER_CENT = 400.0
+_MAX_PER_CENT = 400.0
 """Upper end of the axes; an interval beyond it means that the element is unresolved."""
 _LEAST_DAYS = 7.0
 """Minimum time shown before the first and behind the last period."""
@@ -180,7 +180,7 @@ def _heading(history: HistoryView) -> list[tuple[str, str]]:
 
 
 def _short(text: str) -> str:
-    return text if len(text) <= _MOST_CHARACTERS else text[: _MOST_CHARACTERS - 1] + "…"
+    return text if len(text) <= _MAX_CHARACTERS else text[: _MAX_CHARACTERS - 1] + "…"
 
 
 def _colour(mark: AlarmMark) -> str:
@@ -199,7 +199,7 @@ def _limits(history: HistoryView, elements: int) -> tuple[float, float]:
             ends += [100.0 * point.low[n] / usual, 100.0 * point.high[n] / usual]
     low, high = min(ends), max(ends)
     margin = 0.05 * (high - low)
-    return max(0.0, low - margin), min(high + margin, _MOST_PER_CENT)
+    return max(0.0, low - margin), min(high + margin, _MAX_PER_CENT)
 
 
 def _usual(history: HistoryView, n: int) -> float:

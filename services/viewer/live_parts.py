@@ -32,7 +32,7 @@ ROADS_MIDDLE: Final = STRIP_HEIGHT + 330.0
 """Distance of the roads from the strip's top in pixels; they reach `ROADS_REACH` from there."""
 ROADS_REACH: Final = 120.0
 _QUALITY: Final = 95
-_MOST_ALARMS: Final = 1000
+_MAX_ALARMS: Final = 1000
 NO_RESULT: Final = "No result yet. Results appear seconds after a truck leaves the bridge."
 
 
@@ -153,11 +153,11 @@ def bridge_text(alarm: Alarm | None, *found: str) -> str:
 
 
 def note_alarm(standing: dict[str, Alarm], alarm: Alarm) -> None:
-    """Keep the alarm of each bridge until it is acknowledged, at most `_MOST_ALARMS` of them."""
+    """Keep the alarm of each bridge until it is acknowledged, at most `_MAX_ALARMS` of them."""
     standing.pop(alarm.bridge, None)
     if alarm.acknowledged is not None:
         return
-    if len(standing) >= _MOST_ALARMS:
+    if len(standing) >= _MAX_ALARMS:
         standing.pop(min(standing, key=lambda bridge: standing[bridge].raised))
     standing[alarm.bridge] = alarm
 

@@ -76,9 +76,9 @@ from services.viewer.rerun_places import (
     send_places,
 )
 
-MOST_TRUCKS: Final = 6
+MAX_TRUCKS: Final = 6
 """Maximum number of trucks with accelerations; of others only the position is drawn."""
-MOST_BRIDGES: Final = 8
+MAX_BRIDGES: Final = 8
 """Maximum number of bridges with a tab: those that were approached or crossed first."""
 _TRACK_FIXES: Final = 300
 """Number of fixes, one per second, of a truck's track on the map."""
@@ -208,7 +208,7 @@ class LiveView:
         truck = self._truck(vehicle)
         self._note_time(batch.wall_time_ns)
         plotted = sum(bool(one.channels) for one in self._trucks.values())
-        if not truck.channels and plotted >= MOST_TRUCKS:
+        if not truck.channels and plotted >= MAX_TRUCKS:
             return
         for channel in batch.channels.keys() - truck.channels:
             truck.channels.add(channel)
@@ -392,7 +392,7 @@ class LiveView:
 
     def _add_bridge(self, bridge: str) -> None:
         """Draw a bridge for the first time."""
-        if bridge in self._bridges or len(self._bridges) >= MOST_BRIDGES:
+        if bridge in self._bridges or len(self._bridges) >= MAX_BRIDGES:
             return
         self._bridges[bridge] = None
         self._layout_is_old = True

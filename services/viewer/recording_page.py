@@ -13,9 +13,9 @@ from services.finding.placed import sensors_in_words
 from services.finding.stays import MERGE_S, Passage
 from services.viewer.crossing_view import DetectedCrossingView
 
-MOST_SHOWN = 12
+MAX_SHOWN = 12
 """Maximum number of crossings with a tab of their own, the newest ones."""
-_MOST_GAPS = 8
+_MAX_GAPS = 8
 _S = 1e-9
 
 
@@ -41,7 +41,7 @@ def detected_views(
         views.append(
             DetectedCrossingView(one.vehicle, one.bridge, one.forward, entry, leave, speed, span)
         )
-    return views[-MOST_SHOWN:]
+    return views[-MAX_SHOWN:]
 
 
 def recording_page(found: RecordingSummary) -> str:
@@ -66,10 +66,10 @@ def recording_page(found: RecordingSummary) -> str:
         lines += [
             f"- {_moment(gap.begin_ns)} {gap.vehicle} {gap.stream}: nothing for "
             f"{(gap.end_ns - gap.begin_ns) * _S:.1f} s"
-            for gap in found.gaps[:_MOST_GAPS]
+            for gap in found.gaps[:_MAX_GAPS]
         ]
-        if len(found.gaps) > _MOST_GAPS:
-            lines.append(f"- and {len(found.gaps) - _MOST_GAPS} more")
+        if len(found.gaps) > _MAX_GAPS:
+            lines.append(f"- and {len(found.gaps) - _MAX_GAPS} more")
     lines += ["", f"Measurements only; to interpret them: `driveby identify {found.path.name}`."]
     return "\n".join(lines)
 
@@ -77,13 +77,13 @@ def recording_page(found: RecordingSummary) -> str:
 def _crossings(passings: Sequence[DetectedCrossing]) -> Iterator[str]:
     yield f"**Crossings seen: {len(passings)}**" if passings else "No crossing of a known bridge."
     yield ""
-    for one in passings[-MOST_SHOWN:]:
+    for one in passings[-MAX_SHOWN:]:
         way = "→" if one.forward else "←"
         through = one.passage is Passage.THROUGH
         how = f"{(one.exit_ns - one.entry_ns) * _S:.1f} s on it" if through else one.passage.value
         yield f"- {_moment(one.entry_ns)} {one.vehicle} {way} {one.bridge}, {how}"
-    if len(passings) > MOST_SHOWN:
-        yield f"- and {len(passings) - MOST_SHOWN} earlier"
+    if len(passings) > MAX_SHOWN:
+        yield f"- and {len(passings) - MAX_SHOWN} earlier"
 
 
 def _truck(truck: TruckSummary) -> str:

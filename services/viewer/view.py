@@ -51,7 +51,7 @@ from services.viewer.residuals import residual_cells
 from services.viewer.vehicle_signals import VehicleSignals, signals_of
 
 SUFFIXES = (".rrd", ".mcap", ".json")
-_MOST_RESIDUALS = 3
+_MAX_RESIDUALS = 3
 """Maximum number of crossings with residuals, as the user waits; `identify` computes more."""
 
 
@@ -131,7 +131,7 @@ def convert(
     residuals: dict[str, ResidualCells] = {}
     if crossings and found.site is not None:
         messages = read_messages(target)
-        residuals = residual_cells(crossings, messages, found.site, most=_MOST_RESIDUALS)
+        residuals = residual_cells(crossings, messages, found.site, most=_MAX_RESIDUALS)
     write_views(
         rrd,
         vehicles=signals_of(drives.all()),

@@ -84,7 +84,7 @@ _LONGEST_QUEUE = 200_000
 _LONGEST_NOTE = 1000
 _SOONEST_HEALTH_S = 5.0
 """Shortest time in s between two health messages, as the backlog may change often."""
-_MOST_NAMED = 10
+_MAX_NAMED = 10
 """Maximum number of crossings in one line of the log."""
 _CATCH_UP_EVERY_S = 0.2
 
@@ -438,7 +438,7 @@ def _resume(service: WorkerService, earlier: EarlierRuns) -> None:
         _log.warning(
             "%d crossings waited for a site validation when an earlier run ended (%s): they "
             "continue if their trucks still have them or they are in the logger's recordings",
-            *(len(waited), ", ".join(waited[-_MOST_NAMED:])),
+            *(len(waited), ", ".join(waited[-_MAX_NAMED:])),
         )
 
 
@@ -544,7 +544,7 @@ def _serve(
         _log.warning(
             "%d crossings still wait for a site validation or a process (%s): the next run gets "
             "them from their trucks, or from the logger's recordings",
-            *(len(waiting), ", ".join(waiting[-_MOST_NAMED:])),
+            *(len(waiting), ", ".join(waiting[-_MAX_NAMED:])),
         )
 
 

@@ -49,7 +49,7 @@ from services.recordings.writer import write_recording
 from services.simulation.drive import SimulatedDrive, paper_site, simulate_drive
 from services.viewer.crossing_view import VERDICT_COLOURS
 from services.viewer.live_layout import lane_entity
-from services.viewer.live_view import MOST_BRIDGES
+from services.viewer.live_view import MAX_BRIDGES
 from services.viewer.view import viewer_arguments, viewer_program
 from tests.endpoints import free_endpoint, free_port
 from tests.parent import parent_environment
@@ -383,8 +383,8 @@ def problems_of_view(picture: Picture, plans: dict[str, Plan]) -> list[str]:
         for lane in sorted(driven | picture.verdicts)
         if picture.verdicts[lane] != driven[lane]
     ]
-    if len(picture.bridges) != MOST_BRIDGES:
-        found.append(f"live view: {len(picture.bridges)} bridges instead of {MOST_BRIDGES}")
+    if len(picture.bridges) != MAX_BRIDGES:
+        found.append(f"live view: {len(picture.bridges)} bridges instead of {MAX_BRIDGES}")
     return found
 
 

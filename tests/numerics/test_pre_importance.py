@@ -225,7 +225,7 @@ def test_weighted_draws_give_up_where_tails_are_heavy() -> None:
     of, narrow = coordinates(20), of_normal(np.zeros(20), 0.5 * np.eye(20))
     found = sampling._importance_draws(target, of, narrow, np.zeros(20), 1200, 3, silent)
     assert not sampling._is_enough(found.worth, 1200)
-    assert found.y.shape[0] == 400 * sampling._MOST_BATCHES
+    assert found.y.shape[0] == 400 * sampling._MAX_BATCHES
 
 
 def test_a_surrogate_stays_where_hardly_any_draw_is_possible() -> None:

@@ -15,7 +15,7 @@ from services.drives.tables.stamps import start_of, to_utc, zone_of
 
 Floats = NDArray[np.float64]
 
-_MOST_QUARTERS: Final = 4 * 14
+_MAX_QUARTERS: Final = 4 * 14
 """Largest difference between UTC and a country's clocks, in quarters of an hour."""
 
 
@@ -90,7 +90,7 @@ def check_overlap(
     apart_s = float(other_s[0] - time_s[0])
     quarters = round(apart_s / 900.0)
     name = Path(source).name
-    if not 0 < abs(quarters) <= _MOST_QUARTERS or abs(apart_s - 900.0 * quarters) > 60.0:
+    if not 0 < abs(quarters) <= _MAX_QUARTERS or abs(apart_s - 900.0 * quarters) > 60.0:
         raise InputError(
             f"{part.sheet.path}: begins {apart_s:+.3f} s from {name}, the clocks of both must agree"
         )

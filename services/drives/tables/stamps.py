@@ -39,7 +39,7 @@ _DATE: Final = re.compile(
 _OFFSET: Final = re.compile(r"([+-])(\d{1,2}):?(\d{2})?")
 _FEWEST_ROUNDED: Final = 0.3
 """Share of repeated stamps where they were rounded."""
-_MOST_DROPPED: Final = 0.05
+_MAX_DROPPED: Final = 0.05
 """Largest share of rows with a non-increasing time, which are left out; more is an error."""
 
 
@@ -232,7 +232,7 @@ def kept_rows(
         values[rows][places] == values[left_out], axis=1
     )
     repeated, late = int(is_again.sum()), int((~is_again).sum())
-    if late > max(1, _MOST_DROPPED * time_s.size):
+    if late > max(1, _MAX_DROPPED * time_s.size):
         first = int(left_out[~is_again][0])
         raise InputError(
             f"{where}: times of {late} of {time_s.size} rows are not later than the row before "

@@ -106,7 +106,7 @@ def test_results_of_another_search_keep_their_own_head(
 ) -> None:
     other = HEADER._replace(seed=8, created=BEGIN_S)
     ResultStore(into).put([StoredResult("other", found[0])], other)
-    monkeypatch.setattr(store_module, "_MOST_AT_ONCE", 2)
+    monkeypatch.setattr(store_module, "_MAX_AT_ONCE", 2)
     problems: list[str] = []
     files: list[Results] = list(kept_results(into, problems.append))
     assert problems == []

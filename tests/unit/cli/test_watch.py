@@ -172,7 +172,7 @@ def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
 
 
 def test_what_it_keeps_is_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("_MOST_CROSSINGS", "_MOST_TRUCKS", "_MOST_BRIDGES", "_MOST_SERVICES"):
+    for name in ("_MAX_CROSSINGS", "_MAX_TRUCKS", "_MAX_BRIDGES", "_MAX_SERVICES"):
         monkeypatch.setattr(realm_model, name, 5)
     watched = RealmModel()
     for number in range(20):
@@ -241,7 +241,7 @@ def test_a_bridge_with_an_alarm_is_among_those_that_are_shown(site: Site) -> Non
 def test_where_there_is_no_room_an_alarm_that_stands_is_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(realm_model, "_MOST_BRIDGES", 2)
+    monkeypatch.setattr(realm_model, "_MAX_BRIDGES", 2)
     watched = RealmModel()
     tell(watched, alarm("stands", raised=1.0))
     for number in range(4):

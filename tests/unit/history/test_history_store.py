@@ -156,7 +156,7 @@ def test_damaged_files_and_other_editions_get_a_line_and_stay(
     assert "left out: is of edition 2 of driveby.history, this program knows 1" in lines
     assert len(read.problems) == 3
     # What is lost is added again; what cannot be read is never removed.
-    monkeypatch.setattr(history_store, "_MOST_FILES", 0)
+    monkeypatch.setattr(history_store, "_MAX_FILES", 0)
     assert add_results(tmp_path, some).crossings == 2
     assert len(read_partition(where(tmp_path)).crossings) == 4
     assert torn.exists()

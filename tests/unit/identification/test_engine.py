@@ -545,7 +545,7 @@ def test_a_position_that_was_forgotten_does_not_come_back_at_its_turn(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It would push out newer ones, which say that the other truck is on the bridge now."""
-    monkeypatch.setattr(traffic, "_MOST_FIXES", 80)
+    monkeypatch.setattr(traffic, "_MAX_FIXES", 80)
     site = with_second_truck()
     turns_back = legs((0.0, -60.0), (6.0, -10.0), (8.0, 15.0), (10.0, -10.0), (15.0, -60.0))
     first = messages_of(drive(ACROSS, 15.0), site=site)
@@ -562,7 +562,7 @@ def test_a_position_that_was_forgotten_does_not_come_back_at_its_turn(
 
 
 def test_in_a_recording_no_position_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(traffic, "_MOST_FIXES", 80)
+    monkeypatch.setattr(traffic, "_MAX_FIXES", 80)
     site = with_second_truck()
     then_waits = legs((0.0, -60.0), (6.0, -10.0), (8.0, 15.0), (10.0, -10.0), (15.0, -60.0))
     first = messages_of(drive(ACROSS, 15.0), site=site)

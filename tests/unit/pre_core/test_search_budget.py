@@ -56,7 +56,7 @@ def test_a_search_that_finds_no_fit_ends_within_its_budget(
     best = optimum.find_optimum(inputs)
     assert min(budgets) > 0
     assert best.evaluations == each * len(budgets)
-    assert best.evaluations < optimum._MOST_EVALUATIONS + each
+    assert best.evaluations < optimum._MAX_EVALUATIONS + each
     assert best.ending is Termination.STEPS_EXHAUSTED
 
 

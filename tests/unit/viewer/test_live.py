@@ -31,7 +31,7 @@ from services.common.errors import FailureError
 from services.viewer.crossing_view import elements_of_result
 from services.viewer.live import APPLICATION, live_command
 from services.viewer.live_parts import PERIOD_S, extremes
-from services.viewer.live_view import MOST_TRUCKS, LiveView
+from services.viewer.live_view import MAX_TRUCKS, LiveView
 from tests.endpoints import free_port
 from tests.unit.cli.watching import alarm
 from tests.unit.viewer.found import results_of, some_crossing
@@ -331,11 +331,11 @@ def test_meaningless_interval_is_not_printed(site: Site) -> None:
 
 
 def test_of_many_trucks_all_have_positions_and_some_accelerations(live: Live) -> None:
-    for number in range(MOST_TRUCKS + 3):
+    for number in range(MAX_TRUCKS + 3):
         drives(live, 1, f"truck-{number}")
     paths = {chunk.entity_path for chunk in live.drawn()}
-    assert sum(path.endswith("/acceleration/sprung_front") for path in paths) == MOST_TRUCKS
-    assert sum(path.startswith("/map/position/") for path in paths) == MOST_TRUCKS + 3
+    assert sum(path.endswith("/acceleration/sprung_front") for path in paths) == MAX_TRUCKS
+    assert sum(path.startswith("/map/position/") for path in paths) == MAX_TRUCKS + 3
 
 
 def test_what_cannot_be_read_is_left_out(live: Live) -> None:
