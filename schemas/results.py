@@ -281,7 +281,7 @@ class BridgeResult(BaseModel):
 
     @property
     def elements(self) -> dict[str, ElementState]:
-        """Return EI_1 … EI_n in the order of their numbers."""
+        """EI_1 … EI_n in the order of their numbers."""
         extra = self.__pydantic_extra__
         return {name: extra[name] for name in sorted(extra, key=lambda n: int(n[3:]))}
 

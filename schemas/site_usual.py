@@ -56,17 +56,17 @@ class Implied(NamedTuple):
 
     @property
     def is_unusual(self) -> bool:
-        """Return whether it is out of its range."""
+        """Whether it is out of its range."""
         return not self.low <= self.value <= self.high
 
     @property
     def is_far(self) -> bool:
-        """Return whether it is far out of its range."""
+        """Whether it is far out of its range."""
         return self.value < self.low / _FAR or self.value > self.high * _FAR
 
     @property
     def advice(self) -> str:
-        """Return what is usual, and what was probably meant."""
+        """Sentence that names the usual range, and what was probably meant."""
         usual = f"usual is {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
         return f"{usual}: {self.meant}" if self.meant else f"{usual}: check units and values"
 

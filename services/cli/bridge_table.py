@@ -15,15 +15,15 @@ class BridgeElements(Protocol):
 
     @property
     def id(self) -> str:
-        """Return its name."""
+        """Name of the bridge."""
 
     @property
     def lengths_m(self) -> Sequence[float]:
-        """Return the lengths of its elements, m."""
+        """Lengths of its elements, m."""
 
     @property
     def nominal_flexural_rigidity_nm2(self) -> Sequence[float]:
-        """Return the nominal rigidities of its elements, N·m²."""
+        """Nominal rigidities of its elements, N·m²."""
 
 
 def print_bridge(console: "Console", bridge: BridgeElements, state: BridgeResult) -> None:

@@ -83,7 +83,7 @@ class CrossingRow(NamedTuple):
 
     @property
     def is_over(self) -> bool:
-        """Return whether it has its result."""
+        """Whether it has its result."""
         return self.state in ("good", "suspect", "rejected", "done")
 
 
@@ -153,7 +153,7 @@ class RealmModel:
 
     @property
     def waiting(self) -> int:
-        """Return the number of crossings without a result whose truck has left."""
+        """Number of crossings without a result whose truck has left."""
         return sum(not row.is_over and row.state != "on the bridge" for row in self.rows())
 
     def rows(self) -> list[CrossingRow]:

@@ -67,7 +67,7 @@ class ClusterConfig(NamedTuple):
 
     @property
     def address(self) -> str:
-        """Return the address of the scheduler."""
+        """Address of the scheduler."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'tcp' if self.roles is None else 'tls'}://{host}:{self.port}"
 

@@ -70,7 +70,7 @@ class ArchiveJob(NamedTuple):
 
     @property
     def header(self) -> ResultHeader:
-        """Return the header of every result."""
+        """Header of every result."""
         return header_of(self.site, self.settings, time.time())
 
 

@@ -102,34 +102,34 @@ class DaskExecutor:
 
     @property
     def is_busy(self) -> bool:
-        """Return whether a result or a state is still to be collected."""
+        """Whether a result or a state is still to be collected."""
         waiting = self._pending or self._to_send or self._suspects or self._submitted
         return bool(waiting or self._finished or self._inline.is_busy)
 
     @property
     def is_full(self) -> bool:
-        """Return whether no batch may be submitted, and one more waits."""
+        """Whether no batch may be submitted, and one more waits."""
         return not self._may_send and len(self._pending) >= self._batch
 
     @property
     def has_room(self) -> bool:
-        """Return whether one more crossing would not make it full."""
+        """Whether one more crossing would not make it full."""
         return self._may_send or len(self._pending) + 1 < self._batch
 
     @property
     def is_idle(self) -> bool:
-        """Return whether a worker is free for a batch."""
+        """Whether a worker is free for a batch."""
         return len(self._submitted) < self._workers
 
     @property
     def waiting(self) -> int:
-        """Return the number of crossings not yet submitted to the scheduler."""
+        """Number of crossings not yet submitted to the scheduler."""
         again = (*self._to_send, *self._suspects)
         return len(self._pending) + sum(len(batch.works) for batch in again)
 
     @property
     def running(self) -> list[RunningCrossing]:
-        """Return an empty list: only the workers know."""
+        """Always an empty list: only the workers know."""
         return []
 
     def submit(self, work: IdentificationTask) -> None:
@@ -172,12 +172,12 @@ class DaskExecutor:
 
     @property
     def _window(self) -> int:
-        """Return the number of batches at the scheduler: a running and a waiting one per worker."""
+        """Number of batches at the scheduler: a running and a waiting one per worker."""
         return 2 * self._workers
 
     @property
     def _may_send(self) -> bool:
-        """Return whether there is room, and no suspect batch has to run alone."""
+        """Whether there is room, and no suspect batch has to run alone."""
         suspect = self._suspects or any(one.batch.is_suspect for one in self._submitted.values())
         return not suspect and len(self._submitted) < self._window
 

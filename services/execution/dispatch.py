@@ -51,27 +51,27 @@ class CrossingExecutor(Protocol):
 
     @property
     def is_busy(self) -> bool:
-        """Return whether a result or a state is still to be collected."""
+        """Whether a result or a state is still to be collected."""
 
     @property
     def is_full(self) -> bool:
-        """Return whether results should be collected before more crossings are submitted."""
+        """Whether results should be collected before more crossings are submitted."""
 
     @property
     def has_room(self) -> bool:
-        """Return whether one more crossing would not make it full."""
+        """Whether one more crossing would not make it full."""
 
     @property
     def is_idle(self) -> bool:
-        """Return whether a crossing submitted now starts at once, or after a background task."""
+        """Whether a crossing submitted now starts at once, or after a background task."""
 
     @property
     def waiting(self) -> int:
-        """Return the number of crossings submitted and not started."""
+        """Number of crossings submitted and not started."""
 
     @property
     def running(self) -> list[RunningCrossing]:
-        """Return the running crossings, the one that started first first."""
+        """Running crossings in the order of their start."""
 
     def submit(self, work: IdentificationTask) -> None:
         """Submit a crossing; it is identified now, later or elsewhere."""

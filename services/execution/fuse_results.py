@@ -55,7 +55,7 @@ class CrossingsToFuse(NamedTuple):
 
     @property
     def by_bridge(self) -> dict[str, list[CrossingResult]]:
-        """Return the crossings of each bridge, by its name."""
+        """Crossings of each bridge, by its name."""
         names = sorted({crossing.bridge for crossing in self.crossings})
         return {name: [one for one in self.crossings if one.bridge == name] for name in names}
 

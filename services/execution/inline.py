@@ -39,32 +39,32 @@ class InlineExecutor:
 
     @property
     def is_busy(self) -> bool:
-        """Return whether a result or a state is still to be collected."""
+        """Whether a result or a state is still to be collected."""
         return bool(self._finished or self._fused)
 
     @property
     def is_full(self) -> bool:
-        """Return False: a submitted crossing is identified at once."""
+        """Always false: a submitted crossing is identified at once."""
         return False
 
     @property
     def has_room(self) -> bool:
-        """Return True."""
+        """Always true."""
         return True
 
     @property
     def is_idle(self) -> bool:
-        """Return True."""
+        """Always true."""
         return True
 
     @property
     def waiting(self) -> int:
-        """Return 0."""
+        """Always 0."""
         return 0
 
     @property
     def running(self) -> list[RunningCrossing]:
-        """Return an empty list: no crossing runs between two calls."""
+        """Always an empty list: no crossing runs between two calls."""
         return []
 
     def submit(self, work: IdentificationTask) -> None:

@@ -143,33 +143,33 @@ class ProcessExecutor:
 
     @property
     def is_busy(self) -> bool:
-        """Return whether a result or a state is still to be collected."""
+        """Whether a result or a state is still to be collected."""
         waiting = self._waiting or self._to_fuse
         return bool(waiting or self._finished or self._fused or self._in_use)
 
     @property
     def is_full(self) -> bool:
-        """Return whether enough crossings wait for a process."""
+        """Whether enough crossings wait for a process."""
         return len(self._waiting) >= _WAITING_PER_PROCESS * len(self._slots)
 
     @property
     def has_room(self) -> bool:
-        """Return whether one more crossing would not make it full."""
+        """Whether one more crossing would not make it full."""
         return len(self._waiting) + 1 < _WAITING_PER_PROCESS * len(self._slots)
 
     @property
     def is_idle(self) -> bool:
-        """Return whether a crossing submitted now starts at once, or after a background task."""
+        """Whether a crossing submitted now starts at once, or after a background task."""
         return not self._waiting and len(self._in_use) < len(self._slots)
 
     @property
     def waiting(self) -> int:
-        """Return the number of crossings that wait for a process."""
+        """Number of crossings that wait for a process."""
         return len(self._waiting)
 
     @property
     def running(self) -> list[RunningCrossing]:
-        """Return the running crossings, the one that started first first."""
+        """Running crossings in the order of their start."""
         now_s = time.monotonic()
         found = [
             RunningCrossing(slot.job.name, now_s - slot.began_s)
@@ -219,7 +219,7 @@ class ProcessExecutor:
 
     @property
     def wants_background(self) -> bool:
-        """Return whether a process may be free for one more background task."""
+        """Whether a process may be free for one more background task."""
         begun = sum(1 for p in self._slots if p.job and isinstance(p.job.task, BackgroundTask))
         return len(self._background) + begun < len(self._slots)
 
@@ -246,7 +246,7 @@ class ProcessExecutor:
 
     @property
     def _in_use(self) -> list["_Slot"]:
-        """Return the slots that work on something other than a background task."""
+        """Slots that work on something other than a background task."""
         return [p for p in self._slots if p.job and not isinstance(p.job.task, BackgroundTask)]
 
     def _fill(self) -> None:

@@ -57,7 +57,7 @@ class Scheduler:
 
     @property
     def threads(self) -> int | None:
-        """Return the number of batches its workers run at once; None without a timely answer."""
+        """Number of batches its workers run at once; None without a timely answer."""
         if self._client.status != "running":
             return None
         try:

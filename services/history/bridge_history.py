@@ -51,7 +51,7 @@ class ElementChange(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """Return whether the interval excludes an unchanged EI."""
+        """Whether the interval excludes an unchanged EI."""
         return not self.low <= 1.0 <= self.high
 
 

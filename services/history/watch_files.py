@@ -71,7 +71,7 @@ class MonitoringState(NamedTuple):
 
     @property
     def found_nothing(self) -> bool:
-        """Return whether periods were judged, up to now, and none raised an alarm."""
+        """Whether periods were judged, up to now, and none raised an alarm."""
         return self.state == "watched"
 
 

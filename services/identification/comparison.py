@@ -47,17 +47,17 @@ class Element(NamedTuple):
 
     @property
     def is_weak(self) -> bool:
-        """Return whether it has clearly lost stiffness."""
+        """Whether it has clearly lost stiffness."""
         return self.high < 1.0 - CLEAR_LOSS
 
     @property
     def is_stiff(self) -> bool:
-        """Return whether it is clearly stiffer."""
+        """Whether it is clearly stiffer."""
         return self.low > 1.0 + CLEAR_LOSS
 
     @property
     def visible_loss(self) -> float:
-        """Return the smallest loss of this element that would have been clear."""
+        """Smallest loss of this element that would have been clear."""
         return 1.0 - (1.0 - CLEAR_LOSS) * self.ratio / self.high
 
 
@@ -71,17 +71,17 @@ class Comparison(NamedTuple):
 
     @property
     def weak(self) -> tuple[Element, ...]:
-        """Return the elements that have clearly lost stiffness, the weakest first."""
+        """Elements that have clearly lost stiffness, the weakest first."""
         return tuple(sorted((e for e in self.elements if e.is_weak), key=lambda e: e.ratio))
 
     @property
     def stiff(self) -> tuple[Element, ...]:
-        """Return the clearly stiffer elements."""
+        """Clearly stiffer elements."""
         return tuple(element for element in self.elements if element.is_stiff)
 
     @property
     def rest(self) -> tuple[Element, ...]:
-        """Return all other elements."""
+        """All other elements."""
         return tuple(e for e in self.elements if not e.is_weak and not e.is_stiff)
 
 

@@ -150,7 +150,7 @@ class Engine:
 
     @property
     def unknown_vehicles(self) -> set[str]:
-        """Return trucks that the site file lacks; none of their crossings can be identified."""
+        """Trucks that the site file lacks; none of their crossings can be identified."""
         return self._finder.unknown_vehicles
 
     def _publish(self, found: Iterable[Found]) -> Iterator[EngineOutput]:
@@ -229,7 +229,7 @@ class Engine:
 
     @property
     def has_released(self) -> bool:
-        """Return whether a crossing that waited may continue."""
+        """Whether a crossing that waited may continue."""
         return self._waiting.has_released
 
     def release(self) -> Iterator[EngineOutput]:

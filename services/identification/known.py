@@ -42,7 +42,7 @@ class CrossingRecord:
 
     @property
     def is_identified(self) -> bool:
-        """Return whether it has a result, or a published message about one that is lost here."""
+        """Whether it has a result, or a published message about one that is lost here."""
         return self.has_result or pb.DONE in self.states
 
 

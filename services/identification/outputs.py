@@ -33,7 +33,7 @@ class IdentificationTask(NamedTuple):
 
     @property
     def crossing_id(self) -> str:
-        """Return the id of its crossing."""
+        """Id of its crossing."""
         return self.data.crossing_id
 
 

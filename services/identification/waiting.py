@@ -31,7 +31,7 @@ class Pending(NamedTuple):
 
     @property
     def pair(self) -> VehicleBridgePair:
-        """Return truck and bridge."""
+        """Truck and bridge."""
         return VehicleBridgePair(self.work.data.vehicle.id, self.work.data.bridge.id)
 
 
@@ -158,7 +158,7 @@ class Waiting:
 
     @property
     def has_released(self) -> bool:
-        """Return whether a crossing may continue."""
+        """Whether a crossing may continue."""
         return any(self.is_certified(one.pair) for one in self._pending)
 
     def release(self) -> Pending | None:

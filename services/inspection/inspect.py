@@ -55,7 +55,7 @@ class CheckReport(NamedTuple):
 
     @property
     def is_wrong(self) -> bool:
-        """Return whether any finding is wrong."""
+        """Whether any finding is wrong."""
         return any(_is_wrong(finding) for finding in self.findings)
 
 

@@ -24,7 +24,7 @@ class Fusion(NamedTuple):
 
     @property
     def bridges(self) -> dict[str, BridgeResult]:
-        """Return the fused estimate of each bridge, by its identifier."""
+        """Fused estimate of each bridge, by its identifier."""
         return dict(self.results.bridges)
 
     def to_json(self, path: str | Path) -> None:

@@ -51,17 +51,17 @@ class Simulation(NamedTuple):
 
     @property
     def signals(self) -> Signals:
-        """Return the measurements of the truck, in the form of `read`."""
+        """Measurements of the truck, in the form of `read`."""
         return signals_of_run(self.drive.run, self.site.vehicles[0].id)
 
     @property
     def ei_ratios(self) -> NDArray[np.float64]:
-        """Return the true EI of each element over its nominal value, (n,)."""
+        """True EI of each element over its nominal value, (n,)."""
         return self.drive.rigidity_ratios
 
     @property
     def road_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the true profile under the tyres: chainage and height (m,), both in m."""
+        """True profile under the tyres: chainage and height (m,), both in m."""
         return self.drive.road.x_m, self.drive.road.height_m
 
     def messages(self) -> Iterator[Message]:

@@ -53,22 +53,22 @@ class Solution(NamedTuple):
 
     @property
     def value(self) -> dict[str, Parameter]:
-        """Return the estimate of each parameter, by name; empty for a rejected crossing."""
+        """Estimate of each parameter, by name; empty for a rejected crossing."""
         return dict(self.crossing.parameters or {})
 
     @property
     def verdict(self) -> Verdict:
-        """Return `good`, `suspect` or `rejected`."""
+        """Verdict: `good`, `suspect` or `rejected`."""
         return self.crossing.verdict
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Return why the verdict is not `good`; `crossing.reason_texts` are sentences."""
+        """Reasons why the verdict is not `good`; `crossing.reason_texts` are sentences."""
         return self.crossing.reasons
 
     @property
     def stats(self) -> dict[str, float]:
-        """Return statistics of the search: evaluations, convergence, seconds."""
+        """Statistics of the search: evaluations, convergence, seconds."""
         return dict(self.crossing.diagnostics)
 
     def elements(self) -> "pd.DataFrame":

@@ -29,7 +29,7 @@ class Plan(NamedTuple):
 
     @property
     def site(self) -> Site:
-        """Return the site with the elements and tyres of the plan."""
+        """Site with the elements and tyres of the plan."""
         return self.tracks[0][0].site
 
 

@@ -70,7 +70,7 @@ class BridgeReport(NamedTuple):
 
     @property
     def used(self) -> list[CrossingResult]:
-        """Return the crossings that the numbers are of."""
+        """Crossings behind the numbers."""
         return [one for one in self.crossings if one.crossing_id in self.view.used]
 
 

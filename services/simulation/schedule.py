@@ -26,7 +26,7 @@ class Schedule(NamedTuple):
 
     @property
     def drives(self) -> int:
-        """Return the number of runs on all days."""
+        """Number of runs on all days."""
         return self.runs * self.days
 
     def begin_s(self, number: int, usual_start_s: float = START_TIME_S) -> float:

@@ -52,19 +52,19 @@ class BridgeView(NamedTuple):
 
     @property
     def span_m(self) -> float:
-        """Return the length of the bridge between its outer bearings, m."""
+        """Length of the bridge between its outer bearings, m."""
         return float(self.edges_m[-1])
 
     @property
     def unresolved(self) -> frozenset[int]:
-        """Return the numbers of elements too uncertain to resolve a loss of half their EI."""
+        """Numbers of elements too uncertain to resolve a loss of half their EI."""
         if self.state is None or self.estimate is None:
             return frozenset()
         return unresolved_elements(self.state.elements.values())
 
     @property
     def ambiguous_neighbours(self) -> tuple[int, ...]:
-        """Return the unresolved neighbours of weak elements, where the loss may be instead."""
+        """Unresolved neighbours of weak elements, where the loss may be instead."""
         return comparison.ambiguous_neighbours(self.comparison, self.unresolved)
 
 

@@ -64,7 +64,7 @@ class ResultElements(NamedTuple):
 
     @property
     def elements(self) -> int:
-        """Return the number of elements."""
+        """Number of elements."""
         return len(self.lengths_m)
 
 
@@ -150,12 +150,12 @@ class CrossingView(NamedTuple):
 
     @property
     def span_m(self) -> float:
-        """Return the length of the bridge between its bearings, m."""
+        """Length of the bridge between its bearings, m."""
         return float(self.element_edges_m[-1])
 
     @property
     def resolved_ratio(self) -> FloatArray | None:
-        """Return EI over nominal (n,), NaN for an unresolved element; None if rejected."""
+        """EI over nominal (n,), NaN for an unresolved element; None if rejected."""
         if self.rigidity_nm2 is None:
             return None
         return np.array(
@@ -167,7 +167,7 @@ class CrossingView(NamedTuple):
 
     @property
     def interval_has_meaning(self) -> bool:
-        """Return whether the method has a noise model, without which an interval means nothing."""
+        """Whether the method has a noise model, without which an interval means nothing."""
         return "no_noise_model" not in self.reasons
 
 

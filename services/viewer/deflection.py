@@ -35,7 +35,7 @@ class DeflectionFrames(NamedTuple):
 
     @property
     def largest_m(self) -> float:
-        """Return the largest deflection, downwards and positive, m."""
+        """Largest deflection, downwards and positive, m."""
         return float(-self.deflection_m.min())
 
 

@@ -167,7 +167,7 @@ class LiveView:
 
     @property
     def is_empty(self) -> bool:
-        """Return whether no message has been received yet."""
+        """Whether no message has been received yet."""
         return not self._trucks and not self._bridges
 
     def ingest(self, message: BusMessage) -> None:

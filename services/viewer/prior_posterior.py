@@ -32,7 +32,7 @@ class PriorPosterior(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Return the interval's width over the prior's: 0 for complete information, 1 for none."""
+        """Width of the interval over the prior's: 0 for complete information, 1 for none."""
         return (self.high - self.low) / (self.prior[1] - self.prior[0])
 
 

@@ -55,27 +55,27 @@ class BridgeOnMap(NamedTuple):
 
     @property
     def start_latitude_deg(self) -> float:
-        """Return the latitude of the start; with the three below, the ends for a frame."""
+        """Latitude of the start; with the three below, the ends for a frame."""
         return self.start[0]
 
     @property
     def start_longitude_deg(self) -> float:
-        """Return the longitude of the start."""
+        """Longitude of the start."""
         return self.start[1]
 
     @property
     def end_latitude_deg(self) -> float:
-        """Return the latitude of the end."""
+        """Latitude of the end."""
         return self.end[0]
 
     @property
     def end_longitude_deg(self) -> float:
-        """Return the longitude of the end."""
+        """Longitude of the end."""
         return self.end[1]
 
     @property
     def span_m(self) -> float:
-        """Return the length between the outer bearings, m."""
+        """Length between the outer bearings, m."""
         return self.edges_m[-1]
 
 

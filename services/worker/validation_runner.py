@@ -103,12 +103,12 @@ class ValidationRunner:
 
     @property
     def progress(self) -> tuple[VehicleBridgePair, float] | None:
-        """Return the pair that is being validated, and the share of it that is done."""
+        """Pair that is being validated, and the share of it that is done."""
         return None if self._trial is None else (self._trial.pair, self._trial.share)
 
     @property
     def note(self) -> str:
-        """Return in one line why crossings wait; empty if none does."""
+        """Reason in one line why crossings wait; empty if none does."""
         parts = [f"{pair} is not validated: {reason}" for pair, reason in self._failed.items()]
         if self._trial is not None:
             parts.append(f"{self._trial.pair} is being validated")

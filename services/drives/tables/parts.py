@@ -56,7 +56,7 @@ class TablePart(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return the name of the file."""
+        """Name of the file."""
         return self.sheet.path.name
 
     def has_fixes(self) -> bool:
