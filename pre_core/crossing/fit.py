@@ -202,13 +202,6 @@ def fit_all(
     than sensor noise. A strategy with full weight ends without optimum at clear friction or
     divergence.
     """
-
-    def refresh_at_full_weight(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
-        return update_noise(problem, y, no_force_noise())
-
-    def doubted(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
-        return update_noise(problem, y, friction_gain=FRICTION_GAIN_OF_MISFIT)
-
     front = points(problem, y[None, :]).position_m[0]
     crossing = problem.crossing
     problem = problem._replace(
@@ -220,7 +213,7 @@ def fit_all(
     first = np.delete(free, resting_mode_indices(problem, strategy), axis=1)
     at_full_weight = update_noise(problem, start, no_force_noise())
     at_full_weight, y, ending, evaluations = fit_stage(
-        at_full_weight, start, first, _FREE_STAGES[0], refresh_at_full_weight
+        at_full_weight, start, first, _FREE_STAGES[0], _at_full_weight
     )
     at_full_weight = update_noise(at_full_weight, y, no_force_noise())
     problem = update_noise(at_full_weight, y)
@@ -242,20 +235,28 @@ def fit_all(
                 y,
                 first if is_free else free,
                 rounds,
-                refresh_at_full_weight,
+                _at_full_weight,
                 is_free=is_free,
             )
             evaluations += used
     problem = update_noise(problem, y)
     y = _not_negative(problem, y)
     if not (problem.force.any() or is_accepted(problem, chi2_per_dof(problem, y))):
-        problem = update_noise(problem, y, friction_gain=FRICTION_GAIN_OF_MISFIT)
+        problem = _at_misfit(problem, y)
     if problem.force.any():
-        problem, y, ending, used = _fit_in_noise_rounds(problem, y, free, _MAX_ROUNDS, doubted)
+        problem, y, ending, used = _fit_in_noise_rounds(problem, y, free, _MAX_ROUNDS, _at_misfit)
         evaluations += used
     state = levenberg_marquardt.initial_state(lambda at: all_rows(problem, at), y)
     found = Optimum(problem, state, ending, chi2_per_dof(problem, y), evaluations, 1)
     return found, evaluations + y.size + 1
+
+
+def _at_full_weight(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
+    return update_noise(problem, y, no_force_noise())
+
+
+def _at_misfit(problem: PosteriorProblem, y: FloatArray) -> PosteriorProblem:
+    return update_noise(problem, y, friction_gain=FRICTION_GAIN_OF_MISFIT)
 
 
 def _fit_in_noise_rounds(

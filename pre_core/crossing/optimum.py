@@ -237,9 +237,8 @@ def _refine_likeliest(
             best = found
         if is_accepted(best.problem, best.chi2_per_dof) or len(tried) == strategy.max_candidates:
             break
-        if best.chi2_per_dof > _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]:
-            break
-        if evaluations > max_evaluations:
+        hopeless = _HOPELESS_CHI2[min(len(tried), len(_HOPELESS_CHI2)) - 1]
+        if best.chi2_per_dof > hopeless or evaluations > max_evaluations:
             break
     if best is None:
         return _no_optimum(problem, y, evaluations, len(tried), has_friction=has_friction)

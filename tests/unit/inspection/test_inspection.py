@@ -234,7 +234,7 @@ def test_density_is_that_of_the_noise_whatever_lines_are_on_it() -> None:
         found = density(NoiseSegment(values, 500.0, True))
         assert found is not None
         assert found.ug_per_rthz == pytest.approx(25.0, rel=0.03)
-        assert found.falls == pytest.approx(1.0, abs=0.1)
+        assert found.falls_with_frequency == pytest.approx(1.0, abs=0.1)
     # At 200 Hz a driving truck's wheels hide it.
     assert density(NoiseSegment(run.channels[U1], 200.0, False)) is None
     assert density(NoiseSegment(run.channels[U1][:1000], 500.0, True)) is None
