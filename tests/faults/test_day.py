@@ -20,6 +20,8 @@ from tests.faults.day import (
 pytestmark = pytest.mark.process
 
 
+@pytest.mark.faults
+@pytest.mark.timeout(1200)
 def test_every_crossing_has_one_result_although_the_worker_is_killed(tmp_path: Path) -> None:
     """Four bridges of the road and the one beside them, there and back, at twelve times the speed:
     what the worker cannot keep up with waits."""

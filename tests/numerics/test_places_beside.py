@@ -1,11 +1,14 @@
 """Where a bearing gives and the axles' roads hardly differ, optima lie a hand's breadth apart."""
 
+import pytest
+
 from schemas.results import CrossingResult
 from schemas.settings import IdentificationSettings
 from services.simulation.drawn import default_site
 from studies.validation.surveys import one_crossing
 
 
+@pytest.mark.slow
 def test_the_right_one_of_optima_beside_each_other_is_found() -> None:
     """A crossing for which the walk along the road chooses the next but one: chi2 is 1.3 there."""
     settings = IdentificationSettings(method="pre", threads=1)

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 # In a process of its own: here other tests may have compiled what the warm-up forgets.
 IDENTIFY = """
 import gc, json, sys
@@ -66,6 +68,7 @@ warm_up.warm_up()
 """
 
 
+@pytest.mark.slow
 def test_compiled_and_loaded_kernels_give_the_same_digits(project: Path, tmp_path: Path) -> None:
     """The rows of method `pre`, bit for bit, with an empty cache and with what that has left."""
     first, second = (

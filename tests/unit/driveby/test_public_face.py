@@ -571,6 +571,7 @@ def test_fused_bridge_is_that_of_the_command_line(tmp_path: Path) -> None:
         driveby.fuse()
 
 
+@pytest.mark.slow
 def test_survey_is_that_of_the_command_line(
     tmp_path: Path, project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -399,6 +399,7 @@ def test_eight_two_sided_crossings_are_good_and_fused(shared: Path, tmp_path: Pa
     assert state["verdict"] == "good"
 
 
+@pytest.mark.slow
 def test_averages_written_as_four_channels_have_the_same_answer(two_sided: TwoSided) -> None:
     declared = answer(two_sided.runs[4], two_sided.site)
     middle = answer(averaged(two_sided.runs[4], two_sided.vehicle), middle_site(two_sided.site))
