@@ -34,7 +34,7 @@ HEADER = ResultHeader("0.1.0", 0.0, "0" * 64, {}, 1)
 
 
 class Template(NamedTuple):
-    """A crossing that was identified: what it tells, whatever it tells it of."""
+    """Information of an identified crossing, whatever bridge it is of."""
 
     likelihood: FusionLikelihood
     direction: str
@@ -63,12 +63,12 @@ class Bridge(NamedTuple):
 def templates() -> list[Template]:
     """Those that are stored."""
     found = []
-    for told in json.loads(STORED.read_text()):
-        likelihood = FusionLikelihood.model_validate(told["likelihood"])
+    for outcome in json.loads(STORED.read_text()):
+        likelihood = FusionLikelihood.model_validate(outcome["likelihood"])
         m = len(likelihood.target)
         root = np.zeros((m, m))
         root[np.triu_indices(m)] = likelihood.root
-        found.append(Template(likelihood, told["direction"], root))
+        found.append(Template(likelihood, outcome["direction"], root))
     return found
 
 
@@ -130,7 +130,7 @@ def crossing_of(
         fusion_likelihood=likelihood,
     )
     found = observation_of(crossing)
-    if found is None:  # twice as stiff or half, by its noise: then it tells nothing
+    if found is None:  # twice as stiff or half, by its noise: then it has no information
         return crossing
     own = found.own + sum((s.loading @ s.loading.T for s in found.shared), np.zeros((n, n)))
     values = dict(zip(_names(n), np.exp(found.value), strict=True))

@@ -22,7 +22,7 @@ def object_store(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """moto, with an empty bucket; its address."""
     from moto.server import ThreadedMotoServer
 
-    # It tells of every request where the errors of commands go.
+    # It logs every request where the errors of commands go.
     monkeypatch.setattr(logging.getLogger("werkzeug"), "disabled", True)
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()

@@ -224,7 +224,7 @@ def _is_it(change: Change | None, element: int) -> bool:
 
 @cache
 def _observations() -> list[list[Observation]]:
-    """What three trucks tell, by truck and kind of crossing: covariances and loadings."""
+    """Information of three trucks, by truck and kind of crossing: covariances and loadings."""
     rng = np.random.default_rng(1)
     bridge = bridge_of(rng, "bridge-1")
     out = []

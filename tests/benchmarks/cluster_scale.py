@@ -182,9 +182,9 @@ def results(into: Path) -> dict[str, str]:
     for path in files_of(into):
         rows = decoded(path, KEY, EDITION, ["content", "result"]).to_pylist()
         for row in rows:
-            told = json.loads(zstandard.decompress(row["result"]))
-            told["diagnostics"].pop("seconds", None)
-            found[row["content"]] = json.dumps(told, sort_keys=True)
+            outcome = json.loads(zstandard.decompress(row["result"]))
+            outcome["diagnostics"].pop("seconds", None)
+            found[row["content"]] = json.dumps(outcome, sort_keys=True)
     return found
 
 

@@ -3,8 +3,8 @@
     python -m tests.benchmarks.detection [--minutes 60] [--bridges 10 10000]
 
 A truck drives along a straight road with a bridge every few minutes, which are the site's first
-bridges; all others lie anywhere in a region of 100 km, a kilometre from the road or more. Told is
-the processor time of the part that finds crossings in positions (`Engine`, every fix noted and
+bridges; all others lie anywhere in a region of 100 km, a kilometre from the road or more. Printed
+is the processor time of the part that finds crossings in positions (`Engine`, every fix noted and
 fed), and of taking in the batches of accelerations. Nothing is identified.
 """
 

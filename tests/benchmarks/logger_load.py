@@ -143,14 +143,14 @@ def measure(
     time.sleep(_DRAIN_S)
     began = time.monotonic()
     logger.send_signal(signal.SIGTERM)
-    told, _ = logger.communicate(timeout=120)
+    outcome, _ = logger.communicate(timeout=120)
     stop_s = time.monotonic() - began
     fleet.kill()
     fleet.wait()
     fleet.stdout.close()
     if logger.returncode not in (0, 1):
         raise SystemExit((folder / "logger.log").read_text()[-2000:])
-    latency = json.loads(told.splitlines()[-1])
+    latency = json.loads(outcome.splitlines()[-1])
     duration_s = usages[-1].at_s - usages[0].at_s
     processor_s = usages[-1].processor_s - usages[0].processor_s
     found, twice = recorded(folder)
@@ -271,7 +271,7 @@ def log_plainly(endpoint: str, folder: Path) -> int:
     """Record as the documentation of the libraries shows it: a yardstick of what the rest costs.
 
     One file, what comes is written as it comes, and synced twice a second. Nothing is checked,
-    nothing is asked for again, nothing is told twice or taken out.
+    nothing is requested again, and duplicates stay.
     """
     import zenoh
     from mcap.writer import Writer
@@ -351,8 +351,8 @@ def drive(endpoint: str, trucks: int, seconds: float) -> None:
                 time.sleep(wait_s)
             publish(gateway, tick, batches[(tick + n) % len(batches)])
     sent = round(seconds * BATCHES_PER_S) * MESSAGES_PER_S // BATCHES_PER_S
-    told = {f"truck-{n}": sent for n in range(trucks)} | {_LATE: round(late_s * 1e6)}
-    print(json.dumps(told), flush=True)
+    outcome = {f"truck-{n}": sent for n in range(trucks)} | {_LATE: round(late_s * 1e6)}
+    print(json.dumps(outcome), flush=True)
     time.sleep(600)  # the connections stay, and with them what publishers keep
 
 

@@ -4,7 +4,7 @@
 
 Every truck has a road of its own with five bridges, one every 14 s: 84 crossings a minute, far
 more than two cores identify. Logger and worker are processes of the command `driveby`, all trucks
-are this one. Told is how long a message waits at most before the worker looks at it, how many
+are this one. Printed is how long a message waits at most before the worker looks at it, how many
 crossings it identifies in a minute by method `pre` while the trucks drive, and what is left for
 later.
 """
@@ -125,7 +125,7 @@ def measure(folder: Path, *, trucks: int, seconds: float, processes: int) -> Loa
     site = site_of(trucks)
     fleet.site.write_text(site_toml(site))
     drives = [drive_of(truck, site, seconds) for truck in range(trucks)]
-    told: dict[str, float] = {}
+    outcome: dict[str, float] = {}
     lags, left = [0.0], 0.0
     latest_s = 0.0
     try:
@@ -153,7 +153,7 @@ def measure(folder: Path, *, trucks: int, seconds: float, processes: int) -> Loa
                 listened = time.monotonic() + 0.2
                 while (one := estimates.receive()) is not None:
                     name = pb.Estimate.FromString(one.payload).crossing_id
-                    told.setdefault(name, time.monotonic() - began)
+                    outcome.setdefault(name, time.monotonic() - began)
                 while (one := healths.receive()) is not None:
                     health = pb.Health.FromString(one.payload)
                     if health.service != "worker":
@@ -163,7 +163,7 @@ def measure(folder: Path, *, trucks: int, seconds: float, processes: int) -> Loa
             publisher.close()
     finally:
         fleet.close()
-    times = sorted(told.values())
+    times = sorted(outcome.values())
     span_s = times[-1] - times[0] if len(times) > 1 else 0.0
     driven = trucks * int((seconds * SPEED_M_PER_S - _LEAD_M - 65.0) / APART_M + 1)
     rate = 60.0 * (len(times) - 1) / span_s if span_s else 0.0

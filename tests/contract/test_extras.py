@@ -254,8 +254,8 @@ def test_an_import_of_ros_2_needs_its_extra_only(tmp_path: Path) -> None:
 
 
 def test_a_cluster_needs_two_extras(tmp_path: Path) -> None:
-    told = run("identify,cluster", "cluster", "--tls", f"{tmp_path}/none", code=2)
-    assert f"{tmp_path}/none" in told
+    printed = run("identify,cluster", "cluster", "--tls", f"{tmp_path}/none", code=2)
+    assert f"{tmp_path}/none" in printed
 
 
 def test_tables_need_the_extra_of_notebooks() -> None:

@@ -94,11 +94,11 @@ def contents(into: Path) -> list[str]:
 
 def results_of(path: Path) -> dict[str, Any]:
     """A results file without what may differ between two runs: when, and how long it took."""
-    told = load_results(path).model_dump(mode="json")
-    del told["created"]
-    for crossing in told["crossings"]:
+    published = load_results(path).model_dump(mode="json")
+    del published["created"]
+    for crossing in published["crossings"]:
         crossing["diagnostics"].pop("seconds", None)
-    return told
+    return published
 
 
 def of(recordings: Sequence[Path], *options: str) -> list[str]:

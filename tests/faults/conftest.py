@@ -36,7 +36,7 @@ class Truck:
         """By boot_id the last sequence of accel."""
         self.last_line = ""
         self.is_driving = True
-        """Until it is killed or told to end."""
+        """Whether it has neither been killed nor stopped."""
         spool = fleet.folder / "spool" / vehicle
         self.process = fleet.python(
             "truck_process.py",

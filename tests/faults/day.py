@@ -10,9 +10,9 @@ and once it is away for longer than a truck's history (seconds of the drive). Th
 that was driven must have one result, in its order, and nothing else may have one.
 
 The live view is killed, too, at a random moment before the worker is for the first time: a worker
-that is there tells a new view all that it has told so far. So the view that follows must show each
-crossing of the eight bridges that it draws, those that it met first, once and with a verdict. What
-it shows is read as a viewer reads it, by one that writes what it gets into a file.
+that is there publishes to a new view all that it has published so far. So the view that follows
+must show each crossing of the eight bridges that it draws, those that it met first, once and with a
+verdict. What it shows is read as a viewer reads it, by one that writes what it gets into a file.
 """
 
 import argparse
@@ -388,7 +388,7 @@ def problems_of_view(picture: Picture, plans: dict[str, Plan]) -> list[str]:
     return found
 
 
-class Told(NamedTuple):
+class DayOutcome(NamedTuple):
     """What a day came to."""
 
     crossings: int
@@ -407,24 +407,24 @@ def problems_of(plans: dict[str, Plan], results: Sequence[pb.Estimate]) -> list[
     found = []
     for vehicle, plan in plans.items():
         theirs = sorted((r for r in results if r.vehicle == vehicle), key=lambda r: r.entry_time_ns)
-        told = [
+        published = [
             Crossed(r.bridge, "start_to_end" if r.direction == pb.START_TO_END else "end_to_start")
             for r in theirs
         ]
         if len({r.crossing_id for r in theirs}) != len(theirs):
             found.append(f"{vehicle}: a crossing has two results")
-        if told != plan.crossings:
+        if published != plan.crossings:
             first = next(
                 (
                     n
-                    for n, pair in enumerate(zip(told, plan.crossings, strict=False))
+                    for n, pair in enumerate(zip(published, plan.crossings, strict=False))
                     if pair[0] != pair[1]
                 ),
-                min(len(told), len(plan.crossings)),
+                min(len(published), len(plan.crossings)),
             )
             found.append(
-                f"{vehicle}: {len(told)} results of {len(plan.crossings)} crossings, the first "
-                f"difference at number {first}: {told[first : first + 3]} for "
+                f"{vehicle}: {len(published)} results of {len(plan.crossings)} crossings, the "
+                f"first difference at number {first}: {published[first : first + 3]} for "
                 f"{plan.crossings[first : first + 3]}"
             )
     others = {r.vehicle for r in results} - set(plans)
@@ -442,8 +442,8 @@ def live(
     seed: int,
     method: str = "least-squares",
     processes: int = 1,
-) -> Told:
-    """Drive, kill, wait until all is told, and compare."""
+) -> DayOutcome:
+    """Drive, kill, wait until all is published, and compare."""
     felt = drives()
     plans = {
         name: write_drive(folder / f"{name}.mcap", name, felt, rounds, bridges) for name in TRUCKS
@@ -510,7 +510,7 @@ def live(
         problems.append(fleet.logs())
     shown, to_show = picture.verdicts.total(), driven_in(picture, plans).total()
     counts = (wanted, len(results), shown, to_show, kills)
-    return Told(*counts, seconds, longest_backlog, problems)
+    return DayOutcome(*counts, seconds, longest_backlog, problems)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -528,7 +528,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     folder = options.folder or Path(tempfile.mkdtemp(prefix="driveby-day-"))
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        told = live(
+        outcome = live(
             folder,
             rounds=max(1, round(60.0 * options.minutes / round_s)),
             bridges=_ON_THE_ROAD,
@@ -543,14 +543,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.folder is None:
             shutil.rmtree(folder)
     print(
-        f"{told.crossings} crossings, {told.results} results; of {told.to_show} on the bridges "
-        f"that it draws the live view shows {told.shown}; {told.kills} kills of the worker, one of "
-        f"the view, "
-        f"{told.seconds:.0f} s; {told.longest_backlog} were left when the trucks had arrived"
+        f"{outcome.crossings} crossings, {outcome.results} results; of {outcome.to_show} on the "
+        f"bridges that it draws the live view shows {outcome.shown}; {outcome.kills} kills of the "
+        f"worker, one of the view, {outcome.seconds:.0f} s; {outcome.longest_backlog} were left "
+        "when the trucks had arrived"
     )
-    for problem in told.problems:
+    for problem in outcome.problems:
         print(problem)
-    return 1 if told.problems else 0
+    return 1 if outcome.problems else 0
 
 
 if __name__ == "__main__":

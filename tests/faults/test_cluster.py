@@ -211,8 +211,8 @@ def test_killed_process_loses_no_result(
     assert running.wait() == 0, running.said()
     assert results_of(path) == of_one_process
     assert len(contents(into)) == len(set(contents(into))) == CROSSINGS
-    is_told = "scheduler tcp://" in running.said()
-    assert is_told == (whom == "scheduler"), running.said()
+    is_reported = "scheduler tcp://" in running.said()
+    assert is_reported == (whom == "scheduler"), running.said()
 
 
 @pytest.mark.faults
@@ -454,11 +454,11 @@ def test_client_retries_while_a_worker_is_frozen(
         os.kill(worker, signal.SIGSTOP)
         options = on(one.cluster, into, "--json", str(path))
         running = begin(*of(recordings, *options), DRIVEBY_TEST_CALL_S="2")
-        told = "could not ask for its workers' versions"
-        until(lambda: told in running.said() or running.process.poll() is not None)
+        published = "could not ask for its workers' versions"
+        until(lambda: published in running.said() or running.process.poll() is not None)
         os.kill(worker, signal.SIGCONT)
         assert running.wait() == 0, running.said()
-    assert told in running.said()
+    assert published in running.said()
     assert results_of(path) == of_one_process
 
 

@@ -25,21 +25,21 @@ pytestmark = pytest.mark.process
 def test_every_crossing_has_one_result_although_the_worker_is_killed(tmp_path: Path) -> None:
     """Four bridges of the road and the one beside them, there and back, at twelve times the speed:
     what the worker cannot keep up with waits."""
-    told = live(tmp_path, rounds=1, bridges=4, speed=12.0, kills=1, away_s=0.0, seed=1)
-    assert told.problems == []
-    assert told.crossings == told.results == 16
-    assert told.shown == told.to_show > 0
+    published = live(tmp_path, rounds=1, bridges=4, speed=12.0, kills=1, away_s=0.0, seed=1)
+    assert published.problems == []
+    assert published.crossings == published.results == 16
+    assert published.shown == published.to_show > 0
 
 
 @pytest.mark.faults
 @pytest.mark.timeout(1200)
 def test_killed_five_times_and_away_for_longer_than_a_history(tmp_path: Path) -> None:
-    told = live(tmp_path, rounds=3, bridges=9, speed=8.0, kills=5, away_s=600.0, seed=2)
-    assert told.problems == []
-    assert told.crossings == told.results == 108
+    published = live(tmp_path, rounds=3, bridges=9, speed=8.0, kills=5, away_s=600.0, seed=2)
+    assert published.problems == []
+    assert published.crossings == published.results == 108
     # It draws the first eight of twelve bridges that a truck comes near: two of these nobody
     # crosses, and two half as often as the others.
-    assert told.shown == told.to_show >= 60
+    assert published.shown == published.to_show >= 60
 
 
 def test_the_day_sees_what_is_missing_twice_or_invented() -> None:

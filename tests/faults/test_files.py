@@ -76,7 +76,7 @@ def events_of(path: Path) -> list[EventKind]:
 
 
 class Faulty:
-    """A file whose disk fails as it is told: the lowest place where that can happen."""
+    """A file whose disk fails on request: the lowest place where that can happen."""
 
     def __init__(self, path: Path, write: Callable[[BinaryIO, memoryview], int]) -> None:
         self._file = path.open("xb", buffering=0)

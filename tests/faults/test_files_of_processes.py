@@ -116,12 +116,14 @@ def kill_and_recover(one: Fleet, rng: random.Random, kills: int) -> None:
     alone = [path for path in crashed if not recovered_path(path).exists()]
     assert not any(map(holds_something, alone))
     for path in recovered:
-        assert EventKind.RECORDING_RECOVERED in told_by("recover", [path])
+        assert EventKind.RECORDING_RECOVERED in reported_by("recover", [path])
     if kills == 1:  # else the logger may be killed before it has written down what it recovered
-        assert told_by("logger", files(one)).count(EventKind.RECORDING_RECOVERED) == len(recovered)
+        assert reported_by("logger", files(one)).count(EventKind.RECORDING_RECOVERED) == len(
+            recovered
+        )
 
 
-def told_by(service: str, paths: Iterable[Path]) -> list[EventKind]:
+def reported_by(service: str, paths: Iterable[Path]) -> list[EventKind]:
     return [
         decode_event(message.payload).kind
         for path in paths

@@ -87,18 +87,18 @@ def test_what_was_in_a_file_that_is_gone_is_not_called_durable(
     writer.finish("done", {})
     assert writer.failure is None
     assert found is not None
-    [told] = [decode_event(message.payload) for message in writer.said]
-    assert told.kind == EventKind.RECORDING_GONE
+    [published] = [decode_event(message.payload) for message in writer.said]
+    assert published.kind == EventKind.RECORDING_GONE
     ours = [p for p in folder.glob("live/*/*.mcap") if p.read_bytes()[:5] == b"\x89MCAP"]
     if harm is move:
-        assert f"{path.name} was moved by somebody else" in told.text
+        assert f"{path.name} was moved by somebody else" in published.text
         assert (found.count, found.sequence) == (150, 149)
         moved = tmp_path / "moved.mcap"
         assert (read_info(moved).end or {})["reason"] == "moved"
         ours.append(moved)
     else:
-        assert told.messages == 100
-        assert "100 messages are gone, 100 of them were confirmed as durable" in told.text
+        assert published.messages == 100
+        assert "100 messages are gone, 100 of them were confirmed as durable" in published.text
         assert found.count == 50
         assert not found.HasField("sequence")
         [gone] = writer.withdrawn
@@ -119,7 +119,7 @@ def test_what_was_in_a_file_that_is_gone_is_not_called_durable(
 def test_a_live_recording_that_is_deleted_comes_again_from_the_trucks(
     fleet: Callable[..., Any],
 ) -> None:
-    """What trucks had been told is on the disk they still have for a while."""
+    """Trucks keep for a while what `durable` had reported to be on the disk."""
     one = fleet()
     one.start_logger()
     truck = one.start_truck(rate=50.0)

@@ -33,7 +33,7 @@ def fix(vehicle: str, realm: str, sequence: int) -> Message:
 
 
 def test_files_of_one_vehicle_in_many_realms_leave_room_for_the_others(tmp_path: Path) -> None:
-    """What has no file is told with its cause, and may come again: it is not taken for seen."""
+    """A message without a file is reported with its cause, and may come again."""
     writer = FileWriter(RecordingTarget(tmp_path, None, None, None))
     for number in range(300):
         for sequence in range(3):
@@ -66,7 +66,7 @@ def test_too_many_vehicles_are_reported(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.process
 def test_a_truck_in_300_realms_costs_another_one_nothing(fleet: Callable[..., Any]) -> None:
-    """889 of 1,669 messages of others were lost, because 256 files were open; nobody was told."""
+    """889 of 1,669 messages of others were lost, because 256 files were open, without a report."""
     one = fleet()
     one.start_logger()
     with open_session(connect=one.logger_endpoint, timeout_s=LONGEST_S) as session:
@@ -82,7 +82,7 @@ def test_a_truck_in_300_realms_costs_another_one_nothing(fleet: Callable[..., An
         for publisher in publishers:
             publisher.close()
     one.logger.terminate()
-    assert one.logger.wait(timeout=LONGEST_S) == 1  # something was dropped, and is told
+    assert one.logger.wait(timeout=LONGEST_S) == 1  # something was dropped, and is reported
     numbers, twice = one.recorded()
     assert twice == 0
     for (vehicle, _, _), found in numbers.items():

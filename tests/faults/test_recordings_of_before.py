@@ -55,17 +55,17 @@ def crashed(path: Path, number: int = 50, *, every: int = 10) -> list[Message]:
 def kept(
     folder: Path, *, budget_bytes: int | None = None, min_free_bytes: int = 0
 ) -> list[tuple[str, Event]]:
-    """Keep house until it says no more; return what was told."""
-    told: list[tuple[str, Event]] = []
+    """Keep house until it is idle; return what was reported."""
+    reported: list[tuple[str, Event]] = []
 
-    def tell(realm: str, event: Event) -> None:
-        told.append((realm, event))
+    def report(realm: str, event: Event) -> None:
+        reported.append((realm, event))
 
-    house = RetentionPolicy(folder, ["*"], min_free_bytes, budget_bytes, tell)
+    house = RetentionPolicy(folder, ["*"], min_free_bytes, budget_bytes, report)
     keeper = Housekeeping(house)
     until(lambda: not keeper.is_busy, "the end of the housekeeping")
     keeper.close()
-    return told
+    return reported
 
 
 def test_what_crashed_is_recovered_and_set_aside(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_what_crashed_is_recovered_and_set_aside(tmp_path: Path) -> None:
     elsewhere.write_bytes(content)
     (day / "truck-2-20260101T000000Z.mcap").write_bytes(b"")
     living = RecordingWriter(day / "truck-3.mcap", reason="test")
-    told = kept(tmp_path)
+    reported = kept(tmp_path)
     living.abandon()
     assert sorted(p.name for p in day.iterdir()) == [
         "truck-1-20260101T000000Z.mcap.crashed",
@@ -93,12 +93,12 @@ def test_what_crashed_is_recovered_and_set_aside(tmp_path: Path) -> None:
     assert [m for m in read_messages(recovered) if m.key.owner == "vehicle"] == messages
     assert is_closed(recovered)
     assert elsewhere.read_bytes() == content
-    assert [(realm, event.kind, event.messages) for realm, event in told] == [
+    assert [(realm, event.kind, event.messages) for realm, event in reported] == [
         ("live", EventKind.RECORDING_RECOVERED, 50),
         ("live", EventKind.RECORDING_RECOVERED, 0),
     ]
-    assert "50 messages recovered" in told[0][1].text
-    assert "holds nothing" in told[1][1].text
+    assert "50 messages recovered" in reported[0][1].text
+    assert "holds nothing" in reported[1][1].text
     assert kept(tmp_path)[0][1].text.startswith("truck-3.mcap")  # whose writer is gone now
 
 
@@ -209,11 +209,14 @@ def test_a_budget_deletes_the_oldest_that_may_go_and_nothing_else(
     sizes = {path.name: path.stat().st_size for path in day.glob("*.mcap")}
     assert kept(tmp_path, budget_bytes=sum(sizes.values())) == []
     budget = sum(sizes.values()) - sizes["1-far-away.mcap"] - 10
-    told = kept(tmp_path, budget_bytes=budget)
-    assert [event.kind for _, event in told] == [EventKind.RECORDING_DELETED] * 2
-    assert [event.text.split()[0] for _, event in told] == ["1-far-away.mcap", "2-far-away.mcap"]
-    told = kept(tmp_path, budget_bytes=1)
-    assert [event.kind for _, event in told] == [
+    reported = kept(tmp_path, budget_bytes=budget)
+    assert [event.kind for _, event in reported] == [EventKind.RECORDING_DELETED] * 2
+    assert [event.text.split()[0] for _, event in reported] == [
+        "1-far-away.mcap",
+        "2-far-away.mcap",
+    ]
+    reported = kept(tmp_path, budget_bytes=1)
+    assert [event.kind for _, event in reported] == [
         EventKind.RECORDING_DELETED,
         EventKind.DISK_LOW,
     ]
@@ -224,8 +227,8 @@ def test_a_budget_deletes_the_oldest_that_may_go_and_nothing_else(
     ]
     results = tmp_path / "sim-drive" / "results-1.mcap"
     write_recording(results, [crossing(pb.DONE, SAMPLE)], site_toml=None, reason="test")
-    told = kept(tmp_path, budget_bytes=1)
-    assert "0-with-crossing.mcap" in told[0][1].text
+    reported = kept(tmp_path, budget_bytes=1)
+    assert "0-with-crossing.mcap" in reported[0][1].text
     assert results.exists()
     living.abandon()
 

@@ -215,7 +215,7 @@ def test_a_stretch_of_zeros_costs_only_what_it_covers(
 
 
 def test_index_gives_the_message_count_of_a_damaged_chunk(whole: Whole, tmp_path: Path) -> None:
-    content = bytearray(whole.content[: whole.data_end])  # no END that would tell
+    content = bytearray(whole.content[: whole.data_end])  # no END that would show it
     content[whole.chunks[5].begin + 80] ^= 0xFF
     content[whole.chunks[9].begin + 80] ^= 0xFF
     recovery, data = recovered(damaged(tmp_path, bytes(content)))

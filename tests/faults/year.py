@@ -107,7 +107,7 @@ def year(out: Path, seed: int, weeks: int = WEEKS) -> int:
 
 
 def _done(words: list[str]) -> bool:
-    """Run a command; what it says is told only if it fails."""
+    """Run a command; print its output only if it fails."""
     with contextlib.redirect_stdout(io.StringIO()) as said:
         code = cli.main(words)
     if code != 0:

@@ -226,7 +226,7 @@ def test_driving_back_over_the_mirrored_bridge_feels_the_same() -> None:
     )
     asymmetric = simulate(car, beam, back, under_wheels(road_back, back, 4.4, -1), 0.001)
     difference = np.abs(one.acceleration_m_per_s2 - asymmetric.acceleration_m_per_s2).max(axis=0)
-    assert np.all(difference > 1e-3 * scale)  # the bridge that is not mirrored is told apart
+    assert np.all(difference > 1e-3 * scale)  # the bridge that is not mirrored is distinguished
 
 
 def test_coupling_tolerance(measured: Agree) -> None:

@@ -132,7 +132,7 @@ def test_roads_that_differ_are_noise_at_the_truth() -> None:
     assert 0.8 < with_noise.chi2_per_dof < 1.25
     one_road = drawn._replace(truth=drawn.truth._replace(paths=None))
     assert bound_of(*at_truth(seen, one_road), 0.0).chi2_per_dof > 10.0
-    # Twin tyres tell hardly anything of the elements; several runs in one track more, and less
+    # Twin tyres hardly observe the elements; several runs in one track more, and less
     # more than as many independent ones would.
     lengths_m = np.array(world.site.bridges[0].lengths_m)
     once, often, apart = (

@@ -11,19 +11,19 @@ from tests.numerics.test_fusion import PRIORS, crossing_of, root
 FloatArray = NDArray[np.float64]
 
 SURE = 1e-3
-"""How closely a crossing tells the truck's unknown, in standard deviations of its prior."""
+"""Precision of the truck's unknown in a crossing, in standard deviations of its prior."""
 
 
 def by_truck(
     number: int, unknown: float, std: float = SURE, truck: str = "truck", c: float = 1.0
 ) -> FusionInput:
     """A crossing by a truck whose one unknown is so, over a bridge of compliance `c`."""
-    told = root()
-    told[5, 5] = 1.0 / std
+    information_root = root()
+    information_root[5, 5] = 1.0 / std
     # What is found of the bridge depends on the truck.
-    told[2:5, 5] = 3.0
+    information_root[2:5, 5] = 3.0
     rng = np.random.default_rng(40 + number)
-    return crossing_of(number, np.array([0.0, 0.4, c, c, c, unknown]), told, rng, truck)
+    return crossing_of(number, np.array([0.0, 0.4, c, c, c, unknown]), information_root, rng, truck)
 
 
 def named(*numbers: int) -> VehicleConsistency:

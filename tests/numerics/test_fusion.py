@@ -131,14 +131,18 @@ GAIN = Coordinates(("common_gain",), np.ones(1), np.array([0.01]), np.array([Tru
 
 
 def crossing_of(
-    number: int, x: FloatArray, told: FloatArray, rng: np.random.Generator, truck: str = "truck"
+    number: int,
+    x: FloatArray,
+    information_root: FloatArray,
+    rng: np.random.Generator,
+    truck: str = "truck",
 ) -> FusionInput:
-    """A crossing that tells (bridge, gain) x (6,) with a root `told` (6, 6) of its precision."""
+    """Return a crossing that observes bridge and gain x (6,), with a root (6, 6) of precision."""
     return FusionInput(
         f"crossing-{number:03d}",
         CrossingLikelihood(
-            told,
-            told @ x + rng.standard_normal(6),
+            information_root,
+            information_root @ x + rng.standard_normal(6),
             coordinates(),
             GAIN,
             np.zeros(0),
@@ -153,7 +157,7 @@ def crossing_of(
 
 
 def root(std: float = 0.03) -> FloatArray:
-    """Elements that trade with their neighbours, a gain that is hardly told."""
+    """Elements that trade with their neighbours, a gain that is hardly observed."""
     precision = np.diag([1.0, 4.0, std**-2, std**-2, std**-2, 0.01])
     for i in range(2, 4):
         precision[i, i + 1] = precision[i + 1, i] = 0.4 * std**-2
@@ -175,7 +179,7 @@ def test_the_order_of_crossings_does_not_matter() -> None:
 
 
 def test_a_prior_counts_once() -> None:
-    """Crossings that tell nothing leave the prior, however many."""
+    """Crossings without information leave the prior, however many."""
     rng = np.random.default_rng(2)
     parts = [crossing_of(i, np.zeros(6), 1e-6 * np.eye(6), rng) for i in range(20)]
     found = elements(fuse(parts, PRIORS, 500, 3))
@@ -260,12 +264,15 @@ def test_runs_over_a_real_road(
     assert len(runs) == count
     problem = runs[0].problem
     where = layout(problem)
-    told = [likelihood(run) for run in runs]
+    information_root = [likelihood(run) for run in runs]
     footprints = problem.mismatch.shapes.footprints
-    parts = [FusionInput(f"{i:02d}", of, "truck", 1, footprints, 0.01) for i, of in enumerate(told)]
+    parts = [
+        FusionInput(f"{i:02d}", of, "truck", 1, footprints, 0.01)
+        for i, of in enumerate(information_root)
+    ]
     powers = mass_powers(7)[np.flatnonzero(problem.priors.estimated)][where.bridge]
     odds = log_odds_of_absence(problem)[where.bridge]
-    fused = fuse(parts, BridgePriors(told[0].bridge, powers, odds, 7), 150, 1)
+    fused = fuse(parts, BridgePriors(information_root[0].bridge, powers, odds, 7), 150, 1)
     priors = problem.priors
     ln_ei: NDArray[np.float64] = (
         np.log(priors.theta[EI_1:])

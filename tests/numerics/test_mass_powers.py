@@ -1,4 +1,4 @@
-"""Accelerations do not tell a truck from a heavier one on a bridge that is as much stiffer."""
+"""Accelerations are the same for a heavier truck on a bridge that is as much stiffer."""
 
 from collections import defaultdict
 

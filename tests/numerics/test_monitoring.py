@@ -212,8 +212,8 @@ def test_usual_movements_are_found_by_their_size_and_their_slowness() -> None:
                 moves += 0.015 * np.sqrt(0.5) * rng.standard_normal((weeks, 1))
             if kind == "wander":
                 moves = wandering(rng, weeks, 0.015, 26.0)
-            told = detect_change(with_moves(series(rng, weeks=weeks), moves), AlarmRules())
-            found.append((told.usual_change, told.usual_wander))
+            outcome = detect_change(with_moves(series(rng, weeks=weeks), moves), AlarmRules())
+            found.append((outcome.usual_change, outcome.usual_wander))
     quiet, white, wander = np.array(found).reshape(3, 3, 2).mean(axis=1)
     assert quiet.max() < 0.006
     assert white == pytest.approx([0.015, 0.0], abs=0.006)
@@ -281,9 +281,9 @@ def test_ratios_are_those_of_a_filter_that_knows_of_the_change() -> None:
     for number, period in enumerate(periods):
         states.append(state)
         state, kept = predict_state(state, period.time_days)
-        told = filter_step(state, period)
-        state, weight = update_state(state, told)
-        chart = update_chart(chart, number, kept, wander, weight, told, 1.0)
+        outcome = filter_step(state, period)
+        state, weight = update_state(state, outcome)
+        chart = update_chart(chart, number, kept, wander, weight, outcome, 1.0)
     _, log = log_ratio(chart, state, len(periods) - 1)
     assert chart.begins[-8:] == tuple(range(22, 30))
     for at, since in enumerate(chart.begins):
@@ -306,12 +306,12 @@ def evidence(state: BaselineState, periods: list[Period]) -> float:
     total = 0.0
     for period in periods:
         state, _ = predict_state(state, period.time_days)
-        told = filter_step(state, period)
-        apart = np.linalg.solve(told.covariance, told.value[:, :, None])[:, :, 0]
-        log = -0.5 * np.sum(apart * told.value, axis=1)
-        log = log - 0.5 * np.linalg.slogdet(told.covariance)[1]
+        outcome = filter_step(state, period)
+        apart = np.linalg.solve(outcome.covariance, outcome.value[:, :, None])[:, :, 0]
+        log = -0.5 * np.sum(apart * outcome.value, axis=1)
+        log = log - 0.5 * np.linalg.slogdet(outcome.covariance)[1]
         total += float(np.log(np.sum(np.exp(state.log_weight + log))))
-        state, _ = update_state(state, told)
+        state, _ = update_state(state, outcome)
     return total
 
 
@@ -468,8 +468,8 @@ def test_plain_series_against_skchange() -> None:
             for week, one in enumerate(values)
         ]
         found = detect_change(periods, AlarmRules(0.1, at_least=0.0)).change
-        told = PELT().fit(values[:, None] / 0.03).predict(values[:, None] / 0.03)
-        theirs = np.asarray(told).ravel().tolist()
+        outcome = PELT().fit(values[:, None] / 0.03).predict(values[:, None] / 0.03)
+        theirs = np.asarray(outcome).ravel().tolist()
         assert (found is not None) == has_changed
         if found is not None:
             agree += abs(theirs[0] - found.since) <= 2

@@ -451,7 +451,7 @@ def test_stopping_early_changes_no_decision(
 def test_one_particle_below_its_limit_keeps_four_going(
     paper_case: tuple[Case, PaperWindow], lane: int
 ) -> None:
-    """And the three that have passed theirs are told so all the same."""
+    """And the three that have passed theirs are reported so all the same."""
     case, window = paper_case
     work = workspace(window)
     thetas = perturbed(case.truth, 4, seed=2)

@@ -1,7 +1,7 @@
 """A small part of `make validate`: are the intervals of method `pre` true?
 
-Few crossings tell little: limits are those that true intervals miss once in thousands of runs. The
-whole is on docs/validation.md.
+Few crossings have little power: limits are those that true intervals miss once in thousands of
+runs. The whole is on docs/validation.md.
 """
 
 from functools import partial

@@ -99,7 +99,7 @@ def test_result_says_all_that_the_contract_asks(found: Found, crossing: Crossing
     assert crossing.parameters is not None
     assert {"r_hat", "ess", "acceptance", "iterations", "seconds"} <= set(crossing.diagnostics)
     # Total mass 1 %; common gain 1 % and the mean of four gains of 1 % each, less what the static
-    # load tells of them. (The draws' standard deviation has an error of 2 %.)
+    # load observes of them. (The draws' standard deviation has an error of 2 %.)
     assert crossing.scale_error is not None
     assert 0.01 < crossing.scale_error < 1.06 * np.sqrt(0.01**2 + 0.01**2 + 0.005**2)
     assert crossing.covariance is not None
@@ -128,7 +128,7 @@ def test_result_says_all_that_the_contract_asks(found: Found, crossing: Crossing
 @pytest.mark.slow
 def test_deflection_is_that_of_the_simulation(found: Found) -> None:
     """Within its interval, which is narrower than the common gain's own prior spread of 1.1 %: the
-    weight of the truck, which no sensor measures, tells of both."""
+    weight of the truck, which no sensor measures, determines both."""
     derived = found.results.crossings[0].derived
     assert derived is not None
     deflection = derived.max_deflection_m

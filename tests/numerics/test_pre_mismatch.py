@@ -166,7 +166,7 @@ def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
     road = of_level(level)
     right, wrong = truck(), truck(unknown, 0.01)
     wheelbase = paper_site().vehicles[0].wheelbase_m
-    told = mismatch_power(
+    expected_power = mismatch_power(
         rows, [right, wrong], np.zeros((2, 4)), np.zeros((2, 4)), QUIET, no_force_noise(),
         road, wheelbase, [0],
     )[0]  # fmt: skip
@@ -197,12 +197,12 @@ def test_pull_of_the_mismatch_against_drawn_spectra(unknown: int) -> None:
     weight = np.linalg.inv(np.moveaxis(spectrum, 2, 0))
     drawn = np.einsum("isf,fij,jsf->sf", seen.conj(), weight, change).real / SPEED
     mean, error = drawn.mean(), drawn.mean(axis=1).std() / np.sqrt(drawn.shape[0])
-    assert abs(told) > 5e-5
-    assert mean == pytest.approx(told, abs=4.0 * error + 0.1 * abs(told))
+    assert abs(expected_power) > 5e-5
+    assert mean == pytest.approx(expected_power, abs=4.0 * error + 0.1 * abs(expected_power))
 
 
 def test_draws_of_compliances_against_quadrature() -> None:
-    """An element told poorly, and a bearing that may give or not."""
+    """A poorly observed element, and a bearing that may give or not."""
     precision = np.array([[6.0, 2.0], [2.0, 3.0]])
     linear = np.array([8.0, 3.5])
     sigma, odds = 0.55, -0.3

@@ -70,7 +70,7 @@ def test_at_the_truth_little_of_the_noise_is_left(
 
 
 def test_modes_keep_their_signs_from_bridge_to_bridge(truth: Case) -> None:
-    """How a mode swings is told by its coordinate: it must not turn round with the next bridge."""
+    """The coordinate of a mode fixes how it swings: it must not turn round with the next bridge."""
     basis = crossing(truth).basis
     rng = np.random.default_rng(4)
     for _ in range(20):

@@ -33,7 +33,7 @@ def simulated(wander_m: float = 0.12, *, is_surface: bool = True) -> CrossingSim
 
 
 @cache
-def told(
+def information(
     wander_m: float = 0.12, *, is_surface: bool = True
 ) -> tuple[PlannedPathGroup, BridgePrior]:
     one = simulated(wander_m, is_surface=is_surface)
@@ -41,12 +41,12 @@ def told(
 
 
 def precision(crossings: float, wander_m: float = 0.12, *, is_surface: bool = True) -> np.ndarray:
-    track, known = told(wander_m, is_surface=is_surface)
+    track, known = information(wander_m, is_surface=is_surface)
     return survey_information([track], crossings, known.log_odds.size)
 
 
 def of_elements(matrix: np.ndarray) -> np.ndarray:
-    """What is told of each element where all others are known."""
+    """Return the information on each element where all others are known."""
     return np.diag(matrix)[-7:]
 
 
@@ -81,17 +81,17 @@ def test_what_tracks_share_is_not_averaged_out() -> None:
     few, many = (of_elements(precision(n)) for n in (1, 100))
     assert np.all(many > few)
     assert np.all(many < 10.0 * few)
-    # On one groove nothing is shared: a hundred crossings tell a hundred times as much.
+    # On one groove nothing is shared: a hundred crossings have a hundred times the information.
     groove = [of_elements(precision(n, is_surface=False)) for n in (1, 100)]
     np.testing.assert_allclose(groove[1] / groove[0], 100.0, rtol=1e-9)
     # In the other lane the mismatch is another one.
-    track, known = told()
+    track, known = information()
     apart = survey_information([track, track], 200.0, known.log_odds.size)
     np.testing.assert_allclose(of_elements(apart) / many, 2.0, rtol=1e-6)
 
 
 def test_one_crossing_on_one_groove_reaches_its_bound() -> None:
-    _, known = told(is_surface=False)
+    _, known = information(is_surface=False)
     problem, y = simulated(is_surface=False).truth(CROSSING)
     mismatch = mismatch_of(SITE.vehicles[0], PlannedRoad("A", 0.12, is_surface=False), problem)
     assert not mismatch.level_m3.any()
@@ -141,8 +141,8 @@ def test_alarms_are_as_often_as_they_say() -> None:
     ):
         truth = 1.0 + np.c_[np.zeros(draws), 0.55 * rng.standard_normal((draws, 3))]
         truth[:, 0] = 1.0 / (1.0 - loss)
-        told_c = truth + rng.standard_normal((draws, 4)) @ np.linalg.inv(root)
-        best = np.linalg.solve(matrix + prior, (told_c @ matrix + prior @ np.ones(4)).T)
+        information_c = truth + rng.standard_normal((draws, 4)) @ np.linalg.inv(root)
+        best = np.linalg.solve(matrix + prior, (information_c @ matrix + prior @ np.ones(4)).T)
         alarm = best[0] - 1.0 > 2.3263 * errors.of_nominal[0]
         assert alarm.mean() == pytest.approx(expected, abs=4.0 * np.sqrt(expected / draws) + 1e-3)
 

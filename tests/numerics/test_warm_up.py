@@ -58,12 +58,12 @@ import sys
 from pre_core.crossing import posterior
 from services.execution import warm_up
 
-def told(problem, y):
+def counted(problem, y):
     rows = real(problem, y)
     sys.stdout.write(rows.tobytes().hex())
     raise SystemExit
 
-real, posterior.all_rows = posterior.all_rows, told
+real, posterior.all_rows = posterior.all_rows, counted
 warm_up.warm_up()
 """
 

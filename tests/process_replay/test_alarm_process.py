@@ -60,7 +60,7 @@ def serving(history: Path, endpoint: str) -> "subprocess.Popen[bytes]":
     return subprocess.Popen([sys.executable, "-m", "services", *words])
 
 
-def told(session: zenoh.Session) -> list[pb.Alarm]:
+def alarms_on_bus(session: zenoh.Session) -> list[pb.Alarm]:
     """What a late subscriber gets."""
     replies = session.get(KEY, target=zenoh.QueryTarget.ALL, timeout=LONGEST_S)
     return [pb.Alarm.FromString(r.ok.payload.to_bytes()) for r in replies if r.ok is not None]
@@ -83,17 +83,20 @@ def test_an_alarm_stands_on_the_bus_until_it_is_acknowledged(tmp_path: Path, end
         try:
             for _ in range(2):  # and again behind a restart
                 processes.append(serving(history, endpoint))
-                until(lambda: told(router), "the alarm")
-                (message,) = told(router)
+                until(lambda: alarms_on_bus(router), "the alarm")
+                (message,) = alarms_on_bus(router)
                 assert (message.alarm_id, message.is_acknowledged) == (ALARM.alarm_id, False)
                 assert message.text == ALARM.sentence()
                 ended(processes[-1])
             processes.append(serving(history, endpoint))
-            until(lambda: told(router), "the alarm")
+            until(lambda: alarms_on_bus(router), "the alarm")
             words = ["alarm", "ack", "bridge-2", "--by", "owner", "--note", "props were put in"]
             assert cli.main([*words, "--history", str(history)]) == 0
-            until(lambda: [m for m in told(router) if m.is_acknowledged], "its acknowledgement")
-            (message,) = told(router)
+            until(
+                lambda: [m for m in alarms_on_bus(router) if m.is_acknowledged],
+                "its acknowledgement",
+            )
+            (message,) = alarms_on_bus(router)
             assert (message.acknowledged_by, message.note) == ("owner", "props were put in")
             ended(processes[-1])
         finally:
@@ -102,7 +105,7 @@ def test_an_alarm_stands_on_the_bus_until_it_is_acknowledged(tmp_path: Path, end
                 process.wait()
 
 
-class Told:
+class RunningCommand:
     """A command that runs until its end is wanted, and the lines that it has said."""
 
     def __init__(self, *words: str) -> None:
@@ -135,7 +138,7 @@ class Told:
         assert found, self.lines
         return found[0]
 
-    def __enter__(self) -> "Told":
+    def __enter__(self) -> "RunningCommand":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -153,7 +156,7 @@ class Told:
 
 
 def texts_of(address: str, path: Path) -> list[str]:
-    """What a viewer that comes now is told of the bridge, one text after the other."""
+    """Texts of the bridge that a viewer which comes now receives, one text after the other."""
     command = [viewer_program(), address, "--save", str(path), "--port", str(free_port())]
     path.unlink(missing_ok=True)
     saving = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -222,8 +225,8 @@ def test_history_reaches_the_watchers(
     stands = r"alarm of bridge-1: element 4 is \d+ % weaker than before 2025-04.*: stands$"
     noted = r"alarm of bridge-1: element 4 is .*: acknowledged by the owner$"
     with (
-        Told("watch", *realm) as early,
-        Told("view", "live", "--serve", *realm, *site) as view,
+        RunningCommand("watch", *realm) as early,
+        RunningCommand("view", "live", "--serve", *realm, *site) as view,
         open_session(connect=endpoint, timeout_s=LONGEST_S) as bus,
     ):
         address = view.says("live at ").split()[4].rstrip(";")
@@ -237,10 +240,10 @@ def test_history_reaches_the_watchers(
             return [text.startswith("### Alarm\n\n**Element 4 is ") for text in found]
 
         assert not any(shown())
-        with Told(*serve) as serving:
+        with RunningCommand(*serve) as serving:
             serving.says("bridge-1: element 4 is .*: stands")
             early.says(stands)
-            with Told("watch", *realm) as late:
+            with RunningCommand("watch", *realm) as late:
                 late.says(stands)
             with terminal("watch", *realm) as screen:
                 drawn(screen, r"\x1b\[1;31malarm of bridge-1: stands; element 4 is")
@@ -252,12 +255,18 @@ def test_history_reaches_the_watchers(
             )  # fmt: skip
             assert "acknowledged by the owner on" in done.stdout
             early.says(noted)
-            with Told("watch", *realm) as late:
+            with RunningCommand("watch", *realm) as late:
                 late.says(noted)
                 assert not any(line.endswith(": stands") for line in late.lines)
-            until(lambda: any(told := shown()) and not told[-1], "the viewer without it")
+            until(
+                lambda: any(texts := shown()) and not texts[-1],
+                "the viewer without it",
+            )
             serving.ends_well()
-        with Told(*serve) as serving, Told("watch", *realm) as late:  # over a restart, too
+        with (
+            RunningCommand(*serve) as serving,
+            RunningCommand("watch", *realm) as late,
+        ):  # over a restart, too
             late.says(noted)
             serving.ends_well()
         assert not any("bridge-2" in line for line in early.lines)
@@ -274,7 +283,7 @@ def test_a_history_that_is_away_for_a_while_ends_nothing(
     make_folder(history / "crossings")
     start_logger(start, endpoint, tmp_path / "live.mcap")
     serve = ["alarm", "serve", "--history", str(history), "--endpoint", endpoint]
-    with Told(*serve, "--every", "0.01") as serving:
+    with RunningCommand(*serve, "--every", "0.01") as serving:
         until((history / "alarms/checked.json").exists, "the first look")
         history.rename(tmp_path / "away")
         serving.says(r"history: no such folder.*; checking again in 1 s$")

@@ -51,7 +51,7 @@ def test_bad_messages_are_refused_reported_and_never_written(
     ]
     with (
         open_session(connect=endpoint, timeout_s=LONGEST_S) as stranger,
-        Subscription(stranger, selector(None, "service", "event")) as told,
+        Subscription(stranger, selector(None, "service", "event")) as outcome,
     ):
         for where, payload, attachment in bad:
             stranger.put(
@@ -66,7 +66,7 @@ def test_bad_messages_are_refused_reported_and_never_written(
 
         def all_are_reported() -> bool:
             nonlocal reported
-            if (one := told.receive(0.1)) is not None:
+            if (one := outcome.receive(0.1)) is not None:
                 event = decode_event(one.payload)
                 reported += event.messages if event.kind == EventKind.REFUSED else 0
             return reported >= len(bad)
@@ -154,8 +154,8 @@ def test_how_it_is_stands_in_the_log_as_text_and_as_json(endpoint: str, tmp_path
         assert logger.returncode == 0, log
         line = log.splitlines()[-1]
         if form == "json":
-            told = [json.loads(line) for line in log.splitlines()]
-            figures = [line["figures"] for line in told if "figures" in line][-1]
+            outcome = [json.loads(line) for line in log.splitlines()]
+            figures = [line["figures"] for line in outcome if "figures" in line][-1]
             assert {"rate_per_s", "lag_s", "queue", "lost", "recovered", "duplicates"} <= {*figures}
             assert figures["disk_free_bytes"] > 0
         else:
@@ -197,7 +197,7 @@ def test_full_disk_is_reported_and_ends_the_logger(
         assert "Traceback" not in log
         said: list[RawSample] = []
 
-        def is_told() -> bool:
+        def is_reported() -> bool:
             if (received := services.receive(0.1)) is not None:
                 said.append(received)
             return any(
@@ -205,7 +205,7 @@ def test_full_disk_is_reported_and_ends_the_logger(
                 for r in said
             )
 
-        until(is_told, "that it is not well")
+        until(is_reported, "that it is not well")
         while (received := services.receive(0.1)) is not None:
             said.append(received)
     health = [pb.Health.FromString(r.payload) for r in said if r.key_text.endswith("health")]

@@ -116,7 +116,7 @@ def test_least_squares_gives_the_reference(
 def as_another_processor(which: str, maker: ModuleType, name: str) -> dict[str, Any]:
     """What a process that computes like it makes of a source."""
     if platform.machine() != "x86_64":
-        pytest.skip("only the kernels for x86-64 can be told apart by name")
+        pytest.skip("only the kernels for x86-64 can be distinguished by name")
     settings, needed = AS_ANOTHER_PROCESSOR[which]
     if missing := set(needed) - set(Path("/proc/cpuinfo").read_text().split()):
         pytest.skip(f"this processor has no {', '.join(sorted(missing))}")

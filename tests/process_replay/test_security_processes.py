@@ -126,13 +126,13 @@ def test_a_crossing_is_identified_under_access_control(
         assert truck.wait(timeout=LONGEST_S) == 0
         heard: dict[str, bytes] = {}
 
-        def is_told() -> bool:
+        def is_reported() -> bool:
             one = results.receive(0.2)
             if one is not None:
                 heard[one.key().stream] = one.payload
             return "state" in heard
 
-        until(is_told)
+        until(is_reported)
     worker.terminate()
     assert worker.wait(timeout=LONGEST_S) == 0
     found = pb.Estimate.FromString(heard["estimate"]).parameters

@@ -88,7 +88,7 @@ def test_trucks_that_came_and_left_while_the_worker_was_away(
     folder: Path,
 ) -> None:
     """One in a recording that is closed, one in a recording that is being written; the worker is
-    killed as soon as it has told of the first, and goes on where it was."""
+    killed as soon as it has published the first, and goes on where it was."""
     drive_by()
     logger.send_signal(signal.SIGUSR1)
     drive_by()
@@ -110,7 +110,7 @@ def test_trucks_that_came_and_left_while_the_worker_was_away(
         process.communicate()
         process = begin()
         until(lambda: hears(2), "the second result")
-        until(lambda: hears(2) and len(heard) >= 2 * len(WHOLE), "all that is told")
+        until(lambda: hears(2) and len(heard) >= 2 * len(WHOLE), "all that is published")
         stop(process)
         third = begin()  # and finds nothing left to do
         until(lambda: "republished" in (third.stderr or [""]).readline(), "its start")  # type: ignore[union-attr]
@@ -152,8 +152,8 @@ def test_a_site_file_that_is_edited_while_the_worker_runs(
             one = results.receive(0.1)
             if one is not None:
                 estimate = pb.Estimate.FromString(one.payload)
-                told = estimates.setdefault(estimate.crossing_id, estimate.site_hash)
-                assert told == estimate.site_hash
+                published = estimates.setdefault(estimate.crossing_id, estimate.site_hash)
+                assert published == estimate.site_hash
             return len(estimates) >= number
 
         process = begin()

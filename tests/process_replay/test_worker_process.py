@@ -153,16 +153,16 @@ def test_a_worker_that_comes_late_gives_the_result_once(
         publisher = Publisher(bus, REALM)
         publish(publisher, drive_on)
         process = worker()
-        told = up_to(results, "state") + after(results, 3.0)
+        published = up_to(results, "state") + after(results, 3.0)
         publisher.close()
         terminate(process)
-    streams = [received.key().stream for received in told]
+    streams = [received.key().stream for received in published]
     assert streams == ["crossing"] * 3 + ["estimate", "crossing", "state"]
-    assert ratio_of(told[3]) == pytest.approx(0.4, rel=0.01)
+    assert ratio_of(published[3]) == pytest.approx(0.4, rel=0.01)
 
     found = load_results(tmp_path / "results.json")
     (crossing,) = found.crossings
-    estimate = pb.Estimate.FromString(told[3].payload)
+    estimate = pb.Estimate.FromString(published[3].payload)
     assert crossing.crossing_id == estimate.crossing_id
     assert (found.site_hash, found.version) == (estimate.site_hash, estimate.version)
     info = read_info(tmp_path / "results.mcap")
@@ -170,7 +170,7 @@ def test_a_worker_that_comes_late_gives_the_result_once(
     assert (info.end["reason"], info.end["crossings"]) == ("stopped by a signal", "1")
     assert info.site_toml is not None
     stored = [message.payload for message in read_messages(tmp_path / "results.mcap")]
-    assert stored == [received.payload for received in told]
+    assert stored == [received.payload for received in published]
 
 
 @pytest.mark.parametrize(
@@ -202,10 +202,10 @@ def test_unusable_or_unknown_truck_is_reported_live(
         publisher = Publisher(bus, REALM)
         publish(publisher, sent)
         process = worker()
-        told = up_to(results, "estimate")[-1]
+        published = up_to(results, "estimate")[-1]
         publisher.close()
         terminate(process)
-    estimate = pb.Estimate.FromString(told.payload)
+    estimate = pb.Estimate.FromString(published.payload)
     assert list(estimate.reasons) == [reason]
     assert not estimate.parameters
 
@@ -244,10 +244,10 @@ def test_a_worker_outlives_what_strangers_send(
         publish(publisher, stranger)
         token.undeclare()  # type: ignore[no-untyped-call]
         publish(publisher, drive_on[half:])
-        told = up_to(results, "state")
+        published = up_to(results, "state")
         publisher.close()
         terminate(process)
-    estimates = [received for received in told if received.key().stream == "estimate"]
+    estimates = [received for received in published if received.key().stream == "estimate"]
     assert [ratio_of(one) for one in estimates] == [pytest.approx(0.4, rel=0.01)]
 
 
@@ -370,20 +370,20 @@ def name_of(message: RawSample | Message) -> Name:
 
 
 def once(received: Iterable[RawSample]) -> dict[Name, bytes]:
-    """What a subscriber has that tells duplicates by identity: the first of each."""
+    """Messages of a subscriber that detects duplicates by identity: the first of each."""
     first: dict[Name, bytes] = {}
     for one in received:
         assert first.setdefault(name_of(one), one.payload) == one.payload
     return first
 
 
-def until_whole(subscription: Subscription, told: list[RawSample]) -> list[RawSample]:
-    """Go on until everything of one crossing has been told, and a little longer."""
-    told = list(told)
+def until_whole(subscription: Subscription, published: list[RawSample]) -> list[RawSample]:
+    """Go on until everything of one crossing has been published, and a little longer."""
+    published = list(published)
     deadline = time.monotonic() + LONGEST_S
-    while len(once(told)) < len(WHOLE) and time.monotonic() < deadline:
-        told += after(subscription, 0.2)
-    return told + after(subscription, 1.5)
+    while len(once(published)) < len(WHOLE) and time.monotonic() < deadline:
+        published += after(subscription, 0.2)
+    return published + after(subscription, 1.5)
 
 
 def kill(process: subprocess.Popen[str]) -> None:
@@ -391,9 +391,9 @@ def kill(process: subprocess.Popen[str]) -> None:
     process.communicate()
 
 
-def check_once(told: list[RawSample], restartable: Restartable, recorded: Path) -> None:
-    """One crossing, told once: on the bus, in the results files, and in the logger's recording."""
-    on_bus = once(told)
+def check_once(published: list[RawSample], restartable: Restartable, recorded: Path) -> None:
+    """One crossing, published once: on the bus, in results files and the logger's recording."""
+    on_bus = once(published)
     stored = {name_of(message): message.payload for message in restartable.stored()}
     assert len(stored) == len(restartable.stored())  # none in two files
     assert on_bus == stored
@@ -431,10 +431,10 @@ def test_killed_in_the_middle_of_an_identification(
         before = several(results, 3)
         assert [received.key().stream for received in before] == ["crossing"] * 3
         process = restartable.begin("pre")
-        told = until_whole(results, before)
+        published = until_whole(results, before)
         publisher.close()
         stop(process)
-    check_once(told, restartable, tmp_path / "recorded.mcap")
+    check_once(published, restartable, tmp_path / "recorded.mcap")
     assert len(restartable.paths()) == 2
 
 
@@ -480,7 +480,7 @@ def test_killed_right_after_the_estimate(
         publisher = Publisher(bus, REALM)
         publish(publisher, drive_on)
         process = restartable.begin()
-        told = up_to(results, "estimate")
+        published = up_to(results, "estimate")
         kill(process)
         (path,) = restartable.paths()
         cut_off = path.read_bytes()
@@ -488,16 +488,20 @@ def test_killed_right_after_the_estimate(
         after(health, 0.1)
         process = restartable.begin()
         up_to(health, "health")
-        told = until_whole(results, told) + after(results, 2.5)  # the history is looked at by now
+        published = until_whole(results, published) + after(
+            results, 2.5
+        )  # the history is looked at by now
         latest = [
             pb.BridgeState.FromString(p)
             for p in get_latest(bus, selector(REALM, "bridge", "state"))
         ]
         publisher.close()
         log = stop(process)
-    check_once(told, restartable, tmp_path / "recorded.mcap")
+    check_once(published, restartable, tmp_path / "recorded.mcap")
     (state,) = latest
-    estimate = next(pb.Estimate.FromString(r.payload) for r in told if r.key().stream == "estimate")
+    estimate = next(
+        pb.Estimate.FromString(r.payload) for r in published if r.key().stream == "estimate"
+    )
     assert list(state.crossings_used) == [estimate.crossing_id]
     for number in range(2):
         assert f"results-19990101T00000{number}Z.mcap" in log
@@ -523,13 +527,13 @@ def test_what_is_on_the_disk_and_not_on_the_bus(
         _, log = process.communicate(timeout=LONGEST_S)
         assert process.returncode == 1, log
         publisher.close()
-        told = several(results, 3)
-        assert [received.key().stream for received in told] == ["crossing"] * 3
+        published = several(results, 3)
+        assert [received.key().stream for received in published] == ["crossing"] * 3
         assert [m.key.stream for m in restartable.stored()] == ["crossing"] * 3 + ["estimate"]
         process = restartable.begin()
-        told = until_whole(results, told)
+        published = until_whole(results, published)
         stop(process)
-    check_once(told, restartable, tmp_path / "recorded.mcap")
+    check_once(published, restartable, tmp_path / "recorded.mcap")
 
 
 @pytest.mark.slow
@@ -550,18 +554,18 @@ def test_a_signal_while_a_truck_that_may_have_left_is_waited_for(
         up_to(health, "health")
         publisher = Publisher(bus, REALM)
         publish(publisher, short)
-        told = up_to(results, "crossing")
+        published = up_to(results, "crossing")
         publisher.close()
         stop(process)
-        told += after(results, 1.5)
-        check_once(told, restartable, tmp_path / "recorded.mcap")
+        published += after(results, 1.5)
+        check_once(published, restartable, tmp_path / "recorded.mcap")
         after(health, 0.1)
         process = restartable.begin()
         again = up_to(results, "state") + up_to(health, "health") + after(results, 1.5)
         stop(process)
     again = [received for received in again if received.key().owner == "bridge"]
-    assert once(again) == once(told)  # the last minute, with its old identities
-    check_once(told + again, restartable, tmp_path / "recorded.mcap")
+    assert once(again) == once(published)  # the last minute, with its old identities
+    check_once(published + again, restartable, tmp_path / "recorded.mcap")
 
 
 @pytest.mark.slow
@@ -588,8 +592,10 @@ def test_killed_at_random_moments(
             kill(process)
         process = restartable.begin()
         up_to(health, "health")
-        told = until_whole(results, []) + after(results, 2.5)  # the history is looked at by now
+        published = until_whole(results, []) + after(
+            results, 2.5
+        )  # the history is looked at by now
         publisher.close()
         stop(process)
-        told += after(results, 0.5)
-    check_once(told, restartable, tmp_path / "recorded.mcap")
+        published += after(results, 0.5)
+    check_once(published, restartable, tmp_path / "recorded.mcap")

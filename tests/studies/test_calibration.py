@@ -145,16 +145,16 @@ def test_nothing_to_measure_is_a_missed_aim() -> None:
 def test_what_is_declared_reaches_the_site_file(monkeypatch: pytest.MonkeyPatch) -> None:
     """The control's owner believes in half the noise; the sensors have all of it."""
     drawn = drive(default_site(), draw_truth(default_site(), 3), 3)
-    told: list[Site] = []
+    published: list[Site] = []
 
     def see(runs: object, site: Site, settings: object) -> list[IdentifiedCrossing]:
-        told.append(site)
+        published.append(site)
         return []
 
     monkeypatch.setattr(calibration, "drive", lambda *_: drawn)
     monkeypatch.setattr(calibration, "identify_simulated", see)
     one_crossing(default_site(), 3, IdentificationSettings(), HALF)
-    [site] = told
+    [site] = published
     density = np.array(drawn.site.sensor.noise_density_ug_per_rthz)
     np.testing.assert_allclose(site.sensor.noise_density_ug_per_rthz, 0.5 * density, rtol=1e-12)
 

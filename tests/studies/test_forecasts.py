@@ -34,7 +34,7 @@ def test_each_kind_is_planned_as_it_is_driven() -> None:
 
 
 def test_a_forecast_knows_the_noise_and_the_bridge_of_its_kind() -> None:
-    """A bridge that bends more is known better, sensors of four times the noise tell less."""
+    """A bridge that bends more is known better, sensors of four times the noise observe less."""
     site = default_site()
     steady = forecasts_of(site, [fused("steady", 1.0)])["steady"]
     loud = forecasts_of(site, [fused("scenario-1", 1.0)])["scenario-1"]

@@ -173,12 +173,12 @@ def test_surface_tyres_default_to_the_site_file() -> None:
 
 
 def test_the_surface_is_driven_over_by_the_worlds_truck(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The truth's paths reach the simulation, and the record tells them."""
-    told: list[object] = []
+    """The truth's paths reach the simulation, and the record has them."""
+    reported: list[object] = []
     real = drawn_crossings.measured_run
 
     def keeping(*arguments: Any, **named: Any) -> Any:
-        told.append(named["paths"])
+        reported.append(named["paths"])
         return real(*arguments, **named)
 
     monkeypatch.setattr(drawn_crossings, "measured_run", keeping)
@@ -186,7 +186,7 @@ def test_the_surface_is_driven_over_by_the_worlds_truck(monkeypatch: pytest.Monk
     lines = [validation.one_world(SITE, effect, 2, SETTINGS) for effect in ("free", "surface")]
     paths = draw_out_of_model(SITE, "surface", 2).truth.paths
     assert paths is not None
-    assert told == [None, paths]
+    assert reported == [None, paths]
     assert lines[0]["world"]["wheel_paths"] is None
     assert lines[1]["world"]["wheel_paths"]["rear"] == paths.rear._asdict()
     assert json.loads(json.dumps(lines[1]["world"]))["wheel_paths"]["wander_m"] == 0.12
@@ -363,12 +363,12 @@ def test_what_is_there_is_not_run_again(tmp_path: Path, monkeypatch: pytest.Monk
     assert ran == [("swing", 0), ("swing", 1)]
     # Killed in the middle of a line: that one is run again, and the next stands on its own line.
     path.write_bytes(path.read_bytes()[:-40])
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     found = run_worlds(
-        SITE, ("swing", "air"), 2, path, SETTINGS, 1, lambda *counts: told.append(counts)
+        SITE, ("swing", "air"), 2, path, SETTINGS, 1, lambda *counts: reported.append(counts)
     )
     assert ran[2:] == [("air", 0), ("swing", 1), ("air", 1)]
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert [(line["effect"], line["seed"]) for line in found] == [
         ("swing", 0),
         ("air", 0),

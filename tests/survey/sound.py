@@ -32,10 +32,10 @@ def main() -> None:
             text = site_toml(case.site)
             write_recording(path, case.messages, site_toml=text, reason="test", force=True)
             (run,) = recorded_runs(path, case.site, "site.toml")
-            told = [f for f in findings_of_run(run, case.site) if f.state is not CheckStatus.OK]
-            wrong = [f for f in told if f.state is CheckStatus.WRONG]
+            outcome = [f for f in findings_of_run(run, case.site) if f.state is not CheckStatus.OK]
+            wrong = [f for f in outcome if f.state is CheckStatus.WRONG]
             accused += bool(wrong)
-            counts.update(f"{f.state.value} {f.name}" for f in told)
+            counts.update(f"{f.state.value} {f.name}" for f in outcome)
             for finding in wrong:
                 print(f"{seed}: {finding.text}", flush=True)
     print(f"{accused} of {drives} sound drives accused; {dict(counts)}")

@@ -26,8 +26,8 @@ def table() -> None:
         worst = ""
         if result.parameters is not None:
             worst = f"{np.abs(faults.z_scores(case, result)).max():.1f}"
-        told = ", ".join(f"`{r}`" for r in result.reasons)
-        print(f"| {name} | {result.verdict} | {chi2} | {told} | {worst} |", flush=True)
+        outcome = ", ".join(f"`{r}`" for r in result.reasons)
+        print(f"| {name} | {result.verdict} | {chi2} | {outcome} | {worst} |", flush=True)
 
 
 def signals(count: int) -> None:
@@ -45,8 +45,8 @@ def sound(count: int) -> None:
         worst = ""
         if result.parameters is not None:
             worst = f", worst EI {np.abs(faults.z_scores(case, result)).max():.1f} std"
-        told = ", ".join(result.reasons)
-        print(f"{seed}: {result.verdict} {told} chi2 {result.chi2_per_dof}{worst}", flush=True)
+        outcome = ", ".join(result.reasons)
+        print(f"{seed}: {result.verdict} {outcome} chi2 {result.chi2_per_dof}{worst}", flush=True)
 
 
 if __name__ == "__main__":

@@ -164,7 +164,7 @@ def test_a_fit_that_explains_nothing_is_given_up_before_the_chains(
     assert result.parameters is None
     assert result.chi2_per_dof is not None
     assert result.chi2_per_dof > 1000.0
-    # The coarse steps tell the noise: no place along the road is looked at.
+    # The coarse steps determine the noise: no place along the road is looked at.
     assert result.diagnostics["starts"] == 0.0
     assert result.diagnostics["iterations"] < 2000
 

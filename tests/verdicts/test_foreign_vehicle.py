@@ -90,7 +90,7 @@ def test_a_truck_of_the_same_make_is_named_by_the_others(
 def test_a_truck_that_is_heavier_in_all_its_parts_is_named_by_the_others(
     crossings: tuple[CrossingResult, ...],
 ) -> None:
-    """It moves as the site's truck would over a softer bridge: by itself nobody could tell."""
+    """It moves as the site's truck would over a softer bridge: alone it cannot be distinguished."""
     foreign = crossings[SAME_MOTION]
     assert foreign.verdict == "good", foreign.reasons
     assert np.abs(z_scores(foreign)).max() > 4.0
@@ -131,10 +131,10 @@ def left_out(state: BridgeResult) -> dict[str, LeftOutReason]:
 
 def z_scores(found: BridgeResult | CrossingResult) -> NDArray[np.float64]:
     """Error of every EI in its standard deviations."""
-    told = found.elements if isinstance(found, BridgeResult) else found.parameters
-    assert told
+    outcome = found.elements if isinstance(found, BridgeResult) else found.parameters
+    assert outcome
     truth = RATIOS * np.array(paper_site().bridges[0].nominal_flexural_rigidity_nm2)
-    elements = [told[f"EI_{e + 1}"] for e in range(RATIOS.size)]
+    elements = [outcome[f"EI_{e + 1}"] for e in range(RATIOS.size)]
     return np.array([(one.mean - t) / one.std for one, t in zip(elements, truth, strict=True)])
 
 

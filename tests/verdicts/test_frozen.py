@@ -12,7 +12,7 @@ from tests.verdicts.faults import Fault, Truth
 from tests.verdicts.test_signals import sound
 
 
-def told(seed: int | None, fault: Fault, step_m_per_s2: float = 0.0) -> dict[Reason, str]:
+def outcome(seed: int | None, fault: Fault, step_m_per_s2: float = 0.0) -> dict[Reason, str]:
     truth, case = sound(seed)
     channels = case.run.channels
     if step_m_per_s2:
@@ -27,7 +27,7 @@ def told(seed: int | None, fault: Fault, step_m_per_s2: float = 0.0) -> dict[Rea
 @pytest.mark.parametrize("name", CHANNELS)
 def test_frozen_channel_is_named(name: str, from_s: float, seconds: float) -> None:
     for seed in (None, 2, 1, 6):  # 1 kHz, 200 Hz, 500 Hz, 2 kHz
-        found = told(seed, faults.frozen(name, from_s, seconds))
+        found = outcome(seed, faults.frozen(name, from_s, seconds))
         assert list(found) == [Reason.CHANNEL_STUCK]
         named, _, length = found[Reason.CHANNEL_STUCK].partition(" for ")
         assert named == name
@@ -37,7 +37,7 @@ def test_frozen_channel_is_named(name: str, from_s: float, seconds: float) -> No
 @pytest.mark.parametrize("name", CHANNELS)
 def test_bridged_channel_is_named(name: str) -> None:
     for seed in (None, 2, 1, 6):
-        found = told(seed, faults.frozen(name, 0.5, 0.05, bridged=True))
+        found = outcome(seed, faults.frozen(name, 0.5, 0.05, bridged=True))
         assert list(found) == [Reason.CHANNEL_BRIDGED]
         assert name in found[Reason.CHANNEL_BRIDGED]
 
@@ -46,11 +46,11 @@ def test_bridged_channel_is_named(name: str) -> None:
 def test_sound_channel_is_neither_frozen_nor_bridged(step_m_per_s2: float) -> None:
     """Fine and coarse converters: 16 bits over ±2 g to 12 bits over ±16 g."""
     for seed in (None, *range(8)):
-        assert told(seed, faults.NOTHING, step_m_per_s2) == {}
+        assert outcome(seed, faults.NOTHING, step_m_per_s2) == {}
 
 
 def test_saturated_channel_is_not_frozen() -> None:
-    assert told(None, faults.saturated(CHANNELS[2])) == {}
+    assert outcome(None, faults.saturated(CHANNELS[2])) == {}
 
 
 def test_frozen_channel_is_rejected_before_any_fit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ def at_most(count: int) -> int:
     return min(count, int(os.environ.get("DRIVEBY_WIDTH", count)))
 
 
-def told(found: list[Judged]) -> str:
+def outcome(found: list[Judged]) -> str:
     return "\n".join(f"{one.name}: {one.verdict} {one.reasons} z {one.z.round(1)}" for one in found)
 
 
@@ -37,14 +37,14 @@ def test_lanes_off_the_axis_give_no_wrong_good() -> None:
         for one in found
         if one.verdict == "good" and one.z.size and np.abs(one.z).max() > LARGEST_Z
     ]
-    assert not wrong, told(wrong)
+    assert not wrong, outcome(wrong)
     if len(found) >= WIDE:
         coverage = np.concatenate([one.is_covered for one in found]).mean()
-        assert COVERAGE[0] <= coverage <= COVERAGE[1], told(found)
+        assert COVERAGE[0] <= coverage <= COVERAGE[1], outcome(found)
 
 
 def test_more_axles_than_declared_are_named() -> None:
     found = [judged(more_axles(number)) for number in range(at_most(MORE_AXLES))]
-    assert not [one for one in found if one.verdict == "good"], told(found)
+    assert not [one for one in found if one.verdict == "good"], outcome(found)
     named = [one for one in found if set(one.reasons) - NAMELESS]
-    assert len(named) >= np.ceil(NAMED_SHARE * len(found)), told(found)
+    assert len(named) >= np.ceil(NAMED_SHARE * len(found)), outcome(found)

@@ -65,8 +65,8 @@ def test_each_message_once_with_what_was_before(
         b"%d" % number
         for number in range(80, 100)  # a second of what the truck still has
     ]
-    told = [one.payload for one in found if one.key.owner == "bridge"]
-    assert told == [before, alarm, now, last]
+    published = [one.payload for one in found if one.key.owner == "bridge"]
+    assert published == [before, alarm, now, last]
 
 
 def test_idle_subscriber_delays_no_process(router: zenoh.Session, publisher: Publisher) -> None:

@@ -153,7 +153,7 @@ def test_mending_names_what_is_gone_and_changed(fleet: Path, site: Site) -> None
     a.unlink()
     record(b.with_name("new.mcap"), drive(site, range(20), (10,)))
     b.with_name("new.mcap").replace(b)
-    # Another content of the same size: the time tells it.
+    # Another content of the same size: the time shows it.
     data = bytearray(c.read_bytes())
     data[len(data) // 2] ^= 1
     status = c.stat()
@@ -299,11 +299,11 @@ def test_rows_that_hold_something_else_get_a_line_and_are_made_anew(
     folder = folder_at(str(fleet))
     truth = update_catalog(folder).rows
     (file,) = (fleet / CATALOG).rglob("*.parquet")
-    told = pq.read_table(file).to_pylist()
-    told[1] |= change
-    for row in told:
-        row |= {name: str(row[name]) for name in change if isinstance(told[1][name], str)}
-    file.write_bytes(encoded(pa.Table.from_pylist(told), catalog._KEY, catalog.EDITION))
+    outcome = pq.read_table(file).to_pylist()
+    outcome[1] |= change
+    for row in outcome:
+        row |= {name: str(row[name]) for name in change if isinstance(outcome[1][name], str)}
+    file.write_bytes(encoded(pa.Table.from_pylist(outcome), catalog._KEY, catalog.EDITION))
     site = str(project / "docs/site.example.toml")
     assert cli.main(["catalog", str(fleet), "--site", site]) == 0
     said = capsys.readouterr()

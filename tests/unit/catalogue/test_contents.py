@@ -45,7 +45,7 @@ def test_between_two_boots_a_truck_was_off(tmp_path: Path) -> None:
 def test_crossings_are_those_that_are_identified(
     tmp_path: Path, project: Path, csv_example: Path
 ) -> None:
-    """The sample has one crossing, whose entry the identification tells (docs/contract.md)."""
+    """The sample has one crossing, whose entry the identification publishes (docs/contract.md)."""
     found = summarise_recording(project / "recordings/sample/crossing.mcap")
     (passing,) = found.passings
     assert (passing.vehicle, passing.bridge, passing.forward) == ("truck-1", "bridge-1", True)

@@ -221,7 +221,7 @@ def test_unusual_site_file_is_warned_of_and_used(
 def test_import_previews_writes_a_map_and_reads_by_it(
     capsys: pytest.CaptureFixture[str], drive: Path
 ) -> None:
-    site, output, told = drive / "site.toml", drive.parent / "out.mcap", drive.parent / "map.toml"
+    site, output, named = drive / "site.toml", drive.parent / "out.mcap", drive.parent / "map.toml"
     accel = drive / "accel_00.csv"
     own = "Time,Body front [m/s2],Body rear [m/s2],Axle front [m/s2],Axle rear [m/s2]"
     accel.write_text("\n".join([own, *accel.read_text().splitlines()[1:]]))
@@ -239,8 +239,8 @@ def test_import_previews_writes_a_map_and_reads_by_it(
     assert drawn.read_bytes().startswith(b"\x89PNG")
     drawn.unlink()
     assert listing(drive.parent) == before
-    assert run(capsys, *arguments, "--write-map", told)[0] == 0
-    assert run(capsys, *arguments, "--map", told, "-o", output)[0] == 0
+    assert run(capsys, *arguments, "--write-map", named)[0] == 0
+    assert run(capsys, *arguments, "--map", named, "-o", output)[0] == 0
     by_map = list(read_messages(output))
     assert run(capsys, *arguments, "--yes", "-o", output, "--force")[0] == 0
     assert [one.payload for one in read_messages(output)] == [one.payload for one in by_map]
@@ -590,10 +590,10 @@ def test_logger_records_the_chosen_realms(
     monkeypatch: pytest.MonkeyPatch, given: list[str], realms: object
 ) -> None:
     """And only live without: what appears in other realms is nobody's drive."""
-    told: dict[str, object] = {}
-    monkeypatch.setattr("services.logger.run", lambda **arguments: told.update(arguments) or 0)
+    named: dict[str, object] = {}
+    monkeypatch.setattr("services.logger.run", lambda **arguments: named.update(arguments) or 0)
     assert cli.main(["logger", *given]) == 0
-    assert told["realms"] == realms
+    assert named["realms"] == realms
 
 
 @pytest.mark.parametrize(

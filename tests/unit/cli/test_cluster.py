@@ -1,4 +1,4 @@
-"""`driveby cluster`, `identify --scheduler` and `--into`: what is refused, and what is told."""
+"""`driveby cluster`, `identify --scheduler` and `--into`: what is refused, and what is printed."""
 
 import importlib.util
 import os

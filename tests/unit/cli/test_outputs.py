@@ -163,7 +163,7 @@ def test_two_outputs_have_two_names(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_a_baseline_that_a_site_file_names_is_an_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Results would replace results: the kind alone does not tell."""
+    """Results would replace results: the kind alone does not show it."""
     site, stored = tmp_path / "site.toml", tmp_path / "base.json"
     text = SITE.decode()
     site.write_text(text.replace("[bridge]", '[bridge]\nbaseline = "base.json"'))

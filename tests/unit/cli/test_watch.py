@@ -21,6 +21,7 @@ from tests.unit.cli.watching import (
     a_morning,
     alarm,
     bridge_state,
+    deliver,
     drives,
     estimate,
     health,
@@ -28,7 +29,6 @@ from tests.unit.cli.watching import (
     progress,
     result,
     state,
-    tell,
 )
 
 
@@ -120,7 +120,7 @@ def test_lines_for_a_pipe(site: Site) -> None:
             state("a", pb.IDENTIFYING, "truck-1", 0.0),  # late
             health("logger", ok=False, note="disk full", rate_per_s=3.0),
         )
-        if (one := tell(watched, message)) is not None
+        if (one := deliver(watched, message)) is not None
     ]
     assert said == [
         "truck-1 drives",
@@ -162,9 +162,9 @@ def test_an_empty_realm_names_the_others() -> None:
 
 def test_a_service_that_is_silent_or_unwell_stands_out() -> None:
     watched = RealmModel()
-    tell(watched, health("logger", ok=False, note="disk full"))
-    tell(watched, health("worker"))
-    tell(watched, progress("worker", "", "validating truck-1 on bridge-1", 0.3))
+    deliver(watched, health("logger", ok=False, note="disk full"))
+    deliver(watched, health("worker"))
+    deliver(watched, progress("worker", "", "validating truck-1 on bridge-1", 0.3))
     assert line(drawn(watched), "logger") == "logger not well disk full"
     assert line(drawn(watched), "worker") == "worker well validating truck-1 on bridge-1, 30%"
     watched.services["worker"] = watched.services["worker"]._replace(time_ns=NOW_NS - 10**12)
@@ -177,8 +177,8 @@ def test_what_it_keeps_is_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -
     watched = RealmModel()
     for number in range(20):
         drives(watched, f"truck-{number}", ago_s=20.0 - number)
-        tell(watched, estimate(result(site, f"c-{number}", entry=float(number))))
-        tell(watched, health(f"logger-{number}"))
+        deliver(watched, estimate(result(site, f"c-{number}", entry=float(number))))
+        deliver(watched, health(f"logger-{number}"))
     assert len(watched.crossings) <= 6
     assert watched.rows()[0].crossing_id == "c-19"
     assert set(watched.trucks) == {f"truck-{number}" for number in range(15, 20)}
@@ -191,7 +191,7 @@ def test_what_cannot_be_read_is_left_out() -> None:
         ("vehicle", "accel"), ("vehicle", "gnss"), ("bridge", "crossing"), ("bridge", "estimate"),
         ("bridge", "state"), ("bridge", "alarm"), ("service", "health"), ("service", "progress"),
     ):  # fmt: skip
-        assert tell(watched, heard(owner, "x", stream, b"\xff\x00nonsense")) is None
+        assert deliver(watched, heard(owner, "x", stream, b"\xff\x00nonsense")) is None
     assert not watched.crossings
     assert not watched.alarms
     assert not watched.services
@@ -202,7 +202,9 @@ SENTENCE = "element 4 is 10 % weaker than before 2026-08-27, interval 8 to 12 %"
 
 def test_an_alarm_is_a_line_until_it_is_another(site: Site) -> None:
     watched = RealmModel()
-    said = [tell(watched, one) for one in (alarm(), alarm(), alarm(by="owner"), alarm(by="owner"))]
+    said = [
+        deliver(watched, one) for one in (alarm(), alarm(), alarm(by="owner"), alarm(by="owner"))
+    ]
     assert said == [
         f"alarm of bridge-1: {SENTENCE}: stands",
         None,
@@ -214,14 +216,14 @@ def test_an_alarm_is_a_line_until_it_is_another(site: Site) -> None:
 def test_alarms_that_stand_come_first_on_the_page(site: Site) -> None:
     watched = a_morning(site)
     for number in range(5):
-        tell(watched, alarm(f"old-{number}", by="owner", raised=1.7899e9 + number))
-    tell(watched, alarm())
+        deliver(watched, alarm(f"old-{number}", by="owner", raised=1.7899e9 + number))
+    deliver(watched, alarm())
     lines = drawn(watched)
     assert lines[1] == f"alarm of bridge-1: stands; {SENTENCE}"
     assert lines[2] == f"alarm of old-4: acknowledged by owner; {SENTENCE}"
     assert "  and 2 more alarms, of which 0 stand" in lines
     for number in range(5):
-        tell(watched, alarm(f"new-{number}"))
+        deliver(watched, alarm(f"new-{number}"))
     assert "  and 7 more alarms, of which 2 stand" in drawn(watched)
     assert len(drawn(watched, 80, 24)) <= 26
 
@@ -229,7 +231,7 @@ def test_alarms_that_stand_come_first_on_the_page(site: Site) -> None:
 def test_a_bridge_with_an_alarm_is_among_those_that_are_shown(site: Site) -> None:
     watched = a_fleet(site)
     for number in range(6):
-        tell(watched, bridge_state(site, f"later-{number}"))
+        deliver(watched, bridge_state(site, f"later-{number}"))
     lines = drawn(watched)
     (head,) = [n for n, line in enumerate(lines) if line.startswith("bridge ")]
     shown = [
@@ -243,9 +245,9 @@ def test_where_there_is_no_room_an_alarm_that_stands_is_kept(
 ) -> None:
     monkeypatch.setattr(realm_model, "_MAX_BRIDGES", 2)
     watched = RealmModel()
-    tell(watched, alarm("stands", raised=1.0))
+    deliver(watched, alarm("stands", raised=1.0))
     for number in range(4):
-        tell(watched, alarm(f"old-{number}", by="owner", raised=2.0 + number))
+        deliver(watched, alarm(f"old-{number}", by="owner", raised=2.0 + number))
     assert set(watched.alarms) == {"stands", "old-3"}
 
 
@@ -262,7 +264,7 @@ def test_absent_alarms_are_no_reassurance_on_the_page(site: Site) -> None:
     said = "No alarm was received; it is not known here whether driveby alarm serve watches"
     watched = RealmModel()
     assert not any(one.startswith(said) for one in drawn(watched))
-    tell(watched, bridge_state(site))
+    deliver(watched, bridge_state(site))
     assert line(drawn(watched), said).endswith("any bridge.")
-    tell(watched, alarm())
+    deliver(watched, alarm())
     assert not any(one.startswith(said) for one in drawn(watched))

@@ -33,7 +33,7 @@ def heard(owner: Any, name: str, stream: str, payload: bytes) -> BusMessage:
     return BusMessage(Key("live", owner, name, stream), Identity(1, 0), payload)
 
 
-def tell(watched: RealmModel, message: BusMessage, ago_s: float = 0.0) -> str | None:
+def deliver(watched: RealmModel, message: BusMessage, ago_s: float = 0.0) -> str | None:
     """A message that came so long before now."""
     return watched.ingest(message, NOW_S - ago_s, NOW_NS - round(ago_s * 1e9))
 
@@ -49,10 +49,10 @@ def drives(
         time_ns = NOW_NS - round((since_s + lag_s + 0.05) * 1e9)
         batch = {one: AccelChannel(1000.0, np.zeros(50)) for one in names}
         payload = encode_accel(AccelBatch(1, number, number, time_ns, batch))
-        said.append(tell(watched, heard("vehicle", name, "accel", payload), since_s))
+        said.append(deliver(watched, heard("vehicle", name, "accel", payload), since_s))
         if number % 2 == 0:
             fix = encode_gnss(GnssFix(1, number, number, time_ns, 36.0, 140.0, 20.0, 9.8))
-            said.append(tell(watched, heard("vehicle", name, "gnss", fix), since_s))
+            said.append(deliver(watched, heard("vehicle", name, "gnss", fix), since_s))
     return said
 
 
@@ -156,23 +156,23 @@ def a_morning(site: Site) -> RealmModel:
     drives(watched, "truck-2", lag_s=0.4)
     drives(watched, "truck-3", ago_s=300.0)
     for number, entry in enumerate((0.0, 90.0, 180.0)):
-        tell(watched, estimate(result(site, f"good-{number}", entry=entry)))
+        deliver(watched, estimate(result(site, f"good-{number}", entry=entry)))
     doubtful = result(
         site, "b", "truck-2", verdict="suspect", reasons=("model_misfit",), entry=240.0
     )
-    tell(watched, estimate(doubtful))
+    deliver(watched, estimate(doubtful))
     bad = result(
         site, "c", "truck-3", verdict="rejected", reasons=("channel_missing",), entry=300.0
     )
-    tell(watched, estimate(bad))
-    tell(watched, bridge_state(site))
-    tell(watched, state("d", pb.DETECTED, "truck-1", 550.0))
-    tell(watched, state("d", pb.COMPLETE, "truck-1", 550.0))
-    tell(watched, state("d", pb.IDENTIFYING, "truck-1", 550.0))
-    tell(watched, progress("worker", "d", "sampling", 0.45))
-    tell(watched, state("e", pb.DETECTED, "truck-2", 596.0))
-    tell(watched, health("logger", rate_per_s=120.0, queue=3.0, lost=0.0, dropped=0.0))
-    tell(watched, health("worker", queue=14.0))
+    deliver(watched, estimate(bad))
+    deliver(watched, bridge_state(site))
+    deliver(watched, state("d", pb.DETECTED, "truck-1", 550.0))
+    deliver(watched, state("d", pb.COMPLETE, "truck-1", 550.0))
+    deliver(watched, state("d", pb.IDENTIFYING, "truck-1", 550.0))
+    deliver(watched, progress("worker", "d", "sampling", 0.45))
+    deliver(watched, state("e", pb.DETECTED, "truck-2", 596.0))
+    deliver(watched, health("logger", rate_per_s=120.0, queue=3.0, lost=0.0, dropped=0.0))
+    deliver(watched, health("worker", queue=14.0))
     return watched
 
 
@@ -196,17 +196,17 @@ def a_fleet(site: Site) -> RealmModel:
             )
         of = {"bridge": bridge, "ratios": ratios}
         who = f"truck-{number % 3 + 1}"
-        tell(watched, estimate(result(site, f"{bridge}-a", who, entry=90.0 * number, **of)))
+        deliver(watched, estimate(result(site, f"{bridge}-a", who, entry=90.0 * number, **of)))
         crossings = 40 + 7 * number
-        tell(watched, bridge_state(site, bridge, finding, crossings=crossings, ratios=ratios))
+        deliver(watched, bridge_state(site, bridge, finding, crossings=crossings, ratios=ratios))
     rejected = {"verdict": "rejected", "reasons": ("channel_missing",), "entry": 330.0}
-    tell(watched, estimate(result(site, "c", "truck-3", bridge="bridge-03", **rejected)))
+    deliver(watched, estimate(result(site, "c", "truck-3", bridge="bridge-03", **rejected)))
     for which in (pb.DETECTED, pb.COMPLETE, pb.IDENTIFYING):
-        tell(watched, state("d", which, "truck-1", 550.0, "bridge-11"))
-    tell(watched, progress("worker", "d", "sampling", 0.45))
-    tell(watched, state("e", pb.DETECTED, "truck-2", 596.0, "bridge-07"))
-    tell(watched, alarm("bridge-03", by="the owner", element=2, since=1.7809e9, raised=1.783e9))
-    tell(watched, alarm("bridge-07"))
-    tell(watched, health("logger", rate_per_s=120.0, queue=3.0, lost=0.0, dropped=0.0))
-    tell(watched, health("worker", queue=14.0))
+        deliver(watched, state("d", which, "truck-1", 550.0, "bridge-11"))
+    deliver(watched, progress("worker", "d", "sampling", 0.45))
+    deliver(watched, state("e", pb.DETECTED, "truck-2", 596.0, "bridge-07"))
+    deliver(watched, alarm("bridge-03", by="the owner", element=2, since=1.7809e9, raised=1.783e9))
+    deliver(watched, alarm("bridge-07"))
+    deliver(watched, health("logger", rate_per_s=120.0, queue=3.0, lost=0.0, dropped=0.0))
+    deliver(watched, health("worker", queue=14.0))
     return watched

@@ -1,4 +1,4 @@
-"""Bars: what they are told, and that they are seen on a terminal only."""
+"""Bars: what they receive, and that they are seen on a terminal only."""
 
 import io
 from pathlib import Path
@@ -34,20 +34,20 @@ def recording(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("work", ["survey", "signals", "recover", "view"])
 def test_reading_a_recording_reports_progress(recording: Path, work: str) -> None:
-    told: list[int] = []
+    reported: list[int] = []
     out = recording.with_name("out")
     match work:
         case "survey":
-            summarise_recording(recording, progress=told.append)
+            summarise_recording(recording, progress=reported.append)
         case "signals":
-            signals_of_recording(recording, told.append)
+            signals_of_recording(recording, reported.append)
         case "recover":
-            recover_recording(recording, out.with_suffix(".mcap"), progress=told.append)
+            recover_recording(recording, out.with_suffix(".mcap"), progress=reported.append)
         case "view":
-            convert(recording, out.with_suffix(".rrd"), progress=told.append)
-    assert told == sorted(set(told))
-    assert len(told) > 5
-    assert 0.8 * recording.stat().st_size < told[-1] <= recording.stat().st_size
+            convert(recording, out.with_suffix(".rrd"), progress=reported.append)
+    assert reported == sorted(set(reported))
+    assert len(reported) > 5
+    assert 0.8 * recording.stat().st_size < reported[-1] <= recording.stat().st_size
 
 
 def test_a_bar_goes_over_all_files(tmp_path: Path) -> None:
@@ -89,10 +89,10 @@ def test_steps_are_a_bar_with_the_time_that_is_left() -> None:
 def test_each_step_is_reported_up_to_the_last(
     work: str, recording: Path, tmp_path: Path, project: Path
 ) -> None:
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
 
     def progress(done: int, steps: int) -> None:
-        told.append((done, steps))
+        reported.append((done, steps))
 
     site = load_site(project / "docs/site.example.toml")
     found = results_of(site, some_crossing("a"), some_crossing("b", entry=60.0), used="a")
@@ -113,7 +113,7 @@ def test_each_step_is_reported_up_to_the_last(
                 name=None,
                 writing=progress,
             )
-    done, steps = zip(*told, strict=True)
+    done, steps = zip(*reported, strict=True)
     assert len(set(steps)) == 1
     assert list(done) == sorted(set(done))
     assert len(done) > 1
@@ -150,17 +150,17 @@ def test_unknown_number_of_parts_shows_no_remaining_time() -> None:
 
 
 def test_crossing_reports_progress_up_to_the_end(project: Path) -> None:
-    told: dict[str, list[float]] = {}
+    reported: dict[str, list[float]] = {}
     stages: list[str] = []
 
     def report(crossing_id: str, stage: str, fraction: float) -> None:
-        told.setdefault(crossing_id, []).append(fraction)
+        reported.setdefault(crossing_id, []).append(fraction)
         stages.append(stage)
 
     sample = project / "recordings/sample/crossing.mcap"
     settings = IdentificationSettings(method="pre", seed=1)
     found = identify_recordings([sample], site_of([sample], None), settings, report)
-    ((crossing_id, fractions),) = told.items()
+    ((crossing_id, fractions),) = reported.items()
     assert crossing_id == found.crossings[0].crossing_id
     assert fractions[-1] == 1.0
     assert len(set(fractions)) > 4
@@ -177,8 +177,8 @@ def test_crossing_reports_progress_up_to_the_end(project: Path) -> None:
 
 
 def test_progress_shows_the_share_of_the_usual_time(tmp_path: Path) -> None:
-    """A browser that waits until it is told to go on, and then prints."""
-    told: list[tuple[int, int]] = []
+    """A browser that waits for a signal to go on, and then prints."""
+    reported: list[tuple[int, int]] = []
     go = tmp_path / "go"
     browser = tmp_path / "browser"
     browser.write_text(
@@ -192,12 +192,12 @@ def test_progress_shows_the_share_of_the_usual_time(tmp_path: Path) -> None:
     html.write_text("<p>")
 
     def progress(done: int, steps: int) -> None:
-        told.append((done, steps))
-        if len(told) == 4:
+        reported.append((done, steps))
+        if len(reported) == 4:
             go.touch()
 
     write_pdf(html, tmp_path / "r.pdf", str(browser), progress)
-    done, steps = zip(*told, strict=True)
+    done, steps = zip(*reported, strict=True)
     assert list(done) == sorted(done)
     assert done[0] < done[-1] <= steps[0]
     assert set(steps) == {1500}

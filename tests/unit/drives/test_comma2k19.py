@@ -44,7 +44,7 @@ def test_the_even_grid_keeps_the_clock(drive: Path) -> None:
 
 
 def test_the_receivers_utc_and_the_computers_clock_agree(drive: Path) -> None:
-    """The car's own wheels tell: their speed is on the computer's clock, the receiver's on UTC."""
+    """The wheels show it: their speed is on the computer's clock, the receiver's on UTC."""
     run = read_comma2k19(drive)
     offset = run.accel_time_s[0] - np.load(drive / "processed_log_IMU_accelerometer_t.npy")[0]
     wheels_s = np.load(drive / "processed_log_CAN_speed_t.npy") + offset

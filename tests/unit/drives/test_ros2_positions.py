@@ -74,8 +74,8 @@ def test_a_fix_that_is_alone_has_no_speed() -> None:
     for number in range(3):
         assert positions.add_fix(fix(FIRST_NS + number * 50 * TENTH_NS)) == []
     assert positions.finish() == []
-    told = "fixes without another near enough for a speed, left out"
-    assert anomalies.count("/fix", told) == 3
+    reported = "fixes without another near enough for a speed, left out"
+    assert anomalies.count("/fix", reported) == 3
 
 
 def test_what_comes_twice_is_left_out_and_a_clock_that_went_back_is_followed() -> None:

@@ -389,7 +389,7 @@ def test_metadata_that_names_files_elsewhere_reads_none_of_them(
 def test_metadata_with_aliases_is_refused(
     messages: list[ros2.Ros], site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Ten of ten of ten …: its words would fill the memory when what is wrong with it is told."""
+    """Ten of ten of ten …: its words would fill the memory in the error message."""
     folder = ros2.record(tmp_path / "bag", messages[:100], StoragePlugin.MCAP)
     metadata = folder / "metadata.yaml"
     nested = ", ".join(f"&a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 10))

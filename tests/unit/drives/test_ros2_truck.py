@@ -114,7 +114,7 @@ def test_messages_of_another_frame_and_without_accelerometer_are_left_out() -> N
 
 
 def test_a_topic_is_one_sensor_s() -> None:
-    """Two of one topic, told apart by who publishes or by their frames: the first is heard."""
+    """Two of one topic, distinguished by who publishes or by their frames: the first is heard."""
     for publishers, frames in (((b"one", b"two"), ("a", "a")), ((b"", b""), ("a", "b"))):
         of = truck()
         found: list[Accel | GnssFix] = []
@@ -266,7 +266,7 @@ def test_fixes_have_place_speed_and_accuracies() -> None:
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "outcome"),
     [
         (place(2, status=-1), "messages without a fix, left out"),
         (place(2, status=-2), "messages without a fix, left out"),
@@ -276,11 +276,11 @@ def test_fixes_have_place_speed_and_accuracies() -> None:
         (place(2, latitude=91.0), "fixes without a latitude, left out"),
     ],
 )
-def test_invalid_positions_are_excluded_and_reported(bad: bytes, told: str) -> None:
+def test_invalid_positions_are_excluded_and_reported(bad: bytes, outcome: str) -> None:
     of = truck()
     found = fixes(of, [place(0), place(1), bad, place(3)])
     assert len(found) == 3
-    assert of.anomalies.count(ros2.FIX_TOPIC, told) == 1
+    assert of.anomalies.count(ros2.FIX_TOPIC, outcome) == 1
 
 
 def test_slopes_of_positions_are_speeds_only_where_the_site_does_not_trust_them() -> None:
@@ -297,8 +297,8 @@ def test_a_jump_of_the_position_is_no_speed() -> None:
     text = ros2.ROS2.replace(f'velocity = "{ros2.VELOCITY_TOPIC}"\n', "")
     of = truck(text, speed_noise=0.5)
     assert fixes(of, [place(0), place(1, latitude=60.0)]) == []
-    told = "fixes with an impossible speed, left out"
-    assert of.anomalies.count(ros2.FIX_TOPIC, told) == 2
+    outcome = "fixes with an impossible speed, left out"
+    assert of.anomalies.count(ros2.FIX_TOPIC, outcome) == 2
 
 
 def test_a_truck_needs_its_table() -> None:

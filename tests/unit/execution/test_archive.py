@@ -93,8 +93,8 @@ def same(five: list[Path], tmp_path: Path) -> list[Path]:
 def test_results_are_those_of_all_recordings_together(five: list[Path], tmp_path: Path) -> None:
     whole = identify_recordings(five, site_of(five, None), LEAST_SQUARES)
     found, crossings = done(tmp_path / "into", *five)
-    told = with_common_shares(crossings, found.bridges)
-    assert [timeless(one) for one in told] == [timeless(one) for one in whole.crossings]
+    outcome = with_common_shares(crossings, found.bridges)
+    assert [timeless(one) for one in outcome] == [timeless(one) for one in whole.crossings]
     assert found.bridges == whole.bridges
     assert (found.verdicts.total(), found.there, found.failed, found.problems) == (5, 0, (), ())
 

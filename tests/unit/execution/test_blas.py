@@ -20,7 +20,7 @@ def test_an_identification_computes_with_one_thread_of_blas(project: Path) -> No
         before = blas_threads()
         assert 2 in before
         identify_recordings(
-            sample, site_of(sample, None), settings, lambda *told: inside.extend(blas_threads())
+            sample, site_of(sample, None), settings, lambda *outcome: inside.extend(blas_threads())
         )
         assert set(inside) == {1}
         # numpy and scipy bring one each, and both have what they had.

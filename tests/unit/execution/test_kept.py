@@ -93,9 +93,9 @@ def test_what_others_cannot_read_is_no_result_either(
     first, second = results(2)
     path = ResultStore(tmp_path).put([first, second], HEADER)
     assert path is not None
-    told = pq.read_table(path).to_pylist()
-    told[1] |= change
-    path.write_bytes(encoded(pa.Table.from_pylist(told), store_module.KEY, store_module.EDITION))
+    outcome = pq.read_table(path).to_pylist()
+    outcome[1] |= change
+    path.write_bytes(encoded(pa.Table.from_pylist(outcome), store_module.KEY, store_module.EDITION))
     kept, problems = ResultStore(tmp_path), list[str]()
     assert kept.result(first.content) == first.crossing
     assert kept.result(second.content) is None

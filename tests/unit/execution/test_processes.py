@@ -120,9 +120,9 @@ def pairs() -> Iterator[Any]:
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_the_bytes_are_those_of_one_process(number: int) -> None:
-    told: list[tuple[str, str, float]] = []
+    reported: list[tuple[str, str, float]] = []
     with ProcessExecutor(
-        number, identify=quick, prepare=nothing, report=lambda *how: told.append(how)
+        number, identify=quick, prepare=nothing, report=lambda *how: reported.append(how)
     ) as processes:
         processes.wait_until_warm()
         outputs = list(feed_all(Engine(SITE, SETTINGS, HEADER), processes, pairs()))
@@ -134,13 +134,13 @@ def test_the_bytes_are_those_of_one_process(number: int) -> None:
     found_first = ["estimate", "estimate", "state", "state"]
     assert streams == ["estimate", "state"] * 2 or (number == 2 and streams == found_first)
     names = {o.result.crossing_id for o in WHOLE if o.result}
-    until(lambda: {(name, "half", 0.5) for name in names} <= set(told), "progress of both")
+    until(lambda: {(name, "half", 0.5) for name in names} <= set(reported), "progress of both")
     # The second waits for the only process, where there is one.
-    assert {stage for _, stage, _ in told} <= {"half", "waiting for a process"}
+    assert {stage for _, stage, _ in reported} <= {"half", "waiting for a process"}
 
 
 def by_stream(outputs: list[Any]) -> list[Any]:
-    """States of crossings may be told while another crossing is identified."""
+    """States of crossings may be published while another crossing is identified."""
     return sorted(outputs, key=lambda o: (o.key.stream, o.payload * (o.key.stream == "crossing")))
 
 
@@ -184,14 +184,14 @@ def test_a_hung_process_is_ended_and_its_crossing_fails_at_the_second_time(
     why: str,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    told: list[tuple[str, str, float]] = []
+    reported: list[tuple[str, str, float]] = []
     (first, second) = works()
     with ProcessExecutor(
-        1, identify=search, prepare=nothing, limits=limits, report=lambda *how: told.append(how)
+        1, identify=search, prepare=nothing, limits=limits, report=lambda *how: reported.append(how)
     ) as processes:
         processes.submit(first)
         processes.submit(second)
-        assert (second.crossing_id, "waiting for a process", 0.0) in told
+        assert (second.crossing_id, "waiting for a process", 0.0) in reported
         assert [one.crossing_id for one in processes.running] == [first.crossing_id]
         assert processes.waiting == 1
         results = {work.number: result for work, result in all_of(processes)}
@@ -344,7 +344,7 @@ def test_no_process_outlives_its_parent(end: str) -> None:
 
 
 def test_results_may_come_back_in_any_order() -> None:
-    """What is told of a bridge is the same; the second waits for the first."""
+    """The published state of a bridge is the same; the second waits for the first."""
     more = messages_of(*THERE_AND_BACK, (60.0, -60.0), (80.0, 140.0))
     orders = {}
     for order in ((0, 1, 2), (2, 1, 0), (1, 0, 2)):
@@ -353,13 +353,13 @@ def test_results_may_come_back_in_any_order() -> None:
         said += list(engine.finish())
         found = [one for one in said if isinstance(one, IdentificationTask)]
         assert len(found) == 3
-        told = []
+        reported = []
         for n in order:
             result = Identifications()(found[n].data, SETTINGS, stopwatch=lambda: 0.0)
-            told.append([*engine.done(found[n], result)])
-        orders[order] = [output for outputs in told for output in outputs]
+            reported.append([*engine.done(found[n], result)])
+        orders[order] = [output for outputs in reported for output in outputs]
         if order == (2, 1, 0):
-            assert [len(outputs) for outputs in told] == [0, 0, 9]
+            assert [len(outputs) for outputs in reported] == [0, 0, 9]
         with pytest.raises(KeyError):
             list(engine.done(found[0], result))
     first, *others = orders.values()
@@ -377,7 +377,7 @@ def fuse_of(number: int, bridge: str = "bridge-1") -> FusionTask:
 
 
 def named_by_number(counted: RecentCrossings, bridge: str, fusing: Fusing) -> BridgeResult:
-    """Tells which process made it of what, and when."""
+    """Record which process made it of what, and when."""
     (Path(os.environ["DEADLY_ONCE"]) / f"{time.monotonic_ns()} {bridge} {counted.number}").touch()
     return STATE.model_copy(update={"crossings_left_out_count": counted.number})
 

@@ -269,7 +269,7 @@ def test_wandering_positions_of_a_truck_that_stands_do_not_turn_it() -> None:
 
 
 def senses_fix_by_fix(antenna_m: Floats, speed_m_per_s: Floats, margin_m: float) -> Floats:
-    """What `_senses` must give, as one would tell it while driving."""
+    """What `_senses` must give, as a driver would see it."""
     sense = np.zeros(antenna_m.size)
     current = 0.0
     lowest = highest = farthest = 0

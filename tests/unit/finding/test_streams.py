@@ -147,7 +147,7 @@ def test_missing_batches_are_missing_samples_at_their_place(rate_hz: float) -> N
 
 
 def test_missing_samples_within_a_sequence_are_seen_by_the_time() -> None:
-    """A driver that lost samples goes on numbering its batches: the time tells."""
+    """A driver that lost samples goes on numbering its batches: the time shows it."""
     channels = {"sprung_front": (1000.0, np.arange(50.0))}
     boot = boot_with([batch(0, 0.0, channels), batch(1, 0.05, channels), batch(2, 0.137, channels)])
     values = samples(boot, -1.0, 1.0).channels["sprung_front"]
@@ -297,7 +297,7 @@ def test_a_fix_waits_for_the_one_before_until_that_is_lost() -> None:
     assert boot.fixes().time_s.size == 1
     boot.add_fix(fix(last, 0.1 * last))
     assert [one.sequence for one in boot.release_fixes()] == list(range(2, last + 1))
-    # The lost one comes after all: it is known, but nobody is told.
+    # The lost one comes after all: it is known, and not reported.
     boot.add_fix(fix(1, 0.1))
     assert list(boot.release_fixes()) == []
     assert boot.fixes().time_s.size == last + 1

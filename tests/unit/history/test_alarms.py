@@ -1,4 +1,4 @@
-"""Alarms of a history: raised, kept over restarts, told, acknowledged by somebody only."""
+"""Alarms of a history: raised, kept over restarts, reported, acknowledged by somebody only."""
 
 import json
 import os
@@ -246,25 +246,25 @@ def test_alarms_on_the_wire(history: Path) -> None:
 def test_alarm_is_published_when_raised_noted_and_restarted(
     history: Path,
 ) -> None:
-    told: list[tuple[str, bool]] = []
+    reported: list[tuple[str, bool]] = []
 
     def put(alarm: Alarm, payload: bytes) -> None:
         assert pb.Alarm.FromString(payload).alarm_id == alarm.alarm_id
-        told.append((alarm.bridge, alarm.acknowledged is not None))
+        reported.append((alarm.bridge, alarm.acknowledged is not None))
 
     teller = AlarmPublisher(put)
     teller.publish_changes(history, 1)
-    assert told == []
+    assert reported == []
     (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
     teller.publish_changes(history, 2)
     teller.publish_changes(history, 3)
-    assert told == [("bridge-2", False)]
+    assert reported == [("bridge-2", False)]
     AlarmPublisher(put).publish_changes(history, 4)
-    assert told == [("bridge-2", False)] * 2
+    assert reported == [("bridge-2", False)] * 2
     acknowledge(history, alarm, "owner", "", AFTER_S)
     teller.publish_changes(history, 5)
     teller.publish_changes(history, 6)
-    assert told == [("bridge-2", False), ("bridge-2", False), ("bridge-2", True)]
+    assert reported == [("bridge-2", False), ("bridge-2", False), ("bridge-2", True)]
 
 
 def test_the_commands(history: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -303,16 +303,16 @@ def test_unpublished_notes_are_published_at_the_start(history: Path) -> None:
     """Who heard the alarm stand shows it until it hears that somebody took note of it."""
     (alarm,) = check(history, AlarmSettings(), AFTER_S).standing
     acknowledge(history, alarm, "owner", "", AFTER_S)
-    told: list[tuple[str, bool]] = []
+    reported: list[tuple[str, bool]] = []
 
     def put(alarm: Alarm, payload: bytes) -> None:
-        told.append((alarm.bridge, alarm.acknowledged is not None))
+        reported.append((alarm.bridge, alarm.acknowledged is not None))
 
     month_s = 30 * 86_400.0
     AlarmPublisher(put).publish_changes(history, round((AFTER_S + month_s - 60.0) * 1e9))
-    assert told == [("bridge-2", True)]
+    assert reported == [("bridge-2", True)]
     AlarmPublisher(put).publish_changes(history, round((AFTER_S + month_s + 60.0) * 1e9))
-    assert told == [("bridge-2", True)]
+    assert reported == [("bridge-2", True)]
 
 
 def test_an_acknowledgement_that_is_damaged_can_be_given_again(

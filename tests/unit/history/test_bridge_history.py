@@ -151,16 +151,16 @@ def test_two_different_months_are_named_without_a_judgement(
     before, after = (fused_state(some) for some in months)
     theirs = after["EI_4"].mean / before["EI_4"].mean
     assert of_it.ratio == pytest.approx(theirs, abs=0.02)
-    never, told = statements(past)
+    never, outcome = statements(past)
     assert not never.is_reassuring
-    assert not told.is_reassuring
-    assert told.text.startswith("EI from 2026-03 to 2026-04: element 4 −")
-    assert told.text.endswith("Temperature and season are not taken out.")
+    assert not outcome.is_reassuring
+    assert outcome.text.startswith("EI from 2026-03 to 2026-04: element 4 −")
+    assert outcome.text.endswith("Temperature and season are not taken out.")
     assert cli.main(["history", "bridge-1", "--history", str(folder), "--json",
                      str(tmp_path / "h.json"), "--figures", str(tmp_path)]) == 0  # fmt: skip
     said = capsys.readouterr().out
     assert never.text in said
-    assert told.text in said
+    assert outcome.text in said
     kept = json.loads((tmp_path / "h.json").read_text())
     assert kept["watch"]["state"] == "never_checked"
     assert kept["comparison"]["elements"]["EI_4"]["q975"] == pytest.approx(of_it.high)
@@ -168,8 +168,8 @@ def test_two_different_months_are_named_without_a_judgement(
     for form in (page, (tmp_path / "bridge-1-history.svg").read_text()):
         assert "more than chance" not in form.replace("more than chance, season", "")
         assert "No alarm" not in form
-    assert told.text in page
-    assert drawn.statements == (never, told)
+    assert outcome.text in page
+    assert drawn.statements == (never, outcome)
 
 
 def fused_state(some: Results) -> dict[str, ElementState]:

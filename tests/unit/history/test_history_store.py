@@ -70,12 +70,12 @@ def test_what_is_added_is_there_and_adding_it_again_changes_nothing(tmp_path: Pa
     for one, crossing in zip(kept, more.crossings, strict=True):
         assert one.verdict == "good"
         assert fusable_of(one) == usable(crossing)
-        told, found = unpacked_observation(one.observation or b""), observation_of(crossing)
+        outcome, found = unpacked_observation(one.observation or b""), observation_of(crossing)
         assert found is not None
-        assert np.allclose(told.value, found.value, rtol=1e-12)
-        assert np.allclose(told.own, found.own, rtol=1e-12)
-        assert [s.name for s in told.shared] == [s.name for s in found.shared]
-        for a, b in zip(told.shared, found.shared, strict=True):
+        assert np.allclose(outcome.value, found.value, rtol=1e-12)
+        assert np.allclose(outcome.own, found.own, rtol=1e-12)
+        assert [s.name for s in outcome.shared] == [s.name for s in found.shared]
+        for a, b in zip(outcome.shared, found.shared, strict=True):
             assert np.allclose(a.loading, b.loading, rtol=1e-6, atol=1e-12)
 
 
@@ -234,14 +234,14 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert capsys.readouterr().out == f"{found}: 5 crossings of bridge-1 added\n"
     assert cli.main(["history", "add", str(found), "--history", history]) == 0
     assert capsys.readouterr().out == f"{found}: 0 crossings added, 5 there already\n"
-    table, told, folder = tmp_path / "h.csv", tmp_path / "h.json", tmp_path / "figures"
+    table, outcome, folder = tmp_path / "h.csv", tmp_path / "h.json", tmp_path / "figures"
     drawn = ["--figures", str(folder), "--rrd", str(tmp_path / "h.rrd")]
-    written = ["--csv", str(table), "--json", str(told), *drawn]
+    written = ["--csv", str(table), "--json", str(outcome), *drawn]
     assert cli.main(["history", "bridge-1", "--history", history, *written]) == 0
     said = capsys.readouterr().out
     assert "bridge-1 in realm sim-fleet: 5 crossings in 1 month" in said
     assert len(table.read_text().splitlines()) == 1 + 7
-    (period,) = json.loads(told.read_text())["periods"]
+    (period,) = json.loads(outcome.read_text())["periods"]
     assert period["crossings"] == 5
     assert {path.name for path in folder.iterdir()} == {
         "bridge-1-history.png",
@@ -304,15 +304,17 @@ def test_what_a_killed_writer_left_is_no_damage(tmp_path: Path) -> None:
 
 def rewritten(path: Path, row: int, change: dict[str, object]) -> None:
     """Another value in a row; where it is of another kind, in all of the column."""
-    told = pq.read_table(path).to_pylist()
+    outcome = pq.read_table(path).to_pylist()
     for name, value in change.items():
-        is_alike = value is None or type(value) is type(told[row][name])
-        for number, one in enumerate(told):
+        is_alike = value is None or type(value) is type(outcome[row][name])
+        for number, one in enumerate(outcome):
             if number == row:
                 one[name] = value
             elif not is_alike:
                 one[name] = type(value)()
-    path.write_bytes(encoded(pa.Table.from_pylist(told), history_store.KEY, history_store.EDITION))
+    path.write_bytes(
+        encoded(pa.Table.from_pylist(outcome), history_store.KEY, history_store.EDITION)
+    )
 
 
 BAD_ROWS: list[dict[str, object]] = [

@@ -529,7 +529,7 @@ def test_a_truck_that_was_not_there_at_the_same_time_does_not_count(other: Run, 
 
 
 def test_a_recording_is_fed_truck_by_truck_and_counts_both_all_the_same() -> None:
-    """The first is decided before a position of the second is fed: it is told beforehand."""
+    """The first is decided before a position of the second is fed: it is announced beforehand."""
     site = with_second_truck()
     first = messages_of(drive(ACROSS, 15.0), site=site)
     second = messages_of(drive(ACROSS, 15.0), site=site, vehicle="truck-2")

@@ -54,23 +54,25 @@ class Asking:
         self.wanted: list[VehicleBridgePair] = []
 
     def fed(self, messages: Iterable[Message]) -> list[Output]:
-        return [o for m in messages for o in self.told(self.engine.feed(m.key, m.payload))]
+        return [o for m in messages for o in self.published(self.engine.feed(m.key, m.payload))]
 
-    def told(self, said: Iterable[Output | IdentificationTask | ValidationRequest]) -> list[Output]:
+    def published(
+        self, said: Iterable[Output | IdentificationTask | ValidationRequest]
+    ) -> list[Output]:
         return list(dispatch(self.engine, self.here, said, self.wanted.append))
 
     def resumed(self, said: EngineOutput) -> list[Output]:
-        return self.told(self.engine.resume(known(said)))
+        return self.published(self.engine.resume(known(said)))
 
     def released(self) -> list[Output]:
         found = []
         while self.engine.has_released:
-            found += self.told(self.engine.release())
+            found += self.published(self.engine.release())
         return found
 
 
 def names(outputs: Iterable[Output]) -> list[tuple[str, str]]:
-    """By crossing: what was told of its states, and its estimate."""
+    """Published states and estimates by crossing."""
     found = []
     for output in outputs:
         if output.result is not None:
@@ -98,7 +100,7 @@ def test_without_a_certificate_all_wait_and_it_is_wanted_once() -> None:
     assert asking.engine.waiting() == {PAIR: [ONE, OTHER]}
     assert not asking.engine.has_released
     assert asking.released() == []
-    assert asking.told(asking.engine.release()) == []
+    assert asking.published(asking.engine.release()) == []
     assert not asking.engine.has_undecided(*("sim-test", "truck-1"))
 
 
@@ -115,14 +117,14 @@ def test_with_one_they_go_on_in_order_and_name_it() -> None:
     ]
     assert on_the_wire == [DIGEST, DIGEST]
     assert asking.engine.waiting() == {}
-    # Nothing else differs from what was told where nobody asks.
+    # Nothing else differs from what was published where nobody asks.
     waited = pb.WAITING_NOT_VALIDATED
-    told = [
+    published = [
         o
         for o in [*waiting, *outputs]
         if o.key.stream != "crossing" or pb.Crossing.FromString(o.payload).state != waited
     ]
-    assert sorted(payload_but_certificate(o) for o in told) == sorted(
+    assert sorted(payload_but_certificate(o) for o in published) == sorted(
         payload_but_certificate(o) for o in WHOLE
     )
 
@@ -157,7 +159,7 @@ def test_one_at_a_time_and_none_overtakes_another() -> None:
     first = asking.fed(m for m in FIVE if m.log_time_ns < TWO[-1].log_time_ns)
     assert names(first)[-1] == (OTHER, "WAITING_NOT_VALIDATED")
     asking.engine.certify(PAIR, DIGEST)
-    assert names(asking.told(asking.engine.release())) == of_one(ONE, *GOES_ON)
+    assert names(asking.published(asking.engine.release())) == of_one(ONE, *GOES_ON)
     rest = asking.fed(m for m in FIVE if m.log_time_ns >= TWO[-1].log_time_ns)
     assert {what for _, what in names(rest)} == {"DETECTED", "COMPLETE"}
     after = names(asking.released())
@@ -221,7 +223,7 @@ def test_results_wait_for_room_and_delay_no_process() -> None:
 
 @pytest.mark.parametrize("number", range(7))
 def test_a_run_that_was_cut_off_while_they_waited_goes_on(number: int) -> None:
-    """Whatever was told of them before: no state is told twice, none is left out."""
+    """Whatever was published of them before: no state is published twice, none is left out."""
     before = Asking().fed(TWO)[:number]
     asking = Asking()
     asking.resumed(said_by(before))
@@ -258,8 +260,8 @@ def test_overdue_crossings_are_reported_as_given_up(
     monkeypatch.setattr(under_test, "MAX_WAITING_CROSSINGS", 3)
     asking = Asking()
     with caplog.at_level(logging.WARNING):
-        told = names(asking.fed(FIVE))
-    crossings = list(dict.fromkeys(name for name, _ in told))
+        published = names(asking.fed(FIVE))
+    crossings = list(dict.fromkeys(name for name, _ in published))
     assert len(crossings) == 5
     assert asking.engine.waiting() == {PAIR: crossings[2:]}
     lines = [record.getMessage() for record in caplog.records]

@@ -172,15 +172,15 @@ def test_earlier_crossings_count_in_the_next_state() -> None:
 
 
 def test_results_file_has_the_published_state() -> None:
-    """Not before: it may be told long after the result that it is about."""
+    """Not before: it may be published long after the result that it is about."""
     one = engine()
     results, used = [], []
     for m in TWO:
         for output in one.feed(m.key, m.payload):
             if output.result is not None:
                 results.append((output.result.crossing_id,))
-            told = bridge_states([output])
-            used += [tuple(state.crossings_used) for state in told]
+            published = bridge_states([output])
+            used += [tuple(state.crossings_used) for state in published]
             now = [state.crossings_used for state in one.bridges().values()]
             assert now == used[-1:]
     assert used == results
@@ -189,7 +189,7 @@ def test_results_file_has_the_published_state() -> None:
 def fuses_of(
     run: Engine, said: Iterable[Output | IdentificationTask | FusionTask | ValidationRequest]
 ) -> list[FusionTask]:
-    """What is to be fused when the works of a run are done; their states are told later."""
+    """What is to be fused when the works of a run are done; their states are published later."""
     found = []
     for one in said:
         if isinstance(one, IdentificationTask):
@@ -207,7 +207,7 @@ def state_made_of(fuse: FusionTask) -> BridgeResult:
 
 
 def test_a_state_that_was_made_before_a_result_does_not_count_it() -> None:
-    """The first is told behind both results: the second one's is owed to the next run."""
+    """The first is published behind both results: the second one's is owed to the next run."""
     one = Engine(SITE, SETTINGS, HEADER)
     first, second = (f for m in TWO for f in fuses_of(one, one.feed(m.key, m.payload)))
     outputs = [o for o in WHOLE if o.key.stream != "state"]
@@ -237,11 +237,13 @@ def test_crossings_that_could_not_be_fused_are_a_warning_and_owed(
 
 def test_new_run_has_the_published_states() -> None:
     """Nothing is fused for them once more."""
-    told = state_to_bridge(bridge_states(WHOLE)[-1])[2]
+    published = state_to_bridge(bridge_states(WHOLE)[-1])[2]
     known = known_crossings(said_by(WHOLE), search_hash(HEADER))
     one = Engine(SITE, SETTINGS, HEADER)
-    assert list(one.resume(known, {(REALM, "bridge-1"): told, (REALM, "other"): told})) == []
-    assert one.bridges() == {"bridge-1": told}
+    assert (
+        list(one.resume(known, {(REALM, "bridge-1"): published, (REALM, "other"): published})) == []
+    )
+    assert one.bridges() == {"bridge-1": published}
 
 
 SLOW = ((0.0, -30.0), (40.0, 90.0))
@@ -256,13 +258,13 @@ def test_a_history_that_begins_on_the_bridge_is_no_second_crossing(begin_s: floa
     assert resumed(said_by(fed_all_alone(messages_of(*SLOW))), rest) == []
 
 
-@pytest.mark.parametrize("told", [1, 3])
-def test_published_half_crossing_keeps_its_name(told: int) -> None:
+@pytest.mark.parametrize("published", [1, 3])
+def test_published_half_crossing_keeps_its_name(published: int) -> None:
     whole = fed_all_alone(messages_of(*SLOW))
-    after = resumed(said_by(whole[:told]), messages_of(*SLOW, begin_s=17.0))
+    after = resumed(said_by(whole[:published]), messages_of(*SLOW, begin_s=17.0))
     assert len([o for o in after if o.result]) == 1
     assert {state.crossing_id for state in states(after)} == {states(whole)[0].crossing_id}
-    assert [s.state for s in states(whole[:told] + after)] == [1, 2, 4, 5]
+    assert [s.state for s in states(whole[:published] + after)] == [1, 2, 4, 5]
 
 
 def fed_all_alone(messages: list[Message]) -> list[Output]:
@@ -284,7 +286,7 @@ def test_a_result_of_another_search_does_not_count(change: str) -> None:
 
 @pytest.mark.parametrize("number", [4, 5])
 def test_a_run_cut_off_after_one_of_another_search(number: int) -> None:
-    """That one told a `done` and a state of the bridge, too: of its own result."""
+    """That one published a `done` and a state of the bridge, too: of its own result."""
     other = said_by(fed(engine(header=HEADER._replace(settings={"method": "pre"})), TWO)[:6])
     whole = resumed(other, TWO)
     after = resumed(other + said_by(whole[:number]), TWO)
@@ -385,15 +387,15 @@ def test_fixes_that_come_after_the_decision_make_no_second_crossing() -> None:
     first += one.gone(REALM, "truck-1", for_good=True)
     second = fed(one, between(messages, "gnss", 5.0, 27.0))
     second += [*one.gone(REALM, "truck-1", for_good=True), *one.finish()]
-    told = [o.result for o in first + second if o.result]
-    assert len(told) == 1
+    published = [o.result for o in first + second if o.result]
+    assert len(published) == 1
     (whole,) = [o.result for o in fed_all_alone(messages) if o.result]
-    assert whole.entry_time - told[0].entry_time > 5.0  # or it would prove nothing
+    assert whole.entry_time - published[0].entry_time > 5.0  # or it would prove nothing
 
 
 @pytest.mark.parametrize("ends", ["drives on", "gone", "finish"])
 def test_a_history_that_comes_after_what_is_live_is_looked_at(ends: str) -> None:
-    """Half a minute behind, when its fixes had long been taken to be lost: it tells a crossing."""
+    """Half a minute behind, when its fixes had long counted as lost: it reveals a crossing."""
     long = messages_of(*THERE, (60.0, 540.0))
     stop_s = 60.0 if ends == "drives on" else 40.0
     live = [m for m in long if 12.0 <= m.log_time_ns * 1e-9 - START_S < stop_s]

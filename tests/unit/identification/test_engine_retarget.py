@@ -51,7 +51,7 @@ def test_every_crossing_has_one_result_with_the_hash_of_its_site(time_s: float) 
     one = Asking({PAIR: DIGEST})
     before = one.fed(until(time_s))
     assert retargeted(one, EDITED, passed=DIGEST) == []
-    then = [*one.fed(after(time_s)), *one.told(one.engine.finish())]
+    then = [*one.fed(after(time_s)), *one.published(one.engine.finish())]
     new = site_hash(EDITED)
     assert hashes([*before, *then]) == [
         *(hashes(before)),

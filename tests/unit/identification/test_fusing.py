@@ -40,7 +40,7 @@ AXLE = fusion.AxleFootprint(
 def likelihood(
     ratio: tuple[float, ...], seed: int, nominal: float = NOMINAL, std: float = 0.03
 ) -> fusion.FusionLikelihood:
-    """Of a crossing that tells EI/nominal of every element to `std`."""
+    """Information of a crossing that estimates EI/nominal of every element to `std`."""
     rng = np.random.default_rng(seed)
     elements = [
         fusion.Coordinate(name=f"EI_{n}", location=nominal, scale=0.55, is_log=True)

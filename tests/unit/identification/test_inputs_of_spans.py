@@ -1,4 +1,4 @@
-"""What method `pre` is told of a continuous bridge."""
+"""Inputs of method `pre` for a continuous bridge."""
 
 import numpy as np
 

@@ -136,7 +136,7 @@ def test_later_states_replace_the_final_one(tmp_path: Path) -> None:
     state = state_of(next(counted_bridges()), "bridge-1")
     assert state is not None
     file.replace_bridges({"bridge-1": state})
-    assert not path.exists()  # without a crossing there is nothing to tell
+    assert not path.exists()  # without a crossing there is nothing to publish
     crossings = [result(n) for n in range(2)]
     file.add(crossings[0], {})
     for bridges in ({"bridge-1": state, "bridge-2": state}, {}, {"bridge-1": state}):

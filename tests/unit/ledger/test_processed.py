@@ -30,8 +30,8 @@ def site(position_noise_m: float) -> Site:
     return SITE.model_copy(update={"receiver": receiver})
 
 
-def told_by_the_worker(messages: list[Message], known: Site) -> list[Message]:
-    """What a worker with this site file tells, as it is recorded."""
+def published_by_worker(messages: list[Message], known: Site) -> list[Message]:
+    """Messages of a worker with this site file, as they are recorded."""
     header = ResultHeader(
         "0", 0.0, site_hash(known), SETTINGS.model_dump(mode="json"), SETTINGS.seed
     )
@@ -59,10 +59,10 @@ def test_what_is_no_stay_for_the_worker_is_none_for_the_logger(
     tmp_path: Path, noise_m: float, stays: int
 ) -> None:
     messages = messages_of(*TURNED)
-    told = told_by_the_worker(messages, site(noise_m))
-    assert len([m for m in told if m.key.stream == "estimate"]) == stays
+    published = published_by_worker(messages, site(noise_m))
+    assert len([m for m in published if m.key.stream == "estimate"]) == stays
     path = recorded(tmp_path / "drive.mcap", messages, site(noise_m))
-    results = [recorded(tmp_path / "results.mcap", told)] if told else []
+    results = [recorded(tmp_path / "results.mcap", published)] if published else []
     assert is_processed(path, results)
     assert is_processed(path, []) == (stays == 0)
 
@@ -70,14 +70,14 @@ def test_what_is_no_stay_for_the_worker_is_none_for_the_logger(
 @pytest.mark.parametrize("kept", ["estimate", "crossing"])
 def test_a_result_or_the_word_that_there_is_one_is_enough(tmp_path: Path, kept: str) -> None:
     messages = messages_of(*THROUGH)
-    told = [m for m in told_by_the_worker(messages, SITE) if m.key.stream == kept]
+    published = [m for m in published_by_worker(messages, SITE) if m.key.stream == kept]
     path = recorded(tmp_path / "drive.mcap", messages, SITE)
-    assert is_processed(path, [recorded(tmp_path / "results.mcap", told)])
+    assert is_processed(path, [recorded(tmp_path / "results.mcap", published)])
 
 
 def test_the_word_that_it_is_being_identified_is_not_enough(tmp_path: Path) -> None:
     messages = messages_of(*THROUGH)
-    states = [m for m in told_by_the_worker(messages, SITE) if m.key.stream == "crossing"]
+    states = [m for m in published_by_worker(messages, SITE) if m.key.stream == "crossing"]
     path = recorded(tmp_path / "drive.mcap", messages, SITE)
     assert not is_processed(path, [recorded(tmp_path / "begun.mcap", states[:-1])])
 
@@ -88,7 +88,7 @@ def test_a_crossing_that_is_cut_by_the_next_file_is_known_in_both(
 ) -> None:
     """The truck is on the bridge from 5.5 to 10.3 s."""
     messages = messages_of(*THROUGH)
-    results = recorded(tmp_path / "results.mcap", told_by_the_worker(messages, SITE))
+    results = recorded(tmp_path / "results.mcap", published_by_worker(messages, SITE))
     first = [m for m in messages if m.log_time_ns * 1e-9 - START_S < cut_s]
     second = [m for m in messages if m.log_time_ns * 1e-9 - START_S >= cut_s]
     for name, part in (("first.mcap", first), ("second.mcap", second)):
@@ -98,13 +98,13 @@ def test_a_crossing_that_is_cut_by_the_next_file_is_known_in_both(
 
 
 def test_a_truck_that_stays_on_the_bridge_is_known_by_its_entry(tmp_path: Path) -> None:
-    """Nothing was told of an exit."""
+    """No exit was published."""
     messages = messages_of((0.0, -40.0), (8.0, 15.0), (30.0, 15.0))
-    told = told_by_the_worker(messages, SITE)
-    done = [pb.Crossing.FromString(m.payload) for m in told if m.key.stream == "crossing"][-1]
+    published = published_by_worker(messages, SITE)
+    done = [pb.Crossing.FromString(m.payload) for m in published if m.key.stream == "crossing"][-1]
     assert (done.state, done.exit_time_ns) == (pb.DONE, 0)
     path = recorded(tmp_path / "drive.mcap", messages, SITE)
-    states = [m for m in told if m.key.stream == "crossing"]
+    states = [m for m in published if m.key.stream == "crossing"]
     assert is_processed(path, [recorded(tmp_path / "results.mcap", states)])
 
 
@@ -117,8 +117,8 @@ def test_one_and_two_threads_are_one_search() -> None:
     assert search_hash(header(threads=1)) == search_hash(header(threads=2))
     assert search_hash(header(starts=1)) != search_hash(header(starts=2))
     messages = messages_of(*THROUGH)
-    told = told_by_the_worker(messages, SITE)
-    said = [(m.key, m.payload) for m in told]
+    published = published_by_worker(messages, SITE)
+    said = [(m.key, m.payload) for m in published]
     for threads in (1, 2, 7):
         (known,) = known_crossings(said, search_hash(header(threads=threads)))
         assert known.is_identified

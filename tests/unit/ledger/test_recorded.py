@@ -57,9 +57,9 @@ def looked(files: Files) -> list[RecordedStay]:
 
 
 def taken(
-    files: Files, stays: list[RecordedStay], *, is_final: bool = False, told: int = 0
+    files: Files, stays: list[RecordedStay], *, is_final: bool = False, published: int = 0
 ) -> FetchResult:
-    known = known_crossings(said_by(WHOLE[:told]))
+    known = known_crossings(said_by(WHOLE[:published]))
     return fetch_crossings(files, REALM, stays, known, SITE, SETTINGS, is_final=is_final)
 
 
@@ -105,20 +105,20 @@ def test_what_is_found_is_what_a_worker_finds_that_listens(
     for (_, one), work in zip(found.found, live(), strict=True):
         assert one.pending.work.crossing_id == work.crossing_id
         same_data(one.pending.work, work)
-        told = [pb.Crossing.FromString(o.payload).state for o in one.messages]
-        assert told == [pb.DETECTED, pb.COMPLETE]
+        published = [pb.Crossing.FromString(o.payload).state for o in one.messages]
+        assert published == [pb.DETECTED, pb.COMPLETE]
     payloads = [o.payload for _, one in found.found for o in one.messages]
     assert payloads == [o.payload for o in (*WHOLE[:2], *WHOLE[6:8])]
 
 
-@pytest.mark.parametrize(("told", "left"), [(1, [pb.COMPLETE]), (2, []), (3, [])])
+@pytest.mark.parametrize(("published", "left"), [(1, [pb.COMPLETE]), (2, []), (3, [])])
 def test_only_unpublished_results_are_published(
-    tmp_path: Path, told: int, left: list[pb.CrossingState]
+    tmp_path: Path, published: int, left: list[pb.CrossingState]
 ) -> None:
     files = written(tmp_path, TWO)
-    ((_, one),) = taken(files, looked(files)[:1], told=told).found
+    ((_, one),) = taken(files, looked(files)[:1], published=published).found
     assert [pb.Crossing.FromString(o.payload).state for o in one.messages] == left
-    assert (one.pending.identifying is None) == (told == 3)
+    assert (one.pending.identifying is None) == (published == 3)
 
 
 def test_what_may_still_come_is_waited_for(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def test_a_folder_that_is_not_there_holds_nothing(tmp_path: Path) -> None:
 
 
 def test_the_last_minute_of_a_run_that_ended_well_is_unsure_too(tmp_path: Path) -> None:
-    """The router may have been away when it was stopped: to put a message tells nothing."""
+    """The router may have been away when it was stopped: to put a message confirms nothing."""
     path = written(tmp_path / "results-1.mcap", estimate(0), estimate(1), end=True)
     found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
     assert sequences(found.published) == [(1, 0), (1, 1)]
@@ -178,7 +178,7 @@ def test_no_damage_is_a_failure(tmp_path: Path, position: int) -> None:
 def test_a_damaged_time_of_the_start_is_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Metadata have no checksum of their own that would tell."""
+    """Metadata have no checksum of their own that would show it."""
     path = written(tmp_path / "results-1.mcap", estimate(0))
     content = bytearray(path.read_bytes())
     place = content.index(b"time_ns") + len(b"time_ns") + 4  # behind the length of the value
@@ -231,15 +231,15 @@ def test_the_latest_state_of_each_bridge_is_latched(tmp_path: Path) -> None:
 def test_states_of_earlier_runs_are_read_from_their_messages(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    told = BridgeResult(verdict="rejected", crossings_left_out_count=3)  # type: ignore[call-arg]
+    outcome = BridgeResult(verdict="rejected", crossings_left_out_count=3)  # type: ignore[call-arg]
 
     def state(bridge: str, payload: bytes) -> Message:
         return estimate(0)._replace(key=Key(REALM, "bridge", bridge, "state"), payload=payload)
 
-    payload = bridge_to_protobuf("a", 1, told).SerializeToString()
+    payload = bridge_to_protobuf("a", 1, outcome).SerializeToString()
     written(tmp_path / "results-1.mcap", state("a", payload), state("b", b"x"), end=True)
     found = read_earlier(tmp_path, REALM, NOW_S, SEARCH)
-    assert found.states() == {(REALM, "a"): told}
+    assert found.states() == {(REALM, "a"): outcome}
     assert "skipping a state of b" in caplog.text
 
 

@@ -144,18 +144,18 @@ def test_a_minute_in_which_all_came_late_changes_neither() -> None:
 
 def test_drift_is_reported_when_known_and_when_changed() -> None:
     intake = make()
-    told = []
+    reported = []
     for number in range(40 * 600):
         now_s = number / 10
         behind_ns = round(2 * S + 100e-6 * now_s * S)
         one = message(number, device_ns=number * S // 10, wall_ns=at(now_s)[0] - behind_ns)
         intake.accept(one, at(now_s)[0])
         if number % 10 == 0:
-            told += intake.report(*at(now_s))
-    assert set(kinds(told)) == {EventKind.CLOCK_DRIFT}
-    assert 3 <= len(told) <= 5  # 60 ms in ten minutes
-    assert told[0][1].text == "the truck's clock is 2.000 s behind the logger's"
-    assert "+100.0 ppm" in told[-1][1].text
+            reported += intake.report(*at(now_s))
+    assert set(kinds(reported)) == {EventKind.CLOCK_DRIFT}
+    assert 3 <= len(reported) <= 5  # 60 ms in ten minutes
+    assert reported[0][1].text == "the truck's clock is 2.000 s behind the logger's"
+    assert "+100.0 ppm" in reported[-1][1].text
     figures = intake.clock_figures()
     assert figures["clock_drift_ppm/truck-1"] == pytest.approx(100.0, abs=1.0)
 
@@ -244,7 +244,7 @@ def test_a_vehicle_that_shows_itself_in_8400_realms_locks_out_no_other() -> None
     later = NOW_NS + S
     assert intake.accept(message(1, vehicle="truck-2"), later) is not None
     assert intake.accept(message(0, vehicle="truck-3"), later) is not None
-    for number in range(200):  # as many sources of refusals as are told apart
+    for number in range(200):  # as many sources of refusals as are distinguished
         intake.accept(message(0, vehicle="truck-evil", realm=f"sim-{number + 9000}"), later)
     intake.accept(message(5, vehicle="truck-3")._replace(attachment=None), later)
     evil, honest = intake.report(*at(1.0))
@@ -302,12 +302,12 @@ def test_a_flood_of_holes_takes_bounded_memory(monkeypatch: pytest.MonkeyPatch) 
 
 def test_refusals_are_logged_once_a_minute_and_all_counted() -> None:
     intake = make()
-    told = []
+    reported = []
     for second in range(200):
         intake.accept(message(1)._replace(attachment=None), NOW_NS)
-        told += intake.report(*at(float(second)))
-    told += intake.report(*at(200.0), closing=True)
-    assert [event.messages for _, event in told] == [1, 60, 60, 60, 19]
+        reported += intake.report(*at(float(second)))
+    reported += intake.report(*at(200.0), closing=True)
+    assert [event.messages for _, event in reported] == [1, 60, 60, 60, 19]
 
 
 def test_lost_messages_are_reported_and_no_longer_a_gap() -> None:
@@ -345,11 +345,11 @@ def test_shrinking_gap_is_reported_once() -> None:
     intake = make()
     for sequence in (0, 100):
         intake.accept(message(sequence), NOW_NS)
-    told = intake.report(*at(0.0))
+    reported = intake.report(*at(0.0))
     for second in range(1, 30):
         intake.accept(message(second, recovered=True), NOW_NS)
-        told += intake.report(*at(float(second)))
-    gaps = [event for _, event in told if event.kind == EventKind.GAP]
+        reported += intake.report(*at(float(second)))
+    gaps = [event for _, event in reported if event.kind == EventKind.GAP]
     assert [(gap.first_sequence, gap.last_sequence) for gap in gaps] == [(6, 99)]
 
 

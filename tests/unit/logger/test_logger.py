@@ -275,8 +275,8 @@ def test_what_has_come_is_written_or_counted_before_the_file_is_closed(
     assert [m.sequence for m in found if m.key.owner == "vehicle"] == list(range(written))
     assert code == (0 if written == 50 else 1)
     assert (read_info(file).end or {})["dropped"] == str(50 - written)
-    told = [decode_event(m.payload) for m in found if m.key.stream == "event"]
-    assert sum(e.messages for e in told if e.kind == EventKind.QUEUE_FULL) == 50 - written
+    outcome = [decode_event(m.payload) for m in found if m.key.stream == "event"]
+    assert sum(e.messages for e in outcome if e.kind == EventKind.QUEUE_FULL) == 50 - written
 
 
 def test_a_file_that_is_closed_has_its_row_in_the_catalogue(tmp_path: Path) -> None:

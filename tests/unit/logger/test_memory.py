@@ -27,9 +27,9 @@ print(before, high, resident_mb())
     not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="only glibc gives memory back when asked"
 )
 def test_free_memory_is_given_back() -> None:
-    told = subprocess.run(
+    outcome = subprocess.run(
         [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True
     ).stdout
-    before, high, after = map(float, told.split())
+    before, high, after = map(float, outcome.split())
     assert high > before + 80.0
     assert after < before + 20.0

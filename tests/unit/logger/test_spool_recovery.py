@@ -45,7 +45,7 @@ def flat(ranges: list[tuple[int, int]]) -> set[int]:
 def test_every_missing_number_is_fetched_confirmed_or_lost(
     seen: set[int], held: set[int], durable: int, ripe: int, gone: set[int]
 ) -> None:
-    """What is gone from this logger's disk is on none, whatever the truck was told."""
+    """What is gone from this logger's disk is on none, whatever was reported to the truck."""
     boot = SpoolBoot(1, 31, intervals(held).ranges(), durable, 0)
     found = shortfall(boot, intervals(seen), ripe, intervals(gone).ranges())
     missing = set(range(ripe)) - seen
@@ -466,7 +466,7 @@ def test_a_truck_in_many_realms_leaves_room_for_the_others(router: zenoh.Session
 
 
 def test_a_boot_that_is_gone_from_disk_and_truck_is_lost(router: zenoh.Session) -> None:
-    """And what the truck still has of it is asked for, though it had been told that it is safe."""
+    """And what the truck still has of it is asked for, though it was reported to be safe."""
     logger = Logger(router)
     logger.recovery._gone = {(ACCEL, 1): intervals({0, 1, 2}), (ACCEL, 2): intervals({5, 6})}
     logger.seen.numbers(ACCEL, 2).add_range(0, 4)

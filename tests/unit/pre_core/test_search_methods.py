@@ -230,11 +230,11 @@ def test_an_objective_that_is_not_finite_is_an_ending_not_an_exception(
 
 
 def test_progress_is_reported_once_a_step(method: Method, window: PaperWindow):
-    told = []
+    outcome = []
     _, infos, _ = loop.run_search(
-        *method.bind(window, 1, 2), 3, progress=lambda count, info: told.append((count, info))
+        *method.bind(window, 1, 2), 3, progress=lambda count, info: outcome.append((count, info))
     )
-    assert told == list(enumerate(infos, start=1))
+    assert outcome == list(enumerate(infos, start=1))
 
 
 def test_every_ending_is_a_sentence():

@@ -70,8 +70,8 @@ def test_the_spread_of_the_centre_of_gravity_is_that_of_the_loads() -> None:
     of_axles = (0.15 * 1100 * (1 / 8900 - 1 / 14300), 0.15 * 600 / 14300)
     spread = vehicle_of(HEAD, FRONT, REAR).spread("front_axle_to_cg_m")
     assert spread == pytest.approx(hypot(of_load, *of_axles))
-    told = vehicle_of(HEAD, "front_axle_to_cg_m_spread = 0.3\n", FRONT, REAR)
-    assert told.spread("front_axle_to_cg_m") == 0.3
+    outcome = vehicle_of(HEAD, "front_axle_to_cg_m_spread = 0.3\n", FRONT, REAR)
+    assert outcome.spread("front_axle_to_cg_m") == 0.3
     rough = vehicle_of(HEAD, FRONT + "load_kg_spread = 0.1\n", REAR)
     assert rough.spread("front_axle_to_cg_m") > 2.0 * spread
 

@@ -1,4 +1,4 @@
-"""Simulated drives with what no site file tells, over one and over several spans."""
+"""Simulated drives with what no site file has, over one and over several spans."""
 
 from pathlib import Path
 
@@ -152,10 +152,10 @@ def test_few_elements_have_fewer_modes_than_are_kept() -> None:
 def test_options_of_simulate_reach_the_truth(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    told: list[OutOfModelEffects] = []
+    outcome: list[OutOfModelEffects] = []
 
     def keeping(*, beyond: OutOfModelEffects, **others: object) -> int:
-        told.append(beyond)
+        outcome.append(beyond)
         return 0
 
     monkeypatch.setattr("services.simulation.drive.simulate_command", keeping)
@@ -172,7 +172,7 @@ def test_options_of_simulate_reach_the_truth(
         )
         == 0
     )
-    assert told == [
+    assert outcome == [
         OutOfModelEffects(),
         OutOfModelEffects(
             (2e8, 0.0), (2.5e-10, 1.25e-10), DepartedVehicle(3e5, 17.0, 0.1), 0.08, 1.0, 0.2, 1.38

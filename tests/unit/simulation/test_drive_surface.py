@@ -54,15 +54,15 @@ BAND_CYCLES_PER_M = (0.3, 3.0)
 
 
 class Spy:
-    """What the simulation was told and gave."""
+    """Inputs and outputs of the simulation."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.told: list[tuple[Motion, WheelRoad]] = []
+        self.outcome: list[tuple[Motion, WheelRoad]] = []
         self.gave: list[Any] = []
         real = simulation.simulate
 
         def keeping(car: Any, beam: Any, motion: Motion, road: WheelRoad, *a: Any, **k: Any) -> Any:
-            self.told.append((motion, road))
+            self.outcome.append((motion, road))
             self.gave.append(real(car, beam, motion, road, *a, **k))
             return self.gave[-1]
 
@@ -97,7 +97,7 @@ def test_without_a_surface_everything_is_as_it_was(monkeypatch: pytest.MonkeyPat
     """Bit for bit: one groove under both wheels, and the same streams of noise."""
     spy = Spy(monkeypatch)
     drive = driven(noise_ug_per_rthz=25.0)
-    (motion, felt), fine = spy.told[0], spy.gave[0]
+    (motion, felt), fine = spy.outcome[0], spy.gave[0]
     reach = SITE.vehicles[0].wheelbase_m + 1.0
     low, high = motion.position_m.min() - reach, motion.position_m.max() + reach
     raw = iso_8608_profile(np.floor(low), np.ceil(high), 0.01, "A", 3)
@@ -126,7 +126,7 @@ def test_each_axle_drives_over_the_road_that_its_tyres_feel(
     drive = driven(paths=paths, forward=forward)
     assert drive.rear_road is not None
     sign = 1 if forward else -1
-    motion, felt = spy.told[0]
+    motion, felt = spy.outcome[0]
     expected = under_axles(drive.road, drive.rear_road, motion, SITE.vehicles[0].wheelbase_m, sign)
     np.testing.assert_array_equal(felt.height_m, expected.height_m)
     np.testing.assert_array_equal(felt.rate_m_per_s, expected.rate_m_per_s)
@@ -203,9 +203,9 @@ def test_tyres_are_the_sites_the_askers_or_common_ones() -> None:
     for asked, words in (
         (
             SurfaceOptions("twin"),
-            f"--tyres: the site file tells it, {known.id} has twin_tyre_distance_m",
+            f"--tyres: the site file has it, {known.id} has twin_tyre_distance_m",
         ),
-        (SurfaceOptions(None, 0.0), "--rear-offset: the site file tells it, .* rear_axle_offset_m"),
+        (SurfaceOptions(None, 0.0), "--rear-offset: the site file has it, .* rear_axle_offset_m"),
     ):
         with pytest.raises(InputError, match=words):
             wheel_paths_of(known, asked)
@@ -214,12 +214,12 @@ def test_tyres_are_the_sites_the_askers_or_common_ones() -> None:
 def test_options_of_simulate_reach_the_road(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    told: list[tuple[object, ...]] = []
+    outcome: list[tuple[object, ...]] = []
 
     def keeping(
         *, surface: object, schedule: Schedule, drive_seed: int | None, **others: object
     ) -> int:
-        told.append((surface, schedule.runs, drive_seed))
+        outcome.append((surface, schedule.runs, drive_seed))
         return 0
 
     monkeypatch.setattr("services.simulation.drive.simulate_command", keeping)
@@ -228,7 +228,7 @@ def test_options_of_simulate_reach_the_road(
     assert cli.main([*begin, "--road-surface"]) == 0
     options = "--road-surface --tyres single --rear-offset -0.01 --wander 0.1 --runs 12"
     assert cli.main([*begin, *options.split(), "--drive-seed", "7"]) == 0
-    assert told == [
+    assert outcome == [
         (None, 1, None),
         (SurfaceOptions(None, None, 0.0), 1, None),
         (SurfaceOptions("single", -0.01, 0.1), 12, 7),
@@ -280,6 +280,6 @@ def test_values_of_the_site_file_are_not_requested_again(
     options = ["--scenario", "6", "--site", str(site), "--road-surface", "-o", str(output)]
     assert cli.main(["simulate", *options, "--tyres", "twin"]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("driveby: --tyres: the site file tells it, ")
+    assert error.startswith("driveby: --tyres: the site file has it, ")
     assert error.count("\n") == 1
     assert not output.exists()

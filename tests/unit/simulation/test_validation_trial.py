@@ -247,11 +247,11 @@ def test_conditions_are_the_sites_or_the_usual() -> None:
             "noise_density_ug_per_rthz": (1.0, 2.0, 3.0, 4.0),
         }
     )
-    told = conditions(
+    published = conditions(
         with_bridge(survey_speed_m_per_s=14.0, road_class="C").model_copy(update={"sensor": sensor})
     )
-    assert (told.speed_m_per_s, told.road_class, told.rate_hz) == (14.0, "C", 500.0)
-    assert told.noise_density_ug_per_rthz == (1.0, 2.0, 3.0, 4.0)
+    assert (published.speed_m_per_s, published.road_class, published.rate_hz) == (14.0, "C", 500.0)
+    assert published.noise_density_ug_per_rthz == (1.0, 2.0, 3.0, 4.0)
 
 
 @pytest.mark.parametrize(

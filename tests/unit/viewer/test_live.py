@@ -307,18 +307,18 @@ def test_result_defines_the_elements_without_a_site_file(tmp_path: Path, site: S
     given = result(site).model_dump()
     for name, value in given["parameters"].items():
         value["prior"] = prior if name.startswith("EI_") else None
-    told = CrossingResult.model_validate(given)
-    elements = elements_of_result(told)
+    outcome = CrossingResult.model_validate(given)
+    elements = elements_of_result(outcome)
     assert elements is not None
     assert sum(elements.lengths_m) == pytest.approx(30.0)
     live = made(tmp_path / "told.rrd", None)
-    live.hears("bridge", "estimate", estimate(told))
+    live.hears("bridge", "estimate", estimate(outcome))
     drawn = rows(live.drawn(), "latest/bridge-1/strip/ratio")
     (name,) = [name for name in drawn.column_names if name.endswith("Points2D:labels")]
     assert drawn[name].to_pylist() == [
         ["1.000", "0.980", "1.010", "0.400", "1.020", "1.000", "0.990"]
     ]
-    assert str(lowest_element(told)) == "EI_4 0.400 of nominal (0.377 to 0.424)"
+    assert str(lowest_element(outcome)) == "EI_4 0.400 of nominal (0.377 to 0.424)"
     assert elements_of_result(result(site)) is None  # no priors in it
     assert lowest_element(result(site)) is None
 

@@ -90,7 +90,7 @@ class Worker:
         self._now_s = 0.0
 
     def feed(self, messages: list[Message]) -> list[CrossingResult]:
-        return self._told(o for m in messages for o in self.engine.feed(m.key, m.payload))
+        return self._published(o for m in messages for o in self.engine.feed(m.key, m.payload))
 
     def go_on(self, times: int = 20) -> list[CrossingResult]:
         """The results of so many rounds, each long after the one before."""
@@ -100,10 +100,10 @@ class Worker:
             said = self.backfill.advance(
                 self.engine, self._now_s, has_room=True, want=self.wanted.append
             )
-            results += self._told(said)
+            results += self._published(said)
         return results
 
-    def _told(self, said: Iterator[object]) -> list[CrossingResult]:
+    def _published(self, said: Iterator[object]) -> list[CrossingResult]:
         results = []
         outputs = dispatch(self.engine, self.here, said, self.wanted.append)  # type: ignore[arg-type]
         for output in (*outputs, *collect(self.engine, self.here)):
