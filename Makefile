@@ -42,7 +42,7 @@ down: ## end the containers; recordings, results, spools and certificates stay i
 # One worker computes while the other one waits for processes (tests/groups.py).
 BESIDE := -n 2 --dist loadgroup
 
-test: $(STAMP) ## the default tests (some 17 minutes on 2 busy cores)
+test: $(STAMP) ## the default tests (some 12 minutes on 2 quiet cores)
 	$(BIN)/python -m pytest $(BESIDE)
 
 test-all: $(STAMP) ## the default tests and the slow ones
