@@ -14,6 +14,7 @@ from schemas.topics import Key, Message
 from services.bus.delivery import DeliveryTracker
 from services.bus.publisher import Publisher
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
+from services.common.interrupts import handled_by
 
 _log = logging.getLogger(__name__)
 _MAX_IN_FLIGHT = 20_000
@@ -165,15 +166,8 @@ def set_by_signals(
             on_second()
         stop.set()
 
-    if threading.current_thread() is not threading.main_thread():
+    with handled_by(handle, *numbers):
         yield stop
-        return
-    before = {number: signal.signal(number, handle) for number in numbers}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def leave_at_once() -> None:

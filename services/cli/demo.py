@@ -13,7 +13,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -35,6 +34,7 @@ from services.bus.session import open_session
 from services.bus.subscription import RawSample, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import write_atomically
+from services.common.interrupts import handled_by
 from services.recordings.recording import read_info, read_messages
 from services.simulation.drive import (
     SimulatedDrive,
@@ -163,14 +163,8 @@ def _wait_until_closed(view: "_ChildProcess", console: "Console") -> None:
 @contextlib.contextmanager
 def _terminated_as_interrupted() -> Iterator[None]:
     """Let SIGTERM end the processes too, as Ctrl-C does, instead of leaving them behind."""
-    if threading.current_thread() is not threading.main_thread():
+    with handled_by(signal.default_int_handler, signal.SIGTERM):
         yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _new_folder(out: Path | None) -> Path:

@@ -1,33 +1,38 @@
-"""Steps that an interrupt must not separate."""
+"""Signal handlers for the time of a block, and steps that an interrupt must not separate."""
 
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SignalHandler = Callable[[int, FrameType | None], object]
 
 
 @contextlib.contextmanager
-def interrupts_held() -> Iterator[None]:
-    """Hold SIGINT and SIGTERM back until the block ends, and then deliver them.
+def handled_by(handler: SignalHandler, *numbers: signal.Signals) -> Iterator[None]:
+    """Let `handler` receive signals; restore the previous handlers at the end.
 
-    For moments only. In a thread other than the main one, which gets no signals, nothing is held.
+    Outside the main thread, which alone may set handlers, signals are unchanged.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    held: list[int] = []
-
-    def hold(number: int, _frame: FrameType | None) -> None:
-        held.append(number)
-
-    before = {one: signal.signal(one, hold) for one in _SIGNALS}
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for number, previous in before.items():
+            signal.signal(number, previous)
+
+
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Hold SIGINT and SIGTERM back for the moments of a block, and deliver them at its end."""
+    held: list[int] = []
+    try:
+        with handled_by(lambda number, _: held.append(number), signal.SIGINT, signal.SIGTERM):
+            yield
+    finally:
         for number in held:
             signal.raise_signal(number)

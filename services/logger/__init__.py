@@ -32,6 +32,7 @@ from services.bus.subscription import RawSample, Subscription
 from services.common.disk import DISK
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
+from services.common.interrupts import handled_by
 from services.common.intervals import Intervals
 from services.logger.completeness import Completeness
 from services.logger.drops import QUEUE_IS_FULL, Drop
@@ -432,11 +433,5 @@ def _check_room(folder: Path, min_free_bytes: int) -> None:
 
 @contextlib.contextmanager
 def _rotated_by_signal(writer: FileWriter) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
+    with handled_by(lambda *_: writer.rotate(), signal.SIGUSR1):
         yield
-        return
-    before = signal.signal(signal.SIGUSR1, lambda *_: writer.rotate())
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGUSR1, before)
