@@ -156,7 +156,9 @@ class ArrivalQueue:
 
         Nothing is waited for behind a truck that has left.
         """
-        left = {truck for truck, leave in self._leaves.items() if sum(leave) <= now_s}
+        if not self._new:
+            return []
+        left = self._departed(now_s)
         due: list[TruckMessage] = []
         for name, history in list(self._new.items()):
             if name[:2] in left or history.is_complete(now_s):
@@ -166,7 +168,7 @@ class ArrivalQueue:
 
     def gone(self, now_s: float) -> list[DepartedTruck]:
         """Return the trucks found to have left since the last call."""
-        gone = [t for t, leave in self._leaves.items() if sum(leave) <= now_s]
+        gone = self._departed(now_s)
         lost = [truck for truck, lost_s in self._lost.items() if lost_s <= now_s]
         for truck in gone:
             self._lost[truck] = self._leaves.pop(truck).since_s + _LOST_AFTER_S
@@ -175,6 +177,10 @@ class ArrivalQueue:
         return [DepartedTruck(*t, for_good=False) for t in gone] + [
             DepartedTruck(*t, for_good=True) for t in lost
         ]
+
+    def _departed(self, now_s: float) -> list[_Vehicle]:
+        """Return the trucks whose absence has lasted long enough."""
+        return [truck for truck, leave in self._leaves.items() if sum(leave) <= now_s]
 
     def leaving(self) -> dict[_Vehicle, bool]:
         """Return trucks that may be leaving, and whether messages of theirs wait here."""
