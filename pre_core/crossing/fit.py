@@ -211,11 +211,11 @@ def fit_all(
     start[layout(problem).swing] = 0.0
     free = np.eye(start.size)
     first = np.delete(free, resting_mode_indices(problem, strategy), axis=1)
-    at_full_weight = update_noise(problem, start, no_force_noise())
+    at_full_weight = _at_full_weight(problem, start)
     at_full_weight, y, ending, evaluations = fit_stage(
         at_full_weight, start, first, _FREE_STAGES[0], _at_full_weight
     )
-    at_full_weight = update_noise(at_full_weight, y, no_force_noise())
+    at_full_weight = _at_full_weight(at_full_weight, y)
     problem = update_noise(at_full_weight, y)
     has_friction = problem.force.any() and suspension_weight(problem, y) < _CLEAR_FRICTION_WEIGHT
     if strategy.uses_suspension and has_friction:
@@ -229,7 +229,7 @@ def fit_all(
     else:
         for is_free, rounds in ((True, _EARLY_ROUNDS), (False, _MAX_ROUNDS)):
             y = y if is_free else _not_negative(problem, y)
-            problem = update_noise(problem, y, no_force_noise())
+            problem = _at_full_weight(problem, y)
             problem, y, ending, used = _fit_in_noise_rounds(
                 problem,
                 y,

@@ -146,7 +146,7 @@ def draw_verdict(
 
 
 class BarPlaces(NamedTuple):
-    """Where the bars of elements stand along the bridge, m."""
+    """Places of the bars of elements along the bridge, m."""
 
     centres_m: FloatArray  # (n,)
     lengths_m: FloatArray  # (n,)
