@@ -1,12 +1,14 @@
-"""The truth of the independent simulator, in the names of the method."""
+"""The truth of the independent simulator, in the names of the method; the scenarios' draws."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pre_core import parameters
+from schemas.settings import IdentificationSettings
 from studies.validation import uncertainty
 
 
@@ -18,3 +20,20 @@ def test_truth_has_a_value_for_every_parameter(shared: Path) -> None:
     values = uncertainty._values(known)
     assert set(parameters.names(len(known["EI"]))) == set(values)
     assert np.all(np.isfinite(list(values.values())))
+
+
+def test_each_scenario_has_a_road_and_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    class DrawnError(Exception):
+        pass
+
+    seeds: list[int] = []
+
+    def simulate(*_: object, seed: int, **__: object) -> None:
+        seeds.append(seed)
+        raise DrawnError
+
+    monkeypatch.setattr(uncertainty, "simulate_drive", simulate)
+    for number in range(1, 13):
+        with suppress(DrawnError):
+            uncertainty.one_scenario(number, 25.0, IdentificationSettings(method="pre"))
+    assert len(set(seeds)) == 12
