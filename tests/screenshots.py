@@ -41,7 +41,7 @@ from tests.waiting import LONGEST_S, until
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "recordings/sample/crossing.mcap"
 FOLDER = ROOT / "docs/images"
-MOST_BYTES = 150_000
+MAX_BYTES = 150_000
 
 
 class Shot(NamedTuple):
@@ -57,7 +57,7 @@ SHOTS = (
     Shot("view-recording", "recording.rrd", ("Recording",), None),
     Shot("view-bridge", "good.rrd", ("Bridge",), 15_000),
     Shot("view-crossing", "good.rrd", ("2026-01-01",), 15_000),
-    Shot("view-told", "good.rrd", ("2026-01-01", "Posterior against", "Map"), 15_000),
+    Shot("view-posterior", "good.rrd", ("2026-01-01", "Posterior against", "Map"), 15_000),
     Shot("view-left-over", "suspect.rrd", ("2026-01-01", "Residuals by", "Map"), 15_000),
     Shot("view-suspect", "suspect.rrd", ("2026-01-01",), 9_000),
     Shot("view-rejected", "rejected.rrd", ("2026-01-01",), None),
@@ -255,7 +255,7 @@ def smaller(png: bytes) -> bytes:
     written = io.BytesIO()
     few = Image.open(io.BytesIO(png)).convert("RGB").quantize(128, dither=Image.Dither.NONE)
     few.save(written, "png", optimize=True)
-    assert len(written.getvalue()) < MOST_BYTES, f"{len(written.getvalue())} bytes"
+    assert len(written.getvalue()) < MAX_BYTES, f"{len(written.getvalue())} bytes"
     return written.getvalue()
 
 

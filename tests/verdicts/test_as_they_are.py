@@ -103,7 +103,7 @@ def test_two_spans(shared: Path) -> None:
     assert found.result.derived.springs_believed > 0.5
 
 
-MOST_EVALUATIONS = 2 * 11_317
+MAX_EVALUATIONS = 2 * 11_317
 """Of a crossing on such a road: twice what the sample took before roads could differ."""
 
 
@@ -127,7 +127,7 @@ def check_on_two_roads(found: Judged) -> None:
     assert result.road.mismatch is not None
     assert 1.3e-8 < result.road.mismatch.A_m3 < 5.5e-8  # 2.8e-8 by the integral over the surface
     evaluations = result.diagnostics["iterations"] + result.diagnostics["chain_evaluations"]
-    assert evaluations < MOST_EVALUATIONS
+    assert evaluations < MAX_EVALUATIONS
 
 
 RUNS_OF_D8 = [

@@ -18,7 +18,7 @@ def test_every_picture_is_there_small_and_named_on_the_page(project: Path) -> No
     shots = [shot.name for shot in (*screenshots.SHOTS, *screenshots.OF_SHARED.values())]
     others = ["view-live", "view-live-result", "watch", "report"]
     for name in shots + others:
-        assert (screenshots.FOLDER / f"{name}.png").stat().st_size < screenshots.MOST_BYTES
+        assert (screenshots.FOLDER / f"{name}.png").stat().st_size < screenshots.MAX_BYTES
         assert f"(images/{name}.png)" in page
     shown = re.findall(r"\(images/([\w-]+)\.png\)", page)
     assert {name for name in shown if name.startswith("view-")} < {*shots, *others}
@@ -56,7 +56,7 @@ def test_bridges_of_many_crossings_can_be_shown(
 @pytest.mark.process
 def test_the_picture_of_the_demo_can_be_made_and_names_the_weak_element(tmp_path: Path) -> None:
     kept = screenshots.FOLDER / "demo.png"
-    assert kept.stat().st_size < screenshots.MOST_BYTES
+    assert kept.stat().st_size < screenshots.MAX_BYTES
     taken = pixels(screenshots.smaller(screenshots.take_demo(tmp_path)))
     assert taken.shape == pixels(kept.read_bytes()).shape
     orange = np.abs(taken - np.array([230, 159, 0]) / 255.0).max(axis=2) < 0.05
@@ -70,7 +70,7 @@ def test_the_report_can_be_photographed_and_names_the_weak_element(tmp_path: Pat
         find_browser()
     except FailureError:
         pytest.skip("no browser (Debian: apt install chromium)")
-    assert (screenshots.FOLDER / "report.png").stat().st_size < screenshots.MOST_BYTES
+    assert (screenshots.FOLDER / "report.png").stat().st_size < screenshots.MAX_BYTES
     outputs = ["--json", str(tmp_path / "good.json")]
     assert cli.main(["identify", str(screenshots.SAMPLE), *outputs]) == 0
     taken = pixels(screenshots.smaller(screenshots.take_report(tmp_path)))
