@@ -28,6 +28,9 @@ _MIN_EFFECTIVE_SHARE = 1.0 / 3.0
 """Required effective size of the draws, relative to the requested ones."""
 _BATCH_SHARE = 1.0 / 3.0
 """Size of a batch of weighted draws, relative to the requested ones."""
+_UNWEIGHTED_BATCHES = 2
+"""Number of batches after which the surrogate is refined without weights: the first one's draws lie
+too far apart from the posterior for weights that mean anything."""
 _MAX_BATCHES = 25
 _MAX_RUNS = 14
 """Limit of draws with mismatch, relative to the requested ones."""
@@ -167,7 +170,9 @@ def _importance_draws(
         )
         if _is_enough(worth, draws) or len(used) == _MAX_BATCHES:
             return _WeightedDraws(y, worth)
-        now = surrogate.refine(now, coordinates, x, log_target, count)
+        now = surrogate.refine(
+            now, coordinates, x, log_target, count, is_weighted=len(used) > _UNWEIGHTED_BATCHES
+        )
 
 
 def _in_parts(target: LogDensity, y: FloatArray) -> FloatArray:

@@ -6,6 +6,10 @@ damping. The density is a normal likelihood in x times the exact priors: log-nor
 and point masses of absence. It starts as the Gauss-Newton approximation at the optimum. Where draws
 of it have been weighted by the posterior, a quadratic regression of the log weights moves and bends
 the normal likelihood (cf. Opper and Archambeau 2009), so that the next draws weigh more alike.
+
+Over its own draws such a regression minimises KL(surrogate || posterior), which neglects what they
+seldom reach: a few draws keep large weights. Later regressions count draws by the square root of
+their weights, half-way to KL(posterior || surrogate).
 """
 
 from itertools import product
@@ -25,12 +29,18 @@ FloatArray = NDArray[np.float64]
 _LOWEST = 8.0
 """Largest drop of a log weight, below the median of the latest draws, that the regression sees: far
 tails are not parabolic."""
-_BATCHES_SEEN = 3
-"""Number of latest batches that the regression uses."""
+_BATCHES_SEEN, _BATCHES_SEEN_WEIGHTED = 3, 6
+"""Number of latest batches that the regression uses, without and with weights."""
+_WEIGHT_POWER = 0.5
+"""Power of the weights by which draws count in a weighted regression."""
+_LARGEST_COUNTED = 4.0
+"""Log weight, above the median of the latest draws, up to which it counts: one draw alone must not
+decide."""
 _NUISANCES = 3
 """Number of principal directions of the other coordinates whose curvature is regressed, too."""
 _SHRINKAGE = (1e1, 1e2, 1e3, 1e4, 1e5)
 """Ridge factors from which the evidence chooses, for slopes and for curvatures."""
+_ROUNDING = 1e-12
 _FLATTEST, _STEEPEST = 0.4, 6.0
 """Range of the curvature after one refinement, relative to the one before."""
 
@@ -141,13 +151,17 @@ def refine(
     x: FloatArray,
     log_target: FloatArray,
     latest: int,
+    *,
+    is_weighted: bool = False,
 ) -> Surrogate:
     """Return the surrogate whose likelihood is closest to the target at draws x (k, f).
 
     `log_target` (k,) is the target's log likelihood in the sense of `log_likelihood`; the last
-    `latest` draws are those of `surrogate`, and give the scale of x.
+    `latest` draws are those of `surrogate`, and give the scale of x. Where `is_weighted`, draws
+    count by the square root of their weights.
     """
-    x, log_target = x[-_BATCHES_SEEN * latest :], log_target[-_BATCHES_SEEN * latest :]
+    first = latest * (_BATCHES_SEEN_WEIGHTED if is_weighted else _BATCHES_SEEN)
+    x, log_target = x[-first:], log_target[-first:]
     excess = log_target - log_likelihood(surrogate, x)
     level = np.median(excess[-latest:])
     seen = excess > level - _LOWEST
@@ -157,7 +171,10 @@ def refine(
     spread[spread == 0.0] = np.inf  # absent in all draws
     z = (x - mean) / spread
     along = _directions(coords, z[-latest:])
-    slope, curvature = _regress(z[seen], along, np.minimum(excess[seen] - level, _LOWEST))
+    excess = np.minimum(excess[seen] - level, _LOWEST)
+    power = _WEIGHT_POWER if is_weighted else 0.0
+    weight = np.exp(power * np.minimum(excess, _LARGEST_COUNTED))
+    slope, curvature = _regress(z[seen], along, excess, weight / weight.mean())
     change = (along @ curvature @ along.T) / np.outer(spread, spread)
     precision = _limit_change(surrogate.precision, surrogate.precision - change)
     gradient = surrogate.linear - surrogate.precision @ mean + slope / spread
@@ -174,16 +191,20 @@ def _directions(coords: SurrogateCoordinates, z: FloatArray) -> FloatArray:
     return np.column_stack([np.eye(f)[:, coords.non_normal], main])
 
 
-def _regress(z: FloatArray, along: FloatArray, excess: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _regress(
+    z: FloatArray, along: FloatArray, excess: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return slope (f,) and curvature (d, d) of log weights (k,) over z (k, f) and z @ along.
 
-    Ridge regression; the factors of slopes and curvatures are those of the largest evidence.
+    Ridge regression in which draws count by `weight` (k,), of mean one; the factors of slopes and
+    curvatures are those of the largest evidence.
     """
     u = z @ along
     first, second = np.triu_indices(along.shape[1])
     columns = np.column_stack([z, u[:, first] * u[:, second]])
-    columns -= columns.mean(axis=0)
-    excess = excess - excess.mean()
+    root_weight = np.sqrt(weight)
+    columns = (columns - np.average(columns, axis=0, weights=weight)) * root_weight[:, None]
+    excess = (excess - np.average(excess, weights=weight)) * root_weight
     gram, image, square = columns.T @ columns, columns.T @ excess, float(excess @ excess)
     f = z.shape[1]
     best, found = -np.inf, np.zeros(columns.shape[1])
@@ -193,7 +214,7 @@ def _regress(z: FloatArray, along: FloatArray, excess: FloatArray) -> tuple[Floa
         ridge = np.concatenate([np.full(f, flat), np.full(first.size, bent)])
         root = np.linalg.cholesky(gram + np.diag(ridge))
         half = np.linalg.solve(root, image)
-        unexplained = square - float(half @ half)
+        unexplained = max(square - float(half @ half), _ROUNDING * square)
         evidence = 0.5 * float(np.log(ridge).sum()) - float(np.log(np.diag(root)).sum())
         evidence -= 0.5 * excess.size * np.log(unexplained)
         if evidence > best:
