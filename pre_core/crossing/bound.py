@@ -28,8 +28,7 @@ def central_jacobian(
 ) -> FloatArray:
     """Return derivatives (rows, columns) of all residuals at y (size,) by central differences.
 
-    Coordinates that must not be negative, where there may be no model, do not become so: at zero
-    both points of the difference are above.
+    For coordinates that must not be negative both points are moved up so that none is below zero.
     """
     begin = y[columns] - step
     bounded = np.isin(columns, posterior.layout(problem).half_normal)

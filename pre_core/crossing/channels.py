@@ -60,7 +60,7 @@ class ModelSignals(NamedTuple):
 def channel_signals(
     acceleration_m_per_s2: FloatArray, step_s: float, slowest_rate_hz: float
 ) -> ModelSignals:
-    """Return displacement, velocity, acceleration and three derivatives of samples (4, n).
+    """Return accelerations (4, n), their two integrals and their first three derivatives.
 
     `slowest_rate_hz` is that of the slowest sensor, if its samples were interpolated. Integrals are
     zero in the middle of the record, which minimises the effect of unknown initial values. Raise
@@ -93,7 +93,7 @@ def channel_signals(
 def low_pass(
     pass_share: float, stop_share: float, stop_band_db: float = _STOP_BAND_DB
 ) -> FloatArray:
-    """Return symmetric FIR taps (odd,) of unit sum, by Kaiser's window.
+    """Return symmetric FIR taps (odd,) of unit sum, from a Kaiser window.
 
     `pass_share` and `stop_share` are the pass and stop frequency in cycles per sample.
     """

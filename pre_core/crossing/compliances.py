@@ -4,10 +4,10 @@ Deflections are linear in the compliances c = EI_nominal/EI, exactly for a stati
 bridge. So with all other coordinates x, and c in place of ln EI, the residuals are r + J (x - x_0)
 far beyond their linear range in ln EI. With the log-normal priors of EI, the priors at zero and the
 point masses of absence, this density is cheap, and close to the posterior even where an element is
-known only to a factor.
+known only to within a factor of several.
 
-It is drawn from by Gibbs' sampler: all coordinates that are conditionally normal are integrated
-out; an element's conditional is drawn by slices (Neal 2003), that of a coordinate that may be
+It is sampled by a Gibbs sampler: all coordinates that are conditionally normal are integrated
+out; elements are drawn by slice sampling (Neal 2003); the conditional of a coordinate that may be
 absent is a normal truncated at zero with a point mass there.
 """
 
@@ -105,7 +105,7 @@ def to_compliance_coordinates(
 def marginal(
     precision: FloatArray, linear: FloatArray, sampled: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precision and linear part of a normal (f, f), (f,) marginal in some coordinates."""
+    """Return precision and information vector of the marginal of a normal (f, f), (f,)."""
     others = np.delete(np.arange(linear.size), sampled)
     factor = cho_factor(precision[np.ix_(others, others)], lower=True)
     across = precision[np.ix_(others, sampled)]

@@ -1,7 +1,7 @@
 """Least squares of a crossing from one offset of the bridge: steps, bounds and noise rounds.
 
 Truck and trajectory reach the optimum near a start, while the noise is estimated from the residuals
-again as the truck changes. `optimum` searches the right start.
+again as the truck changes. `optimum` searches for the right start.
 """
 
 from collections.abc import Callable
@@ -59,7 +59,7 @@ _EXCESS_WITH_MISMATCH = 0.25
 
 
 class SearchStrategy(NamedTuple):
-    """Simplifications of a search until the rest is right."""
+    """Simplifications of the model in a search, and its number of starts."""
 
     modes_at_rest: int
     """Number of the bridge's highest modes without initial vibration."""
@@ -302,9 +302,10 @@ def fit_stage(
     stage: tuple[float, int, float],
     refresh_noise: RefreshNoise,
 ) -> tuple[PosteriorProblem, FloatArray, Termination, int]:
-    """Fit along directions (f, d) in an earlier stage: `stage` is temperature, steps, least gain.
+    """Fit along directions (f, d) before the last stage; `stage` is temperature, steps, least gain.
 
-    With mismatch the noise is estimated by `refresh_noise` before every step.
+    Return problem, y, termination and number of evaluations. With mismatch the noise is estimated
+    by `refresh_noise` before every step.
     """
     temperature, steps, enough = stage
     if problem.mismatch.level_m3.any():

@@ -10,9 +10,10 @@ over different strips, and an axle with a lateral offset. Both have a known limi
 which affect the bridge but cannot be measured in one run. The levels A_j follow from the residuals
 before and behind the bridge. At the speed v, d is noise in time with the spectrum S_d(f/v)/v.
 
-Bohman's window truncates the covariance of d and keeps it positive, so that the residuals'
-covariance is banded. Five metres keep the spectrum of unequal tyres to 2 % everywhere, and that of
-an offset, which grows like the logarithm of the wave, to a quarter down to waves of 30 m.
+The Bohman window truncates the covariance of d and keeps it positive, so that the residuals'
+covariance is banded. Its half length of 5 m changes the spectrum of unequal tyres by at most 2 %,
+and that of an offset, which grows like the logarithm of the wavelength, by at most a quarter up to
+wavelengths of 30 m.
 """
 
 from functools import lru_cache
@@ -165,13 +166,13 @@ def _windowed(spectrum: FloatArray) -> FloatArray:
 
 
 def _bohman(share: FloatArray) -> FloatArray:
-    """Return Bohman's window at a share (…) of its length."""
+    """Return the Bohman window at a share (…) of its length."""
     inside = np.minimum(np.abs(share), 1.0)
     return (1.0 - inside) * np.cos(np.pi * inside) + np.sin(np.pi * inside) / np.pi
 
 
 def density_at(mismatch: Mismatch, omega: FloatArray, table: FloatArray) -> FloatArray:
-    """Return rows of a table (s, g) of shapes as spectra in time (s, f), per m³, in m²/Hz."""
+    """Return spectra (s, f) in time, in m²/Hz per m³ of level, of a spatial table (s, g)."""
     n = omega / (2.0 * np.pi * mismatch.speed_m_per_s)
     grid = mismatch.shapes.cycles_per_m
     read = [np.interp(n, grid, row, right=0.0) for row in table]

@@ -16,7 +16,7 @@ level that the residuals determine (`force_noise`). The mismatch is then compute
 alone, s^2 R_i: [1 + m_u s^2/K] n_u + [m_ii s^2/K] n_s + [m_12 s^2/K] n_s'. Both forms differ by
 (k_s/K) b_i and contain the same information; but the quiet combination of residuals depends on the
 truck, and each form has it in a residual of its own where it is needed. Friction is correlated over
-a tenth of a second; Bohman's window, which keeps its covariance positive, truncates this, so that
+a tenth of a second; the Bohman window, which keeps its covariance positive, truncates this, so that
 the residuals' covariance vanishes beyond it and the filter's length.
 
 Where the two axles follow different profiles, their difference is noise of the mismatch alone
@@ -53,10 +53,10 @@ _MANY_FREQUENCIES = 512
 """Number of frequencies that resolves the phase between the axles."""
 _FORCE_CENTRES_HZ = np.arange(0.0, 60.0, 4.0)
 FORCE_SHAPES = _FORCE_CENTRES_HZ.size
-"""Number of bumps, a few hertz wide, in the spectrum of the force noise: that of dry friction falls
-by six decades from the body's bounce to the residuals' highest frequency."""
+"""Number of bumps, a few hertz wide, in the spectrum of the suspension noise: that of dry friction
+falls by six decades from the body's bounce to the residuals' highest frequency."""
 FORCE_MEMORY_S = 0.3
-"""End of the force noise's covariance, which gives the bumps their width."""
+"""End of the suspension noise's covariance, which gives the bumps their width."""
 _MIDDLE_BAND, _TOP_BAND = (0.22, 0.54), (0.65, 0.757)
 """Bands relative to half the residuals' rate: 12 to 30 and 36 to 42 Hz for sensors of 250 Hz and
 more."""
@@ -118,12 +118,12 @@ def force_masses(truck: NoisePath) -> FloatArray:
 
 
 def no_force_noise() -> FloatArray:
-    """Return zero levels (2, shapes) of force noise."""
+    """Return zero levels (2, shapes) of suspension noise, in N²/Hz."""
     return np.zeros((2, FORCE_SHAPES))
 
 
 def _force_shapes(omega: FloatArray) -> FloatArray:
-    """Return spectra (shapes, f) of B(t) cos(omega_k t), B Bohman's window, a half at their tops.
+    """Return spectra (shapes, f) of B(t) cos(omega_k t), B the Bohman window, a half at their tops.
 
     B is the half wave cos(pi t/T) convolved with itself, so that its spectrum is a square.
     """
@@ -132,7 +132,7 @@ def _force_shapes(omega: FloatArray) -> FloatArray:
 
 
 def _bohman(omega: FloatArray) -> FloatArray:
-    """Return the spectrum of Bohman's window ending at +-`FORCE_MEMORY_S`, a half at zero."""
+    """Return the spectrum of the Bohman window ending at +-`FORCE_MEMORY_S`, a half at zero."""
     turn = omega * FORCE_MEMORY_S
     apart = 1.0 - (turn / np.pi) ** 2
     near = np.abs(apart) < 1e-6
@@ -219,7 +219,7 @@ def _body_spectra(
 
 
 def _force_noise_spectra(truck: NoisePath, force: FloatArray, omega: FloatArray) -> FloatArray:
-    """Return the contribution of force noise to the spectra of the body equations: (2, f)."""
+    """Return the contribution of suspension noise to the spectra of the body equations: (2, f)."""
     over = body_divisors(truck)[:, None]
     return np.asarray((force @ _force_shapes(omega)) * omega**4 / over**2)
 
@@ -438,7 +438,10 @@ def noise_power_ratio(
 def suspension_weight(
     rows: RowFilter, truck: NoisePath, density: FloatArray, force: FloatArray
 ) -> float:
-    """Return the suspension weight, 0 to 1, for sensor densities (4,) and force (2, shapes)."""
+    """Return the suspension weight: the mean share, 0 to 1, of sensor noise in the body equations.
+
+    `density` (4,) is that of the sensors, `force` (2, shapes) the suspension noise in N²/Hz.
+    """
     low = rows.omega[rows.omega < 2.0 * np.pi * _SUSPENSION_BAND_HZ]
     sensors = _body_spectra(truck, density, no_force_noise(), low)
     return float((sensors / _body_spectra(truck, density, force, low)).mean())

@@ -300,7 +300,7 @@ def all_rows(problem: PosteriorProblem, y: FloatArray, temperature: float = 1.0)
 
 
 def log_odds_of_absence(problem: PosteriorProblem, inflation: float = 1.0) -> FloatArray:
-    """Return for each coordinate (size,) the log density at exactly zero relative to that per unit.
+    """Return the log ratio (size,) of the point mass at zero to the prior density at zero.
 
     For noise `inflation` times as large, with a prior as much wider; minus infinity without
     absence.

@@ -1,4 +1,4 @@
-"""Filtered residuals of a crossing: low-passed, decimated and differenced twice by one FIR filter.
+"""Rows, the filtered residuals: low-passed, decimated and differenced twice by one FIR filter.
 
 White noise of an acceleration is then stationary, with a covariance that vanishes beyond the
 filter's length.

@@ -1,7 +1,7 @@
 """Posterior draws of one crossing by adaptive importance sampling.
 
 Draws of a cheap density near the posterior (`surrogate`) are weighted by the posterior, and refine
-that density for the next draws. All batches are weighted as of one mixture.
+that density for the next draws. All batches are weighted as draws of one mixture density.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,7 @@ class PosteriorDraws(NamedTuple):
     """Draws (n, chains, f) in the coordinates of the posterior, with their diagnostics.
 
     Weighted draws are resampled by their weights into chains; their `acceptance` is the relative
-    effective size.
+    effective sample size.
     """
 
     draws: FloatArray

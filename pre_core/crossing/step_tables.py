@@ -37,7 +37,7 @@ def sinc_table() -> FloatArray:
 
     Row p interpolates at p/phases of the way from sample taps/2 - 1 to the next; the second axis
     has the weights and their slopes per phase, for smooth cubics between the rows. A sinc in
-    Kaiser's window: images of the model's signals (up to channels.STOP of the rate) begin at 1 -
+    The Kaiser window: images of the model's signals (up to channels.STOP of the rate) begin at 1 -
     STOP.
     """
     phase = np.arange(PHASES + 1) / PHASES

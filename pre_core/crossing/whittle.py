@@ -18,10 +18,10 @@ def maximum_likelihood_levels(
 ) -> tuple[FloatArray, float]:
     """Return the most likely levels (s,) of shapes (s, f) in a periodogram (f,), and their gain.
 
-    `known` (f,) is the spectrum without them. The gain in log-likelihood over none of them is
-    doubled, and halved because a taper correlates neighbours, so that every other frequency is
-    independent. Every level is multiplied by the root of its explained over its claimed power
-    (`prior_power` more, by a prior) until none changes by more than `tolerance`.
+    `known` (f,) is the spectrum without them. The gain is half the likelihood-ratio statistic
+    2 ln(L/L_0), because a taper correlates neighbours: every other frequency is independent. Every
+    level is multiplied by the root of its explained over its claimed power (`prior_power` more, by
+    a prior) until none changes by more than `tolerance`.
     """
     level = start
     for _ in range(_PASSES):

@@ -1,4 +1,4 @@
-"""Quantisation step of the converter that recorded a signal."""
+"""Quantisation step of the analogue-to-digital converter that recorded a signal."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Consistency of a receiver's speeds with its positions."""
+"""Consistency of a GNSS receiver's speeds with its positions."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ def speed_scale(
     """Return the relative excess of the speeds over the positions, and its standard deviation.
 
     Positions (m,) are a + b times the integrated speeds (m,), with white noise and a slow error of
-    exponential correlation. Fewer than four fixes give zero with an infinite deviation.
+    exponential correlation. Fewer than four fixes: zero with an infinite standard deviation.
     """
     if time_s.size < _FEWEST:
         return 0.0, np.inf

@@ -52,7 +52,10 @@ def redundancy_residual(
     delay_spread_s: float,
     slack: float,
 ) -> RedundancyResidual:
-    """Compare sensors (m, n) by combinations `parity` (r, m) of unit one-sided noise density."""
+    """Return the power of combinations `parity` (r, m) of accelerations (m, n), and its limit.
+
+    The combinations have unit one-sided noise density.
+    """
     spectrum, omega = _spectrum(acceleration, step_s)
     rate = 1j * omega * spectrum
     left = parity @ spectrum

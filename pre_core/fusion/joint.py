@@ -86,7 +86,7 @@ def sample_joint(
     report: Report = lambda stage, fraction: None,
     threads: int = 1,
 ) -> FusedDraws:
-    """Return draws as `fuse` does, from a joint; they do not depend on the number of threads."""
+    """Return draws as `fuse` does; they do not depend on the number of threads."""
     between = variability_posterior(joint, priors)
     drawn = _draw_bridge(joint, priors, between, count, seed, report, threads)
     return FusedDraws(*drawn, is_consistent_with_zero(between), joint.shared)

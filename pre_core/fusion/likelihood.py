@@ -128,7 +128,7 @@ def covariance_of_coefficients(
 
 
 def likelihood(found: Optimum, *, with_bends: bool = True) -> CrossingLikelihood:
-    """Return the likelihood of a crossing at its optimum, optionally without terms and offset."""
+    """Return the likelihood at an optimum, optionally without curvature terms and offset."""
     problem, y = found.problem, found.state.y
     where = posterior.layout(problem)
     state = found.state
@@ -237,9 +237,10 @@ def in_coordinates(
 def add_covariance(
     precision: FloatArray, linear: FloatArray, along: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a normal (n, n), (n,) whose coordinates also vary along columns (n, r) by r normals.
+    """Return precision (n, n) and linear part (n,) of a normal with more covariance along columns.
 
-    `root` (r, r) is a root of their covariance, root root'. The precision may be singular.
+    The columns `along` (n, r) add A S A' to the covariance; `root` (r, r) is a root of S, S = root
+    root'. The precision may be singular.
     """
     moved = along @ root
     across = precision @ moved

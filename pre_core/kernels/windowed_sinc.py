@@ -1,4 +1,4 @@
-"""Kaiser-windowed sinc: low-pass, interpolation and delay of even samples in one.
+"""Kaiser-windowed sinc: low-pass, interpolation and delay of evenly spaced samples in one.
 
 Oppenheim and Schafer, Discrete-Time Signal Processing, section 7.5.3. Between pass band and stop
 band such a filter needs a transition of (A - 7.95)/(14.36 (taps - 1)) cycles per sample for a stop
@@ -22,7 +22,7 @@ def windowed_sinc(
     """Return the weights (…) of samples at a `distance` (…) in samples from the wanted time.
 
     They are not normalised. `cutoff`, in cycles per sample, is the frequency of half amplitude; the
-    window ends at `reach`. There Kaiser's window is one (and I_0(beta) in the middle): subtracting
+    window ends at `reach`. There the Kaiser window is one (I_0(beta) in the middle): subtracting
     that as `pedestal` makes a sample that comes into reach change nothing.
     """
     inside = np.maximum(0.0, 1.0 - (distance / reach) ** 2)

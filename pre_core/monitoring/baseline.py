@@ -4,10 +4,10 @@ Every period has an observation y of ln EI with own covariance R and loadings K 
 that it shares with other periods (trucks, wheel-path groups, the other bridge parameters):
 
     y = mu + beta (T - T_0) + wander + K z + own + change,
-    change ~ N(0, q^2 C),    wander: Ornstein-Uhlenbeck of standard deviation s, memory tau,
+    change ~ N(0, q^2 C),    wander: Ornstein-Uhlenbeck, standard deviation s, correlation time tau,
 
 with C = (1 - rho) I + rho 1 1'. Without a temperature, beta (T - T_0) is replaced by an annual wave
-of unknown amplitude and phase in each element, half an annual one and an offset common to all, and
+of unknown amplitude and phase in each element, a semi-annual one and an offset common to all, and
 the weather's deviation from it as noise.
 
 mu, beta, wander, season and z are one normal state of a Kalman filter. q, s and tau are unknown:
@@ -167,7 +167,7 @@ def filter_step(state: BaselineState, period: Period) -> Innovation:
 
 
 def update_state(state: BaselineState, innovation: Innovation) -> tuple[BaselineState, FloatArray]:
-    """Return the state after an innovation, and Kalman's gain (m, size, n)."""
+    """Return the state after an innovation, and the Kalman gain (m, size, n)."""
     weight = np.asarray(
         np.linalg.solve(innovation.covariance, innovation.gain.transpose(0, 2, 1)).transpose(
             0, 2, 1

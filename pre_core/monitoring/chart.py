@@ -5,7 +5,7 @@ A step delta of ln EI in period k adds G(t, k) delta to every later innovation o
 
     G = I - H F,    F <- Phi F + W G,
 
-H the observation matrix, Phi the motion of the state, W Kalman's gain. So no filter has to run for
+H the observation, Phi the state-transition matrix, W the Kalman gain. So no filter has to run for
 a change: sums of G' S^-1 G and G' S^-1 e suffice. With delta ~ N(0, s^2) of one element j, L_jk is
 the ratio of the densities with and without it, the scales of the usual movements integrated out in
 both. The Shiryaev-Roberts statistic
@@ -92,7 +92,7 @@ def update_chart(
     """Return the chart after a period.
 
     `number` is the period's, `kept` (m,) the remaining share of the wander since the previous one,
-    `weight` (m, size, n) Kalman's gain (None without an update), `inflation` the factor of the
+    `weight` (m, size, n) the Kalman gain (None without an update), `inflation` the factor of the
     innovation's covariance.
     """
     m, size, _, n = chart.response.shape

@@ -68,7 +68,7 @@ def surface_density(road_class: str) -> float:
 
 
 def spectra(front: Footprint, rear: Footprint, n: FloatArray) -> tuple[FloatArray, ...]:
-    """Return one-sided spectra (f,) at n > 0 cycles/m on a surface with Phi = k^-3, in m times m².
+    """Return one-sided spectra (f,) in m³ at n > 0 cycles/m on a surface with Phi k^3 = 1 m².
 
     These are of the front axle, the rear axle, the real part of their cross spectrum, and their
     difference front less rear.
