@@ -41,6 +41,7 @@ _NUISANCES = 3
 _SHRINKAGE = (1e1, 1e2, 1e3, 1e4, 1e5)
 """Ridge factors from which the evidence chooses, for slopes and for curvatures."""
 _ROUNDING = 1e-12
+"""Least share of the log weights' variance that counts as unexplained: a zero has no logarithm."""
 _FLATTEST, _STEEPEST = 0.4, 6.0
 """Range of the curvature after one refinement, relative to the one before."""
 
@@ -160,8 +161,8 @@ def refine(
     `latest` draws are those of `surrogate`, and give the scale of x. Where `is_weighted`, draws
     count by the square root of their weights.
     """
-    first = latest * (_BATCHES_SEEN_WEIGHTED if is_weighted else _BATCHES_SEEN)
-    x, log_target = x[-first:], log_target[-first:]
+    count = latest * (_BATCHES_SEEN_WEIGHTED if is_weighted else _BATCHES_SEEN)
+    x, log_target = x[-count:], log_target[-count:]
     excess = log_target - log_likelihood(surrogate, x)
     level = np.median(excess[-latest:])
     seen = excess > level - _LOWEST
