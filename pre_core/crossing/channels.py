@@ -60,7 +60,7 @@ class ModelSignals(NamedTuple):
 def channel_signals(
     acceleration_m_per_s2: FloatArray, step_s: float, slowest_rate_hz: float
 ) -> ModelSignals:
-    """Return accelerations (4, n), their two integrals and their first three derivatives.
+    """Return displacement, velocity, acceleration and its derivatives, from accelerations (4, n).
 
     `slowest_rate_hz` is that of the slowest sensor, if its samples were interpolated. Integrals are
     zero in the middle of the record, which minimises the effect of unknown initial values. Raise

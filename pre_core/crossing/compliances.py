@@ -105,7 +105,7 @@ def to_compliance_coordinates(
 def marginal(
     precision: FloatArray, linear: FloatArray, sampled: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return precision and information vector of the marginal of a normal (f, f), (f,)."""
+    """Return precision and linear part of the marginal of a normal (f, f), (f,)."""
     others = np.delete(np.arange(linear.size), sampled)
     factor = cho_factor(precision[np.ix_(others, others)], lower=True)
     across = precision[np.ix_(others, sampled)]

@@ -233,15 +233,18 @@ def test_weighted_draws_of_a_posterior_that_leans() -> None:
         assert abs(mean - expected) < DEVIATIONS * scatter / np.sqrt(worth.ess)
 
 
-def test_weighted_draws_give_up_where_tails_are_heavy() -> None:
-    """Student's t with half a degree of freedom in each of twenty coordinates.
+ACCEPTED = pytest.mark.xfail(
+    reason="accepted with some seeds, without what lies beyond ten scales: no weight shows it",
+    strict=False,
+)
 
-    With one degree some seeds come near enough, and miss what lies beyond ten scales: weights know
-    only what was drawn. A posterior has normal priors, and no such tails.
-    """
+
+@pytest.mark.parametrize("degrees", [0.5, pytest.param(1.0, marks=ACCEPTED)])
+def test_weighted_draws_give_up_where_tails_are_heavy(degrees: float) -> None:
+    """Student's t in each of twenty coordinates; a posterior has normal priors, no such tails."""
 
     def target(y: FloatArray) -> FloatArray:
-        return np.asarray(-0.75 * np.sum(np.log1p(y**2), axis=1))
+        return np.asarray(-0.5 * (degrees + 1.0) * np.sum(np.log1p(y**2), axis=1))
 
     of, narrow = coordinates(20), of_normal(np.zeros(20), 0.5 * np.eye(20))
     found = sampling._importance_draws(target, of, narrow, np.zeros(20), 1200, 3, silent)
