@@ -98,8 +98,10 @@ class CrossingLikelihood(NamedTuple):
 
 
 def knot_spacing_m(mismatch: Mismatch) -> float:
-    """Return the knot spacing for a mismatch with given levels."""
-    return KNOT_M if mismatch.level_m3[0] > 0.0 else ALIKE_KNOT_M
+    """Return the knot spacing for axles with their tyres, the same in all runs of a truck."""
+    front, rear = mismatch.shapes.footprints
+    is_alike = (front.twin_distance_m > 0.0) == (rear.twin_distance_m > 0.0)
+    return ALIKE_KNOT_M if is_alike else KNOT_M
 
 
 def long_share(cycles_per_m: FloatArray, knot_m: float) -> FloatArray:

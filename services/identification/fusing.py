@@ -16,6 +16,7 @@ from pre_core.fusion.information import BridgePriors
 from pre_core.fusion.joint import FusedDraws, build_joint, sample_joint
 from pre_core.fusion.path_groups import FusionInput
 from pre_core.fusion.vehicle_consistency import find_misattributed
+from pre_core.physics.road import Profile
 from pre_core.physics.surface import Footprint
 from pre_core.search.loop import Report
 from schemas import fusion
@@ -240,8 +241,15 @@ def _part(source: Source, coordinates: of_crossing.Coordinates) -> FusionInput:
     key = [[c.name, c.location, c.scale] for c in of.truck]
     truck = f"{source.vehicle} {key} {of.footprints} {of.mass_spread}"
     front, rear = (Footprint(**axle.model_dump()) for axle in of.footprints)
+    road = source.road
     return FusionInput(
-        source.crossing_id, likelihood, truck, source.direction, (front, rear), of.mass_spread
+        source.crossing_id,
+        likelihood,
+        truck,
+        source.direction,
+        (front, rear),
+        of.mass_spread,
+        None if road is None else Profile(np.array(road.x_m), np.array(road.mean_m)),
     )
 
 

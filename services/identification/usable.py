@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from schemas.fusion import FusionLikelihood
-from schemas.results import CrossingResult, ElementState, Verdict
+from schemas.results import CrossingResult, ElementState, RoadResult, Verdict
 
 LISTED_AT_MOST = 100
 """Maximum number of fused crossings, the newest, and of named excluded ones.
@@ -24,6 +24,8 @@ class Source(NamedTuple):
     vehicle: str
     direction: int
     likelihood: FusionLikelihood
+    road: RoadResult | None = None
+    """Profile that aligns runs with each other."""
 
 
 class FusableCrossing(NamedTuple):
@@ -83,4 +85,5 @@ def source_of(result: CrossingResult) -> Source | None:
     if result.fusion_likelihood is None:
         return None
     direction = 1 if result.direction == "start_to_end" else -1
-    return Source(result.crossing_id, result.vehicle, direction, result.fusion_likelihood)
+    likelihood = result.fusion_likelihood
+    return Source(result.crossing_id, result.vehicle, direction, likelihood, result.road)

@@ -14,19 +14,29 @@ from pre_core.crossing.fit import Optimum
 from pre_core.crossing.posterior import layout, log_odds_of_absence
 from pre_core.fusion.information import BridgePriors
 from pre_core.fusion.joint import FusedDraws, fuse
+from pre_core.fusion.lateral_wander import (
+    SharedFraction,
+    align_runs_m,
+    shared_fraction,
+    wander_grid_m,
+    wander_posterior,
+)
 from pre_core.fusion.likelihood import (
+    ALIKE_KNOT_M,
     KNOT_M,
+    OFF_BRIDGE_STEP_M,
     Coordinates,
     CrossingLikelihood,
     OffBridgeMismatch,
     covariance_of_coefficients,
+    knot_spacing_m,
     likelihood,
     long_share,
 )
-from pre_core.fusion.path_groups import FusionInput, common_share, estimate_wander_m
+from pre_core.fusion.path_groups import FusionInput
 from pre_core.fusion.variability import BETWEEN_SCALE
 from pre_core.parameters import EI_1, mass_powers
-from pre_core.physics.road import REFERENCE_CYCLES_PER_M
+from pre_core.physics.road import REFERENCE_CYCLES_PER_M, Profile
 from pre_core.physics.surface import (
     TYPICAL_FOOTPRINTS,
     axle_profile,
@@ -90,28 +100,99 @@ def test_common_part_of_two_tracks(wander_m: float) -> None:
     assert together / power == pytest.approx(expected, abs=0.1)
 
 
-def test_the_wander_is_found_by_its_share() -> None:
+def test_wander_is_estimated_from_an_exact_share() -> None:
     mismatch = whole()
     for wander_m in (0.05, 0.12, 0.3):
         n = mismatch.shapes.cycles_per_m
         seen = np.sin(np.pi * n) ** 4
         common = mm.between_run_spectra(FRONT, REAR, wander_m)[0]
         share = float(common @ seen / (mismatch.shapes.density[0] @ seen))
-        assert estimate_wander_m(mismatch, share) == pytest.approx(wander_m, rel=0.02)
+        found = wander_posterior(mismatch, SharedFraction(share, 1e-3))
+        assert found.wander_m == pytest.approx(wander_m, rel=0.02)
 
 
-def test_runs_that_are_put_beside_their_place_are_moved_back() -> None:
-    """Of equal powers shared and own, each run up to a metre from where it was driven."""
-    rng = np.random.default_rng(3)
-    shared = rng.standard_normal(240)
-    runs = []
-    for lag in rng.integers(-4, 5, 10):
-        value = np.roll(shared, lag) + rng.standard_normal(240)
-        value[100:160] = np.nan  # the bridge
-        runs.append(OffBridgeMismatch(-30.0 + 0.5 * float(rng.integers(0, 3)), value))
-    assert common_share(runs) == pytest.approx(0.5, abs=0.1)
-    alone = [run._replace(value_m=rng.standard_normal(240)) for run in runs]
-    assert common_share(alone) < 0.2
+def test_wander_without_a_share_is_that_of_the_prior() -> None:
+    found = wander_posterior(whole(), None)
+    assert found.wander_m == pytest.approx(0.12, rel=0.02)
+    assert found.weights.sum() == pytest.approx(1.0)
+    spread = np.sqrt(found.weights @ np.log(wander_grid_m() / found.wander_m) ** 2)
+    assert spread == pytest.approx(0.7, abs=0.05)
+
+
+def test_runs_of_a_truck_have_one_knot_spacing() -> None:
+    """Whatever levels each run estimates, or its group's runs would share no waves."""
+    single, twin = TYPICAL_FOOTPRINTS
+    for axles, spacing in (((single, single), ALIKE_KNOT_M), ((single, twin), KNOT_M)):
+        shapes = mm.mismatch_spectra(*axles)
+        for level in ([0.0, 1e-10], [1e-11, 1e-10], [1e-8, 0.0]):
+            assert knot_spacing_m(mm.Mismatch(shapes, np.array(level), 10.0)) == spacing
+
+
+STEP_M = OFF_BRIDGE_STEP_M
+WANDER_M = 0.12
+
+
+def shifted_runs(
+    noise_m: float, seed: int = 3
+) -> tuple[list[OffBridgeMismatch], list[Profile], FloatArray]:
+    """Return mismatches and roads of ten runs on one surface, each up to a metre from its place."""
+    rng = np.random.default_rng(seed)
+    surface = random_surface(-60.0, 90.0, 0.05, "A", seed)
+    x = np.arange(-50.0, 80.0, STEP_M)
+    on_bridge = np.arange(0.0, 30.0, 0.1)
+    runs, roads, shifts = [], [], rng.uniform(-1.0, 1.0, 10)
+    for shift in shifts:
+        beside = WANDER_M * float(rng.standard_normal())
+        front, rear = (axle_profile(surface, axle, beside) for axle in (FRONT, REAR))
+        value = np.interp(x - shift, front.x_m, front.height_m - rear.height_m)
+        value += noise_m * rng.standard_normal(x.size)
+        value[(x > 0.0) & (x < 30.0)] = np.nan
+        runs.append(OffBridgeMismatch(float(x[0]), value))
+        height = np.interp(on_bridge - shift, front.x_m, 0.5 * (front.height_m + rear.height_m))
+        roads.append(Profile(on_bridge, height))
+    return runs, roads, shifts
+
+
+def test_road_profiles_align_the_runs() -> None:
+    runs, roads, shifts = shifted_runs(0.0)
+    found = align_runs_m(runs, roads)
+    apart = found - shifts
+    assert np.abs(apart - apart.mean()).max() < 0.15
+
+
+def test_mismatch_aligns_runs_without_roads() -> None:
+    runs, _, shifts = shifted_runs(0.0)
+    apart = align_runs_m(runs, [None] * len(runs)) - shifts
+    assert np.median(np.abs(apart - np.median(apart))) < 0.15
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 5e-4])
+def test_shared_fraction_does_not_count_noise_as_mismatch(noise_m: float) -> None:
+    """The noise has the mismatch's power in the waves that are compared."""
+    found, expected = [], 0.0
+    for seed in range(6):
+        runs, roads, _ = shifted_runs(noise_m, seed)
+        share = shared_fraction(runs, align_runs_m(runs, roads), whole())
+        assert share is not None
+        found.append(share.value)
+        n = whole().shapes.cycles_per_m
+        seen = np.sin(np.pi * n) ** 4
+        common = mm.between_run_spectra(FRONT, REAR, WANDER_M)[0]
+        expected = float(common @ seen / (whole().shapes.density[0] @ seen))
+    assert np.mean(found) == pytest.approx(expected, abs=0.1)
+
+
+def test_shared_fraction_of_independent_runs_is_none() -> None:
+    runs = [shifted_runs(0.0, seed)[0][0] for seed in range(10)]
+    share = shared_fraction(runs, np.zeros(10), whole())
+    assert share is not None
+    assert abs(share.value) < 0.1
+    assert share.std < 0.1
+
+
+def test_single_mismatch_has_no_shared_fraction() -> None:
+    runs, _, _ = shifted_runs(0.0)
+    assert shared_fraction([runs[0], None], np.zeros(2), whole()) is None
 
 
 def coordinates() -> Coordinates:
