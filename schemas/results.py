@@ -6,7 +6,7 @@ written; a value that may be unknown is None. `results_on_the_wire` converts to 
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
@@ -19,6 +19,7 @@ SCHEMA_VERSION: Final = 1
 
 Method = Literal["pre", "least_squares", "random_walk"]
 Verdict = Literal["good", "suspect", "rejected"]
+VERDICTS: Final[tuple[Verdict, ...]] = get_args(Verdict)
 Direction = Literal["start_to_end", "end_to_start"]
 
 

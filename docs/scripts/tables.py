@@ -17,6 +17,7 @@ from pydantic.fields import FieldInfo
 
 from pre_core.parameters import DERIVED_UNITS, ELEMENT, SCALARS, TRUCK, ParameterSpec
 from schemas import fusion, results, site, site_axle_tables, site_import, site_ros2, site_sensors
+from schemas.metrics import METRICS
 from schemas.reasons import BRIDGE_REASON_TEXTS, LEFT_OUT_TEXTS
 from schemas.topics import TOPICS, Topic
 from services.cli import main as cli
@@ -85,7 +86,7 @@ _PAGES = {
     "export": "recordings.md#tables-and-maps-driveby-export",
     "fuse": "fusion.md",
     "gateway": "truck.md#ros-2",
-    "health": "logger.md#health",
+    "health": "containers.md#watch",
     "history": "history.md",
     "identify": "engineer.md",
     "import": "recordings.md#tables-of-other-loggers-driveby-import",
@@ -332,10 +333,20 @@ def _remedies(old: str) -> str:
     return re.sub(pattern, row, f"{old}\n", flags=re.MULTILINE)
 
 
+def metrics() -> str:
+    """Return every metric for Prometheus."""
+    rows = (
+        (f"`{one.name}`", one.kind, one.text, f"`{one.label}`" if one.label else "")
+        for one in METRICS
+    )
+    return _table(("metric", "kind", "meaning", "label"), rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "bridge reasons": bridge_reasons,
     "commands": commands,
     "extras": extras,
+    "metrics": metrics,
     "parameters": parameters,
     "result fields": result_fields,
     "site keys": site_keys,

@@ -1,6 +1,10 @@
 """Commands on the bus: demo, logger, worker, truck, gateway, health."""
 
 import argparse
+import json
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +27,7 @@ from services.cli.parsing import (
     whole,
 )
 from services.common.endpoints import DEFAULT_ENDPOINT, default_endpoint
+from services.common.errors import InputError
 
 
 def add_demo(commands: Any) -> None:
@@ -124,7 +129,7 @@ def _logger(options: argparse.Namespace) -> int:
         realms=options.realm or ("live",),
         site=options.site,
         service_id=options.id,
-        ready=lambda: print(f"ready, listening at {listen}", flush=True),
+        ready=_announced(options, f"ready, listening at {listen}"),
         tls=options.tls,
         insecure=options.insecure,
         limits=RotationLimits(
@@ -209,7 +214,7 @@ def _worker(options: argparse.Namespace) -> int:
         file=options.file,
         method=options.method.replace("-", "_"),
         service_id=options.id,
-        ready=lambda: print(f"ready, waiting for crossings in realm {options.realm}", flush=True),
+        ready=_announced(options, f"ready, waiting for crossings in realm {options.realm}"),
         tls=options.tls,
         processes=options.processes,
         limit_s=LIMIT_S if options.cpu_limit is None else options.cpu_limit,
@@ -321,7 +326,7 @@ def _gateway(options: argparse.Namespace) -> int:
         tls=options.tls,
         spool=options.spool,
         spool_budget_bytes=options.spool_budget << 20,
-        ready=lambda: print(f"ready, listening to ROS 2 at {options.ros}", flush=True),
+        ready=_announced(options, f"ready, listening to ROS 2 at {options.ros}"),
     )
 
 
@@ -334,23 +339,79 @@ def add_health(commands: Any) -> None:
         "query the health of a logger or worker over the bus",
         "driveby health logger",
     )
-    p.add_argument("service", metavar="ID", help="the service's --id, such as logger or worker")
+    p.add_argument(
+        "service",
+        nargs="?",
+        metavar="ID",
+        help="the service's --id, such as logger or worker; with --metrics all without it",
+    )
+    p.add_argument(
+        "--metrics", action="store_true", help="print all figures in the format of Prometheus"
+    )
+    p.add_argument(
+        "--serve",
+        type=_address,
+        metavar="[HOST:]PORT",
+        help="with --metrics: HTTP address that answers /metrics until a signal (default host: "
+        "127.0.0.1)",
+    )
     add_endpoint(p)
     add_realm(p)
 
 
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not (port.isdecimal() and int(port) < 65536):
+        raise argparse.ArgumentTypeError(f"{text!r}: a port or HOST:PORT is expected, e.g. 9464")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
 def _health(options: argparse.Namespace) -> int:
+    asked: dict[str, Any] = {
+        "service": options.service,
+        "endpoint": options.endpoint or default_endpoint(options.tls),
+        "tls": options.tls,
+        "realm": options.realm,
+    }
+    if options.metrics:
+        from services.cli.metrics import metrics_command, serve_metrics
+
+        if options.serve is None:
+            print(metrics_command(**asked), end="")
+        else:
+
+            def ready(url: str) -> None:
+                _announced(options, f"ready, metrics at {url}")()
+
+            serve_metrics(**asked, address=options.serve, ready=ready)
+        return 0
+    if options.serve is not None:
+        raise InputError("--serve needs --metrics")
+    if options.service is None:
+        raise InputError("name the service, such as logger or worker; --metrics needs none")
     from services.cli.health import health_command
 
-    print(
-        health_command(
-            service=options.service,
-            endpoint=options.endpoint or default_endpoint(options.tls),
-            tls=options.tls,
-            realm=options.realm,
-        )
-    )
+    print(health_command(**asked))
     return 0
+
+
+def _announced(options: argparse.Namespace, line: str) -> Callable[[], None]:
+    """Return a function that prints that a service is ready, in the form of its log."""
+    if options.log_format != "json":
+        return partial(print, line, flush=True)
+
+    def announce() -> None:
+        record = {"time": time.time(), "level": "info", "logger": "driveby", "message": line}
+        print(json.dumps(record | subject_of(options)), flush=True)
+
+    return announce
+
+
+def subject_of(options: argparse.Namespace) -> dict[str, str]:
+    """Return the fields of a log that hold for all lines of a process (`SUBJECT_FIELDS`)."""
+    given = {"service": "id", "realm": "realm", "vehicle": "vehicle"}
+    found = {name: getattr(options, option, None) for name, option in given.items()}
+    return {name: value for name, value in found.items() if isinstance(value, str)}
 
 
 SERVICES: Final = (_logger, _worker, _truck, _gateway)

@@ -9,12 +9,12 @@ import argparse
 import errno
 import gc
 import io
-import json
 import logging
 import os
 import sys
 import traceback
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final, NoReturn
 
@@ -37,6 +37,7 @@ from services.cli.live import (
     add_logger,
     add_truck,
     add_worker,
+    subject_of,
 )
 from services.cli.needs import check_needs
 from services.cli.offline import (
@@ -55,6 +56,7 @@ from services.cli.view import add_view
 from services.cli.watch import add_watch
 from services.common.errors import EXIT_INTERRUPTED, FailureError, InputError
 from services.common.files import check_kind, is_unicode, name_error
+from services.common.log_lines import configure_logging
 from services.common.outputs import declared
 
 _OBJECTS_BETWEEN_LOOKS: Final = 20_000
@@ -130,8 +132,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
     except InputError as error:
         return _print_error(str(error), EXIT_BAD_INPUT)
+    is_json = options.log_format == "json"
     # The log is a service's only output.
-    _log(options.log_format, verbose=options.verbose or options.handler in (*SERVICES, *CLUSTERS))
+    verbose = options.verbose or options.handler in (*SERVICES, *CLUSTERS)
+    level = logging.INFO if verbose else logging.WARNING
+    configure_logging(options.log_format, level, subject_of(options))
+    fail = partial(_print_error, is_json=is_json)
     handler: Handler = options.handler
     # A name may be no Unicode, and a line with it must not fail.
     for stream in (sys.stdout, sys.stderr):
@@ -149,11 +155,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 code = handler(options)
         sys.stdout.flush()
     except InputError as error:
-        return _print_error(str(error), EXIT_BAD_INPUT)
+        return fail(str(error), EXIT_BAD_INPUT)
     except FailureError as error:
-        return _print_error(str(error), EXIT_FAILED)
+        return fail(str(error), EXIT_FAILED)
     except KeyboardInterrupt:
-        return _print_error("interrupted", EXIT_INTERRUPTED)
+        return fail("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
         # The reader of our output has closed it; Python would fail again when it flushes at exit.
         to_null(sys.stdout)
@@ -162,15 +168,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.debug:
             traceback.print_exc()
         if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":
-            return _print_error(
-                f"{error.object[:200]}: is no name in UTF-8; rename it", EXIT_BAD_INPUT
-            )
+            return fail(f"{error.object[:200]}: is no name in UTF-8; rename it", EXIT_BAD_INPUT)
         if isinstance(error, OSError) and error.filename is not None:
             code = EXIT_BAD_INPUT if error.errno in _BAD_NAMES else EXIT_FAILED
-            return _print_error(str(name_error(Path(os.fsdecode(error.filename)), error)), code)
+            return fail(str(name_error(Path(os.fsdecode(error.filename)), error)), code)
         what = " ".join(f"{type(error).__name__}: {error}".split())[:300]
         hint = "" if options.debug else "; run with --debug for the traceback"
-        return _print_error(f"internal error, please report: {what}{hint}", EXIT_FAILED)
+        return fail(f"internal error, please report: {what}{hint}", EXIT_FAILED)
     return code
 
 
@@ -234,8 +238,11 @@ class _Version(argparse.Action):
         sys.exit(0)
 
 
-def _print_error(line: str, code: int) -> int:
-    print(f"driveby: {line}", file=sys.stderr)
+def _print_error(line: str, code: int, *, is_json: bool = False) -> int:
+    if is_json:
+        logging.getLogger("driveby").error("%s", line)
+    else:
+        print(f"driveby: {line}", file=sys.stderr)
     return code
 
 
@@ -245,31 +252,6 @@ class _Completion(argparse.Action):
     ) -> NoReturn:
         print(completion(parser, str(value)), end="")
         sys.exit(0)
-
-
-class _JsonFormatter(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        line = {
-            "time": round(record.created, 6),
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": record.getMessage(),
-        }
-        if hasattr(record, "figures"):
-            line["figures"] = record.figures
-        return json.dumps(line, ensure_ascii=False)
-
-
-def _log(form: str, *, verbose: bool) -> None:
-    handler = logging.StreamHandler()
-    handler.setFormatter(
-        _JsonFormatter()
-        if form == "json"
-        else logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
-    )
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, handlers=[handler], force=True
-    )
 
 
 if __name__ == "__main__":

@@ -5,8 +5,8 @@ import logging
 import signal
 import threading
 import time
-from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,9 +34,11 @@ from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
 from services.common.interrupts import handled_by
 from services.common.intervals import Intervals
+from services.common.log_lines import about
 from services.logger.completeness import Completeness
 from services.logger.drops import QUEUE_IS_FULL, Drop
 from services.logger.file_layout import RecordingTarget
+from services.logger.health_line import health_line
 from services.logger.housekeeping import Housekeeping, RetentionPolicy
 from services.logger.intake import Intake
 from services.logger.memory import give_back_memory
@@ -67,8 +69,6 @@ _GOODBYE_S = 0.2
 """Time for the connection to send the last messages, because a put only queues."""
 _DROPS_PERIOD_S = 60.0
 """Interval of events on a source's losses other than by a full queue, with a count."""
-_LONG_LAG_S = 60.0
-"""Shortest lag that is explained: the network is rarely the cause."""
 _MAX_DROPS_REPORTED = 1000
 """Number of sources with remembered reports; beyond, all are reported again."""
 _EVENTS_LOGGED = 20
@@ -272,8 +272,10 @@ class _Announcements:
 
     def event(self, realm: str, event: Event) -> None:
         """Write an event to the recording of the vehicle concerned, and publish it."""
-        about = f"{event.vehicle}: " if event.vehicle else ""
-        self._complaints.warn(f"event {event.kind}", "%s: %s%s", event.kind, about, event.text)
+        who = f"{event.vehicle}: " if event.vehicle else ""
+        fields = about(realm=realm, vehicle=event.vehicle)
+        kind = event.kind
+        self._complaints.warn(f"event {kind}", "%s: %s%s", kind, who, event.text, extra=fields)
         message = self._logger.own.message(realm, event)
         self._logger.writer.put(message, always=True)
         with self._lock:
@@ -358,12 +360,7 @@ class _Announcements:
     def _publish_health(self) -> None:
         writer = self._logger.writer
         figures: dict[str, float] = dict(count_all(self._logger.intake.counts, writer))
-        figures |= {
-            "queue": writer.waiting(),
-            "queue_bytes": writer.waiting_bytes(),
-            "written": writer.written,
-            "files": writer.open_files(),
-        }
+        figures |= writer.take_figures()
         if writer.free_bytes is not None:
             figures["disk_free_bytes"] = writer.free_bytes
         figures |= self._completeness.figures()
@@ -378,23 +375,7 @@ class _Announcements:
         realm = self._logger.place.realm or "live"
         payload = message.SerializeToString(deterministic=True)
         self._publisher(realm).put("service", self._logger.service_id, "health", payload)
-        _log.info("%s", _health_line(figures), extra={"figures": figures})
-
-
-def _health_line(figures: Mapping[str, float]) -> str:
-    """Return the figures for the log, once a minute; `health` has all others."""
-    known = defaultdict(float, figures)
-    why = ""
-    if known["lag_s"] > _LONG_LAG_S:
-        why = " (samples so old when they came: played faster than real, sent late, or a clock off)"
-    return (
-        f"{known['trucks_alive']:.0f} trucks, {known['rate_per_s']:.0f} messages/s, "
-        f"lag {known['lag_s']:.2f} s{why}, queue {known['queue']:.0f}, lost {known['lost']:.0f}, "
-        f"missing {known['missing']:.0f}, recovered {known['recovered']:.0f}, "
-        f"duplicates {known['duplicates']:.0f}, refused {known['refused']:.0f}, "
-        f"dropped {known['dropped']:.0f}, written {known['written']:.0f} to "
-        f"{known['files']:.0f} files, {known['disk_free_bytes'] / 1e9:.1f} GB left"
-    )
+        _log.info("%s", health_line(figures), extra={"figures": figures})
 
 
 def _check_realms(realms: Sequence[str]) -> tuple[str, ...]:

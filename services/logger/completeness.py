@@ -18,6 +18,7 @@ from schemas.topics import Key, is_from_recording, parse_key, selector, topic
 from services.bus.subscription import RawSample
 from services.common.errors import InputError
 from services.common.intervals import Intervals
+from services.common.log_lines import about
 from services.logger.intake import Intake
 from services.logger.rate_limited_log import RateLimitedLog
 from services.logger.spool_recovery import REALMS_OF_ONE, SpoolRecovery
@@ -214,12 +215,9 @@ class Completeness:
             if self._alive.get(name, False) != is_here:
                 if is_here:
                     self._recovery.hurry(now_s)
-                _log.info(
-                    "%s in realm %s %s",
-                    name[1],
-                    name[0],
-                    "connected" if is_here else "disconnected",
-                )
+                event = "connected" if is_here else "disconnected"
+                fields = about(realm=where.realm, vehicle=where.identifier)
+                _log.info("%s in realm %s %s", name[1], name[0], event, extra=fields)
             self._alive[name] = is_here
 
     def _counted(self, now_s: float) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """The messages on disk, for `durable`, by which trucks and workers free theirs."""
 
 import threading
+import time
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -25,14 +26,17 @@ class DurableStreams:
 
     def __init__(self) -> None:
         self.version = 0
+        self._lag_ns = 0
         self._streams: dict[tuple[Key, int], _Stream] = {}
         self._lock = threading.Lock()
 
     def add(self, messages: Iterable[Message]) -> None:
         """Note messages that have been synced."""
+        now_ns = time.time_ns()
         with self._lock:
             changed: dict[tuple[Key, int], _Stream] = {}
             for message in messages:
+                self._lag_ns = max(self._lag_ns, now_ns - message.publish_time_ns)
                 name = (message.key, message.boot_id)
                 stream = changed.get(name)
                 if stream is None:
@@ -40,6 +44,12 @@ class DurableStreams:
                 stream.stored.add(message.sequence)
                 stream.settled.add(message.sequence)
             self.version += 1
+
+    def take_lag_s(self) -> float:
+        """Return the longest time in s from receipt to disk since the last call."""
+        with self._lock:
+            lag_ns, self._lag_ns = self._lag_ns, 0
+        return lag_ns * 1e-9
 
     def mark_accounted(
         self, where: Key, boot_id: int, first: int, last: int, *, on_disk: bool

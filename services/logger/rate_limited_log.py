@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections import Counter
+from collections.abc import Mapping
 
 _PERIOD_S = 60.0
 """Period of the count of further warnings, which one line reports."""
@@ -22,14 +23,16 @@ class RateLimitedLog:
         self._numbers: Counter[str] = Counter()
         self._lock = threading.Lock()
 
-    def warn(self, kind: str, text: str, *arguments: object) -> None:
-        """Log a warning, or only count it."""
+    def warn(
+        self, kind: str, text: str, *arguments: object, extra: Mapping[str, str] | None = None
+    ) -> None:
+        """Log a warning, or only count it; `extra` are its fields (`about`)."""
         with self._lock:
             self._since_s.setdefault(kind, time.monotonic())
             self._numbers[kind] += 1
             is_logged = self._numbers[kind] <= self._most
         if is_logged:
-            self._log.warning(text, *arguments)
+            self._log.warning(text, *arguments, extra=extra)
 
     def flush(self, *, closing: bool = False) -> None:
         """Log the counts of kinds whose minute is over, and restart these."""

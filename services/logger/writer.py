@@ -155,17 +155,15 @@ class FileWriter:
         """Return the drops since the last call, by source and cause."""
         return self._drops.drain()
 
-    def waiting(self) -> int:
-        """Return the number of messages in the queue."""
-        return len(self._backlog)
-
-    def waiting_bytes(self) -> int:
-        """Return the memory of the messages in the queue."""
-        return self._backlog.bytes
-
-    def open_files(self) -> int:
-        """Return the number of files being written."""
-        return len(self._files)
+    def take_figures(self) -> dict[str, float]:
+        """Return counts for `health`, and the longest time to disk since the last call."""
+        return {
+            "queue": len(self._backlog),
+            "queue_bytes": self._backlog.bytes,
+            "written": self.written,
+            "files": len(self._files),
+            "durable_lag_s": self._durable.take_lag_s(),
+        }
 
     def rotate(self) -> None:
         """Request the closing of all files; the next message of each truck begins a new one."""

@@ -114,7 +114,7 @@ def run(
             gateway.publisher, keys, SUBSCRIBER_TIMEOUT_S
         ):
             # A real truck continues as well; its cache serves late subscribers.
-            _log.warning("no subscriber to %s in realm %s yet", gateway.vehicle, realm)
+            gateway.log.warning("no subscriber to %s in realm %s yet", gateway.vehicle, realm)
 
         def put(message: Message) -> None:
             identity = Identity(message.boot_id, message.sequence)
@@ -126,9 +126,11 @@ def run(
         )
         confirm(gateway.delivery, sent)
         if gateway.is_online:
-            _log.info("%d messages of %s published in realm %s", sent, gateway.vehicle, realm)
+            gateway.log.info(
+                "%d messages of %s published in realm %s", sent, gateway.vehicle, realm
+            )
         else:
-            _log.warning(
+            gateway.log.warning(
                 "%d messages of %s are in the spool, none were published: no router answered at %s",
                 sent, gateway.vehicle, endpoint,
             )  # fmt: skip

@@ -56,6 +56,7 @@ from schemas.vehicle_info import vehicle_part
 from services.bus.delivery import DeliveryTracker
 from services.bus.publisher import Publisher
 from services.common.errors import FailureError
+from services.common.log_lines import about
 from services.truck.spool import Spool
 
 __all__ = ["Gateway"]
@@ -97,6 +98,7 @@ class Gateway:
         already accepts messages. The gateway closes a session that it has opened.
         """
         self.vehicle = check_identifier(vehicle)
+        self.log = logging.LoggerAdapter(_log, about(realm=realm, vehicle=vehicle))
         boot_id = None if spool is None else spool.boot_id
         self.publisher = Publisher(None, check_realm(realm), boot_id)
         self.delivery = DeliveryTracker(None, realm)
@@ -121,7 +123,7 @@ class Gateway:
         try:
             self._own_session = session()
         except FailureError as error:
-            _log.warning("%s: %s; all messages go to the spool meanwhile", vehicle, error)
+            self.log.warning("%s: %s; all messages go to the spool meanwhile", vehicle, error)
             self._connecting = threading.Thread(
                 target=self._connect, args=(session,), name="connect", daemon=True
             )
@@ -218,11 +220,11 @@ class Gateway:
             except FailureError:
                 self._closing.wait(_CONNECT_PAUSE_S)
             except Exception:  # an unattended truck continues without this thread
-                _log.exception("%s: connecting failed for good", self.vehicle)
+                self.log.exception("%s: connecting failed for good", self.vehicle)
                 return
             else:
                 self._join(self._own_session)
-                _log.info("%s: connected", self.vehicle)
+                self.log.info("%s: connected", self.vehicle)
                 return
 
     def _join(self, session: zenoh.Session) -> None:
@@ -247,7 +249,7 @@ class Gateway:
             self.unspooled += 1
             if time.monotonic() >= self._complained_s + _COMPLAINT_PERIOD_S:
                 self._complained_s = time.monotonic()
-                _log.error(
+                self.log.error(
                     "%s: spool: %s; %d messages so far were published without being on disk",
                     self.vehicle, error.strerror, self.unspooled,
                 )  # fmt: skip
@@ -316,7 +318,7 @@ class _SpoolService:
         try:
             self.spool.close()
         except (OSError, FailureError) as error:
-            _log.error("%s: spool: %s", self._gateway.vehicle, error)
+            self._gateway.log.error("%s: spool: %s", self._gateway.vehicle, error)
 
     def _publish_all(self) -> None:
         publisher, vehicle = self._gateway.publisher, self._gateway.vehicle
@@ -324,7 +326,7 @@ class _SpoolService:
             try:
                 publisher.put(*put)
             except zenoh.ZError as error:  # it stays in the spool
-                _log.debug("%s: %s", vehicle, error)
+                self._gateway.log.debug("%s: %s", vehicle, error)
 
     def _sync_all(self) -> None:
         rounds = 0
@@ -333,7 +335,7 @@ class _SpoolService:
             try:
                 self.spool.sync()
             except (OSError, FailureError) as error:
-                _log.error("%s: spool: %s", self._gateway.vehicle, error)
+                self._gateway.log.error("%s: spool: %s", self._gateway.vehicle, error)
             if rounds % _FREE_EVERY == 0:
                 self._free()
 
@@ -341,7 +343,7 @@ class _SpoolService:
         try:
             self.spool.confirm(self._gateway.delivery.confirmed(self._gateway.vehicle))
         except (OSError, FailureError) as error:  # freed later
-            _log.error("%s: spool: %s", self._gateway.vehicle, error)
+            self._gateway.log.error("%s: spool: %s", self._gateway.vehicle, error)
 
     def _answer_all(self, queries: handlers.Handler[zenoh.Query]) -> None:
         # A thread of our own: one of Zenoh's that calls Python while the interpreter ends
@@ -355,7 +357,7 @@ class _SpoolService:
                 try:
                     self._answer(query)
                 except (ValueError, OSError, zenoh.ZError) as error:
-                    _log.warning("%s: spool query: %s", self._gateway.vehicle, error)
+                    self._gateway.log.warning("%s: spool query: %s", self._gateway.vehicle, error)
 
     def _answer(self, query: zenoh.Query) -> None:
         parameters: Any = query.parameters  # pairs, whatever the type stubs say

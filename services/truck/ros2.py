@@ -118,7 +118,7 @@ def run(
             out.put(item)
         reports.report(closing=True)
         confirm(gateway.delivery, out.sent)
-        _log.info("%d messages of %s published in realm %s", out.sent, vehicle, realm)
+        gateway.log.info("%d messages of %s published in realm %s", out.sent, vehicle, realm)
     return 0
 
 
@@ -171,7 +171,7 @@ class _Reports:
     def report(self, *, closing: bool = False) -> None:
         """Log a line for each kind with news; publish events after a minute, or at the end."""
         for line in self._truck.anomalies.news():
-            _log.warning("%s: %s", self._gateway.vehicle, line)
+            self._gateway.log.warning("%s: %s", self._gateway.vehicle, line)
         now_s = time.monotonic()
         if not closing and now_s < self._event_s + _EVENT_EVERY_S:
             return

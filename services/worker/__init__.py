@@ -19,14 +19,17 @@ import queue
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import zenoh
 
 from schemas.proto import driveby_pb2 as pb
-from schemas.results import verdict_line
+from schemas.results import VERDICTS
 from schemas.settings import IdentificationSettings
 from schemas.signals import TRUCK_DECODERS, Identity
 from schemas.site_file import parse_site, read_site_text
@@ -50,6 +53,7 @@ from services.bus.session import wait_for_router
 from services.bus.subscription import SeenSequences, Subscription
 from services.common.errors import FailureError, InputError
 from services.common.files import check_folder_writable
+from services.common.log_lines import about
 from services.execution.dispatch import CrossingExecutor, collect, dispatch, drain
 from services.execution.hang_watchdog import LIMIT_S, TaskLimits
 from services.execution.offline import header_of
@@ -70,6 +74,7 @@ from services.ledger.runs import (
 )
 from services.worker.arrivals import GONE_AFTER_S, ArrivalQueue, LivenessToken, TruckMessage
 from services.worker.backfill import DAYS, MARGIN_S, Backfill, BackfillSource
+from services.worker.health import QueueLag, Workload, log_result, publish_health, workload
 from services.worker.site_file_watcher import EditedSite, SiteFileWatcher
 from services.worker.validation_runner import ValidationRunner
 
@@ -81,7 +86,6 @@ _POLL_S = 0.1
 """Longest delay in s after which a stop, a token or a result is noticed without a message."""
 _LONGEST_QUEUE = 200_000
 """Messages, two hours of one truck or a minute of a hundred; beyond them publishers wait."""
-_LONGEST_NOTE = 1000
 _SOONEST_HEALTH_S = 5.0
 """Shortest time in s between two health messages, as the backlog may change often."""
 _MAX_NAMED = 10
@@ -105,7 +109,8 @@ class SiteReload(NamedTuple):
         return self.watch.edited(now_s, is_asked=is_asked)
 
 
-class WorkerService(NamedTuple):
+@dataclass(frozen=True)
+class WorkerService:
     """Parts of a run: engine, executor, and destinations of their outputs."""
 
     id: str
@@ -114,6 +119,8 @@ class WorkerService(NamedTuple):
     certificates: ValidationRunner
     publisher: Publisher
     files: ResultFiles
+    verdicts: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(VERDICTS, 0)))
+    """Numbers of this run's results, by verdict."""
 
     def publish(self, outputs: Iterable[Output]) -> None:
         """Write each message to the disk and only then to the bus.
@@ -133,29 +140,20 @@ class WorkerService(NamedTuple):
                     f"{stream} of {identifier} cannot be published: {error}"
                 ) from error
             if output.result is not None:
-                result = output.result
-                _log.info("%s: %s", result.crossing_id, verdict_line(result))
+                self.verdicts[output.result.verdict] += 1
+                log_result(output.result)
 
     def process_outputs(self, outputs: Iterable[EngineOutput]) -> None:
         """Publish the engine's messages, and execute its tasks."""
         self.publish(dispatch(self.engine, self.execution, outputs, self.certificates.request))
 
-
-class _QueueLag(NamedTuple):
-    """Messages received and not yet processed."""
-
-    messages: int
-    lag_s: float
-    """Longest wait in s of a message since the last health message."""
-
-
-class _Backlog(NamedTuple):
-    """Counts of unidentified crossings; running times are left out, as they always change."""
-
-    running: tuple[str, ...]
-    waiting: int
-    waiting_for_certificate: int
-    in_recordings: int
+    def publish_health(self, behind: QueueLag, load: Workload) -> None:
+        """Publish `health`."""
+        put = partial(self.publisher.put, "service", self.id, "health")
+        publish_health(
+            put, self.id, self.execution, behind, load,
+            verdicts=self.verdicts, note=self.certificates.note,
+        )  # fmt: skip
 
 
 def run(
@@ -382,7 +380,10 @@ def _receive_all(
                 # to the next one. A good copy follows, which must not count as known.
                 _check_whole(received.payload, key, identity)
             except ValueError as error:
-                _log.warning("refused %s of %s: %.200s", key.stream, key.identifier, error)
+                fields = about(vehicle=key.identifier)
+                _log.warning(
+                    "refused %s of %s: %.200s", key.stream, key.identifier, error, extra=fields
+                )
                 continue
             if seen.add(key, identity):
                 arrived = TruckMessage(key, *identity, received.payload, now_s)
@@ -458,7 +459,7 @@ def _serve(
     arrivals = ArrivalQueue()
     warned: set[str] = set()
     next_health_s = soonest_health_s = next_catch_up_s = 0.0
-    published_backlog: _Backlog | None = None
+    published_load: Workload | None = None
     leave_at_s = math.inf
     progress: tuple[VehicleBridgePair, float] | None = None
     now_s = time.monotonic()
@@ -471,14 +472,13 @@ def _serve(
     ):
         if time.monotonic() >= soonest_health_s or certificates.has_news:
             soonest_health_s = time.monotonic() + _SOONEST_HEALTH_S
-            backlog = _backlog(engine, execution, backfill)
+            load = workload(engine, execution, backfill)
             is_due = time.monotonic() >= next_health_s or certificates.has_news
-            if is_due or backlog != published_backlog:
+            if is_due or load != published_load:
                 next_health_s = time.monotonic() + HEALTH_PERIOD_S
                 certificates.has_news = False
-                published_backlog = backlog
-                behind = _QueueLag(queued.qsize(), lag_s)
-                _publish_health(service, behind, backlog)
+                published_load = load
+                service.publish_health(QueueLag(queued.qsize(), lag_s), load)
                 lag_s = 0.0
         batch: list[TruckMessage] = []
         one = _next(queued)
@@ -537,7 +537,8 @@ def _serve(
             warned.clear()
         for vehicle in engine.unknown_vehicles - warned:
             warned.add(vehicle)
-            _log.warning("%s drives, but the site file has no such vehicle", vehicle)
+            fields = about(vehicle=vehicle)
+            _log.warning("%s drives, but the site file has no such vehicle", vehicle, extra=fields)
     service.publish(drain(engine, execution))
     waiting = [name for names in engine.waiting().values() for name in names]
     if waiting:
@@ -580,39 +581,3 @@ def _publish_progress(
         fraction=fraction,
     )
     publisher.put("service", service_id, "progress", progress.SerializeToString())
-
-
-def _backlog(engine: Engine, execution: CrossingExecutor, source: Backfill | None) -> _Backlog:
-    waiting = {pair: len(names) for pair, names in engine.waiting().items()}
-    ready = sum(number for pair, number in waiting.items() if engine.is_certified(pair))
-    return _Backlog(
-        tuple(one.crossing_id for one in execution.running),
-        execution.waiting + ready,
-        sum(waiting.values()) - ready,
-        0 if source is None else source.waiting,
-    )
-
-
-def _publish_health(service: WorkerService, behind: _QueueLag, backlog: _Backlog) -> None:
-    running, note = service.execution.running, service.certificates.note
-    notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in running]
-    notes += [f"{backlog.waiting} wait for a process"] if backlog.waiting else []
-    notes += [f"{backlog.in_recordings} wait in recordings"] if backlog.in_recordings else []
-    notes += [note] if note else []
-    health = pb.Health(
-        schema_version=1,
-        time_ns=time.time_ns(),
-        service=service.id,
-        ok=True,
-        figures={
-            "queue": float(behind.messages),
-            "lag_s": behind.lag_s,
-            "identifying": float(len(running)),
-            "identifying_longest_s": max((one.seconds for one in running), default=0.0),
-            "waiting_for_process": float(backlog.waiting),
-            "waiting_for_certificate": float(backlog.waiting_for_certificate),
-            "waiting_in_recordings": float(backlog.in_recordings),
-        },
-        note="; ".join(notes)[:_LONGEST_NOTE],
-    )
-    service.publisher.put("service", service.id, "health", health.SerializeToString())

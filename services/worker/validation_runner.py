@@ -22,6 +22,7 @@ from schemas.validation_records import (
     validation_path,
 )
 from services.common.errors import InputError
+from services.common.log_lines import about
 from services.execution.processes import BackgroundTask, ProcessExecutor
 from services.history.validation_files import save
 from services.simulation.validation_trial import ValidationTrial
@@ -123,9 +124,15 @@ class ValidationRunner:
             self._trial = ValidationTrial(self._site, pair, self._settings)
         except InputError as error:
             self._failed[pair] = str(error)
-            _log.error("%s cannot be validated, its crossings wait: %s", pair, error)
+            _log.error(
+                "%s cannot be validated, its crossings wait: %s", pair, error, extra=_about(pair)
+            )
         else:
-            _log.info("%s has no validation record yet: starting its simulated crossings", pair)
+            _log.info(
+                "%s has no validation record yet: starting its simulated crossings",
+                pair,
+                extra=_about(pair),
+            )
 
     def _advance_trial(self, trial: ValidationTrial) -> None:
         for finished in self._processes.collect_background():
@@ -149,7 +156,7 @@ class ValidationRunner:
         self._processes.cancel_background()
         path = save(self._folder, certificate)
         if certificate.passed:
-            _log.info("%s is validated: %s (%s)", certificate.pair, certificate.reason, path)
+            _log_passed(certificate, path)
             self.has_news = True
             return {certificate.pair: certificate.hash}
         self._record_failure(certificate)
@@ -171,7 +178,7 @@ class ValidationRunner:
                 passed[pair] = certificate.hash
                 self._failed.pop(pair, None)
                 self.has_news = True
-                _log.info("%s is validated: %s (%s)", pair, certificate.reason, path)
+                _log_passed(certificate, path)
             else:
                 self._record_failure(certificate)
             if pair in self._wanted:
@@ -189,4 +196,14 @@ class ValidationRunner:
             pair,
             certificate.reason,
             validation_path(self._folder, certificate.hash),
+            extra=_about(pair),
         )
+
+
+def _log_passed(certificate: ValidationRecord, path: Path) -> None:
+    pair, reason = certificate.pair, certificate.reason
+    _log.info("%s is validated: %s (%s)", pair, reason, path, extra=_about(pair))
+
+
+def _about(pair: VehicleBridgePair) -> dict[str, str]:
+    return about(vehicle=pair.vehicle, bridge=pair.bridge)

@@ -26,6 +26,7 @@ SAMPLE = "recordings/sample/crossing.mcap"
 
 LONG = "takes minutes to hours; `make test-all`, `make faults` or a person runs it"
 WINDOW = "opens a window until somebody closes it; tests/unit/viewer opens it without a screen"
+ENGINE = "needs a container engine; tests/containers has one"
 SERVICE = "runs until it is stopped; tests/process_replay starts it as a process"
 FOUR = "is one of four at once; tests/process_replay/test_four_terminals.py runs them as they stand"
 MACHINES = "is for machines that are not here; tests/process_replay and tests/faults do it on one"
@@ -100,8 +101,10 @@ NOT_RUN = {
     "python -m pytest tests/faults -m soak -k fifty": LONG,
     "make bench": LONG,
     "make mutants MUTANTS=30 SEED=1": LONG,
-    "make up": "needs a container engine; tests/contract/test_compose.py reads its files",
-    "make down": "needs a container engine",
+    "make up": ENGINE,
+    "make down": ENGINE,
+    "docker compose logs --no-log-prefix worker | "
+    "jq 'select(.crossing) | {crossing, verdict}'": ENGINE,
     "make docs": "needs a network the first time; tests/contract/test_site.py builds the site",
     'pip install ".[identify,view,notebook]"': NETWORK,
     'pip install "driveby[identify,view,notebook]"': NETWORK,

@@ -128,13 +128,13 @@ def test_a_disk_that_stalls_for_10_s_loses_nothing_of_100_trucks(tmp_path: Path)
         return number
 
     sent = send(range(2))
-    wait_for(lambda: writer.open_files() == 100)
+    wait_for(lambda: writer.take_figures()["files"] == 100)
     go.clear()
     sent += send(range(2, 4))
     assert stalled.wait(LONGEST_S)
     sent += send(range(4, 204))
-    assert writer.waiting() > 39_000
-    assert writer.waiting_bytes() < QUEUE_BYTES / 2
+    assert writer.take_figures()["queue"] > 39_000
+    assert writer.take_figures()["queue_bytes"] < QUEUE_BYTES / 2
     go.set()
     writer.finish("done", {})
     assert (writer.dropped, writer.failure, writer.written) == (0, None, sent)

@@ -220,7 +220,7 @@ def test_requeued_crossing_is_not_lost(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch, away_s: float
 ) -> None:
     """All this came during an identification of a quarter of an hour, and is looked at after it."""
-    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
+    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
     monkeypatch.setattr("services.worker.time.monotonic", lambda: 1000.0)
     queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     with_token = [
@@ -250,7 +250,7 @@ def test_a_truck_without_token_that_goes_on_talking_does_not_hold_up_the_end(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A message every tenth of a second, each of which says that it has not gone yet."""
-    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
+    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
     monkeypatch.setattr("services.worker.time.monotonic", lambda: 10.0)
     queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     for number in range(1000):
@@ -264,7 +264,7 @@ def test_a_truck_without_token_that_goes_on_talking_does_not_hold_up_the_end(
 def test_truck_silent_before_a_stop_is_decided_before_the_end(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
+    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
     moments = itertools.count(10.0, 0.04)
     monkeypatch.setattr("services.worker.time.monotonic", lambda: next(moments))
     monkeypatch.setattr(worker, "_POLL_S", 0.001)
@@ -302,7 +302,7 @@ class Broken(Watched):
 def test_an_error_of_the_program_is_not_blamed_on_a_message(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
+    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
     queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     queued.put(message(0.0, 1))
     queued.put(message(2.0, 2))
@@ -316,7 +316,7 @@ def test_an_error_of_the_program_is_not_blamed_on_a_message(
 def test_a_malformed_message_is_refused_and_named(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(worker, "_publish_health", lambda *_: None)
+    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
     queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     queued.put(message(0.0)._replace(payload=b"\xff"))
     queued.put(message(2.0)._replace(payload=b"\xfe"))

@@ -1,0 +1,23 @@
+"""The logger's line of its own log on its health."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+
+_LONG_LAG_S = 60.0
+"""Shortest lag that is explained: the network is rarely the cause."""
+
+
+def health_line(figures: Mapping[str, float]) -> str:
+    """Return the figures for the log, once a minute; `health` has all others."""
+    known = defaultdict(float, figures)
+    why = ""
+    if known["lag_s"] > _LONG_LAG_S:
+        why = " (samples so old when they came: played faster than real, sent late, or a clock off)"
+    return (
+        f"{known['trucks_alive']:.0f} trucks, {known['rate_per_s']:.0f} messages/s, "
+        f"lag {known['lag_s']:.2f} s{why}, queue {known['queue']:.0f}, lost {known['lost']:.0f}, "
+        f"missing {known['missing']:.0f}, recovered {known['recovered']:.0f}, "
+        f"duplicates {known['duplicates']:.0f}, refused {known['refused']:.0f}, "
+        f"dropped {known['dropped']:.0f}, written {known['written']:.0f} to "
+        f"{known['files']:.0f} files, {known['disk_free_bytes'] / 1e9:.1f} GB left"
+    )

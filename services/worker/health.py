@@ -1,0 +1,93 @@
+"""The worker's `health`, and its line of the log for each result."""
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from schemas.proto import driveby_pb2 as pb
+from schemas.results import CrossingResult, verdict_line
+from services.common.log_lines import about
+from services.execution.dispatch import CrossingExecutor
+from services.identification.engine import Engine
+from services.worker.backfill import Backfill
+
+_log = logging.getLogger(__name__)
+_LONGEST_NOTE = 1000
+
+
+class QueueLag(NamedTuple):
+    """Messages received and not yet processed."""
+
+    messages: int
+    lag_s: float
+    """Longest wait in s of a message since the last health message."""
+
+
+class Workload(NamedTuple):
+    """Counts of unidentified crossings; running times are left out, as they always change."""
+
+    running: tuple[str, ...]
+    waiting: int
+    waiting_for_certificate: int
+    in_recordings: int
+
+
+def workload(engine: Engine, execution: CrossingExecutor, source: Backfill | None) -> Workload:
+    """Return the counts of unidentified crossings."""
+    waiting = {pair: len(names) for pair, names in engine.waiting().items()}
+    ready = sum(number for pair, number in waiting.items() if engine.is_certified(pair))
+    return Workload(
+        tuple(one.crossing_id for one in execution.running),
+        execution.waiting + ready,
+        sum(waiting.values()) - ready,
+        0 if source is None else source.waiting,
+    )
+
+
+def log_result(result: CrossingResult) -> None:
+    """Log the result of a crossing."""
+    fields = about(
+        realm=result.realm,
+        vehicle=result.vehicle,
+        bridge=result.bridge,
+        crossing=result.crossing_id,
+        verdict=result.verdict,
+    )
+    _log.info("%s: %s", result.crossing_id, verdict_line(result), extra=fields)
+
+
+def publish_health(
+    publish: Callable[[bytes], object],
+    service_id: str,
+    execution: CrossingExecutor,
+    behind: QueueLag,
+    load: Workload,
+    *,
+    verdicts: Mapping[str, int],
+    note: str,
+) -> None:
+    """Publish `health`; `verdicts` are the results of this run, `note` why crossings wait."""
+    running = execution.running
+    notes = [f"{name} is being identified for {seconds:.0f} s" for name, seconds in running]
+    notes += [f"{load.waiting} wait for a process"] if load.waiting else []
+    notes += [f"{load.in_recordings} wait in recordings"] if load.in_recordings else []
+    notes += [note] if note else []
+    figures = {
+        "queue": float(behind.messages),
+        "lag_s": behind.lag_s,
+        "identifying": float(len(running)),
+        "identifying_longest_s": max((one.seconds for one in running), default=0.0),
+        "waiting_for_process": float(load.waiting),
+        "waiting_for_certificate": float(load.waiting_for_certificate),
+        "waiting_in_recordings": float(load.in_recordings),
+    } | {f"crossings/{verdict}": float(number) for verdict, number in verdicts.items()}
+    health = pb.Health(
+        schema_version=1,
+        time_ns=time.time_ns(),
+        service=service_id,
+        ok=True,
+        figures=figures,
+        note="; ".join(notes)[:_LONGEST_NOTE],
+    )
+    publish(health.SerializeToString())
