@@ -202,11 +202,11 @@ def add_worker(commands: Any) -> None:
 
 
 def _worker(options: argparse.Namespace) -> int:
-    from services import worker
-    from services.execution.hang_watchdog import LIMIT_S
-    from services.worker.backfill import DAYS
+    from services.worker.run import run
+    from services.worker.settings import WorkerSettings
 
-    return worker.run(
+    usual = WorkerSettings
+    asked = WorkerSettings(
         endpoint=options.endpoint or default_endpoint(options.tls),
         realm=options.realm,
         site=options.site,
@@ -214,15 +214,18 @@ def _worker(options: argparse.Namespace) -> int:
         file=options.file,
         method=options.method.replace("-", "_"),
         service_id=options.id,
-        ready=_announced(options, f"ready, waiting for crossings in realm {options.realm}"),
         tls=options.tls,
         processes=options.processes,
-        limit_s=LIMIT_S if options.cpu_limit is None else options.cpu_limit,
+        limit_s=usual.limit_s if options.cpu_limit is None else options.cpu_limit,
         certificates=options.validations,
         recordings=options.recordings,
-        recordings_days=DAYS if options.recordings_days is None else options.recordings_days,
+        recordings_days=(
+            usual.recordings_days if options.recordings_days is None else options.recordings_days
+        ),
         validate=True if options.validate_first else False if options.skip_validation else None,
     )
+    line = f"ready, waiting for crossings in realm {options.realm}"
+    return run(asked, _announced(options, line))
 
 
 def add_truck(commands: Any) -> None:

@@ -41,8 +41,6 @@ from services.ledger.recorded_crossings import (
 from services.recordings.recording import is_being_written
 
 _log = logging.getLogger(__name__)
-DAYS: Final = 2.0
-"""Age in days up to which recordings are scanned; older crossings need a request."""
 MARGIN_S: Final = 86_400.0
 """Time in s by which a result may be older than its recording, as spools arrive late."""
 _SCAN_EVERY_S: Final = 10.0

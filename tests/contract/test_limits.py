@@ -34,7 +34,6 @@ LONG_MODULES = {
     "services.logger.writer": 511,
     "services.simulation.two_sided": 861,
     "services.viewer.rerun_crossing": 490,
-    "services.worker.__init__": 618,
 }
 
 LONG_CLASSES = {
@@ -75,8 +74,6 @@ LONG_FUNCTIONS = {
     "services.simulation.out_of_model:draw_out_of_model": 83,
     "services.truck.__init__:run": 76,
     "studies.paper.scenarios:run_scenario": 71,
-    "services.worker.__init__:_serve": 104,
-    "services.worker.__init__:run": 150,
 }
 
 MANY_ARGUMENTS = {
@@ -125,7 +122,6 @@ MANY_ARGUMENTS = {
     "services.viewer.live:live_command": 8,
     "services.viewer.rerun_file:write_rrd": 8,
     "services.viewer.view:write_views": 9,
-    "services.worker.__init__:run": 15,
     "services.worker.backfill:Backfill.__init__": 8,
 }
 
@@ -135,7 +131,6 @@ ROOMS_WITH_CODE = {
     "services.logger": 62,
     "services.replay": 31,
     "services.truck": 37,
-    "services.worker": 71,
 }
 
 SHARED_NAMES = {

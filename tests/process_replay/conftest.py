@@ -45,6 +45,10 @@ if "recordings" in arguments:
 if module == "services.logger":
     arguments["ready"] = lambda: print("ready", flush=True)
 try:
+    if module == "services.worker":
+        from services.worker.run import run
+        from services.worker.settings import WorkerSettings
+        sys.exit(run(WorkerSettings(**arguments)))
     sys.exit(importlib.import_module(module).run(**arguments))
 except InputError as error:
     sys.exit(print(error, file=sys.stderr) or 2)

@@ -24,7 +24,8 @@ from services.cli.health import health_command
 from services.common.errors import InputError
 from services.history.validation_files import save
 from services.recordings.recording import read_messages, read_site
-from services.worker import run as run_worker
+from services.worker.run import run as run_worker
+from services.worker.settings import WorkerSettings
 from tests.builders.certificates import certificate
 from tests.builders.processes import stop
 from tests.process_replay.starting import Process, Start, start_logger
@@ -190,11 +191,13 @@ def test_a_worker_makes_the_certificate_itself(
 def test_other_methods_have_no_certificates(endpoint: str, site: Path) -> None:
     with pytest.raises(InputError, match=r"^--method least-squares: has no certificates"):
         run_worker(
-            endpoint=endpoint,
-            realm="live",
-            site=site,
-            folder=site.parent,
-            file=None,
-            method="least_squares",
-            service_id="worker",
+            WorkerSettings(
+                endpoint=endpoint,
+                realm="live",
+                site=site,
+                folder=site.parent,
+                file=None,
+                method="least_squares",
+                service_id="worker",
+            )
         )

@@ -27,7 +27,8 @@ from services.common.geodesy import bridge_frame, to_lat_lon
 from services.drives.runs import GnssTrack, run_to_messages
 from services.recordings.recording import read_info, read_messages, read_site
 from services.simulation.drive import SimulatedDrive, paper_site
-from services.worker import run as run_worker
+from services.worker.run import run as run_worker
+from services.worker.settings import WorkerSettings
 from tests.builders.processes import stop
 from tests.receiving import several
 from tests.waiting import LONGEST_S
@@ -306,13 +307,15 @@ def test_results_that_exist_are_left_alone(site: Path, endpoint: str, tmp_path: 
     file.write_bytes(b"precious")
     with pytest.raises(InputError, match=re.escape(f"{file}: exists")):
         run_worker(
-            endpoint=endpoint,
-            realm=REALM,
-            site=site,
-            folder=tmp_path,
-            file=file,
-            method="least_squares",
-            service_id="worker",
+            WorkerSettings(
+                endpoint=endpoint,
+                realm=REALM,
+                site=site,
+                folder=tmp_path,
+                file=file,
+                method="least_squares",
+                service_id="worker",
+            )
         )
     assert file.read_bytes() == b"precious"
 

@@ -15,7 +15,6 @@ from schemas.proto import driveby_pb2 as pb
 from schemas.results import ResultHeader
 from schemas.settings import IdentificationSettings
 from schemas.topics import Key, topic
-from services import worker
 from services.bus.publisher import Publisher
 from services.common.errors import FailureError
 from services.execution.inline import InlineExecutor
@@ -23,8 +22,11 @@ from services.identification.engine import Engine
 from services.identification.outputs import Output
 from services.ledger.runs import ResultFiles
 from services.simulation.drive import paper_site
+from services.worker import loop, receiving
 from services.worker.arrivals import ArrivalQueue, DepartedTruck, LivenessToken, TruckMessage
+from services.worker.service import WorkerService
 from tests.unit.worker.test_validation_runner import Places, certificates
+from tests.waiting import LONGEST_S
 
 REALM = "live"
 SETTINGS = IdentificationSettings(method="least_squares")
@@ -185,10 +187,8 @@ def test_hurried_queue_waits_as_for_a_token() -> None:
 NOBODY_WAITS = certificates(Path("not made"), Places())
 
 
-def service_of(engine: Engine, files: ResultFiles) -> worker.WorkerService:
-    return worker.WorkerService(
-        "w", engine, InlineExecutor(), NOBODY_WAITS, Publisher(None, REALM), files
-    )
+def service_of(engine: Engine, files: ResultFiles) -> WorkerService:
+    return WorkerService("w", engine, InlineExecutor(), NOBODY_WAITS, Publisher(None, REALM), files)
 
 
 class Watched(Engine):
@@ -220,8 +220,8 @@ def test_requeued_crossing_is_not_lost(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch, away_s: float
 ) -> None:
     """All this came during an identification of a quarter of an hour, and is looked at after it."""
-    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
-    monkeypatch.setattr("services.worker.time.monotonic", lambda: 1000.0)
+    monkeypatch.setattr(WorkerService, "publish_health", lambda *_: None)
+    monkeypatch.setattr("services.worker.loop.time.monotonic", lambda: 1000.0)
     queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     with_token = [
         token(0.0, is_alive=True),
@@ -235,7 +235,7 @@ def test_requeued_crossing_is_not_lost(
         queued.put(one)
     stop = threading.Event()
     engine = Watched(stop, message(0.0, 3).payload)
-    worker._serve(service_of(engine, files), queued, stop, None)
+    loop.Loop(service_of(engine, files), queued, stop).run()
     assert engine.seen == [message(0.0, number).payload for number in (1, 2, 3)]
 
 
@@ -250,30 +250,30 @@ def test_a_truck_without_token_that_goes_on_talking_does_not_hold_up_the_end(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A message every tenth of a second, each of which says that it has not gone yet."""
-    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
-    monkeypatch.setattr("services.worker.time.monotonic", lambda: 10.0)
+    monkeypatch.setattr(WorkerService, "publish_health", lambda *_: None)
+    monkeypatch.setattr("services.worker.loop.time.monotonic", lambda: 10.0)
     queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     for number in range(1000):
         queued.put(message(0.1 * number, number))
     stop = threading.Event()
     engine = Undecided(stop, message(0.0, 100).payload)
-    worker._serve(service_of(engine, files), queued, stop, None)
+    loop.Loop(service_of(engine, files), queued, stop).run()
     assert engine.seen == [message(0.0, number).payload for number in range(131)]
 
 
 def test_truck_silent_before_a_stop_is_decided_before_the_end(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
+    monkeypatch.setattr(WorkerService, "publish_health", lambda *_: None)
     moments = itertools.count(10.0, 0.04)
-    monkeypatch.setattr("services.worker.time.monotonic", lambda: next(moments))
-    monkeypatch.setattr(worker, "_POLL_S", 0.001)
+    monkeypatch.setattr("services.worker.loop.time.monotonic", lambda: next(moments))
+    monkeypatch.setattr(loop, "POLL_S", 0.001)
     queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     queued.put(message(8.9, 1))
     queued.put(message(10.0, 2))
     stop = threading.Event()
     engine = Undecided(stop, message(0.0, 2).payload)
-    worker._serve(service_of(engine, files), queued, stop, None)
+    loop.Loop(service_of(engine, files), queued, stop).run()
     assert engine.seen == [message(0.0, 1).payload, message(0.0, 2).payload, gone()]
 
 
@@ -283,11 +283,13 @@ def test_a_receiver_that_fails_in_any_way_is_not_taken_for_a_quiet_one(
     def take_all(*_: object) -> None:
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr(worker, "_receive_all", take_all)
-    closing, failed = threading.Event(), threading.Event()
-    bus = cast("zenoh.Session", None)
-    worker._receive(bus, REALM, queue.Queue(), closing, failed)
-    assert failed.is_set()
+    monkeypatch.setattr(receiving.Receiver, "_receive_all", take_all)
+    has_ended = threading.Event()
+    receiver = receiving.Receiver(cast("zenoh.Session", None), REALM, has_ended.set)
+    receiver.start()
+    assert has_ended.wait(LONGEST_S)
+    receiver.close()
+    assert receiver.has_failed
     assert "unforeseen" in caplog.text
 
 
@@ -302,26 +304,26 @@ class Broken(Watched):
 def test_an_error_of_the_program_is_not_blamed_on_a_message(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
+    monkeypatch.setattr(WorkerService, "publish_health", lambda *_: None)
     queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     queued.put(message(0.0, 1))
     queued.put(message(2.0, 2))
     stop = threading.Event()
     engine = Broken(stop, message(0.0, 1).payload)
     with pytest.raises(FailureError, match="could not be processed: singular"):
-        worker._serve(service_of(engine, files), queued, stop, None)
+        loop.Loop(service_of(engine, files), queued, stop).run()
     assert "refused" not in caplog.text
 
 
 def test_a_malformed_message_is_refused_and_named(
     files: ResultFiles, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(worker.WorkerService, "publish_health", lambda *_: None)
+    monkeypatch.setattr(WorkerService, "publish_health", lambda *_: None)
     queued: queue.Queue[TruckMessage | LivenessToken] = queue.Queue()
     queued.put(message(0.0)._replace(payload=b"\xff"))
     queued.put(message(2.0)._replace(payload=b"\xfe"))
     engine = Engine(paper_site(), SETTINGS, HEADER)
     stop = threading.Event()
     ready = threading.Timer(0.5, stop.set)
-    worker._serve(service_of(engine, files), queued, stop, ready.start)
+    loop.Loop(service_of(engine, files), queued, stop).run(ready.start)
     assert caplog.text.count("refused accel of truck-1") == 2

@@ -1,0 +1,137 @@
+"""Reception from the bus in a thread of its own: an identification must not delay a publisher."""
+
+import contextlib
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import zenoh
+
+from schemas.signals import TRUCK_DECODERS, Identity
+from schemas.topics import Key, parse_key, selector
+from services.bus.liveness import LivenessProbe, StaleConnectionError
+from services.bus.realm_listener import OtherRealms
+from services.bus.subscription import RawSample, SeenSequences, Subscription
+from services.common.log_lines import about
+from services.worker.arrivals import LivenessToken, TruckMessage
+
+_log = logging.getLogger(__name__)
+POLL_S: Final = 0.1
+"""Longest delay in s after which a stop, a token or a result is noticed without a message."""
+_LONGEST_QUEUE: Final = 200_000
+"""Messages, two hours of one truck or a minute of a hundred; beyond them publishers wait."""
+ArrivalsQueue = queue.Queue[TruckMessage | LivenessToken]
+
+
+class Receiver:
+    """The thread that receives, and the queue of what it has received and checked."""
+
+    def __init__(self, bus: zenoh.Session, realm: str, at_end: Callable[[], None]) -> None:
+        """Prepare the thread, which calls `at_end` when it ends for whatever reason."""
+        self.queued: ArrivalsQueue = queue.Queue(_LONGEST_QUEUE)
+        self._bus, self._realm, self._at_end = bus, realm, at_end
+        self._closing, self._failed = threading.Event(), threading.Event()
+        self._seen = SeenSequences()
+        self._thread = threading.Thread(target=self._receive, name="receive", daemon=True)
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether nothing more could be received: such a worker must not look alive."""
+        return self._failed.is_set()
+
+    def start(self) -> None:
+        """Start to receive."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _receive(self) -> None:
+        try:
+            self._receive_all()
+        except Exception as error:  # whatever it is, nothing more would be received
+            if not self._closing.is_set():
+                self._failed.set()
+                unforeseen = not isinstance(error, zenoh.ZError | StaleConnectionError)
+                _log.error("the connection to the bus failed: %s", error, exc_info=unforeseen)
+        finally:
+            self._at_end()
+
+    def _receive_all(self) -> None:
+        bus, other_realms = self._bus, OtherRealms(self._bus, self._realm)
+        is_hinted = False
+        tokens = selector(self._realm, "vehicle", "alive")
+        alive = bus.liveliness().declare_subscriber(
+            tokens, zenoh.handlers.FifoChannel(1000), history=True
+        )
+        probe = LivenessProbe(bus, tokens, other_realms.alive)
+        with Subscription(bus, selector(self._realm, "vehicle")) as vehicles:
+            while not self._closing.is_set():
+                received = vehicles.receive(POLL_S)
+                token = alive.handler.try_recv()
+                now_s = time.monotonic()
+                try:
+                    if token is not None:
+                        one = _token(token, now_s)
+                        probe.heard(now_s)
+                        self._put(one)
+                    if received is None:
+                        other_realms.look()
+                        probe.poll(now_s)
+                        if not (is_hinted or self._seen.streams) and (line := other_realms.line()):
+                            is_hinted = True
+                            _log.warning("%s", line)
+                        continue
+                    probe.heard(now_s)
+                    key, identity = received.key(), received.identity()
+                except ValueError as error:
+                    _log.warning("refused: %.200s", error)
+                    continue
+                self._take(received, key, identity, now_s)
+        alive.undeclare()  # type: ignore[no-untyped-call]
+        other_realms.close()
+
+    def _take(self, received: RawSample, key: Key, identity: Identity, now_s: float) -> None:
+        """Queue a message of a truck that is whole and new."""
+        if key.stream not in TRUCK_DECODERS:
+            return
+        try:
+            # A router that cuts off a reader in the middle of a message leaves the rest of it
+            # to the next one. A good copy follows, which must not count as known.
+            _check_whole(received.payload, key, identity)
+        except ValueError as error:
+            line = "refused %s of %s: %.200s"
+            fields = about(vehicle=key.identifier)
+            _log.warning(line, key.stream, key.identifier, error, extra=fields)
+            return
+        if self._seen.add(key, identity):
+            self._put(TruckMessage(key, *identity, received.payload, now_s))
+
+    def _put(self, item: TruckMessage | LivenessToken) -> None:
+        """Wait for room in the queue, but not beyond the end of the service."""
+        while not self._closing.is_set():
+            with contextlib.suppress(queue.Full):
+                self.queued.put(item, timeout=POLL_S)
+                return
+
+
+def _token(sample: Any, now_s: float) -> LivenessToken:
+    """Return a truck's token; raise ValueError for a key of another form."""
+    key = parse_key(str(sample.key_expr))
+    return LivenessToken(key.realm, key.identifier, sample.kind == zenoh.SampleKind.PUT, now_s)
+
+
+def _check_whole(payload: bytes, key: Key, identity: Identity) -> None:
+    """Raise ValueError for a malformed payload, or one that differs from its attachment."""
+    message = TRUCK_DECODERS[key.stream](payload)
+    if (message.boot_id, message.sequence) != identity:
+        raise ValueError(
+            f"says that it is {message.sequence} of boot {message.boot_id}, and came as "
+            f"{identity.sequence} of boot {identity.boot_id}"
+        )
