@@ -65,7 +65,7 @@ USER driveby
 FROM common AS service
 COPY --from=service-environment /opt/driveby /opt/driveby
 # Python writes compiled what is imported here, and nothing when it runs: its files are read-only.
-RUN python -c "import driveby.services.logger, driveby.services.viewer.rerun_file" \
+RUN python -c "import driveby.services.logger.run, driveby.services.viewer.rerun_file" \
     && python -c "import driveby.services.worker, driveby.services.simulation.drive" \
     && driveby health --help >/dev/null
 # The root file system is read-only and numba wants to write beside what it reads, so entrypoint.sh

@@ -12,7 +12,7 @@ from services.common.endpoints import LOOPBACK
 from services.common.errors import InputError
 
 if TYPE_CHECKING:
-    from services.cluster import ClusterCredentials
+    from services.cluster.run import ClusterCredentials
     from services.execution.dispatch import CrossingExecutor
     from services.execution.scheduler import Credentials
 
@@ -157,7 +157,7 @@ def _cores() -> int:
 
 
 def _roles(folder: Path) -> "ClusterCredentials":
-    from services.cluster import ClusterCredentials
+    from services.cluster.run import ClusterCredentials
 
     if not folder.is_dir():
         raise InputError(f"--tls: {folder} is no folder; driveby certs {folder} --cluster makes it")
@@ -166,7 +166,7 @@ def _roles(folder: Path) -> "ClusterCredentials":
 
 
 def _cluster(options: argparse.Namespace) -> int:
-    from services.cluster import ClusterConfig, run
+    from services.cluster.run import ClusterConfig, run
 
     return run(
         ClusterConfig(

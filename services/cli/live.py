@@ -118,11 +118,11 @@ def add_logger(commands: Any) -> None:
 
 
 def _logger(options: argparse.Namespace) -> int:
-    from services import logger
+    from services.logger.run import run
     from services.logger.writer import RotationLimits
 
     listen = options.listen or default_endpoint(options.tls)
-    return logger.run(
+    return run(
         listen=listen,
         folder=options.folder,
         file=options.file,
@@ -278,9 +278,9 @@ def _add_spool(p: argparse.ArgumentParser) -> None:
 
 
 def _truck(options: argparse.Namespace) -> int:
-    from services import truck
+    from services.truck.run import run
 
-    return truck.run(
+    return run(
         recording=options.recording,
         endpoint=options.endpoint or default_endpoint(options.tls),
         realm=options.realm,

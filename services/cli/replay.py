@@ -14,7 +14,7 @@ from services.cli.parsing import (
 )
 
 if TYPE_CHECKING:
-    from services.replay import ReplayStatistics
+    from services.replay.run import ReplayStatistics
 from services.common.endpoints import default_endpoint
 
 
@@ -80,16 +80,16 @@ def add_replay(commands: Any) -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from services import replay
     from services.cli.terminal import has_terminal, terminal
     from services.common.errors import InputError
     from services.common.naming import checked_identifier, identifier_from
     from services.replay.choice import ReplaySelection, parsed_rename
+    from services.replay.run import run
 
     if options.paused and not has_terminal():
         raise InputError("--paused: cannot be resumed: neither input nor output is a terminal")
     name = options.name
-    return replay.run(
+    return run(
         recordings=options.recordings,
         endpoint=options.endpoint or default_endpoint(options.tls),
         speed=options.speed,

@@ -226,7 +226,7 @@ def dropped(folder: Path) -> int:
 
 def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
     """Run the logger, and note when what was published was on the disk."""
-    from services import logger
+    from services.logger import run as logger
     from services.logger import writer
 
     # How many messages took how many ms. A list of all would be most of what an hour adds.

@@ -41,10 +41,10 @@ WITHOUT = (
     "services.drives.importing",
     "services.export.signal_tables",
     "services.ledger.processed",
-    "services.logger",
+    "services.logger.run",
     "services.recordings.recovery",
-    "services.replay",
-    "services.truck",
+    "services.replay.run",
+    "services.truck.run",
     "services.truck.ros2",
 )
 """Modules that are imported without any of these packages."""

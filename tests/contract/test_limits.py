@@ -61,8 +61,8 @@ LONG_FUNCTIONS = {
     "services.ledger.recorded_crossings:scan_stays": 69,
     "services.identification.bridge_state:state_of": 69,
     "services.identification.pre_method:identify_pre": 77,
-    "services.logger.__init__:_record": 61,
-    "services.replay.__init__:run": 70,
+    "services.logger.run:_record": 61,
+    "services.replay.run:run": 70,
     "services.simulation.drawn:draw_truth": 78,
     "services.simulation.drawn:drive": 93,
     "services.simulation.drive_wide:measured_wide_run": 69,
@@ -72,7 +72,7 @@ LONG_FUNCTIONS = {
     "services.simulation.two_sided:cross": 61,
     "services.simulation.wide_cases:draw_wide": 78,
     "services.simulation.out_of_model:draw_out_of_model": 83,
-    "services.truck.__init__:run": 76,
+    "services.truck.run:run": 76,
     "studies.paper.scenarios:run_scenario": 71,
 }
 
@@ -102,10 +102,10 @@ MANY_ARGUMENTS = {
     "services.identification.engine:Engine.__init__": 8,
     "services.identification.pre_method:identify_pre": 9,
     "services.finding.stays:find_stays": 8,
-    "services.logger.__init__:run": 11,
+    "services.logger.run:run": 11,
     "services.notebook.simulate:simulate": 10,
     "services.recordings.writer:RecordingWriter.__init__": 9,
-    "services.replay.__init__:run": 14,
+    "services.replay.run:run": 14,
     "services.security.certs:certs_command": 8,
     "services.simulation.drive:measured_run": 14,
     "services.simulation.drive:simulate_command": 18,
@@ -116,7 +116,7 @@ MANY_ARGUMENTS = {
     "services.simulation.two_sided:_march": 19,
     "services.simulation.two_sided_surface:_heights": 9,
     "services.simulation.wide_crossings:road_under": 8,
-    "services.truck.__init__:run": 11,
+    "services.truck.run:run": 11,
     "services.truck.ros2:run": 9,
     "studies.paper.scenarios:run_scenario": 8,
     "services.viewer.live:live_command": 8,
@@ -127,10 +127,6 @@ MANY_ARGUMENTS = {
 
 ROOMS_WITH_CODE = {
     "pre_core": 5,
-    "services.cluster": 37,
-    "services.logger": 62,
-    "services.replay": 31,
-    "services.truck": 37,
 }
 
 SHARED_NAMES = {

@@ -3,8 +3,8 @@
 import os
 import sys
 
-from services import cluster
 from services.cli.main import main
+from services.cluster import run as cluster
 from services.execution import scheduler
 from tests.parent import die_with_parent
 

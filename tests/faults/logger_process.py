@@ -8,8 +8,8 @@ from typing import Any
 
 from zenoh import ext
 
-from services import logger
 from services.bus import subscription
+from services.logger import run as logger
 from tests.parent import die_with_parent
 
 FORGETFUL_ENV = "DRIVEBY_TEST_FORGETFUL"

@@ -26,10 +26,10 @@ from schemas.signals import (
     encode_info,
 )
 from schemas.topics import Key, Message
-from services import logger
 from services.common.disk import DISK, Disk
 from services.common.errors import FailureError
 from services.logger import file_layout
+from services.logger import run as logger
 from services.logger import writer as writer_module
 from services.logger.backlog import QUEUE_BYTES, Backlog
 from services.logger.file_layout import RecordingTarget

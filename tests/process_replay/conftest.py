@@ -49,7 +49,7 @@ try:
         from services.worker.run import run
         from services.worker.settings import WorkerSettings
         sys.exit(run(WorkerSettings(**arguments)))
-    sys.exit(importlib.import_module(module).run(**arguments))
+    sys.exit(importlib.import_module(f'{module}.run').run(**arguments))
 except InputError as error:
     sys.exit(print(error, file=sys.stderr) or 2)
 except FailureError as error:

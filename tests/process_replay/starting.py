@@ -6,7 +6,7 @@ from pathlib import Path
 
 Process = subprocess.Popen[str]
 Start = Callable[..., Process]
-"""Takes a module and the arguments of its `run`."""
+"""Takes a room and the arguments of its `run`."""
 End = Callable[[Process], None]
 
 

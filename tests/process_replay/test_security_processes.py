@@ -20,7 +20,7 @@ from services.bus.session import open_session
 from services.bus.subscription import Subscription
 from services.common.errors import InputError
 from services.recordings.recording import read_messages, read_site
-from services.truck import Gateway
+from services.truck.gateway import Gateway
 from services.truck.spool import Spool
 from tests.builders.commands import run
 from tests.waiting import LONGEST_S, until

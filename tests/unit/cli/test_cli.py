@@ -591,7 +591,7 @@ def test_logger_records_the_chosen_realms(
 ) -> None:
     """And only live without: what appears in other realms is nobody's drive."""
     named: dict[str, object] = {}
-    monkeypatch.setattr("services.logger.run", lambda **arguments: named.update(arguments) or 0)
+    monkeypatch.setattr("services.logger.run.run", lambda **arguments: named.update(arguments) or 0)
     assert cli.main(["logger", *given]) == 0
     assert named["realms"] == realms
 

@@ -15,10 +15,10 @@ import pytest
 
 from services.cli import terminal
 from services.cli.replay import summary
-from services.replay import ReplayStatistics
 from services.replay.choice import ReplayWindow
 from services.replay.drive import ReplayDrive
 from services.replay.player import Command, Status
+from services.replay.run import ReplayStatistics
 
 S = 1_000_000_000
 DRIVE = ReplayDrive((), {}, ReplayWindow(100 * S, 160 * S), (110 * S, 140 * S), ())

@@ -9,12 +9,12 @@ import pytest
 from schemas.events import EventKind, decode_event
 from schemas.signals import GnssFix, encode_gnss, encode_identity
 from schemas.topics import Key, Message
-from services import logger
 from services.bus.subscription import RawSample
 from services.catalogue.index import read_catalog, update_catalog
 from services.common.disk import DISK
 from services.common.errors import InputError
 from services.common.stores import folder_at
+from services.logger import run as logger
 from services.logger.backlog import Backlog
 from services.logger.file_layout import RecordingTarget
 from services.logger.intake import GAP_PATIENCE_S, Intake
@@ -264,12 +264,12 @@ def test_what_has_come_is_written_or_counted_before_the_file_is_closed(
 
     first_close, stop = threading.Event(), threading.Event()
     stop.set()
-    monkeypatch.setattr("services.logger.Subscription", Backlog)
+    monkeypatch.setattr("services.logger.run.Subscription", Backlog)
     monkeypatch.setattr(
-        "services.logger.stopped_by_signals", lambda on_second: contextlib.nullcontext(stop)
+        "services.logger.run.stopped_by_signals", lambda on_second: contextlib.nullcontext(stop)
     )
     file = tmp_path / "a.mcap"
-    monkeypatch.setattr("services.logger._DRAIN_S", drain_s)
+    monkeypatch.setattr("services.logger.run._DRAIN_S", drain_s)
     code = logger.run(listen=endpoint, folder=tmp_path, file=file, realms=("*",), site=None)
     found = list(read_messages(file))
     assert [m.sequence for m in found if m.key.owner == "vehicle"] == list(range(written))

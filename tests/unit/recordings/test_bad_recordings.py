@@ -20,8 +20,8 @@ from services.recordings import recording as recording_module
 from services.recordings.recording import read_info, read_messages
 from services.recordings.recovery import recover_recording
 from services.recordings.writer import write_recording
-from services.replay import run as replay
-from services.truck import run as truck
+from services.replay.run import run as replay
+from services.truck.run import run as truck
 
 WALL_NS = 1_767_225_600_000_000_000
 ACCEL = Key("sim-x", "vehicle", "truck-1", "accel")
@@ -70,8 +70,8 @@ def _nobody_connects(monkeypatch: pytest.MonkeyPatch) -> None:
     def connect(**_: object) -> None:
         raise AssertionError("the bus was asked before the file was looked at")
 
-    monkeypatch.setattr("services.replay.open_session", connect)
-    monkeypatch.setattr("services.truck.open_session", connect)
+    monkeypatch.setattr("services.replay.run.open_session", connect)
+    monkeypatch.setattr("services.truck.run.open_session", connect)
 
 
 def replayed(path: Path) -> None:

@@ -12,8 +12,8 @@ from schemas.signals import NS_PER_S
 from schemas.topics import Key, Message
 from services.bus import playback
 from services.cli import main as cli
-from services.logger import _health_line
-from services.truck import _driven_now, _log_timing, _times
+from services.logger.run import _health_line
+from services.truck.run import _driven_now, _log_timing, _times
 from tests.unit.bus.test_playback import Clock, Delivered
 from tests.unit.identification.test_engine_resume import THERE, engine, fed, messages_of
 
