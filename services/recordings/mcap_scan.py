@@ -195,7 +195,7 @@ def last_metadata(file: BinaryIO, name: str) -> tuple[Metadata, int] | None:
     return None
 
 
-class _Record(NamedTuple):
+class _McapRecord(NamedTuple):
     end: int
     items: Callable[[], Iterator[Item]]
     is_chunk: bool = False
@@ -203,7 +203,7 @@ class _Record(NamedTuple):
     """Declared decompressed size of a chunk."""
 
 
-def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _Record | None:
+def _record_at(file: BinaryIO, at: int, size: int, *, is_chunked: bool) -> _McapRecord | None:
     """Return the record at the end of the previous one; None if it is invalid."""
     record = _strong_record_at(file, at, size)
     if record is not None:
@@ -235,7 +235,7 @@ def _is_lz4(head: bytes) -> bool:
     return head[name : name + len(_LZ4)] == _LZ4 and head[frame:] == _LZ4_FRAME
 
 
-def _strong_record_at(file: BinaryIO, at: int, size: int) -> _Record | None:
+def _strong_record_at(file: BinaryIO, at: int, size: int) -> _McapRecord | None:
     """Return the record at a byte, if its own content proves that there is one."""
     opcode, length = _header_at(file, at, size) or (0, 0)
     outer_end = at + _HEADER.size + length if opcode else None
@@ -256,7 +256,7 @@ def _header_at(file: BinaryIO, at: int, size: int) -> tuple[int, int] | None:
     return opcode, length
 
 
-def _plain_record_at(file: BinaryIO, at: int, opcode: int, length: int) -> _Record | None:
+def _plain_record_at(file: BinaryIO, at: int, opcode: int, length: int) -> _McapRecord | None:
     end = at + _HEADER.size + length
     if opcode == Opcode.MESSAGE_INDEX:
         head = _read(file, at + _HEADER.size, _INDEX.size)
@@ -284,8 +284,8 @@ def _plain_record_at(file: BinaryIO, at: int, opcode: int, length: int) -> _Reco
     return _found(end, *([record] if isinstance(record, wanted) else []))
 
 
-def _found(end: int, *items: Item) -> _Record:
-    return _Record(end, lambda: iter(items))
+def _found(end: int, *items: Item) -> _McapRecord:
+    return _McapRecord(end, lambda: iter(items))
 
 
 def _is_followed(file: BinaryIO, at: int, size: int) -> bool:
@@ -298,7 +298,7 @@ def _is_followed(file: BinaryIO, at: int, size: int) -> bool:
     return known and length <= size - at - _HEADER.size
 
 
-def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Record | None:
+def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _McapRecord | None:
     """Return the chunk whose record begins at a byte, if its checksum is right.
 
     Both the record's length and the length of the compressed data define its end, and either may be
@@ -328,7 +328,7 @@ def _chunk_at(file: BinaryIO, at: int, size: int, outer_end: int | None) -> _Rec
         content = _decompressed(data) if is_compressed else data
         if content is not None and _holds(content, crc, is_certain=end == outer_end):
             records = partial(_records_of, content, at)
-            return _Record(end, records, is_chunk=True, unpacked_bytes=len(content))
+            return _McapRecord(end, records, is_chunk=True, unpacked_bytes=len(content))
     return None
 
 

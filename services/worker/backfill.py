@@ -8,7 +8,6 @@ at a time are held in memory.
 
 import logging
 import os
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -20,9 +19,7 @@ from typing import Final, NamedTuple
 from schemas.settings import IdentificationSettings
 from schemas.signals import NS_PER_S
 from schemas.site import Site
-from schemas.topics import IDENTIFIER
 from schemas.validation_records import VehicleBridgePair
-from services.common.errors import InputError
 from services.execution.processes import BackgroundResult, BackgroundTask, ProcessExecutor
 from services.finding.stays import Passage, are_one, overlap
 from services.identification.engine import Engine
@@ -38,56 +35,19 @@ from services.ledger.recorded_crossings import (
     fetch_crossings,
     scan_stays,
 )
-from services.recordings.recording import is_being_written
+from services.worker.recording_list import BackfillSource, RecordingGroup, RecordingList
 
 _log = logging.getLogger(__name__)
 MARGIN_S: Final = 86_400.0
 """Time in s by which a result may be older than its recording, as spools arrive late."""
 _SCAN_EVERY_S: Final = 10.0
-_RECORDED_S: Final = 60.0
-"""Age in s up to which a growing recording is active; the logger syncs twice a second."""
-_QUIET_S: Final = 120.0
-"""Time in s after a truck's last message from which missing data count as lost.
-
-`arrivals` applies the same time to the bus.
-"""
 _FETCH_EVERY_S: Final = 1.0
-_TRANSIT_S: Final = 5.0
-"""Time in s in which the truck itself is about to send what the logger has received."""
-_FILES_AT_ONCE: Final = 4
-"""Number of files read at once: an hour of a truck.
-
-The preceding file is read too, where a crossing may have started.
-"""
+_TRANSIT_NS: Final = 5 * NS_PER_S
+"""Time in which the truck itself is about to send what the logger has received."""
 _AT_ONCE: Final = 3
 """Number of crossings held in memory, half a megabyte each or more."""
 _NICE: Final = 10
-_NAME: Final = re.compile(rf"({IDENTIFIER})-\d{{8}}T\d{{6}}Z(?:-\d+)?(?:\.recovered)?\.mcap")
 _Request = Callable[[VehicleBridgePair], None]
-_Signature = tuple[int, int]
-"""Size, and time of the last change in ns."""
-
-
-class BackfillSource(NamedTuple):
-    """Recordings to scan."""
-
-    folder: Path
-    """The logger's folder."""
-    realm: str
-    age_s: float
-
-
-class _File(NamedTuple):
-    path: Path
-    signature: _Signature
-    is_growing: bool
-
-
-class _Group(NamedTuple):
-    """Consecutive recordings of one truck; the first may only hold the start of a crossing."""
-
-    vehicle: str
-    files: tuple[_File, ...]
 
 
 class _MissingStay(NamedTuple):
@@ -109,9 +69,6 @@ class Backfill:
         ledger: Ledger,
         *,
         reader: Callable[[], ProcessExecutor] = lambda: ProcessExecutor(1, prepare=_gently),
-        scan_every_s: float = _SCAN_EVERY_S,
-        transit_s: float = _TRANSIT_S,
-        quiet_s: float = _QUIET_S,
     ) -> None:
         self._source = source
         self._site = site
@@ -119,20 +76,13 @@ class Backfill:
         self._ledger = ledger
         self._open_reader = reader
         self._reader: ProcessExecutor | None = None
-        self._scan_every_s = scan_every_s
-        self._transit_ns = round(transit_s * NS_PER_S)
-        self._quiet_s = quiet_s
+        self._recordings = RecordingList(source)
         self._next_scan_s = self._next_fetch_s = 0.0
-        self._is_first = True
-        self._read: dict[Path, _Signature] = {}
-        self._groups: deque[_Group] = deque()
-        self._scanning: _Group | None = None
+        self._scanning: RecordingGroup | None = None
         self._stays: dict[str, list[_MissingStay]] = {}
         """All stays in recordings by vehicle: other trucks on the bridge matter too."""
         self._open: list[_MissingStay] = []
         """Stays without a known result."""
-        self._final: set[str] = set()
-        """Trucks that are no longer being recorded."""
         self._fetching: tuple[_MissingStay, ...] = ()
         self._is_final = False
         self._found: deque[tuple[RecordedStay, FromRecording]] = deque()
@@ -154,8 +104,7 @@ class Backfill:
     def retarget(self, site: Site) -> None:
         """Continue with the bridges and trucks of another site file."""
         self._site = site
-        self._read.clear()
-        self._groups.clear()
+        self._recordings.clear()
         self._stays.clear()
         self._open.clear()
         self._given_up.clear()
@@ -175,13 +124,16 @@ class Backfill:
         pairs whose site validation recorded crossings wait for.
         """
         if now_s >= self._next_scan_s:
-            self._next_scan_s = now_s + self._scan_every_s
-            self._list(engine)
+            self._next_scan_s = now_s + _SCAN_EVERY_S
+            now = time.time()
+            self._recordings.update(now, self._scanning)
+            engine.note_recorded(self._recordings.growing)
+            self._ledger.forget_before(now - self._source.age_s - MARGIN_S)
         self._collect()
         self._ledger.commit(time.time())
         if self._scanning is None and not self._fetching:
-            if self._groups:
-                self._begin_scan(self._groups.popleft())
+            if self._recordings.groups:
+                self._begin_scan(self._recordings.groups.popleft())
             elif now_s >= self._next_fetch_s and not self._found:
                 self._next_fetch_s = now_s + _FETCH_EVERY_S
                 self._fetch(engine, want)
@@ -189,63 +141,8 @@ class Backfill:
             stay, found = self._found.popleft()
             if self._is_open(engine, stay):
                 yield from engine.take(found, self._others(found))
-        if not (self._groups or self._scanning or self._fetching or self._found):
+        if not (self._recordings.groups or self._scanning or self._fetching or self._found):
             self.close()
-
-    # What there is to read
-
-    def _list(self, engine: Engine) -> None:
-        """List the changed recordings, and the trucks that are being recorded."""
-        by_vehicle: dict[str, list[_File]] = {}
-        now = time.time()
-        for path in sorted((self._source.folder / self._source.realm).glob("*/*.mcap")):
-            named = _NAME.fullmatch(path.name)
-            if named is None:
-                continue
-            try:
-                status = path.stat()
-                if now - status.st_mtime > self._source.age_s:
-                    continue
-                is_fresh = now - status.st_mtime < _RECORDED_S
-                is_growing = is_fresh and is_being_written(path)
-            except (InputError, OSError):
-                continue  # it was recovered or deleted at this moment
-            signature = (status.st_size, status.st_mtime_ns)
-            by_vehicle.setdefault(named[1], []).append(_File(path, signature, is_growing))
-        growing = {v for v, files in by_vehicle.items() if any(f.is_growing for f in files)}
-        engine.note_recorded(growing)
-        quiet_ns = round((now - self._quiet_s) * NS_PER_S)
-        self._final = {
-            vehicle
-            for vehicle, files in by_vehicle.items()
-            if vehicle not in growing and max(f.signature[1] for f in files) < quiet_ns
-        }
-        seen = {file.path for files in by_vehicle.values() for file in files}
-        self._read = {path: signature for path, signature in self._read.items() if path in seen}
-        for vehicle, files in by_vehicle.items():
-            self._groups += self._changed(vehicle, files)
-        self._is_first = False
-        self._ledger.forget_before(now - self._source.age_s - MARGIN_S)
-
-    def _changed(self, vehicle: str, files: list[_File]) -> Iterator[_Group]:
-        """Yield the files not read in their present state, with the preceding ones."""
-        waiting = {f.path for group in self._groups for f in group.files[1:]}
-        if self._scanning is not None:
-            waiting |= {f.path for f in self._scanning.files}
-        new = [
-            n
-            for n, file in enumerate(files)
-            if self._read.get(file.path) != file.signature
-            and file.path not in waiting
-            and (self._is_first or not file.is_growing)
-        ]
-        while new:
-            part = [n for n in new[:_FILES_AT_ONCE] if n - new[0] < _FILES_AT_ONCE]
-            new = new[len(part) :]
-            begin = max(part[0] - 1, 0)
-            for n in part:
-                self._read[files[n].path] = files[n].signature
-            yield _Group(vehicle, tuple(files[begin : part[-1] + 1]))
 
     # The process that reads
 
@@ -266,13 +163,13 @@ class Backfill:
                 self._finish_fetch(finished)
                 self._fetching = ()
 
-    def _begin_scan(self, group: _Group) -> None:
+    def _begin_scan(self, group: RecordingGroup) -> None:
         self._scanning = group
         paths = tuple(file.path for file in group.files)
         run = partial(scan_stays, paths, self._source.realm, group.vehicle, self._site)
         self._submit(BackgroundTask(f"scan recordings of {group.vehicle}", run))
 
-    def _finish_scan(self, group: _Group, finished: BackgroundResult) -> None:
+    def _finish_scan(self, group: RecordingGroup, finished: BackgroundResult) -> None:
         scan = finished.outcome
         if not isinstance(scan, StayScan):
             names = ", ".join(file.path.name for file in group.files)
@@ -338,7 +235,7 @@ class Backfill:
     def _begin_fetch(self, wanted: tuple[_MissingStay, ...]) -> None:
         self._fetching = wanted
         vehicle = wanted[0].stay.vehicle
-        self._is_final = vehicle in self._final
+        self._is_final = vehicle in self._recordings.final
         paths = dict.fromkeys(path for one in wanted for path in one.files)
         known = {
             k.crossing_id: k
@@ -361,7 +258,7 @@ class Backfill:
     def _is_due(self, stay: RecordedStay) -> bool:
         """Return whether it may be complete by now; an incomplete one waits for another scan."""
         before = self._later.get(stay)
-        return before is None or before < self._reads or stay.vehicle in self._final
+        return before is None or before < self._reads or stay.vehicle in self._recordings.final
 
     def _finish_fetch(self, finished: BackgroundResult) -> None:
         fetched = finished.outcome
@@ -387,7 +284,7 @@ class Backfill:
 
     def _is_open(self, engine: Engine, stay: RecordedStay) -> bool:
         """Return whether a stay has no result, is not in progress and will not be sent again."""
-        if stay.received_ns > time.time_ns() - self._transit_ns or self._is_over(stay):
+        if stay.received_ns > time.time_ns() - _TRANSIT_NS or self._is_over(stay):
             return False
         realm = self._source.realm
         if engine.is_tracking(realm, stay.vehicle, stay.boot_id, stay.bridge, stay.entry_s):

@@ -40,9 +40,10 @@ from services.ledger.runs import (
     free_results_path,
     read_earlier,
 )
-from services.worker.backfill import MARGIN_S, Backfill, BackfillSource
+from services.worker.backfill import MARGIN_S, Backfill
 from services.worker.loop import Loop, SiteReload
 from services.worker.receiving import Receiver
+from services.worker.recording_list import BackfillSource
 from services.worker.service import Search, WorkerService, publish_progress
 from services.worker.settings import WorkerSettings
 from services.worker.site_file_watcher import SiteFileWatcher

@@ -42,7 +42,6 @@ LONG_CLASSES = {
     "services.logger.writer:FileWriter": 395,
     "services.truck.spool:Spool": 260,
     "services.viewer.live_view:LiveView": 315,
-    "services.worker.backfill:Backfill": 311,
 }
 
 LONG_FUNCTIONS = {
@@ -122,7 +121,6 @@ MANY_ARGUMENTS = {
     "services.viewer.live:live_command": 8,
     "services.viewer.rerun_file:write_rrd": 8,
     "services.viewer.view:write_views": 9,
-    "services.worker.backfill:Backfill.__init__": 8,
 }
 
 ROOMS_WITH_CODE = {
@@ -130,8 +128,6 @@ ROOMS_WITH_CODE = {
 }
 
 SHARED_NAMES = {
-    "_Record": 2,
-    "_Truck": 2,
 }
 
 LISTS = {

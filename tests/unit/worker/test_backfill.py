@@ -19,7 +19,8 @@ from services.identification.engine import Engine
 from services.identification.known import search_hash
 from services.ledger.crossing_log import Ledger, known_crossings
 from services.recordings.writer import RecordingWriter
-from services.worker.backfill import Backfill, BackfillSource
+from services.worker.backfill import Backfill
+from services.worker.recording_list import BackfillSource
 from tests.unit.identification.test_engine_resume import (
     HEADER,
     REALM,
