@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import settings
 
+from services.security.settings import CertsSettings
 from tests.endpoints import free_endpoint
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def credentials(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from services.security.certs import certs_command
 
     folder = tmp_path_factory.mktemp("bus") / "certs"
-    certs_command(folder=folder, trucks=["truck-1", "truck-2"])
+    certs_command(CertsSettings(folder=folder, trucks=["truck-1", "truck-2"]))
     return folder
 
 

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from services.cli.history import add_history_folder, alarm_line
-from services.cli.parsing import add_endpoint, command, number, whole
+from services.cli.parsing import add_endpoint, command
 from services.common.endpoints import default_endpoint
 from services.common.errors import InputError
+from services.common.options import number, whole
 
 if TYPE_CHECKING:
     from services.history.alarms import AlarmCheck, AlarmSettings

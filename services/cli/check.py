@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from services.cli.parsing import OutputFile, command
+from services.cli.parsing import command
+from services.common.options import OutputFile
 
 if TYPE_CHECKING:
     from services.inspection.inspect import CheckReport

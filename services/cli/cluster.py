@@ -7,9 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from services.cli.parsing import command, option_of, whole
+from services.cli.commands.identify import IdentifyOptions
+from services.cli.parsing import command, option_of
 from services.common.endpoints import LOOPBACK
 from services.common.errors import InputError
+from services.common.options import whole
 
 if TYPE_CHECKING:
     from services.cluster.run import ClusterCredentials
@@ -63,30 +65,7 @@ def add_cluster(commands: Any) -> None:
     )
 
 
-def add_scheduler(p: Any) -> None:
-    """Add `--scheduler` and its related options."""
-    p.add_argument(
-        "--scheduler",
-        metavar="processes|processes:N|tcp://…|tls://…",
-        help="number of processes on this machine (default N: one for each processor), or "
-        "address of a Dask cluster; the results are the same",
-    )
-    p.add_argument(
-        "--batch",
-        type=whole("a number of crossings", 1, 200),
-        metavar="N",
-        help="number of crossings in one task of a cluster (default: 50)",
-    )
-    p.add_argument(
-        "--reconnect-timeout",
-        type=whole("seconds", 1, 86_400),
-        metavar="S",
-        help="seconds to wait for a lost scheduler or for workers (default: 300)",
-    )
-    p.add_argument("--tls", type=Path, metavar="FOLDER", help="credentials of a cluster's client")
-
-
-def check_scheduler(options: argparse.Namespace) -> None:
+def check_scheduler(options: IdentifyOptions) -> None:
     """Raise InputError for an invalid `--scheduler`, before anything is started."""
     said: str | None = options.scheduler
     is_cluster = said is not None and said.partition(":")[0] != _PROCESSES
@@ -104,7 +83,7 @@ def check_scheduler(options: argparse.Namespace) -> None:
 
 
 @contextmanager
-def execution_of(options: argparse.Namespace) -> "Iterator[CrossingExecutor | None]":
+def execution_of(options: IdentifyOptions) -> "Iterator[CrossingExecutor | None]":
     """Run the executor of `--scheduler`, started at entry; None without the option."""
     said: str | None = options.scheduler
     if said is None:
@@ -126,7 +105,7 @@ def execution_of(options: argparse.Namespace) -> "Iterator[CrossingExecutor | No
             yield cluster
 
 
-def _credentials(options: argparse.Namespace) -> "Credentials | None":
+def _credentials(options: IdentifyOptions) -> "Credentials | None":
     return None if options.tls is None else credentials_of(options.tls, "client")
 
 

@@ -1,11 +1,12 @@
 """The command `driveby fuse`: one estimate of each bridge from stored results."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.results import Results, load_results, results_json
 from services.cli.bridge_table import print_bridge
+from services.cli.commands.fuse import FuseOptions
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
 from services.common.progress import Steps, parts_bar, steps_bar
@@ -15,19 +16,13 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-def fuse_command(
-    *,
-    paths: list[Path],
-    json_path: Path | None,
-    baseline: Path | None,
-    fuse_suspect: bool,
-    console: "Console",
-) -> int:
+def fuse_command(asked: FuseOptions, console: "Console") -> int:
     """Fuse all crossings of the results, each once; print every bridge and write it if asked.
 
     Of a crossing in several files the newest result counts. InputError: a file that is no results
     file, results without a crossing that can be fused, or of several realms.
     """
+    paths, json_path, baseline = asked.results, asked.json, asked.baseline
     if json_path is not None:
         check_writable(json_path)
     with steps_bar("reading", console) as progress:
@@ -42,7 +37,9 @@ def fuse_command(
         )
     stored = None if baseline is None else (str(baseline), load_results(baseline))
     with parts_bar("fusing bridge", len(found.by_bridge), console) as report:
-        fused = fuse_crossings(str(paths[0]), found, stored, report, fuse_suspect=fuse_suspect)
+        fused = fuse_crossings(
+            str(paths[0]), found, stored, report, fuse_suspect=asked.fuse_suspect
+        )
     for name, number in fused.unfused.items():
         console.print(f"{name}: none of {number} crossings can be fused", highlight=False)
     for number, (name, elements) in enumerate(fused.bridges.items()):
@@ -54,7 +51,7 @@ def fuse_command(
     return 0
 
 
-def _loaded(paths: list[Path], progress: Steps) -> Iterator[Results]:
+def _loaded(paths: Sequence[Path], progress: Steps) -> Iterator[Results]:
     """Yield the files, with progress by their sizes."""
     sizes = [path.stat().st_size if path.is_file() else 0 for path in paths]
     for path in paths:

@@ -1,7 +1,7 @@
 """The command `driveby identify`: identify crossings of recordings, print and write results."""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from itertools import chain
 from pathlib import Path
@@ -22,6 +22,7 @@ from schemas.site import Bridge, Site
 from schemas.validation_records import VehicleBridgePair
 from services.catalogue.contents import summarise_recording
 from services.cli.bridge_table import print_bridge, print_elements
+from services.cli.commands.identify import IdentifyOptions
 from services.cli.parsing import CERTIFICATES
 from services.common.errors import FailureError, InputError
 from services.common.files import (
@@ -39,7 +40,7 @@ from services.history.validation_files import passed_validations
 from services.identification.bridge_state import Fusing
 from services.ledger.baselines import baselines_of
 from services.recordings.recording import read_messages
-from services.recordings.remote import Source, all_fetched, is_folder_of_recordings
+from services.recordings.remote import all_fetched, is_folder_of_recordings
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -49,19 +50,8 @@ _log = logging.getLogger(__name__)
 
 
 def identify_command(
-    *,
-    recordings: Sequence[Source],
-    site: Path | None,
-    method: str,
-    json_path: Path | None,
-    rrd_path: Path | None,
-    draws_path: Path | None,
-    figures: Path | None,
-    certificates: Path | None = None,
-    seed: int,
-    baseline: Path | None,
-    fuse_suspect: bool,
-    executing: AbstractContextManager[CrossingExecutor | None] | None = None,
+    asked: IdentifyOptions,
+    executing: AbstractContextManager[CrossingExecutor | None] | None,
     console: "Console",
 ) -> int:
     """Identify every crossing in the recordings, print a table and write the requested files.
@@ -72,49 +62,53 @@ def identify_command(
     positions, for an invalid folder of validation records, and if draws of another executor are
     requested.
     """
-    check_certificates(certificates)
-    for source in recordings:
-        if is_folder_of_recordings(source):
-            raise InputError(
-                f"{source}: is a folder; give recordings, or --into DIR for its results"
-            )
-    if draws_path is not None:
-        check_draws(draws_path, method)
-        if executing is not None:
-            raise InputError("--draws: are kept in this process only, leave --scheduler out")
-    for path in (json_path, rrd_path, draws_path):
-        if path is not None:
-            check_writable(path)
-    if figures is not None:
-        check_folder_writable(figures)
-    with all_fetched(recordings) as files:
-        known = site_of(files, site)
-        beside = None if site is None else site.parent
-        fusing = Fusing(baselines_of(known, beside, baseline), fuse_suspect)
-        settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
-        warn_of_no_noise(known, method)
-        records = passed_validations(certificates or CERTIFICATES, known, settings)
-        request = _IdentifyRequest(files, known, settings, fusing, records)
+    _check(asked, executing)
+    with all_fetched(asked.recordings) as files:
+        request = _request(asked, files)
+        known = request.site
         draws: dict[str, Draws] = {}
         found = _found(request, draws, executing, console)
         _print(console, found, known)
-        if json_path is not None:
-            write_atomically(json_path, results_json(found))
-        if rrd_path is not None:
-            _write_rerun(rrd_path, files, found, known, (site or files[0]).parent, console)
-    if figures is not None:
+        if asked.json is not None:
+            write_atomically(asked.json, results_json(found))
+        if asked.rrd is not None:
+            _write_rerun(asked.rrd, files, found, known, (asked.site or files[0]).parent, console)
+    if asked.figures is not None:
         from services.viewer.pictures import write_pictures
 
-        with steps_bar(f"drawing into {figures}", console) as drawn:
-            written = write_pictures(figures, found, known, drawn)
-        console.print(f"{len(written)} pictures in {figures}", highlight=False, soft_wrap=True)
-    if draws_path is not None:
+        with steps_bar(f"drawing into {asked.figures}", console) as drawn:
+            written = write_pictures(asked.figures, found, known, drawn)
+        line = f"{len(written)} pictures in {asked.figures}"
+        console.print(line, highlight=False, soft_wrap=True)
+    if asked.draws is not None:
         kept = (
             DrawsOfCrossing(c.crossing_id, c.vehicle, c.bridge, draws.get(c.crossing_id, {}))
             for c in found.crossings
         )
-        write_draws(draws_path, kept)
+        write_draws(asked.draws, kept)
     return 0
+
+
+def _check(
+    asked: IdentifyOptions,
+    executing: AbstractContextManager[CrossingExecutor | None] | None,
+) -> None:
+    """Raise InputError for inputs and outputs that cannot be used."""
+    check_certificates(asked.validations)
+    for source in asked.recordings:
+        if is_folder_of_recordings(source):
+            raise InputError(
+                f"{source}: is a folder; give recordings, or --into DIR for its results"
+            )
+    if asked.draws is not None:
+        check_draws(asked.draws, asked.search_method)
+        if executing is not None:
+            raise InputError("--draws: are kept in this process only, leave --scheduler out")
+    for path in (asked.json, asked.rrd, asked.draws):
+        if path is not None:
+            check_writable(path)
+    if asked.figures is not None:
+        check_folder_writable(asked.figures)
 
 
 class _IdentifyRequest(NamedTuple):
@@ -125,6 +119,17 @@ class _IdentifyRequest(NamedTuple):
     settings: IdentificationSettings
     fusing: Fusing
     certificates: Mapping[VehicleBridgePair, str]
+
+
+def _request(asked: IdentifyOptions, files: list[Path]) -> _IdentifyRequest:
+    site = site_of(files, asked.site)
+    beside = None if asked.site is None else asked.site.parent
+    fusing = Fusing(baselines_of(site, beside, asked.baseline), asked.fuse_suspect)
+    method, seed = asked.search_method, asked.seed
+    settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
+    warn_of_no_noise(site, method)
+    records = passed_validations(asked.validations or CERTIFICATES, site, settings)
+    return _IdentifyRequest(files, site, settings, fusing, records)
 
 
 def _found(

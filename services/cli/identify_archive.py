@@ -1,6 +1,6 @@
 """The command `driveby identify --into DIR`: an archive of recordings, stored as computed."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
@@ -13,6 +13,7 @@ from schemas.site_file import load_site, parse_site
 from services.catalogue.index import update_catalog
 from services.catalogue.positions import crossings_of
 from services.cli.bridge_table import print_bridge
+from services.cli.commands.identify import IdentifyOptions
 from services.cli.identify import check_certificates, warn_of_no_noise
 from services.cli.parsing import CERTIFICATES, EXIT_SOMETHING_LOST
 from services.common.errors import InputError
@@ -43,26 +44,19 @@ _MAX_BRIDGES = 20
 
 
 def archive_command(
-    *,
-    sources: Sequence[Source],
+    options: IdentifyOptions,
     into: Path,
-    site: Path | None,
-    method: str,
-    json_path: Path | None,
-    certificates: Path | None,
-    seed: int,
-    baseline: Path | None,
-    fuse_suspect: bool,
-    of_single: Mapping[str, Path | None],
     executing: AbstractContextManager[CrossingExecutor | None],
     console: "Console",
 ) -> int:
     """Identify crossings without a result in a folder, print a summary; 3 if input was lost.
 
-    `of_single` are outputs of single crossings only. Raise InputError for one of these, a file or
-    folder that cannot be written, no site file, or a catalogue that cannot be created.
+    Raise InputError for an output of single crossings, a file or folder that cannot be written, no
+    site file, or a catalogue that cannot be created.
     """
-    for name, path in of_single.items():
+    site, json_path, certificates = options.site, options.json, options.validations
+    single = {"rrd": options.rrd, "draws": options.draws, "figures": options.figures}
+    for name, path in single.items():
         if path is not None:
             raise InputError(
                 f"--{name}: is for recordings one looks at; identify these without --into"
@@ -73,15 +67,20 @@ def archive_command(
     make_folder(into)
     check_writable(into / BRIDGES)
     problems: list[str] = []
-    known = _site_of(sources, site)
-    recordings = _recordings(sources, known, problems)
-    settings = IdentificationSettings.model_validate({"method": method, "seed": seed})
-    warn_of_no_noise(known, method)
+    known = _site_of(options.recordings, site)
+    recordings = _recordings(options.recordings, known, problems)
+    settings = IdentificationSettings.model_validate(
+        {"method": options.search_method, "seed": options.seed}
+    )
+    warn_of_no_noise(known, options.search_method)
     asked = ArchiveJob(
         tuple(recordings),
         known,
         settings,
-        Fusing(baselines_of(known, None if site is None else site.parent, baseline), fuse_suspect),
+        Fusing(
+            baselines_of(known, None if site is None else site.parent, options.baseline),
+            options.fuse_suspect,
+        ),
         passed_validations(certificates or CERTIFICATES, known, settings),
     )
     kept = ResultStore(into)

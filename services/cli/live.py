@@ -23,11 +23,10 @@ from services.cli.parsing import (
     add_speed,
     add_tls,
     command,
-    number,
-    whole,
 )
 from services.common.endpoints import DEFAULT_ENDPOINT, default_endpoint
 from services.common.errors import InputError
+from services.common.options import number, whole
 
 
 def add_demo(commands: Any) -> None:

@@ -18,17 +18,22 @@ from functools import partial
 from pathlib import Path
 from typing import Final, NoReturn
 
-from services.cli.access import add_certs
 from services.cli.alarm import add_alarm
-from services.cli.catalog import add_catalog
 from services.cli.check import add_check
 from services.cli.closed_pipe import outliving_output, to_null
 from services.cli.cluster import SERVICES as CLUSTERS
 from services.cli.cluster import add_cluster
+from services.cli.commands.catalog import CATALOG
+from services.cli.commands.certs import CERTS
+from services.cli.commands.export import EXPORT
+from services.cli.commands.fuse import FUSE
+from services.cli.commands.identify import IDENTIFY
+from services.cli.commands.info import INFO
+from services.cli.commands.recover import RECOVER
+from services.cli.commands.replay import REPLAY
+from services.cli.commands.survey import SURVEY
 from services.cli.completion import SHELLS, completion
-from services.cli.export import add_export
 from services.cli.history import add_history
-from services.cli.info import add_info
 from services.cli.live import (
     SERVICES,
     add_demo,
@@ -40,17 +45,10 @@ from services.cli.live import (
     subject_of,
 )
 from services.cli.needs import check_needs
-from services.cli.offline import (
-    add_fuse,
-    add_identify,
-    add_import,
-    add_recover,
-)
+from services.cli.offline import add_import
 from services.cli.parsing import Files, Handler, Parser, add_common, files_of
-from services.cli.replay import add_replay
 from services.cli.report import add_report
 from services.cli.simulate import add_simulate
-from services.cli.survey import add_survey
 from services.cli.validation import add_validate
 from services.cli.view import add_view
 from services.cli.watch import add_watch
@@ -63,31 +61,31 @@ _OBJECTS_BETWEEN_LOOKS: Final = 20_000
 _COUNTS_AT_EXIT: Final = ("_duckdb", "duckdb")
 """Modules made with nanobind, whose types are in cycles that a last collection frees."""
 _COMMANDS: Final = (
-    add_survey,
+    SURVEY.add,
     add_check,
     add_simulate,
     add_import,
-    add_identify,
-    add_fuse,
+    IDENTIFY.add,
+    FUSE.add,
     add_history,
     add_alarm,
-    add_info,
-    add_catalog,
-    add_export,
+    INFO.add,
+    CATALOG.add,
+    EXPORT.add,
     add_report,
     add_validate,
-    add_recover,
+    RECOVER.add,
     add_view,
     add_demo,
     add_logger,
     add_worker,
     add_truck,
     add_gateway,
-    add_replay,
+    REPLAY.add,
     add_watch,
     add_health,
     add_cluster,
-    add_certs,
+    CERTS.add,
 )
 """Commands in the order of `driveby --help`."""
 

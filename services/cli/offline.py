@@ -1,28 +1,18 @@
-"""Commands on files: import, identify, fuse, recover."""
+"""The command `driveby import`."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
-from services.cli.cluster import add_scheduler, check_scheduler, execution_of
 from services.cli.parsing import (
-    CERTIFICATES,
-    OutputFile,
     a_console,
-    add_certificates,
     add_file,
-    add_force,
-    add_method,
     add_output,
     add_output_file,
-    add_output_folder,
-    add_seed,
     add_site,
     command,
-    folder_here,
-    source,
 )
-from services.common.kinds import ARRAYS, IMPORT_MAP, MCAP, NETCDF, PNG, RERUN, RESULTS
+from services.common.kinds import IMPORT_MAP, PNG
 
 
 def add_import(commands: Any) -> None:
@@ -151,164 +141,3 @@ def _how(options: argparse.Namespace, reading: Any) -> Any:
 
     mapping = None if options.map is None else load_map(options.map)
     return HowToRead(mapping, options.zone, options.start, options.yes, reading)
-
-
-def add_identify(commands: Any) -> None:
-    """Add `driveby identify`: estimate the rigidity of each element from recordings."""
-    p = command(
-        commands,
-        "identify",
-        _identify,
-        "estimate the flexural rigidity of each element from recordings",
-        "driveby identify run.mcap --json result.json --rrd result.rrd",
-    )
-    p.add_argument(
-        "recordings",
-        type=source,
-        nargs="+",
-        metavar="REC.mcap",
-        help="recordings, also as s3://…; with --into also folders of them",
-    )
-    add_site(p, "site file (default: the site stored in the recording)")
-    add_method(p)
-    add_output_file(p, "--json", "OUT.json", "JSON file of the results", RESULTS)
-    add_output_file(p, "--rrd", "OUT.rrd", "Rerun file of the results", RERUN)
-    text = "file of the posterior draws of method pre, for ArviZ"
-    add_output_file(p, "--draws", "OUT.npz|OUT.nc", text, ARRAYS, NETCDF)
-    add_output_folder(
-        p, "--figures", "folder for figures of every crossing and bridge, as PNG and SVG"
-    )
-    _add_fusing(p)
-    add_certificates(
-        p, f"folder of the certificates that results refer to (default: {CERTIFICATES})"
-    )
-    add_seed(p)
-    group = p.add_argument_group("many crossings")
-    group.add_argument(
-        "--into",
-        type=folder_here,
-        metavar="DIR",
-        help="store each result here as it is computed; run again to resume. Unreadable input is "
-        "listed and skipped (exit code 3)",
-    )
-    add_scheduler(group)
-
-
-def _add_fusing(p: argparse.ArgumentParser) -> None:
-    add_file(
-        p,
-        "--baseline",
-        "OLD.json",
-        "results that the bridge is compared with (default: those that the site file names)",
-    )
-    p.add_argument(
-        "--fuse-suspect",
-        action="store_true",
-        help="fuse suspect crossings too; the bridge's estimate is suspect then",
-    )
-
-
-def add_fuse(commands: Any) -> None:
-    """Add `driveby fuse`: one estimate of each bridge from stored results."""
-    p = command(
-        commands,
-        "fuse",
-        _fuse,
-        "fuse the results of many crossings into one estimate of each bridge",
-        "driveby fuse monday.json tuesday.json --json week.json",
-    )
-    p.add_argument("results", type=Path, nargs="+", metavar="RESULTS.json", help="results")
-    text = "JSON file of all crossings and the fused estimates"
-    add_output_file(p, "--json", "OUT.json", text, RESULTS)
-    _add_fusing(p)
-
-
-def _fuse(options: argparse.Namespace) -> int:
-    from services.cli.fuse import fuse_command
-
-    return fuse_command(
-        paths=options.results,
-        json_path=options.json,
-        baseline=options.baseline,
-        fuse_suspect=options.fuse_suspect,
-        console=a_console(),
-    )
-
-
-def _identify(options: argparse.Namespace) -> int:
-    from services.cli.identify import identify_command
-    from services.cli.identify_archive import archive_command
-
-    check_scheduler(options)
-    if options.into is not None:
-        return archive_command(
-            sources=options.recordings,
-            into=options.into,
-            site=options.site,
-            method=options.method.replace("-", "_"),
-            json_path=options.json,
-            certificates=options.validations,
-            seed=options.seed,
-            baseline=options.baseline,
-            fuse_suspect=options.fuse_suspect,
-            of_single={name: getattr(options, name) for name in ("rrd", "draws", "figures")},
-            executing=execution_of(options),
-            console=a_console(),
-        )
-    return identify_command(
-        recordings=options.recordings,
-        site=options.site,
-        method=options.method.replace("-", "_"),
-        json_path=options.json,
-        rrd_path=options.rrd,
-        draws_path=options.draws,
-        figures=options.figures,
-        certificates=options.validations,
-        seed=options.seed,
-        baseline=options.baseline,
-        fuse_suspect=options.fuse_suspect,
-        executing=None if options.scheduler is None else execution_of(options),
-        console=a_console(),
-    )
-
-
-def add_recover(commands: Any) -> None:
-    """Add `driveby recover`: rewrite a damaged or truncated recording."""
-    p = command(
-        commands,
-        "recover",
-        _recover,
-        "rewrite a damaged or truncated recording",
-        "driveby recover run.mcap -o whole.mcap",
-    )
-    p.add_argument(
-        "recording", type=Path, metavar="REC.mcap", help="recording to rewrite; left as it is"
-    )
-    p.add_argument(
-        "-o",
-        "--output",
-        type=OutputFile((MCAP,)),
-        metavar="OUT.mcap",
-        help="recording to write (default: REC.recovered.mcap beside it)",
-    )
-    p.add_argument(
-        "--set-aside",
-        action="store_true",
-        help="rename the damaged recording to REC.mcap.crashed afterwards",
-    )
-    add_force(p)
-    p.add_argument("--json", action="store_true", help="print the counts as JSON")
-
-
-def _recover(options: argparse.Namespace) -> int:
-    from services.cli.recover import recover_command
-
-    code, line = recover_command(
-        source=options.recording,
-        output=options.output,
-        set_aside=options.set_aside,
-        force=options.force,
-        as_json=options.json,
-    )
-    print(line)
-    return code

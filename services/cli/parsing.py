@@ -6,13 +6,19 @@ Nothing heavy is imported here: `driveby --help` does not wait for compilers and
 import argparse
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
 
 from services.common.endpoints import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
 from services.common.errors import InputError
 from services.common.kinds import MCAP, Kind
+from services.common.options import (
+    METHODS,
+    OutputFile,
+    folder_here,
+    number,
+    whole,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,7 +28,6 @@ SCENARIOS: Final = range(1, 13)
 CERTIFICATES: Final = RECORDINGS / "certificates"
 EXIT_SOMETHING_LOST: Final = 3
 """Exit code of a success in which input could not be read or identified."""
-METHODS: Final = ("pre", "least-squares", "random-walk")
 
 Handler = Callable[[argparse.Namespace], int]
 """Type of a command's function, which returns the exit code."""
@@ -111,26 +116,6 @@ def add_common(parser: argparse.ArgumentParser, *, suppressed: bool) -> None:
     )
 
 
-def source(text: str) -> Path | str:
-    """Return a file or folder; an address such as s3://bucket/fleet stays as it is."""
-    return text if "://" in text else Path(text)
-
-
-@dataclass(frozen=True)
-class OutputFile:
-    """Type of an argument that names a file to write, and the kinds that it may replace.
-
-    Every other path is an input, or a folder to write to (`folder_here`).
-    """
-
-    kinds: tuple[Kind, ...]
-    """Kinds that may be replaced; None if the command has a rule of its own."""
-
-    def __call__(self, text: str) -> Path:
-        """Return the path."""
-        return Path(text)
-
-
 class Files(NamedTuple):
     """Paths among the arguments of a command."""
 
@@ -159,13 +144,6 @@ def files_of(options: argparse.Namespace) -> Files:
             else:
                 files.inputs.append(path)
     return files
-
-
-def folder_here(text: str) -> Path:
-    """Return a local folder to write to; an address would otherwise name a folder s3:."""
-    if "://" in text:
-        raise argparse.ArgumentTypeError(f"is {text!r}, a folder of this machine is expected")
-    return Path(text)
 
 
 def add_site(p: Any, text: str, *, required: bool = False) -> None:
@@ -287,62 +265,6 @@ def add_realm(p: Any) -> None:
 def add_id(p: argparse.ArgumentParser, default: str) -> None:
     """Add `--id` of a service."""
     p.add_argument("--id", default=default, help=f"name of this service (default: {default})")
-
-
-def number(what: str, *, low: float, high: float, hint: str = "") -> Callable[[str], float]:
-    """Return a parser of numbers between two limits; `what` and `hint` are for its error."""
-
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(
-                f'is "{text}", it must be {what} from {low:g} to {high:g}'
-                + (f"; {hint}" if hint else "")
-            )
-        return value
-
-    return parse
-
-
-def numbers(what: str, *limits: tuple[float, float]) -> Callable[[str], tuple[float, ...]]:
-    """Return a parser of as many numbers, separated by colons, as there are limits."""
-
-    def parse(text: str) -> tuple[float, ...]:
-        parts = text.split(":")
-        if len(parts) != len(limits):
-            raise argparse.ArgumentTypeError(f'is "{text}", it must be {what}')
-        return tuple(
-            number(what, low=low, high=high)(part)
-            for part, (low, high) in zip(parts, limits, strict=True)
-        )
-
-    return parse
-
-
-def names(text: str) -> tuple[str, ...]:
-    """Parse names between commas."""
-    return tuple(name.strip() for name in text.split(","))
-
-
-def whole(what: str, low: int, high: int = (1 << 63) - 1) -> Callable[[str], int]:
-    """Return a parser of whole numbers between two limits; `what` is for its error."""
-
-    def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            limits = f"of at least {low}" if high >= (1 << 63) - 1 else f"from {low} to {high}"
-            raise argparse.ArgumentTypeError(
-                f'is "{text}", it must be {what}, a whole number {limits}'
-            )
-        return value
-
-    return parse
 
 
 def scenario(text: str) -> int:

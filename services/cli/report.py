@@ -4,9 +4,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from services.cli.parsing import OutputFile, add_file, add_site, command
+from services.cli.parsing import add_file, add_site, command
 from services.common.kinds import HTML, PDF
 from services.common.language import LANGUAGES
+from services.common.options import OutputFile
 
 
 def add_report(commands: Any) -> None:

@@ -10,13 +10,11 @@ from services.cli.parsing import (
     add_seed,
     add_site,
     command,
-    number,
-    numbers,
     option_of,
     scenario,
-    whole,
 )
 from services.common.errors import InputError
+from services.common.options import number, numbers, whole
 
 
 def _ratios(text: str) -> tuple[float, ...]:

@@ -12,7 +12,6 @@ from typing import Any, Final, TypeVar
 from services.cli.parsing import (
     CERTIFICATES,
     SCENARIOS,
-    OutputFile,
     a_console,
     add_certificates,
     add_noise,
@@ -21,13 +20,12 @@ from services.cli.parsing import (
     add_seed,
     add_site,
     command,
-    names,
     option_of,
     scenario,
-    whole,
 )
 from services.common.errors import InputError
 from services.common.kinds import AIMS_JSON, RECORDS, VALIDATION_JSON, VALIDATION_PAGE
+from services.common.options import OutputFile, names, whole
 from services.simulation.effects import EFFECTS
 from services.simulation.survey_kinds import KINDS
 from services.simulation.validation_options import (

@@ -3,8 +3,9 @@
 import argparse
 from typing import Any
 
-from services.cli.parsing import a_console, add_endpoint, add_realm, add_site, command, whole
+from services.cli.parsing import a_console, add_endpoint, add_realm, add_site, command
 from services.common.endpoints import LOOPBACK, default_endpoint
+from services.common.options import whole
 
 
 def add_view(commands: Any) -> None:

@@ -10,6 +10,7 @@ from schemas.topics import Key, topic
 from services.common.errors import InputError
 from services.common.naming import checked_identifier
 from services.recordings.merge import TimedMessage
+from services.replay.settings import ReplaySettings
 
 
 class ReplaySelection(NamedTuple):
@@ -28,7 +29,17 @@ class ReplaySelection(NamedTuple):
     """Old and new names of trucks."""
 
 
-EVERYTHING = ReplaySelection()
+def selection_of(asked: ReplaySettings) -> ReplaySelection:
+    """Return the selection of the options; raise InputError for a malformed name."""
+    return ReplaySelection(
+        asked.start,
+        asked.end,
+        asked.duration,
+        asked.topics,
+        asked.exclude,
+        asked.vehicle,
+        tuple(parsed_rename(text) for text in asked.rename),
+    )
 
 
 class ReplayWindow(NamedTuple):

@@ -48,7 +48,7 @@ class ReplayDrive(NamedTuple):
 
 
 def open_drive(
-    paths: list[Path], realm: str, choice: ReplaySelection, site: Path | None
+    paths: Sequence[Path], realm: str, choice: ReplaySelection, site: Path | None
 ) -> ReplayDrive:
     """Check every message of all recordings before connecting.
 

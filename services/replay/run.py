@@ -6,7 +6,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 from typing import NamedTuple
 
 from schemas.signals import Identity
@@ -23,9 +22,10 @@ from services.bus.playback import (
 from services.bus.publisher import Publisher
 from services.bus.session import open_session
 from services.common.errors import FailureError, InputError
-from services.replay.choice import EVERYTHING, ReplaySelection
+from services.replay.choice import selection_of
 from services.replay.drive import ReplayDrive, open_drive, warn_of_silence
 from services.replay.player import Command, Controls, PlaybackResult, PlaybackSettings, play
+from services.replay.settings import ReplaySettings
 
 _log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 10.0
@@ -62,21 +62,12 @@ class ReplayStatistics(NamedTuple):
 
 
 def run(
+    asked: ReplaySettings,
     *,
-    recordings: list[Path],
-    endpoint: str,
-    speed: float,
-    name: str,
-    choice: ReplaySelection = EVERYTHING,
-    skip_gaps: bool = False,
-    loop: bool = False,
-    start_paused: bool = False,
-    site: Path | None = None,
     display: Display | None = None,
     report: Callable[[ReplayStatistics], None] = lambda statistics: None,
     connect_timeout_s: float | None = CONNECT_TIMEOUT_S,
     subscriber_timeout_s: float = SUBSCRIBER_TIMEOUT_S,
-    tls: Path | None = None,
 ) -> int:
     """Publish recordings in the realm `replay-{name}` as one drive; return 0.
 
@@ -84,10 +75,8 @@ def run(
     divided by `speed` (0: as fast as possible). Recorded bridge results and events are published
     too. Return when a logger has everything on disk or, without a logger, when subscribers have had
     the time to fetch missing messages. A logger that saw the same recording twice under one name,
-    or in a `loop`, treats the second as duplicates.
-
-    `recordings` may be folders. `display` shows the position and takes commands; `site` locates the
-    bridges if the recordings do not; `tls` is a folder of credentials, see `open_session`.
+    or in a `loop`, treats the second as duplicates. `display` shows the position and takes
+    commands.
 
     Raise InputError for a missing file, one that is not a recording, a message that no logger would
     accept, an empty selection, and a name that is not an identifier or that of the recorded realm.
@@ -95,33 +84,18 @@ def run(
     ever), no subscriber appears within `subscriber_timeout_s`, or the logger did not confirm
     everything.
     """
-    check_speed(speed)
-    try:
-        realm = check_realm(f"replay-{name}")
-    except ValueError as error:
-        raise InputError(f"name {name!r}: {error}") from None
-    check_speaks_for(tls, "replay")
-    drive = open_drive(recordings, realm, choice, site)
-    if speed > 0.0 and not skip_gaps:
-        warn_of_silence(drive)
-    course = PlaybackSettings(speed, skip_gaps, start_paused, drive.crossings_ns)
+    realm, drive, course = _prepared(asked)
     with (
         stopped_by_signals() as stop,
-        open_session(connect=endpoint, timeout_s=connect_timeout_s, tls=tls) as session,
+        open_session(connect=asked.address, timeout_s=connect_timeout_s, tls=asked.tls) as session,
     ):
         publisher = Publisher(session, realm)
         delivery = DeliveryTracker(session, realm)
         try:
-            keys = [where._replace(identifier=named) for where, named in drive.names.items()]
-            if not declare_and_wait(publisher, keys, subscriber_timeout_s):
-                raise FailureError(
-                    f"no subscriber to realm {realm} at {endpoint}; start "
-                    f"`driveby logger --realm {realm}` or another subscriber of "
-                    f"driveby/v1/{realm}/** first"
-                )
+            _wait_for_subscriber(drive, publisher, asked.address, subscriber_timeout_s)
             with (display or _headless_controls)(realm, drive, stop) as controls:
                 began_s = time.monotonic()
-                played = _play_rounds(drive, publisher, delivery, course, controls, loop=loop)
+                played = _play_rounds(drive, publisher, delivery, course, controls, loop=asked.loop)
                 took_s = time.monotonic() - began_s
             confirm(delivery, sum(played[0].by_stream.values()))
             statistics = _statistics(realm, drive, played, took_s, delivery)
@@ -131,6 +105,35 @@ def run(
             delivery.close()
             publisher.close()
     return 0
+
+
+def _prepared(asked: ReplaySettings) -> tuple[str, ReplayDrive, PlaybackSettings]:
+    """Check everything before connecting; return the realm, the drive and how it is played."""
+    name = asked.realm_name
+    choice = selection_of(asked)
+    check_speed(asked.speed)
+    try:
+        realm = check_realm(f"replay-{name}")
+    except ValueError as error:
+        raise InputError(f"name {name!r}: {error}") from None
+    check_speaks_for(asked.tls, "replay")
+    drive = open_drive(asked.recordings, realm, choice, asked.site)
+    if asked.speed > 0.0 and not asked.skip_gaps:
+        warn_of_silence(drive)
+    course = PlaybackSettings(asked.speed, asked.skip_gaps, asked.paused, drive.crossings_ns)
+    return realm, drive, course
+
+
+def _wait_for_subscriber(
+    drive: ReplayDrive, publisher: Publisher, address: str, timeout_s: float
+) -> None:
+    keys = [where._replace(identifier=named) for where, named in drive.names.items()]
+    if not declare_and_wait(publisher, keys, timeout_s):
+        raise FailureError(
+            f"no subscriber to realm {publisher.realm} at {address}; start "
+            f"`driveby logger --realm {publisher.realm}` or another subscriber of "
+            f"driveby/v1/{publisher.realm}/** first"
+        )
 
 
 class _Round(NamedTuple):

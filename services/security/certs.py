@@ -57,6 +57,7 @@ from services.bus.credentials import (
 from services.common.errors import FailureError, InputError
 from services.common.files import read_bytes, write_atomically
 from services.security.access_control import access_control
+from services.security.settings import CertsSettings
 
 AUTHORITY_DAYS = 3650
 FIRST = tuple(Subject(role, role) for role in ("router", "logger", "worker", "viewer", "replay"))
@@ -108,41 +109,32 @@ class _Authority(NamedTuple):
             raise InputError(f"{self.folder / _ISSUED}: {error}") from None
 
 
-def certs_command(
-    *,
-    folder: Path,
-    trucks: Sequence[str] = (),
-    others: Sequence[str] = (),
-    renew: Sequence[str] = (),
-    revoke: Sequence[str] = (),
-    hosts: Sequence[str] = (),
-    days: int = 365,
-    is_cluster: bool = False,
-) -> list[str]:
-    """Create credentials in `folder` and return lines on its present contents.
+def certs_command(asked: CertsSettings) -> list[str]:
+    """Create credentials in a folder and return lines on its present contents.
 
-    The first run creates the authority, `FIRST` and the named trucks, or with `is_cluster` the
-    authority of a cluster and `FIRST_OF_CLUSTER`. A later one adds `trucks` and `others`
-    (ROLE/NAME), gives the names in `renew` a new key and certificate, removes those in `revoke`
-    from the list, and leaves everything else as it is. Certificates of routers and loggers name
-    this machine and `hosts`.
+    The first run creates the authority, `FIRST` and the named trucks, or with `cluster` the
+    authority of a cluster and `FIRST_OF_CLUSTER`. A later one adds `trucks` and `add` (ROLE/NAME),
+    gives the names in `renew` a new key and certificate, removes those in `revoke` from the list,
+    and leaves everything else as it is. Certificates of routers and loggers name this machine and
+    `host`.
 
     Raise InputError, and create nothing, for a malformed name, one that exists already or was
     revoked, an unknown name to renew or revoke, a role of a cluster in a folder of the bus or the
     other way round, and without the authority's key.
     """
+    folder, hosts, is_cluster = asked.folder, asked.host, asked.cluster
     for host in hosts:
         _check_host(host)
     authority = _existing(folder)
-    wanted = [_truck(name) for name in trucks] + [_other(text) for text in others]
+    wanted = [_truck(name) for name in asked.trucks] + [_other(text) for text in asked.add]
     if authority is None:
-        if renew or revoke:
+        if asked.renew or asked.revoke:
             raise InputError(f"{folder}: has no authority yet, so there is nothing to change")
         wanted = [*(FIRST_OF_CLUSTER if is_cluster else FIRST), *wanted]
     _check_kind(folder, authority, wanted, is_cluster=is_cluster)
     _check_new(folder, authority, wanted)
-    renewed = [] if authority is None else _existing_subjects(authority, renew)
-    revoked = [] if authority is None else _existing_subjects(authority, revoke)
+    renewed = [] if authority is None else _existing_subjects(authority, asked.renew)
+    revoked = [] if authority is None else _existing_subjects(authority, asked.revoke)
     if revoked and revoked[0].role in CLUSTER_ROLES:
         raise InputError("--revoke: Dask knows no revoked certificates; make a new authority")
     if both := set(renewed) & set(revoked):
@@ -157,7 +149,7 @@ def certs_command(
             _revoke(authority, subject)
         for subject in [*wanted, *renewed]:
             assert key is not None  # noqa: S101 - read above, before anything is changed
-            _issue(folder, authority, key, subject, hosts, days)
+            _issue(folder, authority, key, subject, hosts, asked.days)
         _write_access_control(folder, authority)
     except OSError as error:
         raise FailureError(f"{folder}: {error.strerror}: {error.filename}") from None

@@ -52,16 +52,11 @@ LONG_FUNCTIONS = {
     "pre_core.paper.residual:objective": 68,
     "pre_core.physics.simulate:_march": 232,
     "pre_core.physics.simulate:simulate": 115,
-    "services.cli.export:_export": 67,
-    "services.cli.identify:identify_command": 70,
-    "services.cli.info:as_json": 63,
     "services.cli.simulate:_add_beyond": 69,
-    "services.cli.survey:add_survey": 63,
     "services.ledger.recorded_crossings:scan_stays": 69,
     "services.identification.bridge_state:state_of": 69,
     "services.identification.pre_method:identify_pre": 77,
     "services.logger.run:_record": 61,
-    "services.replay.run:run": 70,
     "services.simulation.drawn:draw_truth": 78,
     "services.simulation.drawn:drive": 93,
     "services.simulation.drive_wide:measured_wide_run": 69,
@@ -93,8 +88,6 @@ MANY_ARGUMENTS = {
     "pre_core.physics.newmark:_march": 9,
     "pre_core.physics.simulate:_march": 37,
     "pre_core.physics.simulate:simulate": 11,
-    "services.cli.identify:identify_command": 13,
-    "services.cli.identify_archive:archive_command": 12,
     "services.drives.importing:_import_ros2": 8,
     "services.drives.importing:import_command": 8,
     "services.execution.offline:identify_drives": 8,
@@ -104,8 +97,6 @@ MANY_ARGUMENTS = {
     "services.logger.run:run": 11,
     "services.notebook.simulate:simulate": 10,
     "services.recordings.writer:RecordingWriter.__init__": 9,
-    "services.replay.run:run": 14,
-    "services.security.certs:certs_command": 8,
     "services.simulation.drive:measured_run": 14,
     "services.simulation.drive:simulate_command": 18,
     "services.simulation.drive:simulate_drive": 12,
@@ -127,8 +118,7 @@ ROOMS_WITH_CODE = {
     "pre_core": 5,
 }
 
-SHARED_NAMES = {
-}
+SHARED_NAMES = {}
 
 LISTS = {
     "lines of a module": LONG_MODULES,

@@ -16,6 +16,7 @@ from services.common.errors import FailureError
 from services.execution.result_store import kept_results
 from services.execution.scheduler import Credentials, connect, threads_of
 from services.security.certs import certs_command
+from services.security.settings import CertsSettings
 from tests.drives import drives
 from tests.faults.clusters import (
     Running,
@@ -339,7 +340,7 @@ def test_tls_admits_only_certificates_of_the_cluster(
     credentials: Path, recordings: list[Path], tmp_path: Path
 ) -> None:
     certs = tmp_path / "certs"
-    certs_command(folder=certs, is_cluster=True)
+    certs_command(CertsSettings(folder=certs, cluster=True))
     with cluster(tmp_path, "--tls", str(certs), scheme="tls") as running:
         into = tmp_path / "into"
         options = on(running, into, "--tls", str(certs / "client"))

@@ -26,6 +26,7 @@ from services.bus.subscription import RawSample, Subscription, get_latest
 from services.common.errors import FailureError
 from services.security import certs
 from services.security.certs import certs_command
+from services.security.settings import CertsSettings
 from tests.endpoints import free_endpoint
 from tests.waiting import LONGEST_S, until
 
@@ -358,13 +359,13 @@ def test_strangers_are_not_let_in(
     credentials: Path, router: zenoh.Session, endpoint: str, tmp_path: Path
 ) -> None:
     foreign = tmp_path / "foreign"
-    certs_command(folder=foreign, trucks=["truck-1"])
+    certs_command(CertsSettings(folder=foreign, trucks=["truck-1"]))
     trusting = tmp_path / "trusting"  # another authority's truck that believes our router
     shutil.copytree(foreign / "truck-1", trusting)
     shutil.copy(credentials / "truck-1" / "ca.pem", trusting)
     expired, renewed = (copied(credentials, tmp_path / name) for name in ("expired", "renewed"))
-    certs_command(folder=expired, renew=["truck-1"], days=0)
-    certs_command(folder=renewed, renew=["truck-1"], days=1)
+    certs_command(CertsSettings(folder=expired, renew=["truck-1"], days=0))
+    certs_command(CertsSettings(folder=renewed, renew=["truck-1"], days=1))
     ended = end_of_validity(expired / "truck-1" / "cert.pem")
     until(lambda: datetime.now(UTC) > ended + timedelta(seconds=1), "the end of the certificate")
     believing: dict[str, object] = {
@@ -406,7 +407,7 @@ def test_a_truck_cannot_pose_as_the_router(
         monkeypatch.setattr(
             certs, "_alternative_names", lambda subject, _: real(subject, certs.LOCAL_HOSTS)
         )
-        certs_command(folder=copy, renew=["truck-1"])
+        certs_command(CertsSettings(folder=copy, renew=["truck-1"]))
     victim = credentials / "truck-2"
     with raw_session(endpoint, copy / "truck-1", listen=True):
         assert not opens(endpoint, victim)
@@ -425,7 +426,7 @@ def test_a_router_of_another_name_is_not_believed(
     with raw_session(elsewhere, credentials / "logger", listen=True):
         assert not opens(elsewhere, credentials / "truck-1")
     copy = copied(credentials, tmp_path / "named")
-    certs_command(folder=copy, renew=["logger"], hosts=["127.0.0.2"])
+    certs_command(CertsSettings(folder=copy, renew=["logger"], host=["127.0.0.2"]))
     with raw_session(elsewhere, copy / "logger", listen=True):
         assert opens(elsewhere, credentials / "truck-1", None, LONGEST_S)
 
@@ -433,7 +434,7 @@ def test_a_router_of_another_name_is_not_believed(
 def test_a_revoked_truck_says_nothing(credentials: Path, endpoint: str, tmp_path: Path) -> None:
     """Its key still opens a connection, for Zenoh knows no list of revoked certificates."""
     copy = copied(credentials, tmp_path / "revoked")
-    certs_command(folder=copy, revoke=["truck-1"])
+    certs_command(CertsSettings(folder=copy, revoke=["truck-1"]))
     with open_session(listen=endpoint, tls=copy / "logger") as router:
         heard = listen_to(router, ["**"])
         for name in ("truck-1", "truck-2"):

@@ -42,14 +42,19 @@ for name in ("folder", "file", "site", "recording"):
         arguments[name] = Path(arguments[name])
 if "recordings" in arguments:
     arguments["recordings"] = [Path(path) for path in arguments["recordings"]]
+SETTINGS = {
+    "services.replay": "ReplaySettings",
+    "services.worker": "WorkerSettings",
+}
 if module == "services.logger":
     arguments["ready"] = lambda: print("ready", flush=True)
 try:
-    if module == "services.worker":
-        from services.worker.run import run
-        from services.worker.settings import WorkerSettings
-        sys.exit(run(WorkerSettings(**arguments)))
-    sys.exit(importlib.import_module(f'{module}.run').run(**arguments))
+    run = importlib.import_module(f"{module}.run").run
+    if module in SETTINGS:
+        made_of = getattr(importlib.import_module(f"{module}.settings"), SETTINGS[module])
+        asked = {n: arguments.pop(n) for n in made_of.__dataclass_fields__ if n in arguments}
+        sys.exit(run(made_of(**asked), **arguments))
+    sys.exit(run(**arguments))
 except InputError as error:
     sys.exit(print(error, file=sys.stderr) or 2)
 except FailureError as error:

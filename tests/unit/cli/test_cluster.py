@@ -15,6 +15,7 @@ from services.common.stores import files_below, folder_at, put
 from services.execution import cluster
 from services.execution.result_store import BRIDGES
 from services.security.certs import certs_command
+from services.security.settings import CertsSettings
 from tests.drives import EXACT, drives
 from tests.faults.clusters import results_of
 from tests.object_store import object_store, read_only, use_keys
@@ -64,7 +65,7 @@ def test_credentials_must_be_those_of_a_client(
     capsys: pytest.CaptureFixture[str], credentials: Path, tmp_path: Path
 ) -> None:
     certs = tmp_path / "certs"
-    certs_command(folder=certs, is_cluster=True)
+    certs_command(CertsSettings(folder=certs, cluster=True))
     for folder in (credentials / "truck-1", certs / "scheduler", tmp_path / "none"):
         where = ("--scheduler", "tls://127.0.0.1:8786", "--tls", folder)
         code, err = said(capsys, "identify", EXACT, *where)

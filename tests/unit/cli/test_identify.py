@@ -25,6 +25,7 @@ from schemas.site_file import parse_site, site_hash, site_toml
 from schemas.topics import Message
 from schemas.validation_records import VehicleBridgePair, pair_hash
 from services.cli import main as cli
+from services.cli.commands.identify import IdentifyOptions
 from services.cli.identify import identify_command
 from services.common.errors import InputError
 from services.common.geodesy import bridge_frame, to_lat_lon
@@ -258,19 +259,10 @@ def test_results_are_written_as_the_contract_says(recording: Path, tmp_path: Pat
     for path in (out, rrd):
         path.write_text("of yesterday")
     console = Console(record=True, width=120)
-    code = identify_command(
-        recordings=[recording],
-        site=None,
-        method="least_squares",
-        json_path=out,
-        rrd_path=rrd,
-        draws_path=None,
-        figures=None,
-        seed=5,
-        baseline=None,
-        fuse_suspect=False,
-        console=console,
+    asked = IdentifyOptions(
+        recordings=(recording,), method="least-squares", json=out, rrd=rrd, seed=5
     )
+    code = identify_command(asked, None, console)
     assert code == 0
     found = load_results(out)
     assert (found.program, found.seed, found.settings["method"]) == ("driveby", 5, "least_squares")

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from services.cli import main as cli
-from services.cli.parsing import OutputFile, folder_here, source
 from services.common.errors import InputError
 from services.common.files import check_writable, write_atomically
 from services.common.kinds import RESULTS, Kind, family_of
+from services.common.options import OutputFile, folder_here, source
 from services.common.outputs import add_input, declared
 
 PROJECT = Path(__file__).parents[3]

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from services.cli import terminal
-from services.cli.replay import summary
+from services.cli.commands.replay import summary
 from services.replay.choice import ReplayWindow
 from services.replay.drive import ReplayDrive
 from services.replay.player import Command, Status

@@ -21,6 +21,7 @@ from services.recordings.recording import read_info, read_messages
 from services.recordings.recovery import recover_recording
 from services.recordings.writer import write_recording
 from services.replay.run import run as replay
+from services.replay.settings import ReplaySettings
 from services.truck.run import run as truck
 
 WALL_NS = 1_767_225_600_000_000_000
@@ -75,7 +76,7 @@ def _nobody_connects(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def replayed(path: Path) -> None:
-    replay(recordings=[path], endpoint="tcp/127.0.0.1:1", speed=1.0, name="x")
+    replay(ReplaySettings(recordings=(path,), endpoint="tcp/127.0.0.1:1", name="x"))
 
 
 def driven(path: Path) -> None:

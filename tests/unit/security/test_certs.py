@@ -31,6 +31,7 @@ from services.common.errors import InputError
 from services.security import certs
 from services.security.access_control import access_control
 from services.security.certs import certs_command
+from services.security.settings import CertsSettings
 
 EVERYBODY = ("logger", "replay", "router", "truck-1", "viewer", "worker")
 
@@ -38,7 +39,9 @@ EVERYBODY = ("logger", "replay", "router", "truck-1", "viewer", "worker")
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     made = tmp_path / "certs"
-    certs_command(folder=made, trucks=["truck-1"], hosts=["logger.example.org", "10.0.0.5"])
+    certs_command(
+        CertsSettings(folder=made, trucks=["truck-1"], host=["logger.example.org", "10.0.0.5"])
+    )
     return made
 
 
@@ -91,7 +94,7 @@ def test_private_keys_are_never_readable_by_others_while_they_are_made(
     monkeypatch.setattr(os, "open", spy)
     before = os.umask(0)
     try:
-        certs_command(folder=tmp_path / "certs", trucks=["truck-1"])
+        certs_command(CertsSettings(folder=tmp_path / "certs", trucks=["truck-1"]))
     finally:
         os.umask(before)
     keys = [mode for name, mode in opened if name in (KEY, "ca-key.pem")]
@@ -145,7 +148,7 @@ def test_an_independent_verifier_believes_a_logger_at_its_hosts(
 
 def test_a_truck_more_changes_nothing_but_the_lists(folder: Path) -> None:
     before = contents(folder)
-    certs_command(folder=folder, trucks=["truck-2"], others=["viewer/anna"])
+    certs_command(CertsSettings(folder=folder, trucks=["truck-2"], add=["viewer/anna"]))
     after = contents(folder)
     lists = {folder / name / CONFIGURATION for name in ("router", "logger")}
     assert {path for path in before if after[path] != before[path]} == lists
@@ -160,15 +163,17 @@ def test_without_the_authoritys_key_nothing_is_made_but_somebody_can_be_revoked(
     (folder / "authority" / "ca-key.pem").unlink()
     before = contents(folder)
     with pytest.raises(InputError, match="the authority's private key is not here"):
-        certs_command(folder=folder, trucks=["truck-2"])
+        certs_command(CertsSettings(folder=folder, trucks=["truck-2"]))
     assert contents(folder) == before
-    certs_command(folder=folder, revoke=["truck-1"])
+    certs_command(CertsSettings(folder=folder, revoke=["truck-1"]))
     assert "truck/truck-1" not in names_allowed(folder / "logger" / CONFIGURATION)
 
 
 def test_renewal_replaces_one_key_and_keeps_the_hosts(folder: Path) -> None:
     before = contents(folder)
-    certs_command(folder=folder, renew=["logger"], hosts=["other.example.org"], days=30)
+    certs_command(
+        CertsSettings(folder=folder, renew=["logger"], host=["other.example.org"], days=30)
+    )
     changed = {p for p, content in contents(folder).items() if before.get(p) != content}
     assert changed == {
         folder / "logger" / KEY,
@@ -183,11 +188,11 @@ def test_renewal_replaces_one_key_and_keeps_the_hosts(folder: Path) -> None:
 
 
 def test_a_revoked_name_is_not_issued_again(folder: Path) -> None:
-    certs_command(folder=folder, revoke=["truck-1"])
+    certs_command(CertsSettings(folder=folder, revoke=["truck-1"]))
     with pytest.raises(InputError, match="its old key would become valid again"):
-        certs_command(folder=folder, trucks=["truck-1"])
+        certs_command(CertsSettings(folder=folder, trucks=["truck-1"]))
     with pytest.raises(InputError, match="has no certificate here"):
-        certs_command(folder=folder, renew=["truck-1"])
+        certs_command(CertsSettings(folder=folder, renew=["truck-1"]))
 
 
 @pytest.mark.parametrize(
@@ -202,12 +207,12 @@ def test_a_revoked_name_is_not_issued_again(folder: Path) -> None:
         ({"trucks": ["*"]}, "--trucks: identifier"),
         ({"trucks": [""]}, "--trucks: identifier"),
         ({"trucks": ["x" * 10_000]}, "--trucks: identifier"),
-        ({"others": ["captain/x"]}, "ROLE one of"),
-        ({"others": ["viewer"]}, "--add: identifier ''"),
-        ({"hosts": ["a b"], "renew": ["logger"]}, "the name or the address of a machine"),
-        ({"hosts": ["-x"], "renew": ["logger"]}, "the name or the address of a machine"),
-        ({"hosts": ["a" * 60 + "."] * 1, "renew": ["logger"]}, "the name or the address"),
-        ({"hosts": ["x.org"], "trucks": ["t"]}, "--host concerns routers and loggers"),
+        ({"add": ["captain/x"]}, "ROLE one of"),
+        ({"add": ["viewer"]}, "--add: identifier ''"),
+        ({"host": ["a b"], "renew": ["logger"]}, "the name or the address of a machine"),
+        ({"host": ["-x"], "renew": ["logger"]}, "the name or the address of a machine"),
+        ({"host": ["a" * 60 + "."] * 1, "renew": ["logger"]}, "the name or the address"),
+        ({"host": ["x.org"], "trucks": ["t"]}, "--host concerns routers and loggers"),
         ({"renew": ["nobody"]}, "has no certificate here; there are logger"),
         ({"revoke": ["nobody"]}, "has no certificate here"),
         ({"revoke": ["truck-1"], "renew": ["truck-1"]}, "either renew or revoke"),
@@ -218,24 +223,24 @@ def test_wrong_input_is_named_and_nothing_is_written(
 ) -> None:
     before = contents(folder)
     with pytest.raises(InputError, match=message.replace("*", r"\*")):
-        certs_command(folder=folder, **arguments)  # type: ignore[arg-type]
+        certs_command(CertsSettings(folder=folder, **arguments))  # type: ignore[arg-type]
     assert contents(folder) == before
 
 
 def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
     tmp_path.chmod(0o777)
     with pytest.raises(InputError, match="others may write there; chmod 700"):
-        certs_command(folder=tmp_path)
+        certs_command(CertsSettings(folder=tmp_path))
     with pytest.raises(InputError, match="does not exist"):
-        certs_command(folder=tmp_path / "a" / "b")
+        certs_command(CertsSettings(folder=tmp_path / "a" / "b"))
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a file"):
-        certs_command(folder=tmp_path / "file")
+        certs_command(CertsSettings(folder=tmp_path / "file"))
 
 
 def test_bad_credentials_are_named_before_anybody_connects(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    certs_command(folder=other, trucks=["truck-1"])
+    certs_command(CertsSettings(folder=other, trucks=["truck-1"]))
     truck = folder / "truck-1"
     key, certificate, authority = (
         (truck / name).read_bytes() for name in (KEY, CERTIFICATE, AUTHORITY)
@@ -261,7 +266,7 @@ def test_bad_credentials_are_named_before_anybody_connects(folder: Path, tmp_pat
     refused("no such file")
     (truck / AUTHORITY).write_bytes((other / "truck-1" / AUTHORITY).read_bytes())
     refused("was not issued by the authority")
-    certs_command(folder=folder, renew=["truck-1"], days=0)
+    certs_command(CertsSettings(folder=folder, renew=["truck-1"], days=0))
     refused(r"expired on \d{4}-\d\d-\d\d; renew it")
 
 
@@ -388,7 +393,7 @@ def test_every_topic_has_exactly_the_publishers_that_it_should() -> None:
 @pytest.fixture
 def of_cluster(tmp_path: Path) -> Path:
     made = tmp_path / "cluster-certs"
-    certs_command(folder=made, is_cluster=True)
+    certs_command(CertsSettings(folder=made, cluster=True))
     return made
 
 
@@ -399,20 +404,20 @@ def test_a_cluster_has_an_authority_and_roles_of_its_own(of_cluster: Path) -> No
         usages = read_certificate(of_cluster / role / CERTIFICATE).extensions
         kinds = usages.get_extension_for_class(x509.ExtendedKeyUsage).value
         assert (ExtendedKeyUsageOID.SERVER_AUTH in kinds) == listens
-    certs_command(folder=of_cluster, others=["cluster-worker/two"], renew=["client"])
+    certs_command(CertsSettings(folder=of_cluster, add=["cluster-worker/two"], renew=["client"]))
     assert check_credentials(of_cluster / "two") == ("cluster-worker", "two")
 
 
 def test_nobody_of_the_bus_is_of_a_cluster(of_cluster: Path, folder: Path) -> None:
     """Whoever has a certificate of a cluster's authority runs programs on it."""
     with pytest.raises(InputError, match=r"truck/truck-1: .* is an authority of a cluster"):
-        certs_command(folder=of_cluster, trucks=["truck-1"])
+        certs_command(CertsSettings(folder=of_cluster, trucks=["truck-1"]))
     with pytest.raises(InputError, match=r"client/anna: .* is an authority of the bus"):
-        certs_command(folder=folder, others=["client/anna"])
+        certs_command(CertsSettings(folder=folder, add=["client/anna"]))
     with pytest.raises(InputError, match=r"--cluster needs another folder"):
-        certs_command(folder=folder, is_cluster=True)
+        certs_command(CertsSettings(folder=folder, cluster=True))
     with pytest.raises(InputError, match=r"is an authority of a cluster"):
-        certs_command(folder=folder.parent / "new", trucks=["truck-1"], is_cluster=True)
+        certs_command(CertsSettings(folder=folder.parent / "new", trucks=["truck-1"], cluster=True))
     assert not (folder.parent / "new").exists()
     with pytest.raises(InputError, match=r"knows no revoked certificates"):
-        certs_command(folder=of_cluster, revoke=["client"])
+        certs_command(CertsSettings(folder=of_cluster, revoke=["client"]))

@@ -12,7 +12,7 @@ from schemas.signals import NS_PER_S
 from schemas.topics import Key, Message
 from services.bus import playback
 from services.cli import main as cli
-from services.logger.run import _health_line
+from services.logger.health_line import health_line
 from services.truck.run import _driven_now, _log_timing, _times
 from tests.unit.bus.test_playback import Clock, Delivered
 from tests.unit.identification.test_engine_resume import THERE, engine, fed, messages_of
@@ -119,10 +119,10 @@ def test_a_drive_as_it_was_says_nothing(caplog: pytest.LogCaptureFixture) -> Non
 
 
 def test_long_lag_is_explained_where_it_is_reported() -> None:
-    assert "lag 0.20 s, queue 0" in _health_line({"lag_s": 0.2})
+    assert "lag 0.20 s, queue 0" in health_line({"lag_s": 0.2})
     assert (
         "lag 1356.00 s (samples so old when they came: played faster than real, sent late, or a "
-        "clock off), queue 0" in _health_line({"lag_s": 1356.0})
+        "clock off), queue 0" in health_line({"lag_s": 1356.0})
     )
 
 

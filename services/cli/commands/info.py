@@ -1,17 +1,19 @@
 """The command `driveby info`: contents of recordings, for people and as JSON."""
 
-import argparse
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from services.cli.parsing import add_site, command
+from services.cli.parser import Subcommand
 from services.common.errors import InputError
+from services.common.options import flag, positional, site_option
 
 if TYPE_CHECKING:
+    from schemas.site import Site
     from services.catalogue.contents import Gap, RecordingSummary, TruckSummary
     from services.finding.bridges import DetectedCrossing
 
@@ -20,27 +22,18 @@ _MAX_LINES: Final = 20
 """Maximum number of gaps and crossings of a recording in the listing."""
 
 
-def add_info(commands: Any) -> None:
-    """Add `driveby info`: summarise recordings."""
-    p = command(
-        commands,
-        "info",
-        _info,
-        "summarise recordings: trucks, times, rates, gaps, crossings",
-        "driveby info recordings/sample/crossing.mcap",
+@dataclass(frozen=True, kw_only=True)
+class InfoOptions:
+    """Recordings to summarise."""
+
+    paths: tuple[Path, ...] = positional(
+        "recordings, or folders with recordings below", Path, nargs="+", metavar="REC.mcap|DIR"
     )
-    p.add_argument(
-        "paths",
-        type=Path,
-        nargs="+",
-        metavar="REC.mcap|DIR",
-        help="recordings, or folders with recordings below",
-    )
-    add_site(p, "site file of the bridges (default: that of each recording)")
-    p.add_argument("--json", action="store_true", help="print all findings as JSON")
+    site: Path | None = site_option("site file of the bridges (default: that of each recording)")
+    json: bool = flag("print all findings as JSON")
 
 
-def _info(options: argparse.Namespace) -> int:
+def _info(options: InfoOptions) -> int:
     from schemas.site_file import load_site
     from services.catalogue.contents import summarise_recording
     from services.common.progress import reading_bar
@@ -84,20 +77,7 @@ def as_json(one: "RecordingSummary") -> dict[str, Any]:
         "is_cut_off": info.truncated,
         "damaged_places": info.damaged_chunks,
         "messages": info.messages,
-        "site": None
-        if one.site is None
-        else {
-            "vehicles": [vehicle.id for vehicle in one.site.vehicles],
-            "bridges": [
-                {
-                    "id": bridge.id,
-                    "owner_id": bridge.owner_id,
-                    "span_m": bridge.span_m,
-                    "elements": bridge.elements,
-                }
-                for bridge in one.site.bridges
-            ],
-        },
+        "site": None if one.site is None else _site_as_json(one.site),
         "site_error": one.site_error,
         "trucks": [
             {
@@ -131,6 +111,21 @@ def as_json(one: "RecordingSummary") -> dict[str, Any]:
                 "passage": passing.passage.value.replace(" ", "_"),
             }
             for passing in one.passings
+        ],
+    }
+
+
+def _site_as_json(site: "Site") -> dict[str, Any]:
+    return {
+        "vehicles": [vehicle.id for vehicle in site.vehicles],
+        "bridges": [
+            {
+                "id": bridge.id,
+                "owner_id": bridge.owner_id,
+                "span_m": bridge.span_m,
+                "elements": bridge.elements,
+            }
+            for bridge in site.bridges
         ],
     }
 
@@ -289,3 +284,12 @@ def _size(size_bytes: int) -> str:
         if size_bytes >= bytes_:
             return f"{size_bytes / bytes_:.3g} {unit}"
     return f"{size_bytes} B"
+
+
+INFO: Final = Subcommand(
+    "info",
+    InfoOptions,
+    "summarise recordings: trucks, times, rates, gaps, crossings",
+    "driveby info recordings/sample/crossing.mcap",
+    _info,
+)

@@ -2,11 +2,14 @@
 
 import argparse
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Final
 
-from services.cli.parsing import a_console, add_output_file, add_site, command, number, whole
+from services.cli.parser import Subcommand
+from services.cli.parsing import a_console
 from services.common.kinds import PNG, SURVEY_JSON, SVG
+from services.common.options import number, opt, output_option, site_option, whole
 
 
 def _speeds(text: str) -> tuple[float, float]:
@@ -18,71 +21,61 @@ def _speeds(text: str) -> tuple[float, float]:
     return found
 
 
-def add_survey(commands: Any) -> None:
-    """Add `driveby survey`: forecast accuracy and detection of a survey."""
-    p = command(
-        commands,
-        "survey",
-        _survey,
-        "plan a survey: expected accuracy, detection probability, most useful change",
-        "driveby survey --site site.toml --loss 0.2 --crossings 12 --figure plan.png",
-    )
-    add_site(
-        p,
+@dataclass(frozen=True, kw_only=True)
+class SurveyOptions:
+    """A survey to forecast, and what is written."""
+
+    site: Path = site_option(
         "site file of truck, bridge and sensors, as docs/site.example.toml; its first vehicle "
         "and bridge are used",
         required=True,
     )
-    p.add_argument(
-        "--loss",
-        type=number("a share of EI", low=0.01, high=0.95, hint="20 % is 0.2"),
+    loss: float = opt(
+        "stiffness loss to detect, as a share of EI (default: 0.2)",
+        number("a share of EI", low=0.01, high=0.95, hint="20 % is 0.2"),
         default=0.2,
         metavar="SHARE",
-        help="stiffness loss to detect, as a share of EI (default: 0.2)",
     )
-    p.add_argument(
-        "--crossings",
-        type=whole("a number of crossings", 1, 300),
+    crossings: int = opt(
+        "number of crossings (default: 12)",
+        whole("a number of crossings", 1, 300),
         default=12,
         metavar="N",
-        help="number of crossings (default: 12)",
     )
-    p.add_argument(
-        "--speed",
-        type=_speeds,
-        metavar="M_PER_S",
-        help="speed in m/s, or feasible range SLOWEST:FASTEST; with a range the plan uses the "
+    speed: tuple[float, float] | None = opt(
+        "speed in m/s, or feasible range SLOWEST:FASTEST; with a range the plan uses the "
         "site's survey_speed_m_per_s or 10 m/s (default: 5:20)",
+        _speeds,
+        metavar="M_PER_S",
     )
-    p.add_argument(
-        "--road",
-        choices=tuple("ABCDE"),
-        help="ISO 8608 class (default: the site's road_class, or A, the best)",
+    road: str | None = opt(
+        "ISO 8608 class (default: the site's road_class, or A, the best)", choices=tuple("ABCDE")
     )
-    p.add_argument(
-        "--tyres",
+    tyres: str | None = opt(
+        "tyres of the rear axle; single: like the front ones (default: the site's, or twin)",
         choices=("single", "twin"),
-        help="tyres of the rear axle; single: like the front ones (default: the site's, or twin)",
     )
-    p.add_argument(
-        "--noise",
-        type=number("a noise density", low=0.1, high=1e6),
+    noise: float | None = opt(
+        "noise density of all accelerometers in µg/√Hz (default: the site's)",
+        number("a noise density", low=0.1, high=1e6),
         metavar="UG_PER_RTHZ",
-        help="noise density of all accelerometers in µg/√Hz (default: the site's)",
     )
-    p.add_argument(
-        "--wander",
-        type=number("a standard deviation in m", low=0.01, high=1),
+    wander: float = opt(
+        "lateral standard deviation between runs in m; it adds information (default: 0.12)",
+        number("a standard deviation in m", low=0.01, high=1),
         default=0.12,
         metavar="M",
-        help="lateral standard deviation between runs in m; it adds information (default: 0.12)",
     )
-    text = "file of a figure of detection probability over the number of crossings"
-    add_output_file(p, "--figure", "OUT.png|OUT.svg", text, PNG, SVG)
-    add_output_file(p, "--json", "OUT.json", "JSON file of the whole plan", SURVEY_JSON)
+    figure: Path | None = output_option(
+        "file of a figure of detection probability over the number of crossings",
+        "OUT.png|OUT.svg",
+        PNG,
+        SVG,
+    )
+    json: Path | None = output_option("JSON file of the whole plan", "OUT.json", SURVEY_JSON)
 
 
-def _survey(options: argparse.Namespace) -> int:
+def _survey(options: SurveyOptions) -> int:
     from schemas.site_file import load_site
     from services.common.errors import InputError
     from services.common.files import check_writable, write_atomically
@@ -91,7 +84,7 @@ def _survey(options: argparse.Namespace) -> int:
     from services.planning.forecast_text import as_json, lines_of
     from services.planning.plan_survey import SurveyWishes, plan_survey
 
-    figure: Path | None = options.figure
+    figure = options.figure
     if figure is not None and figure.suffix not in (".png", ".svg"):
         raise InputError(f"{figure}: the name of a picture (.png or .svg) is expected")
     for path in (figure, options.json):
@@ -125,3 +118,12 @@ def _survey(options: argparse.Namespace) -> int:
     for line in sensors_in_words(given.sensor, given.vehicles[0]):
         print(f"sensor {line}")
     return 0
+
+
+SURVEY: Final = Subcommand(
+    "survey",
+    SurveyOptions,
+    "plan a survey: expected accuracy, detection probability, most useful change",
+    "driveby survey --site site.toml --loss 0.2 --crossings 12 --figure plan.png",
+    _survey,
+)

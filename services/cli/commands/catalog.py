@@ -1,12 +1,14 @@
 """The command `driveby catalog`: recordings of a fleet, and crossings in them."""
 
-import argparse
 from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
-from services.cli.parsing import add_output_file, add_site, command
+from services.cli.parser import Subcommand
 from services.common.kinds import CATALOG_CSV, CROSSINGS_CSV
+from services.common.options import flag, output_option, positional, site_option
 
 if TYPE_CHECKING:
     from services.catalogue.positions import CatalogScan
@@ -17,27 +19,24 @@ _MAX_LINES = 40
 _NS_PER_S = 1_000_000_000
 
 
-def add_catalog(commands: Any) -> None:
-    """Add `driveby catalog`: build or update the catalogue of a folder of recordings."""
-    p = command(
-        commands,
-        "catalog",
-        _catalog,
-        "build or repair the catalogue of a folder of recordings and find crossings in it",
-        "driveby catalog recordings --site site.toml",
+@dataclass(frozen=True, kw_only=True)
+class CatalogOptions:
+    """A folder of recordings, and what is listed of it."""
+
+    folder: str = positional("folder with recordings below", metavar="DIR|s3://…")
+    verify: bool = flag(
+        "read every recording and compare it with its row, even where size and time agree"
     )
-    p.add_argument("folder", metavar="DIR|s3://…", help="folder with recordings below")
-    p.add_argument(
-        "--verify",
-        action="store_true",
-        help="read every recording and compare it with its row, even where size and time agree",
+    site: Path | None = site_option("list crossings of its bridges, from positions alone")
+    csv: Path | None = output_option(
+        "CSV file of all crossings (with --site) or recordings",
+        "OUT.csv",
+        CATALOG_CSV,
+        CROSSINGS_CSV,
     )
-    add_site(p, "list crossings of its bridges, from positions alone")
-    text = "CSV file of all crossings (with --site) or recordings"
-    add_output_file(p, "--csv", "OUT.csv", text, CATALOG_CSV, CROSSINGS_CSV)
 
 
-def _catalog(options: argparse.Namespace) -> int:
+def _catalog(options: CatalogOptions) -> int:
     from schemas.site_file import load_site
     from services.catalogue.index import update_catalog
     from services.catalogue.positions import crossings_of
@@ -135,3 +134,12 @@ def _print_crossings(found: "CatalogScan") -> None:
 
 def _time(time_ns: int) -> str:
     return f"{datetime.fromtimestamp(time_ns / _NS_PER_S, UTC):%Y-%m-%d %H:%M:%S}"
+
+
+CATALOG: Final = Subcommand(
+    "catalog",
+    CatalogOptions,
+    "build or repair the catalogue of a folder of recordings and find crossings in it",
+    "driveby catalog recordings --site site.toml",
+    _catalog,
+)

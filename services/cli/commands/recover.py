@@ -1,0 +1,65 @@
+"""The command `driveby recover`: rewrite a damaged recording for every reader."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from services.cli.parser import Subcommand
+from services.common.errors import InputError
+from services.common.kinds import MCAP
+from services.common.options import flag, force_option, output_option, positional
+
+if TYPE_CHECKING:
+    from services.recordings.recovery import Recovery
+
+EXIT_CLEAN, EXIT_LOSSY = 0, 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecoverOptions:
+    """A recording to rewrite, and what becomes of it."""
+
+    recording: Path = positional("recording to rewrite; left as it is", Path, metavar="REC.mcap")
+    output: Path | None = output_option(
+        "recording to write (default: REC.recovered.mcap beside it)",
+        "OUT.mcap",
+        MCAP,
+        flags=("-o", "--output"),
+    )
+    set_aside: bool = flag("rename the damaged recording to REC.mcap.crashed afterwards")
+    force: bool = force_option()
+    json: bool = flag("print the counts as JSON")
+
+
+def _recover(asked: RecoverOptions) -> int:
+    """Recover one recording and print a summary; return 0 (nothing was lost) or 3.
+
+    Raise InputError and FailureError as `recover_recording` does, with nothing changed.
+    """
+    from services.common.progress import reading_bar
+    from services.recordings.recovery import describe, recover_recording, recovered_path
+
+    source, target = asked.recording, asked.output or recovered_path(asked.recording)
+    if asked.set_aside and asked.output is not None:
+        raise InputError("--set-aside goes with the usual name beside the recording, not with -o")
+    with reading_bar("recovering", [source]) as next_file:
+        recovery = recover_recording(
+            source, target, force=asked.force, set_aside=asked.set_aside, progress=next_file()
+        )
+    plain = f"{target}: {describe(recovery)}"
+    print(json.dumps(_as_json(target, recovery)) if asked.json else plain)
+    return EXIT_LOSSY if recovery.is_lossy else EXIT_CLEAN
+
+
+def _as_json(target: Path, recovery: "Recovery") -> dict[str, object]:
+    return {"recording": str(target)} | recovery._asdict() | {"lossy": recovery.is_lossy}
+
+
+RECOVER: Final = Subcommand(
+    "recover",
+    RecoverOptions,
+    "rewrite a damaged or truncated recording",
+    "driveby recover run.mcap -o whole.mcap",
+    _recover,
+)

@@ -1,0 +1,65 @@
+"""Commands whose options are the fields of a frozen dataclass: parser and instance."""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import MISSING, fields
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from services.cli.parsing import command
+from services.common.options import OPTION, Option
+
+_Asked = TypeVar("_Asked")
+
+
+class Subcommand(NamedTuple, Generic[_Asked]):
+    """A command: the class of its options, and the function that takes an instance."""
+
+    name: str
+    options: type[_Asked]
+    summary: str
+    example: str
+    run: Callable[[_Asked], int]
+
+    def add(self, commands: Any) -> None:
+        """Add the command to a parser."""
+        parser = command(commands, self.name, self._handle, self.summary, self.example)
+        _add_fields(parser, self.options)
+
+    def _handle(self, given: argparse.Namespace) -> int:
+        return self.run(_filled(self.options, given))
+
+
+def _add_fields(parser: argparse.ArgumentParser, options: Any) -> None:
+    groups: dict[tuple[str, str], Any] = {("", ""): parser}
+    for one in fields(options):
+        option: Option = one.metadata[OPTION]
+        titled = (option.group, "")
+        if titled not in groups:
+            groups[titled] = parser.add_argument_group(option.group)
+        place = (option.group, option.alternatives)
+        if place not in groups:
+            groups[place] = groups[titled].add_mutually_exclusive_group()
+        settings = dict(option.settings)
+        is_repeated = settings.get("action") in ("append", "extend")
+        if one.default is not MISSING and not is_repeated:
+            settings["default"] = one.default
+        flags = option.flags or (f"--{one.name.replace('_', '-')}",)
+        if flags == ("",):
+            flags = (one.name,)
+        groups[place].add_argument(*flags, **settings)
+
+
+def _filled(options: type[_Asked], given: argparse.Namespace) -> _Asked:
+    """Return the instance that holds what was given."""
+    values = {}
+    for one in fields(options):  # type: ignore[arg-type]
+        option: Option = one.metadata[OPTION]
+        flag = option.flags[-1] if option.flags else ""
+        name = flag.lstrip("-").replace("-", "_") or one.name
+        value = getattr(given, name)
+        values[one.name] = (
+            tuple(value or ())
+            if isinstance(value, list) or (value is None and one.default == ())
+            else value
+        )
+    return options(**values)

@@ -1,0 +1,103 @@
+"""Options of `driveby replay`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.common.endpoints import default_endpoint
+from services.common.options import (
+    endpoint_option,
+    flag,
+    names,
+    number,
+    opt,
+    positional,
+    site_option,
+    speed_option,
+    tls_option,
+)
+
+_PATTERNS = "patterns with * and ?, commas between, of STREAM or OWNER/ID/STREAM"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplaySettings:
+    """A drive, what of it is published, and how."""
+
+    recordings: tuple[Path, ...] = positional(
+        "recordings, or folders of them: one drive, in the order of time",
+        Path,
+        nargs="+",
+        metavar="REC.mcap|DIR",
+    )
+    endpoint: str | None = endpoint_option()
+    tls: Path | None = tls_option()
+    name: str | None = opt("realm replay-NAME (default: name of the first recording)")
+    site: Path | None = site_option(
+        "site file of the bridges, for jumps to crossings (default: that of the recording)"
+    )
+    speed: float = speed_option(1.0, zero="0 for as fast as possible", group="when")
+    start: str | None = opt(
+        "start in seconds into the drive, or as a time in UTC (2026-09-21T22:33:20)",
+        group="when",
+        metavar="S|TIME",
+    )
+    end: str | None = opt(
+        "end, given as for --start", group="when", alternatives="end", metavar="S|TIME"
+    )
+    duration: float | None = opt(
+        "duration in seconds of the drive",
+        number("seconds", low=1e-3, high=1e9),
+        group="when",
+        alternatives="end",
+        metavar="S",
+    )
+    skip_gaps: bool = flag("skip gaps of more than 2 s", group="when")
+    loop: bool = flag(
+        "repeat without end (loggers and workers take the first pass only)", group="when"
+    )
+    paused: bool = flag("begin paused; needs a terminal", group="when")
+    topics: tuple[str, ...] = opt(
+        f"only these: {_PATTERNS} (accel,gnss or vehicle/*/accel)",
+        names,
+        group="what",
+        default=(),
+        action="extend",
+        metavar="PATTERN",
+    )
+    exclude: tuple[str, ...] = opt(
+        "topics to leave out, given as for --topics",
+        names,
+        group="what",
+        default=(),
+        action="extend",
+        metavar="PATTERN",
+    )
+    vehicle: tuple[str, ...] = opt(
+        "publish the messages of these trucks only, and no results",
+        names,
+        group="what",
+        default=(),
+        action="extend",
+        metavar="ID",
+    )
+    rename: tuple[str, ...] = opt(
+        "publish a truck under another name (the messages themselves stay as they are)",
+        group="what",
+        default=(),
+        action="append",
+        metavar="OLD=NEW",
+    )
+
+    @property
+    def address(self) -> str:
+        """Address of the bus."""
+        return self.endpoint or default_endpoint(self.tls)
+
+    @property
+    def realm_name(self) -> str:
+        """Name behind `replay-`; InputError if it is not an identifier."""
+        from services.common.naming import checked_identifier, identifier_from
+
+        if self.name is None:
+            return identifier_from(self.recordings[0].stem)
+        return checked_identifier(self.name, "--name")

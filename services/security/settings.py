@@ -1,0 +1,42 @@
+"""Options of `driveby certs`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.common.options import flag, names, opt, positional, whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class CertsSettings:
+    """Credentials to make in a folder, to renew and to revoke."""
+
+    folder: Path = positional(
+        "folder of credentials; the first run makes an authority, router, logger, worker, "
+        "viewer and replay",
+        Path,
+        metavar="FOLDER",
+    )
+    cluster: bool = flag(
+        "make an authority for a Dask cluster, with scheduler, cluster-worker and client"
+    )
+    trucks: Sequence[str] = opt("names of trucks to add", names, default=(), metavar="ID,…")
+    add: Sequence[str] = opt(
+        "roles to add, e.g. viewer/anna", names, default=(), metavar="ROLE/NAME,…"
+    )
+    host: Sequence[str] = opt(
+        "names and addresses of the machines of router and logger, besides this machine",
+        default=(),
+        nargs="+",
+        metavar="NAME",
+    )
+    days: int = opt(
+        "how long the new certificates are valid (default: 365)",
+        whole("days", 1, 3650),
+        default=365,
+        metavar="N",
+    )
+    renew: Sequence[str] = opt(
+        "names that get a new key and certificate", names, default=(), metavar="NAME,…"
+    )
+    revoke: Sequence[str] = opt("names to exclude from now on", names, default=(), metavar="NAME,…")
