@@ -118,17 +118,17 @@ def add_logger(commands: Any) -> None:
 
 def _logger(options: argparse.Namespace) -> int:
     from services.logger.run import run
+    from services.logger.settings import LoggerSettings
     from services.logger.writer import RotationLimits
 
     listen = options.listen or default_endpoint(options.tls)
-    return run(
+    asked = LoggerSettings(
         listen=listen,
         folder=options.folder,
         file=options.file,
         realms=options.realm or ("live",),
         site=options.site,
         service_id=options.id,
-        ready=_announced(options, f"ready, listening at {listen}"),
         tls=options.tls,
         insecure=options.insecure,
         limits=RotationLimits(
@@ -138,6 +138,7 @@ def _logger(options: argparse.Namespace) -> int:
         ),
         budget_bytes=None if options.budget is None else round(options.budget * 1e6),
     )
+    return run(asked, _announced(options, f"ready, listening at {listen}"))
 
 
 def add_worker(commands: Any) -> None:

@@ -44,6 +44,7 @@ from services.logger.intake import Intake
 from services.logger.memory import give_back_memory
 from services.logger.own_events import OwnEvents
 from services.logger.rate_limited_log import RateLimitedLog
+from services.logger.settings import LoggerSettings
 from services.logger.writer import FileWriter, RotationLimits, count_all
 
 _log = logging.getLogger(__name__)
@@ -73,65 +74,53 @@ _EVENTS_LOGGED = 20
 """Log lines for events of a kind per minute; recordings and bus have all of them."""
 
 
-def run(
-    *,
-    listen: str,
-    folder: Path,
-    file: Path | None,
-    realms: Sequence[str] = ("live",),
-    site: Path | None,
-    service_id: str = "logger",
-    ready: Callable[[], None] | None = None,
-    tls: Path | None = None,
-    insecure: bool = False,
-    limits: RotationLimits | None = None,
-    budget_bytes: int | None = None,
-) -> int:
+def run(asked: LoggerSettings, ready: Callable[[], None] | None = None) -> int:
     """Record until SIGINT or SIGTERM, then finish the files; return 0, or 1 if anything was lost.
 
-    `listen` is the address of the Zenoh router in this process, e.g. `tcp/127.0.0.1:7447`. With
-    `file` everything goes into that one file, else into `folder/REALM/DATE/VEHICLE-TIME.mcap`; no
-    file is ever overwritten. `realms` are the recorded ones: names, or beginnings followed by `*`
-    (`sim-*`; `*`: every one). The text of the site file `site` is put into every recording. `tls`
-    and `insecure` are those of `open_session`; `limits` defines when the next file of a truck
-    begins (SIGUSR1 demands it at once) and how much space the disk must have. Recordings of an
-    earlier run without END are recovered meanwhile; with `budget_bytes` the oldest ones whose
-    crossings have been identified are deleted. `ready` is called once, when messages can be
+    No file is ever overwritten. SIGUSR1 starts the next file of every truck at once. Recordings of
+    an earlier run without END are recovered meanwhile. `ready` is called once, when messages can be
     received. A second signal ends the process at once; the files stay readable.
 
     Raise InputError for a file that exists or cannot be created, a malformed endpoint, realm or
     site file; FailureError if the address is in use, the disk has too little space, or writing
     failed.
     """
-    limits = limits or RotationLimits()
-    if file is not None and budget_bytes is not None:
-        raise InputError("--budget needs a folder of recordings, not --file")
-    realms = _check_realms(realms)
-    realm = single_realm(realms)
-    place = RecordingTarget(folder, file, realm, _read_site(site))
-    _check_service(service_id)
-    check_speaks_for(tls, "logger", service_id)
-    check_folder_writable(file.parent if file is not None else folder)
-    if file is not None and file.exists():
-        raise InputError(f"{file}: exists, and recordings are never overwritten; give another name")
-    _check_room(file.parent if file is not None else folder, limits.min_free_bytes)
-    own = OwnEvents(service_id, time.time_ns())
+    limits = asked.limits or RotationLimits()
+    place, realms = _check(asked, limits)
+    own = OwnEvents(asked.service_id, time.time_ns())
     with (
         stopped_by_signals(on_second=leave_at_once) as stop,
-        open_session(listen=listen, tls=tls, insecure=insecure) as bus,
+        open_session(listen=asked.listen, tls=asked.tls, insecure=asked.insecure) as bus,
     ):
         writer = FileWriter(place, limits, own=own)
         try:
-            intake = Intake(realm, service_id, own.boot_id)
-            logger = _Logger(place, realms, service_id, writer, intake, own)
+            intake = Intake(place.realm, asked.service_id, own.boot_id)
+            logger = _Logger(place, realms, asked.service_id, writer, intake, own)
             with _rotated_by_signal(writer):
-                gone = _record(logger, bus, stop, ready, budget_bytes)
+                gone = _record(logger, bus, stop, ready, asked.budget_bytes)
         except BaseException:
             writer.finish("logger failed", {})
             raise
     if writer.failure is not None:
         raise FailureError(writer.failure)
     return 1 if writer.dropped or gone else 0
+
+
+def _check(asked: LoggerSettings, limits: RotationLimits) -> tuple[RecordingTarget, Sequence[str]]:
+    """Return where to write and the realms; raise as `run` does."""
+    if asked.file is not None and asked.budget_bytes is not None:
+        raise InputError("--budget needs a folder of recordings, not --file")
+    realms = _check_realms(asked.realms)
+    target = RecordingTarget(asked.folder, asked.file, single_realm(realms), _read_site(asked.site))
+    _check_service(asked.service_id)
+    check_speaks_for(asked.tls, "logger", asked.service_id)
+    check_folder_writable(asked.written)
+    if asked.file is not None and asked.file.exists():
+        raise InputError(
+            f"{asked.file}: exists, and recordings are never overwritten; give another name"
+        )
+    _check_room(asked.written, limits.min_free_bytes)
+    return target, realms
 
 
 class _Logger(NamedTuple):
@@ -173,14 +162,7 @@ def _record(
             ready()
         next_report_s = time.monotonic()
         while not stop.is_set() and logger.writer.failure is None:
-            received = _receive(subscriptions)
-            if received is None:
-                stop.wait(_PAUSE_S)
-            began_s = now_s = time.monotonic()
-            while received is not None:
-                _take(logger, received)
-                now_s = time.monotonic()
-                received = _receive(subscriptions) if now_s - began_s < _AT_ONCE_S else None
+            now_s = _take_batch(logger, subscriptions, stop)
             for fetched in completeness.step(now_s, hold=not logger.writer.has_room(_FETCH_ROOM)):
                 _take(logger, fetched)
             if now_s >= next_report_s:
@@ -204,6 +186,21 @@ def _record(
         for subscription in subscriptions:
             subscription.close()
         announcements.close()
+
+
+def _take_batch(
+    logger: _Logger, subscriptions: deque[Subscription], stop: threading.Event
+) -> float:
+    """Take the messages received within a short time, else pause; return the time after it."""
+    received = _receive(subscriptions)
+    if received is None:
+        stop.wait(_PAUSE_S)
+    began_s = now_s = time.monotonic()
+    while received is not None:
+        _take(logger, received)
+        now_s = time.monotonic()
+        received = _receive(subscriptions) if now_s - began_s < _AT_ONCE_S else None
+    return now_s
 
 
 def _receive(subscriptions: deque[Subscription]) -> RawSample | None:

@@ -36,6 +36,7 @@ from schemas.signals import (
     encode_accel,
 )
 from services.bus.session import open_session
+from services.logger.settings import LoggerSettings
 from services.logger.writer import RotationLimits
 from services.recordings.recording import read_identities, read_info
 from services.truck.gateway import Gateway
@@ -246,13 +247,15 @@ def log(endpoint: str, folder: Path, rotate_minutes: float) -> int:
 
     writer.DurableStreams = Timed  # type: ignore[misc]
     code = logger.run(
-        listen=endpoint,
-        folder=folder,
-        file=None,
-        realms=("*",),
-        site=None,
+        LoggerSettings(
+            listen=endpoint,
+            folder=folder,
+            file=None,
+            realms=("*",),
+            site=None,
+            limits=writer.RotationLimits(age_s=rotate_minutes * 60.0),
+        ),
         ready=lambda: print("ready", flush=True),
-        limits=writer.RotationLimits(age_s=rotate_minutes * 60.0),
     )
     shares = {"p50": 0.5, "p99": 0.99, "max": 1.0}
     reached = np.cumsum(delays)

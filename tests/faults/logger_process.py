@@ -10,6 +10,7 @@ from zenoh import ext
 
 from services.bus import subscription
 from services.logger import run as logger
+from services.logger.settings import LoggerSettings
 from tests.parent import die_with_parent
 
 FORGETFUL_ENV = "DRIVEBY_TEST_FORGETFUL"
@@ -35,11 +36,7 @@ def forget_publishers() -> None:
 def main(listen: str, folder: str) -> int:
     logging.basicConfig(level=logging.INFO, stream=sys.stderr)
     return logger.run(
-        listen=listen,
-        folder=Path(folder),
-        file=None,
-        realms=("*",),
-        site=None,
+        LoggerSettings(listen=listen, folder=Path(folder), file=None, realms=("*",), site=None),
         ready=lambda: print("ready", flush=True),
     )
 

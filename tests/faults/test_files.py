@@ -33,6 +33,7 @@ from services.logger import run as logger
 from services.logger import writer as writer_module
 from services.logger.backlog import QUEUE_BYTES, Backlog
 from services.logger.file_layout import RecordingTarget
+from services.logger.settings import LoggerSettings
 from services.logger.writer import FileWriter, RotationLimits
 from services.recordings.recording import is_closed, read_info, read_messages
 from services.recordings.recovery import recover_recording
@@ -363,12 +364,14 @@ def test_low_space_is_reported_and_ends_recording_early(
 def test_the_logger_does_not_start_without_room(tmp_path: Path) -> None:
     with pytest.raises(FailureError, match=r"only \d+ MB left on the disk .* \(--min-free\)"):
         logger.run(
-            listen="tcp/127.0.0.1:1",
-            folder=tmp_path / "new",
-            file=None,
-            realms=("*",),
-            site=None,
-            limits=RotationLimits(min_free_bytes=1 << 60),
+            LoggerSettings(
+                listen="tcp/127.0.0.1:1",
+                folder=tmp_path / "new",
+                file=None,
+                realms=("*",),
+                site=None,
+                limits=RotationLimits(min_free_bytes=1 << 60),
+            )
         )
     assert not (tmp_path / "new").exists()
 

@@ -43,6 +43,7 @@ for name in ("folder", "file", "site", "recording"):
 if "recordings" in arguments:
     arguments["recordings"] = [Path(path) for path in arguments["recordings"]]
 SETTINGS = {
+    "services.logger": "LoggerSettings",
     "services.replay": "ReplaySettings",
     "services.worker": "WorkerSettings",
 }

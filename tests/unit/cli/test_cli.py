@@ -17,6 +17,7 @@ from schemas.topics import Key, Message
 from services.cli import main as cli
 from services.common.errors import FailureError, InputError
 from services.drives import importing
+from services.logger.settings import LoggerSettings
 from services.recordings.recording import read_info, read_messages, read_site
 from services.recordings.writer import RecordingWriter, write_recording
 from tests.builders.commands import run
@@ -590,10 +591,10 @@ def test_logger_records_the_chosen_realms(
     monkeypatch: pytest.MonkeyPatch, given: list[str], realms: object
 ) -> None:
     """And only live without: what appears in other realms is nobody's drive."""
-    named: dict[str, object] = {}
-    monkeypatch.setattr("services.logger.run.run", lambda **arguments: named.update(arguments) or 0)
+    asked: list[LoggerSettings] = []
+    monkeypatch.setattr("services.logger.run.run", lambda one, ready: asked.append(one) or 0)
     assert cli.main(["logger", *given]) == 0
-    assert named["realms"] == realms
+    assert [one.realms for one in asked] == [realms]
 
 
 @pytest.mark.parametrize(

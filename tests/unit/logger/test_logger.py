@@ -18,6 +18,7 @@ from services.logger import run as logger
 from services.logger.backlog import Backlog
 from services.logger.file_layout import RecordingTarget
 from services.logger.intake import GAP_PATIENCE_S, Intake
+from services.logger.settings import LoggerSettings
 from services.logger.writer import FileWriter
 from services.recordings.recording import read_info, read_messages
 from services.recordings.writer import RecordingWriter
@@ -270,7 +271,9 @@ def test_what_has_come_is_written_or_counted_before_the_file_is_closed(
     )
     file = tmp_path / "a.mcap"
     monkeypatch.setattr("services.logger.run._DRAIN_S", drain_s)
-    code = logger.run(listen=endpoint, folder=tmp_path, file=file, realms=("*",), site=None)
+    code = logger.run(
+        LoggerSettings(listen=endpoint, folder=tmp_path, file=file, realms=("*",), site=None)
+    )
     found = list(read_messages(file))
     assert [m.sequence for m in found if m.key.owner == "vehicle"] == list(range(written))
     assert code == (0 if written == 50 else 1)
