@@ -116,7 +116,7 @@ ROOMS_WITH_CODE = {
     "pre_core": 5,
 }
 
-SHARED_NAMES = {}
+SHARED_NAMES: dict[str, int] = {}
 
 LISTS = {
     "lines of a module": LONG_MODULES,
